@@ -1,0 +1,111 @@
+"""The dataset card: YAML that ``datasets`` reads, and a description with tables made from the manifest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from datasets import DatasetInfo, SplitDict, SplitInfo
+from datasets.info import DatasetInfosDict
+from huggingface_hub import DatasetCardData
+
+from cards.templates import render
+from rebar_depth_bench.schema import COLUMN_MEANINGS, column_kind, features
+
+SPLIT = "test"
+_SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
+
+
+def dataset_card(manifest: Mapping[str, Any]) -> str:
+    """Return the folder's ``README.md``: ``datasets.load_dataset(ROOT, config)`` works from its YAML alone.
+
+    Each config's shards are named by a pattern that carries their digest, so that a rebuilt config is another
+    config to the cache of ``datasets`` and never served stale.
+    """
+    return render(
+        "dataset_card.md.j2",
+        yaml=_metadata(manifest).to_yaml(),
+        manifest=manifest,
+        configs=[_config_row(name, entry) for name, entry in manifest["configs"].items()],
+        columns=column_rows(),
+    )
+
+
+def column_rows() -> list[dict[str, str]]:
+    """Return the columns of a row, each eye's pair together, with the type and the meaning of each."""
+    rows: dict[str, dict[str, str]] = {}
+    for name, feature in features().items():
+        kind = column_kind(name)
+        row = rows.setdefault(kind, {"names": "", "type": _type_name(feature), "meaning": COLUMN_MEANINGS[kind]})
+        row["names"] += f"{', ' if row['names'] else ''}`{name}`"
+    return list(rows.values())
+
+
+def _type_name(feature: Any) -> str:
+    kind = type(feature).__name__
+    if kind == "List":
+        inner = _type_name(feature.feature)
+        return f"{inner} x {feature.length}"
+    return "image" if kind == "Image" else str(feature.dtype)
+
+
+def _metadata(manifest: Mapping[str, Any]) -> DatasetCardData:
+    configs: Mapping[str, Mapping[str, Any]] = manifest["configs"]
+    views = sum(len(entry["views"]) for entry in configs.values())
+    card = DatasetCardData(
+        license="cc-by-4.0",
+        pretty_name="Industrial rebar metric depth",
+        task_categories=["depth-estimation"],
+        tags=["depth", "stereo", "construction", "rebar", "synthetic"],
+        size_categories=[next((name for limit, name in _SIZES if views < limit), "100K<n<1M")],
+    )
+    infos = {name: _info(name, entry, manifest["version"]) for name, entry in configs.items()}
+    DatasetInfosDict(infos).to_dataset_card_data(card)
+    card["configs"] = [
+        {"config_name": name, "data_files": [{"split": SPLIT, "path": _shard_pattern(entry["shards"])}]}
+        for name, entry in configs.items()
+    ]
+    return card
+
+
+def _info(name: str, entry: Mapping[str, Any], version: str) -> DatasetInfo:
+    size = entry["bytes"]
+    split = SplitInfo(SPLIT, num_examples=len(entry["views"]), num_bytes=size)
+    return DatasetInfo(
+        features=features(),
+        splits=SplitDict({SPLIT: split}),
+        config_name=name,
+        version=version,
+        dataset_size=size,
+        download_size=size,
+    )
+
+
+def _shard_pattern(shards: Iterable[str]) -> str:
+    """Return the glob of a config's shards, ``<config>/test-*-<digest>.parquet``."""
+    first = next(iter(shards))
+    return f"{first.partition('/')[0]}/{SPLIT}-*-{first.rpartition('-')[2]}"
+
+
+def _config_row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
+    rig, views = entry["rig"], entry["views"]
+    steel = np.array([view["steel_px"] for view in views], float)
+    scored = np.array([view["scored_px"] for view in views], float)
+    seen = steel > 0
+    return {
+        "name": name,
+        "views": len(views),
+        "grid": f"{rig['width']} x {rig['height']}",
+        "distance": _distance(entry["protocol"]),
+        "steel": f"{100 * np.mean(steel) / (rig['width'] * rig['height']):.1f} %",
+        "kept": f"{100 * np.mean(scored[seen] / steel[seen]):.0f} %" if seen.any() else "none",
+        "out_of_protocol": int(np.count_nonzero(scored == 0)),
+        "megabytes": f"{entry['bytes'] / 1e6:.1f}",
+    }
+
+
+def _distance(protocol: Mapping[str, Any]) -> str:
+    if protocol["kind"] == "ring":
+        return f"{protocol['radius_m']:g} m"
+    return f"{min(protocol['radii_m']):g}-{max(protocol['radii_m']):g} m"

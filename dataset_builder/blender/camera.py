@@ -1,0 +1,81 @@
+"""Puts Blender's camera where an OpenCV camera stands."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+from jaxtyping import Float64
+from mathutils import Matrix
+from numpy import ndarray
+
+from rebar_depth_bench.cameras import inverse_rigid
+from rebar_depth_bench.errors import BuildError
+
+SENSOR_MM = 36.0
+CLIP_M = (0.001, 1000.0)
+MAX_DEVIATION = 1e-5
+NAME = "camera"
+
+_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def place_camera(
+    K: Float64[ndarray, "3 3"], cam_from_world: Float64[ndarray, "4 4"], width: int, height: int
+) -> float:
+    """Make the scene's camera the pinhole ``K`` (pixels, centres at integers) of a ``width`` x ``height`` grid.
+
+    Returns the largest deviation between the asked 4 x 4 pose and the one Blender holds (it rounds to
+    float32) and raises ``BuildError`` where that exceeds ``MAX_DEVIATION``. Raises ``ValueError`` for a
+    skewed ``K``, or focal lengths whose ratio Blender's pixel aspect cannot hold.
+    """
+    camera = _scene_camera()
+    _set_grid(K, width, height)
+    _set_optics(camera.data, K, width, height)
+    wanted = inverse_rigid(cam_from_world) @ _OPENGL_FROM_OPENCV
+    camera.matrix_world = Matrix(wanted.tolist())
+    bpy.context.view_layer.update()
+    deviation = float(np.abs(placed_cam_from_world() - cam_from_world).max())
+    if deviation > MAX_DEVIATION:
+        raise BuildError(f"Blender holds a camera pose {deviation:.2e} off the one asked for:\n{cam_from_world}")
+    return deviation
+
+
+def placed_cam_from_world() -> Float64[ndarray, "4 4"]:
+    """Return the pose that Blender holds, in OpenCV axes: its ``matrix_world``, a float32 matrix, inverted."""
+    world_from_gl = np.array(_scene_camera().matrix_world, dtype=np.float64)
+    return np.asarray(np.linalg.inv(world_from_gl @ _OPENGL_FROM_OPENCV))
+
+
+def _scene_camera() -> bpy.types.Object:
+    scene = bpy.context.scene
+    if scene.camera is None:
+        scene.camera = bpy.data.objects.new(NAME, bpy.data.cameras.new(NAME))
+        scene.collection.objects.link(scene.camera)
+    return scene.camera
+
+
+def _set_grid(K: Float64[ndarray, "3 3"], width: int, height: int) -> None:
+    """Set the image size and the pixel aspect: fy / fx, which Blender takes as two numbers from 1 upwards."""
+    if K[0, 1] != 0.0 or K[1, 0] != 0.0:
+        raise ValueError(f"Blender's camera has no skew, K has:\n{K}")
+    aspect = K[1, 1] / K[0, 0]
+    if not 1 / 200 <= aspect <= 200:
+        raise ValueError(f"fy / fx is {aspect}, Blender's pixel aspect reaches from 1/200 to 200")
+    render = bpy.context.scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
+    render.pixel_aspect_x = max(aspect, 1.0)
+    render.pixel_aspect_y = max(1 / aspect, 1.0)
+
+
+def _set_optics(optics: bpy.types.Camera, K: Float64[ndarray, "3 3"], width: int, height: int) -> None:
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    optics.type = "PERSP"
+    optics.sensor_fit = "HORIZONTAL"
+    optics.sensor_width = SENSOR_MM
+    optics.lens_unit = "MILLIMETERS"
+    optics.lens = fx * SENSOR_MM / width
+    optics.shift_x = ((width - 1) / 2 - cx) / width
+    # Both shifts are shares of the sensor's width; a pixel is fx / fy as high as it is wide.
+    optics.shift_y = (cy - (height - 1) / 2) * (fx / fy) / width
+    optics.clip_start, optics.clip_end = CLIP_M
+    optics.dof.use_dof = False

@@ -1,0 +1,114 @@
+"""The room round the board: bench, walls and furniture, all of them real surfaces with depth.
+
+World frame, metres; the bench top lies just under the sheet at z = 0. Nothing that could pass for steel
+reinforcement stands in the room, and nothing stands where the dome's cameras do (0.5 m round the origin).
+The room is open above the heads of the walls: no view of the dome sees that high, and light that leaves
+the room costs no further bounces (a closed one takes four times as long to render).
+"""
+
+from __future__ import annotations
+
+from dataset_builder.blender.solids import Point, box, cylinder, turned_box
+from dataset_builder.model import NOT_STEEL, Mesh, Part
+
+SHEET_THICKNESS_M = 0.0003
+BENCH_TOP_M = -SHEET_THICKNESS_M - 0.0001
+FLOOR_M = -0.78
+WALL_HEAD_M = 1.6
+WEST_M, EAST_M, SOUTH_M, NORTH_M = -2.3, 2.5, -2.1, 2.3
+WALL_THICKNESS_M = 0.1
+
+
+def laboratory() -> tuple[Part, ...]:
+    """Return every surface of the room, none of them steel."""
+    return (*_shell(), *_bench(), *_furniture(), *_on_the_bench())
+
+
+def _part(name: str, mesh: Mesh, material: str) -> Part:
+    return Part(name, mesh, NOT_STEEL, material)
+
+
+def _shell() -> tuple[Part, ...]:
+    """Return floor and four walls; slabs butt against each other from outside and never overlap."""
+    t = WALL_THICKNESS_M
+    low, high = FLOOR_M, WALL_HEAD_M
+    return (
+        _part("floor", box((WEST_M, SOUTH_M, low - t), (EAST_M, NORTH_M, low)), "floor"),
+        _part("wall-west", box((WEST_M - t, SOUTH_M, low), (WEST_M, NORTH_M, high)), "plaster"),
+        _part("wall-east", box((EAST_M, SOUTH_M, low), (EAST_M + t, NORTH_M, high)), "plaster"),
+        _part("wall-south", box((WEST_M, SOUTH_M - t, low), (EAST_M, SOUTH_M, high)), "plaster"),
+        _part("wall-north", box((WEST_M, NORTH_M, low), (EAST_M, NORTH_M + t, high)), "plaster"),
+    )
+
+
+def _bench() -> tuple[Part, ...]:
+    """Return a laboratory bench: a wooden top on a steel-grey frame."""
+    x, y, thickness = 0.95, 0.70, 0.036
+    under = BENCH_TOP_M - thickness
+    legs = [
+        _part(f"bench-leg-{k}", _leg(sx * (x - 0.08), sy * (y - 0.08), under), "painted metal")
+        for k, (sx, sy) in enumerate([(-1, -1), (-1, 1), (1, -1), (1, 1)])
+    ]
+    return (_part("bench-top", box((-x, -y, under), (x, y, BENCH_TOP_M)), "wood"), *legs)
+
+
+def _leg(x_m: float, y_m: float, top_m: float, half_m: float = 0.03) -> Mesh:
+    gap_m = 0.0005
+    return box((x_m - half_m, y_m - half_m, FLOOR_M + gap_m), (x_m + half_m, y_m + half_m, top_m - gap_m))
+
+
+def _furniture() -> tuple[Part, ...]:
+    """Return what the low cameras see behind the bench: cabinets, a shelf with boxes, a pinboard, a radiator."""
+    foot = FLOOR_M + 0.001
+    north, east, west, south = NORTH_M - 0.002, EAST_M - 0.002, WEST_M + 0.002, SOUTH_M + 0.002
+    cabinets = [
+        _part(f"cabinet-{k}", box((x, north - 0.5, foot), (x + 0.594, north, 0.12)), "cabinet")
+        for k, x in enumerate([-1.9, -1.3, -0.7, -0.1, 0.5])
+    ]
+    shelf_boards = [
+        _part(f"shelf-{k}", box((east - 0.35, -1.2, z), (east, 1.0, z + 0.025)), "wood")
+        for k, z in enumerate([-0.42, 0.0, 0.42, 0.84])
+    ]
+    return (
+        *cabinets,
+        _part("worktop", box((-1.92, north - 0.53, 0.121), (1.12, north, 0.155)), "dark laminate"),
+        *shelf_boards,
+        *(_part(f"crate-{k}", mesh, colour) for k, (mesh, colour) in enumerate(_crates(east))),
+        _part("pinboard", box((-1.3, north - 0.02, 0.42), (0.3, north, 1.25)), "cork"),
+        _part("radiator", box((west, -0.9, -0.66), (west + 0.09, 0.9, -0.1)), "painted metal"),
+        _part("door", box((-0.2, south, foot), (0.72, south + 0.04, 1.28)), "door"),
+        _part("locker", box((-1.75, south, foot), (-0.85, south + 0.45, 1.05)), "cabinet"),
+    )
+
+
+def _crates(east_m: float) -> list[tuple[Mesh, str]]:
+    """Return the storage boxes on the shelf: each stands half a millimetre clear of its board."""
+    rows = {-0.3945: "blue plastic", 0.0255: "cardboard", 0.4455: "grey plastic"}
+    widths = [0.34, 0.42, 0.30, 0.46]
+    crates = []
+    for row, (z, colour) in enumerate(rows.items()):
+        y = -1.12 + 0.07 * row
+        for width in widths:
+            mesh = box((east_m - 0.33, y, z), (east_m - 0.03, y + width, z + 0.24 - 0.03 * row))
+            crates.append((mesh, colour))
+            y += width + 0.06
+    return crates
+
+
+def _on_the_bench() -> tuple[Part, ...]:
+    """Return the things that lie about on the bench, beyond the reach of the dome's cameras."""
+    z = BENCH_TOP_M + 0.0005
+
+    def standing(x: float, y: float, size: Point, turn: float) -> Mesh:
+        return turned_box((x, y, z + size[2] / 2), size, turn)
+
+    return (
+        _part("cube-a", standing(-0.70, 0.50, (0.10, 0.10, 0.10), 14), "concrete"),
+        _part("cube-b", standing(-0.55, 0.58, (0.10, 0.10, 0.10), -8), "concrete"),
+        _part("cylinder", cylinder((-0.80, 0.36, z), 0.05, 0.20), "concrete"),
+        _part("toolbox", standing(0.70, 0.54, (0.34, 0.17, 0.14), -12), "red paint"),
+        _part("toolbox-lid", turned_box((0.70, 0.54, z + 0.16), (0.35, 0.18, 0.03), -12), "dark laminate"),
+        _part("notebook", standing(-0.72, -0.45, (0.21, 0.15, 0.014), 24), "blue plastic"),
+        _part("carton", standing(0.76, -0.48, (0.20, 0.15, 0.11), 31), "cardboard"),
+        _part("mug", cylinder((0.80, 0.10, z), 0.041, 0.095), "white glaze"),
+    )

@@ -1,0 +1,102 @@
+"""A few words for Blender's shader nodes, so that a material reads as what it is made of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+Socket = Any
+Colour = tuple[float, float, float]
+"""Linear Rec. 709."""
+
+
+class Shader:
+    """One material's node tree under construction; the methods add nodes and return output sockets."""
+
+    def __init__(self, name: str) -> None:
+        self.material = bpy.data.materials.new(name)
+        self.material.use_nodes = True
+        self._tree = self.material.node_tree
+        self._tree.nodes.clear()
+
+    def node(self, kind: str, inputs: dict[str | int, Any], **settings: Any) -> Any:
+        """Add a node; ``inputs`` are sockets to link or values to set, ``settings`` its own properties."""
+        node = self._tree.nodes.new(kind)
+        for name, value in settings.items():
+            setattr(node, name, value)
+        for key, value in inputs.items():
+            self._feed(node.inputs[key], value)
+        return node
+
+    def _feed(self, socket: Socket, value: Any) -> None:
+        if isinstance(value, bpy.types.NodeSocket):
+            self._tree.links.new(value, socket)
+        elif socket.type == "RGBA":
+            socket.default_value = (*value, 1.0)
+        else:
+            socket.default_value = value
+
+    def position(self) -> Socket:
+        """Return the shading point in the object's own frame, metres."""
+        return self.node("ShaderNodeTexCoord", {}).outputs["Object"]
+
+    def uv(self) -> Socket:
+        """Return the mesh's UV coordinates."""
+        return self.node("ShaderNodeTexCoord", {}).outputs["UV"]
+
+    def object_value(self, name: str) -> Socket:
+        """Return the object's custom property ``name``."""
+        node = self.node("ShaderNodeAttribute", {}, attribute_type="OBJECT", attribute_name=name)
+        return node.outputs["Fac"]
+
+    def stretched(self, position: Socket, scale: tuple[float, float, float]) -> Socket:
+        """Return ``position`` scaled axis by axis."""
+        return self.node("ShaderNodeMapping", {"Vector": position, "Scale": scale}).outputs["Vector"]
+
+    def shifted(self, position: Socket, by_m: Socket) -> Socket:
+        """Return ``position`` shifted by ``by_m`` along all three axes, which picks another part of a noise."""
+        return self.node("ShaderNodeVectorMath", {0: position, 1: by_m}, operation="ADD").outputs[0]
+
+    def noise(self, position: Socket, per_metre: float, detail: float = 2.0) -> Socket:
+        """Return fractal noise round 0.5 with ``per_metre`` features a metre; each ``detail`` costs as much again."""
+        inputs: dict[str | int, Any] = {
+            "Vector": position,
+            "Scale": per_metre,
+            "Detail": detail,
+            "Roughness": 0.6,
+        }
+        return self.node("ShaderNodeTexNoise", inputs, noise_dimensions="3D").outputs["Fac"]
+
+    def step(self, value: Socket, low: float, high: float) -> Socket:
+        """Return a smooth step of ``value`` from 0 at ``low`` to 1 at ``high``."""
+        return self.remap(value, low, high, 0.0, 1.0, "SMOOTHSTEP")
+
+    def remap(
+        self, value: Socket, low: float, high: float, to_low: float, to_high: float, how: str = "LINEAR"
+    ) -> Socket:
+        """Return ``value`` mapped from [low, high] to [to_low, to_high], clamped."""
+        inputs: dict[str | int, Any] = {0: value, 1: low, 2: high, 3: to_low, 4: to_high}
+        return self.node("ShaderNodeMapRange", inputs, interpolation_type=how).outputs["Result"]
+
+    def add(self, a: Socket, b: Socket | float) -> Socket:
+        """Return the sum of two values."""
+        return self.node("ShaderNodeMath", {0: a, 1: b}, operation="ADD").outputs[0]
+
+    def mix(self, share: Socket, a: Socket | Colour, b: Socket | Colour) -> Socket:
+        """Return the colour ``a`` where ``share`` is 0 and ``b`` where it is 1."""
+        # A colour mix has its sockets at 6 and 7, and its result at 2.
+        inputs: dict[str | int, Any] = {0: share, 6: a, 7: b}
+        return self.node("ShaderNodeMix", inputs, data_type="RGBA").outputs[2]
+
+    def bump(self, height: Socket, strength: float, depth_m: float) -> Socket:
+        """Return shading normals for ``height`` (0 to 1) of ``depth_m``; the geometry stays as it is."""
+        inputs: dict[str | int, Any] = {"Height": height, "Strength": strength, "Distance": depth_m}
+        return self.node("ShaderNodeBump", inputs).outputs["Normal"]
+
+    def surface(self, **inputs: Any) -> bpy.types.Material:
+        """Finish with a Principled surface; keywords are its inputs, with ``_`` for a space."""
+        named: dict[str | int, Any] = {key.replace("_", " "): value for key, value in inputs.items()}
+        shader = self.node("ShaderNodeBsdfPrincipled", named).outputs["BSDF"]
+        self.node("ShaderNodeOutputMaterial", {"Surface": shader})
+        return self.material

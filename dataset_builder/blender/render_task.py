@@ -1,0 +1,91 @@
+"""Renders the views of one shard: colour by Cycles, ground truth by ray casting the meshes Cycles renders."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+from numpy import ndarray
+
+from dataset_builder.assemblies import aim_point_m, make_assembly
+from dataset_builder.blender.evaluated import evaluated_world_mesh
+from dataset_builder.blender.render import configure_colour, render_colour
+from dataset_builder.blender.scene import build_scene
+from dataset_builder.configs import view_id
+from dataset_builder.model import WorldMesh
+from dataset_builder.protocols import poses
+from dataset_builder.raycast import RayCaster
+from dataset_builder.rows import Eye, View, encode_view
+from dataset_builder.shards import Staging, stage_row
+from dataset_builder.specs import ConfigSpec
+from dataset_builder.stopwatch import Stopwatch
+from dataset_builder.tasks import RenderTask
+from rebar_depth_bench.cameras import ideal_K, pixel_rays, right_of_rig
+from rebar_depth_bench.digests import file_sha256
+from rebar_depth_bench.ply import write_mesh_ply
+from rebar_depth_bench.schema import EYES
+
+
+def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None]) -> None:
+    """Stage every view of the task that is not staged yet; report each, and the digest of the scene's mesh."""
+    watch = Stopwatch()
+    staging = Staging(task.staging)
+    with watch.timing("scene"):
+        assembly = make_assembly(task.config.scene.assembly)
+        build_scene(assembly, task.config.scene)
+        configure_colour(task.config.colour, task.threads)
+        mesh = evaluated_world_mesh()
+        mesh_sha256 = _stage_mesh(mesh, staging.mesh)
+        caster = RayCaster(mesh)
+        left_poses = poses(task.config.protocol, aim_point_m(assembly), task.config.rig)
+    report({"mesh_sha256": mesh_sha256, "seconds": watch.take()})
+    with tempfile.TemporaryDirectory(dir=task.staging) as scratch:
+        for index in task.indices:
+            path = staging.row(index)
+            if not path.is_file():
+                view = _render_view(task.config, index, left_poses[index], caster, Path(scratch), watch)
+                with watch.timing("encode"):
+                    row, record = encode_view(view)
+                with watch.timing("write"):
+                    stage_row(path, row, record)
+            report({"view": index, "seconds": watch.take()})
+
+
+def _render_view(
+    config: ConfigSpec,
+    index: int,
+    left_cam_from_world: Float64[ndarray, "4 4"],
+    caster: RayCaster,
+    scratch: Path,
+    watch: Stopwatch,
+) -> View:
+    rig = config.rig
+    K = ideal_K(rig.width, rig.height)
+    rays_cam = pixel_rays(K, rig.width, rig.height)
+    eyes = {}
+    for eye_index, eye in enumerate(EYES):
+        pose = left_cam_from_world if eye == "left" else right_of_rig(left_cam_from_world, rig.baseline_m)
+        with watch.timing("colour"):
+            rgb: UInt8[ndarray, "h w 3"] = render_colour(
+                K, pose, rig.width, rig.height, _cycles_seed(config, index, eye_index), scratch
+            )
+        with watch.timing("truth"):
+            truth = caster.cast(rays_cam, pose)
+        eyes[eye] = Eye(rgb, truth.depth_m, truth.mask, truth.bars, K, np.zeros(5), pose)
+    return View(view_id(config.name, index), eyes["left"], eyes["right"], rig.baseline_m)
+
+
+def _cycles_seed(config: ConfigSpec, index: int, eye_index: int) -> int:
+    """Return a seed of its own for every image, so that noise never repeats from view to view."""
+    entropy = [config.scene.seed, *config.name.encode(), index, eye_index]
+    return int(np.random.SeedSequence(entropy).generate_state(1)[0] >> 1)
+
+
+def _stage_mesh(mesh: WorldMesh, path: Path) -> str:
+    if not path.exists():
+        write_mesh_ply(path, mesh.vertices_m, mesh.faces, mesh.face_bar_id)
+    return file_sha256(path)

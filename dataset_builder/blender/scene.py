@@ -1,0 +1,101 @@
+"""Builds the scene in Blender's open file: steel, board, room. World frame, metres."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import bpy
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from dataset_builder.blender.laboratory import SHEET_THICKNESS_M, laboratory
+from dataset_builder.blender.lighting import add_lights
+from dataset_builder.blender.materials import material, paper, surface_variation
+from dataset_builder.blender.solids import box
+from dataset_builder.board import board_texture
+from dataset_builder.model import NOT_STEEL, Assembly, Mesh, Part
+from dataset_builder.specs import BoardSpec, SceneSpec
+
+BAR_ID = "bar_id"
+"""The custom property that carries an object's bar id."""
+
+BOARD_PX_PER_M = 6000.0
+SHARP_EDGE_DEG = 50.0
+SAME_SHAPE_M = 1e-9
+
+
+def build_scene(assembly: Assembly, spec: SceneSpec) -> None:
+    """Replace Blender's open file with the scene: one object per bar, the printed board and the room."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    for part, mesh, origin_m in _with_shared_meshes(assembly.parts):
+        steel = _add_object(part, mesh, origin_m)
+        for name, value in surface_variation(spec.seed, part.bar_id).items():
+            steel[name] = value
+    for part in laboratory():
+        _add_object(part, _mesh_data(part.name, part.mesh, part.material), np.zeros(3))
+    _add_board(spec.board)
+    add_lights()
+    bpy.context.view_layer.update()
+
+
+def _with_shared_meshes(
+    parts: tuple[Part, ...],
+) -> Iterator[tuple[Part, bpy.types.Mesh, Float64[ndarray, "3"]]]:
+    """Yield each part with its mesh data and origin; parts that differ by a shift alone share their data."""
+    shapes: list[tuple[Mesh, str, bpy.types.Mesh]] = []
+    for part in parts:
+        origin_m = part.mesh.vertices_m.min(axis=0)
+        local = Mesh(part.mesh.vertices_m - origin_m, part.mesh.faces)
+        data = next((data for mesh, name, data in shapes if name == part.material and _same(mesh, local)), None)
+        if data is None:
+            data = _mesh_data(part.name, local, part.material)
+            shapes.append((local, part.material, data))
+        yield part, data, origin_m
+
+
+def _same(a: Mesh, b: Mesh) -> bool:
+    return (
+        a.vertices_m.shape == b.vertices_m.shape
+        and np.array_equal(a.faces, b.faces)
+        and bool(np.abs(a.vertices_m - b.vertices_m).max() < SAME_SHAPE_M)
+    )
+
+
+def _add_object(part: Part, data: bpy.types.Mesh, origin_m: Float64[ndarray, "3"]) -> bpy.types.Object:
+    added = bpy.data.objects.new(part.name, data)
+    added.location = origin_m
+    added[BAR_ID] = part.bar_id
+    bpy.context.scene.collection.objects.link(added)
+    return added
+
+
+def _mesh_data(name: str, mesh: Mesh, material_name: str) -> bpy.types.Mesh:
+    """Return Blender mesh data of the very triangles of ``mesh``, round edges smooth, sharp ones sharp."""
+    data = bpy.data.meshes.new(name)
+    data.vertices.add(len(mesh.vertices_m))
+    data.vertices.foreach_set("co", mesh.vertices_m.astype(np.float32).ravel())
+    data.loops.add(mesh.faces.size)
+    data.loops.foreach_set("vertex_index", mesh.faces.ravel())
+    data.polygons.add(len(mesh.faces))
+    data.polygons.foreach_set("loop_start", np.arange(0, mesh.faces.size, 3, dtype=np.int32))
+    data.update(calc_edges=True)
+    data.shade_smooth()
+    data.set_sharp_from_angle(angle=float(np.deg2rad(SHARP_EDGE_DEG)))
+    data.materials.append(material(material_name))
+    return data
+
+
+def _add_board(spec: BoardSpec) -> None:
+    """Add the sheet: its top at z = 0 bears the print, the rest is plain paper."""
+    half_x, half_y = spec.width_m / 2, spec.height_m / 2
+    sheet = box((-half_x, -half_y, -SHEET_THICKNESS_M), (half_x, half_y, 0.0))
+    data = _mesh_data("board", sheet, "sheet edge")
+    data.materials.append(paper(board_texture(spec, BOARD_PX_PER_M)))
+    on_top = (sheet.vertices_m[sheet.faces][:, :, 2] == 0.0).all(axis=1)
+    data.polygons.foreach_set("material_index", on_top.astype(np.int32))
+    # The picture's left edge is at -x and its top edge at +y.
+    uv = sheet.vertices_m[:, :2] / np.array([spec.width_m, spec.height_m]) + 0.5
+    layer = data.uv_layers.new(name="print")
+    layer.data.foreach_set("uv", uv[sheet.faces.ravel()].astype(np.float32).ravel())
+    _add_object(Part("board", sheet, NOT_STEEL, "paper"), data, np.zeros(3))

@@ -1,0 +1,109 @@
+"""Builds or continues a dataset folder: plan, render in worker processes, pack, publish."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dataset_builder.assemblies import make_assembly
+from dataset_builder.blender_process import BlenderProcesses, Event
+from dataset_builder.configs import BuildRequest, check_request
+from dataset_builder.lock import build_lock
+from dataset_builder.plan import BUILD_FOLDER, ConfigPlan, plan_request
+from dataset_builder.publish import check_folder, check_scenes, is_published, publish_config, sweep
+from dataset_builder.shards import runs_of_views
+from dataset_builder.tasks import RenderTask
+
+Progress = Callable[[str, int, int], None]
+"""Called with a config's name, how many of its views are done and how many there are."""
+
+
+@dataclass
+class BuildSummary:
+    """What a build did: configs built, configs found up to date, and where the seconds of its workers went."""
+
+    built: list[str] = field(default_factory=list)
+    up_to_date: list[str] = field(default_factory=list)
+    seconds: Counter[str] = field(default_factory=Counter)
+
+
+def build(
+    request: BuildRequest, out: Path, *, workers: int, threads: int, progress: Progress | None = None
+) -> BuildSummary:
+    """Build the requested configs in ``out``, or continue an interrupted build of the same ones.
+
+    ``workers`` render processes of ``threads`` threads each work at once; neither changes a byte of the
+    result. Each config is published as soon as it is complete.
+
+    Raises ``InputError`` for a request that cannot be built, ``RenderProcessError`` when a render process
+    dies twice.
+    """
+    check_request(request)
+    plans = plan_request(request, out)
+    for assembly in {plan.spec.scene.assembly for plan in plans}:
+        make_assembly(assembly)  # a bad mesh file is told before anything is written
+    check_folder(out)
+    with build_lock(out / BUILD_FOLDER):
+        sweep(out)
+        check_scenes(out, plans)
+        summary = BuildSummary()
+        for plan in plans:
+            if is_published(out, plan):
+                summary.up_to_date.append(plan.spec.name)
+            else:
+                _render(plan, workers, threads, progress, summary)
+                publish_config(out, plan)
+                shutil.rmtree(plan.staging.root)
+                summary.built.append(plan.spec.name)
+    _remove_build_folder(out / BUILD_FOLDER)
+    return summary
+
+
+def _render(
+    plan: ConfigPlan, workers: int, threads: int, progress: Progress | None, summary: BuildSummary
+) -> None:
+    """Run the plan's shards through worker processes; on any failure or interrupt none is left running."""
+    plan.staging.root.mkdir(parents=True, exist_ok=True)
+    done = {index for index in plan.indices if plan.staging.row(index).is_file()}
+    lock = threading.Lock()
+
+    def on_event(event: Event) -> None:
+        with lock:
+            summary.seconds.update(event["seconds"])
+            if "view" in event:
+                done.add(event["view"])
+            if progress is not None:
+                progress(plan.spec.name, len(done), len(plan.indices))
+
+    runs = [run for run in enumerate(runs_of_views(plan.indices)) if not _is_rendered(plan, run[1])]
+    with ThreadPoolExecutor(workers) as pool, BlenderProcesses() as blender:
+        futures = [
+            pool.submit(
+                blender.run,
+                RenderTask(plan.spec, shard, indices, plan.staging.root, threads),
+                f"{plan.spec.name} views {indices[0]} to {indices[-1]}",
+                plan.staging.log(shard),
+                on_event,
+            )
+            for shard, indices in runs
+        ]
+        finished, waiting = wait(futures, return_when=FIRST_EXCEPTION)
+        for future in waiting:
+            future.cancel()
+        for future in finished:
+            future.result()
+
+
+def _is_rendered(plan: ConfigPlan, indices: tuple[int, ...]) -> bool:
+    return plan.staging.mesh.is_file() and all(plan.staging.row(index).is_file() for index in indices)
+
+
+def _remove_build_folder(folder: Path) -> None:
+    """Remove the build folder unless other configs' unfinished pieces stand in it."""
+    if not any(path.is_dir() for path in folder.iterdir()):
+        shutil.rmtree(folder)

@@ -1,0 +1,101 @@
+"""The ``rebar-build`` command."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from dataset_builder.audit import audit, print_audit
+from dataset_builder.build import BuildSummary, build
+from dataset_builder.configs import CONFIGS, BuildRequest
+from dataset_builder.mesh_door import UNITS_M, mesh_file_spec
+from rebar_depth_bench.console import ProgressBars, run_command
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.version import software_version
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``rebar-build``; return its exit status."""
+    options = _parser().parse_args(arguments)
+    command = _audit if options.command == "audit" else _build
+    return run_command(lambda: command(options))
+
+
+def _build(options: argparse.Namespace) -> None:
+    if options.out is None:
+        raise InputError("--out ROOT is missing: the dataset folder to build")
+    if options.workers < 1:
+        raise InputError(f"--workers is {options.workers}, expected 1 or more")
+    request = BuildRequest(
+        configs=tuple(options.config or CONFIGS),
+        views=options.views,
+        width=options.width,
+        height=options.height,
+        samples=options.samples,
+        seed=options.seed,
+        mesh=mesh_file_spec(options.mesh, options.mesh_unit) if options.mesh else None,
+    )
+    threads = max(1, (os.cpu_count() or 1) // options.workers)
+    with ProgressBars() as bars:
+        summary = build(request, options.out, workers=options.workers, threads=threads, progress=bars.update)
+    _print_summary(options.out, summary)
+
+
+def _print_summary(out: Path, summary: BuildSummary) -> None:
+    if summary.up_to_date:
+        print(f"up to date: {', '.join(summary.up_to_date)}")
+    if summary.built:
+        print(f"built: {', '.join(summary.built)}")
+        stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in summary.seconds.most_common())
+        print(f"seconds in render processes: {stages}", file=sys.stderr)
+    print(out)
+
+
+def _audit(options: argparse.Namespace) -> None:
+    with ProgressBars() as bars:
+        report = audit(options.root, depth_views=options.depth_views, progress=bars.update)
+    print_audit(report)
+    if report.failures:
+        raise InputError(f"{options.root}: {len(report.failures)} of {len(report.checks)} checks failed")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="rebar-build",
+        description="Render a dataset folder of stereo views with exact depth, or continue one.",
+    )
+    parser.add_argument("--version", action="version", version=software_version())
+    parser.add_argument("--out", type=Path, metavar="ROOT", help="the dataset folder to build or continue")
+    parser.add_argument(
+        "--config",
+        nargs="+",
+        action="extend",
+        metavar="NAME",
+        help=f"which configs (default: all): {', '.join(CONFIGS)}",
+    )
+    parser.add_argument("--views", type=int, metavar="N", help="N views spread evenly over each full protocol")
+    parser.add_argument("--width", type=int, default=BuildRequest.width, help="pixels (default: %(default)s)")
+    parser.add_argument("--height", type=int, default=BuildRequest.height, help="pixels (default: %(default)s)")
+    parser.add_argument(
+        "--samples", type=int, default=BuildRequest.samples, help="Cycles samples per pixel (default: %(default)s)"
+    )
+    parser.add_argument("--workers", type=int, default=1, help="render processes at once (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of surfaces and noise (default: %(default)s)")
+    parser.add_argument("--mesh", metavar="FILE", help="STL, PLY, OBJ or glTF file that replaces the lattice's rods")
+    parser.add_argument(
+        "--mesh-unit", default="m", metavar="UNIT", help=f"unit of the mesh file: {', '.join(UNITS_M)} (default: m)"
+    )
+    commands = parser.add_subparsers(dest="command", metavar="audit")
+    checking = commands.add_parser("audit", help="check a dataset folder and its ground truth")
+    checking.add_argument("root", metavar="ROOT", help="the dataset folder")
+    checking.add_argument(
+        "--depth-views",
+        type=int,
+        default=4,
+        metavar="N",
+        help="views per config whose depth is compared with Cycles' own (default: %(default)s)",
+    )
+    return parser

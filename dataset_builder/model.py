@@ -1,0 +1,56 @@
+"""What a scene is made of before any renderer sees it: bars, meshes, parts. World frame, metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Float64, Int32, UInt16
+from numpy import ndarray
+
+NOT_STEEL = 0
+"""The bar id of every surface that is not reinforcement."""
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One reinforcing bar: its id (1 and up), what it does, its nominal diameter and its centreline."""
+
+    bar_id: int
+    role: str
+    diameter_m: float
+    axis_m: tuple[tuple[float, float, float], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh, counter-clockwise from outside; ``vertices_m`` in its own frame."""
+
+    vertices_m: Float64[ndarray, "v 3"]
+    faces: Int32[ndarray, "f 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One object of a scene: a mesh in the world frame, the bar it is (0: none) and its material's name."""
+
+    name: str
+    mesh: Mesh
+    bar_id: int
+    material: str
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """The steel of a scene: its bars, and a part for each of them."""
+
+    bars: tuple[Bar, ...]
+    parts: tuple[Part, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class WorldMesh:
+    """All surfaces of a scene as one mesh: what rays are cast against and what ``meshes/*.ply`` holds."""
+
+    vertices_m: Float64[ndarray, "v 3"]
+    faces: Int32[ndarray, "f 3"]
+    face_bar_id: UInt16[ndarray, "f"]

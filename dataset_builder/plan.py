@@ -1,0 +1,72 @@
+"""What a build has to do for one config, and the key that names everything that decides its bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from dataset_builder.configs import BuildRequest
+from dataset_builder.protocols import offsets_m, subset
+from dataset_builder.shards import VIEWS_PER_SHARD, Staging
+from dataset_builder.specs import ConfigSpec
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.digests import parameters_digest
+from rebar_depth_bench.version import software_version
+
+BUILD_FOLDER = ".build"
+_STAMPED = ("bpy", "embreex", "numpy", "opencv-contrib-python-headless", "OpenEXR", "pillow", "pyarrow")
+"""Libraries that decide bytes; their versions are part of the key and stand in the manifest."""
+
+
+@dataclass(frozen=True)
+class ConfigPlan:
+    """One config to build: its spec, which of its protocol's views, and where its pieces are staged."""
+
+    spec: ConfigSpec
+    indices: tuple[int, ...]
+    key: str
+    staging: Staging
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Every parameter of the config, as the manifest holds it."""
+        return config_parameters(self.spec)
+
+
+def plan_config(spec: ConfigSpec, views: int | None, out: Path) -> ConfigPlan:
+    """Return the plan of one config in the dataset folder ``out``."""
+    indices = tuple(subset(len(offsets_m(spec.protocol)), views))
+    decides_bytes = [config_parameters(spec), indices, VIEWS_PER_SHARD, generator_stamp()]
+    key = parameters_digest(decides_bytes)
+    return ConfigPlan(spec, indices, key, Staging(out / BUILD_FOLDER / f"{spec.name}-{key[:16]}"))
+
+
+def plan_request(request: BuildRequest, out: Path) -> list[ConfigPlan]:
+    """Return the plans of all requested configs."""
+    return [plan_config(spec, request.views, out) for spec in request.config_specs()]
+
+
+def config_parameters(spec: ConfigSpec) -> dict[str, Any]:
+    """Return a config's spec as plain JSON values; a mesh file is named without its folder."""
+    parameters = asdict(spec)
+    assembly = parameters["scene"]["assembly"]
+    if "path" in assembly:
+        assembly["path"] = Path(assembly["path"]).name
+    return parameters
+
+
+def generator_stamp() -> Mapping[str, str]:
+    """Return the versions of this software and of the libraries that decide bytes."""
+    return {"rebar-depth-bench": software_version(), **{name: _installed(name) for name in _STAMPED}}
+
+
+def _installed(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        raise InputError(
+            f"{name} is not installed, expected the build extra: pip install 'rebar-depth-bench[build]'"
+        ) from None

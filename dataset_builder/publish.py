@@ -1,0 +1,144 @@
+"""From staged pieces to the dataset folder, in an order that a kill at any moment leaves mendable.
+
+Shards first, under names that carry their content's digest; then meshes and bars; then the card; the manifest
+last. A reader sees the old dataset or the new one. Files that the new manifest no longer names go afterwards.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from cards import dataset_card
+from dataset_builder.assemblies import make_assembly
+from dataset_builder.bars_table import read_other_bars, write_bars
+from dataset_builder.configs import CONFIGS
+from dataset_builder.plan import BUILD_FOLDER, ConfigPlan, generator_stamp
+from dataset_builder.shards import pack_shard, runs_of_views, staged_record
+from rebar_depth_bench.digests import file_sha256, parameters_digest, views_digest
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.files import write_bytes, write_text
+from rebar_depth_bench.folder import FORMAT, MANIFEST, read_manifest
+from rebar_depth_bench.protocol import PROTOCOL
+from rebar_depth_bench.version import software_version
+
+BARS = "bars.parquet"
+CARD = "README.md"
+_TEMPORARY = ".*.tmp"
+_DIGEST_CHARACTERS = 12
+
+
+def is_published(out: Path, plan: ConfigPlan) -> bool:
+    """Return whether the folder already holds exactly what the plan would build."""
+    manifest = _manifest(out)
+    entry = manifest["configs"].get(plan.spec.name)
+    if entry is None or entry["key"] != plan.key:
+        return False
+    wanted = [*entry["shards"], entry["mesh"], BARS, CARD]
+    return all((out / name).is_file() for name in wanted)
+
+
+def check_folder(out: Path) -> None:
+    """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder: nothing foreign is ever touched."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file, expected a folder")
+    ours = (out / MANIFEST, out / BUILD_FOLDER)
+    if out.is_dir() and any(out.iterdir()) and not any(path.exists() for path in ours):
+        raise InputError(f"{out}: is not empty and holds no {MANIFEST}, expected a new or a dataset folder")
+
+
+def check_scenes(out: Path, plans: Sequence[ConfigPlan]) -> None:
+    """Raise ``InputError`` where a config that stays would stand on another version of a scene being built."""
+    planned = {plan.spec.name for plan in plans}
+    for name, entry in _manifest(out)["configs"].items():
+        for plan in plans:
+            scene = plan.parameters["scene"]
+            same_name = entry["scene"]["name"] == scene["name"]
+            if name not in planned and same_name and entry["scene"] != json.loads(json.dumps(scene)):
+                raise InputError(
+                    f"{out}: config {name} was built on scene {scene['name']!r} with other parameters; "
+                    f"build it again too (--config {name} {plan.spec.name}) or choose another folder"
+                )
+
+
+def publish_config(out: Path, plan: ConfigPlan) -> None:
+    """Put a fully staged config into the folder and remove what it replaces."""
+    shards = _publish_shards(out, plan)
+    scene = plan.spec.scene.name
+    mesh = f"meshes/{scene}.ply"
+    write_bytes(out / mesh, plan.staging.mesh.read_bytes())
+    write_bars(out / BARS, [*read_other_bars(out / BARS, scene), (scene, make_assembly(plan.spec.scene.assembly).bars)])
+    records = [staged_record(plan.staging.row(index)) for index in plan.indices]
+    entry = {
+        **plan.parameters,
+        "key": plan.key,
+        "generator": generator_stamp(),
+        "mesh": mesh,
+        "shards": shards,
+        "bytes": sum((out / name).stat().st_size for name in shards),
+        "ground_truth_digest": views_digest([asdict(record) for record in records]),
+        "views": [asdict(record) for record in records],
+    }
+    _write_manifest(out, {**_manifest(out)["configs"], plan.spec.name: entry})
+
+
+def sweep(out: Path) -> None:
+    """Remove what a killed build left behind: temporary files, and shards and meshes no manifest names."""
+    for temporary in [*out.glob(_TEMPORARY), *out.glob(f"*/{_TEMPORARY}")]:
+        temporary.unlink()
+    _remove_unnamed(out, _manifest(out))
+
+
+def _publish_shards(out: Path, plan: ConfigPlan) -> list[str]:
+    """Pack the shards and give each its name in the folder, which carries the digest of all of them."""
+    runs = runs_of_views(plan.indices)
+    packed = [plan.staging.shard(shard) for shard in range(len(runs))]
+    for target, run in zip(packed, runs, strict=True):
+        pack_shard([plan.staging.row(index) for index in run], target)
+    digest = parameters_digest([file_sha256(path) for path in packed])[:_DIGEST_CHARACTERS]
+    names = [
+        f"{plan.spec.name}/test-{shard:05d}-of-{len(runs):05d}-{digest}.parquet" for shard in range(len(runs))
+    ]
+    (out / plan.spec.name).mkdir(exist_ok=True)
+    for path, name in zip(packed, names, strict=True):
+        path.replace(out / name)
+    return names
+
+
+def _write_manifest(out: Path, configs: Mapping[str, Any]) -> None:
+    order = [*CONFIGS, *sorted(set(configs) - set(CONFIGS))]
+    ordered = {name: configs[name] for name in order if name in configs}
+    views = [view for entry in ordered.values() for view in entry["views"]]
+    manifest: dict[str, Any] = {
+        "format": FORMAT,
+        "version": software_version(),
+        "protocol": PROTOCOL,
+        "ground_truth": {"digest": views_digest(views)},
+        "configs": ordered,
+    }
+    write_text(out / CARD, dataset_card(manifest))
+    named = [CARD, BARS, *_config_files(ordered.values())]
+    manifest["files"] = {name: file_sha256(out / name) for name in sorted(set(named))}
+    write_text(out / MANIFEST, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
+    _remove_unnamed(out, manifest)
+
+
+def _config_files(entries: Iterable[Mapping[str, Any]]) -> list[str]:
+    return [name for entry in entries for name in (*entry["shards"], entry["mesh"])]
+
+
+def _remove_unnamed(out: Path, manifest: Mapping[str, Any]) -> None:
+    named = set(_config_files(manifest["configs"].values()))
+    for path in [*out.glob("*/test-*-of-*.parquet"), *out.glob("meshes/*.ply")]:
+        if path.relative_to(out).as_posix() not in named:
+            path.unlink()
+
+
+def _manifest(out: Path) -> dict[str, Any]:
+    """Return the folder's manifest, or an empty one for a folder that has none yet."""
+    if not (out / MANIFEST).is_file():
+        return {"configs": {}}
+    return read_manifest(out / MANIFEST)

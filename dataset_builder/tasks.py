@@ -1,0 +1,48 @@
+"""What a Blender process can be asked to do. Plain values: they are pickled to the process."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxtyping import Float64
+from numpy import ndarray
+
+from dataset_builder.specs import ConfigSpec
+
+
+@dataclass(frozen=True)
+class RenderTask:
+    """Render one shard's views of a config into ``staging``; views already staged are not done again.
+
+    Idempotent: the same task gives the same bytes, however often it is interrupted.
+    """
+
+    config: ConfigSpec
+    shard: int
+    indices: tuple[int, ...]
+    staging: Path
+    threads: int
+
+
+@dataclass(frozen=True, eq=False)
+class DepthCamera:
+    """A camera of an audit: its pinhole matrix, pose and grid."""
+
+    K: Float64[ndarray, "3 3"]
+    cam_from_world: Float64[ndarray, "4 4"]
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class DepthTask:
+    """Render Cycles' own planar depth of a mesh file from some cameras; one float32 .npy each into ``out``."""
+
+    mesh: Path
+    cameras: tuple[DepthCamera, ...]
+    out: Path
+    threads: int
+
+
+Task = RenderTask | DepthTask

@@ -1,0 +1,52 @@
+"""SHA-256 digests: of files, of decoded ground truth, of parameters."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt16
+from numpy import ndarray
+
+_CHUNK_BYTES = 1 << 20
+
+
+def file_sha256(path: Path) -> str:
+    """Return the hex SHA-256 of a file, read in pieces."""
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while chunk := stream.read(_CHUNK_BYTES):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def eye_digest(
+    depth_m: Float32[ndarray, "h w"],
+    mask: Bool[ndarray, "h w"],
+    bars: UInt16[ndarray, "h w"],
+    K: Float64[ndarray, "3 3"],
+    distortion: Float64[ndarray, "5"],
+    cam_from_world: Float64[ndarray, "4 4"],
+) -> str:
+    """Return the hex SHA-256 of one eye's ground truth, of its decoded values and not of their encoding."""
+    digest = hashlib.sha256(np.array(depth_m.shape, "<u4").tobytes())
+    arrays = ((depth_m, "<f4"), (mask, "u1"), (bars, "<u2"), (K, "<f8"), (distortion, "<f8"), (cam_from_world, "<f8"))
+    for array, dtype in arrays:
+        digest.update(np.ascontiguousarray(array, dtype=dtype).data)
+    return digest.hexdigest()
+
+
+def views_digest(views: Iterable[Mapping[str, Any]]) -> str:
+    """Return ``sha256:...`` over the views' ids and eye digests, in order of id: the ground-truth digest."""
+    lines = sorted(f"{view['view_id']} {view['left']} {view['right']}\n" for view in views)
+    return "sha256:" + hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def parameters_digest(parameters: object) -> str:
+    """Return the hex SHA-256 of a JSON-able value in canonical form."""
+    canonical = json.dumps(parameters, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()

@@ -1,0 +1,144 @@
+"""The ground truth a score needs, and nothing more: each view's scored pixels and their depth.
+
+It is gathered once per config and kept next to the dataset under the dataset's digest, as flat arrays that a
+later score maps into memory.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt32
+from numpy import ndarray
+
+from rebar_depth_bench.dataset import load
+from rebar_depth_bench.digests import eye_digest
+from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.files import sync
+from rebar_depth_bench.folder import DatasetFolder, ViewRecord
+from rebar_depth_bench.protocol import PROTOCOL, scored_pixels
+
+CACHE_FOLDER = ".rebar-cache"
+_KINDS = ("rgb", "depth", "mask", "bars", "K", "distortion", "cam_from_world")
+_TRUTH_COLUMNS = ("view_id", *(f"left_{kind}" for kind in _KINDS if kind != "rgb"))
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class ViewTruth:
+    """One view's scored pixels: flat indices into its H x W grid, and their planar depth in metres."""
+
+    view_id: str
+    index: UInt32[ndarray, "n"]
+    depth_m: Float32[ndarray, "n"]
+
+
+@dataclass(frozen=True, eq=False)
+class ConfigTruth:
+    """A config's views in the protocol, in order; a view without a scored pixel is not among them."""
+
+    view_ids: tuple[str, ...]
+    starts: tuple[int, ...]
+    index: UInt32[ndarray, "n"]
+    depth_m: Float32[ndarray, "n"]
+
+    def __iter__(self) -> Iterator[ViewTruth]:
+        """Yield the views."""
+        for view_id, start, end in zip(self.view_ids, self.starts, self.starts[1:], strict=False):
+            yield ViewTruth(view_id, self.index[start:end], self.depth_m[start:end])
+
+
+def config_truth(folder: DatasetFolder, config: str, progress: Progress | None = None) -> ConfigTruth:
+    """Return a config's scored pixels, from the cache or else from the dataset, checked against its manifest.
+
+    Raises ``DatasetError`` naming the view whose ground truth is not the one the manifest's digest stands for.
+    """
+    cached = _cache_path(folder, config)
+    if not cached.is_dir():
+        _fill_cache(folder, config, cached, progress)
+    outline = json.loads((cached / "views.json").read_text())
+    return ConfigTruth(
+        view_ids=tuple(outline["view_ids"]),
+        starts=tuple(outline["starts"]),
+        index=np.load(cached / "index.npy", mmap_mode="r"),
+        depth_m=np.load(cached / "depth_m.npy", mmap_mode="r"),
+    )
+
+
+def _cache_path(folder: DatasetFolder, config: str) -> Path:
+    """Return where a config's scored pixels are kept: in the folder itself, or the user's cache for others."""
+    digest = str(folder.config(config)["ground_truth_digest"]).removeprefix("sha256:")
+    local = folder.local
+    if local is not None and os.access(local, os.W_OK):
+        base = local / CACHE_FOLDER
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "rebar-depth-bench"
+    return base / f"{PROTOCOL}-{config}-{digest[:32]}"
+
+
+def _fill_cache(folder: DatasetFolder, config: str, target: Path, progress: Progress | None) -> None:
+    """Write the flat arrays beside the target and rename them into place, view by view: memory stays flat."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=".filling-", dir=target.parent))
+    try:
+        outline = _write_arrays(folder, config, temporary, progress)
+        (temporary / "views.json").write_text(json.dumps(outline))
+        for path in (*temporary.iterdir(), temporary):
+            sync(path)
+        temporary.rename(target)
+    except FileExistsError:
+        pass  # another process was faster, with the same bytes
+    except OSError:
+        if not target.is_dir():
+            raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _write_arrays(
+    folder: DatasetFolder, config: str, into: Path, progress: Progress | None
+) -> dict[str, list[str] | list[int]]:
+    records = {view.view_id: view for view in folder.views(config)}
+    total = sum(view.scored_px for view in records.values())  # an array of no bytes cannot be mapped
+    index = np.lib.format.open_memmap(into / "index.npy", "w+", np.uint32, (max(total, 1),))
+    depth_m = np.lib.format.open_memmap(into / "depth_m.npy", "w+", np.float32, (max(total, 1),))
+    view_ids: list[str] = []
+    starts = [0]
+    rows = load(folder.root, config, streaming=True, columns=_TRUTH_COLUMNS)
+    for done, row in enumerate(rows, start=1):
+        record = records.pop(row["view_id"], None)
+        pixels = _checked_pixels(row, record, folder.root)
+        if len(pixels):
+            end = starts[-1] + len(pixels)
+            index[starts[-1] : end] = pixels
+            depth_m[starts[-1] : end] = row["left_depth"].ravel()[pixels]
+            view_ids.append(row["view_id"])
+            starts.append(end)
+        if progress is not None:
+            progress(f"ground truth of {config}", done, done + len(records))
+    if records:
+        raise DatasetError(f"{folder.root}: {config} lacks {len(records)} views, among them {min(records)}")
+    index.flush()
+    depth_m.flush()
+    return {"view_ids": view_ids, "starts": starts}
+
+
+def _checked_pixels(row: dict[str, ndarray], record: ViewRecord | None, root: str) -> UInt32[ndarray, "n"]:
+    if record is None:
+        raise DatasetError(f"{root}: view {row['view_id']} is not in the manifest")
+    found = eye_digest(*(row[f"left_{kind}"] for kind in _KINDS if kind != "rgb"))
+    pixels = scored_pixels(row["left_mask"], row["left_depth"])
+    if found != record.left or len(pixels) != record.scored_px:
+        raise DatasetError(
+            f"{root}: view {record.view_id}: ground truth has digest {found[:16]} and {len(pixels)} scored pixels, "
+            f"the manifest says {record.left[:16]} and {record.scored_px}"
+        )
+    return pixels

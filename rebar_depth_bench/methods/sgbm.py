@@ -1,0 +1,101 @@
+"""Semi-global block matching on the rectified pair, with OpenCV.
+
+Matching: H. Hirschmueller, "Stereo Processing by Semiglobal Matching and Mutual Information", TPAMI 2008, in
+OpenCV's 3-way variant. Filter: D. Min et al., "Fast Global Image Smoothing Based on Weighted Least Squares",
+TIP 2014, guided by the left picture, with left-right consistency as confidence (opencv-contrib ximgproc).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+from numpy import ndarray
+
+from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.methods.method import Method, MethodInfo, Predictor
+
+BLOCK_PX = 3
+SEARCH_SHARE_OF_WIDTH = 0.5
+"""Disparities from 0 to this share of the width are searched: any distance from 0.13 m on, for the ideal rig."""
+WLS_LAMBDA = 8000.0
+WLS_SIGMA_COLOUR = 1.5
+_FIXED_POINT = 16.0
+
+
+def _load() -> Predictor:
+    try:
+        import cv2
+        import cv2.ximgproc
+    except ImportError as error:
+        raise MethodError(
+            f"sgbm needs OpenCV with ximgproc ({error}): pip install 'rebar-depth-bench[methods]'"
+        ) from None
+    return lambda row: _predict(cv2, row)
+
+
+def _predict(cv2: ModuleType, row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+    disparity_px = filtered_disparity_px(cv2, row["left_rgb"], row["right_rgb"])
+    return disparity_to_depth_m(disparity_px, row["left_K"], row["right_K"], row["baseline_m"])
+
+
+def disparity_to_depth_m(
+    disparity_px: Float32[ndarray, "h w"],
+    left_K: Float64[ndarray, "3 3"],
+    right_K: Float64[ndarray, "3 3"],
+    baseline_m: float,
+) -> Float32[ndarray, "h w"]:
+    """Return z = fx * B / (disparity - (cx_left - cx_right)); NaN where the disparity is not positive.
+
+    A pixel whose match would lie left of the right picture has no match there: NaN as well.
+    """
+    columns = np.arange(disparity_px.shape[1], dtype=np.float64)
+    parallax_px = disparity_px - (left_K[0, 2] - right_K[0, 2])
+    matched = (disparity_px > 0) & (parallax_px > 0) & (columns - disparity_px >= 0)
+    depth_m = np.full(disparity_px.shape, np.nan, np.float32)
+    depth_m[matched] = left_K[0, 0] * baseline_m / parallax_px[matched]
+    return depth_m
+
+
+def filtered_disparity_px(
+    cv2: ModuleType, left_rgb: UInt8[ndarray, "h w 3"], right_rgb: UInt8[ndarray, "h w 3"]
+) -> Float32[ndarray, "h w"]:
+    """Return the left view's disparity, pixels; <= 0 where there is none.
+
+    OpenCV answers only right of ``numDisparities`` columns, so both pictures are padded by as many.
+    """
+    width = left_rgb.shape[1]
+    search_px = int(-(-width * SEARCH_SHARE_OF_WIDTH // 16) * 16)
+    left, right = (
+        cv2.copyMakeBorder(picture, 0, 0, search_px, 0, cv2.BORDER_REPLICATE) for picture in (left_rgb, right_rgb)
+    )
+    matcher = cv2.StereoSGBM_create(
+        minDisparity=0,
+        numDisparities=search_px,
+        blockSize=BLOCK_PX,
+        P1=8 * 3 * BLOCK_PX**2,
+        P2=32 * 3 * BLOCK_PX**2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    right_matcher = cv2.ximgproc.createRightMatcher(matcher)
+    wls = cv2.ximgproc.createDisparityWLSFilter(matcher)
+    wls.setLambda(WLS_LAMBDA)
+    wls.setSigmaColor(WLS_SIGMA_COLOUR)
+    filtered = wls.filter(matcher.compute(left, right), left, None, right_matcher.compute(right, left))
+    return np.asarray(filtered[:, search_px:], np.float32) / np.float32(_FIXED_POINT)
+
+
+SGBM = Method(
+    MethodInfo(
+        name="sgbm",
+        summary="OpenCV semi-global matching, 3-way, with a weighted-least-squares filter, on the stereo pair",
+        columns=("left_rgb", "right_rgb", "left_K", "right_K", "baseline_m"),
+        uses_intrinsics=True,
+        source="OpenCV StereoSGBM and ximgproc",
+        licence="Apache-2.0",
+    ),
+    _load,
+)

@@ -1,0 +1,5 @@
+"""The HTML report of a result."""
+
+from rebar_depth_bench.report.from_archive import write_report
+
+__all__ = ["write_report"]

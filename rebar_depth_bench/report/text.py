@@ -1,0 +1,115 @@
+"""How numbers, names and verdicts are spelled: the same in the terminal's table and in the HTML report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from decimal import ROUND_DOWN, Decimal
+
+from rebar_depth_bench.metrics import DepthMetrics
+from rebar_depth_bench.protocol import MIN_RANKED_COVERAGE, WITHIN_MM
+from rebar_depth_bench.result import Table
+
+DASH = "–"
+"""Stands for an undefined number, null in the JSON."""
+
+DASH_NOTE = f"{DASH}: undefined, because no pixel has a prediction or a number overflowed."
+
+NATIVE_TITLE = "native (no alignment)"
+SCALED_TITLE = "scaled (oracle median scale per view, s = median(z)/median(p))"
+WITHIN_TITLE = "within t mm (native): share of all scored pixels with |p - z| <= t"
+
+METRIC_HEADS = (("AbsRel", "", "↓"), ("RMSE", "cm", "↓"), ("MAE", "cm", "↓"), ("δ1", "", "↑"))
+"""Name, unit and better direction of each number that ``metric_cells`` spells."""
+
+
+def number(value: float | None, decimals: int) -> str:
+    """Return a number with fixed decimals, in scientific notation where these would hide it, a dash if undefined."""
+    if value is None or not math.isfinite(value):
+        return DASH
+    if value != 0 and not 0.5 * 10**-decimals <= abs(value) < 1e6:
+        return f"{value:.1e}"
+    return f"{value:.{decimals}f}"
+
+
+def percent(share: float | None) -> str:
+    """Return a share in per cent, one decimal, rounded."""
+    return DASH if share is None else f"{share * 100:.1f}"
+
+
+def coverage_percent(share: float | None) -> str:
+    """Return a coverage in per cent, one decimal, rounded down: no gap reads as full, no miss as a pass."""
+    if share is None:
+        return DASH
+    return str((Decimal(repr(share)) * 100).quantize(Decimal("0.1"), rounding=ROUND_DOWN))
+
+
+def metric_cells(metrics: DepthMetrics | None) -> list[str]:
+    """Return AbsRel, RMSE in cm, MAE in cm, delta1."""
+    if metrics is None:
+        return [DASH] * len(METRIC_HEADS)
+    return [
+        number(metrics.abs_rel, 4),
+        number(metrics.rmse_m * 100, 2),
+        number(metrics.mae_m * 100, 2),
+        number(metrics.delta1, 3),
+    ]
+
+
+def scale_cell(scale: float | None) -> str:
+    """Return a scale factor s."""
+    return number(scale, 3)
+
+
+def within_cells(within_mm: Mapping[int, float | None] | Mapping[int, float]) -> list[str]:
+    """Return the shares within 3, 5, 10 and 20 mm, per cent."""
+    return [percent(within_mm[tolerance]) for tolerance in WITHIN_MM]
+
+
+def printable(text: str, limit: int = 200) -> str:
+    """Return a name from an archive without control or direction-changing characters, and cut to ``limit``."""
+    clean = "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text[: limit + 1])
+    return clean if len(clean) <= limit else clean[: limit - 1] + "…"
+
+
+def short_digest(digest: str, digits: int = 12) -> str:
+    """Return ``sha256:`` and the first digits of a digest, enough to tell two datasets apart."""
+    algorithm, colon, value = digest.rpartition(":")
+    return f"{algorithm}{colon}{value[:digits]}"
+
+
+def unranked_reasons(table: Table) -> list[str]:
+    """Return in words why a config's row is not ranked; empty where it is."""
+    if table.ranked:
+        return []
+    reasons = []
+    if table.views == 0:
+        reasons.append("no views")
+    missing = table.views - table.views_scored
+    if missing:
+        reasons.append(f"{missing} of {table.views} {_plural('view', table.views)} without any prediction")
+    if table.coverage is not None and table.coverage < MIN_RANKED_COVERAGE:
+        reasons.append(
+            f"coverage {coverage_percent(table.coverage)} % is below {MIN_RANKED_COVERAGE * 100:.0f} %"
+        )
+    if any(_overflowed(metrics) for metrics in (table.native, table.scaled)):
+        reasons.append("a number overflowed")
+    return reasons or ["not ranked by the scorer"]
+
+
+def config_of(view_id: str) -> str:
+    """Return the config of a view: ``lattice`` of ``lattice/0042``."""
+    return view_id.rpartition("/")[0]
+
+
+def has_dash(rows: Iterable[Iterable[str]]) -> bool:
+    """Return whether any cell is undefined, so that the footnote is due."""
+    return any(cell == DASH for row in rows for cell in row)
+
+
+def _plural(noun: str, count: int) -> str:
+    return noun if count == 1 else f"{noun}s"
+
+
+def _overflowed(metrics: DepthMetrics | None) -> bool:
+    return metrics is not None and not all(math.isfinite(value) for value in vars(metrics).values())

@@ -1,0 +1,135 @@
+"""``score``: an archive against a dataset folder, by protocol ``rebar-1``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from rebar_depth_bench.digests import file_sha256
+from rebar_depth_bench.errors import SubmissionError
+from rebar_depth_bench.folder import DatasetFolder, open_folder
+from rebar_depth_bench.ground_truth import ViewTruth, config_truth
+from rebar_depth_bench.metrics import depth_metrics, is_prediction, median_scale, shares_within
+from rebar_depth_bench.protocol import WITHIN_MM
+from rebar_depth_bench.result import Result, ViewScore, tabulate
+from rebar_depth_bench.submission import EntryError, SubmissionReader, config_of, open_submission
+from rebar_depth_bench.version import software_version
+
+Progress = Callable[[str, int, int], None]
+
+
+def score(
+    archive: str | os.PathLike[str],
+    root: str | Path,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Result:
+    """Score an archive against a dataset folder or Hub repository.
+
+    Views are scored on ``workers`` threads (default: one a core) straight from the archive; memory holds a few
+    views at a time. The result does not depend on the number of workers.
+
+    Raises ``SubmissionError`` with every problem if any part of the archive is at fault, ``DatasetError`` if the
+    folder is.
+    """
+    folder = open_folder(root)
+    with (
+        open_submission(archive, folder.expected_views()) as submission,
+        ThreadPoolExecutor((workers or os.cpu_count() or 1) + 1) as pool,
+    ):
+        if submission.meta is None or submission.structure_problems:
+            raise SubmissionError(str(archive), list(submission.problems()))
+        sha256 = pool.submit(file_sha256, Path(archive))
+        scores = _score_all(submission, folder, pool, progress)
+        return Result(
+            method=submission.meta.method,
+            submission_sha256=sha256.result(),
+            dataset_digest=folder.digest,
+            dataset_version=folder.version,
+            software_version=software_version(),
+            tables={config: tabulate(views) for config, views in scores.items()},
+            views=[view for views in scores.values() for view in views],
+        )
+
+
+def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewScore:
+    """Return the numbers of one view's prediction (planar depth, metres) on the view's scored pixels."""
+    gathered = prediction_m.ravel()[truth.index]
+    valid = is_prediction(gathered)
+    p_m = gathered[valid].astype(np.float64)
+    z_m = truth.depth_m[valid].astype(np.float64)
+    scored_px = len(truth.index)
+    within_mm = shares_within(np.abs(p_m - z_m), scored_px, WITHIN_MM)
+    coverage = len(p_m) / scored_px
+    if not len(p_m):
+        return ViewScore(truth.view_id, scored_px, coverage, None, None, None, within_mm)
+    scale = median_scale(p_m, z_m)
+    with np.errstate(over="ignore"):
+        scaled_m = scale * p_m
+    return ViewScore(
+        view_id=truth.view_id,
+        scored_px=scored_px,
+        coverage=coverage,
+        scale=scale,
+        native=depth_metrics(p_m, z_m),
+        scaled=depth_metrics(scaled_m, z_m),
+        within_mm=within_mm,
+    )
+
+
+def _score_all(
+    submission: SubmissionReader, folder: DatasetFolder, pool: ThreadPoolExecutor, progress: Progress | None
+) -> dict[str, list[ViewScore]]:
+    """Score every view of the archive, or raise with all that is wrong with it and score nothing."""
+    present = {config_of(view_id) for view_id in submission.view_ids}
+    unread = set(submission.view_ids)
+    problems: list[str] = []
+    scores: dict[str, list[ViewScore]] = {}
+    for config in folder.configs:
+        if config in present:
+            truths = list(config_truth(folder, config, progress))
+            outcomes = pool.map(lambda truth: _outcome(submission, truth), truths)
+            scored = list(_watched(outcomes, f"scoring {config}", len(truths), progress))
+            scores[config] = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
+            problems += [outcome for outcome in scored if isinstance(outcome, str)]
+            unread.difference_update(truth.view_id for truth in truths)
+    problems += _problems_out_of_protocol(submission, unread)
+    if problems:
+        raise SubmissionError(str(submission.path), problems)
+    return scores
+
+
+def _outcome(submission: SubmissionReader, truth: ViewTruth) -> ViewScore | str:
+    """Return a view's score, or the sentence that says what is wrong with its entry."""
+    try:
+        return score_view(truth, submission.read(truth.view_id))
+    except EntryError as error:
+        return error.problem
+
+
+def _problems_out_of_protocol(submission: SubmissionReader, view_ids: Iterable[str]) -> list[str]:
+    """Read the entries that no score looks at: a bad one is refused there too."""
+    problems = []
+    for view_id in sorted(view_ids):
+        try:
+            submission.read(view_id)
+        except EntryError as error:
+            problems.append(error.problem)
+    return problems
+
+
+def _watched(
+    outcomes: Iterable[ViewScore | str], what: str, total: int, progress: Progress | None
+) -> Iterator[ViewScore | str]:
+    for done, outcome in enumerate(outcomes, start=1):
+        if progress is not None:
+            progress(what, done, total)
+        yield outcome
+

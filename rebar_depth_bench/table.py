@@ -1,0 +1,202 @@
+"""A result as a table: in the terminal, as wide as it may be, and as tidy CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.measure import Measurement
+from rich.segment import Segments
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from rebar_depth_bench.protocol import PROTOCOL, WITHIN_MM
+from rebar_depth_bench.report import text
+from rebar_depth_bench.result import Result, Table
+
+_UNBOUNDED = 10_000
+_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Columns that stay together, under a title that states their alignment."""
+
+    title: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+def print_table(result: Result, console: Console) -> None:
+    """Print a row per config to ``console``: one table where it fits, else the same columns in two or three.
+
+    No number is ever cut: a console narrower than the narrowest layout gets longer lines.
+    """
+    _print_line(console, _headline(result), style="bold")
+    _print_line(console, _stamps(result), style="dim")
+    names = [text.printable(name) for name in result.tables]
+    for groups in _fitting_layout(names, list(result.tables.values()), console):
+        console.print()
+        for group in groups:
+            if group.title:
+                _print_line(console, group.title, style="italic")
+        _print_whole(console, _rich_table(names, groups))
+    _print_notes(result, console)
+
+
+def result_csv(result: Result) -> str:
+    r"""Return the tables as CSV: a row per config, the JSON's numbers and stamps as columns, ``\n`` line ends.
+
+    Undefined numbers are empty. A text that a spreadsheet would run as a formula gets a leading apostrophe.
+    """
+    content = result.to_dict()
+    rows = [_csv_row(content, name, table) for name, table in content["tables"].items()]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(_csv_header())
+    writer.writerows([_csv_cell(value) for value in row] for row in rows)
+    return out.getvalue()
+
+
+def _headline(result: Result) -> str:
+    return f"{text.printable(result.method)}, protocol {PROTOCOL}"
+
+
+def _stamps(result: Result) -> str:
+    return (
+        f"dataset {text.printable(result.dataset_version)} ({text.short_digest(result.dataset_digest)}), "
+        f"archive {text.short_digest(result.submission_sha256)}, software {result.software_version}"
+    )
+
+
+def _print_line(console: Console, line: str, style: str = "") -> None:
+    """Print text as it is: no markup, no highlighting of numbers, wrapped at words."""
+    console.print(Text(line, style=style))
+
+
+def _print_whole(console: Console, table: RichTable) -> None:
+    """Print a table at its own width even where the console is narrower: rich would cut numbers."""
+    width = _width(table, console)
+    options = console.options.update(width=width, max_width=width)
+    console.print(Segments(list(console.render(table, options))), soft_wrap=True, end="")
+
+
+def _print_notes(result: Result, console: Console) -> None:
+    console.print()
+    _print_line(console, "Means over views; s: median over views. z: truth, p: prediction. ↓ ↑: which way is better.")
+    for name, table in result.tables.items():
+        reasons = text.unranked_reasons(table)
+        if reasons:
+            _print_line(console, f"{text.printable(name)}: not ranked: {'; '.join(reasons)}.", style="yellow")
+    if text.has_dash(row for group in _groups(list(result.tables.values())) for row in group.rows):
+        _print_line(console, text.DASH_NOTE)
+
+
+def _groups(tables: Sequence[Table]) -> tuple[_Group, _Group, _Group, _Group]:
+    """Return the columns of coverage and rank, native, scaled, and tolerances."""
+    metric_heads = tuple(f"{name} {better}\n{unit}" for name, unit, better in text.METRIC_HEADS)
+    return (
+        _Group(
+            "",
+            ("views\nscored\n/all", "cover-\nage ↑\n%", "ranked\n"),
+            tuple(
+                (
+                    f"{one.views_scored}/{one.views}",
+                    text.coverage_percent(one.coverage),
+                    "yes" if one.ranked else "no",
+                )
+                for one in tables
+            ),
+        ),
+        _Group(
+            text.NATIVE_TITLE,
+            tuple(f"native\n{head}" for head in metric_heads),
+            tuple(tuple(text.metric_cells(one.native)) for one in tables),
+        ),
+        _Group(
+            text.SCALED_TITLE,
+            (*(f"scaled\n{head}" for head in metric_heads), "scale\ns\n"),
+            tuple((*text.metric_cells(one.scaled), text.scale_cell(one.scale_median)) for one in tables),
+        ),
+        _Group(
+            text.WITHIN_TITLE,
+            tuple(f"within\n{t} mm\n% ↑" for t in WITHIN_MM),
+            tuple(tuple(text.within_cells(one.within_mm)) for one in tables),
+        ),
+    )
+
+
+def _fitting_layout(names: Sequence[str], tables: Sequence[Table], console: Console) -> list[list[_Group]]:
+    """Return the groups of each table to print: as few tables as the console's width allows."""
+    base, native, scaled, within = _groups(tables)
+    layouts = [
+        [[base, native, scaled, within]],
+        [[native, scaled], [base, within]],
+        [[base, native], [scaled], [within]],
+    ]
+    for layout in layouts[:-1]:
+        if all(_width(_rich_table(names, groups), console) <= console.width for groups in layout):
+            return layout
+    return layouts[-1]
+
+
+def _rich_table(names: Sequence[str], groups: Sequence[_Group]) -> RichTable:
+    table = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
+    heads = [head for group in groups for head in group.heads]
+    lines = max(head.count("\n") for head in heads)
+    table.add_column(_header("config", lines), no_wrap=True)
+    for head in heads:
+        table.add_column(_header(head, lines), justify="right", no_wrap=True)
+    for index, name in enumerate(names):
+        table.add_row(Text(name), *(Text(cell) for group in groups for cell in group.rows[index]))
+    return table
+
+
+def _header(head: str, lines: int) -> Text:
+    """Return a heading of ``lines`` + 1 lines, its own at the bottom."""
+    return Text("\n" * (lines - head.count("\n")) + head)
+
+
+def _width(table: RichTable, console: Console) -> int:
+    """Return the width at which nothing in ``table`` is folded or cut."""
+    return Measurement.get(console, console.options.update(max_width=_UNBOUNDED), table).maximum
+
+
+def _csv_header() -> list[str]:
+    metrics = ("abs_rel", "rmse_cm", "mae_cm", "delta1")
+    return [
+        *("protocol", "method", "config", "views", "views_scored", "coverage", "ranked"),
+        *(f"native_{name}" for name in metrics),
+        *(f"scaled_{name}" for name in metrics),
+        "scale_median",
+        *(f"within_{t}mm" for t in WITHIN_MM),
+        *("dataset_digest", "dataset_version", "submission_sha256", "software_version"),
+    ]
+
+
+def _csv_row(content: dict[str, Any], name: str, table: dict[str, Any]) -> list[Any]:
+    """Return one config's cells in the header's order, from the objects of the result's JSON."""
+    return [
+        *(content["protocol"], content["submission"]["method"], name),
+        *(table[key] for key in ("views", "views_scored", "coverage", "ranked")),
+        *table["native"].values(),
+        *table["scaled"].values(),
+        table["scale_median"],
+        *table["within_mm"].values(),
+        *(content["dataset"]["digest"], content["dataset"]["version"]),
+        *(content["submission"]["sha256"], content["software"]["version"]),
+    ]
+
+
+def _csv_cell(value: str | float | bool | None) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, str):
+        return f"'{value}" if value.startswith(_FORMULA_STARTS) else value
+    return json.dumps(value)

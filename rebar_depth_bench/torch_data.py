@@ -1,0 +1,102 @@
+"""Torch batches from a loaded config. The only module of the bench that needs torch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from datasets import Dataset, IterableDataset
+
+from rebar_depth_bench.errors import MethodError
+
+try:
+    import torch
+    from torch.utils.data import DataLoader
+    from torch.utils.data import IterableDataset as TorchIterableDataset
+    from torch.utils.data import get_worker_info
+except ImportError as error:
+    raise MethodError(
+        f"torch_loader needs torch ({error}): pip install 'rebar-depth-bench[torch]'"
+    ) from None
+
+Batch = dict[str, Any]
+
+_LEFT = {
+    "rgb": "left_rgb",
+    "depth": "left_depth",
+    "mask": "left_mask",
+    "K": "left_K",
+    "poses": "left_cam_from_world",
+}
+_RIGHT = {f"right_{key}": column.replace("left", "right") for key, column in _LEFT.items()}
+_IMAGES = ("rgb", "depth", "mask")
+
+
+def torch_loader(
+    ds: Dataset | IterableDataset,
+    batch_size: int = 1,
+    num_workers: int = 0,
+    *,
+    shuffle: bool = False,
+    stereo: bool = False,
+) -> DataLoader[Batch]:
+    """Return a ``DataLoader`` over what ``load`` returned, streaming or not.
+
+    A batch is a dict: ``rgb`` uint8 B x 3 x H x W, ``depth`` float32 B x 1 x H x W (planar, metres, 0 where no
+    surface), ``mask`` bool B x 1 x H x W, ``K`` float64 B x 3 x 3 (pixels), ``poses`` float64 B x 4 x 4
+    (``cam_from_world``), all of the left view, and ``view_id``, a list. With ``stereo`` also the right view's
+    under ``right_...`` and ``baseline_m`` float64 B.
+
+    Columns that a batch does not need are not decoded. ``shuffle`` needs a dataset that is not streamed.
+    Raises ``MethodError`` where torch is missing.
+    """
+    keys = {**_LEFT, **_RIGHT, "baseline_m": "baseline_m"} if stereo else _LEFT
+    rows = ds.select_columns(["view_id", *keys.values()])
+    source = _Stream(rows) if isinstance(rows, IterableDataset) else rows
+    return DataLoader(
+        source,
+        batch_size=batch_size,
+        num_workers=num_workers,
+        shuffle=shuffle,
+        collate_fn=_Collate(keys),
+    )
+
+
+class _Collate:
+    """Stacks decoded rows into tensors. A class, so that worker processes can pickle it."""
+
+    def __init__(self, keys: Mapping[str, str]) -> None:
+        self._keys = keys
+
+    def __call__(self, rows: Sequence[Mapping[str, Any]]) -> Batch:
+        batch: Batch = {
+            key: _tensor(key, np.stack([np.asarray(row[column]) for row in rows]))
+            for key, column in self._keys.items()
+        }
+        batch["view_id"] = [row["view_id"] for row in rows]
+        return batch
+
+
+def _tensor(key: str, stacked: np.ndarray[Any, Any]) -> torch.Tensor:
+    kind = key.removeprefix("right_")
+    tensor = torch.from_numpy(stacked)
+    if kind not in _IMAGES:
+        return tensor
+    return tensor.permute(0, 3, 1, 2).contiguous() if kind == "rgb" else tensor[:, None]
+
+
+class _Stream(TorchIterableDataset[Mapping[str, Any]]):
+    """A streamed dataset for a ``DataLoader``: each worker takes shards of its own, each row comes once."""
+
+    def __init__(self, rows: IterableDataset) -> None:
+        self._rows = rows
+
+    def __iter__(self) -> Iterator[Mapping[str, Any]]:
+        worker = get_worker_info()
+        if worker is None:
+            yield from self._rows
+            return
+        shards = min(worker.num_workers, self._rows.num_shards)
+        if worker.id < shards:
+            yield from self._rows.shard(num_shards=shards, index=worker.id)

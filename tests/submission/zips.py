@@ -1,0 +1,132 @@
+"""Hand-built zips: every field can be made to lie."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+SHAPE = (3, 4)
+EXPECTED = {"lattice/0000": SHAPE, "lattice/0001": SHAPE, "pile/0000": (2, 5)}
+DEPTH = np.arange(12, dtype=np.float32).reshape(SHAPE) / 7
+
+
+@dataclass(frozen=True)
+class Record:
+    """One entry: what stands in the directory, and what in the local header where they differ."""
+
+    name: bytes
+    data: bytes = b""
+    method: int = 0
+    flags: int = 0
+    size: int | None = None
+    compressed: int | None = None
+    crc: int | None = None
+    mode: int = 0o100644
+    offset: int | None = None
+    extra: bytes = b""
+    local_name: bytes | None = None
+    local_method: int | None = None
+    local_extra: bytes = b""
+    local_size: int | None = None
+    disk: int = 0
+
+
+def deflated(name: bytes, data: bytes, level: int = 6) -> Record:
+    """A sound deflated entry."""
+    packed = zlib.compressobj(level, zlib.DEFLATED, -15)
+    body = packed.compress(data) + packed.flush()
+    return Record(name, body, 8, size=len(data), crc=zlib.crc32(data))
+
+
+def build(records: list[Record], *, count: int | None = None, comment: bytes = b"", disk: int = 0) -> bytes:
+    """Return the zip of these entries."""
+    out, directory = io.BytesIO(), b""
+    for record in records:
+        offset = out.tell() if record.offset is None else record.offset
+        crc = zlib.crc32(record.data) if record.crc is None else record.crc
+        size = len(record.data) if record.size is None else record.size
+        packed = len(record.data) if record.compressed is None else record.compressed
+        name = record.name if record.local_name is None else record.local_name
+        method = record.method if record.local_method is None else record.local_method
+        local_size = size if record.local_size is None else record.local_size
+        if record.offset is None:
+            numbers = (crc, packed, local_size, len(name), len(record.local_extra))
+            out.write(struct.pack("<4s5H3L2H", b"PK\3\4", 20, record.flags, method, 0, 33, *numbers))
+            out.write(name + record.local_extra + record.data)
+        head = struct.pack("<4s4B4H", b"PK\1\2", 20, 3, 20, 0, record.flags, record.method, 0, 33)
+        head += struct.pack("<3L3H", crc, packed, size, len(record.name), len(record.extra), 0)
+        directory += head + struct.pack("<2H2L", record.disk, 0, record.mode << 16, offset)
+        directory += record.name + record.extra
+    start = out.tell()
+    count = len(records) if count is None else count
+    out.write(directory)
+    end = (disk, disk, count, count, len(directory), start, len(comment))
+    out.write(struct.pack("<4s4H2LH", b"PK\5\6", *end) + comment)
+    return out.getvalue()
+
+
+def npy(array: Array, **kwargs: object) -> bytes:
+    """The bytes of an ``.npy``."""
+    buffer = io.BytesIO()
+    np.save(buffer, array, **kwargs)  # type: ignore[arg-type]
+    return buffer.getvalue()
+
+
+def npy_header(text: str, version: bytes = b"\1\0") -> bytes:
+    """An ``.npy`` header with any text."""
+    length = len(text).to_bytes(2 if version == b"\1\0" else 4, "little")
+    return b"\x93NUMPY" + version + length + text.encode()
+
+
+def npz(**arrays: Array) -> bytes:
+    """The bytes of an ``.npz``."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def exr(path: Path, channels: dict[str, Array], **header: object) -> bytes:
+    """The bytes of a scan-line ``.exr``."""
+    fields = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    OpenEXR.File(fields, channels).write(str(path))
+    return path.read_bytes()
+
+
+def chunk(kind: bytes, body: bytes) -> bytes:
+    """A PNG chunk."""
+    return len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big")
+
+
+def png(
+    units: Array, *, bits: int = 16, colour: int = 0, interlace: int = 0, idat: bytes | None = None
+) -> bytes:
+    """A PNG of unfiltered rows."""
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in units)
+    head = struct.pack(">2I5B", units.shape[1], units.shape[0], bits, colour, 0, 0, interlace)
+    body = zlib.compress(rows) if idat is None else idat
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+
+
+META = Record(b"submission.json", b'{"method": "m", "depth_scale": 0.001}')
+FIRST = Record(b"lattice/0000.npy", npy(DEPTH))
+SECOND = Record(b"lattice/0001.npy", npy(DEPTH))
+GOOD = [META, FIRST, SECOND]
+
+
+def with_first(**changes: object) -> list[Record]:
+    """The good archive with other fields in its first view."""
+    return [META, replace(FIRST, **changes), SECOND]  # type: ignore[arg-type]
+
+
+def with_view(suffix: str, data: bytes) -> list[Record]:
+    """The good archive with other bytes for its first view."""
+    return [META, Record(b"lattice/0000" + suffix.encode(), data), SECOND]
