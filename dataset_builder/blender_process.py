@@ -67,8 +67,7 @@ class BlenderProcesses:
                 _send(process.stdin, task)
                 for line in process.stdout:
                     _pass_on(json.loads(line), on_event)
-                process.stdin.close()
-            return process.returncode
+                return process.wait()
         except BaseException:
             process.kill()
             raise

@@ -26,7 +26,6 @@ from dataset_builder.mesh_obj import read_obj
 from dataset_builder.mesh_ply import read_ply
 from dataset_builder.mesh_stl import read_stl
 from dataset_builder.mesh_tools import (
-    checked_mesh,
     component_labels,
     split_by_label,
     turned_outward,

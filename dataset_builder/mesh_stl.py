@@ -43,7 +43,7 @@ def read_stl(content: bytes, where: str) -> Mesh:
     return _mesh(_text_corners(content, where), where)
 
 
-def _text_corners(content: bytes, where: str) -> Float[ndarray, " k"]:
+def _text_corners(content: bytes, where: str) -> Float[ndarray, "k 3"]:
     facets, corners = len(_FACET.findall(content)), _VERTEX.findall(content)
     if len(corners) != 3 * facets:
         raise MeshError(
@@ -51,10 +51,11 @@ def _text_corners(content: bytes, where: str) -> Float[ndarray, " k"]:
             f"expected {3 * facets}"
         )
     try:
-        return np.fromiter(map(float, chain.from_iterable(corners)), np.float64, 3 * len(corners))
+        values = np.fromiter(map(float, chain.from_iterable(corners)), np.float64, 3 * len(corners))
     except ValueError as error:
         raise MeshError(f"{where}: a vertex of this text STL is no number: {error}") from error
+    return values.reshape(-1, 3)
 
 
-def _mesh(corners: Float[ndarray, "..."], where: str) -> Mesh:
+def _mesh(corners: Float[ndarray, "*n 3"], where: str) -> Mesh:
     return checked_mesh(corners, np.arange(corners.size // 3), where)

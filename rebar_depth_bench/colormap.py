@@ -8,7 +8,7 @@ depend on a processor.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Float32, Shaped, UInt8
+from jaxtyping import Float, Float32, UInt8
 from numpy import ndarray
 
 COLOURS = 255
@@ -32,7 +32,7 @@ def _interpolated(anchors: str) -> UInt8[ndarray, "255 3"]:
     left = np.minimum(along // steps, len(points) - 2)
     part = (along - left * steps)[:, None]
     mixed = (points[left] * (steps - part) + points[left + 1] * part + steps // 2) // steps
-    colours = mixed.astype(np.uint8)
+    colours: ndarray = mixed.astype(np.uint8)
     colours.setflags(write=False)
     return colours
 
@@ -44,7 +44,7 @@ ERROR_COLOURS = _interpolated(_ERROR_ANCHORS)
 """Too near (0, blue) over none (127, near white) to too far (254, red-brown): both arms equally dark."""
 
 
-def robust_range(values: Float[ndarray, "n"], share: float = 0.02) -> tuple[float, float]:
+def robust_range(values: Float[ndarray, " n"], share: float = 0.02) -> tuple[float, float]:
     """Return the order statistics that leave out ``share`` of ``values`` at either end (no interpolation).
 
     ``values`` holds at least one number and none that is not finite.
@@ -55,9 +55,7 @@ def robust_range(values: Float[ndarray, "n"], share: float = 0.02) -> tuple[floa
     return float(ordered[low]), float(ordered[high])
 
 
-def positions(
-    values: Float[ndarray, "*shape"], first: float, last: float
-) -> UInt8[ndarray, "*shape"]:
+def positions(values: Float[ndarray, "*shape"], first: float, last: float) -> UInt8[ndarray, "*shape"]:
     """Return where ``values`` fall in a map of 255 colours that runs from ``first`` (0) to ``last`` (254).
 
     Values beyond either end take the end's colour, and so do infinities; NaN takes colour 0. ``first`` may
@@ -68,7 +66,8 @@ def positions(
         return np.full(values.shape, steps // 2, dtype=np.uint8)
     with np.errstate(invalid="ignore", over="ignore"):
         along = (values.astype(np.float64) - first) * steps / (last - first)
-    return np.rint(np.clip(np.nan_to_num(along, nan=0.0), 0, steps)).astype(np.uint8)
+    found: ndarray = np.rint(np.clip(np.nan_to_num(along, nan=0.0), 0, steps)).astype(np.uint8)
+    return found
 
 
 def depth_preview(
@@ -88,11 +87,3 @@ def depth_preview(
         far, near = robust_range(inverse)
         indices[surface] = positions(inverse, far, near) + np.uint8(1)
     return indices, palette
-
-
-def coloured(
-    indices: UInt8[ndarray, "*shape"], colours: UInt8[ndarray, "255 3"]
-) -> Shaped[ndarray, "*shape 3"]:
-    """Return the RGB image (uint8) of positions in a map."""
-    image: ndarray = colours[indices]
-    return image

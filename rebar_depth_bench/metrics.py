@@ -35,12 +35,11 @@ def depth_metrics(p_m: Float64[ndarray, "n"], z_m: Float64[ndarray, "n"]) -> Dep
     """Return the errors of a prediction as it stands. Values too large to square give ``inf``, never a warning."""
     with np.errstate(over="ignore", under="ignore", divide="ignore", invalid="ignore"):
         error_m = np.abs(p_m - z_m)
-        ratio = p_m / z_m
         return DepthMetrics(
             abs_rel=float(np.mean(error_m / z_m)),
             rmse_m=float(np.sqrt(np.mean(error_m * error_m))),
             mae_m=float(np.mean(error_m)),
-            delta1=float(np.mean(np.maximum(ratio, 1.0 / ratio) < DELTA1_RATIO)),
+            delta1=float(np.mean(np.maximum(p_m / z_m, z_m / p_m) < DELTA1_RATIO)),
         )
 
 

@@ -16,12 +16,12 @@ from rich.segment import Segments
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from rebar_depth_bench import wording
 from rebar_depth_bench.protocol import PROTOCOL, WITHIN_MM
-from rebar_depth_bench.report import text
 from rebar_depth_bench.result import Result, Table
 
 _UNBOUNDED = 10_000
-_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
+_FORMULA_STARTS = ("=", "+", "-", "@")
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def print_table(result: Result, console: Console) -> None:
     """
     _print_line(console, _headline(result), style="bold")
     _print_line(console, _stamps(result), style="dim")
-    names = [text.printable(name) for name in result.tables]
+    names = [wording.printable(name) for name in result.tables]
     for groups in _fitting_layout(names, list(result.tables.values()), console):
         console.print()
         for group in groups:
@@ -51,9 +51,10 @@ def print_table(result: Result, console: Console) -> None:
 
 
 def result_csv(result: Result) -> str:
-    r"""Return the tables as CSV: a row per config, the JSON's numbers and stamps as columns, ``\n`` line ends.
+    r"""Return the tables as CSV: a row per config, the JSON's numbers and stamps as columns, ``\n`` ends.
 
-    Undefined numbers are empty. A text that a spreadsheet would run as a formula gets a leading apostrophe.
+    Undefined numbers are empty. A text that a spreadsheet would run as a formula gets a leading apostrophe,
+    and control characters in it become U+FFFD.
     """
     content = result.to_dict()
     rows = [_csv_row(content, name, table) for name, table in content["tables"].items()]
@@ -65,13 +66,14 @@ def result_csv(result: Result) -> str:
 
 
 def _headline(result: Result) -> str:
-    return f"{text.printable(result.method)}, protocol {PROTOCOL}"
+    return f"{wording.printable(result.method)}, protocol {PROTOCOL}"
 
 
 def _stamps(result: Result) -> str:
+    digest = wording.short_digest(result.dataset_digest)
     return (
-        f"dataset {text.printable(result.dataset_version)} ({text.short_digest(result.dataset_digest)}), "
-        f"archive {text.short_digest(result.submission_sha256)}, software {result.software_version}"
+        f"dataset {wording.printable(result.dataset_version)} ({digest}), "
+        f"archive {wording.short_digest(result.submission_sha256)}, software {result.software_version}"
     )
 
 
@@ -89,18 +91,22 @@ def _print_whole(console: Console, table: RichTable) -> None:
 
 def _print_notes(result: Result, console: Console) -> None:
     console.print()
-    _print_line(console, "Means over views; s: median over views. z: truth, p: prediction. ↓ ↑: which way is better.")
+    _print_line(
+        console, "Means over views; s: median over views. z: truth, p: prediction. ↓ ↑: which way is better."
+    )
     for name, table in result.tables.items():
-        reasons = text.unranked_reasons(table)
+        reasons = wording.unranked_reasons(table)
         if reasons:
-            _print_line(console, f"{text.printable(name)}: not ranked: {'; '.join(reasons)}.", style="yellow")
-    if text.has_dash(row for group in _groups(list(result.tables.values())) for row in group.rows):
-        _print_line(console, text.DASH_NOTE)
+            _print_line(
+                console, f"{wording.printable(name)}: not ranked: {'; '.join(reasons)}.", style="yellow"
+            )
+    if wording.has_dash(row for group in _groups(list(result.tables.values())) for row in group.rows):
+        _print_line(console, wording.DASH_NOTE)
 
 
 def _groups(tables: Sequence[Table]) -> tuple[_Group, _Group, _Group, _Group]:
     """Return the columns of coverage and rank, native, scaled, and tolerances."""
-    metric_heads = tuple(f"{name} {better}\n{unit}" for name, unit, better in text.METRIC_HEADS)
+    metric_heads = tuple(f"{name} {better}\n{unit}" for name, unit, better in wording.METRIC_HEADS)
     return (
         _Group(
             "",
@@ -108,26 +114,28 @@ def _groups(tables: Sequence[Table]) -> tuple[_Group, _Group, _Group, _Group]:
             tuple(
                 (
                     f"{one.views_scored}/{one.views}",
-                    text.coverage_percent(one.coverage),
+                    wording.coverage_percent(one.coverage),
                     "yes" if one.ranked else "no",
                 )
                 for one in tables
             ),
         ),
         _Group(
-            text.NATIVE_TITLE,
+            wording.NATIVE_TITLE,
             tuple(f"native\n{head}" for head in metric_heads),
-            tuple(tuple(text.metric_cells(one.native)) for one in tables),
+            tuple(tuple(wording.metric_cells(one.native)) for one in tables),
         ),
         _Group(
-            text.SCALED_TITLE,
+            wording.SCALED_TITLE,
             (*(f"scaled\n{head}" for head in metric_heads), "scale\ns\n"),
-            tuple((*text.metric_cells(one.scaled), text.scale_cell(one.scale_median)) for one in tables),
+            tuple(
+                (*wording.metric_cells(one.scaled), wording.scale_cell(one.scale_median)) for one in tables
+            ),
         ),
         _Group(
-            text.WITHIN_TITLE,
+            wording.WITHIN_TITLE,
             tuple(f"within\n{t} mm\n% ↑" for t in WITHIN_MM),
-            tuple(tuple(text.within_cells(one.within_mm)) for one in tables),
+            tuple(tuple(wording.within_cells(one.within_mm)) for one in tables),
         ),
     )
 
@@ -198,5 +206,6 @@ def _csv_cell(value: str | float | bool | None) -> str:
     if value is None:
         return ""
     if isinstance(value, str):
-        return f"'{value}" if value.startswith(_FORMULA_STARTS) else value
+        clean = wording.printable(value, limit=_UNBOUNDED)
+        return f"'{clean}" if clean.startswith(_FORMULA_STARTS) else clean
     return json.dumps(value)

@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from markupsafe import Markup, escape
 
 from rebar_depth_bench.report.axis import LogAxis, decade_axis, label, unit_axis
-from rebar_depth_bench.report.text import number, printable, scale_cell
 from rebar_depth_bench.result import Table, ViewScore
+from rebar_depth_bench.wording import number, printable, scale_cell
 
 WIDTH = 460
 """View box width: small enough that 13 px text stays readable when a phone shrinks the chart."""
@@ -59,10 +59,12 @@ def scale_chart(tables: Mapping[str, Table], views: Mapping[str, Sequence[ViewSc
         rows.append(_dots(points, "points"))
         rows.append(_median_mark(tables[name].scale_median, axis, y))
     description = (
-        "Scale factor s = median(z)/median(p) of every view; s = 1 is metric, below 1 the prediction is too far. "
+        "Scale factor s = median(z)/median(p) of every view: 1 is metric, below 1 the prediction is too far. "
         + _spoken(tables, lambda table: f"median {scale_cell(table.scale_median)}")
     )
-    return _svg("Scale factor of each view", description, bottom + 22, _vertical_grid(axis, bottom) + "".join(rows))
+    return _svg(
+        "Scale factor of each view", description, bottom + 22, _vertical_grid(axis, bottom) + "".join(rows)
+    )
 
 
 def views_chart(config: str, views: Sequence[ViewScore]) -> Markup:
@@ -78,7 +80,9 @@ def views_chart(config: str, views: Sequence[ViewScore]) -> Markup:
     body += f'<path class="missing" d="{missing}"/>' if missing else ""
     body += _text(left + 6, bottom + 18, "first view") + _text(_RIGHT, bottom + 18, "last view", "end")
     without = sum(view.native is None for view in views)
-    description = f"AbsRel of the {len(views)} views of {printable(config)}, {without} without any prediction."
+    description = (
+        f"AbsRel of the {len(views)} views of {printable(config)}, {without} without any prediction."
+    )
     return _svg(f"AbsRel by view, {printable(config)}", description, bottom + 26, body)
 
 
@@ -104,7 +108,9 @@ def _text(x: float, y: float, content: str, classes: str = "start") -> str:
 
 def _vertical_grid(axis: LogAxis, bottom: float) -> str:
     lines = "".join(f"M{axis.at(tick):.1f} 10V{bottom:g}" for tick in axis.ticks())
-    labels = "".join(_text(round(axis.at(t), 1), bottom + 15, label(t), _anchor(axis, t)) for t in axis.ticks())
+    labels = "".join(
+        _text(round(axis.at(t), 1), bottom + 15, label(t), _anchor(axis, t)) for t in axis.ticks()
+    )
     return f'<path class="axis" d="{lines}"/>{labels}'
 
 

@@ -12,11 +12,13 @@ from dataclasses import dataclass
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from rebar_depth_bench import wording
 from rebar_depth_bench.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
-from rebar_depth_bench.report import charts, text
+from rebar_depth_bench.report import charts
 from rebar_depth_bench.report.panels import ViewImages, ViewPanels, colour_bar_uri, view_images
 from rebar_depth_bench.result import Result, Table, ViewScore
+from rebar_depth_bench.submission import config_of
 
 WORST_SHOWN = 10
 """Views of a config that are listed at once; the others are folded away."""
@@ -70,24 +72,28 @@ def render_report(result: Result, panels: Sequence[ViewPanels], *, title: str | 
     views = _views_by_config(result)
     configs = [_config(name, views[name]) for name in result.tables]
     rows = [_table_row(name, table) for name, table in result.tables.items()]
-    return _environment().get_template("report.html.j2").render(
-        title=text.printable(title if title is not None else result.method),
-        method=text.printable(result.method),
-        stamps=_stamps(result),
-        protocol=PROTOCOL,
-        min_coverage=f"{MIN_RANKED_COVERAGE * 100:.0f}",
-        metric_heads=text.METRIC_HEADS,
-        tolerances=WITHIN_MM,
-        dash_note=text.DASH_NOTE,
-        dash_in_results=_any_dash(rows),
-        dash_in_views=_any_dash([row for one in configs for row in one.worst]),
-        rows=rows,
-        alignment_chart=charts.alignment_chart(result.tables),
-        scale_chart=charts.scale_chart(result.tables, views),
-        configs=configs,
-        panels=[_shown(view) for view in panels],
-        depth_bar=colour_bar_uri(DEPTH_COLOURS[::-1]),
-        error_bar=colour_bar_uri(ERROR_COLOURS),
+    return (
+        _environment()
+        .get_template("report.html.j2")
+        .render(
+            title=wording.printable(title if title is not None else result.method),
+            method=wording.printable(result.method),
+            stamps=_stamps(result),
+            protocol=PROTOCOL,
+            min_coverage=f"{MIN_RANKED_COVERAGE * 100:.0f}",
+            metric_heads=wording.METRIC_HEADS,
+            tolerances=WITHIN_MM,
+            dash_note=wording.DASH_NOTE,
+            dash_in_results=_any_dash(rows),
+            dash_in_views=_any_dash([row for one in configs for row in one.worst]),
+            rows=rows,
+            alignment_chart=charts.alignment_chart(result.tables),
+            scale_chart=charts.scale_chart(result.tables, views),
+            configs=configs,
+            panels=[_shown(view) for view in panels],
+            depth_bar=colour_bar_uri(DEPTH_COLOURS[::-1]),
+            error_bar=colour_bar_uri(ERROR_COLOURS),
+        )
     )
 
 
@@ -105,24 +111,24 @@ def _environment() -> Environment:
 def _stamps(result: Result) -> list[tuple[str, str]]:
     return [
         ("Protocol", PROTOCOL),
-        ("Dataset version", text.printable(result.dataset_version)),
-        ("Dataset digest", text.printable(result.dataset_digest)),
-        ("Archive sha256", text.printable(result.submission_sha256.removeprefix("sha256:"))),
-        ("Software", f"rebar-depth-bench {text.printable(result.software_version)}"),
+        ("Dataset version", wording.printable(result.dataset_version)),
+        ("Dataset digest", wording.printable(result.dataset_digest)),
+        ("Archive sha256", wording.printable(result.submission_sha256.removeprefix("sha256:"))),
+        ("Software", f"rebar-depth-bench {wording.printable(result.software_version)}"),
     ]
 
 
 def _views_by_config(result: Result) -> Mapping[str, list[ViewScore]]:
     views: dict[str, list[ViewScore]] = {name: [] for name in result.tables}
     for view in result.views:
-        views.setdefault(text.config_of(view.view_id), []).append(view)
+        views.setdefault(config_of(view.view_id), []).append(view)
     return views
 
 
 def _config(name: str, views: Sequence[ViewScore]) -> _Config:
     worst = sorted(views, key=_badness, reverse=True)[:WORST_SHOWN]
     return _Config(
-        name=text.printable(name),
+        name=wording.printable(name),
         chart=charts.views_chart(name, views),
         worst=[_view_row(view) for view in worst],
         all=[_view_row(view) for view in views] if len(views) > WORST_SHOWN else [],
@@ -131,7 +137,7 @@ def _config(name: str, views: Sequence[ViewScore]) -> _Config:
 
 
 def _badness(view: ViewScore) -> float:
-    """Return what views are sorted by: native AbsRel, views without any prediction and overflows above all."""
+    """Return what views are sorted by: native AbsRel; no prediction at all and overflows are the worst."""
     if view.native is None or not math.isfinite(view.native.abs_rel):
         return math.inf
     return view.native.abs_rel
@@ -139,34 +145,34 @@ def _badness(view: ViewScore) -> float:
 
 def _table_row(name: str, table: Table) -> _Row:
     return _Row(
-        name=text.printable(name),
+        name=wording.printable(name),
         views=f"{table.views_scored}/{table.views}",
-        coverage=text.coverage_percent(table.coverage),
+        coverage=wording.coverage_percent(table.coverage),
         ranked=table.ranked,
-        reasons="; ".join(text.unranked_reasons(table)),
-        native=text.metric_cells(table.native),
-        scaled=text.metric_cells(table.scaled),
-        scale=text.scale_cell(table.scale_median),
-        within=text.within_cells(table.within_mm),
+        reasons="; ".join(wording.unranked_reasons(table)),
+        native=wording.metric_cells(table.native),
+        scaled=wording.metric_cells(table.scaled),
+        scale=wording.scale_cell(table.scale_median),
+        within=wording.within_cells(table.within_mm),
     )
 
 
 def _view_row(view: ViewScore) -> _Row:
     return _Row(
-        name=text.printable(view.view_id),
+        name=wording.printable(view.view_id),
         views=f"{view.scored_px:,}".replace(",", "\N{NARROW NO-BREAK SPACE}"),
-        coverage=text.coverage_percent(view.coverage),
+        coverage=wording.coverage_percent(view.coverage),
         ranked=True,
         reasons="",
-        native=text.metric_cells(view.native),
-        scaled=text.metric_cells(view.scaled),
-        scale=text.scale_cell(view.scale),
-        within=text.within_cells(view.within_mm),
+        native=wording.metric_cells(view.native),
+        scaled=wording.metric_cells(view.scaled),
+        scale=wording.scale_cell(view.scale),
+        within=wording.within_cells(view.within_mm),
     )
 
 
 def _any_dash(rows: Sequence[_Row]) -> bool:
-    return text.has_dash([*row.native, *row.scaled, row.scale, row.coverage, *row.within] for row in rows)
+    return wording.has_dash([*row.native, *row.scaled, row.scale, row.coverage, *row.within] for row in rows)
 
 
 def _shown(view: ViewPanels) -> _Shown:

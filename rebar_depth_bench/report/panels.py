@@ -26,6 +26,7 @@ _NO_DEPTH = ((136, 136, 136), (112, 112, 112))
 _NO_PREDICTION = ((240, 200, 0), (16, 16, 16))
 _HATCH_PX = 4
 _MAX_LIMIT_CM = 1e9
+_SLACK = 1e-6  # a float32 error of 30 cm is a little more than 30 cm
 _ROUND_STEPS = (1, 2, 3, 5, 7, 10)
 _BACKDROP_LEVELS = 16
 _BACKDROP_BRIGHTEST = 84
@@ -35,8 +36,9 @@ _BACKDROP_BRIGHTEST = 84
 class ViewPanels:
     """What the report shows of one view; all arrays share H x W.
 
-    ``rgb`` uint8 H x W x 3; ``truth_m`` float32 metres, 0 where there is no surface; ``prediction_m`` float
-    metres, not finite or <= 0 where there is none; ``steel`` bool, rim included; ``score`` the view's numbers.
+    ``rgb`` uint8 H x W x 3; ``truth_m`` float32 metres, 0 where there is no surface; ``prediction_m``
+    float metres, not finite or <= 0 where there is none; ``steel`` bool, rim included; ``score`` the
+    view's numbers.
     """
 
     view_id: str
@@ -103,7 +105,7 @@ def view_images(view: ViewPanels) -> ViewImages:
 
 
 def depth_range(truth_m: Float32[ndarray, "h w"], scored: ndarray) -> tuple[float, float]:
-    """Return (near, far) in metres: the robust range of the true depth at the flat indices ``scored``, and a tenth more."""
+    """Return (near, far) in metres: robust range of the true depth at flat indices ``scored``, a tenth wider."""
     values = truth_m.ravel()[scored] if scored.size else truth_m[truth_m > 0]
     if not values.size:
         return 0.0, 1.0
@@ -113,7 +115,7 @@ def depth_range(truth_m: Float32[ndarray, "h w"], scored: ndarray) -> tuple[floa
 
 
 def predicted_range(prediction_m: Float[ndarray, "h w"], scored: ndarray) -> tuple[float, float] | None:
-    """Return the robust range, metres, of the valid predictions at the flat indices ``scored``; None of none."""
+    """Return the robust range, metres, of valid predictions at the flat indices ``scored``; None of none."""
     values = prediction_m.ravel()[scored].astype(np.float64)
     values = values[np.isfinite(values) & (values > 0)]
     return robust_range(values) if values.size else None
@@ -129,7 +131,7 @@ def signed_error(view: ViewPanels, scale: float) -> Float64[ndarray, "h w"]:
 
 
 def error_limit_cm(error_m: Float64[ndarray, "h w"], scored: ndarray) -> float | None:
-    """Return the colour limit: 95 % of the scored pixels' errors are within, rounded up to one round digit, cm."""
+    """Return the colour limit, cm: at least 95 % of the scored pixels' errors lie within; one round digit."""
     errors = np.abs(error_m.ravel()[scored])
     errors = errors[np.isfinite(errors)]
     if not errors.size:
@@ -138,9 +140,7 @@ def error_limit_cm(error_m: Float64[ndarray, "h w"], scored: ndarray) -> float |
     return _rounded_up(min(max(reach_cm, 0.01), _MAX_LIMIT_CM))
 
 
-def depth_image(
-    depth_m: Float[ndarray, "h w"], near_m: float, far_m: float
-) -> UInt8[ndarray, "h w 3"]:
+def depth_image(depth_m: Float[ndarray, "h w"], near_m: float, far_m: float) -> UInt8[ndarray, "h w 3"]:
     """Return depth in colour, near bright and far dark, grey hatching where there is none."""
     with np.errstate(invalid="ignore"):
         present = np.isfinite(depth_m) & (depth_m > 0)
@@ -155,7 +155,7 @@ def error_image(
     rgb: UInt8[ndarray, "h w 3"],
     limit_cm: float | None,
 ) -> UInt8[ndarray, "h w 3"]:
-    """Return the signed error on steel in colour over a dimmed grey scene, hazard stripes where it is missing."""
+    """Return signed error on steel in colour over the dimmed scene, hazard stripes where it is missing."""
     image = _backdrop(rgb)
     missing = steel & np.isnan(error_m)
     image[missing] = hatching(steel.shape, *_NO_PREDICTION)[missing]
@@ -171,7 +171,8 @@ def hatching(
     """Return diagonal stripes of two colours."""
     rows, columns = np.indices(shape)
     stripe = (rows + columns) // _HATCH_PX % 2
-    return np.array((first, second), dtype=np.uint8)[stripe]
+    image: ndarray = np.array((first, second), dtype=np.uint8)[stripe]
+    return image
 
 
 def reduced_colour(rgb: UInt8[ndarray, "h w 3"], step: int) -> UInt8[ndarray, "h w 3"]:
@@ -193,7 +194,7 @@ def _backdrop(rgb: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
 
 def _rounded_up(value: float) -> float:
     power = 10.0 ** math.floor(math.log10(value))
-    return next(round(step * power, 6) for step in _ROUND_STEPS if step * power >= value * (1 - 1e-9))
+    return next(round(step * power, 6) for step in _ROUND_STEPS if step * power >= value * (1 - _SLACK))
 
 
 def _data_uri(image: UInt8[ndarray, "h w 3"], *, kind: str = "WEBP", lossless: bool = True) -> str:

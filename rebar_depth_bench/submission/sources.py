@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import weakref
 from pathlib import Path
 from typing import Protocol
 
@@ -32,6 +33,7 @@ class FileSource:
 
     def __init__(self, path: Path) -> None:
         self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        self._close = weakref.finalize(self, os.close, self._fd)
         self.size = os.fstat(self._fd).st_size
 
     def read_at(self, offset: int, length: int) -> memoryview:
@@ -46,9 +48,8 @@ class FileSource:
 
     def close(self) -> None:
         """Close the file; views already handed out stay valid. Closing twice is harmless."""
-        fd, self._fd = self._fd, -1
-        if fd >= 0:
-            os.close(fd)
+        self._close()
+        self._fd = -1
 
 
 class MemorySource:

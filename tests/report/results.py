@@ -1,4 +1,4 @@
-"""Results for the tests of this folder, made the way the scorer makes them: scores of views through ``tabulate``."""
+"""Results for these tests, made as the scorer makes them: scores of views through ``tabulate``."""
 
 from __future__ import annotations
 

@@ -286,3 +286,12 @@ def test_a_file_cut_while_it_is_open_is_an_entry_error(tmp_path: Path) -> None:
         os.truncate(path, 100)
         with pytest.raises(EntryError, match=f"{ENTRY}: the archive was shortened while it was read"):
             reader.read("lattice/0000")
+
+
+def test_a_reader_that_is_dropped_closes_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "s.zip"
+    path.write_bytes(build(GOOD))
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for _ in range(5):
+        assert open_submission(path, EXPECTED).view_ids
+    assert len(list(Path("/proc/self/fd").iterdir())) == before

@@ -47,13 +47,13 @@ def test_a_header_that_claims_640_gb_allocates_nothing(check: Check) -> None:
     assert held < MEGABYTE
 
 
-@pytest.mark.parametrize("declared", [100_000_000, 176])
+@pytest.mark.parametrize("declared", [20_000_000, 176])
 def test_a_bomb_of_zeros_is_stopped_whatever_size_it_declares(check: Check, declared: int) -> None:
-    bomb = replace(deflated(b"lattice/0000.npy", bytes(100_000_000)), size=declared)
+    bomb = replace(deflated(b"lattice/0000.npy", bytes(20_000_000)), size=declared)
     content = build([META, bomb, SECOND])
     problems, held = peak(lambda: check(content))
     expected = (
-        "the declared size is 100000000 bytes, expected at most 4192"
+        "the declared size is 20000000 bytes, expected at most 4192"
         if declared > 4192
         else f"{len(bomb.data)} bytes are deflated for 176, expected at most 1200"
     )
@@ -145,13 +145,13 @@ def test_damaged_archives_are_accepted_or_refused_in_words(tmp_path: Path) -> No
     random = np.random.default_rng(20251121)
     samples = _samples(tmp_path)
     refused = 0
-    for round_ in range(1500):
+    for round_ in range(700):
         path = tmp_path / "s.zip"
         path.write_bytes(_mutate(samples[round_ % len(samples)], random))
         problems = check_archive(path, EXPECTED)
         refused += bool(problems)
         assert all(problem.isprintable() and len(problem) < 1000 for problem in problems)
-    assert 1200 < refused < 1500
+    assert 500 < refused < 700
 
 
 DAMAGE_INSIDE = """
@@ -163,7 +163,7 @@ from rebar_depth_bench.submission.decode import FORMATS
 from rebar_depth_bench.submission import EntryError
 random, outcomes = np.random.default_rng(7), dict()
 for path in sorted(Path(sys.argv[1]).iterdir()):
-    for _ in range(400):
+    for _ in range(250):
         data = _mutate(path.read_bytes(), random)
         try:
             FORMATS[path.suffix].decode(path.name, memoryview(data), (3, 4), 1.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import struct
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -90,7 +91,8 @@ def npy_header(text: str, version: bytes = b"\1\0") -> bytes:
 def npz(**arrays: Array) -> bytes:
     """The bytes of an ``.npz``."""
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
+    save: Callable[..., None] = np.savez_compressed  # numpy 2 types its keywords as options.
+    save(buffer, **arrays)
     return buffer.getvalue()
 
 

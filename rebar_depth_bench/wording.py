@@ -24,7 +24,7 @@ METRIC_HEADS = (("AbsRel", "", "↓"), ("RMSE", "cm", "↓"), ("MAE", "cm", "↓
 
 
 def number(value: float | None, decimals: int) -> str:
-    """Return a number with fixed decimals, in scientific notation where these would hide it, a dash if undefined."""
+    """Return a number with fixed decimals, scientific where these would hide it, a dash if undefined."""
     if value is None or not math.isfinite(value):
         return DASH
     if value != 0 and not 0.5 * 10**-decimals <= abs(value) < 1e6:
@@ -67,7 +67,7 @@ def within_cells(within_mm: Mapping[int, float | None] | Mapping[int, float]) ->
 
 
 def printable(text: str, limit: int = 200) -> str:
-    """Return a name from an archive without control or direction-changing characters, and cut to ``limit``."""
+    """Return a name from an archive without control or direction-changing characters, cut to ``limit``."""
     clean = "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text[: limit + 1])
     return clean if len(clean) <= limit else clean[: limit - 1] + "…"
 
@@ -95,11 +95,6 @@ def unranked_reasons(table: Table) -> list[str]:
     if any(_overflowed(metrics) for metrics in (table.native, table.scaled)):
         reasons.append("a number overflowed")
     return reasons or ["not ranked by the scorer"]
-
-
-def config_of(view_id: str) -> str:
-    """Return the config of a view: ``lattice`` of ``lattice/0042``."""
-    return view_id.rpartition("/")[0]
 
 
 def has_dash(rows: Iterable[Iterable[str]]) -> bool:

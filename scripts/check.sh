@@ -1,0 +1,11 @@
+#!/usr/bin/env bash
+# Everything CI runs, in the order that fails fastest. usage: scripts/check.sh BIN
+set -euo pipefail
+cd "$(dirname "$0")/.."
+bin=$1
+
+"$bin/ruff" format --check .
+"$bin/ruff" check .
+"$bin/mypy"
+"$bin/lint-imports"
+"$bin/pytest" "${@:2}"

@@ -1,0 +1,35 @@
+#!/usr/bin/env bash
+# Makes or reuses a virtual environment with one of the project's extras.
+# usage: scripts/environment.sh PYTHON VENV EXTRA
+set -euo pipefail
+cd "$(dirname "$0")/.."
+python=$1 venv=$2 extra=$3
+
+fail() {
+    echo "error: $1" >&2
+    exit 1
+}
+
+command -v "$python" >/dev/null 2>&1 ||
+    fail "$python is not on the PATH; install Python 3.11 (Debian: apt-get install python3.11 python3.11-venv), which Blender 4.5 needs exactly, or name it: make PYTHON=/path/to/python3.11"
+version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+[ "$version" = 3.11 ] || fail "$python is Python $version; Blender 4.5 needs exactly 3.11"
+"$python" -c 'import ensurepip, venv' 2>/dev/null ||
+    fail "$python lacks venv; install it (Debian: apt-get install python3.11-venv)"
+
+# The stamp names what was installed from which descriptions; anything else installs anew.
+stamp="$venv/.installed-$extra"
+wanted=$(cat pyproject.toml constraints.txt | "$python" -c 'import hashlib, sys; print(hashlib.sha256(sys.stdin.buffer.read()).hexdigest())')
+if [ ! -x "$venv/bin/python" ] || [ "$(cat "$stamp" 2>/dev/null)" != "$wanted" ]; then
+    echo "installing the environment into $venv (a few minutes the first time)" >&2
+    [ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
+    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
+        --constraint constraints.txt --editable ".[$extra]"
+    echo "$wanted" >"$stamp"
+fi
+
+if ! complaint=$("$venv/bin/python" -c 'import bpy' 2>&1); then
+    library=$(printf '%s\n' "$complaint" | sed -n 's/.*ImportError: \([^ :]*\.so[^ :]*\): cannot open shared object.*/\1/p')
+    [ -n "$library" ] && fail "Blender needs the system library $library; on Debian: apt-get install libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libice6 libgl1"
+    fail "Blender's Python module does not import: $(printf '%s\n' "$complaint" | tail -n 1)"
+fi

@@ -1,0 +1,108 @@
+"""The numbers of the protocol: golden cases by hand, and what must hold for any prediction."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from rebar_depth_bench.metrics import depth_metrics, is_prediction, median_scale, shares_within
+
+DEPTHS = hnp.arrays(np.float64, st.integers(1, 40), elements=st.floats(0.05, 50.0))
+
+
+def pairs() -> st.SearchStrategy[tuple[np.ndarray, np.ndarray]]:
+    return st.integers(1, 40).flatmap(
+        lambda n: st.tuples(
+            hnp.arrays(np.float64, n, elements=st.floats(0.05, 50.0)),
+            hnp.arrays(np.float64, n, elements=st.floats(0.05, 50.0)),
+        )
+    )
+
+
+def test_golden_case_by_hand() -> None:
+    z = np.array([1.0, 2.0, 4.0, 5.0])
+    p = np.array([1.5, 2.0, 3.0, 7.0])
+    found = depth_metrics(p, z)
+    assert found.abs_rel == pytest.approx((0.5 / 1 + 0 + 1 / 4 + 2 / 5) / 4)
+    assert found.rmse_m == pytest.approx(math.sqrt((0.25 + 0 + 1 + 4) / 4))
+    assert found.mae_m == pytest.approx((0.5 + 0 + 1 + 2) / 4)
+    assert found.delta1 == 0.25  # ratios 1.5, 1, 1.33, 1.4
+    assert median_scale(p, z) == pytest.approx(3.0 / 2.5)  # means of the two middle values
+
+
+def test_delta1_is_strict_at_its_threshold() -> None:
+    z = np.array([4.0, 4.0, 5.0])
+    p = np.array([5.0, np.nextafter(5.0, 0), 4.0])
+    assert depth_metrics(p, z).delta1 == pytest.approx(1 / 3)
+
+
+def test_exact_prediction_is_exactly_perfect() -> None:
+    z = np.linspace(0.1, 17, 101)
+    found = depth_metrics(z.copy(), z)
+    assert (found.abs_rel, found.rmse_m, found.mae_m, found.delta1) == (0.0, 0.0, 0.0, 1.0)
+    assert median_scale(z.copy(), z) == 1.0
+
+
+@given(pairs())
+def test_metrics_agree_with_exact_rational_arithmetic(pair: tuple[np.ndarray, np.ndarray]) -> None:
+    p, z = pair
+    n = len(z)
+    errors = [abs(Fraction(a) - Fraction(b)) for a, b in zip(p.tolist(), z.tolist(), strict=True)]
+    found = depth_metrics(p, z)
+    abs_rel = sum(e / Fraction(b) for e, b in zip(errors, z.tolist(), strict=True)) / n
+    assert found.abs_rel == pytest.approx(float(abs_rel), rel=1e-12, abs=1e-15)
+    assert found.mae_m == pytest.approx(float(sum(errors) / n), rel=1e-12, abs=1e-15)
+    assert found.rmse_m == pytest.approx(math.sqrt(sum(e * e for e in errors) / n), rel=1e-12, abs=1e-15)
+
+
+@given(pairs(), st.floats(1e-3, 1e3))
+def test_scaled_error_does_not_depend_on_the_predictions_unit(
+    pair: tuple[np.ndarray, np.ndarray], unit: float
+) -> None:
+    p, z = pair
+    first = depth_metrics(median_scale(p, z) * p, z)
+    second = depth_metrics(median_scale(unit * p, z) * (unit * p), z)
+    assert first.abs_rel == pytest.approx(second.abs_rel, rel=1e-9, abs=1e-12)
+    assert first.rmse_m == pytest.approx(second.rmse_m, rel=1e-9, abs=1e-12)
+
+
+@given(pairs())
+def test_bounds_and_order(pair: tuple[np.ndarray, np.ndarray]) -> None:
+    p, z = pair
+    found = depth_metrics(p, z)
+    assert 0.0 <= found.delta1 <= 1.0
+    assert 0.0 <= found.mae_m <= found.rmse_m * (1 + 1e-12)
+    shares = shares_within(np.abs(p - z), len(z), (3, 5, 10, 20))
+    assert list(shares.values()) == sorted(shares.values())
+    assert all(0.0 <= share <= 1.0 for share in shares.values())
+
+
+@given(DEPTHS, st.randoms(use_true_random=False))
+def test_order_of_pixels_does_not_matter(z: np.ndarray, random: object) -> None:
+    p = z[::-1] + 0.5
+    order = np.random.default_rng(0).permutation(len(z))
+    first, second = depth_metrics(p, z), depth_metrics(p[order], z[order])
+    assert first.abs_rel == pytest.approx(second.abs_rel, rel=1e-12)
+    assert median_scale(p, z) == median_scale(p[order], z[order])
+
+
+def test_tolerance_counts_missing_pixels_as_failures() -> None:
+    error_m = np.array([0.0, 0.003, 0.0031, 0.02])
+    assert shares_within(error_m, 8, (3, 20)) == {3: 2 / 8, 20: 4 / 8}
+
+
+def test_what_is_a_prediction() -> None:
+    values = np.array([1.0, 0.0, -1.0, np.nan, np.inf, -np.inf, 5e-324])
+    assert is_prediction(values).tolist() == [True, False, False, False, False, False, True]
+
+
+@pytest.mark.parametrize("huge", [1e200, 1e308])
+def test_overflow_gives_infinity_and_no_warning(huge: float) -> None:
+    z = np.array([1.0, 2.0, 3.0])
+    assert math.isinf(depth_metrics(np.full(3, huge), z).rmse_m)
