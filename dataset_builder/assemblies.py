@@ -21,11 +21,11 @@ def make_assembly(spec: LatticeSpec | MeshFileSpec) -> Assembly:
     return lattice_assembly(spec)
 
 
-def aim_point_m(assembly: Assembly) -> Float64[ndarray, "3"]:
+def aim_point_m(assembly: Assembly) -> Float64[ndarray, 3]:
     """Return what cameras look at: the middle of the steel's bounding box, to the millimetre.
 
     Rounding keeps ribs and float32 storage from moving the cameras.
     """
     vertices = np.concatenate([part.mesh.vertices_m for part in assembly.parts])
-    middle: Float64[ndarray, "3"] = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    return np.round(middle, _TARGET_DECIMALS) + 0.0
+    middle: Float64[ndarray, 3] = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    return np.asarray(np.round(middle, _TARGET_DECIMALS) + 0.0)  # no negative zero

@@ -153,7 +153,7 @@ class _Axis:
     """A centreline with frames carried along it without twist: tangent, and a normal that theta counts from."""
 
     points_m: Float64[ndarray, "n 3"]
-    arc_m: Float64[ndarray, "n"]
+    arc_m: Float64[ndarray, " n"]
     tangent: Float64[ndarray, "n 3"]
     normal: Float64[ndarray, "n 3"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
 
 import pyarrow as pa
@@ -23,7 +23,7 @@ SCHEMA = pa.schema(
 """``axis`` is the centreline as a polyline, world frame, metres."""
 
 
-def write_bars(path: Path, scenes: Iterable[tuple[str, tuple[Bar, ...]]]) -> None:
+def write_bars(path: Path, scenes: Mapping[str, tuple[Bar, ...]]) -> None:
     """Write the bars of all scenes, in order of scene name and bar id."""
     rows = [
         {
@@ -33,20 +33,20 @@ def write_bars(path: Path, scenes: Iterable[tuple[str, tuple[Bar, ...]]]) -> Non
             "diameter_m": bar.diameter_m,
             "axis": [list(point) for point in bar.axis_m],
         }
-        for scene, bars in sorted(scenes)
+        for scene, bars in sorted(scenes.items())
         for bar in bars
     ]
     with replacing(path) as temporary:
         pq.write_table(pa.Table.from_pylist(rows, schema=SCHEMA), temporary)
 
 
-def read_other_bars(path: Path, scene: str) -> list[tuple[str, tuple[Bar, ...]]]:
-    """Return the bars of every scene in the file but one; nothing if there is no file yet."""
+def read_bars(path: Path) -> dict[str, tuple[Bar, ...]]:
+    """Return the bars of every scene in the file; nothing if there is no file yet."""
     if not path.is_file():
-        return []
+        return {}
     scenes: dict[str, list[Bar]] = {}
     for row in pq.read_table(path).to_pylist():
         axis_m = tuple((x, y, z) for x, y, z in row["axis"])
         bar = Bar(row["bar_id"], row["role"], row["diameter_m"], axis_m)
         scenes.setdefault(row["scene"], []).append(bar)
-    return [(name, tuple(bars)) for name, bars in scenes.items() if name != scene]
+    return {name: tuple(bars) for name, bars in scenes.items()}

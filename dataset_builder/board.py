@@ -124,8 +124,8 @@ def _draw_caption(
     texture: UInt8[ndarray, "h w"], text: str, row_below: int, column: int, module_px: int
 ) -> None:
     """Print ``text`` small and grey under a marker, below its quiet zone; none where the sheet ends."""
-    scale = module_px / 90
+    scale, thickness = module_px / 70, max(1, module_px // 20)
     baseline = row_below + round(1.75 * module_px)
     if baseline < texture.shape[0] - module_px:
         origin = (column, baseline)
-        cv2.putText(texture, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, GREY_INK, 1, cv2.LINE_AA)
+        cv2.putText(texture, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, GREY_INK, thickness, cv2.LINE_AA)

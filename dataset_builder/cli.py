@@ -80,13 +80,21 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--width", type=int, default=BuildRequest.width, help="pixels (default: %(default)s)")
     parser.add_argument("--height", type=int, default=BuildRequest.height, help="pixels (default: %(default)s)")
     parser.add_argument(
-        "--samples", type=int, default=BuildRequest.samples, help="Cycles samples per pixel (default: %(default)s)"
+        "--samples",
+        type=int,
+        default=BuildRequest.samples,
+        help="Cycles samples per pixel (default: %(default)s)",
     )
     parser.add_argument("--workers", type=int, default=1, help="render processes at once (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of surfaces and noise (default: %(default)s)")
-    parser.add_argument("--mesh", metavar="FILE", help="STL, PLY, OBJ or glTF file that replaces the lattice's rods")
     parser.add_argument(
-        "--mesh-unit", default="m", metavar="UNIT", help=f"unit of the mesh file: {', '.join(UNITS_M)} (default: m)"
+        "--mesh", metavar="FILE", help="STL, PLY, OBJ or glTF file that replaces the lattice's rods"
+    )
+    parser.add_argument(
+        "--mesh-unit",
+        default="m",
+        metavar="UNIT",
+        help=f"unit of the mesh file: {', '.join(UNITS_M)} (default: m)",
     )
     commands = parser.add_subparsers(dest="command", metavar="audit")
     checking = commands.add_parser("audit", help="check a dataset folder and its ground truth")

@@ -53,4 +53,4 @@ class WorldMesh:
 
     vertices_m: Float64[ndarray, "v 3"]
     faces: Int32[ndarray, "f 3"]
-    face_bar_id: UInt16[ndarray, "f"]
+    face_bar_id: UInt16[ndarray, " f"]

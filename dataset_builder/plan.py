@@ -12,8 +12,8 @@ from dataset_builder.configs import BuildRequest
 from dataset_builder.protocols import offsets_m, subset
 from dataset_builder.shards import VIEWS_PER_SHARD, Staging
 from dataset_builder.specs import ConfigSpec
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.digests import parameters_digest
+from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
 
 BUILD_FOLDER = ".build"

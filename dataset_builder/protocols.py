@@ -16,13 +16,13 @@ GOLDEN_TURN_DEG = 360.0 * (5**0.5 - 1) / 2
 
 
 def poses(
-    protocol: DomeSpec | RingSpec, target_m: Float64[ndarray, "3"], rig: RigSpec
+    protocol: DomeSpec | RingSpec, target_m: Float64[ndarray, 3], rig: RigSpec
 ) -> list[Float64[ndarray, "4 4"]]:
     """Return the left camera's ``cam_from_world`` of every view of the full protocol, in order."""
     return [aim_rig(target_m + direction, target_m, rig.baseline_m) for direction in offsets_m(protocol)]
 
 
-def offsets_m(protocol: DomeSpec | RingSpec) -> list[Float64[ndarray, "3"]]:
+def offsets_m(protocol: DomeSpec | RingSpec) -> list[Float64[ndarray, 3]]:
     """Return the left camera's centre relative to the target, view by view.
 
     A dome runs shell by shell, ring by ring, azimuth by azimuth: neighbours in order are neighbours in space.
@@ -41,7 +41,7 @@ def offsets_m(protocol: DomeSpec | RingSpec) -> list[Float64[ndarray, "3"]]:
 
 
 def aim_rig(
-    left_centre_m: Float64[ndarray, "3"], target_m: Float64[ndarray, "3"], baseline_m: float
+    left_centre_m: Float64[ndarray, 3], target_m: Float64[ndarray, 3], baseline_m: float
 ) -> Float64[ndarray, "4 4"]:
     """Return ``cam_from_world`` of a left camera whose rig, not whose own axis, looks at the target.
 
@@ -53,7 +53,7 @@ def aim_rig(
     sine = baseline_m / 2 / distance_m
     cosine = (1.0 - sine * sine) ** 0.5
     yaw = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
-    return rigid(yaw, np.zeros(3)) @ towards
+    return np.asarray(rigid(yaw, np.zeros(3)) @ towards)
 
 
 def subset(total: int, wanted: int | None) -> list[int]:
@@ -63,8 +63,7 @@ def subset(total: int, wanted: int | None) -> list[int]:
     return [(2 * i + 1) * total // (2 * wanted) for i in range(wanted)]
 
 
-def _spherical(radius_m: float, elevation_deg: float, azimuth_deg: float) -> Float64[ndarray, "3"]:
+def _spherical(radius_m: float, elevation_deg: float, azimuth_deg: float) -> Float64[ndarray, 3]:
     elevation, azimuth = radians(elevation_deg), radians(azimuth_deg)
-    return radius_m * np.array(
-        [cos(elevation) * cos(azimuth), cos(elevation) * sin(azimuth), sin(elevation)], dtype=np.float64
-    )
+    level = cos(elevation)
+    return np.array([radius_m * level * cos(azimuth), radius_m * level * sin(azimuth), radius_m * sin(elevation)])

@@ -14,7 +14,7 @@ from typing import Any
 
 from cards import dataset_card
 from dataset_builder.assemblies import make_assembly
-from dataset_builder.bars_table import read_other_bars, write_bars
+from dataset_builder.bars_table import read_bars, write_bars
 from dataset_builder.configs import CONFIGS
 from dataset_builder.plan import BUILD_FOLDER, ConfigPlan, generator_stamp
 from dataset_builder.shards import pack_shard, runs_of_views, staged_record
@@ -70,7 +70,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
     scene = plan.spec.scene.name
     mesh = f"meshes/{scene}.ply"
     write_bytes(out / mesh, plan.staging.mesh.read_bytes())
-    write_bars(out / BARS, [*read_other_bars(out / BARS, scene), (scene, make_assembly(plan.spec.scene.assembly).bars)])
+    write_bars(out / BARS, {**read_bars(out / BARS), scene: make_assembly(plan.spec.scene.assembly).bars})
     records = [staged_record(plan.staging.row(index)) for index in plan.indices]
     entry = {
         **plan.parameters,

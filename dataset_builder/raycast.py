@@ -62,21 +62,23 @@ class RayCaster:
         bars[hit] = self._face_bar_id[face[hit]]
         shape = (height, width)
         return EyeTruth(
-            depth_m=depth_m.astype(np.float32).reshape(shape), mask=bars.reshape(shape) > 0, bars=bars.reshape(shape)
+            depth_m=depth_m.astype(np.float32).reshape(shape),
+            mask=bars.reshape(shape) > 0,
+            bars=bars.reshape(shape),
         )
 
     def _first_face(
-        self, centre_m: Float64[ndarray, "3"], directions: Float64[ndarray, "n 3"]
-    ) -> Int32[ndarray, "n"]:
+        self, centre_m: Float64[ndarray, 3], directions: Float64[ndarray, "n 3"]
+    ) -> Int32[ndarray, " n"]:
         origins = np.broadcast_to((centre_m - self._origin_m).astype(np.float32), directions.shape)
-        found: Int32[ndarray, "n"] = self._scene.run(
+        found: Int32[ndarray, " n"] = self._scene.run(
             np.ascontiguousarray(origins), directions.astype(np.float32), query="INTERSECT"
         )
         return found
 
     def _plane_depth_m(
-        self, centre_m: Float64[ndarray, "3"], directions: Float64[ndarray, "n 3"], face: Int32[ndarray, "n"]
-    ) -> Float64[ndarray, "n"]:
+        self, centre_m: Float64[ndarray, 3], directions: Float64[ndarray, "n 3"], face: Int32[ndarray, " n"]
+    ) -> Float64[ndarray, " n"]:
         """Return the ray parameter at which each ray meets its face's plane: n . (a - c) / n . d."""
         normal = self._normal[face]
         towards = self._plane[face] - normal @ centre_m

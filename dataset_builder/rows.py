@@ -27,7 +27,7 @@ class Eye:
     mask: Bool[ndarray, "h w"]
     bars: UInt16[ndarray, "h w"]
     K: Float64[ndarray, "3 3"]
-    distortion: Float64[ndarray, "5"]
+    distortion: Float64[ndarray, 5]
     cam_from_world: Float64[ndarray, "4 4"]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -12,7 +12,7 @@ class Stopwatch:
     """Adds up wall-clock seconds by stage until they are taken."""
 
     def __init__(self) -> None:
-        self._seconds: Counter[str] = Counter()
+        self._seconds: defaultdict[str, float] = defaultdict(float)
 
     @contextmanager
     def timing(self, stage: str) -> Iterator[None]:
@@ -21,7 +21,7 @@ class Stopwatch:
         try:
             yield
         finally:
-            self._seconds[stage] += time.perf_counter() - start  # type: ignore[assignment]
+            self._seconds[stage] += time.perf_counter() - start
 
     def take(self) -> dict[str, float]:
         """Return the seconds since the last call, by stage, and start again from zero."""

@@ -27,7 +27,7 @@ def ideal_K(width: int, height: int) -> Float[ndarray, "3 3"]:
 
 
 def look_at(
-    eye_m: Float[ndarray, "3"], target_m: Float[ndarray, "3"], up: Float[ndarray, "3"] | None = None
+    eye_m: Float[ndarray, 3], target_m: Float[ndarray, 3], up: Float[ndarray, 3] | None = None
 ) -> Float[ndarray, "4 4"]:
     """Return ``cam_from_world`` of a camera at ``eye_m`` whose optical axis passes through ``target_m``.
 
@@ -46,7 +46,7 @@ def look_at(
     return rigid(rotation, -rotation @ np.asarray(eye_m, float))
 
 
-def rigid(rotation: Float[ndarray, "3 3"], translation: Float[ndarray, "3"]) -> Float[ndarray, "4 4"]:
+def rigid(rotation: Float[ndarray, "3 3"], translation: Float[ndarray, 3]) -> Float[ndarray, "4 4"]:
     """Return the 4 x 4 matrix of ``x -> rotation @ x + translation``."""
     pose = np.eye(4)
     pose[:3, :3] = rotation
@@ -59,7 +59,7 @@ def inverse_rigid(pose: Float[ndarray, "4 4"]) -> Float[ndarray, "4 4"]:
     return rigid(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3])
 
 
-def camera_centre(cam_from_world: Float[ndarray, "4 4"]) -> Float[ndarray, "3"]:
+def camera_centre(cam_from_world: Float[ndarray, "4 4"]) -> Float[ndarray, 3]:
     """Return the camera's centre in the world frame, metres."""
     return inverse_rigid(cam_from_world)[:3, 3]
 
@@ -73,7 +73,7 @@ def right_of_rig(left_cam_from_world: Float[ndarray, "4 4"], baseline_m: float) 
 
 def transform(pose: Float[ndarray, "4 4"], points: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 3"]:
     """Apply a 4 x 4 pose to points."""
-    return points @ pose[:3, :3].T + pose[:3, 3]
+    return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
 
 def project(K: Float[ndarray, "3 3"], points_cam: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 2"]:

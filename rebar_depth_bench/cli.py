@@ -95,12 +95,20 @@ def _parser() -> argparse.ArgumentParser:
     predicting.add_argument("--data", required=True, metavar="ROOT", help="dataset folder or Hub repository id")
     predicting.add_argument("--out", required=True, type=Path, metavar="ARCHIVE", help="the zip to write")
     predicting.add_argument(
-        "--config", nargs="+", action="extend", metavar="NAME", help="which configs (default: all of the folder)"
+        "--config",
+        nargs="+",
+        action="extend",
+        metavar="NAME",
+        help="which configs (default: all of the folder)",
     )
 
     demo = _command(commands, "demo", _demo, "render a small lattice set, predict, score and report")
-    demo.add_argument("--out", type=Path, default=Path(DEMO_FOLDER), help="folder to work in (default: %(default)s)")
-    demo.add_argument("--views", type=int, default=DEMO_VIEWS, help="stereo views to render (default: %(default)s)")
+    demo.add_argument(
+        "--out", type=Path, default=Path(DEMO_FOLDER), help="folder to work in (default: %(default)s)"
+    )
+    demo.add_argument(
+        "--views", type=int, default=DEMO_VIEWS, help="stereo views to render (default: %(default)s)"
+    )
     return parser
 
 

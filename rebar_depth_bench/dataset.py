@@ -66,7 +66,9 @@ def load(
     open_folder(root).config(config)
     kept = _checked_columns(columns)
     loaded = datasets.load_dataset(str(root), config, split=SPLIT, streaming=streaming)
-    undecoded = Features({name: feature for name, feature in features(decode_images=False).items() if name in kept})
+    undecoded = Features(
+        {name: feature for name, feature in features(decode_images=False).items() if name in kept}
+    )
     selected = loaded.select_columns(list(kept)).cast(undecoded)
     if isinstance(selected, IterableDataset):
         return selected.map(decode_row)

@@ -29,12 +29,19 @@ def eye_digest(
     mask: Bool[ndarray, "h w"],
     bars: UInt16[ndarray, "h w"],
     K: Float64[ndarray, "3 3"],
-    distortion: Float64[ndarray, "5"],
+    distortion: Float64[ndarray, 5],
     cam_from_world: Float64[ndarray, "4 4"],
 ) -> str:
     """Return the hex SHA-256 of one eye's ground truth, of its decoded values and not of their encoding."""
     digest = hashlib.sha256(np.array(depth_m.shape, "<u4").tobytes())
-    arrays = ((depth_m, "<f4"), (mask, "u1"), (bars, "<u2"), (K, "<f8"), (distortion, "<f8"), (cam_from_world, "<f8"))
+    arrays = (
+        (depth_m, "<f4"),
+        (mask, "u1"),
+        (bars, "<u2"),
+        (K, "<f8"),
+        (distortion, "<f8"),
+        (cam_from_world, "<f8"),
+    )
     for array, dtype in arrays:
         digest.update(np.ascontiguousarray(array, dtype=dtype).data)
     return digest.hexdigest()

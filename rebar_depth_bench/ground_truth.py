@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, UInt32
@@ -37,8 +38,8 @@ class ViewTruth:
     """One view's scored pixels: flat indices into its H x W grid, and their planar depth in metres."""
 
     view_id: str
-    index: UInt32[ndarray, "n"]
-    depth_m: Float32[ndarray, "n"]
+    index: UInt32[ndarray, " n"]
+    depth_m: Float32[ndarray, " n"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +48,8 @@ class ConfigTruth:
 
     view_ids: tuple[str, ...]
     starts: tuple[int, ...]
-    index: UInt32[ndarray, "n"]
-    depth_m: Float32[ndarray, "n"]
+    index: UInt32[ndarray, " n"]
+    depth_m: Float32[ndarray, " n"]
 
     def __iter__(self) -> Iterator[ViewTruth]:
         """Yield the views."""
@@ -107,9 +108,9 @@ def _write_arrays(
     folder: DatasetFolder, config: str, into: Path, progress: Progress | None
 ) -> dict[str, list[str] | list[int]]:
     records = {view.view_id: view for view in folder.views(config)}
-    total = sum(view.scored_px for view in records.values())  # an array of no bytes cannot be mapped
-    index = np.lib.format.open_memmap(into / "index.npy", "w+", np.uint32, (max(total, 1),))
-    depth_m = np.lib.format.open_memmap(into / "depth_m.npy", "w+", np.float32, (max(total, 1),))
+    total = sum(view.scored_px for view in records.values())
+    index = _new_array(into / "index.npy", np.uint32, total)
+    depth_m = _new_array(into / "depth_m.npy", np.float32, total)
     view_ids: list[str] = []
     starts = [0]
     rows = load(folder.root, config, streaming=True, columns=_TRUTH_COLUMNS)
@@ -131,14 +132,20 @@ def _write_arrays(
     return {"view_ids": view_ids, "starts": starts}
 
 
-def _checked_pixels(row: dict[str, ndarray], record: ViewRecord | None, root: str) -> UInt32[ndarray, "n"]:
+def _new_array(path: Path, dtype: type, length: int) -> np.memmap[Any, Any]:
+    """Return a .npy file mapped for writing; it holds at least one value, for nothing cannot be mapped."""
+    mapped: np.memmap[Any, Any] = np.lib.format.open_memmap(path, "w+", dtype, (max(length, 1),))  # type: ignore[no-untyped-call]
+    return mapped
+
+
+def _checked_pixels(row: dict[str, ndarray], record: ViewRecord | None, root: str) -> UInt32[ndarray, " n"]:
     if record is None:
         raise DatasetError(f"{root}: view {row['view_id']} is not in the manifest")
     found = eye_digest(*(row[f"left_{kind}"] for kind in _KINDS if kind != "rgb"))
     pixels = scored_pixels(row["left_mask"], row["left_depth"])
     if found != record.left or len(pixels) != record.scored_px:
         raise DatasetError(
-            f"{root}: view {record.view_id}: ground truth has digest {found[:16]} and {len(pixels)} scored pixels, "
-            f"the manifest says {record.left[:16]} and {record.scored_px}"
+            f"{root}: view {record.view_id}: ground truth has digest {found[:16]} and {len(pixels)} "
+            f"scored pixels, the manifest says {record.left[:16]} and {record.scored_px}"
         )
     return pixels

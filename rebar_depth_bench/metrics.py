@@ -31,7 +31,7 @@ class DepthMetrics:
     delta1: float
 
 
-def depth_metrics(p_m: Float64[ndarray, "n"], z_m: Float64[ndarray, "n"]) -> DepthMetrics:
+def depth_metrics(p_m: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"]) -> DepthMetrics:
     """Return the errors of a prediction as it stands. Values too large to square give ``inf``, never a warning."""
     with np.errstate(over="ignore", under="ignore", divide="ignore", invalid="ignore"):
         error_m = np.abs(p_m - z_m)
@@ -43,20 +43,20 @@ def depth_metrics(p_m: Float64[ndarray, "n"], z_m: Float64[ndarray, "n"]) -> Dep
         )
 
 
-def median_scale(p_m: Float64[ndarray, "n"], z_m: Float64[ndarray, "n"]) -> float:
+def median_scale(p_m: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"]) -> float:
     """Return the oracle scale s = median(z) / median(p); an even count takes the mean of the two middle values."""
     with np.errstate(over="ignore"):
         return float(np.median(z_m) / np.median(p_m))
 
 
-def is_prediction(p_m: Float[ndarray, "n"]) -> Bool[ndarray, "n"]:
+def is_prediction(p_m: Float[ndarray, " n"]) -> Bool[ndarray, " n"]:
     """Return which values are predictions: finite and > 0."""
     with np.errstate(invalid="ignore"):
-        return np.isfinite(p_m) & (p_m > 0)
+        return np.asarray(np.isfinite(p_m) & (p_m > 0))
 
 
 def shares_within(
-    error_m: Float64[ndarray, "n"], scored_px: int, tolerances_mm: Iterable[int]
+    error_m: Float64[ndarray, " n"], scored_px: int, tolerances_mm: Iterable[int]
 ) -> dict[int, float]:
     """Return for each tolerance the share of ALL ``scored_px`` pixels with an absolute error no larger.
 

@@ -33,7 +33,7 @@ def interior(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     return kept
 
 
-def scored_pixels(mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"]) -> UInt32[ndarray, "n"]:
+def scored_pixels(mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"]) -> UInt32[ndarray, " n"]:
     """Return the flat, ascending indices of the pixels a view is scored on: interior steel with depth > 0.
 
     None at all means that the view is out of the protocol.

@@ -132,4 +132,3 @@ def _watched(
         if progress is not None:
             progress(what, done, total)
         yield outcome
-

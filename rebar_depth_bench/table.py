@@ -97,9 +97,7 @@ def _print_notes(result: Result, console: Console) -> None:
     for name, table in result.tables.items():
         reasons = wording.unranked_reasons(table)
         if reasons:
-            _print_line(
-                console, f"{wording.printable(name)}: not ranked: {'; '.join(reasons)}.", style="yellow"
-            )
+            _print_line(console, f"{wording.printable(name)}: not ranked: {'; '.join(reasons)}.", style="yellow")
     if wording.has_dash(row for group in _groups(list(result.tables.values())) for row in group.rows):
         _print_line(console, wording.DASH_NOTE)
 
@@ -128,9 +126,7 @@ def _groups(tables: Sequence[Table]) -> tuple[_Group, _Group, _Group, _Group]:
         _Group(
             wording.SCALED_TITLE,
             (*(f"scaled\n{head}" for head in metric_heads), "scale\ns\n"),
-            tuple(
-                (*wording.metric_cells(one.scaled), wording.scale_cell(one.scale_median)) for one in tables
-            ),
+            tuple((*wording.metric_cells(one.scaled), wording.scale_cell(one.scale_median)) for one in tables),
         ),
         _Group(
             wording.WITHIN_TITLE,

@@ -14,11 +14,8 @@ try:
     import torch
     from torch.utils.data import DataLoader
     from torch.utils.data import IterableDataset as TorchIterableDataset
-    from torch.utils.data import get_worker_info
 except ImportError as error:
-    raise MethodError(
-        f"torch_loader needs torch ({error}): pip install 'rebar-depth-bench[torch]'"
-    ) from None
+    raise MethodError(f"torch_loader needs torch ({error}): pip install 'rebar-depth-bench[torch]'") from None
 
 Batch = dict[str, Any]
 
@@ -87,16 +84,10 @@ def _tensor(key: str, stacked: np.ndarray[Any, Any]) -> torch.Tensor:
 
 
 class _Stream(TorchIterableDataset[Mapping[str, Any]]):
-    """A streamed dataset for a ``DataLoader``: each worker takes shards of its own, each row comes once."""
+    """A streamed dataset as torch knows them; ``datasets`` itself gives each worker shards of its own."""
 
     def __init__(self, rows: IterableDataset) -> None:
         self._rows = rows
 
     def __iter__(self) -> Iterator[Mapping[str, Any]]:
-        worker = get_worker_info()
-        if worker is None:
-            yield from self._rows
-            return
-        shards = min(worker.num_workers, self._rows.num_shards)
-        if worker.id < shards:
-            yield from self._rows.shard(num_shards=shards, index=worker.id)
+        return iter(self._rows)

@@ -89,9 +89,7 @@ def unranked_reasons(table: Table) -> list[str]:
     if missing:
         reasons.append(f"{missing} of {table.views} {_plural('view', table.views)} without any prediction")
     if table.coverage is not None and table.coverage < MIN_RANKED_COVERAGE:
-        reasons.append(
-            f"coverage {coverage_percent(table.coverage)} % is below {MIN_RANKED_COVERAGE * 100:.0f} %"
-        )
+        reasons.append(f"coverage {coverage_percent(table.coverage)} % is below {MIN_RANKED_COVERAGE * 100:.0f} %")
     if any(_overflowed(metrics) for metrics in (table.native, table.scaled)):
         reasons.append("a number overflowed")
     return reasons or ["not ranked by the scorer"]

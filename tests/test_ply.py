@@ -80,9 +80,7 @@ def test_trimesh_reads_the_same_mesh(tmp_path: Path) -> None:
 
 def test_other_comments_are_no_other_layout(tmp_path: Path) -> None:
     mesh = arrays()
-    content = written(tmp_path, mesh).replace(
-        b"element face", b"comment \xff\nobj_info mine\nelement face", 1
-    )
+    content = written(tmp_path, mesh).replace(b"element face", b"comment \xff\nobj_info mine\nelement face", 1)
     assert has_mesh_ply_header(content)
     np.testing.assert_array_equal(parse_mesh_ply(content, "x")[0], mesh[0])
 
@@ -140,9 +138,7 @@ def test_a_body_that_is_no_triangle_mesh_is_refused(tmp_path: Path) -> None:
         parse_mesh_ply(quad, "x.ply")
     for corner in (-1, 50):
         index = np.array([0, 1, corner], "<i4").tobytes()
-        with pytest.raises(
-            DatasetError, match=rf"face 2 names vertices \[0, 1, {corner}\], expected 0 to 49"
-        ):
+        with pytest.raises(DatasetError, match=rf"face 2 names vertices \[0, 1, {corner}\], expected 0 to 49"):
             parse_mesh_ply(content[: faces_at + 31] + index + content[faces_at + 43 :], "x.ply")
     nan = np.array(np.nan, "<f8").tobytes()
     with pytest.raises(DatasetError, match=r"vertex 49 is \[.*nan\], expected finite metres"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -14,8 +15,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rebar_depth_bench import SubmissionError, score
-from rebar_depth_bench.ground_truth import ViewTruth
+from rebar_depth_bench import DatasetError, SubmissionError, score
+from rebar_depth_bench.ground_truth import CACHE_FOLDER, ViewTruth
 from rebar_depth_bench.protocol import interior
 from rebar_depth_bench.result import Table, tabulate
 from rebar_depth_bench.scoring import score_view
@@ -106,7 +107,17 @@ def test_same_bytes_for_any_number_of_workers_and_on_the_command_line(
     one, four = (score(archive, tiny_root, workers=workers).to_json() for workers in (1, 4))
     assert one == four
     target = tmp_path / "result.json"
-    command = [sys.executable, "-m", "rebar_depth_bench", "score", archive, "--data", tiny_root, "--json", target]
+    command = [
+        sys.executable,
+        "-m",
+        "rebar_depth_bench",
+        "score",
+        str(archive),
+        "--data",
+        str(tiny_root),
+        "--json",
+        str(target),
+    ]
     subprocess.run(command, check=True, capture_output=True)
     assert target.read_bytes() == one
 
@@ -119,7 +130,7 @@ def test_one_bad_entry_refuses_the_whole_archive(
     with zipfile.ZipFile(good) as source, zipfile.ZipFile(bad, "w") as target:
         for name in source.namelist():
             content = source.read(name)
-            broken = name.endswith("0.npy") or name.endswith("5.npy")
+            broken = name.endswith(("0.npy", "5.npy"))
             target.writestr(name, content[:-7] if broken else content)
     with pytest.raises(SubmissionError) as caught:
         score(bad, tiny_root)
@@ -157,12 +168,9 @@ def test_a_config_may_be_left_out_whole(tiny_truth: Depths, tiny_root: Path, arc
     assert list(score(archive_of(tiny_truth), tiny_root).tables) == ["lattice"]
 
 
-def test_a_damaged_ground_truth_is_named(tiny_root: Path, tiny_truth: Depths, archive_of: Archive, tmp_path: Path) -> None:
-    import shutil
-
-    from rebar_depth_bench import DatasetError
-    from rebar_depth_bench.ground_truth import CACHE_FOLDER
-
+def test_a_damaged_ground_truth_is_named(
+    tiny_root: Path, tiny_truth: Depths, archive_of: Archive, tmp_path: Path
+) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(tiny_root, copy, ignore=shutil.ignore_patterns(CACHE_FOLDER))
     manifest = json.loads((copy / "manifest.json").read_text())

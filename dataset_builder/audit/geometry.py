@@ -1,16 +1,17 @@
-"""Ground truth against geometry known by other means than the ray caster: bar axes, the board, the other eye."""
+"""Ground truth against geometry known without the ray caster: bar axes, the board, the other eye."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Bool, Float32, Float64, UInt16
 from numpy import ndarray
 
+from dataset_builder.model import Bar
 from rebar_depth_bench.cameras import inverse_rigid, pixel_rays, project, transform
 from rebar_depth_bench.protocol import interior
 
@@ -44,24 +45,23 @@ def world_points_m(
 
 
 def axis_distance_ratio(
-    points_m: Float64[ndarray, "h w 3"], bars: UInt16[ndarray, "h w"], table: pd.DataFrame
-) -> Float64[ndarray, "n"]:
+    points_m: Float64[ndarray, "h w 3"], bars: UInt16[ndarray, "h w"], steel: Iterable[Bar]
+) -> Float64[ndarray, " n"]:
     """Return each steel pixel's distance from its bar's centreline over the bar's nominal radius.
 
     Round the whole bar it is 1 give or take the ribs; on an end cap less.
     """
     ratios = []
-    for bar in table.itertuples():
+    for bar in steel:
         on_bar = points_m[bars == bar.bar_id]
         if len(on_bar):
-            axis = np.array([list(point) for point in bar.axis], dtype=np.float64)
-            ratios.append(_polyline_distance_m(on_bar, axis) / (bar.diameter_m / 2))
+            ratios.append(_polyline_distance_m(on_bar, np.array(bar.axis_m)) / (bar.diameter_m / 2))
     return np.concatenate(ratios) if ratios else np.zeros(0)
 
 
 def board_error_m(
     row: Mapping[str, Any], eye: str, board: Mapping[str, Any], points_m: Float64[ndarray, "h w 3"]
-) -> Float64[ndarray, "n"]:
+) -> Float64[ndarray, " n"]:
     """Return how far from z = 0 the points lie that are not steel and stand over the board's known rectangle.
 
     A millimetre along its edge is left out: the sheet has sides.
@@ -94,19 +94,29 @@ def epipolar_counts(row: Mapping[str, Any]) -> EpipolarCounts:
 
 
 def _classified(
-    around_m: Float32[ndarray, "n 16"], depth_m: Float64[ndarray, "n"], same_bar: Bool[ndarray, "n"], outside: int
+    around_m: Float32[ndarray, "n 16"],
+    depth_m: Float64[ndarray, " n"],
+    same_bar: Bool[ndarray, " n"],
+    outside: int,
 ) -> EpipolarCounts:
     nearest, farthest = around_m.min(axis=1), around_m.max(axis=1)
     behind = nearest > depth_m + EPIPOLAR_TOLERANCE_M
     hidden = ~behind & (~same_bar | (farthest < depth_m - EPIPOLAR_TOLERANCE_M))
-    counts = (np.count_nonzero(~behind & ~hidden), np.count_nonzero(hidden), outside, np.count_nonzero(behind))
+    counts = (
+        np.count_nonzero(~behind & ~hidden),
+        np.count_nonzero(hidden),
+        outside,
+        np.count_nonzero(behind),
+    )
     return EpipolarCounts(*(int(count) for count in counts))
 
 
-def _polyline_distance_m(points_m: Float64[ndarray, "n 3"], axis_m: Float64[ndarray, "k 3"]) -> Float64[ndarray, "n"]:
+def _polyline_distance_m(
+    points_m: Float64[ndarray, "n 3"], axis_m: Float64[ndarray, "k 3"]
+) -> Float64[ndarray, " n"]:
     """Return the distance of points from the nearest segment's line, ends included."""
     distances = []
-    for a, b in zip(axis_m[:-1], axis_m[1:], strict=True):
+    for a, b in pairwise(axis_m):
         along = b - a
         share = np.clip((points_m - a) @ along / (along @ along), 0.0, 1.0)
         distances.append(np.linalg.norm(points_m - (a + share[:, None] * along), axis=1))

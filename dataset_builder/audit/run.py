@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from dataset_builder.audit.files import check_digests, check_files
 from dataset_builder.audit.geometry import (
@@ -20,7 +19,10 @@ from dataset_builder.audit.geometry import (
 from dataset_builder.audit.report import AuditReport, Check
 from dataset_builder.audit.rows import row_problems
 from dataset_builder.audit.second_renderer import cycles_difference_m
+from dataset_builder.bars_table import read_bars
+from dataset_builder.model import Bar
 from dataset_builder.protocols import subset
+from dataset_builder.publish import BARS
 from rebar_depth_bench.dataset import load
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.folder import DatasetFolder, open_folder
@@ -58,10 +60,10 @@ def _config_checks(
     folder: DatasetFolder, root: Path, config: str, depth_views: int, progress: Progress
 ) -> list[Check]:
     entry, records = folder.config(config), folder.views(config)
-    bars = pd.read_parquet(root / "bars.parquet").query("scene == @entry['scene']['name']")
-    bar_ids = set(bars["bar_id"].tolist())
+    steel = read_bars(root / BARS)[entry["scene"]["name"]]
+    bar_ids = {bar.bar_id for bar in steel}
     problems: list[str] = []
-    geometry = _Geometry(entry, bars)
+    geometry = _Geometry(entry, steel)
     again = set(subset(len(records), depth_views))
     kept = []
     rows = load(root, config, streaming=True)
@@ -73,7 +75,10 @@ def _config_checks(
         progress(f"audit of {config}", n + 1, len(records))
     if n + 1 != len(records):
         problems.append(f"{config} has {n + 1} rows, the manifest {len(records)}")
-    checks = [Check(f"{config}: rows", f"{n + 1} views", "all invariants", tuple(problems)), *geometry.checks(config)]
+    checks = [
+        Check(f"{config}: rows", f"{n + 1} views", "all invariants", tuple(problems)),
+        *geometry.checks(config),
+    ]
     if kept:
         off_m = cycles_difference_m(
             root / entry["mesh"], kept, lambda done, total: progress(f"Cycles depth of {config}", done, total)
@@ -85,9 +90,9 @@ def _config_checks(
 class _Geometry:
     """Gathers the geometric figures of a config's views."""
 
-    def __init__(self, entry: Mapping[str, Any], bars: pd.DataFrame) -> None:
+    def __init__(self, entry: Mapping[str, Any], steel: tuple[Bar, ...]) -> None:
         self._board = entry["scene"]["board"]
-        self._bars = bars
+        self._steel = steel
         self._axis_ratio = 0.0
         self._board_error_m = 0.0
         self._epipolar = np.zeros(4, dtype=np.int64)
@@ -95,7 +100,7 @@ class _Geometry:
     def add(self, row: Mapping[str, Any]) -> None:
         for eye in EYES:
             points_m = world_points_m(row[f"{eye}_depth"], row[f"{eye}_K"], row[f"{eye}_cam_from_world"])
-            ratios = axis_distance_ratio(points_m, row[f"{eye}_bars"], self._bars)
+            ratios = axis_distance_ratio(points_m, row[f"{eye}_bars"], self._steel)
             self._axis_ratio = max(self._axis_ratio, float(ratios.max(initial=0.0)))
             error_m = board_error_m(row, eye, self._board, points_m)
             self._board_error_m = max(self._board_error_m, float(error_m.max(initial=0.0)))

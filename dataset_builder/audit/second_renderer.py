@@ -19,11 +19,14 @@ from rebar_depth_bench.schema import EYES
 
 def cycles_difference_m(
     mesh: Path, rows: Sequence[Mapping[str, Any]], progress: Callable[[int, int], None]
-) -> Float64[ndarray, "n"]:
+) -> Float64[ndarray, " n"]:
     """Return |dataset depth - Cycles depth|, metres, of every steel pixel of the rows' two eyes."""
     cameras = tuple(
         DepthCamera(
-            row[f"{eye}_K"], row[f"{eye}_cam_from_world"], row[f"{eye}_depth"].shape[1], row[f"{eye}_depth"].shape[0]
+            row[f"{eye}_K"],
+            row[f"{eye}_cam_from_world"],
+            row[f"{eye}_depth"].shape[1],
+            row[f"{eye}_depth"].shape[0],
         )
         for row in rows
         for eye in EYES
@@ -31,7 +34,9 @@ def cycles_difference_m(
     with tempfile.TemporaryDirectory() as folder, BlenderProcesses() as blender:
         task = DepthTask(mesh, cameras, Path(folder), os.cpu_count() or 1)
         log = Path(folder) / "blender.log"
-        blender.run(task, f"the audit of {mesh.name}", log, lambda event: progress(event["camera"] + 1, len(cameras)))
+        blender.run(
+            task, f"the audit of {mesh.name}", log, lambda event: progress(event["camera"] + 1, len(cameras))
+        )
         rendered = [np.load(Path(folder) / f"{n}.npy") for n in range(len(cameras))]
     eyes = [(row[f"{eye}_depth"], row[f"{eye}_mask"]) for row in rows for eye in EYES]
     differences = [

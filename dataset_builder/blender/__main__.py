@@ -1,4 +1,4 @@
-"""The Blender process: reads one pickled task, reports events as JSON lines, keeps Blender's prints to a log."""
+"""The Blender process: one pickled task in, events as JSON lines out, Blender's own prints to a log."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from typing import Any, BinaryIO
 from rebar_depth_bench.errors import InputError
 
 
+Report = Callable[[Mapping[str, Any]], None]
+
+
 def main() -> int:
     """Run the task that stands on standard input; ``sys.argv[1]`` is the log's path."""
     report = _claim_standard_output(sys.argv[1])
@@ -25,16 +28,17 @@ def main() -> int:
     return 0
 
 
-def _runner(task: object) -> Callable[[Any, Callable[[Mapping[str, Any]], None]], None]:
+def _runner(task: object) -> Callable[[Any, Report], None]:
     """Return the function that runs a task. Imported late: by now Blender's prints go to the log."""
     from dataset_builder.blender.depth_task import run_depth_task
     from dataset_builder.blender.render_task import run_render_task
     from dataset_builder.tasks import DepthTask, RenderTask
 
-    return {RenderTask: run_render_task, DepthTask: run_depth_task}[type(task)]
+    runners: Mapping[type, Callable[[Any, Report], None]] = {RenderTask: run_render_task, DepthTask: run_depth_task}
+    return runners[type(task)]
 
 
-def _claim_standard_output(log: str) -> Callable[[Mapping[str, Any]], None]:
+def _claim_standard_output(log: str) -> Report:
     """Send file descriptors 1 and 2 to the log and return a function that writes events to the old 1."""
     events = os.fdopen(os.dup(1), "w", buffering=1)
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)

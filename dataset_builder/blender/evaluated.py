@@ -66,7 +66,7 @@ def _local_mesh(data: bpy.types.Mesh) -> Mesh:
     co = np.empty(len(data.vertices) * 3, dtype=np.float32)
     data.vertices.foreach_get("co", co)
     data.calc_loop_triangles()
-    corners: Int32[ndarray, "n"] = np.empty(len(data.loop_triangles) * 3, dtype=np.int32)
+    corners: Int32[ndarray, " n"] = np.empty(len(data.loop_triangles) * 3, dtype=np.int32)
     data.loop_triangles.foreach_get("vertices", corners)
     return Mesh(co.reshape(-1, 3).astype(np.float64), corners.reshape(-1, 3))
 

@@ -11,7 +11,7 @@ import bpy
 from mathutils import Vector
 
 SKY_COLOUR = (0.86, 0.93, 1.0)
-SKY_STRENGTH = 0.55
+SKY_STRENGTH = 0.38
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Panel:
 
 
 PANELS = (
-    Panel("ceiling-panel", (-0.35, 0.45, 1.9), (0.0, 0.05, 0.0), (1.2, 0.6), 42.0, (1.0, 0.93, 0.85)),
-    Panel("window", (-1.9, -0.9, 1.5), (0.0, 0.0, 0.0), (1.4, 0.9), 26.0, (0.82, 0.91, 1.0)),
+    Panel("ceiling-panel", (-0.35, 0.45, 1.9), (0.0, 0.05, 0.0), (0.9, 0.45), 62.0, (1.0, 0.93, 0.85)),
+    Panel("window", (-1.9, -0.9, 1.5), (0.0, 0.0, 0.0), (1.1, 0.9), 40.0, (0.82, 0.91, 1.0)),
 )
 
 

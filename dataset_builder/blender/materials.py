@@ -1,4 +1,4 @@
-"""What the scene's surfaces look like. Bumps are shading only: no material moves a surface."""
+"""What the scene's surfaces look like: colour and gloss only, no material moves or bumps a surface."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def material(name: str) -> bpy.types.Material:
     """Return the material ``name`` of the open file, made on first use."""
     found = bpy.data.materials.get(name)
     if found is None:
-        found = _plain(name) if name in _PLAIN else _MAKERS[name](name)
+        found = _MAKERS[name](name)
     return found
 
 
@@ -40,7 +40,7 @@ def paper(texture: UInt8[ndarray, "h w"]) -> bpy.types.Material:
     printed = shader.node("ShaderNodeTexImage", {"Vector": shader.uv()}, image=image, extension="EXTEND")
     # Ink is no black hole and paper no mirror: keep both inside what a printer delivers.
     colour = shader.mix(printed.outputs["Color"], (0.018, 0.018, 0.02), (0.74, 0.735, 0.71))
-    return shader.surface(Base_Color=colour, Roughness=0.75, Specular_IOR_Level=0.3)
+    return shader.matt(colour)
 
 
 def _image(name: str, texture: UInt8[ndarray, "h w"]) -> bpy.types.Image:
@@ -61,17 +61,16 @@ def _steel(name: str) -> bpy.types.Material:
     """Blue-grey mill scale with patches of rust; amount, pattern and tone come from each bar's properties."""
     shader = Shader(name)
     at = shader.shifted(shader.position(), shader.object_value(PATTERN))
-    patches, grain = shader.noise(at, 70.0, 3.0), shader.noise(at, 900.0, 1.0)
-    dark = shader.mix(shader.object_value(TONE), (0.050, 0.057, 0.068), (0.105, 0.112, 0.125))
-    scale = shader.mix(shader.step(grain, 0.35, 0.75), dark, (0.20, 0.205, 0.215))
-    rust = shader.mix(shader.step(grain, 0.35, 0.65), (0.060, 0.024, 0.012), (0.235, 0.088, 0.032))
-    threshold = shader.add(patches, shader.remap(shader.object_value(RUST), 0.0, 1.0, -0.14, 0.14))
-    rusty = shader.step(shader.add(threshold, shader.remap(grain, 0.0, 1.0, -0.06, 0.06)), 0.48, 0.60)
+    patches, grain = shader.noise(at, 70.0, 3.0), shader.noise(at, 700.0, 1.0)
+    dark = shader.mix(shader.object_value(TONE), (0.105, 0.118, 0.140), (0.190, 0.200, 0.218))
+    scale = shader.mix(shader.step(grain, 0.25, 0.85), dark, (0.255, 0.262, 0.275))
+    rust = shader.mix(shader.step(grain, 0.3, 0.7), (0.095, 0.042, 0.022), (0.250, 0.105, 0.045))
+    threshold = shader.add(patches, shader.remap(shader.object_value(RUST), 0.0, 1.0, -0.15, 0.12))
+    rusty = shader.step(shader.add(threshold, shader.remap(grain, 0.0, 1.0, -0.05, 0.05)), 0.46, 0.62)
     return shader.surface(
         Base_Color=shader.mix(rusty, scale, rust),
-        Metallic=shader.remap(rusty, 0.0, 1.0, 0.75, 0.05),
-        Roughness=shader.add(shader.remap(rusty, 0.0, 1.0, 0.38, 0.78), shader.remap(grain, 0, 1, -0.08, 0.1)),
-        Normal=shader.bump(grain, 0.25, 0.0002),
+        Metallic=shader.remap(rusty, 0.0, 1.0, 0.70, 0.05),
+        Roughness=shader.add(shader.remap(rusty, 0.0, 1.0, 0.36, 0.72), shader.remap(grain, 0, 1, -0.06, 0.08)),
     )
 
 
@@ -79,58 +78,46 @@ def _wood(name: str) -> bpy.types.Material:
     """Oiled beech: grain along x."""
     shader = Shader(name)
     at = shader.position()
-    figure = shader.noise(shader.stretched(at, (1.2, 14.0, 14.0)), 3.0)
-    pores = shader.noise(shader.stretched(at, (10.0, 240.0, 240.0)), 2.0, 0.0)
-    base = shader.mix(shader.step(figure, 0.3, 0.7), (0.30, 0.185, 0.100), (0.42, 0.28, 0.165))
-    colour = shader.mix(shader.step(pores, 0.56, 0.75), base, (0.22, 0.13, 0.07))
-    return shader.surface(Base_Color=colour, Roughness=0.48, Specular_IOR_Level=0.4)
+    figure = shader.noise(shader.stretched(at, (1.0, 12.0, 12.0)), 4.0)
+    pores = shader.noise(shader.stretched(at, (22.0, 330.0, 330.0)), 2.0, 0.0)
+    base = shader.mix(shader.step(figure, 0.3, 0.7), (0.31, 0.195, 0.108), (0.40, 0.265, 0.155))
+    return shader.matt(shader.mix(shader.step(pores, 0.55, 0.85), base, (0.25, 0.15, 0.083)))
 
 
-def _concrete(name: str) -> bpy.types.Material:
-    shader = Shader(name)
-    at = shader.position()
-    colour = shader.mix(shader.noise(at, 45.0, 3.0), (0.24, 0.235, 0.225), (0.46, 0.455, 0.44))
-    return shader.surface(
-        Base_Color=colour, Roughness=0.9, Normal=shader.bump(shader.noise(at, 400.0), 0.3, 0.0005)
-    )
-
-
-def _speckled(
-    light: Colour, dark: Colour, per_metre: float, roughness: float
-) -> Callable[[str], bpy.types.Material]:
-    """Return a maker of two-tone speckled matter."""
+def _speckled(light: Colour, dark: Colour, per_metre: float) -> Callable[[str], bpy.types.Material]:
+    """Return a maker of matt two-tone speckled matter."""
 
     def make(name: str) -> bpy.types.Material:
         shader = Shader(name)
         share = shader.step(shader.noise(shader.position(), per_metre), 0.35, 0.65)
-        return shader.surface(Base_Color=shader.mix(share, dark, light), Roughness=roughness)
+        return shader.matt(shader.mix(share, dark, light))
 
     return make
 
 
-def _plain(name: str) -> bpy.types.Material:
-    colour, roughness = _PLAIN[name]
-    return Shader(name).surface(Base_Color=colour, Roughness=roughness)
+def _matt(colour: Colour) -> Callable[[str], bpy.types.Material]:
+    return lambda name: Shader(name).matt(colour)
 
 
-_PLAIN: dict[str, tuple[Colour, float]] = {
-    "painted metal": ((0.42, 0.44, 0.45), 0.4),
-    "cabinet": ((0.50, 0.52, 0.53), 0.45),
-    "dark laminate": ((0.045, 0.047, 0.052), 0.4),
-    "door": ((0.26, 0.31, 0.34), 0.5),
-    "red paint": ((0.36, 0.035, 0.025), 0.35),
-    "blue plastic": ((0.04, 0.10, 0.26), 0.45),
-    "grey plastic": ((0.20, 0.21, 0.22), 0.5),
-    "white glaze": ((0.66, 0.66, 0.64), 0.15),
-    "sheet edge": ((0.70, 0.70, 0.68), 0.8),
-}
+def _glossy(colour: Colour, roughness: float) -> Callable[[str], bpy.types.Material]:
+    return lambda name: Shader(name).surface(Base_Color=colour, Roughness=roughness)
+
 
 _MAKERS: dict[str, Callable[[str], bpy.types.Material]] = {
     "steel": _steel,
     "wood": _wood,
-    "concrete": _concrete,
-    "plaster": _speckled((0.62, 0.61, 0.58), (0.56, 0.55, 0.53), 6.0, 0.95),
-    "floor": _speckled((0.25, 0.26, 0.27), (0.17, 0.18, 0.19), 60.0, 0.5),
-    "cork": _speckled((0.36, 0.22, 0.11), (0.20, 0.115, 0.055), 120.0, 0.9),
-    "cardboard": _speckled((0.40, 0.27, 0.155), (0.34, 0.225, 0.125), 25.0, 0.85),
+    "concrete": _speckled((0.46, 0.455, 0.44), (0.27, 0.265, 0.255), 45.0),
+    "plaster": _speckled((0.63, 0.62, 0.59), (0.585, 0.575, 0.55), 5.0),
+    "floor": _speckled((0.25, 0.26, 0.27), (0.17, 0.18, 0.19), 60.0),
+    "cork": _speckled((0.36, 0.22, 0.11), (0.20, 0.115, 0.055), 120.0),
+    "cardboard": _speckled((0.40, 0.27, 0.155), (0.34, 0.225, 0.125), 25.0),
+    "painted metal": _matt((0.42, 0.44, 0.45)),
+    "cabinet": _matt((0.50, 0.52, 0.53)),
+    "dark laminate": _matt((0.045, 0.047, 0.052)),
+    "door": _matt((0.26, 0.31, 0.34)),
+    "blue plastic": _matt((0.05, 0.11, 0.26)),
+    "grey plastic": _matt((0.20, 0.21, 0.22)),
+    "sheet edge": _matt((0.70, 0.70, 0.68)),
+    "red paint": _glossy((0.33, 0.045, 0.035), 0.35),
+    "white glaze": _glossy((0.66, 0.66, 0.64), 0.15),
 }

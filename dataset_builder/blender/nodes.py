@@ -89,14 +89,15 @@ class Shader:
         inputs: dict[str | int, Any] = {0: share, 6: a, 7: b}
         return self.node("ShaderNodeMix", inputs, data_type="RGBA").outputs[2]
 
-    def bump(self, height: Socket, strength: float, depth_m: float) -> Socket:
-        """Return shading normals for ``height`` (0 to 1) of ``depth_m``; the geometry stays as it is."""
-        inputs: dict[str | int, Any] = {"Height": height, "Strength": strength, "Distance": depth_m}
-        return self.node("ShaderNodeBump", inputs).outputs["Normal"]
+    def matt(self, colour: Socket | Colour) -> bpy.types.Material:
+        """Finish with a plain diffuse surface, a good deal cheaper to render than ``surface``."""
+        return self._finish(self.node("ShaderNodeBsdfDiffuse", {"Color": colour}).outputs["BSDF"])
 
     def surface(self, **inputs: Any) -> bpy.types.Material:
         """Finish with a Principled surface; keywords are its inputs, with ``_`` for a space."""
         named: dict[str | int, Any] = {key.replace("_", " "): value for key, value in inputs.items()}
-        shader = self.node("ShaderNodeBsdfPrincipled", named).outputs["BSDF"]
+        return self._finish(self.node("ShaderNodeBsdfPrincipled", named).outputs["BSDF"])
+
+    def _finish(self, shader: Socket) -> bpy.types.Material:
         self.node("ShaderNodeOutputMaterial", {"Surface": shader})
         return self.material

@@ -40,9 +40,11 @@ def configure_colour(spec: ColourSpec, threads: int) -> None:
         denoising_quality="HIGH",
         denoising_prefilter="FAST",
         denoising_input_passes="RGB_ALBEDO_NORMAL",
-        max_bounces=4,
+        max_bounces=3,
         diffuse_bounces=2,
         glossy_bounces=3,
+        # Two lamps need no tree to choose between them; without it a frame takes a fifth less time.
+        use_light_tree=False,
         sample_clamp_indirect=4.0,
         caustics_reflective=False,
         caustics_refractive=False,

@@ -80,9 +80,7 @@ def views_chart(config: str, views: Sequence[ViewScore]) -> Markup:
     body += f'<path class="missing" d="{missing}"/>' if missing else ""
     body += _text(left + 6, bottom + 18, "first view") + _text(_RIGHT, bottom + 18, "last view", "end")
     without = sum(view.native is None for view in views)
-    description = (
-        f"AbsRel of the {len(views)} views of {printable(config)}, {without} without any prediction."
-    )
+    description = f"AbsRel of the {len(views)} views of {printable(config)}, {without} without any prediction."
     return _svg(f"AbsRel by view, {printable(config)}", description, bottom + 26, body)
 
 
@@ -108,9 +106,7 @@ def _text(x: float, y: float, content: str, classes: str = "start") -> str:
 
 def _vertical_grid(axis: LogAxis, bottom: float) -> str:
     lines = "".join(f"M{axis.at(tick):.1f} 10V{bottom:g}" for tick in axis.ticks())
-    labels = "".join(
-        _text(round(axis.at(t), 1), bottom + 15, label(t), _anchor(axis, t)) for t in axis.ticks()
-    )
+    labels = "".join(_text(round(axis.at(t), 1), bottom + 15, label(t), _anchor(axis, t)) for t in axis.ticks())
     return f'<path class="axis" d="{lines}"/>{labels}'
 
 

@@ -105,7 +105,7 @@ def view_images(view: ViewPanels) -> ViewImages:
 
 
 def depth_range(truth_m: Float32[ndarray, "h w"], scored: ndarray) -> tuple[float, float]:
-    """Return (near, far) in metres: robust range of the true depth at flat indices ``scored``, a tenth wider."""
+    """Return (near, far), metres: robust range of true depth at flat indices ``scored``, a tenth wider."""
     values = truth_m.ravel()[scored] if scored.size else truth_m[truth_m > 0]
     if not values.size:
         return 0.0, 1.0

@@ -68,27 +68,21 @@ def _check_header(name: str, data: memoryview, shape: tuple[int, int]) -> None:
     _check_channel(name, channels)
     found = (window[3] - window[1] + 1, window[2] - window[0] + 1)
     if found != shape:
-        raise EntryError(
-            f"{name}: the data window is {show_shape(found)}, expected {show_shape(shape)} (H x W)"
-        )
+        raise EntryError(f"{name}: the data window is {show_shape(found)}, expected {show_shape(shape)} (H x W)")
     if tiles is not None:
         _check_tiles(name, tiles, shape)
 
 
 def _check_channel(name: str, channels: list[tuple[str, int, int, int]]) -> None:
     if len(channels) != 1:
-        names = ", ".join(show(channel[0]) for channel in channels[:4]) + (
-            ", ..." if len(channels) > 4 else ""
-        )
+        names = ", ".join(show(channel[0]) for channel in channels[:4]) + (", ..." if len(channels) > 4 else "")
         raise EntryError(f"{name}: the OpenEXR file has {len(channels)} channels ({names}), expected one")
     label, kind, x_step, y_step = channels[0]
     if kind not in (1, 2):
         found = _PIXEL_TYPES.get(kind, f"of type {kind}")
         raise EntryError(f"{name}: the channel {show(label)} is {found}, expected HALF or FLOAT")
     if (x_step, y_step) != (1, 1):
-        raise EntryError(
-            f"{name}: the channel {show(label)} is subsampled {x_step} x {y_step}, expected 1 x 1"
-        )
+        raise EntryError(f"{name}: the channel {show(label)} is subsampled {x_step} x {y_step}, expected 1 x 1")
 
 
 def _check_tiles(name: str, tiles: tuple[int, int, int], shape: tuple[int, int]) -> None:

@@ -68,9 +68,7 @@ def _parse_header(name: str, data: memoryview, shape: tuple[int, int]) -> _Heade
             f"{name}: the .npy header is {show(text.strip())}, expected descr, fortran_order and shape"
         )
     if _is_object(descr[0]):
-        raise EntryError(
-            f"{name}: the array holds pickled Python objects (dtype object), expected float16/32/64"
-        )
+        raise EntryError(f"{name}: the array holds pickled Python objects (dtype object), expected float16/32/64")
     if not _FLOATS.fullmatch(descr[0]):
         found = show(descr[0]) if descr[0] else "structured"
         raise EntryError(f"{name}: the dtype is {found}, expected float16, float32 or float64")
@@ -99,7 +97,5 @@ def _header_text(name: str, head: bytes) -> tuple[str, int]:
             f"{name}: the .npy header declares {length} bytes, expected at most {HEADER_LIMIT - start}"
         )
     if start + length > len(head):
-        raise EntryError(
-            f"{name}: the .npy header is cut off at {len(head)} bytes, expected {start + length}"
-        )
+        raise EntryError(f"{name}: the .npy header is cut off at {len(head)} bytes, expected {start + length}")
     return head[start : start + length].decode("utf-8", "backslashreplace"), start + length

@@ -64,18 +64,14 @@ def _chunks(name: str, data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
             )
         kind, content = bytes(data[at + 4 : at + 8]), data[at + 8 : end - 4]
         if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            raise EntryError(
-                f"{name}: the PNG chunk at byte {at} is corrupt: its checksum is not the one stored"
-            )
+            raise EntryError(f"{name}: the PNG chunk at byte {at} is corrupt: its checksum is not the one stored")
         yield kind, content
         at = end
     if at != len(data):
         raise EntryError(f"{name}: {len(data) - at} bytes follow the PNG's end, expected none")
 
 
-def _check_header(
-    name: str, chunks: list[tuple[bytes, memoryview]], shape: tuple[int, int]
-) -> tuple[int, ...]:
+def _check_header(name: str, chunks: list[tuple[bytes, memoryview]], shape: tuple[int, int]) -> tuple[int, ...]:
     kind, content = chunks[0]
     if kind != b"IHDR" or len(content) != _HEADER.size or sum(k == b"IHDR" for k, _ in chunks) != 1:
         raise EntryError(f"{name}: the PNG does not start with its one header chunk, expected IHDR")

@@ -49,9 +49,7 @@ class SubmissionReader:
         try:
             self._source = FileSource(self.path)
         except OSError as error:
-            return _Inspection(
-                (f"the file cannot be opened: {error.strerror}, expected a readable zip archive",)
-            )
+            return _Inspection((f"the file cannot be opened: {error.strerror}, expected a readable zip archive",))
         try:
             return _inspect(self._source, self._expected)
         except (DirectoryError, EOFError) as error:
@@ -80,9 +78,7 @@ class SubmissionReader:
         """
         scale = self.meta.depth_scale if self.meta else None
         if scale is None and self._suffix(view_id) == ".png":
-            raise EntryError(
-                f"{view_id}.png: {METADATA_NAME} has no depth_scale, expected metres per PNG unit"
-            )
+            raise EntryError(f"{view_id}.png: {METADATA_NAME} has no depth_scale, expected metres per PNG unit")
         return self._decode(view_id, scale or 1.0)
 
     def problems(self) -> Iterator[str]:
@@ -159,12 +155,8 @@ def _inspect(source: ByteSource, expected: ExpectedViews) -> _Inspection:
     checked = check_entries(source, directory, lambda name: size_limit(name, expected))
     well_named = [item for item in checked if not has_bad_name(item.entry)]
     layout = lay_out([item.entry.name for item in well_named], expected)
-    meta, meta_problems = _read_meta(
-        source, well_named[layout.metadata] if layout.metadata is not None else None
-    )
-    sound = {
-        view: well_named[index] for view, index in layout.views.items() if not well_named[index].problems
-    }
+    meta, meta_problems = _read_meta(source, well_named[layout.metadata] if layout.metadata is not None else None)
+    sound = {view: well_named[index] for view, index in layout.views.items() if not well_named[index].problems}
     problems = (
         *(problem for item in checked for problem in item.problems),
         *layout.problems,

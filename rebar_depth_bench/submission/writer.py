@@ -80,9 +80,7 @@ class SubmissionWriter:
         if self._zip is None:
             raise InputError(f"{self.path}: the writer is not open, expected add() inside its 'with' block")
         if not isinstance(view_id, str) or not _VIEW_ID.fullmatch(view_id):
-            raise InputError(
-                f"view_id is {show(str(view_id))}, expected '<config>/<number>' like 'lattice/0000'"
-            )
+            raise InputError(f"view_id is {show(str(view_id))}, expected '<config>/<number>' like 'lattice/0000'")
         if view_id in self._view_ids:
             raise InputError(f"{view_id}: the view was added twice, expected once")
         if seconds is not None and not (isinstance(seconds, int | float) and 0 <= seconds < math.inf):

@@ -61,9 +61,7 @@ def check_entries(source: ByteSource, directory: Directory, limit: SizeLimit) ->
     )
 
 
-def _check_entry(
-    source: ByteSource, entry: ZipEntry, directory_offset: int, limit: SizeLimit
-) -> CheckedEntry:
+def _check_entry(source: ByteSource, entry: ZipEntry, directory_offset: int, limit: SizeLimit) -> CheckedEntry:
     data_offset, local_problems = _check_local(source, entry, directory_offset)
     found = [*_name_problems(entry), *_kind_problems(entry), *_size_problems(entry, limit), *local_problems]
     return CheckedEntry(entry, data_offset, tuple(f"{show(entry.name)}: {problem}" for problem in found))
@@ -75,9 +73,7 @@ def _name_problems(entry: ZipEntry) -> list[str]:
         return ["the name has a control character, expected plain text"]
     escapes = name.startswith("/") or "\\" in name or re.match(r"[A-Za-z]:", name) or ".." in name.split("/")
     return (
-        ["the name escapes the archive, expected a relative path without '..', '\\' or a drive"]
-        if escapes
-        else []
+        ["the name escapes the archive, expected a relative path without '..', '\\' or a drive"] if escapes else []
     )
 
 
@@ -117,9 +113,7 @@ def _check_local(source: ByteSource, entry: ZipEntry, directory_offset: int) -> 
     """Compare the entry with its local header; return where its data starts, and what is wrong."""
     start = entry.header_offset
     if start + _LOCAL.size > directory_offset:
-        return 0, [
-            f"the data is declared at byte {start}, expected it before the directory at {directory_offset}"
-        ]
+        return 0, [f"the data is declared at byte {start}, expected it before the directory at {directory_offset}"]
     magic, _, flags, method, _, _, crc, compressed, size, name_length, extra_length = _LOCAL.unpack(
         source.read_at(start, _LOCAL.size)
     )

@@ -171,9 +171,7 @@ def _widen(values: tuple[int, int, int], extra: bytes, index: int) -> tuple[int,
     wide = _zip64_field(extra)
     needed = sum(value == _FULL32 for value in values)
     if len(wide) < 8 * needed:
-        raise DirectoryError(
-            f"the zip directory record of entry {index} lacks its zip64 sizes, expected {needed}"
-        )
+        raise DirectoryError(f"the zip directory record of entry {index} lacks its zip64 sizes, expected {needed}")
     numbers = iter(struct.unpack_from(f"<{needed}Q", wide))
     size, compressed, offset = (next(numbers) if value == _FULL32 else value for value in values)
     return size, compressed, offset

@@ -92,13 +92,9 @@ def y_up(mesh: Mesh) -> Mesh:
 
 def gltf_tree(meshes: tuple[Mesh, ...]) -> tuple[dict[str, Any], bytes]:
     """A glTF with one node per mesh, and its buffer."""
-    blobs = [
-        b for m in meshes for b in (m.vertices_m.astype("<f4").tobytes(), m.faces.astype("<u4").tobytes())
-    ]
+    blobs = [b for m in meshes for b in (m.vertices_m.astype("<f4").tobytes(), m.faces.astype("<u4").tobytes())]
     offsets = np.cumsum([0, *map(len, blobs)]).tolist()
-    views = [
-        {"buffer": 0, "byteOffset": at, "byteLength": len(b)} for at, b in zip(offsets, blobs, strict=False)
-    ]
+    views = [{"buffer": 0, "byteOffset": at, "byteLength": len(b)} for at, b in zip(offsets, blobs, strict=False)]
     accessors: list[dict[str, Any]] = []
     for n, mesh in enumerate(meshes):
         vertices, corners = len(mesh.vertices_m), mesh.faces.size
@@ -110,9 +106,7 @@ def gltf_tree(meshes: tuple[Mesh, ...]) -> tuple[dict[str, Any], bytes]:
         "scene": 0,
         "scenes": [{"nodes": list(count)}],
         "nodes": [{"mesh": n, "name": "bar"} for n in count],
-        "meshes": [
-            {"primitives": [{"attributes": {"POSITION": 2 * n}, "indices": 2 * n + 1}]} for n in count
-        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 2 * n}, "indices": 2 * n + 1}]} for n in count],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": offsets[-1]}],
@@ -133,9 +127,7 @@ def joined_arrays(meshes: tuple[Mesh, ...], ids: tuple[int, ...]) -> tuple[ndarr
     starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
     return (
         np.concatenate([mesh.vertices_m for mesh in meshes]),
-        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]).astype(
-            np.int32
-        ),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]).astype(np.int32),
         np.concatenate([np.full(len(m.faces), i, np.uint16) for m, i in zip(meshes, ids, strict=True)]),
     )
 
@@ -149,9 +141,7 @@ def loaded(folder: Path, name: str, content: bytes | str, unit: str | float = "m
 def assert_is_tubes(assembly: Assembly, atol: float = 1e-7) -> None:
     """The three tubes in their order, in the world, in metres."""
     assert [bar.bar_id for bar in assembly.bars] == [part.bar_id for part in assembly.parts] == [1, 2, 3]
-    for bar, part, mesh, (start, end, diameter) in zip(
-        assembly.bars, assembly.parts, TUBES, LINES, strict=True
-    ):
+    for bar, part, mesh, (start, end, diameter) in zip(assembly.bars, assembly.parts, TUBES, LINES, strict=True):
         assert bar.role == "imported"
         assert (part.name, part.material) == (f"bar-{bar.bar_id:03d}", "steel")
         assert (part.mesh.vertices_m.dtype, part.mesh.faces.dtype) == (np.float64, np.int32)
@@ -166,9 +156,7 @@ def assert_is_tubes(assembly: Assembly, atol: float = 1e-7) -> None:
 
 def test_own_ply_keeps_ids_and_every_bit(tmp_path: Path) -> None:
     board = Mesh(np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]]), np.array([[0, 1, 2]], np.int32))
-    write_mesh_ply(
-        tmp_path / "scene.ply", *joined_arrays((TUBES[0], board, *TUBES[1:]), (7, 0, 40_000, 65_535))
-    )
+    write_mesh_ply(tmp_path / "scene.ply", *joined_arrays((TUBES[0], board, *TUBES[1:]), (7, 0, 40_000, 65_535)))
 
     assembly = load_assembly(mesh_file_spec(tmp_path / "scene.ply", "m"))
 
@@ -258,9 +246,7 @@ def test_faces_of_two_bars_may_alternate(tmp_path: Path) -> None:
     woven = faces.reshape(2, -1, 3).transpose(1, 0, 2).reshape(-1, 3)
     assembly = loaded(tmp_path, "a.stl", stl((Mesh(vertices, np.ascontiguousarray(woven)),)))
     for part, mesh in zip(assembly.parts, TUBES[:2], strict=True):
-        np.testing.assert_allclose(
-            part.mesh.vertices_m[part.mesh.faces], mesh.vertices_m[mesh.faces], atol=1e-7
-        )
+        np.testing.assert_allclose(part.mesh.vertices_m[part.mesh.faces], mesh.vertices_m[mesh.faces], atol=1e-7)
 
 
 @pytest.mark.parametrize("key", ["o", "g"])

@@ -38,9 +38,7 @@ def overflowed(view_id: str) -> ViewScore:
 def result(*views: ViewScore, method: str = "my model") -> Result:
     """Return the result of ``views``, a table per config in the order of appearance."""
     configs = dict.fromkeys(view.view_id.rpartition("/")[0] for view in views)
-    tables = {
-        name: tabulate([view for view in views if view.view_id.startswith(f"{name}/")]) for name in configs
-    }
+    tables = {name: tabulate([view for view in views if view.view_id.startswith(f"{name}/")]) for name in configs}
     return Result(
         method=method,
         submission_sha256="0123456789abcdef" * 4,

@@ -141,9 +141,7 @@ def test_no_panels_no_section() -> None:
 
 
 def test_the_worst_views_come_first_and_all_views_follow_in_protocol_order() -> None:
-    views = [
-        scored(f"lattice/{index:04d}", abs_rel=0.1 * (index % 7 + 1)) for index in range(WORST_SHOWN + 5)
-    ]
+    views = [scored(f"lattice/{index:04d}", abs_rel=0.1 * (index % 7 + 1)) for index in range(WORST_SHOWN + 5)]
     views[3] = unpredicted("lattice/0003")
     page = _Page(render_report(result(*views), []))
     ids = re.findall(r"lattice/\d{4}", page.text)

@@ -33,9 +33,7 @@ def decode(suffix: str, data: bytes, shape: tuple[int, int], scale: float = 1.0)
 
 
 @settings(max_examples=60, deadline=None)
-@given(
-    data=st.data(), code=st.sampled_from(["<f2", ">f2", "<f4", ">f4", "<f8", ">f8"]), fortran=st.booleans()
-)
+@given(data=st.data(), code=st.sampled_from(["<f2", ">f2", "<f4", ">f4", "<f8", ">f8"]), fortran=st.booleans())
 def test_npy_and_npz_return_every_float_as_it_is(data: st.DataObject, code: str, fortran: bool) -> None:
     shape = data.draw(shapes)
     array = np.array(data.draw(arrays.arrays(np.dtype(code), shape)), order="F" if fortran else "C")

@@ -32,9 +32,7 @@ def peak(run: Callable[[], list[str]]) -> tuple[list[str], int]:
 
 
 def test_a_header_that_claims_640_gb_allocates_nothing(check: Check) -> None:
-    data = (
-        npy_header("{'descr': '<f4', 'fortran_order': False, 'shape': (400000, 400000), }") + DEPTH.tobytes()
-    )
+    data = npy_header("{'descr': '<f4', 'fortran_order': False, 'shape': (400000, 400000), }") + DEPTH.tobytes()
     records = [
         META,
         Record(b"lattice/0000.npy", data),
@@ -64,9 +62,7 @@ def test_a_bomb_of_zeros_is_stopped_whatever_size_it_declares(check: Check, decl
 def test_a_small_bomb_inflates_to_one_byte_too_many_and_no_more(check: Check) -> None:
     bomb = replace(deflated(b"lattice/0000.npy", bytes(1_000_000)), size=3000)
     problems, held = peak(lambda: check([META, bomb, SECOND]))
-    assert problems == [
-        "lattice/0000.npy: the data inflates to more than 3000 bytes, expected the declared 3000"
-    ]
+    assert problems == ["lattice/0000.npy: the data inflates to more than 3000 bytes, expected the declared 3000"]
     assert held < MEGABYTE // 2
 
 
@@ -132,9 +128,7 @@ def _mutate(content: bytes, random: np.random.Generator) -> bytes:
         del data[random.integers(len(data)) :]
     elif kind == 2:
         at = random.integers(len(data) - 4)
-        data[at : at + 4] = random.choice(
-            [b"\xff\xff\xff\xff", bytes(4), b"\1\0\0\0", b"PK\5\6", b"\0\0\0\x80"]
-        )
+        data[at : at + 4] = random.choice([b"\xff\xff\xff\xff", bytes(4), b"\1\0\0\0", b"PK\5\6", b"\0\0\0\x80"])
     else:
         first, second = sorted(random.integers(len(data), size=2))
         data[first:second] = data[first:second][: random.integers(20)]

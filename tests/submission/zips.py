@@ -108,9 +108,7 @@ def chunk(kind: bytes, body: bytes) -> bytes:
     return len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big")
 
 
-def png(
-    units: Array, *, bits: int = 16, colour: int = 0, interlace: int = 0, idat: bytes | None = None
-) -> bytes:
+def png(units: Array, *, bits: int = 16, colour: int = 0, interlace: int = 0, idat: bytes | None = None) -> bytes:
     """A PNG of unfiltered rows."""
     rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in units)
     head = struct.pack(">2I5B", units.shape[1], units.shape[0], bits, colour, 0, 0, interlace)

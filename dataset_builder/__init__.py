@@ -1,0 +1,1 @@
+"""Builds dataset folders: scenes, cameras, colour, exact ground truth, shards."""
