@@ -34,6 +34,12 @@ class RibPattern:
     seam_half_deg: float = 10.0
     segments_per_row: int = 10
 
+    def __post_init__(self) -> None:
+        if not 0 < self.spacing <= 0.7:
+            raise ValueError(f"rib spacing is {self.spacing} d, ASTM A615 allows up to 0.7 d")
+        if not 45 <= self.angle_deg <= 90:
+            raise ValueError(f"rib angle is {self.angle_deg} degrees to the axis, ASTM A615 asks for 45 or more")
+
 
 def ribbed_bar_mesh(
     centreline_m: Float64[ndarray, "n 3"], diameter_m: float, ribs: RibPattern | None = None
@@ -161,9 +167,11 @@ class _Axis:
     def along(cls, points_m: Float64[ndarray, "n 3"]) -> _Axis:
         steps = np.diff(points_m, axis=0)
         lengths = np.linalg.norm(steps, axis=1)
-        if len(points_m) < 2 or lengths.min() <= 0:
+        if len(lengths) == 0 or lengths.min() <= 0:
             raise ValueError("a centreline needs two or more points, none repeated in a row")
         directions = steps / lengths[:, None]
+        if ((directions[:-1] * directions[1:]).sum(axis=1) < -0.999).any():
+            raise ValueError("the centreline turns back on itself at one of its points")
         tangent = np.concatenate([directions[:1], directions[:-1] + directions[1:], directions[-1:]])
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
         return cls(points_m, np.concatenate([[0.0], np.cumsum(lengths)]), tangent, _carried_normals(tangent))
@@ -207,8 +215,6 @@ def _rotated_between(
 ) -> Float64[ndarray, "3"]:
     """Return ``vector`` turned by the smallest rotation that takes unit ``before`` to unit ``after``."""
     cross, cosine = np.cross(before, after), float(before @ after)
-    if cosine < -0.999:
-        raise ValueError("the centreline turns back on itself between two of its points")
     turned = vector + np.cross(cross, vector) + np.cross(cross, np.cross(cross, vector)) / (1 + cosine)
     return np.asarray(turned)
 

@@ -120,9 +120,7 @@ def _draw_border(texture: UInt8[ndarray, "h w"], px_per_m: float) -> None:
     ring[line:-line, line:-line] = inner
 
 
-def _draw_caption(
-    texture: UInt8[ndarray, "h w"], text: str, row_below: int, column: int, module_px: int
-) -> None:
+def _draw_caption(texture: UInt8[ndarray, "h w"], text: str, row_below: int, column: int, module_px: int) -> None:
     """Print ``text`` small and grey under a marker, below its quiet zone; none where the sheet ends."""
     scale, thickness = module_px / 70, max(1, module_px // 20)
     baseline = row_below + round(1.75 * module_px)

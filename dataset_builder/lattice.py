@@ -40,8 +40,7 @@ def lattice_assembly(spec: LatticeSpec) -> Assembly:
     """
     _check(spec)
     along_x = {
-        diameter_m: ribbed_bar_mesh(_centred_line_m(spec.extent_m), diameter_m)
-        for diameter_m in spec.diameters_m
+        diameter_m: ribbed_bar_mesh(_centred_line_m(spec.extent_m), diameter_m) for diameter_m in spec.diameters_m
     }
     bars, parts = [], []
     for bar_id, rod in enumerate(_rods(spec), start=1):

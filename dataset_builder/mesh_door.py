@@ -1,7 +1,7 @@
 """The door for users' own assemblies: a mesh file becomes bars and parts in world metres, as it stands.
 
 Nothing is moved: the file's frame is the world, z up, with the board at z = 0. What counts as a bar in each
-format is told in ``mesh_formats``.
+format, and which id it gets, is told in ``mesh_parts``.
 """
 
 from __future__ import annotations
@@ -11,19 +11,14 @@ import math
 import os
 from pathlib import Path
 
-import numpy as np
-
 from dataset_builder.bar_estimate import estimate_bar
-from dataset_builder.mesh_formats import READERS
+from dataset_builder.mesh_parts import SUFFIXES, read_parts
 from dataset_builder.model import Assembly, Bar, Mesh, Part
 from dataset_builder.specs import MeshFileSpec
 from rebar_depth_bench.errors import MeshError
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 """Metres in one of each named unit."""
-MIN_EXTENT_M = 0.001
-MAX_EXTENT_M = 100.0
-"""An assembly's largest side lies strictly between these, or its unit is wrong."""
 MATERIAL = "steel"
 
 
@@ -39,7 +34,6 @@ def mesh_file_spec(path: str | os.PathLike[str], unit: str | float) -> MeshFileS
         raise MeshError(f"{path}: unknown unit {unit!r}, expected one of {', '.join(UNITS_M)} or metres")
     unit_m = UNITS_M[unit] if isinstance(unit, str) else float(unit)
     _check_unit(unit_m, str(path))
-    _check_suffix(path)
     return MeshFileSpec(os.fspath(path), hashlib.sha256(_content(path)).hexdigest(), unit_m)
 
 
@@ -52,48 +46,23 @@ def load_assembly(spec: MeshFileSpec) -> Assembly:
     bar, more than 65,535 bars, a bar without area or a coordinate that is not finite, or where its extent
     is absurd for the unit.
     """
-    where = spec.path
-    _check_unit(spec.unit_m, where)
-    _check_suffix(where)
-    content = _content(where)
+    _check_unit(spec.unit_m, spec.path)
+    content = _content(spec.path)
     found = hashlib.sha256(content).hexdigest()
     if found != spec.sha256:
-        raise MeshError(f"{where}: changed since it was chosen: sha256 {found} found, {spec.sha256} expected")
-    meshes = READERS[Path(where).suffix.lower()](content, where)
-    if not meshes:
-        raise MeshError(f"{where}: no triangle found, expected the surface of at least one bar")
-    meshes = {bar_id: _in_metres(mesh, spec.unit_m) for bar_id, mesh in sorted(meshes.items())}
-    _check_extent(meshes, spec)
+        raise MeshError(f"{spec.path}: changed since it was chosen: sha256 {found} found, {spec.sha256} expected")
+    meshes = read_parts(content, spec)
     return Assembly(
-        bars=tuple(_bar(bar_id, mesh, where) for bar_id, mesh in meshes.items()),
+        bars=tuple(_bar(bar_id, mesh, spec.path) for bar_id, mesh in meshes.items()),
         parts=tuple(Part(f"bar-{bar_id:03d}", mesh, bar_id, MATERIAL) for bar_id, mesh in meshes.items()),
     )
-
-
-def _in_metres(mesh: Mesh, unit_m: float) -> Mesh:
-    # Metres stay what they are to the bit: a product with 1.0 is exact.
-    return Mesh(mesh.vertices_m * unit_m, mesh.faces)
 
 
 def _bar(bar_id: int, mesh: Mesh, where: str) -> Bar:
     try:
         return estimate_bar(bar_id, mesh)
     except ValueError as error:
-        raise MeshError(
-            f"{where}: bar {bar_id} ({len(mesh.faces)} triangles) is no surface: {error}"
-        ) from error
-
-
-def _check_extent(meshes: dict[int, Mesh], spec: MeshFileSpec) -> None:
-    """Raise ``MeshError`` for a size that no assembly of reinforcement has."""
-    low = np.min([mesh.vertices_m.min(axis=0) for mesh in meshes.values()], axis=0)
-    high = np.max([mesh.vertices_m.max(axis=0) for mesh in meshes.values()], axis=0)
-    extent = float((high - low).max())
-    if not MIN_EXTENT_M < extent < MAX_EXTENT_M:
-        raise MeshError(
-            f"{spec.path}: the assembly is {extent:.6g} m long, expected {MIN_EXTENT_M:g} to "
-            f"{MAX_EXTENT_M:g} m: is the unit right? One file unit was taken as {spec.unit_m:g} m"
-        )
+        raise MeshError(f"{where}: bar {bar_id} ({len(mesh.faces)} triangles) is no surface: {error}") from error
 
 
 def _check_unit(unit_m: float, where: str) -> None:
@@ -101,13 +70,10 @@ def _check_unit(unit_m: float, where: str) -> None:
         raise MeshError(f"{where}: one file unit is {unit_m} m, expected a positive length")
 
 
-def _check_suffix(path: str | os.PathLike[str]) -> None:
-    suffix = Path(path).suffix.lower()
-    if suffix not in READERS:
-        raise MeshError(f"{path}: mesh files of kind {suffix!r} are not read, expected {', '.join(READERS)}")
-
-
 def _content(path: str | os.PathLike[str]) -> bytes:
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise MeshError(f"{path}: mesh files of kind {suffix!r} are not read, expected {', '.join(SUFFIXES)}")
     try:
         return Path(path).read_bytes()
     except OSError as error:

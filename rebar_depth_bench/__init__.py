@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from rebar_depth_bench.dataset import load
-from rebar_depth_bench.errors import (
-    DatasetError,
-    InputError,
-    MethodError,
-    RebarDepthError,
-    SubmissionError,
-)
-from rebar_depth_bench.result import Result, Table, ViewScore
-from rebar_depth_bench.scoring import score
-from rebar_depth_bench.submission import SubmissionWriter
-
 if TYPE_CHECKING:
+    from rebar_depth_bench.dataset import load
+    from rebar_depth_bench.errors import (
+        DatasetError,
+        InputError,
+        MethodError,
+        RebarDepthError,
+        SubmissionError,
+    )
+    from rebar_depth_bench.result import Result, Table, ViewScore
+    from rebar_depth_bench.scoring import score
+    from rebar_depth_bench.submission import SubmissionWriter
     from rebar_depth_bench.torch_data import torch_loader
 
 __all__ = [
@@ -34,11 +34,19 @@ __all__ = [
     "torch_loader",
 ]
 
+_HOMES = {
+    "load": "dataset",
+    "score": "scoring",
+    "torch_loader": "torch_data",
+    "SubmissionWriter": "submission",
+    "Result": "result",
+    "Table": "result",
+    "ViewScore": "result",
+}
+
 
 def __getattr__(name: str) -> Any:
-    """Import what needs torch only when it is asked for."""
-    if name == "torch_loader":
-        from rebar_depth_bench.torch_data import torch_loader
-
-        return torch_loader
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """Import a public name when it is first asked for: what it stands on takes seconds."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES.get(name, 'errors')}"), name)

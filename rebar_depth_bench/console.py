@@ -73,7 +73,7 @@ def exiting_in_words() -> Iterator[None]:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(EXIT_OTHER) from None
     except KeyboardInterrupt:
-        print("interrupted; the same command goes on where it stopped", file=sys.stderr)
+        print("interrupted; run the same command again to go on", file=sys.stderr)
         raise SystemExit(EXIT_OTHER) from None
 
 

@@ -8,14 +8,14 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt16
+from jaxtyping import Float32, Float64, UInt16
 from numpy import ndarray
 
 from dataset_builder.model import Bar
 from rebar_depth_bench.cameras import inverse_rigid, pixel_rays, project, transform
 from rebar_depth_bench.protocol import interior
 
-EPIPOLAR_TOLERANCE_M = 0.001
+_MIN_WIDTH_PX = 2.0
 _AROUND = tuple((dv, du) for dv in (-1, 0, 1, 2) for du in (-1, 0, 1, 2))
 """The pixel centres round a projection, relative to the one above and left of it."""
 _BOARD_EDGE_M = 0.001
@@ -72,43 +72,38 @@ def board_error_m(
     return np.asarray(np.abs(points_m[plane][:, 2]))
 
 
-def epipolar_counts(row: Mapping[str, Any]) -> EpipolarCounts:
+def epipolar_counts(row: Mapping[str, Any], steel: Iterable[Bar]) -> EpipolarCounts:
     """Look the left view's interior steel pixels up in the right view.
 
-    The cameras are parallel, so a point keeps its depth. The right view is read at the 4 x 4 pixel centres
-    round the projection; a point is contradicted only if all of them lie behind it.
+    The cameras are parallel, so a point keeps its depth. The right view is read at the 4 x 4 pixel centres round
+    the projection. A point is seen if its bar is there at its depth, give or take the bar's diameter; hidden if
+    something there is nearer; contradicted otherwise. Bars thinner than two pixels can slip between pixel
+    centres and are left out.
     """
-    steel = interior(row["left_mask"])
-    points_m = world_points_m(row["left_depth"], row["left_K"], row["left_cam_from_world"])[steel]
-    right_cam = transform(row["right_cam_from_world"], points_m)
-    uv = project(row["right_K"], right_cam)
-    corner = np.floor(uv).astype(int)
+    diameter_of = np.zeros(np.iinfo(np.uint16).max + 1)
+    for bar in steel:
+        diameter_of[bar.bar_id] = bar.diameter_m
+    diameter_m = diameter_of[row["left_bars"]]
+    wide = diameter_m * row["left_K"][0, 0] >= _MIN_WIDTH_PX * row["left_depth"]
+    chosen = interior(row["left_mask"]) & wide
+    points_m = world_points_m(row["left_depth"], row["left_K"], row["left_cam_from_world"])[chosen]
+    in_right = transform(row["right_cam_from_world"], points_m)
+    corner = np.floor(project(row["right_K"], in_right)).astype(int)
     height, width = row["right_depth"].shape
     inside = ((corner >= 1) & (corner < np.array([width, height]) - 2)).all(axis=1)
     u, v = corner[inside].T
-    around = np.stack([row["right_depth"][v + dv, u + du] for dv, du in _AROUND], axis=1)
-    ids = np.stack([row["right_bars"][v + dv, u + du] for dv, du in _AROUND], axis=1)
-    depth_m = right_cam[inside, 2]
-    same_bar = (ids == row["left_bars"][steel][inside][:, None]).any(axis=1)
-    return _classified(around, depth_m, same_bar, int(np.count_nonzero(~inside)))
-
-
-def _classified(
-    around_m: Float32[ndarray, "n 16"],
-    depth_m: Float64[ndarray, " n"],
-    same_bar: Bool[ndarray, " n"],
-    outside: int,
-) -> EpipolarCounts:
-    nearest, farthest = around_m.min(axis=1), around_m.max(axis=1)
-    behind = nearest > depth_m + EPIPOLAR_TOLERANCE_M
-    hidden = ~behind & (~same_bar | (farthest < depth_m - EPIPOLAR_TOLERANCE_M))
-    counts = (
-        np.count_nonzero(~behind & ~hidden),
-        np.count_nonzero(hidden),
-        outside,
-        np.count_nonzero(behind),
+    around_m = np.stack([row["right_depth"][v + dv, u + du] for dv, du in _AROUND], axis=1)
+    around_bars = np.stack([row["right_bars"][v + dv, u + du] for dv, du in _AROUND], axis=1)
+    depth_m = in_right[inside, 2, None]
+    near_enough = np.abs(around_m - depth_m) <= diameter_m[chosen][inside, None]
+    seen = (near_enough & (around_bars == row["left_bars"][chosen][inside, None])).any(axis=1)
+    hidden = ~seen & (around_m < depth_m).any(axis=1)
+    return EpipolarCounts(
+        seen=int(np.count_nonzero(seen)),
+        hidden=int(np.count_nonzero(hidden)),
+        outside=int(np.count_nonzero(~inside)),
+        contradicted=int(np.count_nonzero(~seen & ~hidden)),
     )
-    return EpipolarCounts(*(int(count) for count in counts))
 
 
 def _polyline_distance_m(

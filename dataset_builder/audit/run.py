@@ -104,7 +104,7 @@ class _Geometry:
             self._axis_ratio = max(self._axis_ratio, float(ratios.max(initial=0.0)))
             error_m = board_error_m(row, eye, self._board, points_m)
             self._board_error_m = max(self._board_error_m, float(error_m.max(initial=0.0)))
-        counts = epipolar_counts(row)
+        counts = epipolar_counts(row, self._steel)
         self._epipolar += (counts.seen, counts.hidden, counts.outside, counts.contradicted)
 
     def checks(self, config: str) -> list[Check]:

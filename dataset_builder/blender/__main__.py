@@ -34,7 +34,10 @@ def _runner(task: object) -> Callable[[Any, Report], None]:
     from dataset_builder.blender.render_task import run_render_task
     from dataset_builder.tasks import DepthTask, RenderTask
 
-    runners: Mapping[type, Callable[[Any, Report], None]] = {RenderTask: run_render_task, DepthTask: run_depth_task}
+    runners: Mapping[type, Callable[[Any, Report], None]] = {
+        RenderTask: run_render_task,
+        DepthTask: run_depth_task,
+    }
     return runners[type(task)]
 
 

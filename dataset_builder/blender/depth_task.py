@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from dataset_builder.blender.render import configure_colour, render_depth
-from dataset_builder.blender.scene import _add_object, _mesh_data
+from dataset_builder.blender.scene import add_object, mesh_data
 from dataset_builder.model import NOT_STEEL, Mesh, Part
 from dataset_builder.specs import ColourSpec
 from dataset_builder.tasks import DepthTask
@@ -23,7 +23,7 @@ def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None])
     vertices_m, faces, _ = read_mesh_ply(task.mesh)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     part = Part("dataset", Mesh(vertices_m, faces), NOT_STEEL, "steel")
-    _add_object(part, _mesh_data(part.name, part.mesh, part.material), np.zeros(3))
+    add_object(part, mesh_data(part.name, part.mesh, part.material), np.zeros(3))
     configure_colour(ColourSpec(samples=1, denoise=False), task.threads)
     with tempfile.TemporaryDirectory(dir=task.out) as scratch:
         for n, camera in enumerate(task.cameras):

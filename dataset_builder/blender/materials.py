@@ -106,7 +106,7 @@ def _glossy(colour: Colour, roughness: float) -> Callable[[str], bpy.types.Mater
 _MAKERS: dict[str, Callable[[str], bpy.types.Material]] = {
     "steel": _steel,
     "wood": _wood,
-    "concrete": _speckled((0.46, 0.455, 0.44), (0.27, 0.265, 0.255), 45.0),
+    "concrete": _speckled((0.40, 0.40, 0.39), (0.335, 0.335, 0.325), 60.0),
     "plaster": _speckled((0.63, 0.62, 0.59), (0.585, 0.575, 0.55), 5.0),
     "floor": _speckled((0.25, 0.26, 0.27), (0.17, 0.18, 0.19), 60.0),
     "cork": _speckled((0.36, 0.22, 0.11), (0.20, 0.115, 0.055), 120.0),

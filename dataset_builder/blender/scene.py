@@ -29,11 +29,11 @@ def build_scene(assembly: Assembly, spec: SceneSpec) -> None:
     """Replace Blender's open file with the scene: one object per bar, the printed board and the room."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     for part, mesh, origin_m in _with_shared_meshes(assembly.parts):
-        steel = _add_object(part, mesh, origin_m)
+        steel = add_object(part, mesh, origin_m)
         for name, value in surface_variation(spec.seed, part.bar_id).items():
             steel[name] = value
     for part in laboratory():
-        _add_object(part, _mesh_data(part.name, part.mesh, part.material), np.zeros(3))
+        add_object(part, mesh_data(part.name, part.mesh, part.material), np.zeros(3))
     _add_board(spec.board)
     add_lights()
     bpy.context.view_layer.update()
@@ -49,7 +49,7 @@ def _with_shared_meshes(
         local = Mesh(part.mesh.vertices_m - origin_m, part.mesh.faces)
         data = next((data for mesh, name, data in shapes if name == part.material and _same(mesh, local)), None)
         if data is None:
-            data = _mesh_data(part.name, local, part.material)
+            data = mesh_data(part.name, local, part.material)
             shapes.append((local, part.material, data))
         yield part, data, origin_m
 
@@ -62,7 +62,8 @@ def _same(a: Mesh, b: Mesh) -> bool:
     )
 
 
-def _add_object(part: Part, data: bpy.types.Mesh, origin_m: Float64[ndarray, "3"]) -> bpy.types.Object:
+def add_object(part: Part, data: bpy.types.Mesh, origin_m: Float64[ndarray, "3"]) -> bpy.types.Object:
+    """Put ``data`` into the open scene at ``origin_m`` (world, metres), marked with the part's bar id."""
     added = bpy.data.objects.new(part.name, data)
     added.location = origin_m
     added[BAR_ID] = part.bar_id
@@ -70,7 +71,7 @@ def _add_object(part: Part, data: bpy.types.Mesh, origin_m: Float64[ndarray, "3"
     return added
 
 
-def _mesh_data(name: str, mesh: Mesh, material_name: str) -> bpy.types.Mesh:
+def mesh_data(name: str, mesh: Mesh, material_name: str) -> bpy.types.Mesh:
     """Return Blender mesh data of the very triangles of ``mesh``, round edges smooth, sharp ones sharp."""
     data = bpy.data.meshes.new(name)
     data.vertices.add(len(mesh.vertices_m))
@@ -90,7 +91,7 @@ def _add_board(spec: BoardSpec) -> None:
     """Add the sheet: its top at z = 0 bears the print, the rest is plain paper."""
     half_x, half_y = spec.width_m / 2, spec.height_m / 2
     sheet = box((-half_x, -half_y, -SHEET_THICKNESS_M), (half_x, half_y, 0.0))
-    data = _mesh_data("board", sheet, "sheet edge")
+    data = mesh_data("board", sheet, "sheet edge")
     data.materials.append(paper(board_texture(spec, BOARD_PX_PER_M)))
     on_top = (sheet.vertices_m[sheet.faces][:, :, 2] == 0.0).all(axis=1)
     data.polygons.foreach_set("material_index", on_top.astype(np.int32))
@@ -98,4 +99,4 @@ def _add_board(spec: BoardSpec) -> None:
     uv = sheet.vertices_m[:, :2] / np.array([spec.width_m, spec.height_m]) + 0.5
     layer = data.uv_layers.new(name="print")
     layer.data.foreach_set("uv", uv[sheet.faces.ravel()].astype(np.float32).ravel())
-    _add_object(Part("board", sheet, NOT_STEEL, "paper"), data, np.zeros(3))
+    add_object(Part("board", sheet, NOT_STEEL, "paper"), data, np.zeros(3))

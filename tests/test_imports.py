@@ -1,0 +1,48 @@
+"""What importing costs and drags in, seen from a fresh interpreter."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+SCORING = "import rebar_depth_bench as rdb; rdb.score; rdb.load; rdb.SubmissionWriter; import rebar_depth_bench.cli"
+
+
+def modules_after(statement: str) -> set[str]:
+    code = f"{statement}\nimport sys\nprint(*sys.modules)"
+    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(finished.stdout.split())
+
+
+def test_loading_and_scoring_need_neither_torch_nor_blender_nor_the_builder() -> None:
+    found = modules_after(SCORING)
+    assert "rebar_depth_bench.scoring" in found
+    heavy = {"torch", "bpy", "mathutils", "cv2", "embreex", "trimesh", "fastapi", "dataset_builder", "leaderboard"}
+    assert not found & heavy
+
+
+def test_the_packages_own_import_is_light() -> None:
+    assert not modules_after("import rebar_depth_bench") & {"datasets", "pyarrow", "numpy", "torch"}
+
+
+def test_planning_a_build_does_not_import_blender() -> None:
+    found = modules_after("import dataset_builder.cli")
+    assert "dataset_builder.build" in found
+    assert not found & {"bpy", "mathutils", "torch"}
+
+
+@pytest.mark.parametrize("name", ["load", "score", "SubmissionWriter", "torch_loader", "Result", "SubmissionError"])
+def test_public_names_are_there(name: str) -> None:
+    import rebar_depth_bench
+
+    assert name in rebar_depth_bench.__all__
+    assert getattr(rebar_depth_bench, name).__name__ == name
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    import rebar_depth_bench
+
+    with pytest.raises(AttributeError, match="has no attribute 'lod'"):
+        rebar_depth_bench.lod  # noqa: B018
