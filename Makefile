@@ -20,7 +20,7 @@ format: env-dev ## Format the code and sort out what the linter can
 	$(BIN)/ruff check --fix .
 
 cards: env-dev ## Write the benchmark card from the code
-	$(BIN)/python -m cards.benchmark > cards/BENCHMARK.md
+	$(BIN)/python -m cards > cards/BENCHMARK.md
 
 env: ## Make .venv for building, predicting and scoring
 	@scripts/environment.sh $(PYTHON) $(VENV) build

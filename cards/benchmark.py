@@ -18,6 +18,3 @@ def benchmark_card() -> str:
         methods=[method.info for method in METHODS.values()],
     )
 
-
-if __name__ == "__main__":
-    print(benchmark_card(), end="")

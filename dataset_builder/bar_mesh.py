@@ -9,6 +9,7 @@ triangles draw it sharply.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64, Int32
@@ -68,7 +69,7 @@ def outer_radius_m(diameter_m: float, ribs: RibPattern | None = None) -> float:
     return diameter_m * (_core_ratio(ribs) + max(ribs.height, ribs.seam_height))
 
 
-def _ring_angles(ribs: RibPattern) -> Float64[ndarray, "k"]:
+def _ring_angles(ribs: RibPattern) -> Float64[ndarray, " k"]:
     """Return one ring's angles: four per seam (foot, crown, crown, foot), the rows between them evenly cut."""
     foot = np.deg2rad(ribs.seam_half_deg)
     row = np.linspace(foot, np.pi - foot, ribs.segments_per_row + 1)
@@ -76,7 +77,7 @@ def _ring_angles(ribs: RibPattern) -> Float64[ndarray, "k"]:
     return np.concatenate([half, half + np.pi])
 
 
-def _ring_positions(length: float, ribs: RibPattern) -> Float64[ndarray, "r"]:
+def _ring_positions(length: float, ribs: RibPattern) -> Float64[ndarray, " r"]:
     """Return where rings are needed along a bar of ``length`` diameters: its ends and every rib edge."""
     edges = np.array([-ribs.base_width, -ribs.top_width, ribs.top_width, ribs.base_width]) / 2
     # The second row's ribs stand half a spacing further on.
@@ -88,7 +89,7 @@ def _ring_positions(length: float, ribs: RibPattern) -> Float64[ndarray, "r"]:
 
 
 def _rib_height(
-    along: Float64[ndarray, "r 1"], theta: Float64[ndarray, "k"], ribs: RibPattern
+    along: Float64[ndarray, "r 1"], theta: Float64[ndarray, " k"], ribs: RibPattern
 ) -> Float64[ndarray, "r k"]:
     """Return how far the surface stands above the core, in diameters."""
     foot = np.deg2rad(ribs.seam_half_deg)
@@ -125,7 +126,7 @@ def _core_ratio(ribs: RibPattern) -> float:
 
 
 def _inclined(
-    ring_at: Float64[ndarray, "r"], theta: Float64[ndarray, "k"], ribs: RibPattern
+    ring_at: Float64[ndarray, " r"], theta: Float64[ndarray, " k"], ribs: RibPattern
 ) -> Float64[ndarray, "r k"]:
     """Return arc lengths (diameters) of rings tilted to the rib angle, levelling out at the flat ends."""
     lead = 0.5 / np.tan(np.deg2rad(ribs.angle_deg))
@@ -151,7 +152,8 @@ def _tube_faces(rings: int, segments: int) -> Int32[ndarray, "f 3"]:
     first_centre, last_centre, last_ring = rings * segments, rings * segments + 1, (rings - 1) * segments
     first_cap = np.stack([np.full(segments, first_centre), rim_next, rim], axis=1)
     last_cap = np.stack([np.full(segments, last_centre), last_ring + rim, last_ring + rim_next], axis=1)
-    return np.concatenate([side, first_cap, last_cap]).astype(np.int32)
+    faces: Int32[ndarray, "f 3"] = np.concatenate([side, first_cap, last_cap]).astype(np.int32)
+    return faces
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +185,7 @@ class _Axis:
     def surface_points_m(
         self,
         s_m: Float64[ndarray, "r k"],
-        theta: Float64[ndarray, "k"],
+        theta: Float64[ndarray, " k"],
         radius_m: Float64[ndarray, "r k"],
     ) -> Float64[ndarray, "r k 3"]:
         """Return the points at arc length ``s_m`` and angle ``theta``, ``radius_m`` off the centreline."""
@@ -205,14 +207,14 @@ def _carried_normals(tangent: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"
     """Return normals without twist: each is the one before it, made perpendicular to its own tangent."""
     least_aligned = np.eye(3)[np.argmin(np.abs(tangent[0]))]
     normals = [_unit(np.cross(np.cross(tangent[0], least_aligned), tangent[0]))]
-    for before, here in zip(tangent[:-1], tangent[1:], strict=True):
+    for before, here in pairwise(tangent):
         normals.append(_rotated_between(normals[-1], before, here))
     return np.stack(normals)
 
 
 def _rotated_between(
-    vector: Float64[ndarray, "3"], before: Float64[ndarray, "3"], after: Float64[ndarray, "3"]
-) -> Float64[ndarray, "3"]:
+    vector: Float64[ndarray, " 3"], before: Float64[ndarray, " 3"], after: Float64[ndarray, " 3"]
+) -> Float64[ndarray, " 3"]:
     """Return ``vector`` turned by the smallest rotation that takes unit ``before`` to unit ``after``."""
     cross, cosine = np.cross(before, after), float(before @ after)
     turned = vector + np.cross(cross, vector) + np.cross(cross, np.cross(cross, vector)) / (1 + cosine)

@@ -68,13 +68,13 @@ def _marker_centres_m(spec: BoardSpec) -> list[tuple[float, float]]:
     x_m = _whole_millimetres(spec.width_m / 2 - inset_m)
     y_m = _whole_millimetres(spec.height_m / 2 - inset_m)
     if spec.markers == 6:
-        edge_row = (-x_m, x_m)
+        edge_row = [-x_m, x_m]
     elif spec.markers == 12:
         inner_m = _whole_millimetres(x_m / 2)
-        edge_row = (-x_m, -inner_m, 0.0, inner_m, x_m)
+        edge_row = [-x_m, -inner_m, 0.0, inner_m, x_m]
     else:
         raise ValueError(f"a board has 6 or 12 markers, not {spec.markers}")
-    rows = {y_m: edge_row, 0.0: (-x_m, x_m), -y_m: edge_row}
+    rows = {y_m: edge_row, 0.0: [-x_m, x_m], -y_m: edge_row}
     centres = [(x, y) for y, row in rows.items() for x in row]
     _check_quiet_zones(centres, spec)
     return centres

@@ -19,7 +19,7 @@ from rebar_depth_bench.version import software_version
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-build``; return its exit status."""
-    options = _parser().parse_args(arguments)
+    options = argument_parser().parse_args(arguments)
     command = _audit if options.command == "audit" else _build
     return run_command(lambda: command(options))
 
@@ -62,7 +62,8 @@ def _audit(options: argparse.Namespace) -> None:
         raise InputError(f"{options.root}: {len(report.failures)} of {len(report.checks)} checks failed")
 
 
-def _parser() -> argparse.ArgumentParser:
+def argument_parser() -> argparse.ArgumentParser:
+    """Return the command's argument parser."""
     parser = argparse.ArgumentParser(
         prog="rebar-build",
         description="Render a dataset folder of stereo views with exact depth, or continue one.",

@@ -26,7 +26,7 @@ from rebar_depth_bench.version import software_version
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-bench``; return its exit status."""
-    options = _parser().parse_args(arguments)
+    options = argument_parser().parse_args(arguments)
     datasets.disable_progress_bars()
     return run_command(lambda: options.run(options))
 
@@ -72,7 +72,8 @@ def _demo(options: argparse.Namespace) -> None:
     run_demo(options.out, options.views)
 
 
-def _parser() -> argparse.ArgumentParser:
+def argument_parser() -> argparse.ArgumentParser:
+    """Return the command's argument parser."""
     parser = argparse.ArgumentParser(
         prog="rebar-bench",
         description="Score metric depth on reinforcement against exact ground truth.",

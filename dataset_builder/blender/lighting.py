@@ -1,4 +1,4 @@
-"""The light of the room: a soft sky through its open top, a large ceiling panel and a window's worth from one side.
+"""The light of the room: a soft sky through its open top, a ceiling panel, a window's worth from one side.
 
 Lights are no surfaces: cameras do not see them, and they have no depth.
 """

@@ -59,7 +59,7 @@ class Shader:
         return self.node("ShaderNodeVectorMath", {0: position, 1: by_m}, operation="ADD").outputs[0]
 
     def noise(self, position: Socket, per_metre: float, detail: float = 2.0) -> Socket:
-        """Return fractal noise round 0.5 with ``per_metre`` features a metre; each ``detail`` costs as much again."""
+        """Return fractal noise round 0.5, ``per_metre`` features a metre; ``detail`` more octaves."""
         inputs: dict[str | int, Any] = {
             "Vector": position,
             "Scale": per_metre,

@@ -41,7 +41,7 @@ def build_scene(assembly: Assembly, spec: SceneSpec) -> None:
 
 def _with_shared_meshes(
     parts: tuple[Part, ...],
-) -> Iterator[tuple[Part, bpy.types.Mesh, Float64[ndarray, "3"]]]:
+) -> Iterator[tuple[Part, bpy.types.Mesh, Float64[ndarray, " 3"]]]:
     """Yield each part with its mesh data and origin; parts that differ by a shift alone share their data."""
     shapes: list[tuple[Mesh, str, bpy.types.Mesh]] = []
     for part in parts:
@@ -62,7 +62,7 @@ def _same(a: Mesh, b: Mesh) -> bool:
     )
 
 
-def add_object(part: Part, data: bpy.types.Mesh, origin_m: Float64[ndarray, "3"]) -> bpy.types.Object:
+def add_object(part: Part, data: bpy.types.Mesh, origin_m: Float64[ndarray, " 3"]) -> bpy.types.Object:
     """Put ``data`` into the open scene at ``origin_m`` (world, metres), marked with the part's bar id."""
     added = bpy.data.objects.new(part.name, data)
     added.location = origin_m

@@ -59,7 +59,7 @@ def test_length_is_exact_and_ends_are_flat() -> None:
     assert bar.area_faces[caps].sum() / 2 == pytest.approx(np.pi / 4 * 0.007**2, rel=0.1)
 
 
-def ribs_at_m(mesh: Mesh, ribs: RibPattern, diameter_m: float, side: float) -> Float64[ndarray, "n"]:
+def ribs_at_m(mesh: Mesh, ribs: RibPattern, diameter_m: float, side: float) -> Float64[ndarray, " n"]:
     """Return where along x the ribs of the row that faces ``side`` * z stand, in the row's middle."""
     around = np.arctan2(mesh.vertices_m[:, 1], mesh.vertices_m[:, 2] * side)
     radius_m = np.linalg.norm(mesh.vertices_m[:, 1:], axis=1)

@@ -144,7 +144,7 @@ def mesh(folder: Path) -> WorldMesh:
 
 
 def steel_vertices_m(mesh: WorldMesh, bar_id: int) -> Float64[ndarray, "n 3"]:
-    return mesh.vertices_m[np.unique(mesh.faces[mesh.face_bar_id == bar_id])]
+    return np.asarray(mesh.vertices_m[np.unique(mesh.faces[mesh.face_bar_id == bar_id])])
 
 
 @pytest.mark.parametrize("other", ["colour_after_depth", "colour_two_threads"])
@@ -226,7 +226,8 @@ def test_markers_are_where_the_layout_says_and_not_mirrored(arrays: dict[str, nd
     K, cam_from_world, _, _ = ABOVE
     for marker_id, found in zip(ids.ravel(), corners, strict=True):
         expected = project(K, transform(cam_from_world, marker_corners_m(SCENE.board)[int(marker_id)]))
-        np.testing.assert_allclose(found[0], expected, atol=1.0)
+        # Two samples a pixel leave the detector a pixel or two; a mirrored or turned marker is 40 px off.
+        np.testing.assert_allclose(found[0], expected, atol=2.0)
 
 
 def test_camera_stands_where_it_was_put(facts: dict[str, Any]) -> None:

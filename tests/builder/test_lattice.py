@@ -7,6 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from numpy import ndarray
 
 from dataset_builder.bar_mesh import outer_radius_m
 from dataset_builder.lattice import CLEAR_GAP_M, LIFT_M, lattice_assembly
@@ -78,7 +79,7 @@ def test_grid_neighbours_differ_in_diameter(lattice: Assembly) -> None:
 
 
 def test_rods_of_one_kind_share_their_shape(lattice: Assembly) -> None:
-    shapes = {}
+    shapes: dict[float, ndarray] = {}
     for bar, part in zip(lattice.bars, lattice.parts, strict=True):
         run = run_of(bar)
         middle = np.array(bar.axis_m).mean(axis=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataset_builder.lattice import lattice_assembly
-from dataset_builder.mesh_door import UNITS_M, load_assembly, mesh_file_spec
-from dataset_builder.model import Assembly, Mesh
+from dataset_builder.mesh_door import load_assembly, mesh_file_spec
+from dataset_builder.model import Assembly
 from dataset_builder.specs import LatticeSpec
 from rebar_depth_bench.errors import MeshError
 from rebar_depth_bench.ply import write_mesh_ply
@@ -85,7 +86,8 @@ def test_a_lattice_comes_back_through_every_format(tmp_path: Path, suffix: str) 
     assert [bar.bar_id for bar in back.bars] == [part.bar_id for part in back.parts] == list(range(1, 13))
     for bar, bar_in in zip(back.bars, lattice.bars, strict=True):
         np.testing.assert_allclose(bar.axis_m, bar_in.axis_m, rtol=0, atol=1e-4)
-        assert (bar.role, bar.diameter_m) == ("imported", pytest.approx(bar_in.diameter_m, rel=0.05))
+        assert bar.role == "imported"
+        assert bar.diameter_m == pytest.approx(bar_in.diameter_m, rel=0.05)
     for part, mesh in zip(back.parts, meshes, strict=True):
         assert (part.name, part.material) == (f"bar-{part.bar_id:03d}", "steel")
         assert (part.mesh.vertices_m.dtype, part.mesh.faces.dtype) == (np.float64, np.int32)
@@ -132,7 +134,7 @@ def test_one_soup_is_split_by_first_faces(tmp_path: Path) -> None:
 
 
 def test_objects_are_numbered_by_name_whatever_their_order(tmp_path: Path) -> None:
-    names = ("bar10", "bar9", "bar 1")
+    names = ("bar10", "bar9", "bar1")
     files = {"a.obj": obj(RODS, names), "a.glb": scene(RODS, names).export(file_type="glb")}
     for name, content in files.items():
         assert diameters_mm(loaded(tmp_path, name, content)) == [20, 10, 16]
@@ -141,11 +143,13 @@ def test_objects_are_numbered_by_name_whatever_their_order(tmp_path: Path) -> No
 def test_an_object_of_two_pieces_is_one_bar(tmp_path: Path) -> None:
     content = obj((joined(RODS[:2]), RODS[2]), ("a", "b")).replace(b"usemtl steel", b"usemtl steel\ng group", 1)
     assert [len(part.mesh.faces) for part in loaded(tmp_path, "a.obj", content).parts] == [512, 256]
-    tree = trimesh.exchange.gltf.export_gltf(scene(RODS, "abc"), embed_buffers=True)["model.gltf"].decode()
-    both = '"primitives":[' + ",".join(f'{{"attributes":{{"POSITION":{at + 1}}},"indices":{at}}}' for at in (0, 2))
-    start, end = tree.index('"primitives":['), tree.index("]", tree.index('"primitives":['))
-    two_primitives = loaded(tmp_path, "a.gltf", tree[:start] + both + tree[end:]).parts
-    assert [len(part.mesh.faces) for part in two_primitives] == [512, 256, 256]
+    tree = json.loads(GLTF)
+    tree["meshes"][0]["primitives"] += tree["meshes"].pop(1)["primitives"]
+    tree["nodes"][1]["mesh"] = 1
+    tree["nodes"].pop(2)
+    tree["scenes"] = [{"nodes": [1, 0]}]
+    parts = loaded(tmp_path, "a.gltf", json.dumps(tree)).parts
+    assert [len(part.mesh.faces) for part in parts] == [512, 256]
 
 
 def test_gltf_is_turned_z_up_and_its_transforms_apply(tmp_path: Path) -> None:
@@ -172,10 +176,12 @@ def test_polygons_are_triangulated_and_closed_parts_turned_outward(tmp_path: Pat
         assert trimesh.Trimesh(part.mesh.vertices_m, part.mesh.faces).is_volume
 
 
-@pytest.mark.parametrize("unit", [*UNITS_M, 0.5])
-def test_units(tmp_path: Path, unit: str | float) -> None:
-    unit_m = {"m": 1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048, 0.5: 0.5}[unit]
-    assembly = loaded(tmp_path, "a.obj", obj(RODS, "abc", 1 / unit_m), unit)
+@pytest.mark.parametrize(
+    ("unit", "per_metre"),
+    [("m", 1), ("cm", 100), ("mm", 1000), ("in", 1 / 0.0254), ("ft", 1 / 0.3048), (0.5, 2)],
+)
+def test_units(tmp_path: Path, unit: str | float, per_metre: float) -> None:
+    assembly = loaded(tmp_path, "a.obj", obj(RODS, "abc", per_metre), unit)
     assert diameters_mm(assembly) == [16, 10, 20]
     np.testing.assert_allclose(assembly.parts[1].mesh.vertices_m, RODS[1].vertices, atol=1e-12)
 
@@ -225,7 +231,7 @@ def test_too_many_bars(tmp_path: Path) -> None:
 
 GLB = scene(RODS, "abc").export(file_type="glb")
 GLTF = trimesh.exchange.gltf.export_gltf(scene(RODS, "abc"), embed_buffers=True)["model.gltf"].decode()
-STL_TEXT = trimesh.exchange.stl.export_stl_ascii(RODS[0])
+STL = trimesh.exchange.stl.export_stl_ascii(RODS[0])
 PLY = trimesh.exchange.ply.export_ply(RODS[0], encoding="ascii").decode()
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 UNREADABLE = "not a mesh file of its kind that can be read"
@@ -238,44 +244,23 @@ HOSTILE: dict[str, tuple[str, bytes | str, str]] = {
     "nan": (".obj", TRIANGLE + "v nan 0 0\nf 1 2 4", "a vertex is .nan, 0.0, 0.0., expected finite"),
     "no area": (".obj", TRIANGLE + "f 1 2 2", "bar 1 .1 triangles. is no surface: every triangle has zero area"),
     "empty stl": (".stl", "", "no triangle found"),
-    "cut binary stl": (
-        ".stl",
-        trimesh.exchange.stl.export_stl(RODS[0])[:-1],
-        "(no triangle found|cannot?|can be) ",
-    ),
-    "cut text stl": (".stl", STL_TEXT[:-80], "no triangle found"),
-    "garbled text stl": (".stl", STL_TEXT.replace("vertex 0", "vertex O", 1), UNREADABLE),
-    "inf in one of two solids": (
-        ".stl",
-        STL_TEXT + "\n" + STL_TEXT.replace("vertex 0", "vertex inf", 1),
-        "finite",
-    ),
+    "cut binary stl": (".stl", trimesh.exchange.stl.export_stl(RODS[0])[:-1], "no triangle found"),
+    "cut text stl": (".stl", STL[:-80], "no triangle found"),
+    "garbled text stl": (".stl", STL.replace("vertex 0", "vertex O", 1), UNREADABLE),
+    "inf in a second solid": (".stl", STL + "\n" + STL.replace("vertex 0.0", "vertex inf", 1), "finite"),
     "empty ply": (".ply", "", UNREADABLE),
     "half a ply header": (".ply", PLY[:60], UNREADABLE),
     "ply without y": (".ply", PLY.replace("float y", "float w"), UNREADABLE),
-    "ply corner beyond": (
-        ".ply",
-        PLY.replace("\n3 ", "\n3 9", 1),
-        "triangles name vertices 0 to 9.*, expected 0 to",
-    ),
-    "foreign bar_id": (
-        ".ply",
-        PLY.replace("end_h", "property int bar_id\nend_h"),
-        "bar_id, but not this dataset's",
-    ),
+    "ply corner beyond": (".ply", PLY.replace("\n3 ", "\n3 999", 1), "triangles name vertices 0 to 999"),
+    "foreign bar_id": (".ply", PLY.replace("end_h", "property int bar_id\nend_h"), "it has bar_id, but not"),
     "empty glb": (".glb", "", UNREADABLE),
     "cut glb": (".glb", GLB[:-4], UNREADABLE),
     "glb with a wild accessor": (".glb", GLB.replace(b'"count":130', b'"count":999', 1), UNREADABLE),
-    "glb of half sizes": (".glb", GLB.replace(b'"sparse"', b'"s"').replace(b"count", b"sparse", 1), UNREADABLE),
     "deep gltf": (".gltf", "[" * 100_000, UNREADABLE),
     "no gltf": (".gltf", "{}", "no triangle found"),
     "gltf 1": (".gltf", '{"asset": {"version": "1.0"}}', UNREADABLE),
     "sparse gltf": (".gltf", GLTF.replace('"count"', '"sparse":{},"count"', 1), "sparse, instanced"),
-    "outside buffer": (
-        ".gltf",
-        GLTF.replace('"uri":"data:', '"uri":"../b.bin","x":"', 1),
-        "b.bin' would be looked for",
-    ),
+    "outside buffer": (".gltf", GLTF.replace('"data:', '"b.bin","x":"', 1), "'b.bin' would be looked for"),
 }
 
 
@@ -288,7 +273,7 @@ def test_hostile_files(tmp_path: Path, suffix: str, content: bytes | str, words:
     assert "\n" not in str(caught.value)
 
 
-SAMPLES = {"a.obj": obj(RODS[:1], "a"), "a.glb": GLB, "a.gltf": GLTF.encode(), "b.stl": STL_TEXT.encode()}
+SAMPLES = {"a.obj": obj(RODS[:1], "a"), "a.glb": GLB, "a.gltf": GLTF.encode(), "b.stl": STL.encode()}
 SAMPLES |= {"a.stl": trimesh.exchange.stl.export_stl(RODS[0]), "b.ply": PLY.encode()}
 SAMPLES |= {"a.ply": trimesh.exchange.ply.export_ply(RODS[0])}
 

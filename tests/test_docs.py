@@ -1,0 +1,64 @@
+"""The README's commands parse, its Python runs, its tables and links are true."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from argparse import ArgumentParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dataset_builder.cli import argument_parser as build_parser
+from dataset_builder.configs import CONFIGS
+from rebar_depth_bench.cli import argument_parser as bench_parser
+from rebar_depth_bench.methods import METHODS
+
+PAGES = [Path("README.md"), Path("CONTRIBUTING.md"), Path("ARCHITECTURE.md"), Path("cards/BENCHMARK.md")]
+PARSERS: dict[str, ArgumentParser] = {"rebar-build": build_parser(), "rebar-bench": bench_parser()}
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(), flags=re.DOTALL)
+
+
+def commands() -> list[str]:
+    lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
+    inline = re.findall(r"`(rebar-(?:build|bench) [^`\n]*)`", Path("README.md").read_text())
+    return [line for line in [*lines, *inline] if line.startswith(tuple(PARSERS))]
+
+
+@pytest.mark.parametrize("command", commands())
+def test_every_command_shown_is_one_that_parses(command: str) -> None:
+    program, *arguments = shlex.split(command, comments=True)
+    assert PARSERS[program].parse_args(arguments)
+
+
+def test_the_python_shown_runs(tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = blocks(Path("README.md"), "python")
+    monkeypatch.chdir(tmp_path)
+    shown = first.replace('"demo-output/dataset"', repr(str(tiny_root)))
+    assert shown != first
+    names: dict[str, object] = {"my_model": lambda rgb, K: np.full(rgb.shape[:2], K[0, 0] / 200)}
+    exec(shown + second, names)
+    assert (tmp_path / "submission.zip").is_file()
+    batch = next(iter(names["loader"]))  # type: ignore[call-overload]
+    assert {"rgb", "depth", "mask", "K", "poses", "view_id", "right_rgb", "baseline_m"} <= set(batch)
+
+
+def test_tables_name_every_config_and_method() -> None:
+    readme = Path("README.md").read_text()
+    assert set(re.findall(r"^\| `([\w-]+)` \|", readme, flags=re.MULTILINE)) == {*CONFIGS, *METHODS}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=str)
+def test_links_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\(([^)#]+)\)", page.read_text())
+    assert all((page.parent / link).exists() for link in links if "://" not in link)
+
+
+def test_make_targets_shown_exist() -> None:
+    targets = set(re.findall(r"^([a-z-]+):.*##", Path("Makefile").read_text(), flags=re.MULTILINE))
+    shown = {name for page in PAGES for name in re.findall(r"\bmake ([a-z-]+)\b(?:`|\s+#)", page.read_text())}
+    assert {"demo", "test"} <= shown <= targets
