@@ -25,7 +25,7 @@ def main(views: str = "8", config: str = "lattice") -> None:
         request = BuildRequest(configs=(config,), views=count)
         summary = build(request, Path(scratch) / "dataset", workers=1, threads=os.cpu_count() or 1)
         wall_s = time.perf_counter() - start
-    seconds = dict(summary.seconds)
+    seconds: dict[str, float] = dict(summary.seconds)
     seconds["processes, packing, publishing"] = wall_s - sum(seconds.values())
     colour_s = seconds["colour"]
     table = [

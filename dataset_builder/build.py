@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ class BuildSummary:
 
     built: list[str] = field(default_factory=list)
     up_to_date: list[str] = field(default_factory=list)
-    seconds: Counter[str] = field(default_factory=Counter)
+    seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
 
 
 def build(
@@ -74,7 +74,8 @@ def _render(
 
     def on_event(event: Event) -> None:
         with lock:
-            summary.seconds.update(event["seconds"])
+            for stage, spent in event["seconds"].items():
+                summary.seconds[stage] += spent
             if "view" in event:
                 done.add(event["view"])
             if progress is not None:

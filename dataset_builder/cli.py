@@ -49,7 +49,8 @@ def _print_summary(out: Path, summary: BuildSummary) -> None:
         print(f"up to date: {', '.join(summary.up_to_date)}")
     if summary.built:
         print(f"built: {', '.join(summary.built)}")
-        stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in summary.seconds.most_common())
+        longest_first = sorted(summary.seconds.items(), key=lambda item: -item[1])
+        stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in longest_first)
         print(f"seconds in render processes: {stages}", file=sys.stderr)
     print(out)
 
