@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -58,12 +59,8 @@ def depth_codecs(shape: tuple[int, int]) -> Mapping[str, Codec]:
         pass
     else:
         for name, compression in (("deflate", 8), ("zstd", 50000)):
-            codecs[f"TIFF {name} + predictor 3"] = (
-                lambda depth_m, compression=compression: imagecodecs.tiff_encode(
-                    depth_m, compression=compression, predictor=3
-                ),
-                imagecodecs.tiff_decode,
-            )
+            encode = partial(imagecodecs.tiff_encode, compression=compression, predictor=3)
+            codecs[f"TIFF {name} + predictor 3"] = (encode, imagecodecs.tiff_decode)
     try:
         from pcodec import ChunkConfig, standalone
     except ImportError:

@@ -3,7 +3,7 @@
 World frame, metres; the bench top lies just under the sheet at z = 0. Nothing that could pass for steel
 reinforcement stands in the room, and nothing stands where the dome's cameras do (0.5 m round the origin).
 The room is open above the heads of the walls: no view of the dome sees that high, and light that leaves
-the room costs no further bounces (a closed one takes four times as long to render).
+the room costs no further bounces.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def _on_the_bench() -> tuple[Part, ...]:
         _part("cube-b", standing(-0.55, 0.58, (0.10, 0.10, 0.10), -8), "concrete"),
         _part("cylinder", cylinder((-0.80, 0.36, z), 0.05, 0.20), "concrete"),
         _part("toolbox", standing(0.70, 0.54, (0.34, 0.17, 0.14), -12), "red paint"),
-        _part("toolbox-lid", turned_box((0.70, 0.54, z + 0.16), (0.35, 0.18, 0.03), -12), "dark laminate"),
+        _part("toolbox-lid", turned_box((0.70, 0.54, z + 0.1555), (0.35, 0.18, 0.03), -12), "dark laminate"),
         _part("notebook", standing(-0.72, -0.45, (0.21, 0.15, 0.014), 24), "blue plastic"),
         _part("carton", standing(0.76, -0.48, (0.20, 0.15, 0.11), 31), "cardboard"),
         _part("mug", cylinder((0.80, 0.10, z), 0.041, 0.095), "white glaze"),

@@ -90,7 +90,7 @@ class Shader:
         return self.node("ShaderNodeMix", inputs, data_type="RGBA").outputs[2]
 
     def matt(self, colour: Socket | Colour) -> bpy.types.Material:
-        """Finish with a plain diffuse surface, a good deal cheaper to render than ``surface``."""
+        """Finish with a plain diffuse surface, cheaper to render than ``surface``."""
         return self._finish(self.node("ShaderNodeBsdfDiffuse", {"Color": colour}).outputs["BSDF"])
 
     def surface(self, **inputs: Any) -> bpy.types.Material:

@@ -205,6 +205,8 @@ def test_evaluated_mesh_follows_what_is_done_to_objects(folder: Path, mesh: Worl
     assert 1 not in changed.face_bar_id
     moved, before = steel_vertices_m(changed, 2), steel_vertices_m(mesh, 2)
     assert moved[:, 0].mean() - before[:, 0].mean() == pytest.approx(1.0, abs=0.05)
+    # Turned by 0.3 rad about the vertical, a rod along x reaches sideways.
+    assert np.ptp(moved[:, 1]) > np.ptp(before[:, 1]) + 0.02
     thick, thin = (np.ptp(steel_vertices_m(m, 3)[:, 1:], axis=0) for m in (changed, mesh))
     assert (thick > thin + 0.005).all()
     np.testing.assert_array_equal(steel_vertices_m(changed, 4), steel_vertices_m(mesh, 4))

@@ -109,18 +109,20 @@ def test_own_ply_keeps_ids_and_winding_and_leaves_the_board_out(tmp_path: Path) 
     assert [(part.bar_id, part.name) for part in parts] == [(7, "bar-007"), (40_000, "bar-40000")]
     np.testing.assert_array_equal(parts[0].mesh.faces, inside_out.faces)
     np.testing.assert_array_equal(parts[1].mesh.vertices_m, RODS[0].vertices)
+    in_feet = load_assembly(mesh_file_spec(tmp_path / "a.ply", "ft")).parts[1].mesh.vertices_m
+    np.testing.assert_array_equal(in_feet, RODS[0].vertices * 0.3048)
     write_mesh_ply(tmp_path / "a.ply", whole.vertices, whole.faces, bar_id * 0)
     with pytest.raises(MeshError, match="every face has bar_id 0"):
         load_assembly(mesh_file_spec(tmp_path / "a.ply", "m"))
-    with pytest.raises(MeshError, match="truncated or damaged"):
+    with pytest.raises(MeshError, match=f"^{tmp_path}/b.ply: truncated or damaged"):
         loaded(tmp_path, "b.ply", (tmp_path / "a.ply").read_bytes()[:-1])
 
 
 def test_one_soup_is_split_by_first_faces(tmp_path: Path) -> None:
-    """Faces of two rods alternate; a foreign PLY and both kinds of STL tell the same."""
+    """Faces of two rods alternate, and their vertices come the other way round."""
     first, second = RODS[2], RODS[1]
-    faces = np.stack([first.faces, second.faces + len(first.vertices)], axis=1).reshape(-1, 3)
-    soup = trimesh.Trimesh(np.concatenate([first.vertices, second.vertices]), faces, process=False)
+    faces = np.stack([first.faces + len(second.vertices), second.faces], axis=1).reshape(-1, 3)
+    soup = trimesh.Trimesh(np.concatenate([second.vertices, first.vertices]), faces, process=False)
     solids = "".join(trimesh.exchange.stl.export_stl_ascii(body) + "\n" for body in (first, second))
     for name, content in {
         "a.stl": trimesh.exchange.stl.export_stl(soup),
@@ -141,7 +143,8 @@ def test_objects_are_numbered_by_name_whatever_their_order(tmp_path: Path) -> No
 
 
 def test_an_object_of_two_pieces_is_one_bar(tmp_path: Path) -> None:
-    content = obj((joined(RODS[:2]), RODS[2]), ("a", "b")).replace(b"usemtl steel", b"usemtl steel\ng group", 1)
+    lines = obj((joined(RODS[:2]), RODS[2]), "ab").split(b"\n")
+    content = b"\n".join([*lines[:400], b"usemtl paint", b"g group", *lines[400:]])
     assert [len(part.mesh.faces) for part in loaded(tmp_path, "a.obj", content).parts] == [512, 256]
     tree = json.loads(GLTF)
     tree["meshes"][0]["primitives"] += tree["meshes"].pop(1)["primitives"]
@@ -162,8 +165,8 @@ def test_gltf_is_turned_z_up_and_its_transforms_apply(tmp_path: Path) -> None:
     first, second = (
         part.mesh.vertices_m for part in loaded(tmp_path, "a.glb", found.export(file_type="glb")).parts
     )
-    np.testing.assert_allclose(first, [[1, -3, 2], [1, -3, 4], [-19, -13, 2]], atol=1e-5)
-    np.testing.assert_allclose(second, [[0, 0, 0], [2, 0, 0], [0, -0.1, 2]], atol=1e-7)
+    np.testing.assert_allclose(first, [[1.0, -3, 2], [1.0, -3, 4], [-19.0, -13, 2]], atol=1e-5)
+    np.testing.assert_allclose(second, [[0.0, 0, 0], [2.0, 0, 0], [0, -0.1, 2]], atol=1e-7)
 
 
 def test_polygons_are_triangulated_and_closed_parts_turned_outward(tmp_path: Path) -> None:
@@ -186,19 +189,27 @@ def test_units(tmp_path: Path, unit: str | float, per_metre: float) -> None:
     np.testing.assert_allclose(assembly.parts[1].mesh.vertices_m, RODS[1].vertices, atol=1e-12)
 
 
-def test_estimates_of_open_tubes_and_square_bars(tmp_path: Path) -> None:
-    """Far from the origin; an open tube's half is tessellated finely; a square bar has its area's diameter."""
+def test_estimates_of_an_open_tube_and_a_wedge(tmp_path: Path) -> None:
+    """Far from the origin; one end of the tube is open, and one side there is tessellated finely.
+
+    The wedge's section is a 3-4-5 triangle: the middle of its surface lies beside that of its volume.
+    """
     tube = rod(0.016)
-    tube.update_faces(np.abs(tube.face_normals[:, 0]) < 0.5)
-    tube = tube.subdivide(np.flatnonzero(tube.triangles_center[:, 1] > 0))
-    square = trimesh.creation.box((0.01, 0.5, 0.01))
-    for body in (tube, square):
+    tube.update_faces(tube.face_normals[:, 0] < 0.5)
+    for _ in range(3):
+        x, y, _ = tube.triangles_center.T
+        tube = tube.subdivide(np.flatnonzero((x > 0.26) & (y > 0)))
+    ends = [[x, y, z] for x in (0.0, 1.0) for y, z in ((0.0, 0.0), (0.03, 0.0), (0.0, 0.04))]
+    faces = [[0, 2, 1], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]]
+    wedge = trimesh.Trimesh(ends, faces)
+    for body in (tube, wedge):
         body.apply_translation([300, -200, 500])
-    bars = loaded(tmp_path, "a.obj", obj((tube, square), "ab")).bars
-    np.testing.assert_allclose(bars[0].axis_m, [[300, -200, 500.1], [300.5, -200, 500.1]], atol=1e-6)
-    np.testing.assert_allclose(bars[1].axis_m, [[300, -200.25, 500], [300, -199.75, 500]], atol=1e-6)
-    assert bars[0].diameter_m == pytest.approx(0.016, rel=0.002)
-    assert bars[1].diameter_m == pytest.approx(0.01 * (4 / np.pi) ** 0.5, rel=1e-6)
+    bars = loaded(tmp_path, "a.obj", obj((tube, wedge), "ab")).bars
+    np.testing.assert_allclose(bars[0].axis_m, [[300.0, -200, 500.1], [300.5, -200, 500.1]], rtol=0, atol=2e-6)
+    middle = [-200 + 0.01, 500 + 0.04 / 3]
+    np.testing.assert_allclose(bars[1].axis_m, [[300, *middle], [301, *middle]], rtol=0, atol=2e-5)
+    assert bars[0].diameter_m == pytest.approx(0.016, rel=0.005)
+    assert bars[1].diameter_m == pytest.approx((4 * 0.0006 / np.pi) ** 0.5, rel=1e-3)
 
 
 def test_what_the_spec_refuses(tmp_path: Path) -> None:
