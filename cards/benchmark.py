@@ -17,4 +17,3 @@ def benchmark_card() -> str:
         within_mm=WITHIN_MM,
         methods=[method.info for method in METHODS.values()],
     )
-

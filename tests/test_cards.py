@@ -45,7 +45,9 @@ def test_the_dataset_cards_yaml_lists_what_is_there(tiny_root: Path) -> None:
     assert counts == {"lattice": 9, "lattice-orbit": 2}
 
 
-def test_the_dataset_cards_shares_are_those_of_the_masks(tiny_root: Path, tiny_masks: dict[str, np.ndarray]) -> None:
+def test_the_dataset_cards_shares_are_those_of_the_masks(
+    tiny_root: Path, tiny_masks: dict[str, np.ndarray]
+) -> None:
     steel = np.mean([mask.mean() for mask in tiny_masks.values()])
     row = next(line for line in (tiny_root / "README.md").read_text().splitlines() if "`lattice`" in line)
     assert f"| {100 * steel:.1f} % |" in row

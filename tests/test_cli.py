@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import signal
 import subprocess
 import sys
+import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rebar_depth_bench import score
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN
 
 Depths = dict[str, np.ndarray]
@@ -35,7 +38,9 @@ def predicted(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict
     return archives
 
 
-def test_score_writes_table_json_csv_and_report(predicted: dict[str, Path], tiny_root: Path, tmp_path: Path) -> None:
+def test_score_writes_table_json_csv_and_report(
+    predicted: dict[str, Path], tiny_root: Path, tmp_path: Path
+) -> None:
     targets = {kind: tmp_path / f"out.{kind}" for kind in ("json", "csv", "html")}
     options = [part for kind, path in targets.items() for part in (f"--{kind}", path)]
     finished = bench("score", predicted["sgbm"], "--data", tiny_root, *options)
@@ -62,8 +67,6 @@ def _is_number(text: str) -> bool:
 
 
 def test_the_papers_finding_shows_on_the_two_methods(predicted: dict[str, Path], tiny_root: Path) -> None:
-    from rebar_depth_bench import score
-
     stereo = score(predicted["sgbm"], tiny_root).tables["lattice"]
     control = score(predicted["constant"], tiny_root).tables["lattice"]
     assert stereo.native is not None
@@ -74,7 +77,9 @@ def test_the_papers_finding_shows_on_the_two_methods(predicted: dict[str, Path],
     assert control.scaled.abs_rel < 0.1 * control.native.abs_rel
 
 
-def test_predicting_twice_gives_the_same_archive(predicted: dict[str, Path], tiny_root: Path, tmp_path: Path) -> None:
+def test_predicting_twice_gives_the_same_archive(
+    predicted: dict[str, Path], tiny_root: Path, tmp_path: Path
+) -> None:
     again = tmp_path / "again.zip"
     assert bench("predict", "constant", "--data", tiny_root, "--out", again, "--config", "lattice").returncode == 0
     assert again.read_bytes() == predicted["constant"].read_bytes()
@@ -113,7 +118,7 @@ def test_a_bad_archive_ends_in_words_with_every_problem(command: str, tiny_root:
         (("methods",), 0, ""),
     ],
 )
-def test_exit_statuses(arguments: tuple[str, ...], status: int, words: str, tiny_root: Path, tmp_path: Path) -> None:
+def test_exit_statuses(arguments: tuple[str, ...], status: int, words: str, tiny_root: Path) -> None:
     finished = bench(*(str(tiny_root) if part == "ROOT" else part for part in arguments))
     assert finished.returncode == status
     assert words in finished.stderr
@@ -136,9 +141,6 @@ def test_a_closed_pipe_is_no_traceback(predicted: dict[str, Path], tiny_root: Pa
 
 
 def test_an_interrupted_prediction_leaves_nothing(tiny_root: Path, tmp_path: Path) -> None:
-    import signal
-    import time
-
     archive = tmp_path / "half.zip"
     command = [sys.executable, "-m", "rebar_depth_bench", "predict", "sgbm", "--data", str(tiny_root)]
     running = subprocess.Popen([*command, "--out", str(archive)], stderr=subprocess.PIPE, text=True)

@@ -7,7 +7,9 @@ import sys
 
 import pytest
 
-SCORING = "import rebar_depth_bench as rdb; rdb.score; rdb.load; rdb.SubmissionWriter; import rebar_depth_bench.cli"
+SCORING = (
+    "import rebar_depth_bench as rdb; rdb.score; rdb.load; rdb.SubmissionWriter; import rebar_depth_bench.cli"
+)
 
 
 def modules_after(statement: str) -> set[str]:
@@ -33,7 +35,9 @@ def test_planning_a_build_does_not_import_blender() -> None:
     assert not found & {"bpy", "mathutils", "torch"}
 
 
-@pytest.mark.parametrize("name", ["load", "score", "SubmissionWriter", "torch_loader", "Result", "SubmissionError"])
+@pytest.mark.parametrize(
+    "name", ["load", "score", "SubmissionWriter", "torch_loader", "Result", "SubmissionError"]
+)
 def test_public_names_are_there(name: str) -> None:
     import rebar_depth_bench
 

@@ -12,7 +12,6 @@ from typing import Any, BinaryIO
 
 from rebar_depth_bench.errors import InputError
 
-
 Report = Callable[[Mapping[str, Any]], None]
 
 

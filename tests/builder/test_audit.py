@@ -88,17 +88,23 @@ def moved(pose: np.ndarray) -> np.ndarray:
     ("damage", "words"),
     [
         (lambda row: {"left_depth": row["left_depth"].astype(np.float64)}, "depth is float64"),
-        (lambda row: {"right_rgb": row["right_rgb"][:-1]}, "rgb is uint8 (89, 160, 3), expected uint8 (90, 160, 3)"),
+        (
+            lambda row: {"right_rgb": row["right_rgb"][:-1]},
+            "rgb is uint8 (89, 160, 3), expected uint8 (90, 160, 3)",
+        ),
         (lambda row: {"left_depth": -row["left_depth"]}, "below 0"),
         (lambda row: {"left_mask": ~row["left_mask"]}, "the mask differs from the pixels that have a bar id"),
         (lambda row: {"left_depth": 0 * row["left_depth"]}, "steel pixels without depth"),
         (lambda row: {"right_bars": np.where(row["right_mask"], 999, 0).astype(np.uint16)}, "bar ids [999]"),
         (lambda row: {"left_K": row["left_K"] + 1e-9}, "left_K is not the ideal matrix"),
         (lambda row: {"left_cam_from_world": 1.001 * row["left_cam_from_world"]}, "no rigid pose"),
-        (lambda row: {"baseline_m": 0.12001}, "baseline_m is 0.12001, expected 0.12"),
+        (lambda _: {"baseline_m": 0.12001}, "baseline_m is 0.12001, expected 0.12"),
         (lambda row: {"right_cam_from_world": moved(row["right_cam_from_world"])}, "does not stand baseline_m"),
-        (lambda row: {"left_depth": np.nextafter(row["left_depth"], np.float32(9))}, "left ground truth has another"),
-        (lambda row: {"view_id": "lattice/0001"}, "the row's view_id is lattice/0001"),
+        (
+            lambda row: {"left_depth": np.nextafter(row["left_depth"], np.float32(9))},
+            "left ground truth has another",
+        ),
+        (lambda _: {"view_id": "lattice/0001"}, "the row's view_id is lattice/0001"),
     ],
 )
 def test_every_broken_invariant_is_named(

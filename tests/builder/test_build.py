@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import datasets
@@ -16,7 +18,9 @@ import numpy as np
 import pytest
 
 import rebar_depth_bench as rdb
+from dataset_builder.bars_table import read_bars
 from dataset_builder.plan import BUILD_FOLDER
+from rebar_depth_bench.folder import open_folder
 from tests.conftest import TINY, TINY_VIEWS, run_build
 
 pytestmark = pytest.mark.render
@@ -27,7 +31,9 @@ def contents(root: Path) -> dict[str, str]:
     files = (path for path in root.rglob("*") if path.is_file())
     named = {path.relative_to(root).as_posix(): path for path in files}
     return {
-        name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in named.items() if not name.startswith(".")
+        name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for name, path in named.items()
+        if not name.startswith(".")
     }
 
 
@@ -54,11 +60,15 @@ def staged_rows(root: Path) -> int:
     return len(list(root.glob(f"{BUILD_FOLDER}/*/rows/????.parquet")))
 
 
-def wait_until(condition: object, timeout_s: float = 120) -> None:
+def wait_until(condition: Callable[[], object], timeout_s: float = 120) -> None:
     deadline = time.monotonic() + timeout_s
-    while not condition():  # type: ignore[operator]
+    while not condition():
         assert time.monotonic() < deadline, "waited too long"
         time.sleep(0.02)
+
+
+def progressed_or_ended(root: Path, already: int, build: subprocess.Popen[bytes]) -> bool:
+    return staged_rows(root) > already or build.poll() is not None
 
 
 LATTICE = ("--config", "lattice", "--views", str(TINY_VIEWS), *TINY)
@@ -78,7 +88,7 @@ def test_killed_again_and_again_it_finishes_to_the_same_bytes(lattice_only: Path
     for kill in range(6):
         build = start_build(root, *LATTICE)
         already = staged_rows(root)
-        wait_until(lambda before=already: staged_rows(root) > before or build.poll() is not None)
+        wait_until(partial(progressed_or_ended, root, already, build))
         time.sleep(float(rng.uniform(0, 0.4)))
         if kill % 2:
             os.kill(build.pid, signal.SIGKILL)
@@ -156,6 +166,22 @@ def test_a_rebuild_with_other_parameters_is_never_served_stale(tmp_path: Path) -
     assert not old_shards & set(root.glob("lattice/*.parquet"))
 
 
+def test_the_lattices_own_mesh_goes_in_through_the_mesh_door_to_the_same_ground_truth(
+    tiny_root: Path, tmp_path: Path
+) -> None:
+    mesh = tiny_root / "meshes" / "lattice.ply"
+    finished = run_build("--out", tmp_path / "again", *LATTICE, "--mesh", mesh, "--mesh-unit", "m")
+    assert finished.returncode == 0, finished.stderr
+    first, again = open_folder(tiny_root), open_folder(tmp_path / "again")
+    assert first.config("lattice")["ground_truth_digest"] == again.config("lattice")["ground_truth_digest"]
+    assert again.config("lattice")["scene"]["assembly"]["path"] == "lattice.ply"
+    bars = (read_bars(root / "bars.parquet")["lattice"] for root in (tiny_root, tmp_path / "again"))
+    for drawn, estimated in zip(*bars, strict=True):
+        assert estimated.bar_id == drawn.bar_id
+        assert estimated.diameter_m == pytest.approx(drawn.diameter_m, rel=0.01)
+        assert np.array(estimated.axis_m) == pytest.approx(np.array(drawn.axis_m), abs=1e-4)
+
+
 def test_a_second_build_at_once_is_refused_in_words(tmp_path: Path) -> None:
     root = tmp_path / "dataset"
     build = start_build(root, *LATTICE)
@@ -197,7 +223,9 @@ def test_manifest_and_card_describe_the_folder(lattice_only: Path) -> None:
         (("--mesh", __file__), "mesh files of kind '.py' are not read, expected"),
     ],
 )
-def test_bad_requests_end_in_words_and_write_nothing(tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:
+def test_bad_requests_end_in_words_and_write_nothing(
+    tmp_path: Path, arguments: tuple[str, ...], words: str
+) -> None:
     root = tmp_path / "dataset"
     refused = run_build("--out", root, *arguments)
     assert refused.returncode == 2
