@@ -23,7 +23,7 @@ LATTICE_DOME = DomeSpec(
     elevations_deg=(15.0, 27.0, 39.0, 51.0, 63.0, 75.0),
     azimuths=12,
 )
-"""The paper's 504 views at 0.22-0.43 m; the far shells lie closer, which keeps the steel at 4.5-7.2 % of the frame."""
+"""The paper's 504 views at 0.22-0.43 m; far shells lie closer, so that steel covers 4.5-7.2 % of the frame."""
 LATTICE_RING = RingSpec(radius_m=0.325, elevation_deg=35.0, azimuths=100)
 
 

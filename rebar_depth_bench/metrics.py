@@ -21,13 +21,13 @@ from rebar_depth_bench.protocol import DELTA1_RATIO
 class DepthMetrics:
     """Errors of one view, or their means over views.
 
-    ``abs_rel`` = mean(|p - z| / z); ``rmse_m`` = sqrt(mean((p - z)^2)); ``mae_m`` = mean(|p - z|);
+    ``abs_rel`` = mean(|p - z| / z); ``rmse_cm`` = 100 sqrt(mean((p - z)^2)); ``mae_cm`` = 100 mean(|p - z|);
     ``delta1`` = share of pixels with max(p/z, z/p) < 1.25.
     """
 
     abs_rel: float
-    rmse_m: float
-    mae_m: float
+    rmse_cm: float
+    mae_cm: float
     delta1: float
 
 
@@ -37,8 +37,8 @@ def depth_metrics(p_m: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"]) -> D
         error_m = np.abs(p_m - z_m)
         return DepthMetrics(
             abs_rel=float(np.mean(error_m / z_m)),
-            rmse_m=float(np.sqrt(np.mean(error_m * error_m))),
-            mae_m=float(np.mean(error_m)),
+            rmse_cm=100.0 * float(np.sqrt(np.mean(error_m * error_m))),
+            mae_cm=100.0 * float(np.mean(error_m)),
             delta1=float(np.mean(np.maximum(p_m / z_m, z_m / p_m) < DELTA1_RATIO)),
         )
 

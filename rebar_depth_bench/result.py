@@ -108,7 +108,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _mean_metrics(metrics: Sequence[DepthMetrics]) -> DepthMetrics | None:
-    names = ("abs_rel", "rmse_m", "mae_m", "delta1")
+    names = ("abs_rel", "rmse_cm", "mae_cm", "delta1")
     means = {name: _mean([getattr(one, name) for one in metrics]) for name in names}
     if any(mean is None for mean in means.values()):
         return None
@@ -131,8 +131,8 @@ def _metrics_dict(metrics: DepthMetrics | None) -> dict[str, float | None]:
         return dict.fromkeys(("abs_rel", "rmse_cm", "mae_cm", "delta1"))
     return {
         "abs_rel": _number(metrics.abs_rel),
-        "rmse_cm": _number(metrics.rmse_m * 100),
-        "mae_cm": _number(metrics.mae_m * 100),
+        "rmse_cm": _number(metrics.rmse_cm),
+        "mae_cm": _number(metrics.mae_cm),
         "delta1": _number(metrics.delta1),
     }
 

@@ -50,8 +50,8 @@ def metric_cells(metrics: DepthMetrics | None) -> list[str]:
         return [DASH] * len(METRIC_HEADS)
     return [
         number(metrics.abs_rel, 4),
-        number(metrics.rmse_m * 100, 2),
-        number(metrics.mae_m * 100, 2),
+        number(metrics.rmse_cm, 2),
+        number(metrics.mae_cm, 2),
         number(metrics.delta1, 3),
     ]
 

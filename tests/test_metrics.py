@@ -30,8 +30,8 @@ def test_golden_case_by_hand() -> None:
     p = np.array([1.5, 2.0, 3.0, 7.0])
     found = depth_metrics(p, z)
     assert found.abs_rel == pytest.approx((0.5 / 1 + 0 + 1 / 4 + 2 / 5) / 4)
-    assert found.rmse_m == pytest.approx(math.sqrt((0.25 + 0 + 1 + 4) / 4))
-    assert found.mae_m == pytest.approx((0.5 + 0 + 1 + 2) / 4)
+    assert found.rmse_cm == pytest.approx(100 * math.sqrt((0.25 + 0 + 1 + 4) / 4))
+    assert found.mae_cm == pytest.approx(100 * (0.5 + 0 + 1 + 2) / 4)
     assert found.delta1 == 0.25  # ratios 1.5, 1, 1.33, 1.4
     assert median_scale(p, z) == pytest.approx(3.0 / 2.5)  # means of the two middle values
 
@@ -45,7 +45,7 @@ def test_delta1_is_strict_at_its_threshold() -> None:
 def test_exact_prediction_is_exactly_perfect() -> None:
     z = np.linspace(0.1, 17, 101)
     found = depth_metrics(z.copy(), z)
-    assert (found.abs_rel, found.rmse_m, found.mae_m, found.delta1) == (0.0, 0.0, 0.0, 1.0)
+    assert (found.abs_rel, found.rmse_cm, found.mae_cm, found.delta1) == (0.0, 0.0, 0.0, 1.0)
     assert median_scale(z.copy(), z) == 1.0
 
 
@@ -57,8 +57,8 @@ def test_metrics_agree_with_exact_rational_arithmetic(pair: tuple[np.ndarray, np
     found = depth_metrics(p, z)
     abs_rel = sum(e / Fraction(b) for e, b in zip(errors, z.tolist(), strict=True)) / n
     assert found.abs_rel == pytest.approx(float(abs_rel), rel=1e-12, abs=1e-15)
-    assert found.mae_m == pytest.approx(float(sum(errors) / n), rel=1e-12, abs=1e-15)
-    assert found.rmse_m == pytest.approx(math.sqrt(sum(e * e for e in errors) / n), rel=1e-12, abs=1e-15)
+    assert found.mae_cm == pytest.approx(100 * float(sum(errors) / n), rel=1e-12, abs=1e-13)
+    assert found.rmse_cm == pytest.approx(100 * math.sqrt(sum(e * e for e in errors) / n), rel=1e-12, abs=1e-13)
 
 
 @given(pairs(), st.floats(1e-3, 1e3))
@@ -69,7 +69,7 @@ def test_scaled_error_does_not_depend_on_the_predictions_unit(
     first = depth_metrics(median_scale(p, z) * p, z)
     second = depth_metrics(median_scale(unit * p, z) * (unit * p), z)
     assert first.abs_rel == pytest.approx(second.abs_rel, rel=1e-9, abs=1e-12)
-    assert first.rmse_m == pytest.approx(second.rmse_m, rel=1e-9, abs=1e-12)
+    assert first.rmse_cm == pytest.approx(second.rmse_cm, rel=1e-9, abs=1e-12)
 
 
 @given(pairs())
@@ -77,7 +77,7 @@ def test_bounds_and_order(pair: tuple[np.ndarray, np.ndarray]) -> None:
     p, z = pair
     found = depth_metrics(p, z)
     assert 0.0 <= found.delta1 <= 1.0
-    assert 0.0 <= found.mae_m <= found.rmse_m * (1 + 1e-12)
+    assert 0.0 <= found.mae_cm <= found.rmse_cm * (1 + 1e-12)
     shares = shares_within(np.abs(p - z), len(z), (3, 5, 10, 20))
     assert list(shares.values()) == sorted(shares.values())
     assert all(0.0 <= share <= 1.0 for share in shares.values())
@@ -105,4 +105,4 @@ def test_what_is_a_prediction() -> None:
 @pytest.mark.parametrize("huge", [1e200, 1e308])
 def test_overflow_gives_infinity_and_no_warning(huge: float) -> None:
     z = np.array([1.0, 2.0, 3.0])
-    assert math.isinf(depth_metrics(np.full(3, huge), z).rmse_m)
+    assert math.isinf(depth_metrics(np.full(3, huge), z).rmse_cm)

@@ -89,7 +89,7 @@ def test_json_has_the_contracts_keys_and_units() -> None:
         "scale_median",
         "within_mm",
     ]
-    assert table["native"] == {"abs_rel": 0.25, "rmse_cm": 25.0, "mae_cm": 25.0, "delta1": 0.5}
+    assert table["native"] == {"abs_rel": 0.25, "rmse_cm": 0.25, "mae_cm": 0.25, "delta1": 0.5}
     assert list(table["within_mm"]) == ["3", "5", "10", "20"]
     assert list(content["views"][0]) == [
         "view_id",

@@ -34,7 +34,7 @@ def test_ground_truth_is_exactly_perfect(tiny_truth: Depths, tiny_root: Path, ar
     assert table.native is not None
     for metrics in (table.native, table.scaled):
         assert metrics is not None
-        assert (metrics.abs_rel, metrics.rmse_m, metrics.mae_m, metrics.delta1) == (0.0, 0.0, 0.0, 1.0)
+        assert (metrics.abs_rel, metrics.rmse_cm, metrics.mae_cm, metrics.delta1) == (0.0, 0.0, 0.0, 1.0)
     assert table.scale_median == 1.0
     assert table.coverage == 1.0
     assert table.ranked
@@ -48,7 +48,7 @@ def test_twice_the_depth_is_all_scale(tiny_truth: Depths, tiny_root: Path, archi
     assert table.native.abs_rel == 1.0
     assert table.native.delta1 == 0.0
     assert table.scale_median == 0.5
-    assert (table.scaled.abs_rel, table.scaled.rmse_m, table.scaled.delta1) == (0.0, 0.0, 1.0)
+    assert (table.scaled.abs_rel, table.scaled.rmse_cm, table.scaled.delta1) == (0.0, 0.0, 1.0)
 
 
 def test_all_negative_predictions_have_null_metrics_and_no_rank(
@@ -84,8 +84,8 @@ def test_an_independent_evaluation_agrees(
         rows.append(
             [
                 np.mean(np.abs(p - z) / z),
-                np.sqrt(np.mean((p - z) ** 2)),
-                np.mean(np.abs(p - z)),
+                100 * np.sqrt(np.mean((p - z) ** 2)),
+                100 * np.mean(np.abs(p - z)),
                 np.mean(np.maximum(p / z, z / p) < 1.25),
                 np.mean(np.abs(s * p - z) / z),
                 np.mean(np.abs(p - z) <= 0.01),
@@ -95,7 +95,7 @@ def test_an_independent_evaluation_agrees(
     means = np.mean(rows, axis=0)
     assert table.native is not None
     assert table.scaled is not None
-    found = [table.native.abs_rel, table.native.rmse_m, table.native.mae_m, table.native.delta1]
+    found = [table.native.abs_rel, table.native.rmse_cm, table.native.mae_cm, table.native.delta1]
     assert [*found, table.scaled.abs_rel, table.within_mm[10]] == pytest.approx(means[:6].tolist(), rel=1e-12)
     assert table.scale_median == pytest.approx(np.median([row[6] for row in rows]), rel=1e-12)
 

@@ -17,8 +17,8 @@ def scored(view_id: str, abs_rel: float = 0.75, coverage: float = 1.0, scale: fl
         scored_px=43210,
         coverage=coverage,
         scale=scale,
-        native=DepthMetrics(abs_rel=abs_rel, rmse_m=0.2009, mae_m=0.1871, delta1=0.1234),
-        scaled=DepthMetrics(abs_rel=0.0613, rmse_m=0.0152, mae_m=0.0117, delta1=0.9876),
+        native=DepthMetrics(abs_rel=abs_rel, rmse_cm=20.09, mae_cm=18.71, delta1=0.1234),
+        scaled=DepthMetrics(abs_rel=0.0613, rmse_cm=1.52, mae_cm=1.17, delta1=0.9876),
         within_mm={3: 0.0123, 5: 0.0456, 10: 0.0789, 20: 0.1357},
     )
 
@@ -30,7 +30,7 @@ def unpredicted(view_id: str) -> ViewScore:
 
 def overflowed(view_id: str) -> ViewScore:
     """Return a view whose prediction was too large to square."""
-    native = DepthMetrics(abs_rel=1e200, rmse_m=math.inf, mae_m=1e200, delta1=0.0)
+    native = DepthMetrics(abs_rel=1e200, rmse_cm=math.inf, mae_cm=1e202, delta1=0.0)
     view = scored(view_id)
     return ViewScore(view_id, 5, 1.0, 1e-200, native, view.scaled, view.within_mm)
 
