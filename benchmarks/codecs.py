@@ -46,12 +46,14 @@ def pillow(kind: str, **options: Any) -> Codec:
 
 
 def depth_codecs(shape: tuple[int, int]) -> Mapping[str, Codec]:
+    tags = {317: 3, 278: shape[0]}  # floating-point predictor, one strip
     codecs = {
         "EXR ZIP": exr(OpenEXR.ZIP_COMPRESSION),
         "EXR ZSTD": exr(OpenEXR.ZSTD_COMPRESSION),
         "EXR HTJ2K": exr(OpenEXR.HTJ2K256_COMPRESSION),
         "EXR PIZ": exr(OpenEXR.PIZ_COMPRESSION),
-        "TIFF deflate (Pillow)": pillow("TIFF", compression="tiff_adobe_deflate"),
+        "TIFF deflate + predictor 3, Pillow": pillow("TIFF", compression="tiff_adobe_deflate", tiffinfo=tags),
+        "TIFF zstd + predictor 3, Pillow": pillow("TIFF", compression="zstd", tiffinfo=tags),
     }
     try:
         import imagecodecs
@@ -60,7 +62,7 @@ def depth_codecs(shape: tuple[int, int]) -> Mapping[str, Codec]:
     else:
         for name, compression in (("deflate", 8), ("zstd", 50000)):
             encode = partial(imagecodecs.tiff_encode, compression=compression, predictor=3)
-            codecs[f"TIFF {name} + predictor 3"] = (encode, imagecodecs.tiff_decode)
+            codecs[f"TIFF {name} + predictor 3, imagecodecs"] = (encode, imagecodecs.tiff_decode)
     try:
         from pcodec import ChunkConfig, standalone
     except ImportError:

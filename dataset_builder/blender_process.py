@@ -59,21 +59,15 @@ class BlenderProcesses:
 
     def _run_once(self, task: Task, log: Path, on_event: Callable[[Event], None]) -> int:
         log.parent.mkdir(parents=True, exist_ok=True)
-        process = self._start(log)
-        try:
-            with process:
-                assert process.stdin is not None
-                assert process.stdout is not None
-                _send(process.stdin, task)
-                for line in process.stdout:
-                    _pass_on(json.loads(line), on_event)
-                return process.wait()
-        except BaseException:
-            process.kill()
-            raise
-        finally:
-            with self._lock:
-                self._running.discard(process)
+        with self._start(log) as process:
+            try:
+                return _talk(process, task, on_event)
+            except BaseException:
+                process.kill()
+                raise
+            finally:
+                with self._lock:
+                    self._running.discard(process)
 
     def _start(self, log: Path) -> subprocess.Popen[bytes]:
         with self._lock:
@@ -87,6 +81,18 @@ class BlenderProcesses:
             )
             self._running.add(process)
             return process
+
+
+def _talk(process: subprocess.Popen[bytes], task: Task, on_event: Callable[[Event], None]) -> int:
+    """Hand the task over, pass the events on, and return the process's exit status."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    _send(process.stdin, task)
+    for line in process.stdout:
+        if not line.endswith(b"\n"):
+            break  # it died in the middle of a word
+        _pass_on(json.loads(line), on_event)
+    return process.wait()
 
 
 def _send(stream: Any, task: Task) -> None:

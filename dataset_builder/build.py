@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import threading
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,9 +18,7 @@ from dataset_builder.plan import BUILD_FOLDER, ConfigPlan, plan_request
 from dataset_builder.publish import check_folder, check_scenes, is_published, publish_config, sweep
 from dataset_builder.shards import runs_of_views
 from dataset_builder.tasks import RenderTask
-
-Progress = Callable[[str, int, int], None]
-"""Called with a config's name, how many of its views are done and how many there are."""
+from rebar_depth_bench.progress import Progress, silent
 
 
 @dataclass
@@ -33,7 +31,7 @@ class BuildSummary:
 
 
 def build(
-    request: BuildRequest, out: Path, *, workers: int, threads: int, progress: Progress | None = None
+    request: BuildRequest, out: Path, *, workers: int, threads: int, progress: Progress = silent
 ) -> BuildSummary:
     """Build the requested configs in ``out``, or continue an interrupted build of the same ones.
 
@@ -49,24 +47,30 @@ def build(
         make_assembly(assembly)  # a bad mesh file is told before anything is written
     check_folder(out)
     with build_lock(out / BUILD_FOLDER):
-        sweep(out)
-        check_scenes(out, plans)
-        summary = BuildSummary()
-        for plan in plans:
-            if is_published(out, plan):
-                summary.up_to_date.append(plan.spec.name)
-            else:
-                _render(plan, workers, threads, progress, summary)
-                publish_config(out, plan)
-                shutil.rmtree(plan.staging.root)
-                summary.built.append(plan.spec.name)
-    _remove_build_folder(out / BUILD_FOLDER)
+        try:
+            sweep(out)
+            check_scenes(out, plans)
+            return _build_plans(plans, out, workers, threads, progress)
+        finally:
+            _remove_build_folder(out / BUILD_FOLDER)
+
+
+def _build_plans(
+    plans: Sequence[ConfigPlan], out: Path, workers: int, threads: int, progress: Progress
+) -> BuildSummary:
+    summary = BuildSummary()
+    for plan in plans:
+        if is_published(out, plan):
+            summary.up_to_date.append(plan.spec.name)
+        else:
+            _render(plan, workers, threads, progress, summary)
+            publish_config(out, plan)
+            summary.built.append(plan.spec.name)
+        shutil.rmtree(plan.staging.root, ignore_errors=True)
     return summary
 
 
-def _render(
-    plan: ConfigPlan, workers: int, threads: int, progress: Progress | None, summary: BuildSummary
-) -> None:
+def _render(plan: ConfigPlan, workers: int, threads: int, progress: Progress, summary: BuildSummary) -> None:
     """Run the plan's shards through worker processes; on any failure or interrupt none is left running."""
     plan.staging.root.mkdir(parents=True, exist_ok=True)
     done = {index for index in plan.indices if plan.staging.row(index).is_file()}
@@ -78,8 +82,7 @@ def _render(
                 summary.seconds[stage] += spent
             if "view" in event:
                 done.add(event["view"])
-            if progress is not None:
-                progress(plan.spec.name, len(done), len(plan.indices))
+            progress(plan.spec.name, len(done), len(plan.indices))
 
     runs = [run for run in enumerate(runs_of_views(plan.indices)) if not _is_rendered(plan, run[1])]
     with ThreadPoolExecutor(workers) as pool, BlenderProcesses() as blender:
@@ -105,6 +108,6 @@ def _is_rendered(plan: ConfigPlan, indices: tuple[int, ...]) -> bool:
 
 
 def _remove_build_folder(folder: Path) -> None:
-    """Remove the build folder unless other configs' unfinished pieces stand in it."""
+    """Remove the build folder unless unfinished pieces stand in it."""
     if not any(path.is_dir() for path in folder.iterdir()):
         shutil.rmtree(folder)

@@ -6,25 +6,43 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from dataset_builder.audit import audit, print_audit
-from dataset_builder.build import BuildSummary, build
 from dataset_builder.configs import CONFIGS, BuildRequest
-from dataset_builder.mesh_door import UNITS_M, mesh_file_spec
 from rebar_depth_bench.console import ProgressBars, run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
+
+if TYPE_CHECKING:
+    from dataset_builder.build import BuildSummary
+
+_EXTRA = ("bpy", "cv2", "embreex", "trimesh")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-build``; return its exit status."""
     options = argument_parser().parse_args(arguments)
     command = _audit if options.command == "audit" else _build
-    return run_command(lambda: command(options))
+    return run_command(lambda: command(options), interrupted="interrupted; run the same command again to go on")
+
+
+def _check_extra() -> None:
+    """Raise ``InputError`` where the build extra is not installed; what needs it is imported only after this."""
+    missing = [name for name in _EXTRA if find_spec(name) is None]
+    if missing:
+        raise InputError(
+            f"not installed: {', '.join(missing)}; expected the build extra: "
+            "pip install 'rebar-depth-bench[build]'"
+        )
 
 
 def _build(options: argparse.Namespace) -> None:
+    _check_extra()
+    from dataset_builder.build import build
+    from dataset_builder.mesh_door import mesh_file_spec
+
     if options.out is None:
         raise InputError("--out ROOT is missing: the dataset folder to build")
     if options.workers < 1:
@@ -56,6 +74,9 @@ def _print_summary(out: Path, summary: BuildSummary) -> None:
 
 
 def _audit(options: argparse.Namespace) -> None:
+    _check_extra()
+    from dataset_builder.audit import audit, print_audit
+
     with ProgressBars() as bars:
         report = audit(options.root, depth_views=options.depth_views, progress=bars.update)
     print_audit(report)
@@ -96,7 +117,7 @@ def argument_parser() -> argparse.ArgumentParser:
         "--mesh-unit",
         default="m",
         metavar="UNIT",
-        help=f"unit of the mesh file: {', '.join(UNITS_M)} (default: m)",
+        help="unit of the mesh file: m, cm, mm, in or ft (default: m)",
     )
     commands = parser.add_subparsers(dest="command", metavar="audit")
     checking = commands.add_parser("audit", help="check a dataset folder and its ground truth")

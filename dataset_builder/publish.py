@@ -1,7 +1,8 @@
 """From staged pieces to the dataset folder, in an order that a kill at any moment leaves mendable.
 
 Shards first, under names that carry their content's digest; then meshes and bars; then the card; the manifest
-last. A reader sees the old dataset or the new one. Files that the new manifest no longer names go afterwards.
+last. Files that the new manifest no longer names go afterwards. A folder whose card, bars or meshes are not those
+of its manifest was left by a kill in between: the next build publishes anew.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from cards import dataset_card
 from dataset_builder.assemblies import make_assembly
 from dataset_builder.bars_table import read_bars, write_bars
 from dataset_builder.configs import CONFIGS
+from dataset_builder.lock import LOCK
 from dataset_builder.plan import BUILD_FOLDER, ConfigPlan, generator_stamp
 from dataset_builder.shards import pack_shard, runs_of_views, staged_record
 from rebar_depth_bench.digests import file_sha256, parameters_digest, views_digest
@@ -26,6 +28,7 @@ from rebar_depth_bench.protocol import PROTOCOL
 from rebar_depth_bench.version import software_version
 
 BARS = "bars.parquet"
+MESHES = "meshes"
 CARD = "README.md"
 _TEMPORARY = ".*.tmp"
 _DIGEST_CHARACTERS = 12
@@ -37,16 +40,21 @@ def is_published(out: Path, plan: ConfigPlan) -> bool:
     entry = manifest["configs"].get(plan.spec.name)
     if entry is None or entry["key"] != plan.key:
         return False
-    wanted = [*entry["shards"], entry["mesh"], BARS, CARD]
-    return all((out / name).is_file() for name in wanted)
+    small = all(_is_as_named(out, name, manifest) for name in (entry["mesh"], BARS, CARD))
+    return small and all((out / name).is_file() for name in entry["shards"])
+
+
+def _is_as_named(out: Path, name: str, manifest: Mapping[str, Any]) -> bool:
+    return (out / name).is_file() and file_sha256(out / name) == manifest["files"].get(name)
 
 
 def check_folder(out: Path) -> None:
     """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder: nothing foreign is ever touched."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, expected a folder")
-    ours = (out / MANIFEST, out / BUILD_FOLDER)
-    if out.is_dir() and any(out.iterdir()) and not any(path.exists() for path in ours):
+    if (out / MANIFEST).is_file():
+        read_manifest(out / MANIFEST)
+    elif out.is_dir() and any(out.iterdir()) and not (out / BUILD_FOLDER / LOCK).is_file():
         raise InputError(f"{out}: is not empty and holds no {MANIFEST}, expected a new or a dataset folder")
 
 
@@ -68,7 +76,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
     """Put a fully staged config into the folder and remove what it replaces."""
     shards = _publish_shards(out, plan)
     scene = plan.spec.scene.name
-    mesh = f"meshes/{scene}.ply"
+    mesh = f"{MESHES}/{scene}.ply"
     write_bytes(out / mesh, plan.staging.mesh.read_bytes())
     write_bars(out / BARS, {**read_bars(out / BARS), scene: make_assembly(plan.spec.scene.assembly).bars})
     records = [staged_record(plan.staging.row(index)) for index in plan.indices]
@@ -87,9 +95,10 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
 
 def sweep(out: Path) -> None:
     """Remove what a killed build left behind: temporary files, and shards and meshes no manifest names."""
-    for temporary in [*out.glob(_TEMPORARY), *out.glob(f"*/{_TEMPORARY}")]:
-        temporary.unlink()
     _remove_unnamed(out, _manifest(out))
+    for folder in (out, out / MESHES, *(out / name for name in CONFIGS)):
+        for temporary in folder.glob(_TEMPORARY):
+            temporary.unlink()
 
 
 def _publish_shards(out: Path, plan: ConfigPlan) -> list[str]:
@@ -132,7 +141,8 @@ def _config_files(entries: Iterable[Mapping[str, Any]]) -> list[str]:
 
 def _remove_unnamed(out: Path, manifest: Mapping[str, Any]) -> None:
     named = set(_config_files(manifest["configs"].values()))
-    for path in [*out.glob("*/test-*-of-*.parquet"), *out.glob("meshes/*.ply")]:
+    shards = (path for name in CONFIGS for path in (out / name).glob("test-*-of-*.parquet"))
+    for path in [*shards, *(out / MESHES).glob("*.ply")]:
         if path.relative_to(out).as_posix() not in named:
             path.unlink()
 

@@ -16,6 +16,7 @@ from numpy import ndarray
 
 from dataset_builder.model import WorldMesh
 from rebar_depth_bench.cameras import inverse_rigid
+from rebar_depth_bench.errors import BuildError
 
 _MISS = -1
 
@@ -58,6 +59,8 @@ class RayCaster:
         hit = face != _MISS
         depth_m = np.zeros(len(face))
         depth_m[hit] = self._plane_depth_m(centre_m, directions[hit], face[hit])
+        if not (np.isfinite(depth_m) & (depth_m >= 0)).all():
+            raise BuildError("a ray meets the plane of the face it hit nowhere or behind the camera")
         bars = np.zeros(len(face), np.uint16)
         bars[hit] = self._face_bar_id[face[hit]]
         shape = (height, width)

@@ -45,7 +45,8 @@ def _score(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace) -> None:
     expected = open_folder(options.data).expected_views()
-    problems = check_archive(options.archive, expected)
+    with ProgressBars() as bars:
+        problems = check_archive(options.archive, expected, bars.update)
     if problems:
         raise SubmissionError(str(options.archive), problems)
     print(f"{options.archive}: no problem found")
@@ -53,11 +54,11 @@ def _check(options: argparse.Namespace) -> None:
 
 def _methods(_: argparse.Namespace) -> None:
     table = RichTable(title="Methods")
-    for heading in ("method", "what it does", "needs", "licence"):
+    for heading in ("method", "what it does", "needs", "source", "licence"):
         table.add_column(heading, overflow="fold")
     for method in METHODS.values():
         info = method.info
-        table.add_row(info.name, info.summary, ", ".join(info.columns), info.licence)
+        table.add_row(info.name, info.summary, ", ".join(info.columns), info.source, info.licence)
     Console().print(table)
 
 

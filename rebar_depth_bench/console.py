@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from types import TracebackType
 
 from rich.console import Console
@@ -60,30 +59,17 @@ class ProgressBars:
             print(f"{name}: {done} of {total}", file=sys.stderr, flush=True)
 
 
-@contextmanager
-def exiting_in_words() -> Iterator[None]:
-    """Turn this project's errors into one message on standard error and the contract's exit status."""
+def run_command(command: Callable[[], None], interrupted: str = "interrupted") -> int:
+    """Run a command and return the contract's exit status; our errors become words on standard error."""
     try:
-        yield
-    except InputError as error:
-        _complain(error, EXIT_INPUT)
+        command()
     except RebarDepthError as error:
-        _complain(error, EXIT_OTHER)
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(EXIT_OTHER) from None
+        return EXIT_OTHER
     except KeyboardInterrupt:
-        print("interrupted; run the same command again to go on", file=sys.stderr)
-        raise SystemExit(EXIT_OTHER) from None
-
-
-def run_command(command: Callable[[], None]) -> int:
-    """Run a command under ``exiting_in_words`` and return its exit status."""
-    with exiting_in_words():
-        command()
+        print(interrupted, file=sys.stderr)
+        return EXIT_OTHER
     return EXIT_DONE
-
-
-def _complain(error: RebarDepthError, status: int) -> None:
-    print(f"error: {error}", file=sys.stderr)
-    raise SystemExit(status) from None

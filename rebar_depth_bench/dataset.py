@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, overload
 
 import datasets
 import numpy as np
-from datasets import Dataset, Features, IterableDataset
+import pyarrow as pa
+from datasets import Dataset, Image, IterableDataset
+from datasets.exceptions import DatasetGenerationError, DatasetsError
 
 from rebar_depth_bench import codecs
 from rebar_depth_bench.errors import DatasetError
@@ -63,16 +65,40 @@ def load(
 
     Raises ``DatasetError`` for a folder, config or column that does not exist.
     """
+    undecoded = load_undecoded(root, config, streaming=streaming, columns=columns)
+    if isinstance(undecoded, IterableDataset):
+        return undecoded.map(decode_row)
+    return undecoded.with_transform(decode_batch)
+
+
+def load_undecoded(
+    root: str | Path, config: str, *, streaming: bool, columns: Sequence[str] | None
+) -> Dataset | IterableDataset:
+    """Load a config whose image and depth cells are still bytes, for ``decode_row``. Raises as ``load`` does."""
     open_folder(root).config(config)
     kept = _checked_columns(columns)
-    loaded = datasets.load_dataset(str(root), config, split=SPLIT, streaming=streaming)
-    undecoded = Features(
-        {name: feature for name, feature in features(decode_images=False).items() if name in kept}
-    )
-    selected = loaded.select_columns(list(kept)).cast(undecoded)
-    if isinstance(selected, IterableDataset):
-        return selected.map(decode_row)
-    return selected.with_transform(decode_batch)
+    try:
+        loaded = datasets.load_dataset(str(root), config, split=SPLIT, streaming=streaming)
+    except (DatasetsError, DatasetGenerationError, OSError, pa.ArrowException) as error:
+        raise DatasetError(f"{root}: config {config} cannot be loaded: {error}") from error
+    selected = loaded.select_columns(list(kept))
+    for name in kept:
+        if isinstance(selected.features[name], Image):
+            selected = selected.cast_column(name, Image(decode=False))  # a change of reading, not of data
+    return selected
+
+
+def iterate(root: str | Path, config: str, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield a config's decoded rows one by one, nothing cached. Raises ``DatasetError`` for damaged shards."""
+    rows = iter(load(root, config, streaming=True, columns=columns))
+    while True:
+        try:
+            row = next(rows)
+        except StopIteration:
+            return
+        except (OSError, pa.ArrowException, DatasetsError) as error:
+            raise DatasetError(f"{root}: config {config} cannot be read: {error}") from error
+        yield row
 
 
 def decode_row(row: Mapping[str, Any]) -> dict[str, Any]:

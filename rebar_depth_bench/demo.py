@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from rebar_depth_bench.console import ProgressBars
+from rebar_depth_bench.console import EXIT_INPUT, ProgressBars
 from rebar_depth_bench.errors import BuildError, InputError
 from rebar_depth_bench.files import write_bytes
 from rebar_depth_bench.methods import METHODS
@@ -23,7 +23,7 @@ from rebar_depth_bench.scoring import score
 from rebar_depth_bench.table import print_table
 
 DEMO_FOLDER = "demo-output"
-DEMO_VIEWS = 6
+DEMO_VIEWS = 5
 DEMO_CONFIG = "lattice"
 
 
@@ -56,6 +56,8 @@ def _build(data: Path, views: int) -> None:
         raise InputError("the demo renders with Blender: pip install 'rebar-depth-bench[build]'")
     command = ["-m", "dataset_builder", "--out", str(data), "--config", DEMO_CONFIG, "--views", str(views)]
     finished = subprocess.run([sys.executable, *command], stdout=sys.stderr, check=False)
+    if finished.returncode == EXIT_INPUT:
+        raise InputError("the demo's set cannot be built, for the reason above")
     if finished.returncode:
         raise BuildError(f"rebar-build ended with exit status {finished.returncode}, expected 0")
 

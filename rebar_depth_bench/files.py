@@ -8,15 +8,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from rebar_depth_bench.errors import InputError
+
 
 @contextmanager
 def replacing(target: Path) -> Iterator[Path]:
     """Yield a temporary path in the target's folder; on a clean exit it is flushed and becomes ``target``.
 
-    On an exception the temporary file is removed and an earlier ``target`` stays as it was.
+    On an exception the temporary file is removed and an earlier ``target`` stays as it was. Raises ``InputError``
+    where no file of that name can be written.
     """
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent)
+    if target.is_dir():
+        raise InputError(f"{target}: is a folder, expected the name of a file to write")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written: {error.strerror}") from None
     os.close(handle)
     temporary = Path(name)
     try:

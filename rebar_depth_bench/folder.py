@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,10 @@ class ViewRecord:
     right: str
     steel_px: int
     scored_px: int
+
+
+_VIEW_KEYS = {field.name for field in fields(ViewRecord)}
+_CONFIG_KEYS = {"scene", "rig", "views", "ground_truth_digest", "key", "shards", "mesh"}
 
 
 @dataclass(frozen=True)
@@ -100,7 +104,20 @@ def read_manifest(path: Path) -> dict[str, Any]:
     missing = [key for key in ("version", "ground_truth", "configs", "files") if key not in manifest]
     if missing:
         raise DatasetError(f"{path}: lacks {', '.join(missing)}")
+    _check_configs(path, manifest["configs"])
     return dict(manifest)
+
+
+def _check_configs(path: Path, configs: object) -> None:
+    if not isinstance(configs, dict):
+        raise DatasetError(f"{path}: configs is a {type(configs).__name__}, expected an object")
+    for name, entry in configs.items():
+        keys = set(entry) if isinstance(entry, dict) else set()
+        missing = sorted(_CONFIG_KEYS - keys)
+        if missing:
+            raise DatasetError(f"{path}: config {name} lacks {', '.join(missing)}")
+        if any(not isinstance(view, dict) or set(view) != _VIEW_KEYS for view in entry["views"]):
+            raise DatasetError(f"{path}: a view of config {name} has not exactly {', '.join(sorted(_VIEW_KEYS))}")
 
 
 def _manifest_path(root: str) -> Path:

@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,18 +19,18 @@ import numpy as np
 from jaxtyping import Float32, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.dataset import load
+from rebar_depth_bench.dataset import iterate
 from rebar_depth_bench.digests import eye_digest
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.files import sync
 from rebar_depth_bench.folder import DatasetFolder, ViewRecord
+from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.protocol import PROTOCOL, scored_pixels
 
 CACHE_FOLDER = ".rebar-cache"
+_DIGEST_CHARACTERS = 32
 _KINDS = ("rgb", "depth", "mask", "bars", "K", "distortion", "cam_from_world")
 _TRUTH_COLUMNS = ("view_id", *(f"left_{kind}" for kind in _KINDS if kind != "rgb"))
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,14 +57,21 @@ class ConfigTruth:
             yield ViewTruth(view_id, self.index[start:end], self.depth_m[start:end])
 
 
-def config_truth(folder: DatasetFolder, config: str, progress: Progress | None = None) -> ConfigTruth:
+def config_truth(folder: DatasetFolder, config: str, progress: Progress = silent) -> ConfigTruth:
     """Return a config's scored pixels, from the cache or else from the dataset, checked against its manifest.
 
     Raises ``DatasetError`` naming the view whose ground truth is not the one the manifest's digest stands for.
     """
     cached = _cache_path(folder, config)
-    if not cached.is_dir():
-        _fill_cache(folder, config, cached, progress)
+    try:
+        return _read_cache(cached)
+    except (OSError, ValueError, KeyError):
+        shutil.rmtree(cached, ignore_errors=True)  # not there, or damaged
+    _fill_cache(folder, config, cached, progress)
+    return _read_cache(cached)
+
+
+def _read_cache(cached: Path) -> ConfigTruth:
     outline = json.loads((cached / "views.json").read_text())
     return ConfigTruth(
         view_ids=tuple(outline["view_ids"]),
@@ -82,12 +89,14 @@ def _cache_path(folder: DatasetFolder, config: str) -> Path:
         base = local / CACHE_FOLDER
     else:
         base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "rebar-depth-bench"
-    return base / f"{PROTOCOL}-{config}-{digest[:32]}"
+    return base / f"{PROTOCOL}-{config}-{digest[:_DIGEST_CHARACTERS]}"
 
 
-def _fill_cache(folder: DatasetFolder, config: str, target: Path, progress: Progress | None) -> None:
+def _fill_cache(folder: DatasetFolder, config: str, target: Path, progress: Progress) -> None:
     """Write the flat arrays beside the target and rename them into place, view by view: memory stays flat."""
     target.parent.mkdir(parents=True, exist_ok=True)
+    for outdated in target.parent.glob(f"{PROTOCOL}-{config}-{'?' * _DIGEST_CHARACTERS}"):
+        shutil.rmtree(outdated, ignore_errors=True)
     temporary = Path(tempfile.mkdtemp(prefix=".filling-", dir=target.parent))
     try:
         outline = _write_arrays(folder, config, temporary, progress)
@@ -95,17 +104,15 @@ def _fill_cache(folder: DatasetFolder, config: str, target: Path, progress: Prog
         for path in (*temporary.iterdir(), temporary):
             sync(path)
         temporary.rename(target)
-    except FileExistsError:
-        pass  # another process was faster, with the same bytes
     except OSError:
-        if not target.is_dir():
+        if not target.is_dir():  # else another process was faster, with the same bytes
             raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _write_arrays(
-    folder: DatasetFolder, config: str, into: Path, progress: Progress | None
+    folder: DatasetFolder, config: str, into: Path, progress: Progress
 ) -> dict[str, list[str] | list[int]]:
     records = {view.view_id: view for view in folder.views(config)}
     total = sum(view.scored_px for view in records.values())
@@ -113,7 +120,7 @@ def _write_arrays(
     depth_m = _new_array(into / "depth_m.npy", np.float32, total)
     view_ids: list[str] = []
     starts = [0]
-    rows = load(folder.root, config, streaming=True, columns=_TRUTH_COLUMNS)
+    rows = iterate(folder.root, config, _TRUTH_COLUMNS)
     for done, row in enumerate(rows, start=1):
         record = records.pop(row["view_id"], None)
         pixels = _checked_pixels(row, record, folder.root)
@@ -123,8 +130,7 @@ def _write_arrays(
             depth_m[starts[-1] : end] = row["left_depth"].ravel()[pixels]
             view_ids.append(row["view_id"])
             starts.append(end)
-        if progress is not None:
-            progress(f"ground truth of {config}", done, done + len(records))
+        progress(f"ground truth of {config}", done, done + len(records))
     if records:
         raise DatasetError(f"{folder.root}: {config} lacks {len(records)} views, among them {min(records)}")
     index.flush()

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from rebar_depth_bench.dataset import load
+from rebar_depth_bench.dataset import iterate
 from rebar_depth_bench.folder import open_folder
 from rebar_depth_bench.methods import Method
+from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
-
-Progress = Callable[[str, int, int], None]
 
 
 def predict(
@@ -19,7 +18,7 @@ def predict(
     archive: str | Path,
     *,
     configs: Sequence[str] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> None:
     """Predict every view of the named configs (default: all) and write the archive, whole or not at all.
 
@@ -34,8 +33,7 @@ def predict(
         archive, method=info.name, description=info.summary, uses_intrinsics=info.uses_intrinsics
     ) as writer:
         for name in names:
-            rows = load(root, name, streaming=True, columns=("view_id", *info.columns))
+            rows = iterate(root, name, ("view_id", *info.columns))
             for done, row in enumerate(rows, start=1):
                 writer.add(row["view_id"], run(row))
-                if progress is not None:
-                    progress(f"{info.name} on {name}", done, totals[name])
+                progress(f"{info.name} on {name}", done, totals[name])

@@ -95,6 +95,13 @@ def tabulate(views: Sequence[ViewScore]) -> Table:
     )
 
 
+def badness(view: ViewScore) -> float:
+    """Return what views are sorted by: native AbsRel; no prediction at all and overflows are the worst."""
+    if view.native is None or not math.isfinite(view.native.abs_rel):
+        return math.inf
+    return view.native.abs_rel
+
+
 def _mean(values: Sequence[float]) -> float | None:
     """Return the correctly rounded mean, None of nothing, inf where a value is not finite."""
     if not values:

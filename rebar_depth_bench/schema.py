@@ -30,9 +30,9 @@ def features(*, decode_images: bool = True) -> Features:
 
 COLUMN_MEANINGS: dict[str, str] = {
     "view_id": "`<config>/<0000>`: the view's index in its full protocol, also when a subset is built",
-    "rgb": "lossless 8-bit colour, H x W",
+    "rgb": "lossless 8-bit colour, H x W, WebP",
     "depth": "lossless float32 planar depth along the optical axis, metres, 0.0 where there is no surface; "
-    "one-channel OpenEXR",
+    'TIFF, which `Image(mode="F")` of `datasets` reads too',
     "mask": "1-bit: steel, rim included",
     "bars": "16-bit: the bar's id as in `bars.parquet`, 0 where no steel",
     "preview": "8-bit colour-mapped depth, for people and the Hub viewer",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -11,17 +11,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from rebar_depth_bench.digests import file_sha256
-from rebar_depth_bench.errors import SubmissionError
+from rebar_depth_bench.errors import InputError, SubmissionError
 from rebar_depth_bench.folder import DatasetFolder, open_folder
 from rebar_depth_bench.ground_truth import ViewTruth, config_truth
 from rebar_depth_bench.metrics import depth_metrics, is_prediction, median_scale, shares_within
+from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.protocol import WITHIN_MM
 from rebar_depth_bench.result import Result, ViewScore, tabulate
 from rebar_depth_bench.submission import EntryError, SubmissionReader, config_of, open_submission
 from rebar_depth_bench.version import software_version
-
-Progress = Callable[[str, int, int], None]
 
 
 def score(
@@ -29,7 +27,7 @@ def score(
     root: str | Path,
     *,
     workers: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Result:
     """Score an archive against a dataset folder or Hub repository.
 
@@ -39,6 +37,8 @@ def score(
     Raises ``SubmissionError`` with every problem if any part of the archive is at fault, ``DatasetError`` if the
     folder is.
     """
+    if workers is not None and workers < 1:
+        raise InputError(f"workers is {workers}, expected 1 or more")
     folder = open_folder(root)
     with (
         open_submission(archive, folder.expected_views()) as submission,
@@ -46,7 +46,7 @@ def score(
     ):
         if submission.meta is None or submission.structure_problems:
             raise SubmissionError(str(archive), list(submission.problems()))
-        sha256 = pool.submit(file_sha256, Path(archive))
+        sha256 = pool.submit(submission.sha256)
         scores = _score_all(submission, folder, pool, progress)
         return Result(
             method=submission.meta.method,
@@ -85,7 +85,7 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
 
 
 def _score_all(
-    submission: SubmissionReader, folder: DatasetFolder, pool: ThreadPoolExecutor, progress: Progress | None
+    submission: SubmissionReader, folder: DatasetFolder, pool: ThreadPoolExecutor, progress: Progress
 ) -> dict[str, list[ViewScore]]:
     """Score every view of the archive, or raise with all that is wrong with it and score nothing."""
     present = {config_of(view_id) for view_id in submission.view_ids}
@@ -126,9 +126,8 @@ def _problems_out_of_protocol(submission: SubmissionReader, view_ids: Iterable[s
 
 
 def _watched(
-    outcomes: Iterable[ViewScore | str], what: str, total: int, progress: Progress | None
+    outcomes: Iterable[ViewScore | str], what: str, total: int, progress: Progress
 ) -> Iterator[ViewScore | str]:
     for done, outcome in enumerate(outcomes, start=1):
-        if progress is not None:
-            progress(what, done, total)
+        progress(what, done, total)
         yield outcome

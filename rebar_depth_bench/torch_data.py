@@ -45,7 +45,8 @@ def torch_loader(
     (``cam_from_world``), all of the left view, and ``view_id``, a list. With ``stereo`` also the right view's
     under ``right_...`` and ``baseline_m`` float64 B.
 
-    Columns that a batch does not need are not decoded. ``shuffle`` needs a dataset that is not streamed.
+    Columns that a batch does not need are not decoded; a streamed dataset has its columns decoded already, so
+    give ``load`` the ``columns`` it needs. ``shuffle`` needs a dataset that is not streamed.
     Raises ``MethodError`` where torch is missing.
     """
     keys = {**_LEFT, **_RIGHT, "baseline_m": "baseline_m"} if stereo else _LEFT

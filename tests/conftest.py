@@ -5,13 +5,18 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rebar_depth_bench.dataset import load
+# Before anything of ours is imported: libraries read these once.
+_CACHES = tempfile.TemporaryDirectory(prefix="rebar-test-caches-")
+os.environ.update(HF_HOME=_CACHES.name, XDG_CACHE_HOME=_CACHES.name, HF_HUB_OFFLINE="1")
+
+from rebar_depth_bench import SubmissionWriter, load  # noqa: E402
 
 TINY = ("--width", "160", "--height", "90", "--samples", "1")
 TINY_VIEWS = 9
@@ -25,10 +30,10 @@ def run_build(*arguments: str | Path, timeout_s: float = 600) -> subprocess.Comp
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _private_caches(tmp_path_factory: pytest.TempPathFactory) -> None:
+def _private_caches() -> Iterator[None]:
     """Keep the caches of ``datasets`` and the Hub away from the user's, and the network out."""
-    folder = tmp_path_factory.mktemp("caches")
-    os.environ["XDG_CACHE_HOME"] = str(folder)
+    yield
+    _CACHES.cleanup()
 
 
 @pytest.fixture(scope="session")
@@ -58,7 +63,6 @@ def tiny_masks(tiny_root: Path) -> dict[str, np.ndarray]:
 @pytest.fixture
 def archive_of(tmp_path: Path) -> Callable[..., Path]:
     """Write predictions, by view id, as a submission archive."""
-    from rebar_depth_bench import SubmissionWriter
 
     def write(predictions: dict[str, np.ndarray], name: str = "submission.zip") -> Path:
         with SubmissionWriter(tmp_path / name, method="test") as writer:

@@ -87,7 +87,7 @@ def test_predicting_twice_gives_the_same_archive(
 
 def test_check_passes_a_good_archive(predicted: dict[str, Path], tiny_root: Path) -> None:
     finished = bench("check", predicted["sgbm"], "--data", tiny_root)
-    assert (finished.returncode, finished.stderr) == (0, "")
+    assert finished.returncode == 0
     assert "no problem found" in finished.stdout
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import datasets
 import numpy as np
@@ -11,6 +15,7 @@ import torch
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.cameras import ideal_K, right_of_rig
+from rebar_depth_bench.dataset import iterate
 from rebar_depth_bench.folder import open_folder
 from rebar_depth_bench.schema import features
 
@@ -109,3 +114,46 @@ def test_manifest_knows_every_view(tiny_root: Path) -> None:
     assert len(folder.expected_views()) == VIEWS + 2
     assert set(folder.expected_views().values()) == {(HEIGHT, WIDTH)}
     assert folder.digest.startswith("sha256:")
+
+
+def test_loading_does_not_copy_the_dataset_again(tiny_root: Path) -> None:
+    ds = rdb.load(tiny_root, "lattice", columns=["view_id", "left_depth", "left_rgb"])
+    assert ds[0]["left_rgb"].dtype == np.uint8
+    assert ds.cache_files
+    assert not [file for file in ds.cache_files if "cache-" in Path(file["filename"]).name]
+
+
+@pytest.mark.parametrize("damage", ["truncated", "missing"])
+def test_a_damaged_shard_is_told_in_words(tiny_root: Path, tmp_path: Path, damage: str) -> None:
+    copy = tmp_path / "dataset"
+    shutil.copytree(tiny_root, copy, ignore=shutil.ignore_patterns(".rebar-cache"))
+    for shard in copy.glob("lattice/*.parquet"):
+        if damage == "missing":
+            shard.unlink()
+        else:
+            shard.write_bytes(shard.read_bytes()[:-100])
+    with pytest.raises(rdb.DatasetError, match=r"dataset: config lattice cannot be (loaded|read)"):
+        list(iterate(copy, "lattice", ["view_id"]))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda manifest: manifest.pop("configs"), "lacks configs"),
+        (lambda manifest: manifest.update(format="other"), "format is 'other', expected 'rebar-depth-dataset-1'"),
+        (lambda manifest: manifest.update(configs=[]), "configs is a list, expected an object"),
+        (lambda manifest: manifest["configs"]["lattice"].pop("views"), "config lattice lacks views"),
+        (
+            lambda manifest: manifest["configs"]["lattice"]["views"][0].pop("left"),
+            "a view of config lattice has not",
+        ),
+    ],
+)
+def test_a_damaged_manifest_is_told_in_words(
+    tiny_root: Path, tmp_path: Path, change: Callable[[dict[str, Any]], object], words: str
+) -> None:
+    manifest = json.loads((tiny_root / "manifest.json").read_text())
+    change(manifest)
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(rdb.DatasetError, match=words):
+        open_folder(tmp_path)

@@ -30,9 +30,25 @@ def test_the_packages_own_import_is_light() -> None:
 
 
 def test_planning_a_build_does_not_import_blender() -> None:
-    found = modules_after("import dataset_builder.cli")
+    found = modules_after("import dataset_builder.cli, dataset_builder.build, dataset_builder.audit")
     assert "dataset_builder.build" in found
     assert not found & {"bpy", "mathutils", "torch"}
+
+
+def test_without_the_build_extra_one_sentence_names_it() -> None:
+    code = """
+import importlib.util, sys
+find = importlib.util.find_spec
+importlib.util.find_spec = lambda name, *rest: None if name in ("bpy", "trimesh") else find(name, *rest)
+sys.modules["trimesh"] = None
+from dataset_builder.cli import main
+sys.exit(main(["--out", "nowhere"]))
+"""
+    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert finished.returncode == 2
+    assert finished.stderr == (
+        "error: not installed: bpy, trimesh; expected the build extra: pip install 'rebar-depth-bench[build]'\n"
+    )
 
 
 @pytest.mark.parametrize(

@@ -180,3 +180,12 @@ def test_a_damaged_ground_truth_is_named(
     with pytest.raises(DatasetError, match=f"view {view_id}: ground truth has digest"):
         score(archive_of(tiny_truth), copy)
     assert not list(copy.glob(f"{CACHE_FOLDER}/*lattice-*"))
+
+
+def test_a_damaged_cache_is_made_anew(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+    archive = archive_of(tiny_truth)
+    before = score(archive, tiny_root).to_json()
+    for name in ("views.json", "index.npy"):
+        cached = next(tiny_root.glob(f"{CACHE_FOLDER}/rebar-1-lattice-*/{name}"))
+        cached.write_bytes(cached.read_bytes()[:20])
+        assert score(archive, tiny_root).to_json() == before

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from dataset_builder.audit.report import Check
+from dataset_builder.plan import BUILD_FOLDER
 from rebar_depth_bench.digests import file_sha256, views_digest
 from rebar_depth_bench.folder import MANIFEST, DatasetFolder
-from rebar_depth_bench.ground_truth import CACHE_FOLDER
 
 
 def check_files(folder: DatasetFolder, root: Path) -> Check:
@@ -16,6 +16,8 @@ def check_files(folder: DatasetFolder, root: Path) -> Check:
     problems = [problem for name, sha256 in named.items() if (problem := _file_problem(root, name, sha256))]
     strangers = sorted(_present(root) - set(named) - {MANIFEST})
     problems += [f"{name}: is not in the manifest" for name in strangers]
+    if (root / BUILD_FOLDER).exists():
+        problems.append(f"{BUILD_FOLDER}: an unfinished build stands there; run rebar-build again or remove it")
     return Check("files against the manifest", f"{len(named)} files", "every SHA-256 equal", tuple(problems))
 
 
@@ -44,4 +46,4 @@ def _file_problem(root: Path, name: str, sha256: str) -> str | None:
 def _present(root: Path) -> set[str]:
     """Return the folder's files, those of the scoring cache and other hidden folders left out."""
     names = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
-    return {name for name in names if not name.startswith((".", CACHE_FOLDER))}
+    return {name for name in names if not name.startswith(".")}

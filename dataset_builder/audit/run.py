@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,11 @@ from dataset_builder.bars_table import read_bars
 from dataset_builder.model import Bar
 from dataset_builder.protocols import subset
 from dataset_builder.publish import BARS
-from rebar_depth_bench.dataset import load
-from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.dataset import iterate
+from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.folder import DatasetFolder, open_folder
-from rebar_depth_bench.schema import EYES
+from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.schema import EYES, features
 
 MAX_BOARD_ERROR_M = 1e-6
 MAX_AXIS_RATIO = 1.2
@@ -36,15 +37,15 @@ MAX_CYCLES_MEDIAN_M = 1e-6
 MAX_CYCLES_OFF_SHARE = 1e-3
 CYCLES_OFF_M = 1e-3
 
-Progress = Callable[[str, int, int], None]
 
-
-def audit(root: str | Path, *, depth_views: int = 4, progress: Progress | None = None) -> AuditReport:
+def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent) -> AuditReport:
     """Check every invariant of a local dataset folder and its ground truth against other sources.
 
     ``depth_views`` views per config, spread evenly, are rendered again by Cycles' depth pass.
-    Raises ``DatasetError`` where the folder cannot be read at all.
+    Raises ``DatasetError`` where the folder cannot be read at all, ``InputError`` for a negative ``depth_views``.
     """
+    if depth_views < 0:
+        raise InputError(f"--depth-views is {depth_views}, expected 0 or more")
     folder = open_folder(root)
     if folder.local is None:
         raise DatasetError(f"{root}: is not a folder on this machine, expected one to audit")
@@ -52,7 +53,7 @@ def audit(root: str | Path, *, depth_views: int = 4, progress: Progress | None =
     checks = [files, check_digests(folder)]
     if files.passed:  # rows of a damaged folder cannot be judged
         for config in folder.configs:
-            checks += _config_checks(folder, folder.local, config, depth_views, progress or _silent)
+            checks += _config_checks(folder, folder.local, config, depth_views, progress)
     return AuditReport(str(root), tuple(checks))
 
 
@@ -64,19 +65,23 @@ def _config_checks(
     bar_ids = {bar.bar_id for bar in steel}
     problems: list[str] = []
     geometry = _Geometry(entry, steel)
-    again = set(subset(len(records), depth_views))
+    again = set(subset(len(records), depth_views) if depth_views else ())
     kept = []
-    rows = load(root, config, streaming=True)
-    for n, (row, record) in enumerate(zip(rows, records, strict=False)):
-        problems += row_problems(row, record, entry["rig"], bar_ids)
+    rows = iterate(root, config, tuple(features()))
+    found = 0
+    for n, row in enumerate(rows):
+        found = n + 1
+        if found > len(records):
+            continue
+        problems += row_problems(row, records[n], entry["rig"], bar_ids)
         geometry.add(row)
         if n in again:
             kept.append(row)
         progress(f"audit of {config}", n + 1, len(records))
-    if n + 1 != len(records):
-        problems.append(f"{config} has {n + 1} rows, the manifest {len(records)}")
+    if found != len(records):
+        problems.append(f"{config} has {found} rows, the manifest names {len(records)} views")
     checks = [
-        Check(f"{config}: rows", f"{n + 1} views", "all invariants", tuple(problems)),
+        Check(f"{config}: rows", f"{found} views", "all invariants", tuple(problems)),
         *geometry.checks(config),
     ]
     if kept:
@@ -84,6 +89,8 @@ def _config_checks(
             root / entry["mesh"], kept, lambda done, total: progress(f"Cycles depth of {config}", done, total)
         )
         checks.append(_cycles_check(config, off_m, len(kept)))
+    else:
+        checks.append(Check(f"{config}: depth against Cycles", "skipped", "none asked for"))
     return checks
 
 
@@ -157,7 +164,3 @@ def _cycles_check(config: str, off_m: np.ndarray[Any, Any], views: int) -> Check
         f"median {MAX_CYCLES_MEDIAN_M * 1e6:g} um, {MAX_CYCLES_OFF_SHARE:.1%} over 1 mm",
         (found,) if bad else (),
     )
-
-
-def _silent(what: str, done: int, total: int) -> None:
-    """Show nothing."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -26,12 +27,13 @@ from dataset_builder.stopwatch import Stopwatch
 from dataset_builder.tasks import RenderTask
 from rebar_depth_bench.cameras import ideal_K, pixel_rays, right_of_rig
 from rebar_depth_bench.digests import file_sha256
+from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.ply import write_mesh_ply
 from rebar_depth_bench.schema import EYES
 
 
 def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None]) -> None:
-    """Stage every view of the task that is not staged yet; report each, and the digest of the scene's mesh."""
+    """Stage every view of the task that is not staged yet; report each."""
     watch = Stopwatch()
     staging = Staging(task.staging)
     with watch.timing("scene"):
@@ -39,10 +41,10 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
         build_scene(assembly, task.config.scene)
         configure_colour(task.config.colour, task.threads)
         mesh = evaluated_world_mesh()
-        mesh_sha256 = _stage_mesh(mesh, staging.mesh)
+        _stage_mesh(mesh, staging.mesh)
         caster = RayCaster(mesh)
         left_poses = poses(task.config.protocol, aim_point_m(assembly), task.config.rig)
-    report({"mesh_sha256": mesh_sha256, "seconds": watch.take()})
+    report({"seconds": watch.take()})
     with tempfile.TemporaryDirectory(dir=task.staging) as scratch:
         for index in task.indices:
             path = staging.row(index)
@@ -85,7 +87,10 @@ def _cycles_seed(config: ConfigSpec, index: int, eye_index: int) -> int:
     return int(np.random.SeedSequence(entropy).generate_state(1)[0] >> 1)
 
 
-def _stage_mesh(mesh: WorldMesh, path: Path) -> str:
-    if not path.exists():
-        write_mesh_ply(path, mesh.vertices_m, mesh.faces, mesh.face_bar_id)
-    return file_sha256(path)
+def _stage_mesh(mesh: WorldMesh, path: Path) -> None:
+    """Stage the scene's mesh; every shard of a config must be cast against the very same one."""
+    own = path.with_name(f"mesh-{os.getpid()}.ply")
+    write_mesh_ply(own, mesh.vertices_m, mesh.faces, mesh.face_bar_id)
+    if path.exists() and file_sha256(path) != file_sha256(own):
+        raise BuildError(f"{own}: the scene's mesh differs from {path}, which another shard was cast against")
+    own.replace(path)

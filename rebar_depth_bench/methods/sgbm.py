@@ -21,8 +21,11 @@ from rebar_depth_bench.methods.method import Method, MethodInfo, Predictor
 BLOCK_PX = 3
 SEARCH_SHARE_OF_WIDTH = 0.5
 """Disparities from 0 to this share of the width are searched: any distance from 0.13 m on, for the ideal rig."""
+SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 96, 600
+"""Per pixel of a block: higher than OpenCV's examples, for bars repeat and their background is plain."""
+PRE_FILTER_CAP = 63
 WLS_LAMBDA = 8000.0
-WLS_SIGMA_COLOUR = 1.5
+WLS_SIGMA_COLOUR = 2.5
 _FIXED_POINT = 16.0
 
 
@@ -76,8 +79,9 @@ def filtered_disparity_px(
         minDisparity=0,
         numDisparities=search_px,
         blockSize=BLOCK_PX,
-        P1=8 * 3 * BLOCK_PX**2,
-        P2=32 * 3 * BLOCK_PX**2,
+        P1=SMALL_STEP_PENALTY * BLOCK_PX**2,
+        P2=LARGE_STEP_PENALTY * BLOCK_PX**2,
+        preFilterCap=PRE_FILTER_CAP,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
     right_matcher = cv2.ximgproc.createRightMatcher(matcher)

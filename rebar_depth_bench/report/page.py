@@ -5,7 +5,6 @@ Every text that comes from an archive or a dataset passes ``printable`` and jinj
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -17,7 +16,7 @@ from rebar_depth_bench.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
 from rebar_depth_bench.report import charts
 from rebar_depth_bench.report.panels import ViewImages, ViewPanels, colour_bar_uri, view_images
-from rebar_depth_bench.result import Result, Table, ViewScore
+from rebar_depth_bench.result import Result, Table, ViewScore, badness
 from rebar_depth_bench.submission import config_of
 
 WORST_SHOWN = 10
@@ -126,7 +125,7 @@ def _views_by_config(result: Result) -> Mapping[str, list[ViewScore]]:
 
 
 def _config(name: str, views: Sequence[ViewScore]) -> _Config:
-    worst = sorted(views, key=_badness, reverse=True)[:WORST_SHOWN]
+    worst = sorted(views, key=badness, reverse=True)[:WORST_SHOWN]
     return _Config(
         name=wording.printable(name),
         chart=charts.views_chart(name, views),
@@ -134,13 +133,6 @@ def _config(name: str, views: Sequence[ViewScore]) -> _Config:
         all=[_view_row(view) for view in views] if len(views) > WORST_SHOWN else [],
         views=len(views),
     )
-
-
-def _badness(view: ViewScore) -> float:
-    """Return what views are sorted by: native AbsRel; no prediction at all and overflows are the worst."""
-    if view.native is None or not math.isfinite(view.native.abs_rel):
-        return math.inf
-    return view.native.abs_rel
 
 
 def _table_row(name: str, table: Table) -> _Row:

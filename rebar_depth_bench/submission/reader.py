@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import Self
 
+from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.submission.decode import FORMATS, Depth
 from rebar_depth_bench.submission.layout import ExpectedViews, lay_out, size_limit
 from rebar_depth_bench.submission.metadata import METADATA_NAME, MetadataError, SubmissionMeta, parse_metadata
@@ -30,10 +31,9 @@ class _Inspection:
 
 
 class SubmissionReader:
-    """An open archive. Made by ``open_submission``; a context manager; pickles by path.
+    """An open archive. Made by ``open_submission``; a context manager.
 
-    ``read`` may be called from many threads at once. A pickled reader opens and checks the file again
-    where it is unpickled. The file must not be written to while it is open.
+    ``read`` may be called from many threads at once. The file must not be written to while it is open.
     """
 
     def __init__(self, path: str | os.PathLike[str], expected: ExpectedViews) -> None:
@@ -81,15 +81,22 @@ class SubmissionReader:
             raise EntryError(f"{view_id}.png: {METADATA_NAME} has no depth_scale, expected metres per PNG unit")
         return self._decode(view_id, scale or 1.0)
 
-    def problems(self) -> Iterator[str]:
+    def problems(self, progress: Progress = silent) -> Iterator[str]:
         """Yield every problem: those of the structure, then those of decoding each view in sorted order."""
         yield from self.structure_problems
         scale = self.meta.depth_scale if self.meta else None
-        for view_id in self.view_ids:
+        for done, view_id in enumerate(self.view_ids, start=1):
+            progress(f"checking {self.path.name}", done, len(self.view_ids))
             try:
                 self._decode(view_id, scale or 1.0)
             except EntryError as error:
                 yield error.problem
+
+    def sha256(self) -> str:
+        """Return the hex SHA-256 of the very file that is read."""
+        if self._source is None:
+            raise ValueError(f"{self.path}: the submission is closed")
+        return self._source.sha256()
 
     def close(self) -> None:
         """Close the file; arrays already read stay valid."""
@@ -118,9 +125,6 @@ class SubmissionReader:
     ) -> None:
         self.close()
 
-    def __reduce__(self) -> tuple[type[Self], tuple[Path, dict[str, tuple[int, int]]]]:
-        return type(self), (self.path, self._expected)
-
 
 def open_submission(path: str | os.PathLike[str], expected: ExpectedViews) -> SubmissionReader:
     """Open an archive and check its structure; ``expected`` has every view of the dataset folder.
@@ -130,10 +134,10 @@ def open_submission(path: str | os.PathLike[str], expected: ExpectedViews) -> Su
     return SubmissionReader(path, expected)
 
 
-def check_archive(path: str | os.PathLike[str], expected: ExpectedViews) -> list[str]:
+def check_archive(path: str | os.PathLike[str], expected: ExpectedViews, progress: Progress = silent) -> list[str]:
     """Return every problem of an archive, each entry decoded; an empty list means it can be scored."""
     with open_submission(path, expected) as reader:
-        return list(reader.problems())
+        return list(reader.problems(progress))
 
 
 def _file_problem(path: Path) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import mmap
 import os
 import weakref
@@ -21,6 +22,9 @@ class ByteSource(Protocol):
 
     def read_at(self, offset: int, length: int) -> memoryview:
         """Return exactly ``length`` bytes, or raise ``EOFError`` if the source holds fewer."""
+
+
+_PIECE_BYTES = 1 << 20
 
 
 class FileSource:
@@ -45,6 +49,15 @@ class FileSource:
         lead = offset % mmap.ALLOCATIONGRANULARITY
         mapped = mmap.mmap(self._fd, lead + length, access=mmap.ACCESS_READ, offset=offset - lead)
         return memoryview(mapped)[lead:]
+
+    def sha256(self) -> str:
+        """Return the hex SHA-256 of the whole file, read in pieces."""
+        digest = hashlib.sha256()
+        offset = 0
+        while piece := os.pread(self._fd, _PIECE_BYTES, offset):
+            digest.update(piece)
+            offset += len(piece)
+        return digest.hexdigest()
 
     def close(self) -> None:
         """Close the file; views already handed out stay valid. Closing twice is harmless."""

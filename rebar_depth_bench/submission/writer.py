@@ -6,9 +6,9 @@ import json
 import math
 import os
 import re
-import secrets
 import zipfile
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
@@ -16,6 +16,7 @@ from typing import BinaryIO, Self
 import numpy as np
 
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.files import replacing
 from rebar_depth_bench.submission.metadata import METADATA_NAME, method_problems, type_problems, url_problems
 from rebar_depth_bench.submission.npy import Depth
 from rebar_depth_bench.submission.problems import show
@@ -63,7 +64,7 @@ class SubmissionWriter:
         _check_metadata(self._metadata)
         self._seconds: dict[str, float] = {}
         self._view_ids: set[str] = set()
-        self._part: Path | None = None
+        self._open = ExitStack()
         self._file: BinaryIO | None = None
         self._zip: zipfile.ZipFile | None = None
 
@@ -86,7 +87,7 @@ class SubmissionWriter:
         if seconds is not None and not (isinstance(seconds, int | float) and 0 <= seconds < math.inf):
             raise InputError(f"{view_id}: seconds is {seconds!r}, expected a finite number of at least 0")
         values = _as_depth(view_id, depth)
-        self._write_entry(f"{view_id}.npy", _npy_header(values), values.data.cast("B"))
+        self._write_entry(self._zip, f"{view_id}.npy", _npy_header(values), values.data.cast("B"))
         self._view_ids.add(view_id)
         if seconds is not None:
             self._seconds[view_id] = float(seconds)
@@ -96,43 +97,26 @@ class SubmissionWriter:
             raise InputError(f"{self.path.parent}: no such folder, expected one to write the archive into")
         if self.path.is_dir():
             raise InputError(f"{self.path}: the path is a directory, expected a file name for the archive")
-        part = self.path.with_name(f".{self.path.name}.{secrets.token_hex(8)}.part")
-        self._file = part.open("xb")
-        self._part = part
-        self._zip = zipfile.ZipFile(self._file, "w", allowZip64=True)
+        with ExitStack() as stack:
+            part = stack.enter_context(replacing(self.path))
+            self._file = stack.enter_context(part.open("wb"))
+            self._zip = zipfile.ZipFile(self._file, "w", allowZip64=True)
+            self._open = stack.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            if kind is None:
-                self._finish()
-        finally:
-            self._discard()
-
-    def _finish(self) -> None:
-        assert self._zip is not None
-        assert self._file is not None
-        assert self._part is not None
-        self._write_entry(METADATA_NAME, b"", memoryview(self._metadata_bytes()))
-        self._zip.close()
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._part.replace(self.path)
-        self._part = None
-        _sync_folder(self.path.parent)
-
-    def _discard(self) -> None:
-        """Close what is open and remove the unfinished file, if any."""
-        archive, file, part = self._zip, self._file, self._part
-        self._zip = self._file = self._part = None
-        if part is not None:
-            part.unlink(missing_ok=True)
-        if archive is not None and archive.fp is not None:
-            archive.fp = None  # Closing it would write a directory into the discarded file.
-        if file is not None:
-            file.close()
+        archive, self._zip = self._zip, None
+        assert archive is not None
+        with self._open:
+            try:
+                if error is not None:
+                    raise error
+                self._write_entry(archive, METADATA_NAME, b"", memoryview(self._metadata_bytes()))
+                archive.close()
+            finally:
+                archive.fp = None  # closing it again would write a directory into a discarded file
 
     def _metadata_bytes(self) -> bytes:
         values = {key: value for key, value in self._metadata.items() if value is not None}
@@ -141,8 +125,7 @@ class SubmissionWriter:
             values["runtime"] = {**(runtime if isinstance(runtime, dict) else {}), "seconds": self._seconds}
         return (json.dumps(values, indent=2, sort_keys=True) + "\n").encode("utf-8")
 
-    def _write_entry(self, name: str, header: bytes, body: memoryview) -> None:
-        assert self._zip is not None
+    def _write_entry(self, archive: zipfile.ZipFile, name: str, header: bytes, body: memoryview) -> None:
         assert self._file is not None
         info = zipfile.ZipInfo(name, _EPOCH)
         info.create_system = 3
@@ -151,7 +134,7 @@ class SubmissionWriter:
         info.file_size = len(header) + len(body)
         if self._compression == zipfile.ZIP_STORED:
             info.extra = _padding(self._file.tell() + _LOCAL_HEADER + len(name) + len(header))
-        with self._zip.open(info, "w") as entry:
+        with archive.open(info, "w") as entry:
             entry.write(header)
             entry.write(body)
 
@@ -197,11 +180,3 @@ def _check_metadata(values: Mapping[str, object]) -> None:
         found.append(f"the metadata is not JSON ({error}), expected text, finite numbers, lists and objects")
     if found:
         raise InputError("; ".join(found))
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

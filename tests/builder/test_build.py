@@ -234,9 +234,28 @@ def test_bad_requests_end_in_words_and_write_nothing(
     assert not root.exists()
 
 
-def test_a_foreign_folder_is_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
+@pytest.mark.parametrize("marker", ["notes.txt", ".build/state", "manifest.json", ".rebar-build/state"])
+def test_a_foreign_folder_is_left_alone(tmp_path: Path, marker: str) -> None:
+    foreign = [marker, "meshes/mine.ply", "lattice/test-0-of-1.parquet", ".draft.tmp"]
+    for name in foreign:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("mine")
     refused = run_build("--out", tmp_path, *LATTICE)
     assert refused.returncode == 2
-    assert "is not empty and holds no manifest.json" in refused.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert "Traceback" not in refused.stderr
+    assert sorted(
+        path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()
+    ) == sorted(foreign)
+
+
+def test_what_a_kill_between_publishing_and_tidying_leaves_is_mended(lattice_only: Path) -> None:
+    """The staging of a published config, and a card that is not the manifest's."""
+    before = contents(lattice_only)
+    key = json.loads((lattice_only / "manifest.json").read_text())["configs"]["lattice"]["key"]
+    leftover = lattice_only / BUILD_FOLDER / f"lattice-{key[:16]}" / "rows"
+    leftover.mkdir(parents=True)
+    assert "up to date" in run_build("--out", lattice_only, *LATTICE).stdout
+    assert not (lattice_only / BUILD_FOLDER).exists()
+    (lattice_only / "README.md").write_text("of a build that was killed")
+    assert "built: lattice" in run_build("--out", lattice_only, *LATTICE).stdout
+    assert contents(lattice_only) == before

@@ -7,9 +7,11 @@ import pytest
 
 from dataset_builder.assemblies import aim_point_m, make_assembly
 from dataset_builder.configs import CONFIGS
+from dataset_builder.model import WorldMesh
 from dataset_builder.protocols import poses, subset
+from dataset_builder.raycast import RayCaster
 from dataset_builder.specs import ConfigSpec
-from rebar_depth_bench.cameras import camera_centre, ideal_K, project, right_of_rig, transform
+from rebar_depth_bench.cameras import camera_centre, ideal_K, pixel_rays, project, right_of_rig, transform
 
 
 @pytest.fixture(params=["lattice", "lattice-orbit"])
@@ -57,6 +59,21 @@ def test_the_rigs_middle_axis_passes_through_the_target(config: ConfigSpec) -> N
         seen_right = transform(right_of_rig(left, config.rig.baseline_m), target)
         assert seen_left == pytest.approx([config.rig.baseline_m / 2, 0, seen_left[2]], abs=1e-9)
         assert seen_right == pytest.approx([-config.rig.baseline_m / 2, 0, seen_left[2]], abs=1e-9)
+
+
+def test_steel_covers_as_much_of_the_frame_as_in_the_paper(config: ConfigSpec) -> None:
+    assembly = make_assembly(config.scene.assembly)
+    meshes = [part.mesh for part in assembly.parts]
+    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+    steel = WorldMesh(
+        np.concatenate([mesh.vertices_m for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]).astype(np.int32),
+        np.ones(sum(len(mesh.faces) for mesh in meshes), np.uint16),
+    )
+    caster, rays = RayCaster(steel), pixel_rays(ideal_K(160, 90), 160, 90)
+    left_poses = poses(config.protocol, aim_point_m(assembly), config.rig)[::5]
+    share = np.mean([caster.cast(rays, pose).mask.mean() for pose in left_poses])
+    assert 0.045 <= share <= 0.072
 
 
 def test_cameras_stand_above_the_board_and_upright(config: ConfigSpec) -> None:
