@@ -108,6 +108,11 @@ def test_errors_in_words(tiny_root: Path, tmp_path: Path) -> None:
         rdb.load(tmp_path / "missing", "lattice")
 
 
+def test_a_hub_repository_that_cannot_be_had_is_told_in_words() -> None:
+    with pytest.raises(rdb.DatasetError, match="as a Hub repository its manifest.json cannot be had"):
+        rdb.load("nobody/nothing-here", "lattice")
+
+
 def test_manifest_knows_every_view(tiny_root: Path) -> None:
     folder = open_folder(tiny_root)
     assert folder.configs == ("lattice", "lattice-orbit")
