@@ -12,6 +12,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +36,12 @@ _TRUTH_COLUMNS = ("view_id", *(f"left_{kind}" for kind in _KINDS if kind != "rgb
 
 @dataclass(frozen=True, eq=False)
 class ViewTruth:
-    """One view's scored pixels: flat indices into its H x W grid, and their planar depth in metres."""
+    """One view's scored pixels: flat indices into its H x W grid, their planar depth in metres, and its median."""
 
     view_id: str
     index: UInt32[ndarray, " n"]
     depth_m: Float32[ndarray, " n"]
+    median_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,13 +50,15 @@ class ConfigTruth:
 
     view_ids: tuple[str, ...]
     starts: tuple[int, ...]
+    medians_m: tuple[float, ...]
     index: UInt32[ndarray, " n"]
     depth_m: Float32[ndarray, " n"]
 
     def __iter__(self) -> Iterator[ViewTruth]:
         """Yield the views."""
-        for view_id, start, end in zip(self.view_ids, self.starts, self.starts[1:], strict=False):
-            yield ViewTruth(view_id, self.index[start:end], self.depth_m[start:end])
+        bounds = pairwise(self.starts)
+        for view_id, (start, end), median_m in zip(self.view_ids, bounds, self.medians_m, strict=True):
+            yield ViewTruth(view_id, self.index[start:end], self.depth_m[start:end], median_m)
 
 
 def config_truth(folder: DatasetFolder, config: str, progress: Progress = silent) -> ConfigTruth:
@@ -76,6 +80,7 @@ def _read_cache(cached: Path) -> ConfigTruth:
     return ConfigTruth(
         view_ids=tuple(outline["view_ids"]),
         starts=tuple(outline["starts"]),
+        medians_m=tuple(outline["medians_m"]),
         index=np.load(cached / "index.npy", mmap_mode="r"),
         depth_m=np.load(cached / "depth_m.npy", mmap_mode="r"),
     )
@@ -113,13 +118,14 @@ def _fill_cache(folder: DatasetFolder, config: str, target: Path, progress: Prog
 
 def _write_arrays(
     folder: DatasetFolder, config: str, into: Path, progress: Progress
-) -> dict[str, list[str] | list[int]]:
+) -> dict[str, list[str] | list[int] | list[float]]:
     records = {view.view_id: view for view in folder.views(config)}
     total = sum(view.scored_px for view in records.values())
     index = _new_array(into / "index.npy", np.uint32, total)
     depth_m = _new_array(into / "depth_m.npy", np.float32, total)
     view_ids: list[str] = []
     starts = [0]
+    medians_m: list[float] = []
     rows = iterate(folder.root, config, _TRUTH_COLUMNS)
     for done, row in enumerate(rows, start=1):
         record = records.pop(row["view_id"], None)
@@ -127,7 +133,9 @@ def _write_arrays(
         if len(pixels):
             end = starts[-1] + len(pixels)
             index[starts[-1] : end] = pixels
-            depth_m[starts[-1] : end] = row["left_depth"].ravel()[pixels]
+            scored_m = row["left_depth"].ravel()[pixels]
+            depth_m[starts[-1] : end] = scored_m
+            medians_m.append(float(np.median(scored_m.astype(np.float64))))
             view_ids.append(row["view_id"])
             starts.append(end)
         progress(f"ground truth of {config}", done, done + len(records))
@@ -135,7 +143,7 @@ def _write_arrays(
         raise DatasetError(f"{folder.root}: {config} lacks {len(records)} views, among them {min(records)}")
     index.flush()
     depth_m.flush()
-    return {"view_ids": view_ids, "starts": starts}
+    return {"view_ids": view_ids, "starts": starts, "medians_m": medians_m}
 
 
 def _new_array(path: Path, dtype: type, length: int) -> np.memmap[Any, Any]:

@@ -63,14 +63,17 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
     """Return the numbers of one view's prediction (planar depth, metres) on the view's scored pixels."""
     gathered = prediction_m.ravel()[truth.index]
     valid = is_prediction(gathered)
-    p_m = gathered[valid].astype(np.float64)
-    z_m = truth.depth_m[valid].astype(np.float64)
+    if valid.all():
+        p_m, z_m, z_median_m = gathered.astype(np.float64), truth.depth_m.astype(np.float64), truth.median_m
+    else:
+        p_m, z_m = gathered[valid].astype(np.float64), truth.depth_m[valid].astype(np.float64)
+        z_median_m = float(np.median(z_m)) if len(z_m) else 0.0
     scored_px = len(truth.index)
     within_mm = shares_within(np.abs(p_m - z_m), scored_px, WITHIN_MM)
     coverage = len(p_m) / scored_px
     if not len(p_m):
         return ViewScore(truth.view_id, scored_px, coverage, None, None, None, within_mm)
-    scale = median_scale(p_m, z_m)
+    scale = median_scale(p_m, z_median_m)
     with np.errstate(over="ignore"):
         scaled_m = scale * p_m
     return ViewScore(

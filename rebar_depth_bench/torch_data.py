@@ -27,7 +27,6 @@ _LEFT = {
     "poses": "left_cam_from_world",
 }
 _RIGHT = {f"right_{key}": column.replace("left", "right") for key, column in _LEFT.items()}
-_IMAGES = ("rgb", "depth", "mask")
 
 
 def torch_loader(
@@ -77,11 +76,12 @@ class _Collate:
 
 
 def _tensor(key: str, stacked: np.ndarray[Any, Any]) -> torch.Tensor:
+    """Return a batch's tensor; colour keeps its channels last in memory, which costs no copy."""
     kind = key.removeprefix("right_")
     tensor = torch.from_numpy(stacked)
-    if kind not in _IMAGES:
-        return tensor
-    return tensor.permute(0, 3, 1, 2).contiguous() if kind == "rgb" else tensor[:, None]
+    if kind == "rgb":
+        return tensor.permute(0, 3, 1, 2)
+    return tensor[:, None] if kind in ("depth", "mask") else tensor
 
 
 class _Stream(TorchIterableDataset[Mapping[str, Any]]):

@@ -109,7 +109,7 @@ def test_errors_in_words(tiny_root: Path, tmp_path: Path) -> None:
 
 
 def test_a_hub_repository_that_cannot_be_had_is_told_in_words() -> None:
-    with pytest.raises(rdb.DatasetError, match="as a Hub repository its manifest.json cannot be had"):
+    with pytest.raises(rdb.DatasetError, match=r"as a Hub repository its manifest\.json cannot be had"):
         rdb.load("nobody/nothing-here", "lattice")
 
 

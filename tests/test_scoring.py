@@ -146,7 +146,7 @@ def test_blanking_pixels_never_improves_what_ranks(seed: int, share: float, blan
     rng = np.random.default_rng(seed)
     z = rng.uniform(0.2, 0.5, 400).astype(np.float32)
     p = (z * rng.uniform(0.5, 2.0) + rng.normal(0, 0.02, 400)).astype(np.float32)
-    truth = ViewTruth("lattice/0000", np.arange(400, dtype=np.uint32), z)
+    truth = ViewTruth("lattice/0000", np.arange(400, dtype=np.uint32), z, float(np.median(z)))
     whole = score_view(truth, p.reshape(20, 20))
     blanked = p.copy()
     worst_first = np.argsort(-np.abs(p - z))

@@ -24,6 +24,7 @@ SEARCH_SHARE_OF_WIDTH = 0.5
 SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 96, 600
 """Per pixel of a block: higher than OpenCV's examples, for bars repeat and their background is plain."""
 PRE_FILTER_CAP = 63
+MIN_PARALLAX_PX = 1.0
 WLS_LAMBDA = 8000.0
 WLS_SIGMA_COLOUR = 2.5
 _FIXED_POINT = 16.0
@@ -51,13 +52,14 @@ def disparity_to_depth_m(
     right_K: Float64[ndarray, "3 3"],
     baseline_m: float,
 ) -> Float32[ndarray, "h w"]:
-    """Return z = fx * B / (disparity - (cx_left - cx_right)); NaN where the disparity is not positive.
+    """Return z = fx * B / (disparity - (cx_left - cx_right)); NaN where the parallax is below a pixel.
 
-    A pixel whose match would lie left of the right picture has no match there: NaN as well.
+    There a depth is worth nothing: half a pixel more or less halves or doubles it. A pixel whose match would lie
+    left of the right picture has no match: NaN as well.
     """
     columns = np.arange(disparity_px.shape[1], dtype=np.float64)
     parallax_px = disparity_px - (left_K[0, 2] - right_K[0, 2])
-    matched = (disparity_px > 0) & (parallax_px > 0) & (columns - disparity_px >= 0)
+    matched = (disparity_px > 0) & (parallax_px >= MIN_PARALLAX_PX) & (columns - disparity_px >= 0)
     depth_m = np.full(disparity_px.shape, np.nan, np.float32)
     depth_m[matched] = left_K[0, 0] * baseline_m / parallax_px[matched]
     return depth_m
