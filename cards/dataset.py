@@ -95,7 +95,9 @@ def _config_row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
     seen = steel > 0
     return {
         "name": name,
-        "views": len(views),
+        "views": f"{len(views)} of {entry['protocol_views']}",
+        "samples": entry["colour"]["samples"],
+        "steel_source": _steel_source(entry["scene"]["assembly"]),
         "grid": f"{rig['width']} x {rig['height']}",
         "distance": _distance(entry["protocol"]),
         "steel": f"{100 * np.mean(steel) / (rig['width'] * rig['height']):.1f} %",
@@ -103,6 +105,10 @@ def _config_row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
         "out_of_protocol": int(np.count_nonzero(scored == 0)),
         "megabytes": f"{entry['bytes'] / 1e6:.1f}",
     }
+
+
+def _steel_source(assembly: Mapping[str, Any]) -> str:
+    return f"`{assembly['path']}`, not the standard one" if assembly["kind"] == "mesh-file" else assembly["kind"]
 
 
 def _distance(protocol: Mapping[str, Any]) -> str:

@@ -9,9 +9,12 @@ from numpy import ndarray
 from dataset_builder.lattice import lattice_assembly
 from dataset_builder.mesh_door import load_assembly
 from dataset_builder.model import Assembly
-from dataset_builder.specs import LatticeSpec, MeshFileSpec
+from dataset_builder.protocols import offsets_m
+from dataset_builder.specs import ConfigSpec, LatticeSpec, MeshFileSpec
+from rebar_depth_bench.errors import MeshError
 
 _TARGET_DECIMALS = 3
+_BELOW_BOARD_M = 0.001
 
 
 def make_assembly(spec: LatticeSpec | MeshFileSpec) -> Assembly:
@@ -19,6 +22,21 @@ def make_assembly(spec: LatticeSpec | MeshFileSpec) -> Assembly:
     if isinstance(spec, MeshFileSpec):
         return load_assembly(spec)
     return lattice_assembly(spec)
+
+
+def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
+    """Raise ``MeshError`` where an assembly reaches below the board or out to the config's nearest camera."""
+    vertices_m = np.concatenate([part.mesh.vertices_m for part in assembly.parts])
+    lowest_m = float(vertices_m[:, 2].min())
+    if lowest_m < -_BELOW_BOARD_M:
+        raise MeshError(f"the assembly reaches down to z = {lowest_m:.4g} m, expected it on the board, z = 0")
+    reach_m = float(np.linalg.norm(vertices_m - aim_point_m(assembly), axis=1).max())
+    nearest_m = min(float(np.linalg.norm(offset)) for offset in offsets_m(config.protocol))
+    if reach_m >= nearest_m:
+        raise MeshError(
+            f"the assembly reaches {reach_m:.4g} m from its middle, expected less than the {nearest_m:.4g} m "
+            f"at which the cameras of {config.name} stand: is the unit right?"
+        )
 
 
 def aim_point_m(assembly: Assembly) -> Float64[ndarray, 3]:

@@ -10,12 +10,19 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dataset_builder.assemblies import make_assembly
+from dataset_builder.assemblies import check_fits, make_assembly
 from dataset_builder.blender_process import BlenderProcesses, Event
 from dataset_builder.configs import BuildRequest, check_request
 from dataset_builder.lock import build_lock
 from dataset_builder.plan import BUILD_FOLDER, ConfigPlan, plan_request
-from dataset_builder.publish import check_folder, check_scenes, is_published, publish_config, sweep
+from dataset_builder.publish import (
+    check_folder,
+    check_scenes,
+    is_published,
+    mend_descriptions,
+    publish_config,
+    sweep,
+)
 from dataset_builder.shards import runs_of_views
 from dataset_builder.tasks import RenderTask
 from rebar_depth_bench.progress import Progress, silent
@@ -43,8 +50,8 @@ def build(
     """
     check_request(request)
     plans = plan_request(request, out)
-    for assembly in {plan.spec.scene.assembly for plan in plans}:
-        make_assembly(assembly)  # a bad mesh file is told before anything is written
+    for plan in plans:  # a bad mesh file is told before anything is written
+        check_fits(make_assembly(plan.spec.scene.assembly), plan.spec)
     check_folder(out)
     with build_lock(out / BUILD_FOLDER):
         try:
@@ -61,12 +68,14 @@ def _build_plans(
     summary = BuildSummary()
     for plan in plans:
         if is_published(out, plan):
+            mend_descriptions(out, plan)
             summary.up_to_date.append(plan.spec.name)
         else:
             _render(plan, workers, threads, progress, summary)
             publish_config(out, plan)
             summary.built.append(plan.spec.name)
-        shutil.rmtree(plan.staging.root, ignore_errors=True)
+        for staging in plan.all_stagings():
+            shutil.rmtree(staging, ignore_errors=True)
     return summary
 
 

@@ -15,6 +15,7 @@ from dataset_builder.specs import ConfigSpec
 from rebar_depth_bench.digests import parameters_digest
 from rebar_depth_bench.version import software_version
 
+_KEY_CHARACTERS = 16
 BUILD_FOLDER = ".rebar-build"
 _STAMPED = ("bpy", "embreex", "numpy", "opencv-contrib-python-headless", "OpenEXR", "pillow", "pyarrow")
 """Libraries that decide bytes; their versions are part of the key and stand in the manifest."""
@@ -29,6 +30,10 @@ class ConfigPlan:
     key: str
     staging: Staging
 
+    def all_stagings(self) -> list[Path]:
+        """Return the staging folders of this config, those of abandoned builds with other parameters included."""
+        return list(self.staging.root.parent.glob(f"{self.spec.name}-{'[0-9a-f]' * _KEY_CHARACTERS}"))
+
     @property
     def parameters(self) -> dict[str, Any]:
         """Every parameter of the config, as the manifest holds it."""
@@ -40,7 +45,7 @@ def plan_config(spec: ConfigSpec, views: int | None, out: Path) -> ConfigPlan:
     indices = tuple(subset(len(offsets_m(spec.protocol)), views))
     decides_bytes = [config_parameters(spec), indices, VIEWS_PER_SHARD, generator_stamp()]
     key = parameters_digest(decides_bytes)
-    return ConfigPlan(spec, indices, key, Staging(out / BUILD_FOLDER / f"{spec.name}-{key[:16]}"))
+    return ConfigPlan(spec, indices, key, Staging(out / BUILD_FOLDER / f"{spec.name}-{key[:_KEY_CHARACTERS]}"))
 
 
 def plan_request(request: BuildRequest, out: Path) -> list[ConfigPlan]:

@@ -2,7 +2,7 @@
 
 Shards first, under names that carry their content's digest; then meshes and bars; then the card; the manifest
 last. Files that the new manifest no longer names go afterwards. A folder whose card, bars or meshes are not those
-of its manifest was left by a kill in between: the next build publishes anew.
+of its manifest was left by a kill in between: the next build mends it.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from dataset_builder.bars_table import read_bars, write_bars
 from dataset_builder.configs import CONFIGS
 from dataset_builder.lock import LOCK
 from dataset_builder.plan import BUILD_FOLDER, ConfigPlan, generator_stamp
+from dataset_builder.protocols import offsets_m
 from dataset_builder.shards import pack_shard, runs_of_views, staged_record
 from rebar_depth_bench.digests import file_sha256, parameters_digest, views_digest
 from rebar_depth_bench.errors import InputError
@@ -35,13 +36,20 @@ _DIGEST_CHARACTERS = 12
 
 
 def is_published(out: Path, plan: ConfigPlan) -> bool:
-    """Return whether the folder already holds exactly what the plan would build."""
+    """Return whether the folder already holds the shards and the mesh that the plan would build, byte for byte."""
     manifest = _manifest(out)
     entry = manifest["configs"].get(plan.spec.name)
     if entry is None or entry["key"] != plan.key:
         return False
-    small = all(_is_as_named(out, name, manifest) for name in (entry["mesh"], BARS, CARD))
-    return small and all((out / name).is_file() for name in entry["shards"])
+    return all(_is_as_named(out, name, manifest) for name in (*entry["shards"], entry["mesh"]))
+
+
+def mend_descriptions(out: Path, plan: ConfigPlan) -> None:
+    """Write bars, card and manifest of a published config again if bars or card are not the manifest's."""
+    manifest = _manifest(out)
+    if not all(_is_as_named(out, name, manifest) for name in (BARS, CARD)):
+        _write_bars(out, plan)
+        _write_manifest(out, manifest["configs"])
 
 
 def _is_as_named(out: Path, name: str, manifest: Mapping[str, Any]) -> bool:
@@ -75,14 +83,14 @@ def check_scenes(out: Path, plans: Sequence[ConfigPlan]) -> None:
 def publish_config(out: Path, plan: ConfigPlan) -> None:
     """Put a fully staged config into the folder and remove what it replaces."""
     shards = _publish_shards(out, plan)
-    scene = plan.spec.scene.name
-    mesh = f"{MESHES}/{scene}.ply"
+    mesh = f"{MESHES}/{plan.spec.scene.name}.ply"
     write_bytes(out / mesh, plan.staging.mesh.read_bytes())
-    write_bars(out / BARS, {**read_bars(out / BARS), scene: make_assembly(plan.spec.scene.assembly).bars})
+    _write_bars(out, plan)
     records = [staged_record(plan.staging.row(index)) for index in plan.indices]
     entry = {
         **plan.parameters,
         "key": plan.key,
+        "protocol_views": len(offsets_m(plan.spec.protocol)),
         "generator": generator_stamp(),
         "mesh": mesh,
         "shards": shards,
@@ -91,6 +99,11 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
         "views": [asdict(record) for record in records],
     }
     _write_manifest(out, {**_manifest(out)["configs"], plan.spec.name: entry})
+
+
+def _write_bars(out: Path, plan: ConfigPlan) -> None:
+    scene = plan.spec.scene
+    write_bars(out / BARS, {**read_bars(out / BARS), scene.name: make_assembly(scene.assembly).bars})
 
 
 def sweep(out: Path) -> None:

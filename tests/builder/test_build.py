@@ -209,7 +209,10 @@ def test_manifest_and_card_describe_the_folder(lattice_only: Path) -> None:
     scene = manifest["configs"]["lattice"]["scene"]
     assert scene["assembly"]["diameters_m"] == [0.007, 0.004]
     assert manifest["configs"]["lattice"]["generator"]["bpy"].startswith("4.5")
-    assert "| `lattice` | 9 | 160 x 90 | 0.22-0.43 m |" in (lattice_only / "README.md").read_text()
+    assert (
+        "| `lattice` | lattice | 9 of 504 | 160 x 90 | 1 | 0.22-0.43 m |"
+        in (lattice_only / "README.md").read_text()
+    )
 
 
 @pytest.mark.parametrize(
@@ -252,10 +255,19 @@ def test_what_a_kill_between_publishing_and_tidying_leaves_is_mended(lattice_onl
     """The staging of a published config, and a card that is not the manifest's."""
     before = contents(lattice_only)
     key = json.loads((lattice_only / "manifest.json").read_text())["configs"]["lattice"]["key"]
-    leftover = lattice_only / BUILD_FOLDER / f"lattice-{key[:16]}" / "rows"
-    leftover.mkdir(parents=True)
+    for name in (key[:16], "0123456789abcdef"):
+        (lattice_only / BUILD_FOLDER / f"lattice-{name}" / "rows").mkdir(parents=True)
     assert "up to date" in run_build("--out", lattice_only, *LATTICE).stdout
     assert not (lattice_only / BUILD_FOLDER).exists()
-    (lattice_only / "README.md").write_text("of a build that was killed")
+    for name in ("README.md", "bars.parquet"):
+        (lattice_only / name).unlink()
+        assert "up to date" in run_build("--out", lattice_only, *LATTICE).stdout
+        assert contents(lattice_only) == before
+
+
+def test_a_damaged_shard_is_built_again(lattice_only: Path) -> None:
+    before = contents(lattice_only)
+    shard = next(lattice_only.glob("lattice/*-00001-of-*.parquet"))
+    shard.write_bytes(shard.read_bytes()[:-1] + b"!")
     assert "built: lattice" in run_build("--out", lattice_only, *LATTICE).stdout
     assert contents(lattice_only) == before

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from dataset_builder.assemblies import aim_point_m, make_assembly
+from dataset_builder.assemblies import aim_point_m, check_fits, make_assembly
 from dataset_builder.configs import CONFIGS
 from dataset_builder.model import WorldMesh
 from dataset_builder.protocols import poses, subset
 from dataset_builder.raycast import RayCaster
 from dataset_builder.specs import ConfigSpec
 from rebar_depth_bench.cameras import camera_centre, ideal_K, pixel_rays, project, right_of_rig, transform
+from rebar_depth_bench.errors import MeshError
 
 
 @pytest.fixture(params=["lattice", "lattice-orbit"])
@@ -94,3 +97,22 @@ def test_subset_is_spread_evenly_and_whole_when_all_are_wanted() -> None:
         assert len(set(indices)) == wanted
         gaps = np.diff(indices)
         assert not len(gaps) or np.ptp(gaps) <= 1
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift_m", "words"),
+    [
+        (1000, 0.0, "is the unit right"),
+        (1, -0.01, "reaches down to z = -0.00995 m, expected it on the board"),
+    ],
+)
+def test_an_assembly_that_does_not_fit_the_cameras_is_refused(scale: float, shift_m: float, words: str) -> None:
+    config = CONFIGS["lattice"]()
+    assembly = make_assembly(config.scene.assembly)
+    check_fits(assembly, config)
+    moved = [
+        replace(part, mesh=replace(part.mesh, vertices_m=scale * part.mesh.vertices_m + [0, 0, shift_m]))
+        for part in assembly.parts
+    ]
+    with pytest.raises(MeshError, match=words):
+        check_fits(replace(assembly, parts=tuple(moved)), config)
