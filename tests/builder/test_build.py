@@ -104,10 +104,12 @@ def test_killed_again_and_again_it_finishes_to_the_same_bytes(lattice_only: Path
 def test_no_render_process_outlives_a_killed_build(tmp_path: Path) -> None:
     build = start_build(tmp_path / "dataset", *LATTICE)
     wait_until(lambda: render_processes_of(build.pid))
-    render = render_processes_of(build.pid)
+    rendering = [Path(f"/proc/{pid}") for pid in render_processes_of(build.pid)]
+    assert all(process.exists() for process in rendering)
     os.kill(build.pid, signal.SIGKILL)
     build.communicate()
-    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in render), timeout_s=20)
+    wait_until(lambda: not any(process.exists() for process in rendering), timeout_s=20)
+    assert not any(process.exists() for process in rendering)
 
 
 def test_other_worker_counts_give_the_same_bytes(lattice_only: Path, tmp_path: Path) -> None:
