@@ -7,7 +7,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -140,13 +139,29 @@ def test_a_closed_pipe_is_no_traceback(predicted: dict[str, Path], tiny_root: Pa
     assert "constant" in finished.stdout
 
 
+SLOW_METHOD = """
+import sys, time
+from dataclasses import replace
+from rebar_depth_bench.cli import main
+from rebar_depth_bench.methods import METHODS, Method
+
+constant = METHODS["constant"]
+
+def load():
+    predict = constant.load()
+    return lambda row: (time.sleep(0.5), predict(row))[1]
+
+METHODS["slow"] = Method(replace(constant.info, name="slow"), load)
+sys.exit(main(sys.argv[1:]))
+"""
+
+
 def test_an_interrupted_prediction_leaves_nothing(tiny_root: Path, tmp_path: Path) -> None:
-    archive = tmp_path / "half.zip"
-    command = [sys.executable, "-m", "rebar_depth_bench", "predict", "sgbm", "--data", str(tiny_root)]
-    running = subprocess.Popen([*command, "--out", str(archive)], stderr=subprocess.PIPE, text=True)
+    command = [sys.executable, "-c", SLOW_METHOD, "predict", "slow", "--data", str(tiny_root)]
+    command += ["--out", str(tmp_path / "half.zip")]
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert running.stderr is not None
     assert "1 of 9" in running.stderr.readline()
-    time.sleep(0.05)
     running.send_signal(signal.SIGINT)
     _, complaint = running.communicate(timeout=60)
     assert running.returncode == 1
