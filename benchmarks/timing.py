@@ -29,9 +29,11 @@ def machine() -> str:
     return f"{models[0] if models else platform.processor()}, {os.cpu_count()} cores, load {load:.1f} at the start"
 
 
-def print_markdown(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+def print_markdown(
+    headings: Sequence[str], rows: Sequence[Sequence[object]], say: Callable[[str], object] = print
+) -> None:
     """Print a Markdown table."""
-    print(f"| {' | '.join(headings)} |")
-    print(f"|{'---|' * len(headings)}")
+    say(f"| {' | '.join(headings)} |")
+    say(f"|{'---|' * len(headings)}")
     for row in rows:
-        print(f"| {' | '.join(str(cell) for cell in row)} |")
+        say(f"| {' | '.join(str(cell) for cell in row)} |")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
@@ -10,18 +13,20 @@ from dataset_builder.lattice import lattice_assembly
 from dataset_builder.mesh_door import load_assembly
 from dataset_builder.model import Assembly
 from dataset_builder.protocols import offsets_m
-from dataset_builder.specs import ConfigSpec, LatticeSpec, MeshFileSpec
+from dataset_builder.specs import AssemblySpec, ConfigSpec, LatticeSpec, MeshFileSpec
 from rebar_depth_bench.errors import MeshError
 
+_MAKERS: Mapping[type, Callable[[Any], Assembly]] = {
+    LatticeSpec: lattice_assembly,
+    MeshFileSpec: load_assembly,
+}
 _TARGET_DECIMALS = 3
 _BELOW_BOARD_M = 0.001
 
 
-def make_assembly(spec: LatticeSpec | MeshFileSpec) -> Assembly:
-    """Return the bars and meshes of an assembly; raise ``MeshError`` where a mesh file cannot serve."""
-    if isinstance(spec, MeshFileSpec):
-        return load_assembly(spec)
-    return lattice_assembly(spec)
+def make_assembly(spec: AssemblySpec) -> Assembly:
+    """Return the bars and meshes of an assembly; raise ``MeshError`` where a user's file cannot serve."""
+    return _MAKERS[type(spec)](spec)
 
 
 def check_fits(assembly: Assembly, config: ConfigSpec) -> None:

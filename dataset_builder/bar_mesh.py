@@ -63,6 +63,29 @@ def ribbed_bar_mesh(
     return Mesh(vertices, _tube_faces(len(ring_at), len(theta)))
 
 
+def plain_bar_mesh(centreline_m: Float64[ndarray, "n 3"], diameter_m: float, segments: int = 24) -> Mesh:
+    """Return the watertight mesh of a bar without ribs, for bars so far away that ribs are a fraction of a pixel.
+
+    A ring stands at every point of ``centreline_m`` (metres), both ends are flat and closed. The polygon of
+    ``segments`` corners has the area of the nominal section.
+    """
+    axis = _Axis.along(np.asarray(centreline_m, dtype=np.float64))
+    if diameter_m <= 0:
+        raise ValueError(f"diameter_m is {diameter_m}, a bar needs a positive one")
+    theta = np.arange(segments) * 2 * np.pi / segments
+    radius_m = plain_outer_radius_m(diameter_m, segments)
+    s_m = np.repeat(axis.arc_m[:, None], segments, axis=1)
+    side = axis.surface_points_m(s_m, theta, np.full_like(s_m, radius_m))
+    vertices = np.concatenate([side.reshape(-1, 3), axis.points_m[[0, -1]]])
+    return Mesh(vertices, _tube_faces(len(axis.points_m), segments))
+
+
+def plain_outer_radius_m(diameter_m: float, segments: int = 24) -> float:
+    """Return the circumradius of the polygon that has the area of a circle of ``diameter_m``, metres."""
+    wedge = 2 * np.pi / segments
+    return float(diameter_m / 2 * np.sqrt(wedge / np.sin(wedge)))
+
+
 def outer_radius_m(diameter_m: float, ribs: RibPattern | None = None) -> float:
     """Return the distance from the axis that no point of a straight bar exceeds: core plus rib, metres."""
     ribs = RibPattern() if ribs is None else ribs

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from rebar_depth_bench.calibration import StereoCalibration
+
 
 @dataclass(frozen=True)
 class LatticeSpec:
@@ -20,6 +22,40 @@ class LatticeSpec:
     extent_m: float = 0.100
     pitch_m: float = 0.020
     diameters_m: tuple[float, float] = (0.007, 0.004)
+
+
+@dataclass(frozen=True)
+class PileSpec:
+    """Overlapping-hook stirrups that fell in a heap; ``state`` names the stored poses they came to rest in."""
+
+    kind: str = "pile"
+    stirrups: int = 6
+    diameter_m: float = 0.010
+    size_m: tuple[float, float] = (0.280, 0.200)
+    state: str = "pile-0"
+
+
+@dataclass(frozen=True)
+class PierSpec:
+    """A square pier cage of 231 bars: verticals, two lapped half hoops a level, and a tie a level."""
+
+    kind: str = "pier"
+    side_m: float = 4.80
+    height_m: float = 6.67
+    verticals: int = 96
+    levels: int = 45
+    vertical_diameter_m: float = 0.032
+    hoop_diameter_m: float = 0.016
+    tie_diameter_m: float = 0.016
+
+
+@dataclass(frozen=True)
+class CageFileSpec:
+    """An assembly read bar by bar from a TOML or IFC file; ``sha256`` pins its content."""
+
+    path: str
+    sha256: str
+    kind: str = "cage-file"
 
 
 @dataclass(frozen=True)
@@ -43,13 +79,28 @@ class BoardSpec:
     dictionary: str = "DICT_4X4_50"
 
 
+AssemblySpec = LatticeSpec | PileSpec | PierSpec | CageFileSpec | MeshFileSpec
+
+
+@dataclass(frozen=True)
+class AppearanceSpec:
+    """What the paper's scenes leave out: names of ``appearance.VARIANTS``, none in the standard configs."""
+
+    variants: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True)
 class SceneSpec:
-    """One scene: the steel, the board it stands on, and the seed of its surface variation."""
+    """One scene: the steel, what it stands on and in, and the seed of its surface variation.
+
+    ``environment`` is a name of ``blender.environments.ENVIRONMENTS``: ``laboratory`` or ``outdoors``.
+    """
 
     name: str
-    assembly: LatticeSpec | MeshFileSpec
-    board: BoardSpec
+    assembly: AssemblySpec
+    board: BoardSpec | None
+    environment: str = "laboratory"
+    appearance: AppearanceSpec = field(default_factory=AppearanceSpec)
     seed: int = 0
 
 
@@ -75,19 +126,27 @@ class RingSpec:
 
 @dataclass(frozen=True)
 class RigSpec:
-    """A parallel stereo rig with the ideal pinhole K of its grid."""
+    """A stereo rig and the grid it is seen on.
+
+    Without a ``calibration`` it is two parallel ideal pinholes, ``baseline_m`` apart. With one, ``grid`` tells
+    whether the images are the ``raw`` distorted ones or the ``rectified`` pair; ``baseline_m`` is then the
+    calibration's.
+    """
 
     width: int = 1280
     height: int = 720
     baseline_m: float = 0.120
+    calibration: StereoCalibration | None = None
+    grid: str = "ideal"
 
 
 @dataclass(frozen=True)
 class ColourSpec:
-    """How Cycles renders colour."""
+    """How Cycles renders colour; ``prefilter`` is how OIDN treats its albedo and normal guides."""
 
     samples: int = 16
     denoise: bool = True
+    prefilter: str = "FAST"
 
 
 @dataclass(frozen=True)

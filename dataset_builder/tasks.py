@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxtyping import Float64
-from numpy import ndarray
-
+from dataset_builder.optics import Camera
 from dataset_builder.specs import ConfigSpec
 
 
@@ -25,22 +23,12 @@ class RenderTask:
     threads: int
 
 
-@dataclass(frozen=True, eq=False)
-class DepthCamera:
-    """A camera of an audit: its pinhole matrix, pose and grid."""
-
-    K: Float64[ndarray, "3 3"]
-    cam_from_world: Float64[ndarray, "4 4"]
-    width: int
-    height: int
-
-
 @dataclass(frozen=True)
 class DepthTask:
     """Render Cycles' own planar depth of a mesh file from some cameras; one float32 .npy each into ``out``."""
 
     mesh: Path
-    cameras: tuple[DepthCamera, ...]
+    cameras: tuple[Camera, ...]
     out: Path
     threads: int
 

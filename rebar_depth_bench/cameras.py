@@ -82,7 +82,9 @@ def project(K: Float[ndarray, "3 3"], points_cam: Float[ndarray, "*n 3"]) -> Flo
     return np.asarray(homogeneous[..., :2] / homogeneous[..., 2:])
 
 
-def pixel_rays(K: Float[ndarray, "3 3"], width: int, height: int) -> Float[ndarray, "h w 3"]:
+def pixel_rays(
+    K: Float[ndarray, "3 3"], width: int, height: int, distortion: Float[ndarray, " 5"] | None = None
+) -> Float[ndarray, "h w 3"]:
     """Return ``((u - cx)/fx, (v - cy)/fy, 1)`` at every pixel centre: a ray's parameter is planar depth."""
     u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     return np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)

@@ -13,7 +13,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.blender_process import BlenderProcesses
-from dataset_builder.tasks import DepthCamera, DepthTask
+from dataset_builder.optics import Camera
+from dataset_builder.tasks import DepthTask
 from rebar_depth_bench.schema import EYES
 
 
@@ -22,8 +23,9 @@ def cycles_difference_m(
 ) -> Float64[ndarray, " n"]:
     """Return |dataset depth - Cycles depth|, metres, of every steel pixel of the rows' two eyes."""
     cameras = tuple(
-        DepthCamera(
+        Camera(
             row[f"{eye}_K"],
+            row[f"{eye}_distortion"],
             row[f"{eye}_cam_from_world"],
             row[f"{eye}_depth"].shape[1],
             row[f"{eye}_depth"].shape[0],

@@ -8,6 +8,7 @@ from jaxtyping import Float64
 from mathutils import Matrix
 from numpy import ndarray
 
+from dataset_builder.optics import Camera
 from rebar_depth_bench.cameras import inverse_rigid
 from rebar_depth_bench.errors import BuildError
 
@@ -19,24 +20,24 @@ NAME = "camera"
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def place_camera(
-    K: Float64[ndarray, "3 3"], cam_from_world: Float64[ndarray, "4 4"], width: int, height: int
-) -> float:
-    """Make the scene's camera the pinhole ``K`` (pixels, centres at integers) of a ``width`` x ``height`` grid.
+def place_camera(asked: Camera) -> float:
+    """Make the scene's camera the one asked for (pixel centres at integers).
 
     Returns the largest deviation between the asked 4 x 4 pose and the one Blender holds (it rounds to
     float32) and raises ``BuildError`` where that exceeds ``MAX_DEVIATION``. Raises ``ValueError`` for a
     skewed ``K``, or focal lengths whose ratio Blender's pixel aspect cannot hold.
     """
     camera = _scene_camera()
-    _set_grid(K, width, height)
-    _set_optics(camera.data, K, width, height)
-    wanted = inverse_rigid(cam_from_world) @ _OPENGL_FROM_OPENCV
+    _set_grid(asked.K, asked.width, asked.height)
+    _set_optics(camera.data, asked.K, asked.width, asked.height)
+    wanted = inverse_rigid(asked.cam_from_world) @ _OPENGL_FROM_OPENCV
     camera.matrix_world = Matrix(wanted.tolist())
     bpy.context.view_layer.update()
-    deviation = float(np.abs(placed_cam_from_world() - cam_from_world).max())
+    deviation = float(np.abs(placed_cam_from_world() - asked.cam_from_world).max())
     if deviation > MAX_DEVIATION:
-        raise BuildError(f"Blender holds a camera pose {deviation:.2e} off the one asked for:\n{cam_from_world}")
+        raise BuildError(
+            f"Blender holds a camera pose {deviation:.2e} off the one asked for:\n{asked.cam_from_world}"
+        )
     return deviation
 
 

@@ -27,6 +27,6 @@ def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None])
     configure_colour(ColourSpec(samples=1, denoise=False), task.threads)
     with tempfile.TemporaryDirectory(dir=task.out) as scratch:
         for n, camera in enumerate(task.cameras):
-            depth_m = render_depth(camera.K, camera.cam_from_world, camera.width, camera.height, Path(scratch))
+            depth_m = render_depth(camera, Path(scratch))
             np.save(task.out / f"{n}.npy", depth_m)
             report({"camera": n})

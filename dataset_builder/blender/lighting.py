@@ -32,8 +32,8 @@ PANELS = (
 )
 
 
-def add_lights() -> None:
-    """Light the open scene."""
+def add_laboratory_lights() -> None:
+    """Light the open scene as a room."""
     _add_sky()
     for panel in PANELS:
         _add_panel(panel)

@@ -10,11 +10,12 @@ from typing import Any
 import bpy
 import numpy as np
 import OpenEXR
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, UInt8
 from numpy import ndarray
 from PIL import Image
 
 from dataset_builder.blender.camera import place_camera
+from dataset_builder.optics import Camera
 from dataset_builder.specs import ColourSpec
 from rebar_depth_bench.errors import BuildError
 
@@ -38,7 +39,7 @@ def configure_colour(spec: ColourSpec, threads: int) -> None:
         use_denoising=spec.denoise,
         denoiser="OPENIMAGEDENOISE",
         denoising_quality="HIGH",
-        denoising_prefilter="FAST",
+        denoising_prefilter=spec.prefilter,
         denoising_input_passes="RGB_ALBEDO_NORMAL",
         max_bounces=3,
         diffuse_bounces=2,
@@ -53,37 +54,24 @@ def configure_colour(spec: ColourSpec, threads: int) -> None:
     _apply(scene.view_settings, exposure=EXPOSURE_STOPS, gamma=1.0)
 
 
-def render_colour(
-    K: Float64[ndarray, "3 3"],
-    cam_from_world: Float64[ndarray, "4 4"],
-    width: int,
-    height: int,
-    seed: int,
-    scratch_dir: Path,
-) -> UInt8[ndarray, "h w 3"]:
+def render_colour(camera: Camera, seed: int, scratch_dir: Path) -> UInt8[ndarray, "h w 3"]:
     """Render one colour picture; ``seed`` fixes its noise. Raises ``BuildError`` before ``configure_colour``."""
     scene = bpy.context.scene
     if scene.render.engine != "CYCLES":
         raise BuildError("the scene is not set up for colour: call configure_colour after build_scene")
-    place_camera(K, cam_from_world, width, height)
+    place_camera(camera)
     scene.cycles.seed = seed
     with _written(scratch_dir / "colour.png", file_format="PNG", color_mode="RGB", color_depth="8") as path:
         return np.array(Image.open(path).convert("RGB"), dtype=np.uint8)
 
 
-def render_depth(
-    K: Float64[ndarray, "3 3"],
-    cam_from_world: Float64[ndarray, "4 4"],
-    width: int,
-    height: int,
-    scratch_dir: Path,
-) -> Float32[ndarray, "h w"]:
+def render_depth(camera: Camera, scratch_dir: Path) -> Float32[ndarray, "h w"]:
     """Render planar depth through pixel centres, metres, 0.0 where nothing is; leaves all settings as found.
 
     Cycles takes depth from its first sample, which a filter of vanishing width keeps on the pixel centre.
     """
     scene, layer = bpy.context.scene, bpy.context.view_layer
-    place_camera(K, cam_from_world, width, height)
+    place_camera(camera)
     with (
         _overridden(scene.render, engine="CYCLES"),
         _overridden(scene.cycles, device="CPU", samples=1, use_adaptive_sampling=False, use_denoising=False),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.assemblies import aim_point_m, make_assembly
@@ -18,6 +18,7 @@ from dataset_builder.blender.render import configure_colour, render_colour
 from dataset_builder.blender.scene import build_scene
 from dataset_builder.configs import view_id
 from dataset_builder.model import WorldMesh
+from dataset_builder.optics import rig_cameras
 from dataset_builder.protocols import poses
 from dataset_builder.raycast import RayCaster
 from dataset_builder.rows import Eye, View, encode_view
@@ -25,11 +26,10 @@ from dataset_builder.shards import Staging, stage_row
 from dataset_builder.specs import ConfigSpec
 from dataset_builder.stopwatch import Stopwatch
 from dataset_builder.tasks import RenderTask
-from rebar_depth_bench.cameras import ideal_K, pixel_rays, right_of_rig
+from rebar_depth_bench.cameras import pixel_rays
 from rebar_depth_bench.digests import file_sha256
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.ply import write_mesh_ply
-from rebar_depth_bench.schema import EYES
 
 
 def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None]) -> None:
@@ -65,20 +65,17 @@ def _render_view(
     scratch: Path,
     watch: Stopwatch,
 ) -> View:
-    rig = config.rig
-    K = ideal_K(rig.width, rig.height)
-    rays_cam = pixel_rays(K, rig.width, rig.height)
     eyes = {}
-    for eye_index, eye in enumerate(EYES):
-        pose = left_cam_from_world if eye == "left" else right_of_rig(left_cam_from_world, rig.baseline_m)
+    for eye_index, (eye, camera) in enumerate(rig_cameras(config.rig, left_cam_from_world).items()):
         with watch.timing("colour"):
-            rgb: UInt8[ndarray, "h w 3"] = render_colour(
-                K, pose, rig.width, rig.height, _cycles_seed(config, index, eye_index), scratch
-            )
+            rgb = render_colour(camera, _cycles_seed(config, index, eye_index), scratch)
         with watch.timing("truth"):
-            truth = caster.cast(rays_cam, pose)
-        eyes[eye] = Eye(rgb, truth.depth_m, truth.mask, truth.bars, K, np.zeros(5), pose)
-    return View(view_id(config.name, index), eyes["left"], eyes["right"], rig.baseline_m)
+            rays_cam = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
+            truth = caster.cast(rays_cam, camera.cam_from_world)
+        eyes[eye] = Eye(
+            rgb, truth.depth_m, truth.mask, truth.bars, camera.K, camera.distortion, camera.cam_from_world
+        )
+    return View(view_id(config.name, index), eyes["left"], eyes["right"], config.rig.baseline_m)
 
 
 def _cycles_seed(config: ConfigSpec, index: int, eye_index: int) -> int:

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.blender.laboratory import SHEET_THICKNESS_M, laboratory
-from dataset_builder.blender.lighting import add_lights
+from dataset_builder.blender.environments import ENVIRONMENTS
+from dataset_builder.blender.laboratory import SHEET_THICKNESS_M
 from dataset_builder.blender.materials import material, paper, surface_variation
 from dataset_builder.blender.solids import box
 from dataset_builder.board import board_texture
@@ -26,16 +26,18 @@ SAME_SHAPE_M = 1e-9
 
 
 def build_scene(assembly: Assembly, spec: SceneSpec) -> None:
-    """Replace Blender's open file with the scene: one object per bar, the printed board and the room."""
+    """Replace Blender's open file with the scene: one object per bar, what it stands on and in."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     for part, mesh, origin_m in _with_shared_meshes(assembly.parts):
         steel = add_object(part, mesh, origin_m)
         for name, value in surface_variation(spec.seed, part.bar_id).items():
             steel[name] = value
-    for part in laboratory():
+    environment = ENVIRONMENTS[spec.environment]
+    for part in environment.parts():
         add_object(part, mesh_data(part.name, part.mesh, part.material), np.zeros(3))
-    _add_board(spec.board)
-    add_lights()
+    if spec.board is not None:
+        _add_board(spec.board)
+    environment.add_lights()
     bpy.context.view_layer.update()
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from numpy import ndarray
 from dataset_builder.board import marker_corners_m
 from dataset_builder.lattice import lattice_assembly
 from dataset_builder.model import WorldMesh
+from dataset_builder.optics import Camera
 from dataset_builder.protocols import aim_rig
 from dataset_builder.raycast import RayCaster
 from dataset_builder.specs import BoardSpec, ColourSpec, LatticeSpec, SceneSpec
@@ -33,15 +35,17 @@ BARS = 12
 TARGET_M = np.array([0.0, 0.0, 0.05])
 REPOSITORY = Path(__file__).parents[2]
 
-LOW = (ideal_K(128, 72), aim_rig(np.array([0.20, -0.24, 0.15]), TARGET_M, 0.12), 128, 72)
-ODD = (
+LOW = Camera(ideal_K(128, 72), np.zeros(5), aim_rig(np.array([0.20, -0.24, 0.15]), TARGET_M, 0.12), 128, 72)
+ODD = Camera(
     np.array([[70.0, 0.0, 40.3], [0.0, 83.0, 61.7], [0.0, 0.0, 1.0]]),
+    np.zeros(5),
     look_at(np.array([-0.3, -0.2, 0.3]), TARGET_M),
     110,
     90,
 )
-ABOVE = (
+ABOVE = Camera(
     np.array([[360.0, 0.0, 239.5], [0.0, 360.0, 179.5], [0.0, 0.0, 1.0]]),
+    np.zeros(5),
     look_at(np.array([0.0, 0.0, 0.44]), np.zeros(3), np.array([0.0, 1.0, 0.0])),
     480,
     360,
@@ -57,22 +61,22 @@ def probe(folder: Path) -> None:
 
     facts: dict[str, Any] = {}
     build_scene(lattice_assembly(SCENE.assembly), SCENE)  # type: ignore[arg-type]
-    facts["refusal"] = _message_of(lambda: render_colour(*LOW, seed=1, scratch_dir=folder))
-    facts["skew"] = _message_of(lambda: place_camera(LOW[0] + np.eye(3, k=1), *LOW[1:]))
+    facts["refusal"] = _message_of(lambda: render_colour(LOW, seed=1, scratch_dir=folder))
+    facts["skew"] = _message_of(lambda: place_camera(replace(LOW, K=LOW.K + np.eye(3, k=1))))
     mesh = evaluated_world_mesh()
-    arrays: dict[str, ndarray] = {"depth_first": render_depth(*ODD, scratch_dir=folder)}
+    arrays: dict[str, ndarray] = {"depth_first": render_depth(ODD, scratch_dir=folder)}
     configure_colour(ColourSpec(samples=2), threads=1)
-    arrays["colour"] = render_colour(*LOW, seed=1, scratch_dir=folder)
-    arrays["depth_low"] = render_depth(*LOW, scratch_dir=folder)
-    arrays["colour_after_depth"] = render_colour(*LOW, seed=1, scratch_dir=folder)
-    arrays["other_seed"] = render_colour(*LOW, seed=2, scratch_dir=folder)
+    arrays["colour"] = render_colour(LOW, seed=1, scratch_dir=folder)
+    arrays["depth_low"] = render_depth(LOW, scratch_dir=folder)
+    arrays["colour_after_depth"] = render_colour(LOW, seed=1, scratch_dir=folder)
+    arrays["other_seed"] = render_colour(LOW, seed=2, scratch_dir=folder)
     facts["left_over"] = sorted(path.name for path in folder.iterdir())
     build_scene(lattice_assembly(SCENE.assembly), SCENE)  # type: ignore[arg-type]
     again = evaluated_world_mesh()
     configure_colour(ColourSpec(samples=2), threads=2)
-    arrays["colour_two_threads"] = render_colour(*LOW, seed=1, scratch_dir=folder)
-    arrays["above"] = render_colour(*ABOVE, seed=1, scratch_dir=folder)
-    facts["deviation"] = place_camera(*LOW)
+    arrays["colour_two_threads"] = render_colour(LOW, seed=1, scratch_dir=folder)
+    arrays["above"] = render_colour(ABOVE, seed=1, scratch_dir=folder)
+    facts["deviation"] = place_camera(LOW)
     facts["mesh_repeats"] = _same_mesh(mesh, again)
     facts["objects"] = _steel_objects()
     _hide_and_move()
@@ -168,10 +172,10 @@ def test_exposure_is_sound(arrays: dict[str, ndarray]) -> None:
 
 @pytest.mark.parametrize(("name", "camera"), [("depth_low", LOW), ("depth_first", ODD)])
 def test_cycles_sees_the_evaluated_mesh(
-    arrays: dict[str, ndarray], mesh: WorldMesh, name: str, camera: tuple[Any, ...]
+    arrays: dict[str, ndarray], mesh: WorldMesh, name: str, camera: Camera
 ) -> None:
-    K, cam_from_world, width, height = camera
-    truth = RayCaster(mesh).cast(pixel_rays(K, width, height), cam_from_world)
+    rays_cam = pixel_rays(camera.K, camera.width, camera.height)
+    truth = RayCaster(mesh).cast(rays_cam, camera.cam_from_world)
     assert truth.mask.mean() > 0.01
     assert arrays[name].dtype == np.float32
     off_m = np.abs(arrays[name].astype(np.float64) - truth.depth_m)
@@ -225,9 +229,8 @@ def test_markers_are_where_the_layout_says_and_not_mirrored(arrays: dict[str, nd
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(arrays["above"])
     assert sorted(ids.ravel()) == list(range(6))
-    K, cam_from_world, _, _ = ABOVE
     for marker_id, found in zip(ids.ravel(), corners, strict=True):
-        expected = project(K, transform(cam_from_world, marker_corners_m(SCENE.board)[int(marker_id)]))
+        expected = project(ABOVE.K, transform(ABOVE.cam_from_world, marker_corners_m(BoardSpec())[int(marker_id)]))
         # Two samples a pixel leave the detector a pixel or two; a mirrored or turned marker is 40 px off.
         np.testing.assert_allclose(found[0], expected, atol=2.0)
 
