@@ -14,6 +14,12 @@ from cards.templates import render
 from rebar_depth_bench.schema import COLUMN_MEANINGS, column_kind, features
 
 SPLIT = "test"
+_OPTICS = {
+    "ideal": "",
+    "raw": "factory-calibrated lenses, on the distorted grid as the sensor sees it",
+    "rectified": "factory-calibrated lenses, on the grid that OpenCV's stereoRectify makes of the pair; "
+    "depth along the rectified axis",
+}
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 
 
@@ -103,12 +109,15 @@ def _config_row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
         "steel": f"{100 * np.mean(steel) / (rig['width'] * rig['height']):.1f} %",
         "kept": f"{100 * np.mean(scored[seen] / steel[seen]):.0f} %" if seen.any() else "none",
         "out_of_protocol": int(np.count_nonzero(scored == 0)),
+        "sheet": entry["sheet"],
+        "variants": entry["scene"]["appearance"]["variants"],
+        "optics": _OPTICS[rig["grid"]],
         "megabytes": f"{entry['bytes'] / 1e6:.1f}",
     }
 
 
 def _steel_source(assembly: Mapping[str, Any]) -> str:
-    return f"`{assembly['path']}`, not the standard one" if assembly["kind"] == "mesh-file" else assembly["kind"]
+    return f"`{assembly['path']}`, not a standard one" if "path" in assembly else assembly["kind"]
 
 
 def _distance(protocol: Mapping[str, Any]) -> str:

@@ -1,8 +1,8 @@
 """From staged pieces to the dataset folder, in an order that a kill at any moment leaves mendable.
 
-Shards first, under names that carry their content's digest; then meshes and bars; then the card; the manifest
-last. Files that the new manifest no longer names go afterwards. A folder whose card, bars or meshes are not those
-of its manifest was left by a kill in between: the next build mends it.
+Shards first, under names that carry their content's digest; then meshes and bars; then pictures and card; the
+manifest last. Files that the new manifest no longer names go afterwards. A folder whose card, bars or pictures are
+not those of its manifest was left by a kill in between: the next build mends it.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from dataset_builder.assemblies import make_assembly
 from dataset_builder.bars_table import read_bars, write_bars
 from dataset_builder.configs import CONFIGS
 from dataset_builder.lock import LOCK
+from dataset_builder.pictures import write_contact_sheet, write_scenes_strip
 from dataset_builder.plan import BUILD_FOLDER, ConfigPlan, generator_stamp
 from dataset_builder.protocols import offsets_m
 from dataset_builder.shards import pack_shard, runs_of_views, staged_record
@@ -31,6 +32,10 @@ from rebar_depth_bench.version import software_version
 BARS = "bars.parquet"
 MESHES = "meshes"
 CARD = "README.md"
+PICTURES = "pictures"
+STRIP = f"{PICTURES}/scenes.webp"
+"""One view of each kind of assembly, side by side."""
+_SHARDS = "*/test-*-of-*.parquet"
 _TEMPORARY = ".*.tmp"
 _DIGEST_CHARACTERS = 12
 
@@ -45,9 +50,11 @@ def is_published(out: Path, plan: ConfigPlan) -> bool:
 
 
 def mend_descriptions(out: Path, plan: ConfigPlan) -> None:
-    """Write bars, card and manifest of a published config again if bars or card are not the manifest's."""
+    """Write what describes a published config again if any of it is not the manifest's."""
     manifest = _manifest(out)
-    if not all(_is_as_named(out, name, manifest) for name in (BARS, CARD)):
+    descriptions = (BARS, CARD, STRIP, manifest["configs"][plan.spec.name]["sheet"])
+    if not all(_is_as_named(out, name, manifest) for name in descriptions):
+        write_contact_sheet(out, manifest["configs"][plan.spec.name]["shards"], out / _sheet(plan))
         _write_bars(out, plan)
         _write_manifest(out, manifest["configs"])
 
@@ -85,6 +92,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
     shards = _publish_shards(out, plan)
     mesh = f"{MESHES}/{plan.spec.scene.name}.ply"
     write_bytes(out / mesh, plan.staging.mesh.read_bytes())
+    write_contact_sheet(out, shards, out / _sheet(plan))
     _write_bars(out, plan)
     records = [staged_record(plan.staging.row(index)) for index in plan.indices]
     entry = {
@@ -93,6 +101,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
         "protocol_views": len(offsets_m(plan.spec.protocol)),
         "generator": generator_stamp(),
         "mesh": mesh,
+        "sheet": _sheet(plan),
         "shards": shards,
         "bytes": sum((out / name).stat().st_size for name in shards),
         "ground_truth_digest": views_digest([asdict(record) for record in records]),
@@ -106,10 +115,15 @@ def _write_bars(out: Path, plan: ConfigPlan) -> None:
     write_bars(out / BARS, {**read_bars(out / BARS), scene.name: make_assembly(scene.assembly).bars})
 
 
+def _sheet(plan: ConfigPlan) -> str:
+    return f"{PICTURES}/{plan.spec.name}.webp"
+
+
 def sweep(out: Path) -> None:
-    """Remove what a killed build left behind: temporary files, and shards and meshes no manifest names."""
+    """Remove what a killed build left behind: temporary files, and what no manifest names."""
     _remove_unnamed(out, _manifest(out))
-    for folder in (out, out / MESHES, *(out / name for name in CONFIGS)):
+    configs = {path.parent for path in out.glob(_SHARDS)}
+    for folder in (out, out / MESHES, out / PICTURES, *configs, *(out / name for name in CONFIGS)):
         for temporary in folder.glob(_TEMPORARY):
             temporary.unlink()
 
@@ -141,21 +155,23 @@ def _write_manifest(out: Path, configs: Mapping[str, Any]) -> None:
         "ground_truth": {"digest": views_digest(views)},
         "configs": ordered,
     }
+    by_scene = {entry["scene"]["assembly"]["kind"]: entry for entry in reversed(ordered.values())}
+    write_scenes_strip(out, list(reversed(by_scene.values())), out / STRIP)
     write_text(out / CARD, dataset_card(manifest))
-    named = [CARD, BARS, *_config_files(ordered.values())]
+    named = [CARD, BARS, STRIP, *_config_files(ordered.values())]
     manifest["files"] = {name: file_sha256(out / name) for name in sorted(set(named))}
     write_text(out / MANIFEST, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
     _remove_unnamed(out, manifest)
 
 
 def _config_files(entries: Iterable[Mapping[str, Any]]) -> list[str]:
-    return [name for entry in entries for name in (*entry["shards"], entry["mesh"])]
+    return [name for entry in entries for name in (*entry["shards"], entry["mesh"], entry["sheet"])]
 
 
 def _remove_unnamed(out: Path, manifest: Mapping[str, Any]) -> None:
     named = set(_config_files(manifest["configs"].values()))
-    shards = (path for name in CONFIGS for path in (out / name).glob("test-*-of-*.parquet"))
-    for path in [*shards, *(out / MESHES).glob("*.ply")]:
+    named.add(STRIP)
+    for path in [*out.glob(_SHARDS), *(out / MESHES).glob("*.ply"), *(out / PICTURES).glob("*.webp")]:
         if path.relative_to(out).as_posix() not in named:
             path.unlink()
 
