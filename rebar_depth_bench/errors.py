@@ -40,6 +40,15 @@ class SubmissionError(InputError):
         super().__init__(f"{archive}: {problem_summary(self.problems)}")
 
 
+class CalibrationError(InputError):
+    """A calibration file is refused: ``problems`` holds every reason, one sentence each."""
+
+    def __init__(self, path: str, problems: Sequence[str]) -> None:
+        self.path = path
+        self.problems = tuple(problems)
+        super().__init__(f"{path}: {problem_summary(self.problems)}")
+
+
 class BuildError(RebarDepthError):
     """A build could not finish for a reason that is not the user's input."""
 

@@ -39,7 +39,7 @@ COLUMN_MEANINGS: dict[str, str] = {
     "K": "3 x 3 pinhole matrix, pixels; pixel centres at integer coordinates",
     "distortion": "k1 k2 p1 p2 k3 (OpenCV), zeros where the grid has none",
     "cam_from_world": "4 x 4 rigid pose: `x_cam = cam_from_world @ x_world`; OpenCV axes, metres",
-    "baseline_m": "metres from the left to the right camera along the left one's x axis",
+    "baseline_m": "metres between the two camera centres; along the left one's x axis except on a raw grid",
 }
 """What a column holds, by its name or its kind (the name without the eye)."""
 

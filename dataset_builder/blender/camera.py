@@ -8,6 +8,7 @@ from jaxtyping import Float64
 from mathutils import Matrix
 from numpy import ndarray
 
+from dataset_builder.blender.distorted_camera import set_distorted_optics
 from dataset_builder.optics import Camera
 from rebar_depth_bench.cameras import inverse_rigid
 from rebar_depth_bench.errors import BuildError
@@ -21,15 +22,21 @@ _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def place_camera(asked: Camera) -> float:
-    """Make the scene's camera the one asked for (pixel centres at integers).
+    """Make the scene's camera the one asked for (pixel centres at integers): a pinhole, or a lens with distortion.
 
     Returns the largest deviation between the asked 4 x 4 pose and the one Blender holds (it rounds to
     float32) and raises ``BuildError`` where that exceeds ``MAX_DEVIATION``. Raises ``ValueError`` for a
-    skewed ``K``, or focal lengths whose ratio Blender's pixel aspect cannot hold.
+    skewed ``K``, or a pinhole's focal lengths whose ratio Blender's pixel aspect cannot hold.
     """
+    if asked.K[0, 1] != 0.0 or asked.K[1, 0] != 0.0:
+        raise ValueError(f"Blender's camera has no skew, K has:\n{asked.K}")
     camera = _scene_camera()
-    _set_grid(asked.K, asked.width, asked.height)
-    _set_optics(camera.data, asked.K, asked.width, asked.height)
+    distorted = asked.distortion.any()
+    _set_grid(asked.width, asked.height, aspect=1.0 if distorted else asked.K[1, 1] / asked.K[0, 0])
+    # The lens needs none of it, but what an earlier camera left would show in a few pixels' last bit.
+    _set_pinhole_optics(camera.data, asked.K, asked.width, asked.height)
+    if distorted:
+        set_distorted_optics(camera.data, asked)
     wanted = inverse_rigid(asked.cam_from_world) @ _OPENGL_FROM_OPENCV
     camera.matrix_world = Matrix(wanted.tolist())
     bpy.context.view_layer.update()
@@ -55,11 +62,8 @@ def _scene_camera() -> bpy.types.Object:
     return scene.camera
 
 
-def _set_grid(K: Float64[ndarray, "3 3"], width: int, height: int) -> None:
+def _set_grid(width: int, height: int, aspect: float) -> None:
     """Set the image size and the pixel aspect: fy / fx, which Blender takes as two numbers from 1 upwards."""
-    if K[0, 1] != 0.0 or K[1, 0] != 0.0:
-        raise ValueError(f"Blender's camera has no skew, K has:\n{K}")
-    aspect = K[1, 1] / K[0, 0]
     if not 1 / 200 <= aspect <= 200:
         raise ValueError(f"fy / fx is {aspect}, Blender's pixel aspect reaches from 1/200 to 200")
     render = bpy.context.scene.render
@@ -68,7 +72,7 @@ def _set_grid(K: Float64[ndarray, "3 3"], width: int, height: int) -> None:
     render.pixel_aspect_y = max(1 / aspect, 1.0)
 
 
-def _set_optics(optics: bpy.types.Camera, K: Float64[ndarray, "3 3"], width: int, height: int) -> None:
+def _set_pinhole_optics(optics: bpy.types.Camera, K: Float64[ndarray, "3 3"], width: int, height: int) -> None:
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     optics.type = "PERSP"
     optics.sensor_fit = "HORIZONTAL"

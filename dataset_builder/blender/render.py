@@ -17,6 +17,7 @@ from PIL import Image
 from dataset_builder.blender.camera import place_camera
 from dataset_builder.optics import Camera
 from dataset_builder.specs import ColourSpec
+from rebar_depth_bench.cameras import pixel_rays
 from rebar_depth_bench.errors import BuildError
 
 DEPTH_CHANNEL = "ViewLayer.Depth.Z"
@@ -68,7 +69,9 @@ def render_colour(camera: Camera, seed: int, scratch_dir: Path) -> UInt8[ndarray
 def render_depth(camera: Camera, scratch_dir: Path) -> Float32[ndarray, "h w"]:
     """Render planar depth through pixel centres, metres, 0.0 where nothing is; leaves all settings as found.
 
-    Cycles takes depth from its first sample, which a filter of vanishing width keeps on the pixel centre.
+    Cycles takes depth from its first sample, which a filter of vanishing width keeps on the pixel centre. Behind
+    a lens with distortion it gives the distance along the ray instead, which is divided by the length of the ray
+    ``(x, y, 1)``.
     """
     scene, layer = bpy.context.scene, bpy.context.view_layer
     place_camera(camera)
@@ -79,7 +82,14 @@ def render_depth(camera: Camera, scratch_dir: Path) -> Float32[ndarray, "h w"]:
         _overridden(layer, use_pass_z=True),
         _written(scratch_dir / "depth.exr", file_format="OPEN_EXR_MULTILAYER", color_depth="32") as path,
     ):
-        return _read_depth_m(path)
+        depth_m = _read_depth_m(path)
+    return depth_m / _range_over_depth(camera) if camera.distortion.any() else depth_m
+
+
+def _range_over_depth(camera: Camera) -> Float32[ndarray, "h w"]:
+    """Return how many times as far as its planar depth a point on each pixel's ray is."""
+    rays_cam = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
+    return np.asarray(np.linalg.norm(rays_cam, axis=-1), dtype=np.float32)
 
 
 def _read_depth_m(path: Path) -> Float32[ndarray, "h w"]:

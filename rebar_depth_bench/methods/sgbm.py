@@ -1,5 +1,7 @@
 """Semi-global block matching on the rectified pair, with OpenCV.
 
+A raw pair is rectified first and its depth brought back to the raw grid (``raw_stereo``).
+
 Matching: H. Hirschmueller, "Stereo Processing by Semiglobal Matching and Mutual Information", TPAMI 2008, in
 OpenCV's 3-way variant. Filter: D. Min et al., "Fast Global Image Smoothing Based on Weighted Least Squares",
 TIP 2014, guided by the left picture, with left-right consistency as confidence (opencv-contrib ximgproc).
@@ -34,11 +36,23 @@ def _load() -> Predictor:
     try:
         import cv2
         import cv2.ximgproc
+
+        from rebar_depth_bench import raw_stereo
     except ImportError as error:
         raise MethodError(
             f"sgbm needs OpenCV with ximgproc ({error}): pip install 'rebar-depth-bench[methods]'"
         ) from None
-    return lambda row: _predict(cv2, row)
+    return lambda row: (_predict if raw_stereo.is_rectified(row) else _predict_raw)(cv2, row)
+
+
+def _predict_raw(cv2: ModuleType, row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+    from rebar_depth_bench import raw_stereo
+
+    pair = raw_stereo.rectified_pair(row)
+    disparity_px = filtered_disparity_px(cv2, pair.left_rgb, pair.right_rgb)
+    depth_m = disparity_to_depth_m(disparity_px, pair.K, pair.K, pair.baseline_m)
+    depth_m[~raw_stereo.matched_in_right(pair, disparity_px)] = np.nan
+    return raw_stereo.raw_depth_m(pair, depth_m)
 
 
 def _predict(cv2: ModuleType, row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
@@ -98,7 +112,10 @@ SGBM = Method(
     MethodInfo(
         name="sgbm",
         summary="OpenCV semi-global matching, 3-way, with a weighted-least-squares filter, on the stereo pair",
-        columns=("left_rgb", "right_rgb", "left_K", "right_K", "baseline_m"),
+        columns=(
+            *("left_rgb", "right_rgb", "left_K", "right_K", "left_distortion", "right_distortion"),
+            *("left_cam_from_world", "right_cam_from_world", "baseline_m"),
+        ),
         uses_intrinsics=True,
         source="OpenCV StereoSGBM and ximgproc",
         licence="Apache-2.0",

@@ -1,0 +1,115 @@
+"""A pair on the raw grid for methods that want it rectified, and their depth brought back to the raw left grid.
+
+Nothing is invented on the way back: each raw pixel takes the one rectified pixel its ray falls on, and depth
+along the rectified axis becomes depth along the raw one by that ray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from numpy import ndarray
+
+from rebar_depth_bench.cameras import inverse_rigid, pixel_rays, project
+from rebar_depth_bench.rectification import Rectification, rectify_pair
+
+PARALLEL_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class RectifiedPair:
+    """A rectified pair, and the way back to the raw left grid.
+
+    Both pictures have the pinhole ``K`` (pixels) and lie on one canvas, wide enough for every raw pixel of both
+    eyes. ``seen_by_right`` tells which pixels of the canvas the raw right picture shows. ``pixel`` is the canvas
+    pixel (column, row) that each raw left pixel's ray falls on, ``depth_ratio`` raw depth over rectified depth.
+    """
+
+    left_rgb: UInt8[ndarray, "hc wc 3"]
+    right_rgb: UInt8[ndarray, "hc wc 3"]
+    K: Float64[ndarray, "3 3"]
+    baseline_m: float
+    seen_by_right: Bool[ndarray, "hc wc"]
+    pixel: Int64[ndarray, "h w 2"]
+    depth_ratio: Float64[ndarray, "h w"]
+
+
+def is_rectified(row: Mapping[str, Any]) -> bool:
+    """Tell whether a row's eyes are parallel pinholes, the right one on the left one's x axis."""
+    parallel = np.eye(4)
+    parallel[0, 3] = -row["baseline_m"]
+    straight = not (row["left_distortion"].any() or row["right_distortion"].any())
+    return straight and bool(np.abs(_right_from_left(row) - parallel).max() <= PARALLEL_TOLERANCE)
+
+
+def rectified_pair(row: Mapping[str, Any]) -> RectifiedPair:
+    """Rectify a dataset row's pair with its own K, distortion and poses (``rectification.rectify_pair``).
+
+    Raises ``ValueError`` in words for a lens model that cannot be inverted.
+    """
+    height, width, _ = row["left_rgb"].shape
+    Ks, distortions = (row["left_K"], row["right_K"]), (row["left_distortion"], row["right_distortion"])
+    rectified = rectify_pair(Ks, distortions, _right_from_left(row), width, height, row["baseline_m"])
+    rays = [
+        pixel_rays(K, width, height, distortion) @ rotation.T
+        for K, distortion, rotation in zip(Ks, distortions, _rotations(rectified), strict=True)
+    ]
+    K, canvas = _canvas(rectified.K, [project(rectified.K, eye) for eye in rays])
+    left, right = (
+        cv2.initUndistortRectifyMap(*eye, K, canvas, cv2.CV_32FC1)
+        for eye in zip(Ks, distortions, _rotations(rectified), strict=True)
+    )
+    return RectifiedPair(
+        left_rgb=_resampled(row["left_rgb"], left),
+        right_rgb=_resampled(row["right_rgb"], right),
+        K=K,
+        baseline_m=rectified.baseline_m,
+        seen_by_right=(np.abs(right[0] - (width - 1) / 2) <= width / 2)
+        & (np.abs(right[1] - (height - 1) / 2) <= height / 2),
+        pixel=np.rint(project(K, rays[0])).astype(np.int64),
+        depth_ratio=1.0 / rays[0][..., 2],
+    )
+
+
+def raw_depth_m(pair: RectifiedPair, rectified_depth_m: Float32[ndarray, "hc wc"]) -> Float32[ndarray, "h w"]:
+    """Return the raw left grid's planar depth from the rectified left picture's; NaN stays NaN."""
+    column, row = np.moveaxis(pair.pixel, -1, 0)
+    return np.asarray(rectified_depth_m[row, column] * pair.depth_ratio, dtype=np.float32)
+
+
+def matched_in_right(pair: RectifiedPair, disparity_px: Float32[ndarray, "hc wc"]) -> Bool[ndarray, "hc wc"]:
+    """Tell which pixels of the rectified left picture have their match inside the raw right picture."""
+    rows, columns = np.indices(disparity_px.shape)
+    match = np.rint(columns - np.nan_to_num(disparity_px)).astype(np.int64)
+    on_canvas = (match >= 0) & (match < disparity_px.shape[1])
+    return np.asarray(on_canvas & pair.seen_by_right[rows, np.where(on_canvas, match, 0)])
+
+
+def _right_from_left(row: Mapping[str, Any]) -> Float64[ndarray, "4 4"]:
+    return np.asarray(row["right_cam_from_world"] @ inverse_rigid(row["left_cam_from_world"]))
+
+
+def _rotations(rectified: Rectification) -> tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3 3"]]:
+    return rectified.R_left, rectified.R_right
+
+
+def _canvas(
+    K: Float64[ndarray, "3 3"], places_px: list[Float64[ndarray, "h w 2"]]
+) -> tuple[Float64[ndarray, "3 3"], tuple[int, int]]:
+    """Return K moved by whole pixels, and the width and height, so that all places lie on the canvas."""
+    low = np.floor(np.min([eye.min(axis=(0, 1)) for eye in places_px], axis=0)).astype(int)
+    high = np.ceil(np.max([eye.max(axis=(0, 1)) for eye in places_px], axis=0)).astype(int)
+    moved = K.copy()
+    moved[:2, 2] -= low
+    width, height = (high - low + 1).tolist()
+    return moved, (width, height)
+
+
+def _resampled(rgb: UInt8[ndarray, "h w 3"], maps: Any) -> UInt8[ndarray, "hc wc 3"]:
+    map_x, map_y = maps
+    return np.asarray(cv2.remap(rgb, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
