@@ -9,16 +9,30 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.cage_file import load_cage
 from dataset_builder.lattice import lattice_assembly
 from dataset_builder.mesh_door import load_assembly
 from dataset_builder.model import Assembly
+from dataset_builder.pier import pier_assembly
+from dataset_builder.pile import pile_assembly
 from dataset_builder.protocols import offsets_m
-from dataset_builder.specs import AssemblySpec, ConfigSpec, LatticeSpec, MeshFileSpec
+from dataset_builder.specs import (
+    AssemblySpec,
+    CageFileSpec,
+    ConfigSpec,
+    LatticeSpec,
+    MeshFileSpec,
+    PierSpec,
+    PileSpec,
+)
 from rebar_depth_bench.errors import MeshError
 
 _MAKERS: Mapping[type, Callable[[Any], Assembly]] = {
+    CageFileSpec: load_cage,
     LatticeSpec: lattice_assembly,
     MeshFileSpec: load_assembly,
+    PierSpec: pier_assembly,
+    PileSpec: pile_assembly,
 }
 _TARGET_DECIMALS = 3
 _BELOW_BOARD_M = 0.001

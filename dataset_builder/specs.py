@@ -26,7 +26,10 @@ class LatticeSpec:
 
 @dataclass(frozen=True)
 class PileSpec:
-    """Overlapping-hook stirrups that fell in a heap; ``state`` names the stored poses they came to rest in."""
+    """Overlapping-hook stirrups that fell in a heap; ``state`` names the stored poses they came to rest in.
+
+    ``size_m`` is a hoop's outside size, long side first, by the nominal diameter.
+    """
 
     kind: str = "pile"
     stirrups: int = 6
