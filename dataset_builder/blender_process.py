@@ -14,14 +14,17 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from dataset_builder.tasks import Task
-from rebar_depth_bench.errors import InputError, RenderProcessError
+from rebar_depth_bench.errors import BuildError, InputError, RebarDepthError, RenderProcessError
 
 Event = Mapping[str, Any]
+_ERRORS: Mapping[str, type[RebarDepthError]] = {"input_error": InputError, "build_error": BuildError}
+"""The events that end a task, and what each is raised as."""
 ATTEMPTS = 2
 _LOG_TAIL_LINES = 15
 
@@ -48,7 +51,8 @@ class BlenderProcesses:
     def run(self, task: Task, what: str, log: Path, on_event: Callable[[Event], None]) -> None:
         """Run ``task``; a process that dies is started once more, then ``RenderProcessError`` names ``what``.
 
-        Raises ``InputError`` in the process's own words where it found the input at fault.
+        Raises ``InputError`` in the process's own words where it found the input at fault, ``BuildError``
+        where it refused to go on.
         """
         for attempt in range(1, ATTEMPTS + 1):
             status = self._run_once(task, log, on_event)
@@ -99,13 +103,15 @@ def _send(stream: Any, task: Task) -> None:
     try:
         stream.write(pickle.dumps(task))
         stream.flush()
-    except BrokenPipeError:
-        return  # the process died at once; its exit status and log say why
+    except BrokenPipeError:  # the process died at once; its exit status and log say why
+        with suppress(BrokenPipeError):
+            stream.close()  # what it could not be told must not be tried again when the process is left
 
 
 def _pass_on(event: Event, on_event: Callable[[Event], None]) -> None:
-    if "input_error" in event:
-        raise InputError(event["input_error"])
+    for name, error in _ERRORS.items():
+        if name in event:
+            raise error(event[name])
     on_event(event)
 
 

@@ -1,4 +1,4 @@
-"""Builds or continues a dataset folder: plan, render in worker processes, pack, publish."""
+"""Builds or continues a dataset folder: plan, render units of work here or elsewhere, pack, publish."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import shutil
 import threading
 from collections import defaultdict
 from collections.abc import Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, wait
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from dataset_builder.assemblies import check_fits, make_assembly
-from dataset_builder.blender_process import BlenderProcesses, Event
 from dataset_builder.configs import BuildRequest, check_request
 from dataset_builder.lock import build_lock
 from dataset_builder.plan import BUILD_FOLDER, ConfigPlan, plan_request
@@ -23,8 +23,8 @@ from dataset_builder.publish import (
     publish_config,
     sweep,
 )
-from dataset_builder.shards import runs_of_views
-from dataset_builder.tasks import RenderTask
+from dataset_builder.renderers import Renderer, local_processes
+from dataset_builder.units import receive, units_of
 from rebar_depth_bench.progress import Progress, silent
 
 
@@ -38,15 +38,21 @@ class BuildSummary:
 
 
 def build(
-    request: BuildRequest, out: Path, *, workers: int, threads: int, progress: Progress = silent
+    request: BuildRequest,
+    out: Path,
+    *,
+    workers: int = 1,
+    threads: int = 1,
+    cluster: Renderer | None = None,
+    progress: Progress = silent,
 ) -> BuildSummary:
     """Build the requested configs in ``out``, or continue an interrupted build of the same ones.
 
-    ``workers`` render processes of ``threads`` threads each work at once; neither changes a byte of the
-    result. Each config is published as soon as it is complete.
+    ``workers`` render processes of ``threads`` threads each work at once on this machine, or the machines of a
+    ``cluster`` do; none of them changes a byte of the result. Each config is published as soon as it is complete.
 
     Raises ``InputError`` for a request that cannot be built, ``RenderProcessError`` when a render process
-    dies twice.
+    dies twice, ``BuildError`` where what came back does not match.
     """
     check_request(request)
     plans = plan_request(request, out)
@@ -57,21 +63,20 @@ def build(
         try:
             sweep(out)
             check_scenes(out, plans)
-            return _build_plans(plans, out, workers, threads, progress)
+            with nullcontext(cluster) if cluster else local_processes(workers, threads) as renderer:
+                return _build_plans(plans, out, renderer, progress)
         finally:
             _remove_build_folder(out / BUILD_FOLDER)
 
 
-def _build_plans(
-    plans: Sequence[ConfigPlan], out: Path, workers: int, threads: int, progress: Progress
-) -> BuildSummary:
+def _build_plans(plans: Sequence[ConfigPlan], out: Path, renderer: Renderer, progress: Progress) -> BuildSummary:
     summary = BuildSummary()
     for plan in plans:
         if is_published(out, plan):
             mend_descriptions(out, plan)
             summary.up_to_date.append(plan.spec.name)
         else:
-            _render(plan, workers, threads, progress, summary)
+            _render(plan, renderer, progress, summary)
             publish_config(out, plan)
             summary.built.append(plan.spec.name)
         for staging in plan.all_stagings():
@@ -79,41 +84,40 @@ def _build_plans(
     return summary
 
 
-def _render(plan: ConfigPlan, workers: int, threads: int, progress: Progress, summary: BuildSummary) -> None:
-    """Run the plan's shards through worker processes; on any failure or interrupt none is left running."""
+class _ViewCount:
+    """Counts a plan's staged views, each once, and tells the progress. Safe to call from any thread."""
+
+    def __init__(self, plan: ConfigPlan, progress: Progress) -> None:
+        self._plan = plan
+        self._progress = progress
+        self._done = {index for index in plan.indices if plan.staging.row(index).is_file()}
+        self._lock = threading.Lock()
+
+    def add(self, *indices: int) -> None:
+        """Count views as done; with none, tell how far the build is."""
+        with self._lock:
+            self._done.update(indices)
+            self._progress(self._plan.spec.name, len(self._done), len(self._plan.indices))
+
+
+def _render(plan: ConfigPlan, renderer: Renderer, progress: Progress, summary: BuildSummary) -> None:
+    """Render and stage what is left of the plan; on any failure or interrupt nothing more is started."""
     plan.staging.root.mkdir(parents=True, exist_ok=True)
-    done = {index for index in plan.indices if plan.staging.row(index).is_file()}
-    lock = threading.Lock()
-
-    def on_event(event: Event) -> None:
-        with lock:
-            for stage, spent in event["seconds"].items():
-                summary.seconds[stage] += spent
-            if "view" in event:
-                done.add(event["view"])
-            progress(plan.spec.name, len(done), len(plan.indices))
-
-    runs = [run for run in enumerate(runs_of_views(plan.indices)) if not _is_rendered(plan, run[1])]
-    with ThreadPoolExecutor(workers) as pool, BlenderProcesses() as blender:
-        futures = [
-            pool.submit(
-                blender.run,
-                RenderTask(plan.spec, shard, indices, plan.staging.root, threads),
-                f"{plan.spec.name} views {indices[0]} to {indices[-1]}",
-                plan.staging.log(shard),
-                on_event,
-            )
-            for shard, indices in runs
-        ]
-        finished, waiting = wait(futures, return_when=FIRST_EXCEPTION)
+    count = _ViewCount(plan, progress)
+    count.add()
+    waiting = {renderer.submit(unit, plan.staging, count.add): unit for unit in units_of(plan)}
+    try:
+        while waiting:
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                unit = waiting.pop(future)  # and with it its bytes, which may be many
+                delivery = future.result()
+                receive(unit, delivery, plan.staging)
+                for stage, spent in delivery.seconds.items():
+                    summary.seconds[stage] += spent
+                count.add(*unit.indices)
+    finally:
         for future in waiting:
             future.cancel()
-        for future in finished:
-            future.result()
-
-
-def _is_rendered(plan: ConfigPlan, indices: tuple[int, ...]) -> bool:
-    return plan.staging.mesh.is_file() and all(plan.staging.row(index).is_file() for index in indices)
 
 
 def _remove_build_folder(folder: Path) -> None:

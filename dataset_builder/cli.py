@@ -6,17 +6,20 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dataset_builder.configs import CONFIGS, BuildRequest
+from dataset_builder.appearance import VARIANTS
+from dataset_builder.configs import CONFIGS, LATTICE_CONFIGS, BuildRequest
 from rebar_depth_bench.console import ProgressBars, run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
 
 if TYPE_CHECKING:
     from dataset_builder.build import BuildSummary
+    from dataset_builder.renderers import Renderer
 
 _EXTRA = ("bpy", "cv2", "embreex", "trimesh")
 
@@ -24,7 +27,7 @@ _EXTRA = ("bpy", "cv2", "embreex", "trimesh")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-build``; return its exit status."""
     options = argument_parser().parse_args(arguments)
-    command = _audit if options.command == "audit" else _build
+    command = {"audit": _audit, "export": _export}.get(options.command, _build)
     return run_command(lambda: command(options), interrupted="interrupted; run the same command again to go on")
 
 
@@ -41,25 +44,56 @@ def _check_extra() -> None:
 def _build(options: argparse.Namespace) -> None:
     _check_extra()
     from dataset_builder.build import build
-    from dataset_builder.mesh_door import mesh_file_spec
 
     if options.out is None:
         raise InputError("--out ROOT is missing: the dataset folder to build")
-    if options.workers < 1:
-        raise InputError(f"--workers is {options.workers}, expected 1 or more")
-    request = BuildRequest(
-        configs=tuple(options.config or CONFIGS),
+    if options.cluster is not None and options.workers is not None:
+        raise InputError(
+            f"--workers {options.workers} stands beside --cluster {options.cluster}, expected one of them: "
+            "on a cluster its workers decide how many views are rendered at once"
+        )
+    workers = 1 if options.workers is None else options.workers
+    if workers < 1:
+        raise InputError(f"--workers is {workers}, expected 1 or more")
+    request = _request(options)
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    with _cluster(options.cluster) as cluster, ProgressBars() as bars:
+        summary = build(
+            request, options.out, workers=workers, threads=threads, cluster=cluster, progress=bars.update
+        )
+    _print_summary(options.out, summary)
+
+
+def _request(options: argparse.Namespace) -> BuildRequest:
+    """Return what the options ask for; own scenes come alone unless configs are named."""
+    from dataset_builder.mesh_door import mesh_file_spec
+    from dataset_builder.scene_file import scene_config
+
+    default = () if options.scene else LATTICE_CONFIGS if options.mesh else CONFIGS
+    return BuildRequest(
+        configs=tuple(options.config or default),
         views=options.views,
         width=options.width,
         height=options.height,
         samples=options.samples,
         seed=options.seed,
         mesh=mesh_file_spec(options.mesh, options.mesh_unit) if options.mesh else None,
+        variants=tuple(options.variant or ()),
+        scenes=tuple(scene_config(path) for path in options.scene or ()),
     )
-    threads = max(1, (os.cpu_count() or 1) // options.workers)
-    with ProgressBars() as bars:
-        summary = build(request, options.out, workers=options.workers, threads=threads, progress=bars.update)
-    _print_summary(options.out, summary)
+
+
+def _cluster(address: str | None) -> AbstractContextManager[Renderer | None]:
+    """Return what connects to the cluster at ``address``, or nothing where none is asked for."""
+    if address is None:
+        return nullcontext()
+    if find_spec("distributed") is None:
+        raise InputError(
+            "not installed: distributed; --cluster needs it: pip install 'rebar-depth-bench[cluster]'"
+        )
+    from dataset_builder.cluster import on_cluster
+
+    return on_cluster(address)
 
 
 def _print_summary(out: Path, summary: BuildSummary) -> None:
@@ -82,6 +116,17 @@ def _audit(options: argparse.Namespace) -> None:
     print_audit(report)
     if report.failures:
         raise InputError(f"{options.root}: {len(report.failures)} of {len(report.checks)} checks failed")
+
+
+def _export(options: argparse.Namespace) -> None:
+    _check_extra()
+    from dataset_builder.export import export
+
+    with ProgressBars() as bars:
+        summary = export(options.root, options.to, options.config, options.views, progress=bars.update)
+    for config in summary.configs:
+        print(f"{config.config}: {config.views} views, {config.written} files written, {config.kept} kept")
+    print(options.to)
 
 
 def argument_parser() -> argparse.ArgumentParser:
@@ -108,7 +153,12 @@ def argument_parser() -> argparse.ArgumentParser:
         default=BuildRequest.samples,
         help="Cycles samples per pixel (default: %(default)s)",
     )
-    parser.add_argument("--workers", type=int, default=1, help="render processes at once (default: %(default)s)")
+    parser.add_argument("--workers", type=int, metavar="N", help="render processes at once (default: 1)")
+    parser.add_argument(
+        "--cluster",
+        metavar="ADDRESS",
+        help="render on the workers of the dask scheduler at this address, such as tcp://host:8786",
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of surfaces and noise (default: %(default)s)")
     parser.add_argument(
         "--mesh", metavar="FILE", help="STL, PLY, OBJ or glTF file that replaces the lattice's rods"
@@ -119,7 +169,21 @@ def argument_parser() -> argparse.ArgumentParser:
         metavar="UNIT",
         help="unit of the mesh file: m, cm, mm, in or ft (default: m)",
     )
-    commands = parser.add_subparsers(dest="command", metavar="audit")
+    parser.add_argument(
+        "--scene",
+        nargs="+",
+        action="extend",
+        metavar="FILE",
+        help="build your own cage too: a TOML file, or an IFC model; alone unless --config names others",
+    )
+    parser.add_argument(
+        "--variant",
+        nargs="+",
+        action="extend",
+        metavar="NAME",
+        help=f"another look, told in the config's name: {', '.join(VARIANTS)}",
+    )
+    commands = parser.add_subparsers(dest="command", metavar="{audit,export}")
     checking = commands.add_parser("audit", help="check a dataset folder and its ground truth")
     checking.add_argument("root", metavar="ROOT", help="the dataset folder")
     checking.add_argument(
@@ -129,4 +193,13 @@ def argument_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="views per config whose depth is compared with Cycles' own (default: %(default)s)",
     )
+    exporting = commands.add_parser("export", help="write a dataset folder as PNG, OpenEXR, COLMAP and nerfstudio")
+    exporting.add_argument("root", metavar="ROOT", help="the dataset folder")
+    exporting.add_argument(
+        "--to", type=Path, required=True, metavar="DIR", help="a new folder, or one to go on with"
+    )
+    exporting.add_argument(
+        "--config", nargs="+", action="extend", metavar="NAME", help="which configs (default: all)"
+    )
+    exporting.add_argument("--views", type=int, metavar="N", help="N views spread evenly over those of the folder")
     return parser

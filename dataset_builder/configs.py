@@ -5,13 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from dataset_builder.appearance import check_variants
+from dataset_builder.optics import zed_rig
 from dataset_builder.specs import (
+    AppearanceSpec,
+    AssemblySpec,
     BoardSpec,
     ColourSpec,
     ConfigSpec,
     DomeSpec,
     LatticeSpec,
     MeshFileSpec,
+    PierSpec,
+    PileSpec,
     RigSpec,
     RingSpec,
     SceneSpec,
@@ -24,22 +30,45 @@ LATTICE_DOME = DomeSpec(
     azimuths=12,
 )
 """The paper's 504 views at 0.22-0.43 m; far shells lie closer, so that steel covers 4.5-7.2 % of the frame."""
+PILE_DOME = DomeSpec(
+    radii_m=(0.50, 0.57, 0.59, 0.62, 0.65, 0.67, 0.90),
+    elevations_deg=(28.0, 37.0, 46.0, 55.0, 64.0, 73.0),
+    azimuths=12,
+)
+"""The paper's 504 views at 0.50-0.90 m, above what stands on the bench; steel covers 4.5-7.2 % in two of three."""
+PIER_DOME = DomeSpec(
+    radii_m=(8.0, 11.0, 13.0, 14.5, 15.5, 16.25, 17.0),
+    elevations_deg=(-7.5, -1.0, 7.0, 17.0, 29.0, 44.0),
+    azimuths=12,
+)
+"""The paper's 504 views at 8-17 m: from a person's height, a mast and a drone."""
 LATTICE_RING = RingSpec(radius_m=0.325, elevation_deg=35.0, azimuths=100)
 
 
-def _lattice_scene() -> SceneSpec:
-    return SceneSpec(name="lattice", assembly=LatticeSpec(), board=BoardSpec(markers=6))
+def _lattice_scene(markers: int = 6, name: str = "lattice") -> SceneSpec:
+    return SceneSpec(name=name, assembly=LatticeSpec(), board=BoardSpec(markers=markers))
 
 
 CONFIGS: Mapping[str, Callable[[], ConfigSpec]] = {
     "lattice": lambda: ConfigSpec("lattice", _lattice_scene(), LATTICE_DOME),
     "lattice-orbit": lambda: ConfigSpec("lattice-orbit", _lattice_scene(), LATTICE_RING),
+    "lattice-zed": lambda: ConfigSpec("lattice-zed", _lattice_scene(), LATTICE_DOME, zed_rig()),
+    "lattice-zed-raw": lambda: ConfigSpec("lattice-zed-raw", _lattice_scene(), LATTICE_DOME, zed_rig(grid="raw")),
+    "lattice-12": lambda: ConfigSpec("lattice-12", _lattice_scene(12, "lattice-12"), LATTICE_DOME),
+    "pile": lambda: ConfigSpec("pile", SceneSpec("pile", PileSpec(), BoardSpec()), PILE_DOME),
+    "pier": lambda: ConfigSpec("pier", SceneSpec("pier", PierSpec(), None, "outdoors"), PIER_DOME),
 }
+LATTICE_CONFIGS = tuple(name for name in CONFIGS if name.startswith("lattice"))
+"""Where ``--mesh`` takes the place of the rods."""
 
 
 @dataclass(frozen=True)
 class BuildRequest:
-    """What a user asks of ``rebar-build``: which configs, how many views, at which size and quality."""
+    """What a user asks of ``rebar-build``: which configs, how many views, at which size and quality.
+
+    ``scenes`` are configs of the user's own. ``mesh`` takes the place of the lattice's rods. ``variants`` are
+    names of ``appearance.VARIANTS``; configs and scenes that have any carry them in their names.
+    """
 
     configs: tuple[str, ...] = tuple(CONFIGS)
     views: int | None = None
@@ -48,22 +77,44 @@ class BuildRequest:
     samples: int = ColourSpec.samples
     seed: int = 0
     mesh: MeshFileSpec | None = None
+    variants: tuple[str, ...] = ()
+    scenes: tuple[ConfigSpec, ...] = ()
 
     def config_specs(self) -> list[ConfigSpec]:
-        """Return the specs of the requested configs; raise ``InputError`` for an unknown one."""
-        return [self._config_spec(name) for name in dict.fromkeys(self.configs)]
+        """Return the specs of everything requested; raise ``InputError`` for what is unknown or does not fit."""
+        check_variants(self.variants)
+        known = [_known_config(name) for name in dict.fromkeys(self.configs)]
+        return [self._requested(spec) for spec in (*known, *self.scenes)]
 
-    def _config_spec(self, name: str) -> ConfigSpec:
-        if name not in CONFIGS:
-            raise InputError(f"no config {name!r}, expected one of {', '.join(CONFIGS)}")
-        spec = CONFIGS[name]()
-        scene = replace(spec.scene, seed=self.seed, assembly=self.mesh or spec.scene.assembly)
+    def _requested(self, spec: ConfigSpec) -> ConfigSpec:
+        suffix = "".join(f"-{name}" for name in self.variants)
+        scene = replace(
+            spec.scene,
+            name=spec.scene.name + suffix,
+            assembly=self._assembly(spec),
+            appearance=AppearanceSpec(self.variants),
+            seed=self.seed,
+        )
         return replace(
             spec,
+            name=spec.name + suffix,
             scene=scene,
             rig=replace(spec.rig, width=self.width, height=self.height),
             colour=replace(spec.colour, samples=self.samples),
         )
+
+    def _assembly(self, spec: ConfigSpec) -> AssemblySpec:
+        if self.mesh is None:
+            return spec.scene.assembly
+        if not isinstance(spec.scene.assembly, LatticeSpec):
+            raise InputError(f"--mesh takes the place of the lattice's rods, but {spec.name} is no lattice")
+        return self.mesh
+
+
+def _known_config(name: str) -> ConfigSpec:
+    if name not in CONFIGS:
+        raise InputError(f"no config {name!r}, expected one of {', '.join(CONFIGS)}")
+    return CONFIGS[name]()
 
 
 def view_id(config: str, index: int) -> str:

@@ -17,7 +17,6 @@ TILE_PX = (320, 180)
 COLUMNS = 6
 SHEET_VIEWS = 12
 STRIP_PANEL_PX = (640, 360)
-_WEBP = {"format": "WEBP", "quality": 82, "method": 4}
 _BACKGROUND = (24, 24, 24)
 
 
@@ -82,5 +81,5 @@ def _labelled(tile: Image.Image, label: str) -> Image.Image:
 
 def _save(picture: Image.Image, target: Path) -> None:
     stream = io.BytesIO()
-    picture.save(stream, **_WEBP)
+    picture.save(stream, "WEBP", quality=82)
     write_bytes(target, stream.getvalue())

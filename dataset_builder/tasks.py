@@ -11,9 +11,10 @@ from dataset_builder.specs import ConfigSpec
 
 @dataclass(frozen=True)
 class RenderTask:
-    """Render one shard's views of a config into ``staging``; views already staged are not done again.
+    """Render views of one shard of a config into ``staging``; views already staged are not done again.
 
-    Idempotent: the same task gives the same bytes, however often it is interrupted.
+    Idempotent: the same task gives the same bytes, however often it is interrupted. Where ``mesh_sha256`` is
+    known, a scene whose mesh has another digest is refused before anything is rendered.
     """
 
     config: ConfigSpec
@@ -21,6 +22,7 @@ class RenderTask:
     indices: tuple[int, ...]
     staging: Path
     threads: int
+    mesh_sha256: str | None = None
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any, BinaryIO
 
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import BuildError, InputError
 
 Report = Callable[[Mapping[str, Any]], None]
 
@@ -24,6 +24,8 @@ def main() -> int:
         _runner(task)(task, report)
     except InputError as error:
         report({"input_error": str(error)})
+    except BuildError as error:
+        report({"build_error": str(error)})
     return 0
 
 

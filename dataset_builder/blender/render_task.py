@@ -41,7 +41,7 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
         build_scene(assembly, task.config.scene)
         configure_colour(task.config.colour, task.threads)
         mesh = evaluated_world_mesh()
-        _stage_mesh(mesh, staging.mesh)
+        _stage_mesh(mesh, staging.mesh, task.mesh_sha256)
         caster = RayCaster(mesh)
         left_poses = poses(task.config.protocol, aim_point_m(assembly), task.config.rig)
     report({"seconds": watch.take()})
@@ -84,10 +84,15 @@ def _cycles_seed(config: ConfigSpec, index: int, eye_index: int) -> int:
     return int(np.random.SeedSequence(entropy).generate_state(1)[0] >> 1)
 
 
-def _stage_mesh(mesh: WorldMesh, path: Path) -> None:
+def _stage_mesh(mesh: WorldMesh, path: Path, expected_sha256: str | None) -> None:
     """Stage the scene's mesh; every shard of a config must be cast against the very same one."""
     own = path.with_name(f"mesh-{os.getpid()}.ply")
     write_mesh_ply(own, mesh.vertices_m, mesh.faces, mesh.face_bar_id)
-    if path.exists() and file_sha256(path) != file_sha256(own):
-        raise BuildError(f"{own}: the scene's mesh differs from {path}, which another shard was cast against")
+    expected = file_sha256(path) if path.exists() else expected_sha256
+    found = file_sha256(own)
+    if expected not in (None, found):
+        raise BuildError(
+            f"{own}: the scene's mesh has sha256 {found}, expected {expected}, which other views of the config "
+            "were cast against"
+        )
     own.replace(path)
