@@ -27,18 +27,19 @@ from dataset_builder.raycast import RayCaster
 from dataset_builder.specs import ColourSpec
 from rebar_depth_bench.cameras import ideal_K, pixel_rays
 
-REFERENCE = ColourSpec(samples=256, denoise=False)
+REFERENCE = ColourSpec(samples=256, prefilter="ACCURATE")
+"""Denoised: the noise left in 256 raw samples would hide what is better than it."""
 RIVAL = ColourSpec(samples=16, prefilter="ACCURATE")
 """What BlenderProc renders with by default, at 16 samples."""
 CANDIDATES = (
     RIVAL,
-    ColourSpec(samples=4),
-    ColourSpec(samples=6),
+    ColourSpec(samples=16, denoise=False),
     ColourSpec(samples=8),
     ColourSpec(samples=8, prefilter="ACCURATE"),
     ColourSpec(samples=12),
     ColourSpec(samples=16),
-    ColourSpec(samples=16, denoise=False),
+    ColourSpec(samples=24),
+    ColourSpec(samples=32),
 )
 PSNR_PEAK = 255.0
 

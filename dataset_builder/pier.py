@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64
@@ -29,6 +30,9 @@ HOOK_DEG = 135.0
 """Half hoops end in such hooks round a vertical, and so does one end of each tie."""
 
 OTHER_TIE_END_DEG = 90.0
+
+RING_STEP_M = 0.2
+"""Triangles as long as a bar and millimetres wide cost Cycles its precision in float32."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,4 +145,13 @@ def _bent(role: str, link: Link, corners: Float64[ndarray, "n 2"], run: int) -> 
 
 def _shape(role: str, diameter_m: float, line_m: Float64[ndarray, "n 3"]) -> _Shape:
     check_stock_length(role, float(np.linalg.norm(np.diff(line_m, axis=0), axis=1).sum()))
-    return _Shape(role, diameter_m, line_m, plain_bar_mesh(line_m, diameter_m))
+    return _Shape(role, diameter_m, line_m, plain_bar_mesh(_with_rings(line_m), diameter_m))
+
+
+def _with_rings(line_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "k 3"]:
+    """Return the line with points in between, none further than ``RING_STEP_M`` from the next."""
+    pieces = [line_m[:1]]
+    for start, end in pairwise(line_m):
+        count = int(np.ceil(np.linalg.norm(end - start) / RING_STEP_M))
+        pieces.append(start + (end - start) * np.arange(1, count + 1)[:, None] / count)
+    return np.concatenate(pieces)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from cards import dataset_card
-from dataset_builder.assemblies import make_assembly
+from dataset_builder.assemblies import aim_point_m, make_assembly
 from dataset_builder.bars_table import read_bars, write_bars
 from dataset_builder.configs import CONFIGS
 from dataset_builder.lock import LOCK
@@ -98,6 +98,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
     entry = {
         **plan.parameters,
         "key": plan.key,
+        "aim_point_m": aim_point_m(make_assembly(plan.spec.scene.assembly)).tolist(),
         "protocol_views": len(offsets_m(plan.spec.protocol)),
         "generator": generator_stamp(),
         "mesh": mesh,

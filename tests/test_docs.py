@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dataset_builder.appearance import VARIANTS
 from dataset_builder.cli import argument_parser as build_parser
 from dataset_builder.configs import CONFIGS
 from rebar_depth_bench.cli import argument_parser as bench_parser
@@ -47,9 +48,10 @@ def test_the_python_shown_runs(tiny_root: Path, tmp_path: Path, monkeypatch: pyt
     assert {"rgb", "depth", "mask", "K", "poses", "view_id", "right_rgb", "baseline_m"} <= set(batch)
 
 
-def test_tables_name_every_config_and_method() -> None:
+def test_tables_name_every_config_variant_and_method() -> None:
     readme = Path("README.md").read_text()
-    assert set(re.findall(r"^\| `([\w-]+)` \|", readme, flags=re.MULTILINE)) == {*CONFIGS, *METHODS}
+    assert set(re.findall(r"^\| `([\w-]+)` \|", readme, flags=re.MULTILINE)) == {*CONFIGS, *METHODS, *VARIANTS}
+    assert all(f"| `{variant.name}` | {variant.words} |" in readme for variant in VARIANTS.values())
 
 
 @pytest.mark.parametrize("page", PAGES, ids=str)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +45,18 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
         _stage_mesh(mesh, staging.mesh, task.mesh_sha256)
         caster = RayCaster(mesh)
         left_poses = poses(task.config.protocol, aim_point_m(assembly), task.config.rig)
+        cameras = rig_cameras(task.config.rig, np.eye(4))
+        rays_cam = {
+            eye: pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
+            for eye, camera in cameras.items()
+        }
     report({"seconds": watch.take()})
     with tempfile.TemporaryDirectory(dir=task.staging) as scratch:
+        studio = _Studio(task.config, caster, rays_cam, Path(scratch))
         for index in task.indices:
             path = staging.row(index)
             if not path.is_file():
-                view = _render_view(task.config, index, left_poses[index], caster, Path(scratch), watch)
+                view = _render_view(studio, index, left_poses[index], watch)
                 with watch.timing("encode"):
                     row, record = encode_view(view)
                 with watch.timing("write"):
@@ -57,21 +64,26 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
             report({"view": index, "seconds": watch.take()})
 
 
+@dataclass(frozen=True, eq=False)
+class _Studio:
+    """What all views of a task share: the config, the scene's mesh, each eye's rays, a folder for pictures."""
+
+    config: ConfigSpec
+    caster: RayCaster
+    rays_cam: Mapping[str, Float64[ndarray, "h w 3"]]
+    scratch: Path
+
+
 def _render_view(
-    config: ConfigSpec,
-    index: int,
-    left_cam_from_world: Float64[ndarray, "4 4"],
-    caster: RayCaster,
-    scratch: Path,
-    watch: Stopwatch,
+    studio: _Studio, index: int, left_cam_from_world: Float64[ndarray, "4 4"], watch: Stopwatch
 ) -> View:
+    config = studio.config
     eyes = {}
     for eye_index, (eye, camera) in enumerate(rig_cameras(config.rig, left_cam_from_world).items()):
         with watch.timing("colour"):
-            rgb = render_colour(camera, _cycles_seed(config, index, eye_index), scratch)
+            rgb = render_colour(camera, _cycles_seed(config, index, eye_index), studio.scratch)
         with watch.timing("truth"):
-            rays_cam = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
-            truth = caster.cast(rays_cam, camera.cam_from_world)
+            truth = studio.caster.cast(studio.rays_cam[eye], camera.cam_from_world)
         eyes[eye] = Eye(
             rgb, truth.depth_m, truth.mask, truth.bars, camera.K, camera.distortion, camera.cam_from_world
         )
