@@ -6,18 +6,21 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from dataset_builder.blender.laboratory import laboratory
-from dataset_builder.blender.lighting import add_laboratory_lights
+from dataset_builder.blender.light_rigs import LABORATORY_LIGHT, OUTDOOR_LIGHT
+from dataset_builder.blender.lighting import LightRig
+from dataset_builder.blender.outdoors import outdoors
 from dataset_builder.model import Part
 
 
 @dataclass(frozen=True)
 class Environment:
-    """A place: its surfaces (world frame, none of them steel) and a function that lights the open scene."""
+    """A place: its surfaces (world frame, none of them steel), and its light by light variant (None: as it is)."""
 
     parts: Callable[[], tuple[Part, ...]]
-    add_lights: Callable[[], None]
+    light: Mapping[str | None, LightRig]
 
 
 ENVIRONMENTS: Mapping[str, Environment] = {
-    "laboratory": Environment(laboratory, add_laboratory_lights),
+    "laboratory": Environment(laboratory, LABORATORY_LIGHT),
+    "outdoors": Environment(outdoors, OUTDOOR_LIGHT),
 }

@@ -15,6 +15,10 @@ RUST, PATTERN, TONE = "rust_amount", "pattern_shift_m", "scale_tone"
 """Custom properties of a steel object that its material reads."""
 
 
+STEEL_LOOKS = {"mill-scale": "steel, mill-scale", "rusted": "steel, rusted", "wet": "steel, wet"}
+"""The material of each steel variant."""
+
+
 def surface_variation(seed: int, bar_id: int) -> dict[str, float]:
     """Return one bar's share of rust (0 to 1), shift of pattern and tone of scale, drawn from both numbers."""
     random = np.random.default_rng([seed, bar_id])
@@ -57,21 +61,38 @@ def _image(name: str, texture: UInt8[ndarray, "h w"]) -> bpy.types.Image:
     return image
 
 
-def _steel(name: str) -> bpy.types.Material:
-    """Blue-grey mill scale with patches of rust; amount, pattern and tone come from each bar's properties."""
-    shader = Shader(name)
-    at = shader.shifted(shader.position(), shader.object_value(PATTERN))
-    patches, grain = shader.noise(at, 70.0, 3.0), shader.noise(at, 700.0, 1.0)
-    dark = shader.mix(shader.object_value(TONE), (0.105, 0.118, 0.140), (0.190, 0.200, 0.218))
-    scale = shader.mix(shader.step(grain, 0.25, 0.85), dark, (0.255, 0.262, 0.275))
-    rust = shader.mix(shader.step(grain, 0.3, 0.7), (0.095, 0.042, 0.022), (0.250, 0.105, 0.045))
-    threshold = shader.add(patches, shader.remap(shader.object_value(RUST), 0.0, 1.0, -0.15, 0.12))
-    rusty = shader.step(shader.add(threshold, shader.remap(grain, 0.0, 1.0, -0.05, 0.05)), 0.46, 0.62)
-    return shader.surface(
-        Base_Color=shader.mix(rusty, scale, rust),
-        Metallic=shader.remap(rusty, 0.0, 1.0, 0.70, 0.05),
-        Roughness=shader.add(shader.remap(rusty, 0.0, 1.0, 0.36, 0.72), shader.remap(grain, 0, 1, -0.06, 0.08)),
-    )
+def _steel(
+    rust_shift: tuple[float, float] = (-0.15, 0.12),
+    tint: float = 1.0,
+    metallic: float = 0.40,
+    roughness: tuple[float, float] = (0.50, 0.74),
+) -> Callable[[str], bpy.types.Material]:
+    """Return a maker of blue-grey mill scale with patches of rust.
+
+    Amount, pattern and tone come from each bar's properties: ``rust_shift`` is how much rust the amounts 0 and 1
+    make, ``roughness`` that of scale and of rust; ``tint`` darkens both.
+    """
+
+    def tinted(red: float, green: float, blue: float) -> Colour:
+        return red * tint, green * tint, blue * tint
+
+    def make(name: str) -> bpy.types.Material:
+        shader = Shader(name)
+        at = shader.shifted(shader.position(), shader.object_value(PATTERN))
+        patches, grain = shader.noise(at, 70.0, 3.0), shader.noise(at, 700.0, 1.0)
+        dark = shader.mix(shader.object_value(TONE), tinted(0.105, 0.118, 0.140), tinted(0.190, 0.200, 0.218))
+        scale = shader.mix(shader.step(grain, 0.25, 0.85), dark, tinted(0.255, 0.262, 0.275))
+        rust = shader.mix(shader.step(grain, 0.3, 0.7), tinted(0.095, 0.042, 0.022), tinted(0.250, 0.105, 0.045))
+        threshold = shader.add(patches, shader.remap(shader.object_value(RUST), 0.0, 1.0, *rust_shift))
+        rusty = shader.step(shader.add(threshold, shader.remap(grain, 0.0, 1.0, -0.05, 0.05)), 0.46, 0.62)
+        gloss = shader.add(shader.remap(rusty, 0.0, 1.0, *roughness), shader.remap(grain, 0, 1, -0.06, 0.08))
+        return shader.surface(
+            Base_Color=shader.mix(rusty, scale, rust),
+            Metallic=shader.remap(rusty, 0.0, 1.0, metallic, 0.05),
+            Roughness=gloss,
+        )
+
+    return make
 
 
 def _wood(name: str) -> bpy.types.Material:
@@ -95,6 +116,34 @@ def _speckled(light: Colour, dark: Colour, per_metre: float) -> Callable[[str], 
     return make
 
 
+def _mottled(
+    light: Colour, dark: Colour, per_metre: float, stains_per_metre: float, stain: Colour
+) -> Callable[[str], bpy.types.Material]:
+    """Return a maker of ground: matt two-tone grain under large stains."""
+
+    def make(name: str) -> bpy.types.Material:
+        shader = Shader(name)
+        at = shader.position()
+        grain = shader.mix(shader.step(shader.noise(at, per_metre, 1.0), 0.3, 0.7), dark, light)
+        stains = shader.step(shader.noise(at, stains_per_metre, 2.0), 0.42, 0.72)
+        return shader.matt(shader.mix(stains, grain, stain))
+
+    return make
+
+
+def _grained(
+    light: Colour, dark: Colour, scale: tuple[float, float, float]
+) -> Callable[[str], bpy.types.Material]:
+    """Return a maker of sawn wood; ``scale`` is features a metre along x, y and z."""
+
+    def make(name: str) -> bpy.types.Material:
+        shader = Shader(name)
+        grain = shader.noise(shader.stretched(shader.position(), scale), 1.0)
+        return shader.matt(shader.mix(shader.step(grain, 0.25, 0.75), dark, light))
+
+    return make
+
+
 def _matt(colour: Colour) -> Callable[[str], bpy.types.Material]:
     return lambda name: Shader(name).matt(colour)
 
@@ -104,7 +153,10 @@ def _glossy(colour: Colour, roughness: float) -> Callable[[str], bpy.types.Mater
 
 
 _MAKERS: dict[str, Callable[[str], bpy.types.Material]] = {
-    "steel": _steel,
+    "steel": _steel(),
+    "steel, mill-scale": _steel(rust_shift=(-0.45, -0.16), tint=1.15, metallic=0.8, roughness=(0.30, 0.60)),
+    "steel, rusted": _steel(rust_shift=(0.10, 0.30), tint=1.15),
+    "steel, wet": _steel(tint=0.48, metallic=0.45, roughness=(0.13, 0.17)),
     "wood": _wood,
     "concrete": _speckled((0.40, 0.40, 0.39), (0.335, 0.335, 0.325), 60.0),
     "plaster": _speckled((0.63, 0.62, 0.59), (0.585, 0.575, 0.55), 5.0),
@@ -120,4 +172,18 @@ _MAKERS: dict[str, Callable[[str], bpy.types.Material]] = {
     "sheet edge": _matt((0.70, 0.70, 0.68)),
     "red paint": _glossy((0.33, 0.045, 0.035), 0.35),
     "white glaze": _glossy((0.66, 0.66, 0.64), 0.15),
+    "plywood": _grained((0.52, 0.34, 0.17), (0.40, 0.25, 0.12), (9.0, 9.0, 1.6)),
+    "timber": _grained((0.56, 0.41, 0.23), (0.42, 0.28, 0.14), (14.0, 14.0, 14.0)),
+    "orange plastic": _matt((0.62, 0.17, 0.02)),
+    "black rubber": _matt((0.022, 0.022, 0.024)),
+    "black wire": _glossy((0.03, 0.03, 0.033), 0.45),
+    "site concrete": _mottled((0.44, 0.43, 0.41), (0.36, 0.355, 0.34), 26.0, 0.7, (0.31, 0.30, 0.28)),
+    "blinding": _matt((0.47, 0.46, 0.44)),
+    "gravel": _mottled((0.42, 0.36, 0.28), (0.25, 0.21, 0.165), 14.0, 0.11, (0.29, 0.235, 0.172)),
+    "soil": _mottled((0.26, 0.175, 0.105), (0.15, 0.10, 0.062), 3.5, 0.5, (0.21, 0.15, 0.09)),
+    "trees": _mottled((0.085, 0.115, 0.045), (0.03, 0.05, 0.022), 0.9, 0.12, (0.055, 0.07, 0.03)),
+    "container blue": _matt((0.045, 0.13, 0.26)),
+    "container sand": _matt((0.45, 0.37, 0.24)),
+    "hoarding white": _matt((0.66, 0.66, 0.64)),
+    "hoarding blue": _matt((0.06, 0.17, 0.42)),
 }

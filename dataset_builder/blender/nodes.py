@@ -11,14 +11,11 @@ Colour = tuple[float, float, float]
 """Linear Rec. 709."""
 
 
-class Shader:
-    """One material's node tree under construction; the methods add nodes and return output sockets."""
+class Tree:
+    """A node tree under construction; the methods add nodes and return output sockets."""
 
-    def __init__(self, name: str) -> None:
-        self.material = bpy.data.materials.new(name)
-        self.material.use_nodes = True
-        self._tree = self.material.node_tree
-        self._tree.nodes.clear()
+    def __init__(self, tree: bpy.types.NodeTree) -> None:
+        self._tree = tree
 
     def node(self, kind: str, inputs: dict[str | int, Any], **settings: Any) -> Any:
         """Add a node; ``inputs`` are sockets to link or values to set, ``settings`` its own properties."""
@@ -40,6 +37,10 @@ class Shader:
     def position(self) -> Socket:
         """Return the shading point in the object's own frame, metres."""
         return self.node("ShaderNodeTexCoord", {}).outputs["Object"]
+
+    def direction(self) -> Socket:
+        """Return the direction of a ray that leaves the scene; for a world's tree."""
+        return self.node("ShaderNodeTexCoord", {}).outputs["Generated"]
 
     def uv(self) -> Socket:
         """Return the mesh's UV coordinates."""
@@ -83,11 +84,29 @@ class Shader:
         """Return the sum of two values."""
         return self.node("ShaderNodeMath", {0: a, 1: b}, operation="ADD").outputs[0]
 
+    def product(self, a: Socket, b: Socket | float) -> Socket:
+        """Return the product of two values."""
+        return self.node("ShaderNodeMath", {0: a, 1: b}, operation="MULTIPLY").outputs[0]
+
+    def power(self, base: Socket, exponent: float) -> Socket:
+        """Return ``base`` (not negative) to the power ``exponent``."""
+        return self.node("ShaderNodeMath", {0: base, 1: exponent}, operation="POWER").outputs[0]
+
     def mix(self, share: Socket, a: Socket | Colour, b: Socket | Colour) -> Socket:
         """Return the colour ``a`` where ``share`` is 0 and ``b`` where it is 1."""
         # A colour mix has its sockets at 6 and 7, and its result at 2.
         inputs: dict[str | int, Any] = {0: share, 6: a, 7: b}
         return self.node("ShaderNodeMix", inputs, data_type="RGBA").outputs[2]
+
+
+class Shader(Tree):
+    """One material's node tree, empty at first; ``matt`` or ``surface`` finishes it."""
+
+    def __init__(self, name: str) -> None:
+        self.material = bpy.data.materials.new(name)
+        self.material.use_nodes = True
+        super().__init__(self.material.node_tree)
+        self._tree.nodes.clear()
 
     def matt(self, colour: Socket | Colour) -> bpy.types.Material:
         """Finish with a plain diffuse surface, cheaper to render than ``surface``."""

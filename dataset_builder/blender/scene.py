@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import bpy
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.appearance import LIGHT, STEEL, check_variants, one_of_slot
 from dataset_builder.blender.environments import ENVIRONMENTS
 from dataset_builder.blender.laboratory import SHEET_THICKNESS_M
-from dataset_builder.blender.materials import material, paper, surface_variation
-from dataset_builder.blender.solids import box
+from dataset_builder.blender.lighting import add_light
+from dataset_builder.blender.materials import STEEL_LOOKS, material, paper, surface_variation
 from dataset_builder.board import board_texture
 from dataset_builder.model import NOT_STEEL, Assembly, Mesh, Part
+from dataset_builder.occluders import occluders
+from dataset_builder.solids import box
 from dataset_builder.specs import BoardSpec, SceneSpec
 
 BAR_ID = "bar_id"
@@ -26,19 +30,29 @@ SAME_SHAPE_M = 1e-9
 
 
 def build_scene(assembly: Assembly, spec: SceneSpec) -> None:
-    """Replace Blender's open file with the scene: one object per bar, what it stands on and in."""
+    """Replace Blender's open file with the scene: one object per bar, what it stands on and in, its appearance.
+
+    Raises ``InputError`` where the appearance's variants do not pass ``check_variants``.
+    """
+    variants = spec.appearance.variants
+    check_variants(variants)
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    for part, mesh, origin_m in _with_shared_meshes(assembly.parts):
+    for part, mesh, origin_m in _with_shared_meshes(_looking(assembly.parts, one_of_slot(variants, STEEL))):
         steel = add_object(part, mesh, origin_m)
         for name, value in surface_variation(spec.seed, part.bar_id).items():
             steel[name] = value
     environment = ENVIRONMENTS[spec.environment]
-    for part in environment.parts():
+    for part in (*environment.parts(), *occluders(assembly, spec)):
         add_object(part, mesh_data(part.name, part.mesh, part.material), np.zeros(3))
     if spec.board is not None:
         _add_board(spec.board)
-    environment.add_lights()
+    add_light(environment.light[one_of_slot(variants, LIGHT)])
     bpy.context.view_layer.update()
+
+
+def _looking(parts: tuple[Part, ...], look: str | None) -> tuple[Part, ...]:
+    """Return the steel's parts in the material of a steel variant, or as they are."""
+    return parts if look is None else tuple(replace(part, material=STEEL_LOOKS[look]) for part in parts)
 
 
 def _with_shared_meshes(

@@ -1,0 +1,208 @@
+"""The building site round a pier: footing slab, ground, and what stands about beyond the cameras.
+
+World frame, metres. The slab's top is z = 0 and the ground lies below it. The steel stands on the origin and
+cameras stand up to 17 m from it; but for slab and ground nothing is nearer than ``CLEAR_M`` to the origin in
+plan, and nothing is steel reinforcement. A ridge of trees closes the view; the sky above is no surface.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from dataset_builder.model import NOT_STEEL, Mesh, Part
+from dataset_builder.solids import about_z, box, joined, placed, turned_box
+
+CLEAR_M = 19.0
+SLAB_HALF_M = 3.2
+GROUND_M = -0.12
+GROUND_HALF_M = 100.0
+TREES_M = (72.0, 84.0)
+"""Inner and outer radius of the ring of trees."""
+
+_STANDS_M = GROUND_M + 0.002
+
+
+def outdoors() -> tuple[Part, ...]:
+    """Return every surface of the site, none of them steel."""
+    return (*_ground(), *_containers(), *_hoarding(), *_stacks(), _spoil_heap(), _trees())
+
+
+def _part(name: str, mesh: Mesh, material: str) -> Part:
+    return Part(name, mesh, NOT_STEEL, material)
+
+
+def _ground() -> tuple[Part, ...]:
+    """Return the footing slab on its blinding, and the ground, which the slab's foot is let into."""
+    s, g, b = SLAB_HALF_M, GROUND_HALF_M, SLAB_HALF_M + 0.35
+    return (
+        _part("slab", box((-s, -s, -0.6), (s, s, 0.0)), "site concrete"),
+        _part("blinding", box((-b, -b, -0.5), (b, b, -0.075)), "blinding"),
+        _part("ground", box((-g, -g, GROUND_M - 1.0), (g, g, GROUND_M)), "gravel"),
+    )
+
+
+def _containers() -> tuple[Part, ...]:
+    """Return two site containers; the corrugation of their long sides shows from afar."""
+    places = {"blue": ((-17.0, 21.0), 12.0, "container blue"), "sand": ((-8.5, 25.0), -6.0, "container sand")}
+    parts = []
+    for name, ((x, y), turn_deg, material) in places.items():
+        for piece, mesh, look in (("body", _corrugated(5.9, 2.3, 2.45), material), ("frame", _frame(), material)):
+            moved = placed(mesh, about_z(turn_deg), (x, y, _STANDS_M))
+            parts.append(_part(f"container-{name}-{piece}", moved, look))
+        door = placed(box((3.035, -1.0, 0.2), (3.06, 1.0, 2.35)), about_z(turn_deg), (x, y, _STANDS_M))
+        parts.append(_part(f"container-{name}-door", door, "painted metal"))
+    return tuple(parts)
+
+
+def _corrugated(length_m: float, width_m: float, height_m: float, pitch_m: float = 0.28) -> Mesh:
+    """Return a box along x on z = 0.08 whose long sides are folded to trapezoids."""
+    folds = round(length_m / pitch_m)
+    x = np.append((np.arange(folds)[:, None] + [0.0, 0.3, 0.5, 0.8]).ravel(), folds) * length_m / folds
+    inset = np.append(np.tile([0.0, 0.0, 0.045, 0.045], folds), 0.0)
+    half = width_m / 2 - inset
+    low, count = 0.08, len(x)
+    corners = [
+        np.stack([x - length_m / 2, side * half, np.full(count, z)], axis=1)
+        for side in (-1, 1)
+        for z in (low, low + height_m)
+    ]
+    here = np.arange(count - 1)
+    faces = [*_strip(here, 0, 1, count), *_strip(here, 1, 3, count), *_strip(here, 3, 2, count)]
+    faces += _strip(here, 2, 0, count)
+    ends = [[0, 2 * count, 3 * count], [0, 3 * count, count]]
+    ends += [[corner + count - 1 for corner in face[::-1]] for face in ends]
+    return Mesh(np.concatenate(corners), np.concatenate([*faces, ends])[:, ::-1].astype(np.int32))
+
+
+def _strip(here: ndarray, row: int, other: int, count: int) -> list[ndarray]:
+    """Return the triangles between two rows of ``count`` vertices each."""
+    a, b = row * count + here, other * count + here
+    return [np.stack([a, b, b + 1], axis=1), np.stack([a, b + 1, a + 1], axis=1)]
+
+
+def _frame() -> Mesh:
+    """Return a container's corner posts and rails; the corrugated body ends inside them."""
+    x, y, t, h = 3.03, 1.22, 0.16, 2.6
+    posts = [box(_low(sx, x, t, sy, y, 0.0), _high(sx, x, t, sy, y, h)) for sx in (-1, 1) for sy in (-1, 1)]
+    inner = x - t - 0.001
+    rails = [
+        box((-inner, min(s * y, s * (y - 0.12)), z), (inner, max(s * y, s * (y - 0.12)), z + 0.15))
+        for s in (-1, 1)
+        for z in (0.01, h - 0.16)
+    ]
+    ends = [
+        box((min(s * x, s * (x - 0.12)), -y + t + 0.001, z), (max(s * x, s * (x - 0.12)), y - t - 0.001, z + 0.15))
+        for s in (-1, 1)
+        for z in (0.01, h - 0.16)
+    ]
+    return joined([*posts, *rails, *ends])
+
+
+def _low(sx: int, x: float, t: float, sy: int, y: float, z: float) -> tuple[float, float, float]:
+    return min(sx * x, sx * (x - t)), min(sy * y, sy * (y - t)), z
+
+
+def _high(sx: int, x: float, t: float, sy: int, y: float, z: float) -> tuple[float, float, float]:
+    return max(sx * x, sx * (x - t)), max(sy * y, sy * (y - t)), z
+
+
+def _hoarding() -> tuple[Part, ...]:
+    """Return two runs of closed panels, a hand's breadth between panels, each on a concrete foot."""
+    runs = {"east": ((31.0, -16.0), 97.0, 14), "south": ((-24.0, -29.0), 4.0, 18)}
+    sheets: dict[str, list[Mesh]] = {"hoarding white": [], "hoarding blue": []}
+    feet = []
+    for (x, y), turn_deg, panels in runs.values():
+        along = about_z(turn_deg)[:, 0]
+        for k in range(panels):
+            at = np.array([x, y, _STANDS_M]) + 2.46 * k * along
+            colour = "hoarding blue" if k % 5 == 3 else "hoarding white"
+            sheets[colour].append(turned_box((at[0], at[1], at[2] + 1.2), (2.4, 0.04, 2.0), turn_deg))
+            feet.append(turned_box((at[0], at[1], at[2] + 0.09), (0.7, 0.25, 0.18), turn_deg))
+    panels_of = tuple(_part(f"hoarding-{colour[9:]}", joined(meshes), colour) for colour, meshes in sheets.items())
+    return (*panels_of, _part("hoarding-feet", joined(feet), "site concrete"))
+
+
+def _stacks() -> tuple[Part, ...]:
+    """Return stacked timber on bearers, and concrete blocks two high."""
+    timber = []
+    for layer in range(6):
+        for k in range(5):
+            at = (0.0, (k - 2) * 0.27, 0.12 + 0.145 * layer)
+            timber.append(turned_box(at, (4.2 + 0.07 * ((3 * k + layer) % 4), 0.24, 0.12), 0.0))
+    bearers = [turned_box((x, 0.0, 0.025), (0.1, 1.5, 0.05), 0.0) for x in (-1.4, 1.4)]
+    blocks = [
+        turned_box(((k - 1.5) * 1.66, 0.0, 0.4 + 0.81 * row), (1.6, 0.8, 0.8), 0.0)
+        for row in range(2)
+        for k in range(4 - row)
+    ]
+    return (
+        _part("timber", placed(joined(timber), about_z(35.0), (22.5, 7.5, _STANDS_M)), "timber"),
+        _part("bearers", placed(joined(bearers), about_z(35.0), (22.5, 7.5, _STANDS_M)), "timber"),
+        _part("blocks", placed(joined(blocks), about_z(-64.0), (-25.0, -6.5, _STANDS_M)), "site concrete"),
+    )
+
+
+def _spoil_heap() -> Part:
+    """Return a low heap of earth with its foot in the ground."""
+    random = np.random.default_rng(11)
+    heap = _mound(rings=9, columns=36, radius_m=7.0, height_m=3.1, random=random)
+    return _part("spoil-heap", placed(heap, np.diag([1.35, 1.0, 1.0]), (12.0, 31.5, GROUND_M)), "soil")
+
+
+def _mound(rings: int, columns: int, radius_m: float, height_m: float, random: np.random.Generator) -> Mesh:
+    """Return a closed mound: rings of vertices from its buried foot to its top, a fan above and one below."""
+    share = np.linspace(1.0, 0.06, rings)[:, None]
+    angle = np.arange(columns) * 2 * np.pi / columns
+    radius = radius_m * share * (1 + 0.10 * np.sin(3 * angle + 1.0) + random.normal(0, 0.03, (rings, columns)))
+    height = height_m * (1 - share) ** 0.8 * (1 + random.normal(0, 0.05, (rings, columns)))
+    height[0] = -0.3
+    sides = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1).reshape(-1, 3)
+    vertices = np.concatenate([sides, [[0.0, 0.0, height_m], [0.0, 0.0, -0.3]]])
+    ring, column = (grid.ravel() for grid in np.meshgrid(np.arange(rings - 1), np.arange(columns), indexing="ij"))
+    here, beside = ring * columns + column, ring * columns + (column + 1) % columns
+    rim = np.arange(columns)
+    following, top, last = (rim + 1) % columns, rings * columns, (rings - 1) * columns
+    faces = np.concatenate(
+        [
+            np.stack([here, beside, beside + columns], 1),
+            np.stack([here, beside + columns, here + columns], 1),
+            np.stack([last + rim, last + following, np.full(columns, top)], 1),
+            np.stack([following, rim, np.full(columns, top + 1)], 1),
+        ]
+    )
+    return Mesh(vertices, faces.astype(np.int32))
+
+
+def _trees() -> Part:
+    """Return a closed ring whose ragged crest reads as the edge of a wood."""
+    columns = 420
+    random = np.random.default_rng(7)
+    angle = np.arange(columns) * 2 * np.pi / columns
+    crest_m = 6.2 + 1.5 * np.sin(2 * angle + 0.7) + 1.0 * np.sin(5 * angle) + random.uniform(-1.3, 1.3, columns)
+    inner_m, outer_m = TREES_M[0] + random.uniform(-1.0, 1.0, columns), np.full(columns, TREES_M[1])
+    top_m = inner_m + random.uniform(3.0, 6.0, columns)
+    foot_m = np.full(columns, GROUND_M - 0.5)
+    outline = [
+        (inner_m, foot_m),
+        (outer_m, foot_m),
+        (outer_m, foot_m + 1.0),
+        (top_m, crest_m),
+        (inner_m, 0.5 * crest_m),
+    ]
+    return _part("trees", _ring(outline, angle), "trees")
+
+
+def _ring(
+    outline: list[tuple[Float64[ndarray, " c"], Float64[ndarray, " c"]]], angle: Float64[ndarray, " c"]
+) -> Mesh:
+    """Return a closed ring about z from an outline of (radius, height) that varies from column to column."""
+    rows, columns = len(outline), len(angle)
+    vertices = np.concatenate([np.stack([r * np.cos(angle), r * np.sin(angle), h], axis=1) for r, h in outline])
+    row, column = (grid.ravel() for grid in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
+    here, up = row * columns + column, (row + 1) % rows * columns + column
+    beside = row * columns + (column + 1) % columns
+    beside_up = (row + 1) % rows * columns + (column + 1) % columns
+    faces = np.concatenate([np.stack([here, beside, beside_up], 1), np.stack([here, beside_up, up], 1)])
+    return Mesh(vertices, faces.astype(np.int32))
