@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 from dataset_builder.model import Bar
 from rebar_depth_bench.files import replacing
 
+BARS = "bars.parquet"
 SCHEMA = pa.schema(
     [
         ("scene", pa.string()),

@@ -66,7 +66,7 @@ def _build(options: argparse.Namespace) -> None:
 
 def _request(options: argparse.Namespace) -> BuildRequest:
     """Return what the options ask for; own scenes come alone unless configs are named."""
-    from dataset_builder.mesh_door import mesh_file_spec
+    from dataset_builder.assemblies.mesh_door import mesh_file_spec
     from dataset_builder.scene_file import scene_config
 
     default = () if options.scene else LATTICE_CONFIGS if options.mesh else CONFIGS

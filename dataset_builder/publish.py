@@ -15,7 +15,7 @@ from typing import Any
 
 from cards import dataset_card
 from dataset_builder.assemblies import aim_point_m, make_assembly
-from dataset_builder.bars_table import read_bars, write_bars
+from dataset_builder.bars_table import BARS, read_bars, write_bars
 from dataset_builder.configs import CONFIGS
 from dataset_builder.lock import LOCK
 from dataset_builder.pictures import write_contact_sheet, write_scenes_strip
@@ -29,7 +29,6 @@ from rebar_depth_bench.folder import FORMAT, MANIFEST, read_manifest
 from rebar_depth_bench.protocol import PROTOCOL
 from rebar_depth_bench.version import software_version
 
-BARS = "bars.parquet"
 MESHES = "meshes"
 CARD = "README.md"
 PICTURES = "pictures"

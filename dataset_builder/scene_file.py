@@ -14,9 +14,9 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.assemblies import aim_point_m, check_fits, make_assembly
-from dataset_builder.cage_file import cage_file_spec
+from dataset_builder.assemblies.cage_file import cage_file_spec
+from dataset_builder.assemblies.mesh_door import mesh_file_spec
 from dataset_builder.configs import CONFIGS, LATTICE_DOME
-from dataset_builder.mesh_door import mesh_file_spec
 from dataset_builder.model import Assembly
 from dataset_builder.protocols import offsets_m
 from dataset_builder.scene_toml import SceneToml, name_kind, read_scene_toml

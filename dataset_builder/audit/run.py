@@ -20,9 +20,8 @@ from dataset_builder.audit.report import AuditReport, Check
 from dataset_builder.audit.rows import array_problems, row_problems
 from dataset_builder.audit.second_renderer import cycles_difference_m, cycles_verdict
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, RayMemory, audited_view
-from dataset_builder.bars_table import read_bars
+from dataset_builder.bars_table import BARS, read_bars
 from dataset_builder.protocols import subset
-from dataset_builder.publish import BARS
 from rebar_depth_bench.dataset import iterate
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.folder import DatasetFolder, ViewRecord, open_folder

@@ -11,14 +11,14 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.appearance import LIGHT, STEEL, check_variants, one_of_slot
+from dataset_builder.appearance.occluders import occluders
 from dataset_builder.blender.environments import ENVIRONMENTS
 from dataset_builder.blender.laboratory import SHEET_THICKNESS_M
 from dataset_builder.blender.lighting import add_light
 from dataset_builder.blender.materials import STEEL_LOOKS, material, paper, surface_variation
 from dataset_builder.board import board_texture
 from dataset_builder.model import NOT_STEEL, Assembly, Mesh, Part
-from dataset_builder.occluders import occluders
-from dataset_builder.solids import box
+from dataset_builder.shapes.solids import box
 from dataset_builder.specs import BoardSpec, SceneSpec
 
 BAR_ID = "bar_id"

@@ -16,13 +16,13 @@ from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
-from dataset_builder.bar_mesh import plain_bar_mesh
-from dataset_builder.bending import bent_line_m
 from dataset_builder.board import board_texture
 from dataset_builder.model import Bar, WorldMesh
 from dataset_builder.optics import Camera, rig_cameras
 from dataset_builder.protocols import aim_rig
 from dataset_builder.raycast import EyeTruth, RayCaster
+from dataset_builder.shapes.bar_mesh import plain_bar_mesh
+from dataset_builder.shapes.bending import bent_line_m
 from dataset_builder.specs import BoardSpec, RigSpec
 from rebar_depth_bench.calibration import Lens, StereoCalibration
 from rebar_depth_bench.cameras import inverse_rigid, pixel_rays, transform

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from dataset_builder.cage_bars import CageBar
-from dataset_builder.ifc_bars import ifc_bars
-from dataset_builder.ifc_model import ifcopenshell as package
+from dataset_builder.assemblies.cage_bars import CageBar
+from dataset_builder.assemblies.ifc_bars import ifc_bars
+from dataset_builder.assemblies.ifc_model import ifcopenshell as package
 
 ifcopenshell = package()
 Numbers = Sequence[float]

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.bar_mesh import plain_outer_radius_m
 from dataset_builder.model import Assembly, Bar
+from dataset_builder.shapes.bar_mesh import plain_outer_radius_m
 
 
 def line_m(bar: Bar) -> Float64[ndarray, "n 3"]:

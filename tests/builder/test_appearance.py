@@ -15,9 +15,9 @@ import pytest
 from numpy import ndarray
 
 from dataset_builder.appearance import LIGHT, STEEL, THINGS, VARIANTS, check_variants
-from dataset_builder.lattice import lattice_assembly
+from dataset_builder.appearance.occluders import MAKERS, occluders
+from dataset_builder.assemblies.lattice import lattice_assembly
 from dataset_builder.model import Assembly
-from dataset_builder.occluders import MAKERS, occluders
 from dataset_builder.optics import Camera
 from dataset_builder.protocols import aim_rig
 from dataset_builder.raycast import RayCaster

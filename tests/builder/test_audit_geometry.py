@@ -36,7 +36,7 @@ from dataset_builder.audit.projection import (
 )
 from dataset_builder.audit.second_renderer import cycles_difference_m, cycles_verdict
 from dataset_builder.audit.views import AuditedView
-from dataset_builder.bending import bent_line_m
+from dataset_builder.shapes.bending import bent_line_m
 from rebar_depth_bench.cameras import pixel_rays
 from tests.builder.audit_scene import BOARD, RIGS, config, scene, view, with_depth
 

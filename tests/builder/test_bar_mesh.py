@@ -8,8 +8,8 @@ import trimesh
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.bar_mesh import RibPattern, outer_radius_m, ribbed_bar_mesh
 from dataset_builder.model import Mesh
+from dataset_builder.shapes.bar_mesh import RibPattern, outer_radius_m, ribbed_bar_mesh
 
 LENGTH_M = 0.1
 

@@ -19,8 +19,8 @@ import pytest
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.assemblies.lattice import lattice_assembly
 from dataset_builder.board import marker_corners_m
-from dataset_builder.lattice import lattice_assembly
 from dataset_builder.model import WorldMesh
 from dataset_builder.optics import Camera
 from dataset_builder.protocols import aim_rig

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 import trimesh
 
+from dataset_builder.assemblies.mesh_door import mesh_file_spec
 from dataset_builder.cluster import on_cluster
 from dataset_builder.configs import CONFIGS
-from dataset_builder.mesh_door import mesh_file_spec
 from dataset_builder.plan import BUILD_FOLDER, generator_stamp, plan_config
 from dataset_builder.shards import Staging
 from dataset_builder.units import units_of

@@ -17,8 +17,8 @@ import pytest
 from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
+from dataset_builder.assemblies.lattice import lattice_assembly
 from dataset_builder.board import marker_corners_m
-from dataset_builder.lattice import lattice_assembly
 from dataset_builder.model import WorldMesh
 from dataset_builder.optics import Camera, rig_cameras, zed_rig
 from dataset_builder.protocols import aim_rig

@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
 
-from dataset_builder import ifc_meshes
-from dataset_builder.cage_file import cage_file_spec, load_cage
-from dataset_builder.ifc_bars import ifc_bars
-from dataset_builder.ifc_geometry import arc_through, axis_placement
+from dataset_builder.assemblies import ifc_meshes
+from dataset_builder.assemblies.cage_file import cage_file_spec, load_cage
+from dataset_builder.assemblies.ifc_bars import ifc_bars
+from dataset_builder.assemblies.ifc_geometry import arc_through, axis_placement
 from dataset_builder.model import Bar
 from tests.builder.ifc_writer import Ifc, extruded, ifcopenshell
 

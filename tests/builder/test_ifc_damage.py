@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dataset_builder import ifc_meshes
-from dataset_builder.cage_file import cage_file_spec, load_cage
-from dataset_builder.ifc_bars import _swept, ifc_bars
+from dataset_builder.assemblies import ifc_meshes
+from dataset_builder.assemblies.cage_file import cage_file_spec, load_cage
+from dataset_builder.assemblies.ifc_bars import _swept, ifc_bars
 from dataset_builder.model import Assembly
 from dataset_builder.scene_file import scene_config
 from rebar_depth_bench.errors import InputError, MeshError
@@ -133,8 +133,8 @@ def test_a_missing_package_says_how_to_install_it(monkeypatch: pytest.MonkeyPatc
 def test_blender_and_ifcopenshell_live_in_one_process() -> None:
     code = """
 import bpy
-from dataset_builder.cage_file import cage_file_spec, load_cage
-from dataset_builder.ifc_model import open_model, world_meshes
+from dataset_builder.assemblies.cage_file import cage_file_spec, load_cage
+from dataset_builder.assemblies.ifc_model import open_model, world_meshes
 from pathlib import Path
 assert len(load_cage(cage_file_spec("examples/column.ifc")).bars) == 13
 model = open_model(Path("examples/column.ifc").read_bytes(), "a")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy import ndarray
 
-from dataset_builder.bar_mesh import outer_radius_m
-from dataset_builder.lattice import CLEAR_GAP_M, LIFT_M, lattice_assembly
+from dataset_builder.assemblies.lattice import CLEAR_GAP_M, LIFT_M, lattice_assembly
 from dataset_builder.model import Assembly, Bar
+from dataset_builder.shapes.bar_mesh import outer_radius_m
 from dataset_builder.specs import LatticeSpec
 
 SPEC = LatticeSpec()

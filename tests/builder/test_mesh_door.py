@@ -13,8 +13,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataset_builder.lattice import lattice_assembly
-from dataset_builder.mesh_door import load_assembly, mesh_file_spec
+from dataset_builder.assemblies.lattice import lattice_assembly
+from dataset_builder.assemblies.mesh_door import load_assembly, mesh_file_spec
 from dataset_builder.model import Assembly
 from dataset_builder.specs import LatticeSpec
 from rebar_depth_bench.errors import MeshError

@@ -19,19 +19,19 @@ from jaxtyping import Float64
 from numpy import ndarray
 from scipy.spatial import ConvexHull
 
+from dataset_builder.appearance.occluders import MAKERS, occluders
 from dataset_builder.assemblies import aim_point_m
-from dataset_builder.bar_mesh import outer_radius_m, plain_bar_mesh
+from dataset_builder.assemblies.lattice import lattice_assembly
+from dataset_builder.assemblies.pier import pier_assembly
+from dataset_builder.assemblies.pile import pile_assembly
 from dataset_builder.blender.laboratory import laboratory
 from dataset_builder.blender.outdoors import CLEAR_M, SLAB_HALF_M, outdoors
 from dataset_builder.board import marker_corners_m
 from dataset_builder.configs import LATTICE_DOME, LATTICE_RING, PIER_DOME, PILE_DOME
-from dataset_builder.lattice import lattice_assembly
 from dataset_builder.model import NOT_STEEL, Assembly, Bar, Mesh, Part
-from dataset_builder.occluders import MAKERS, occluders
 from dataset_builder.optics import rig_cameras
-from dataset_builder.pier import pier_assembly
-from dataset_builder.pile import pile_assembly
 from dataset_builder.protocols import poses
+from dataset_builder.shapes.bar_mesh import outer_radius_m, plain_bar_mesh
 from dataset_builder.specs import (
     AppearanceSpec,
     AssemblySpec,

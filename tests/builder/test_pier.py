@@ -12,11 +12,11 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from dataset_builder.assemblies import aim_point_m, make_assembly
-from dataset_builder.bar_mesh import plain_outer_radius_m
-from dataset_builder.lattice import LIFT_M
+from dataset_builder.assemblies.lattice import LIFT_M
+from dataset_builder.assemblies.pier import pier_assembly
+from dataset_builder.assemblies.pier_layout import CLEAR_GAP_M
 from dataset_builder.model import Assembly, Bar, Part
-from dataset_builder.pier import pier_assembly
-from dataset_builder.pier_layout import CLEAR_GAP_M
+from dataset_builder.shapes.bar_mesh import plain_outer_radius_m
 from dataset_builder.specs import PierSpec
 from tests.builder.polylines import (
     hooks_m,

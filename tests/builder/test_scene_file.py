@@ -15,15 +15,15 @@ from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from dataset_builder.assemblies import aim_point_m, check_fits, make_assembly
-from dataset_builder.bar_mesh import outer_radius_m
-from dataset_builder.cage_bars import MAX_RIBS, CageBar, cage_assembly
-from dataset_builder.cage_file import cage_file_spec, load_cage
+from dataset_builder.assemblies.cage_bars import MAX_RIBS, CageBar, cage_assembly
+from dataset_builder.assemblies.cage_file import cage_file_spec, load_cage
+from dataset_builder.assemblies.lattice import lattice_assembly
 from dataset_builder.configs import LATTICE_DOME
-from dataset_builder.lattice import lattice_assembly
 from dataset_builder.model import Assembly, Bar
 from dataset_builder.protocols import offsets_m
 from dataset_builder.scene_file import NEAREST_PER_REACH, scene_config
 from dataset_builder.scene_toml import read_scene_toml
+from dataset_builder.shapes.bar_mesh import outer_radius_m
 from dataset_builder.specs import BoardSpec, CageFileSpec, DomeSpec, LatticeSpec, MeshFileSpec, RingSpec
 from rebar_depth_bench.errors import InputError, MeshError
 from rebar_depth_bench.ply import write_mesh_ply

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dataset_builder.heap import DropSpec, drop_poses, free_markers
-from dataset_builder.pile import STATES, Pose, placed_m, settled_poses, stirrup_line_m
+from dataset_builder.assemblies.heap import DropSpec, drop_poses, free_markers
+from dataset_builder.assemblies.pile import STATES, Pose, placed_m, settled_poses, stirrup_line_m
 from dataset_builder.specs import BoardSpec, PileSpec
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'rebar-depth-bench[physics]'")
 
-from dataset_builder.settling import PHYSICS, Settled, dropped, faults, settled  # noqa: E402
+from dataset_builder.assemblies.settling import PHYSICS, Settled, dropped, faults, settled  # noqa: E402
 
 SPEC = PileSpec()
 STORED = json.loads((STATES / "pile-0.json").read_text())
@@ -112,7 +112,15 @@ def test_stirrups_start_apart_whichever_way_they_tilt() -> None:
 
 
 def test_the_command_refuses_in_words(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "dataset_builder.settling", "--seed", "-1", "--out", str(tmp_path / "x.json")]
+    command = [
+        sys.executable,
+        "-m",
+        "dataset_builder.assemblies.settling",
+        "--seed",
+        "-1",
+        "--out",
+        str(tmp_path / "x.json"),
+    ]
     refused = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert refused.returncode == 2
     assert "Traceback" not in refused.stderr

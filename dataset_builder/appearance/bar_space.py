@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from dataset_builder.bar_mesh import outer_radius_m, plain_outer_radius_m
 from dataset_builder.model import Bar
+from dataset_builder.shapes.bar_mesh import outer_radius_m, plain_outer_radius_m
 
 _PARALLEL = 1e-12
 

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.bar_mesh import RibPattern, plain_bar_mesh, ribbed_bar_mesh
-from dataset_builder.mesh_parts import MAX_BARS, MAX_EXTENT_M, MIN_EXTENT_M
+from dataset_builder.assemblies.mesh_parts import MAX_BARS, MAX_EXTENT_M, MIN_EXTENT_M
 from dataset_builder.model import Assembly, Bar, Mesh, Part
+from dataset_builder.shapes.bar_mesh import RibPattern, plain_bar_mesh, ribbed_bar_mesh
 from rebar_depth_bench.errors import MeshError, problem_summary
 
 MATERIAL = "steel"

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.bending import bend_radius_m, bent_line_m
+from dataset_builder.shapes.bending import bend_radius_m, bent_line_m
 
 HOOK_DEG = 135.0
 """How far each end turns round its corner, into the core: the seismic hook of ACI 318-19, section 25.3.4 (read in

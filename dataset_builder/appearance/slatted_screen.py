@@ -7,9 +7,9 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.appearance import SUN_FROM
+from dataset_builder.appearance.steel_site import GAP_M, Site
 from dataset_builder.model import NOT_STEEL, Part
-from dataset_builder.solids import box, joined, placed
-from dataset_builder.steel_site import GAP_M, Site
+from dataset_builder.shapes.solids import box, joined, placed
 
 DISTANCE = 6.0
 """The screen's plane is this many half diagonals from the steel's middle; cameras stay nearer."""

@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.cage_file import load_cage
-from dataset_builder.lattice import lattice_assembly
-from dataset_builder.mesh_door import load_assembly
+from dataset_builder.assemblies.cage_file import load_cage
+from dataset_builder.assemblies.lattice import lattice_assembly
+from dataset_builder.assemblies.mesh_door import load_assembly
+from dataset_builder.assemblies.pier import pier_assembly
+from dataset_builder.assemblies.pile import pile_assembly
 from dataset_builder.model import Assembly
-from dataset_builder.pier import pier_assembly
-from dataset_builder.pile import pile_assembly
 from dataset_builder.protocols import offsets_m
 from dataset_builder.specs import (
     AssemblySpec,

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.appearance.steel_site import GAP_M, Rect, Site
 from dataset_builder.model import NOT_STEEL, Mesh, Part
-from dataset_builder.solids import about_z, box, lathe, placed
-from dataset_builder.steel_site import GAP_M, Rect, Site
+from dataset_builder.shapes.solids import about_z, box, lathe, placed
 
 CLEAR = 0.04
 """Clutter keeps this share of the steel's span away from its bounding box."""

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.bar_mesh import outer_radius_m, ribbed_bar_mesh
 from dataset_builder.model import Assembly, Bar, Mesh, Part
+from dataset_builder.shapes.bar_mesh import outer_radius_m, ribbed_bar_mesh
 from dataset_builder.specs import LatticeSpec
 
 CLEAR_GAP_M = 2e-4

@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from dataset_builder.appearance import SHADOWS, check_variants
-from dataset_builder.clutter import clutter
-from dataset_builder.formwork import formwork
+from dataset_builder.appearance.clutter import clutter
+from dataset_builder.appearance.formwork import formwork
+from dataset_builder.appearance.slatted_screen import slatted_screen
+from dataset_builder.appearance.spacers import spacers
+from dataset_builder.appearance.steel_site import Site
+from dataset_builder.appearance.tie_wire import tie_wire
 from dataset_builder.model import Assembly, Part
-from dataset_builder.slatted_screen import slatted_screen
-from dataset_builder.spacers import spacers
 from dataset_builder.specs import SceneSpec
-from dataset_builder.steel_site import Site
-from dataset_builder.tie_wire import tie_wire
 
 MAKERS: Mapping[str, Callable[[Site], tuple[Part, ...]]] = {
     "tie-wire": tie_wire,

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.bar_space import Capsules
+from dataset_builder.appearance.bar_space import Capsules
 from dataset_builder.board import marker_corners_m
 from dataset_builder.model import Assembly, Bar, Part
 from dataset_builder.specs import SceneSpec

@@ -10,11 +10,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.bar_mesh import plain_bar_mesh
-from dataset_builder.bending import bent_line_m
-from dataset_builder.lattice import LIFT_M, STEEL
-from dataset_builder.model import Assembly, Bar, Mesh, Part
-from dataset_builder.pier_layout import (
+from dataset_builder.assemblies.lattice import LIFT_M, STEEL
+from dataset_builder.assemblies.pier_layout import (
     Link,
     PierLayout,
     check_stock_length,
@@ -22,6 +19,9 @@ from dataset_builder.pier_layout import (
     tie_row,
     vertical_places_m,
 )
+from dataset_builder.model import Assembly, Bar, Mesh, Part
+from dataset_builder.shapes.bar_mesh import plain_bar_mesh
+from dataset_builder.shapes.bending import bent_line_m
 from dataset_builder.specs import PierSpec
 
 VERTICAL, HOOP, TIE = "vertical", "hoop", "tie"

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.bar_mesh import plain_outer_radius_m
-from dataset_builder.bending import bend_radius_m
+from dataset_builder.shapes.bar_mesh import plain_outer_radius_m
+from dataset_builder.shapes.bending import bend_radius_m
 from dataset_builder.specs import PierSpec
 
 CLEAR_GAP_M = 5e-4

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dataset_builder.appearance.steel_site import GAP_M, Site
 from dataset_builder.model import NOT_STEEL, Mesh, Part
-from dataset_builder.solids import about_z, box, placed
-from dataset_builder.steel_site import GAP_M, Site
+from dataset_builder.shapes.solids import about_z, box, placed
 
 WIDTHS = (0.8, 0.5)
 """The panels' widths, as shares of the side they stand at."""

@@ -1,8 +1,8 @@
 """Surfaces of IFC objects, from ifcopenshell's geometry kernel in a process of its own.
 
 The kernel may run for ever or crash on a damaged shape; the process then ends by a signal, and whose turn it was
-is known. ``python -m dataset_builder.ifc_meshes`` reads one pickle (content, where, ids) from standard input and
-writes one a shape: vertices and triangles, or the words of an error.
+is known. ``python -m dataset_builder.assemblies.ifc_meshes`` reads one pickle (content, where, ids) from standard
+input and writes one a shape: vertices and triangles, or the words of an error.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from io import BytesIO
 
 import numpy as np
 
-from dataset_builder.ifc_model import open_model, world_meshes
+from dataset_builder.assemblies.ifc_model import open_model, world_meshes
 from dataset_builder.model import Mesh
 
 SECONDS_PER_SHAPE = 60
-COMMAND = (sys.executable, "-m", "dataset_builder.ifc_meshes")
+COMMAND = (sys.executable, "-m", "dataset_builder.assemblies.ifc_meshes")
 
 
 def meshes_of(content: bytes, where: str, ids: list[int]) -> list[Mesh | str]:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.bending import bent_line_m
+from dataset_builder.shapes.bending import bent_line_m
 
 STEP_DEG = 6.0
 """Arcs come as points this far apart at most, like those of ``bent_line_m``."""

@@ -1,6 +1,6 @@
 """Lets stirrups fall in a heap, with MuJoCo, and stores where they come to rest.
 
-python -m dataset_builder.settling --seed S --out FILE
+python -m dataset_builder.assemblies.settling --seed S --out FILE
 
 Tries the seeds from ``S`` on, in order, and writes the first heap that ``faults`` finds nothing against. A
 stirrup is a rigid chain of capsules along the centreline of its mesh, as thick as the ribs reach. Contacts keep
@@ -24,9 +24,17 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.bar_mesh import outer_radius_m
-from dataset_builder.heap import DropSpec, centred, drop_poses, free_markers, height_m, reach_m, tilts_deg
-from dataset_builder.pile import RIBS, Pose, placed_m, stirrup_line_m
+from dataset_builder.assemblies.heap import (
+    DropSpec,
+    centred,
+    drop_poses,
+    free_markers,
+    height_m,
+    reach_m,
+    tilts_deg,
+)
+from dataset_builder.assemblies.pile import RIBS, Pose, placed_m, stirrup_line_m
+from dataset_builder.shapes.bar_mesh import outer_radius_m
 from dataset_builder.specs import BoardSpec, PileSpec
 from rebar_depth_bench.console import run_command
 from rebar_depth_bench.errors import BuildError
@@ -243,7 +251,9 @@ def _whole_from_0(text: str) -> int:
 
 def main() -> int:
     """Find a good heap and write it; the exit status is the contract's."""
-    parser = argparse.ArgumentParser(prog="python -m dataset_builder.settling", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m dataset_builder.assemblies.settling", description=__doc__.split("\n")[0]
+    )
     parser.add_argument("--seed", type=_whole_from_0, default=0, help="the first seed to try")
     parser.add_argument("--out", type=Path, required=True, help="the state, a JSON file")
     arguments = parser.parse_args()

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dataset_builder.bending import bent_line_m, mandrel_diameter_m
-from dataset_builder.cage_bars import CageBar, cage_assembly, refuse
-from dataset_builder.ifc_bars import ifc_bars
+from dataset_builder.assemblies.cage_bars import CageBar, cage_assembly, refuse
+from dataset_builder.assemblies.ifc_bars import ifc_bars
 from dataset_builder.model import Assembly, Bar
 from dataset_builder.scene_toml import TomlBar, read_scene_toml
+from dataset_builder.shapes.bending import bent_line_m, mandrel_diameter_m
 from dataset_builder.specs import CageFileSpec
 from rebar_depth_bench.errors import InputError, MeshError
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.assemblies.pile import Pose, placed_m
 from dataset_builder.board import MARKER_MODULES, marker_corners_m
-from dataset_builder.pile import Pose, placed_m
 from dataset_builder.specs import BoardSpec
 
 _SAMPLE_M = 0.002

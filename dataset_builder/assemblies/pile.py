@@ -1,7 +1,7 @@
 """The pile: overlapping-hook stirrups as they came to rest in a heap on the board.
 
 The poses are stored with the package, because a simulation gives other last digits on another machine;
-``dataset_builder.settling`` made them and makes them again.
+``dataset_builder.assemblies.settling`` made them and makes them again.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.bar_mesh import RibPattern, outer_radius_m, ribbed_bar_mesh
+from dataset_builder.assemblies.stirrup import stirrup_centreline_m
 from dataset_builder.model import Assembly, Bar, Mesh, Part
+from dataset_builder.shapes.bar_mesh import RibPattern, outer_radius_m, ribbed_bar_mesh
 from dataset_builder.specs import PileSpec
-from dataset_builder.stirrup import stirrup_centreline_m
 from rebar_depth_bench.errors import MeshError
 
 STATES = Path(__file__).with_name("settled")

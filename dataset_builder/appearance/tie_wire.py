@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.bar_mesh import plain_bar_mesh
-from dataset_builder.bar_space import Capsules, Crossing, crossings
+from dataset_builder.appearance.bar_space import Capsules, Crossing, crossings
+from dataset_builder.appearance.steel_site import GAP_M, Site
 from dataset_builder.model import NOT_STEEL, Part
-from dataset_builder.solids import joined
-from dataset_builder.steel_site import GAP_M, Site
+from dataset_builder.shapes.bar_mesh import plain_bar_mesh
+from dataset_builder.shapes.solids import joined
 
 WIRE_M = 0.0012
 """Diameter of annealed tie wire."""

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.bar_space import Capsules
+from dataset_builder.appearance.bar_space import Capsules
+from dataset_builder.appearance.steel_site import GAP_M, Site
 from dataset_builder.model import NOT_STEEL, Mesh, Part
-from dataset_builder.solids import about_z, box, joined, lathe, placed
-from dataset_builder.steel_site import GAP_M, Site
+from dataset_builder.shapes.solids import about_z, box, joined, lathe, placed
 
 BARS_PER_SPACER = 6
 FEWEST, MOST = 4, 48

@@ -11,8 +11,8 @@ import math
 import os
 from pathlib import Path
 
-from dataset_builder.bar_estimate import estimate_bar
-from dataset_builder.mesh_parts import SUFFIXES, read_parts
+from dataset_builder.assemblies.bar_estimate import estimate_bar
+from dataset_builder.assemblies.mesh_parts import SUFFIXES, read_parts
 from dataset_builder.model import Assembly, Bar, Mesh, Part
 from dataset_builder.specs import MeshFileSpec
 from rebar_depth_bench.errors import MeshError

@@ -1,0 +1,5 @@
+"""Exports a dataset folder as plain pictures, OpenEXR depth, COLMAP models and nerfstudio transforms."""
+
+from dataset_builder.export.run import ConfigExport, ExportSummary, export
+
+__all__ = ["ConfigExport", "ExportSummary", "export"]

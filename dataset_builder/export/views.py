@@ -1,0 +1,105 @@
+"""The views of a dataset folder as an export needs them: cameras at once, pictures only when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from datasets.exceptions import DatasetGenerationError, DatasetsError
+
+from dataset_builder.optics import Camera
+from rebar_depth_bench.dataset import decode_row, load_undecoded
+from rebar_depth_bench.digests import eye_digest
+from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.folder import DatasetFolder, ViewRecord
+from rebar_depth_bench.schema import EYES
+
+_CAMERA_KINDS = ("K", "distortion", "cam_from_world")
+_TRUTH_KINDS = ("depth", "mask", "bars", *_CAMERA_KINDS)
+_COLUMNS = ("view_id", "baseline_m", *(f"{eye}_{kind}" for eye in EYES for kind in ("rgb", *_TRUTH_KINDS)))
+
+
+@dataclass(frozen=True, eq=False)
+class CameraView:
+    """The cameras of one stereo view, by eye, without its pictures."""
+
+    view_id: str
+    baseline_m: float
+    cameras: Mapping[str, Camera]
+
+    def stem(self, eye: str) -> str:
+        """Return what all files of one eye are called, without folder and ending: ``0000_left``."""
+        return f"{self.view_id.rpartition('/')[2]}_{eye}"
+
+
+@dataclass(frozen=True, eq=False)
+class StoredView:
+    """One row of a dataset folder, its pictures still encoded."""
+
+    view: CameraView
+    record: ViewRecord
+    row: Mapping[str, Any]
+
+    def pictures(self) -> dict[str, Any]:
+        """Return the decoded row (see ``rebar_depth_bench.load``), checked against the manifest.
+
+        Raises ``DatasetError`` naming the view that cannot be decoded, or whose ground truth has not the digest of
+        the manifest.
+        """
+        try:
+            decoded = decode_row(self.row)
+        except (OSError, ValueError) as error:
+            raise DatasetError(f"view {self.record.view_id}: a picture cannot be decoded: {error}") from error
+        for eye, expected in (("left", self.record.left), ("right", self.record.right)):
+            found = eye_digest(*(decoded[f"{eye}_{kind}"] for kind in _TRUTH_KINDS))
+            if found != expected:
+                raise DatasetError(
+                    f"view {self.record.view_id}: the {eye} ground truth has digest {found[:16]}, "
+                    f"the manifest says {expected[:16]}"
+                )
+        return decoded
+
+
+def stored_views(folder: DatasetFolder, config: str, wanted: Collection[str]) -> Iterator[StoredView]:
+    """Yield the wanted views of a config in the folder's order, one row in memory at a time.
+
+    Raises ``DatasetError`` for shards that cannot be read, lack a wanted view or hold an unknown one.
+    """
+    records = {record.view_id: record for record in folder.views(config)}
+    missing = set(wanted)
+    grid = folder.grid(config)
+    for row in _rows(folder, config):
+        view_id = row["view_id"]
+        if view_id not in records:
+            raise DatasetError(f"{folder.root}: view {view_id} is not in the manifest")
+        if view_id in missing:
+            missing.remove(view_id)
+            yield StoredView(_camera_view(row, grid), records[view_id], row)
+    if missing:
+        raise DatasetError(f"{folder.root}: {config} lacks {len(missing)} views, among them {min(missing)}")
+
+
+def _rows(folder: DatasetFolder, config: str) -> Iterator[Mapping[str, Any]]:
+    rows = iter(load_undecoded(folder.root, config, streaming=True, columns=_COLUMNS))
+    while True:
+        try:
+            row: Mapping[str, Any] = next(rows)
+        except StopIteration:
+            return
+        except (OSError, pa.ArrowException, DatasetsError, DatasetGenerationError) as error:
+            raise DatasetError(f"{folder.root}: config {config} cannot be read: {error}") from error
+        yield row
+
+
+def _camera_view(row: Mapping[str, Any], grid: tuple[int, int]) -> CameraView:
+    cameras = {eye: _camera(row, eye, grid) for eye in EYES}
+    return CameraView(row["view_id"], float(row["baseline_m"]), cameras)
+
+
+def _camera(row: Mapping[str, Any], eye: str, grid: tuple[int, int]) -> Camera:
+    K, distortion, pose = (np.array(row[f"{eye}_{kind}"], np.float64) for kind in _CAMERA_KINDS)
+    height, width = grid
+    return Camera(K, distortion, cam_from_world=pose, width=width, height=height)
