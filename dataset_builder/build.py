@@ -17,6 +17,7 @@ from dataset_builder.lock import build_lock
 from dataset_builder.plan import BUILD_FOLDER, ConfigPlan, plan_request
 from dataset_builder.publish import (
     check_folder,
+    check_kept_files,
     check_scenes,
     is_published,
     mend_descriptions,
@@ -63,6 +64,7 @@ def build(
         try:
             sweep(out)
             check_scenes(out, plans)
+            check_kept_files(out, plans)
             with nullcontext(cluster) if cluster else local_processes(workers, threads) as renderer:
                 return _build_plans(plans, out, renderer, progress)
         finally:

@@ -119,7 +119,6 @@ def _audit(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    _check_extra()
     from dataset_builder.export import export
 
     with ProgressBars() as bars:

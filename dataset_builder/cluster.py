@@ -191,6 +191,8 @@ def render_away(unit: Unit, assembly_file: bytes | None) -> Delivery:
             delivery = render_unit(own, staging, threads, blender, _view_teller(worker), worker.address)
         except BuildError as error:
             raise type(error)(f"worker {worker.address}: {error}") from None
+        except InputError as error:
+            raise InputError(f"worker {worker.address}: {error}") from None
         return packed(delivery, unit, staging)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from dataset_builder.appearance import check_variants
+from dataset_builder.appearance import VARIANTS, check_variants
 from dataset_builder.optics import zed_rig
 from dataset_builder.specs import (
     AppearanceSpec,
@@ -84,15 +84,21 @@ class BuildRequest:
         """Return the specs of everything requested; raise ``InputError`` for what is unknown or does not fit."""
         check_variants(self.variants)
         known = [_known_config(name) for name in dict.fromkeys(self.configs)]
-        return [self._requested(spec) for spec in (*known, *self.scenes)]
+        specs = [self._requested(spec) for spec in (*known, *self.scenes)]
+        names = [spec.name for spec in specs]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise InputError(f"more than one config would be named {', '.join(twice)}: give a scene another name")
+        return specs
 
     def _requested(self, spec: ConfigSpec) -> ConfigSpec:
-        suffix = "".join(f"-{name}" for name in self.variants)
+        variants = tuple(name for name in VARIANTS if name in self.variants)  # one look, one name
+        suffix = "".join(f"-{name}" for name in variants)
         scene = replace(
             spec.scene,
             name=spec.scene.name + suffix,
             assembly=self._assembly(spec),
-            appearance=AppearanceSpec(self.variants),
+            appearance=AppearanceSpec(variants),
             seed=self.seed,
         )
         return replace(

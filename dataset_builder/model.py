@@ -4,11 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from jaxtyping import Float64, Int32, UInt16
 from numpy import ndarray
 
 NOT_STEEL = 0
 """The bar id of every surface that is not reinforcement."""
+
+
+MAX_BARS = int(np.iinfo(np.uint16).max)
+"""Bar ids are 16-bit, and 0 is taken."""
+
+STEEL = "steel"
+"""The material of bars."""
+
+ESTIMATED = "imported"
+"""The role of a bar whose axis and diameter were estimated from its surface."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +56,11 @@ class Assembly:
 
     bars: tuple[Bar, ...]
     parts: tuple[Part, ...]
+
+    @property
+    def vertices_m(self) -> Float64[ndarray, "v 3"]:
+        """The vertices of all parts, world frame, metres."""
+        return np.concatenate([part.mesh.vertices_m for part in self.parts])
 
 
 @dataclass(frozen=True, eq=False)

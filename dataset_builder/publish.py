@@ -72,6 +72,15 @@ def check_folder(out: Path) -> None:
         raise InputError(f"{out}: is not empty and holds no {MANIFEST}, expected a new or a dataset folder")
 
 
+def check_kept_files(out: Path, plans: Sequence[ConfigPlan]) -> None:
+    """Raise ``InputError`` where a config that stays has lost a shard or its mesh."""
+    planned = {plan.spec.name for plan in plans}
+    for name, entry in _manifest(out)["configs"].items():
+        lost = [file for file in (*entry["shards"], entry["mesh"]) if not (out / file).is_file()]
+        if lost and name not in planned:
+            raise InputError(f"{out}: {lost[0]} of config {name} is missing; build it again too: --config {name}")
+
+
 def check_scenes(out: Path, plans: Sequence[ConfigPlan]) -> None:
     """Raise ``InputError`` where a config that stays would stand on another version of a scene being built."""
     planned = {plan.spec.name for plan in plans}
@@ -155,6 +164,9 @@ def _write_manifest(out: Path, configs: Mapping[str, Any]) -> None:
         "ground_truth": {"digest": views_digest(views)},
         "configs": ordered,
     }
+    for entry in ordered.values():
+        if not (out / entry["sheet"]).is_file():
+            write_contact_sheet(out, entry["shards"], out / entry["sheet"])
     by_scene = {entry["scene"]["assembly"]["kind"]: entry for entry in reversed(ordered.values())}
     write_scenes_strip(out, list(reversed(by_scene.values())), out / STRIP)
     write_text(out / CARD, dataset_card(manifest))

@@ -65,6 +65,12 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     environment = said.environment or ("outdoors" if misfit else "laboratory")
     if environment == "laboratory" and misfit:
         raise InputError(f'{path}: {misfit}: stand it at the origin, or choose environment = "outdoors"')
+    if cameras_m > OUTDOORS_CAMERAS_M and said.protocol is None:
+        raise InputError(
+            f"{path}: the cage is too large for the dome that is fitted to it: cameras would stand "
+            f"{cameras_m:.4g} m from the world's origin, at most {OUTDOORS_CAMERAS_M} m is clear; is the "
+            "unit right, does the cage stand at the origin? Else give [cameras] in a TOML file"
+        )
     if cameras_m > OUTDOORS_CAMERAS_M:
         raise InputError(
             f"{path}: cameras stand {cameras_m:.4g} m from the world's origin, expected at most "

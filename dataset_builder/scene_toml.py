@@ -30,8 +30,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from dataset_builder.assemblies.mesh_door import UNITS_M
-from dataset_builder.assemblies.mesh_parts import MAX_BARS
+from dataset_builder.length_units import UNITS_M
+from dataset_builder.model import MAX_BARS
 from dataset_builder.specs import DomeSpec, RigSpec, RingSpec
 from dataset_builder.toml_table import (
     FLAG,

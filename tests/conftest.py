@@ -23,7 +23,7 @@ TINY_VIEWS = 9
 """One more than a shard holds."""
 
 
-def run_build(*arguments: str | Path, timeout_s: float = 600) -> subprocess.CompletedProcess[str]:
+def run_build(*arguments: str | Path, timeout_s: float = 3600) -> subprocess.CompletedProcess[str]:
     """Run ``rebar-build`` as a user does."""
     command = [sys.executable, "-m", "dataset_builder", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)

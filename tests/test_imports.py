@@ -11,6 +11,17 @@ SCORING = (
     "import rebar_depth_bench as rdb; rdb.score; rdb.load; rdb.SubmissionWriter; import rebar_depth_bench.cli"
 )
 
+BUILDER = [
+    "appearance.occluders",
+    "assemblies",
+    "assemblies.cage_file",
+    "configs",
+    "export",
+    "optics",
+    "scene_toml",
+]
+"""Each package, and the modules between which imports could run in a circle."""
+
 
 def modules_after(statement: str) -> set[str]:
     code = f"{statement}\nimport sys\nprint(*sys.modules)"
@@ -33,6 +44,11 @@ def test_planning_a_build_does_not_import_blender() -> None:
     found = modules_after("import dataset_builder.cli, dataset_builder.build, dataset_builder.audit")
     assert "dataset_builder.build" in found
     assert not found & {"bpy", "mathutils", "torch"}
+
+
+@pytest.mark.parametrize("name", BUILDER)
+def test_every_module_of_the_builder_can_be_the_first_to_be_imported(name: str) -> None:
+    assert f"dataset_builder.{name}" in modules_after(f"import dataset_builder.{name}")
 
 
 def test_without_the_build_extra_one_sentence_names_it() -> None:

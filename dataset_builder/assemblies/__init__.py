@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.appearance import SHADOWS
+from dataset_builder.appearance.slatted_screen import DISTANCE
 from dataset_builder.assemblies.cage_file import load_cage
 from dataset_builder.assemblies.lattice import lattice_assembly
 from dataset_builder.assemblies.mesh_door import load_assembly
@@ -25,7 +27,7 @@ from dataset_builder.specs import (
     PierSpec,
     PileSpec,
 )
-from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.errors import InputError, MeshError
 
 _MAKERS: Mapping[type, Callable[[Any], Assembly]] = {
     CageFileSpec: load_cage,
@@ -45,7 +47,7 @@ def make_assembly(spec: AssemblySpec) -> Assembly:
 
 def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
     """Raise ``MeshError`` where an assembly reaches below the board or out to the config's nearest camera."""
-    vertices_m = np.concatenate([part.mesh.vertices_m for part in assembly.parts])
+    vertices_m = assembly.vertices_m
     lowest_m = float(vertices_m[:, 2].min())
     if lowest_m < -_BELOW_BOARD_M:
         raise MeshError(f"the assembly reaches down to z = {lowest_m:.4g} m, expected it on the board, z = 0")
@@ -56,6 +58,21 @@ def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
             f"the assembly reaches {reach_m:.4g} m from its middle, expected less than the {nearest_m:.4g} m "
             f"at which the cameras of {config.name} stand: is the unit right?"
         )
+    _check_screen(vertices_m, config)
+
+
+def _check_screen(vertices_m: Float64[ndarray, "n 3"], config: ConfigSpec) -> None:
+    """Raise ``InputError`` where the screen of the variant ``shadows`` would hang among the cameras."""
+    if SHADOWS not in config.scene.appearance.variants:
+        return
+    farthest_m = max(float(np.linalg.norm(offset)) for offset in offsets_m(config.protocol))
+    right_eye_m = float(np.hypot(farthest_m, config.rig.baseline_m))
+    screen_m = DISTANCE * float(np.linalg.norm(np.ptp(vertices_m, axis=0))) / 2
+    if right_eye_m >= screen_m:
+        raise InputError(
+            f"the screen of the variant {SHADOWS!r} would hang {screen_m:.4g} m from the steel, expected it "
+            f"beyond the cameras of {config.name}, which stand up to {right_eye_m:.4g} m from it"
+        )
 
 
 def aim_point_m(assembly: Assembly) -> Float64[ndarray, 3]:
@@ -63,6 +80,6 @@ def aim_point_m(assembly: Assembly) -> Float64[ndarray, 3]:
 
     Rounding keeps ribs and float32 storage from moving the cameras.
     """
-    vertices = np.concatenate([part.mesh.vertices_m for part in assembly.parts])
+    vertices = assembly.vertices_m
     middle: Float64[ndarray, 3] = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     return np.asarray(np.round(middle, _TARGET_DECIMALS) + 0.0)  # no negative zero

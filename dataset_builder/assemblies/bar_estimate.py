@@ -9,7 +9,7 @@ import trimesh
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.model import Bar, Mesh
+from dataset_builder.model import ESTIMATED, Bar, Mesh
 
 # Of a surface's area to the power 3/2: a closed sheet of no thickness stays below, any wire far above.
 _NO_VOLUME = 1e-9
@@ -44,7 +44,7 @@ def estimate_bar(bar_id: int, mesh: Mesh) -> Bar:
         distance = np.linalg.norm(offset - along[..., None] * direction, axis=-1).mean(axis=1)
         diameter = 2 * float(np.average(distance, weights=body.area_faces))
     ends = (_point(origin + centroid + low * direction), _point(origin + centroid + high * direction))
-    return Bar(bar_id, "imported", diameter, ends)
+    return Bar(bar_id, ESTIMATED, diameter, ends)
 
 
 def _principal_direction(body: trimesh.Trimesh) -> Float64[ndarray, " 3"]:

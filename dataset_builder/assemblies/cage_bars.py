@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.assemblies.mesh_parts import MAX_BARS, MAX_EXTENT_M, MIN_EXTENT_M
-from dataset_builder.model import Assembly, Bar, Mesh, Part
+from dataset_builder.assemblies.mesh_parts import MAX_EXTENT_M, MIN_EXTENT_M
+from dataset_builder.model import MAX_BARS, STEEL, Assembly, Bar, Mesh, Part
 from dataset_builder.shapes.bar_mesh import RibPattern, plain_bar_mesh, ribbed_bar_mesh
 from rebar_depth_bench.errors import MeshError, problem_summary
 
-MATERIAL = "steel"
 MIN_DIAMETER_M, MAX_DIAMETER_M = 0.0005, 0.2
 """From thin binding wire to far beyond the thickest bar made; outside, the unit is wrong."""
 
@@ -68,7 +67,7 @@ def cage_assembly(bars: Sequence[CageBar], where: str) -> Assembly:
             problems.append(f"{bar.label}: {error}")
     refuse(problems, where)
     parts = (
-        Part(f"{bar.bar.role}-{bar.bar.bar_id:03d}", mesh, bar.bar.bar_id, MATERIAL)
+        Part(f"{bar.bar.role}-{bar.bar.bar_id:03d}", mesh, bar.bar.bar_id, STEEL)
         for bar, mesh in zip(chosen, meshes, strict=True)
     )
     return Assembly(tuple(bar.bar for bar in chosen), tuple(parts))

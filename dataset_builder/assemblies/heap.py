@@ -11,6 +11,7 @@ from numpy import ndarray
 
 from dataset_builder.assemblies.pile import Pose, placed_m
 from dataset_builder.board import MARKER_MODULES, marker_corners_m
+from dataset_builder.shapes.bending import resampled_m
 from dataset_builder.specs import BoardSpec
 
 _SAMPLE_M = 0.002
@@ -82,7 +83,7 @@ def tilts_deg(poses: Sequence[Pose]) -> list[float]:
 
 def free_markers(lines_m: Sequence[Float64[ndarray, "n 3"]], radius_m: float, board: BoardSpec) -> tuple[int, ...]:
     """Return the markers that no steel covers as seen from above, nor their quiet zone of one module."""
-    points_m = np.concatenate([_resampled_m(line)[:, :2] for line in lines_m])
+    points_m = np.concatenate([resampled_m(line, _SAMPLE_M)[:, :2] for line in lines_m])
     quiet_m = board.marker_side_m / MARKER_MODULES
     free = []
     for marker_id, corners_m in marker_corners_m(board).items():
@@ -119,10 +120,3 @@ def _hoop_middle_m(line_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, " 3"]:
     """Return the middle of the hoop, which the hooks draw the centroid away from."""
     middle: Float64[ndarray, " 3"] = (line_m.min(axis=0) + line_m.max(axis=0)) / 2
     return middle
-
-
-def _resampled_m(line_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "k 3"]:
-    """Return points along a line, every two millimetres or closer."""
-    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line_m, axis=0), axis=1))])
-    at_m = np.linspace(0.0, along_m[-1], int(np.ceil(along_m[-1] / _SAMPLE_M)) + 1)
-    return np.stack([np.interp(at_m, along_m, column) for column in line_m.T], axis=-1)

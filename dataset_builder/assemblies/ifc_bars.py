@@ -27,8 +27,7 @@ from dataset_builder.assemblies.cage_bars import CageBar
 from dataset_builder.assemblies.ifc_geometry import directrix, mapped_matrix, placement_matrix
 from dataset_builder.assemblies.ifc_meshes import meshes_of
 from dataset_builder.assemblies.ifc_model import Entity, Model, angle_unit_rad, length_unit_m, open_model
-from dataset_builder.assemblies.mesh_parts import MAX_BARS
-from dataset_builder.model import Bar, Mesh
+from dataset_builder.model import MAX_BARS, Bar, Mesh
 from rebar_depth_bench.errors import MeshError
 
 ROLES = {"LIGATURE": "stirrup"}

@@ -54,8 +54,7 @@ def main() -> None:
     content, where, ids = pickle.load(sys.stdin.buffer)
     with os.fdopen(os.dup(1), "wb") as answers:
         os.dup2(2, 1)
-        signal.alarm(SECONDS_PER_SHAPE)
-        model = open_model(content, where)
+        model = open_model(content, where)  # the parent has opened this very content
         for number in ids:
             signal.alarm(SECONDS_PER_SHAPE)
             pickle.dump(_mesh(model, number), answers)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import re
+from collections import Counter
 from textwrap import shorten
 from typing import Any
 
@@ -129,7 +130,7 @@ def _check_text(text: str, where: str) -> None:
     instances = [int(number) for number in _INSTANCE.findall(bare)]
     defined = set(instances)
     if len(defined) < len(instances):
-        twice = next(number for number in instances if instances.count(number) > 1)
+        twice = next(number for number, times in Counter(instances).items() if times > 1)
         raise MeshError(f"{where}: instance #{twice} is defined twice, expected each once")
     lost = sorted({int(number) for number in _REFERENCE.findall(bare)} - defined)
     if lost:

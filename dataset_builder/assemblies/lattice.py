@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.model import Assembly, Bar, Mesh, Part
+from dataset_builder.model import STEEL, Assembly, Bar, Mesh, Part
 from dataset_builder.shapes.bar_mesh import outer_radius_m, ribbed_bar_mesh
 from dataset_builder.specs import LatticeSpec
 
@@ -18,7 +18,6 @@ CLEAR_GAP_M = 2e-4
 LIFT_M = 5e-5
 """The upright rods' ends stand this far above the paper, lest they coincide with it."""
 
-STEEL = "steel"
 AXES = ("x", "y", "z")
 
 

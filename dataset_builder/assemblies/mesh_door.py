@@ -13,13 +13,10 @@ from pathlib import Path
 
 from dataset_builder.assemblies.bar_estimate import estimate_bar
 from dataset_builder.assemblies.mesh_parts import SUFFIXES, read_parts
-from dataset_builder.model import Assembly, Bar, Mesh, Part
+from dataset_builder.length_units import UNITS_M
+from dataset_builder.model import STEEL, Assembly, Bar, Mesh, Part
 from dataset_builder.specs import MeshFileSpec
 from rebar_depth_bench.errors import MeshError
-
-UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-"""Metres in one of each named unit."""
-MATERIAL = "steel"
 
 
 def mesh_file_spec(path: str | os.PathLike[str], unit: str | float) -> MeshFileSpec:
@@ -54,7 +51,7 @@ def load_assembly(spec: MeshFileSpec) -> Assembly:
     meshes = read_parts(content, spec)
     return Assembly(
         bars=tuple(_bar(bar_id, mesh, spec.path) for bar_id, mesh in meshes.items()),
-        parts=tuple(Part(f"bar-{bar_id:03d}", mesh, bar_id, MATERIAL) for bar_id, mesh in meshes.items()),
+        parts=tuple(Part(f"bar-{bar_id:03d}", mesh, bar_id, STEEL) for bar_id, mesh in meshes.items()),
     )
 
 

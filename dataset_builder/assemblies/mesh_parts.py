@@ -31,15 +31,13 @@ from jaxtyping import Integer
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from dataset_builder.model import NOT_STEEL, Mesh
+from dataset_builder.model import MAX_BARS, NOT_STEEL, Mesh
 from dataset_builder.specs import MeshFileSpec
 from rebar_depth_bench.errors import DatasetError, MeshError
 from rebar_depth_bench.ply import has_mesh_ply_header, parse_mesh_ply
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 """The suffixes of the mesh files that are read, in lower case."""
-MAX_BARS = int(np.iinfo(np.uint16).max)
-"""Bar ids are 16-bit, and 0 is taken."""
 MIN_EXTENT_M = 0.001
 MAX_EXTENT_M = 100.0
 """An assembly's largest side lies strictly between these, or its unit is wrong."""

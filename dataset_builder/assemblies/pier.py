@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.assemblies.lattice import LIFT_M, STEEL
+from dataset_builder.assemblies.lattice import LIFT_M
 from dataset_builder.assemblies.pier_layout import (
     Link,
     PierLayout,
@@ -19,7 +19,7 @@ from dataset_builder.assemblies.pier_layout import (
     tie_row,
     vertical_places_m,
 )
-from dataset_builder.model import Assembly, Bar, Mesh, Part
+from dataset_builder.model import STEEL, Assembly, Bar, Mesh, Part
 from dataset_builder.shapes.bar_mesh import plain_bar_mesh
 from dataset_builder.shapes.bending import bent_line_m
 from dataset_builder.specs import PierSpec

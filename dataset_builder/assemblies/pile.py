@@ -17,7 +17,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.assemblies.stirrup import stirrup_centreline_m
-from dataset_builder.model import Assembly, Bar, Mesh, Part
+from dataset_builder.model import STEEL, Assembly, Bar, Mesh, Part
 from dataset_builder.shapes.bar_mesh import RibPattern, outer_radius_m, ribbed_bar_mesh
 from dataset_builder.specs import PileSpec
 from rebar_depth_bench.errors import MeshError
@@ -28,7 +28,6 @@ STATES = Path(__file__).with_name("settled")
 RIBS = RibPattern(segments_per_row=8)
 """The usual ribs with two mesh segments less per row: 57 thousand triangles a stirrup."""
 
-STEEL = "steel"
 ROLE = "stirrup"
 UNIT_TOLERANCE = 1e-9
 

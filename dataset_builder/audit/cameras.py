@@ -85,8 +85,8 @@ def protocol_problems(entry: Mapping[str, Any], views: Sequence[ExpectedView]) -
     expected = [view.view_id for view in views]
     if found != expected:
         wrong = next((pair for pair in zip(found, expected, strict=False) if pair[0] != pair[1]), None)
-        said = f"the first that differs is {wrong[0]}, expected {wrong[1]}" if wrong else ""
-        yield f"the manifest names {len(found)} views, its protocol gives {len(expected)} of these: {said}"
+        said = f": the first that differs is {wrong[0]}, expected {wrong[1]}" if wrong else ""
+        yield f"the manifest names {len(found)} views, its protocol gives {len(expected)} of these{said}"
 
 
 def camera_problems(row: Mapping[str, Any], expected: ExpectedView) -> Iterator[str]:

@@ -45,7 +45,7 @@ def largest_axis_excess(config: AuditedConfig, view: AuditedView) -> float:
 
     What a polyline's chords leave of a bend's arc is taken off: the bound is the same for every bar.
     """
-    ratios = [axis_distance_ratio(eye.points_m, eye.bars, config.steel) for eye in view.eyes.values()]
+    ratios = [axis_distance_ratio(eye.points_m, eye.bars, config.drawn_steel) for eye in view.eyes.values()]
     return max(float(found.max(initial=0.0)) for found in ratios)
 
 
@@ -108,11 +108,11 @@ def polyline_distance_m(
 
 
 def axis_verdict(config: AuditedConfig, ratios: Sequence[float]) -> Check:
-    """Hold the largest ratio of all views against what ribs allow; of a mesh file's parts it is only told."""
+    """Hold the largest ratio of all views against what ribs allow; estimated axes are left out."""
     name, largest = f"{config.name}: steel on its bar's axis", max(ratios, default=0.0)
     found = f"at most {largest:.3f} radii"
-    if config.axes_are_estimates:
-        return Check(name, found, "none: the axes are estimates")
+    if not config.drawn_steel:
+        return Check(name, "the axes are estimates", "left out")
     problem = f"a steel pixel lies {largest:.3f} nominal radii from its bar's axis"
     return Check(name, found, f"{MAX_AXIS_RATIO} radii", (problem,) if largest > MAX_AXIS_RATIO else ())
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 from numpy import ndarray
 
 from dataset_builder.appearance import LIGHT, THINGS, of_slot
-from dataset_builder.model import Bar
+from dataset_builder.model import ESTIMATED, Bar
 from dataset_builder.optics import Camera
 from dataset_builder.specs import BoardSpec
 from rebar_depth_bench.cameras import inverse_rigid, pixel_rays, transform
@@ -21,7 +21,7 @@ from rebar_depth_bench.schema import EYES
 
 @dataclass(frozen=True, eq=False)
 class AuditedConfig:
-    """A config's manifest entry, the bars of its scene, and the cameras that its views must have."""
+    """A config's manifest entry, the bars of its scene, and its board."""
 
     name: str
     entry: Mapping[str, Any]
@@ -29,9 +29,9 @@ class AuditedConfig:
     board: BoardSpec | None
 
     @property
-    def axes_are_estimates(self) -> bool:
-        """Whether the bars' axes were guessed from a mesh file's parts, which may be bent."""
-        return bool(self.entry["scene"]["assembly"]["kind"] == "mesh-file")
+    def drawn_steel(self) -> tuple[Bar, ...]:
+        """The bars whose axes are known; an estimated axis is straight where its bar may be bent."""
+        return tuple(bar for bar in self.steel if bar.role != ESTIMATED)
 
     @property
     def has_things(self) -> bool:

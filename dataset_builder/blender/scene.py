@@ -13,7 +13,7 @@ from numpy import ndarray
 from dataset_builder.appearance import LIGHT, STEEL, check_variants, one_of_slot
 from dataset_builder.appearance.occluders import occluders
 from dataset_builder.blender.environments import ENVIRONMENTS
-from dataset_builder.blender.laboratory import SHEET_THICKNESS_M
+from dataset_builder.blender.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M
 from dataset_builder.blender.lighting import add_light
 from dataset_builder.blender.materials import STEEL_LOOKS, material, paper, surface_variation
 from dataset_builder.board import board_texture
@@ -42,7 +42,11 @@ def build_scene(assembly: Assembly, spec: SceneSpec) -> None:
         for name, value in surface_variation(spec.seed, part.bar_id).items():
             steel[name] = value
     environment = ENVIRONMENTS[spec.environment]
-    for part in (*environment.parts(), *occluders(assembly, spec)):
+    # A floor that steel may stand on would lie in one plane with the sheet: under a board it sinks.
+    sunk_m = 0.0 if spec.board is None else min(0.0, BENCH_TOP_M - environment.floor_m)
+    for part in environment.parts():
+        add_object(part, mesh_data(part.name, part.mesh, part.material), np.array([0.0, 0.0, sunk_m]))
+    for part in occluders(assembly, spec):
         add_object(part, mesh_data(part.name, part.mesh, part.material), np.zeros(3))
     if spec.board is not None:
         _add_board(spec.board)

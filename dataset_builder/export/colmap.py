@@ -15,6 +15,7 @@ from numpy import ndarray
 from dataset_builder.export.views import CameraView
 from dataset_builder.model import Bar
 from dataset_builder.optics import Camera
+from dataset_builder.shapes.bending import resampled_m
 
 HALF_PIXEL = 0.5
 POINTS_WANTED = 10_000
@@ -61,15 +62,11 @@ def points_txt(bars: Sequence[Bar]) -> str:
 
 
 def axis_points_m(bars: Sequence[Bar]) -> Float64[ndarray, "n 3"]:
-    """Return points spread evenly over the bars' centrelines, legs' ends included; world frame, metres."""
-    legs = [leg for bar in bars for leg in zip(bar.axis_m[:-1], bar.axis_m[1:], strict=True)]
-    if not legs:
-        return np.empty((0, 3))
-    starts, ends = np.array(legs, dtype=np.float64).transpose(1, 0, 2)
-    lengths_m = np.linalg.norm(ends - starts, axis=1)
-    step_m = max(float(lengths_m.sum()) / POINTS_WANTED, _SHORTEST_STEP_M)
-    counts = np.ceil(lengths_m / step_m).astype(int) + 1
-    return np.concatenate([np.linspace(*leg, count) for leg, count in zip(legs, counts, strict=True)])
+    """Return points spread evenly over each bar's centreline, its ends included; world frame, metres."""
+    axes_m = [np.array(bar.axis_m, dtype=np.float64) for bar in bars]
+    length_m = sum(float(np.linalg.norm(np.diff(axis_m, axis=0), axis=1).sum()) for axis_m in axes_m)
+    step_m = max(length_m / POINTS_WANTED, _SHORTEST_STEP_M)
+    return np.concatenate([np.empty((0, 3)), *(resampled_m(axis_m, step_m) for axis_m in axes_m)])
 
 
 def quaternion_wxyz(rotation: Float64[ndarray, "3 3"]) -> Float64[ndarray, " 4"]:

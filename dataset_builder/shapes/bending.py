@@ -53,6 +53,13 @@ def bent_line_m(
     return _without_repeats(np.concatenate(pieces))
 
 
+def resampled_m(line_m: Float64[ndarray, "n 3"], step_m: float) -> Float64[ndarray, "k 3"]:
+    """Return points spread evenly along a line, both ends included, ``step_m`` apart or closer."""
+    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line_m, axis=0), axis=1))])
+    at_m = np.linspace(0.0, along_m[-1], int(np.ceil(along_m[-1] / step_m)) + 1)
+    return np.stack([np.interp(at_m, along_m, column) for column in line_m.T], axis=-1)
+
+
 def _turn(before: Float64[ndarray, " 3"], after: Float64[ndarray, " 3"]) -> float:
     """Return the angle by which the direction changes at a corner, radians."""
     turn = float(np.arctan2(np.linalg.norm(np.cross(before, after)), before @ after))

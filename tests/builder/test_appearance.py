@@ -118,7 +118,7 @@ def test_names_that_go_are_let_through() -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("appearance")
     command = [sys.executable, "-m", "tests.builder.test_appearance", str(path)]
-    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=600, check=False)
+    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=1800, check=False)
     assert finished.returncode == 0, finished.stderr
     return path
 

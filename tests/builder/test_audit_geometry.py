@@ -36,6 +36,7 @@ from dataset_builder.audit.projection import (
 )
 from dataset_builder.audit.second_renderer import cycles_difference_m, cycles_verdict
 from dataset_builder.audit.views import AuditedView
+from dataset_builder.model import ESTIMATED
 from dataset_builder.shapes.bending import bent_line_m
 from rebar_depth_bench.cameras import pixel_rays
 from tests.builder.audit_scene import BOARD, RIGS, config, scene, view, with_depth
@@ -124,9 +125,12 @@ def test_things_may_hide_the_board_but_nothing_lies_below_it() -> None:
     assert not passed(with_a_thing(0.02, 0.95))
 
 
-def test_axes_that_are_estimates_are_told_and_not_judged() -> None:
-    assert axis_verdict(config(kind="mesh-file"), [7.0]).passed
-    assert not axis_verdict(config(), [MAX_AXIS_RATIO + 0.01]).passed
+def test_estimated_axes_are_left_out_and_drawn_ones_judged() -> None:
+    drawn = config()
+    known, guessed = drawn.steel[:1], replace(drawn.steel[1], role=ESTIMATED)
+    assert replace(drawn, steel=(*known, guessed)).drawn_steel == known
+    assert axis_verdict(replace(drawn, steel=(guessed,)), [7.0]).bound == "left out"
+    assert not axis_verdict(drawn, [MAX_AXIS_RATIO + 0.01]).passed
 
 
 def test_epipolar_share_is_that_of_all_views() -> None:

@@ -126,7 +126,7 @@ def _save_mesh(path: Path, mesh: WorldMesh) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("blender")
     command = [sys.executable, "-m", "tests.builder.test_blender_scene", str(path)]
-    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=300, check=False)
+    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=1800, check=False)
     assert finished.returncode == 0, finished.stderr
     return path
 

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -57,7 +58,9 @@ class Cluster:
         scratch = self.folder / f"worker-{len(self.processes)}"
         scratch.mkdir()
         options = ("--nthreads", "1", "--no-nanny", "--local-directory", str(scratch))
+        log = self.folder / f"worker-{len(self.processes)}.log"
         self.workers.append(self._start("worker", self.address, *options, **environment))
+        wait_until(lambda: b"Registered to" in log.read_bytes())
 
     def _start(self, role: str, *arguments: str, **environment: str) -> subprocess.Popen[bytes]:
         with (self.folder / f"{role}-{len(self.processes)}.log").open("wb") as log:
@@ -139,13 +142,13 @@ def test_interrupted_it_goes_on_and_a_killed_worker_is_replaced(
     build = start_build(root, *LATTICE, "--cluster", cluster.address)
     wait_until(lambda: staged_rows(root) or build.poll() is not None)
     build.send_signal(signal.SIGINT)
-    _, complaint = build.communicate(timeout=60)
+    _, complaint = build.communicate(timeout=300)
     assert build.returncode == 1, complaint.decode()
     assert "run the same command again to go on" in complaint.decode()
     assert "Traceback" not in complaint.decode()
     already = staged_rows(root)
     assert 0 < already < VIEWS
-    wait_until(lambda: not rendering(cluster), timeout_s=60)  # nobody waits for what was under way
+    wait_until(lambda: not rendering(cluster), timeout_s=300)  # nobody waits for what was under way
 
     build = start_build(root, *LATTICE, "--cluster", cluster.address)
     wait_until(lambda: rendering(cluster) or build.poll() is not None)
@@ -159,7 +162,7 @@ def test_interrupted_it_goes_on_and_a_killed_worker_is_replaced(
     assert build.returncode == 0, complaint.decode()
     assert f"lattice: {already} of {VIEWS}" in complaint.decode()
     assert contents(root) == contents(local_root)
-    wait_until(lambda: not any(process.exists() for process in orphans), timeout_s=20)
+    wait_until(lambda: not any(process.exists() for process in orphans), timeout_s=120)
 
 
 def rendering(cluster: Cluster) -> list[int]:
@@ -168,11 +171,14 @@ def rendering(cluster: Cluster) -> list[int]:
 
 def test_a_unit_that_crashes_blender_twice_ends_the_build_in_words(cluster: Cluster, tmp_path: Path) -> None:
     build = start_build(tmp_path / "dataset", *LATTICE, "--cluster", cluster.address)
+    deadline = time.monotonic() + 900
     while build.poll() is None:
+        assert time.monotonic() < deadline, "waited too long"
         for pid in rendering(cluster):
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-    _, complaint = build.communicate()
+        time.sleep(0.02)
+    _, complaint = build.communicate(timeout=120)
     said = complaint.decode()
     assert build.returncode == 1
     assert "error: worker tcp://127.0.0.1:" in said

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,13 @@ import pytest
 from PIL import Image
 
 import rebar_depth_bench as rdb
+from dataset_builder.assemblies import check_fits, make_assembly
 from dataset_builder.audit import audit
 from dataset_builder.bars_table import read_bars
 from dataset_builder.configs import CONFIGS, BuildRequest
 from dataset_builder.pictures import STRIP_PANEL_PX, TILE_PX
 from dataset_builder.protocols import offsets_m
-from dataset_builder.specs import RigSpec
+from dataset_builder.specs import RigSpec, RingSpec
 from rebar_depth_bench.cameras import ideal_K
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring import score
@@ -149,6 +151,10 @@ def test_a_users_scene_and_a_variant_stand_beside_the_standard_configs(tmp_path:
     [
         (BuildRequest(variants=("rust",)), "no appearance variant 'rust', expected one of dusk"),
         (BuildRequest(variants=("wet", "rusted")), "wet, rusted all set the steel, expected one of them"),
+        (
+            BuildRequest(configs=(), scenes=(CONFIGS["pile"](), CONFIGS["pile"]())),
+            "more than one config would be named pile",
+        ),
         (BuildRequest(configs=("pier", "latice")), "no config 'latice', expected one of lattice"),
     ],
 )
@@ -162,6 +168,22 @@ def test_a_mesh_takes_the_place_of_rods_alone(tmp_path: Path) -> None:
     refused = run_build("--out", tmp_path / "dataset", "--config", "pile", "--mesh", tmp_path / "a.stl")
     assert refused.returncode == 2
     assert "--mesh takes the place of the lattice's rods, but pile is no lattice" in refused.stderr
+
+
+def test_the_order_of_variants_makes_no_other_look() -> None:
+    one, other = (
+        BuildRequest(variants=names).config_specs() for names in (("wet", "formwork"), ("formwork", "wet"))
+    )
+    assert one == other
+    assert one[0].name == "lattice-wet-formwork"
+
+
+def test_the_screen_of_the_shadows_never_hangs_among_the_cameras() -> None:
+    [spec] = BuildRequest(configs=("lattice",), variants=("shadows",)).config_specs()
+    check_fits(make_assembly(spec.scene.assembly), spec)
+    far = replace(spec, protocol=RingSpec(radius_m=0.6, elevation_deg=30.0, azimuths=4))
+    with pytest.raises(InputError, match=r"would hang 0\.5"):
+        check_fits(make_assembly(far.scene.assembly), far)
 
 
 def test_size_and_samples_reach_every_rig() -> None:

@@ -79,7 +79,7 @@ def probe(folder: Path) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("blender")
     command = [sys.executable, "-m", "tests.builder.test_distorted_camera", str(path)]
-    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=600, check=False)
+    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=1800, check=False)
     assert finished.returncode == 0, finished.stderr
     return path
 
