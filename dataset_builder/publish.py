@@ -167,13 +167,19 @@ def _write_manifest(out: Path, configs: Mapping[str, Any]) -> None:
     for entry in ordered.values():
         if not (out / entry["sheet"]).is_file():
             write_contact_sheet(out, entry["shards"], out / entry["sheet"])
-    by_scene = {entry["scene"]["assembly"]["kind"]: entry for entry in reversed(ordered.values())}
+    by_scene = {_strip_key(entry): entry for entry in reversed(ordered.values())}
     write_scenes_strip(out, list(reversed(by_scene.values())), out / STRIP)
     write_text(out / CARD, dataset_card(manifest))
     named = [CARD, BARS, STRIP, *_config_files(ordered.values())]
     manifest["files"] = {name: file_sha256(out / name) for name in sorted(set(named))}
     write_text(out / MANIFEST, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
     _remove_unnamed(out, manifest)
+
+
+def _strip_key(entry: Mapping[str, Any]) -> str:
+    """Return what is shown once: each kind of the standard assemblies, and each assembly of a user's."""
+    assembly = entry["scene"]["assembly"]
+    return str(assembly.get("sha256", assembly["kind"]))
 
 
 def _config_files(entries: Iterable[Mapping[str, Any]]) -> list[str]:

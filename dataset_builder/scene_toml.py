@@ -30,6 +30,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from dataset_builder.appearance import VARIANTS
 from dataset_builder.length_units import UNITS_M
 from dataset_builder.model import MAX_BARS
 from dataset_builder.specs import DomeSpec, RigSpec, RingSpec
@@ -87,8 +88,13 @@ def name_kind(taken: Collection[str]) -> Kind[str]:
     """Return the kind of names a scene may have: none of those ``taken``."""
     expected = "a name of small letters, digits and hyphens that starts with a letter or digit"
     if taken:
-        expected += f" and is none of {', '.join(taken)}"
-    return text(expected, lambda name: bool(_NAME.fullmatch(name)) and name not in taken)
+        expected += f", is none of {', '.join(taken)} and ends in no variant's name"
+    return text(expected, lambda name: bool(_NAME.fullmatch(name)) and name not in taken and not _is_variant(name))
+
+
+def _is_variant(name: str) -> bool:
+    """Tell whether a config and one of its variants could have this name."""
+    return any(name.endswith(f"-{variant}") for variant in VARIANTS)
 
 
 def read_scene_toml(content: bytes, where: str, taken: Collection[str] = ()) -> SceneToml:

@@ -48,9 +48,13 @@ def make_assembly(spec: AssemblySpec) -> Assembly:
 def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
     """Raise ``MeshError`` where an assembly reaches below the board or out to the config's nearest camera."""
     vertices_m = assembly.vertices_m
-    lowest_m = float(vertices_m[:, 2].min())
+    lowest = min(assembly.parts, key=lambda part: float(part.mesh.vertices_m[:, 2].min()))
+    lowest_m = float(lowest.mesh.vertices_m[:, 2].min())
     if lowest_m < -_BELOW_BOARD_M:
-        raise MeshError(f"the assembly reaches down to z = {lowest_m:.4g} m, expected it on the board, z = 0")
+        raise MeshError(
+            f"{config.name}: {lowest.name} reaches down to z = {lowest_m:.4g} m, ribs and all, expected 0 or "
+            "above, where the board or the ground is"
+        )
     reach_m = float(np.linalg.norm(vertices_m - aim_point_m(assembly), axis=1).max())
     nearest_m = min(float(np.linalg.norm(offset)) for offset in offsets_m(config.protocol))
     if reach_m >= nearest_m:

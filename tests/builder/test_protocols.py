@@ -103,7 +103,7 @@ def test_subset_is_spread_evenly_and_whole_when_all_are_wanted() -> None:
     ("scale", "shift_m", "words"),
     [
         (1000, 0.0, "is the unit right"),
-        (1, -0.01, "reaches down to z = -0.00995 m, expected it on the board"),
+        (1, -0.01, "reaches down to z = -0.00995 m, ribs and all, expected 0 or above"),
     ],
 )
 def test_an_assembly_that_does_not_fit_the_cameras_is_refused(scale: float, shift_m: float, words: str) -> None:
