@@ -19,6 +19,7 @@ WRONG = [
     (MM + "nmae = 'x'\n" + BAR, "'nmae' is not a known key, did you mean name"),
     (MM + "zzz = 1\n" + BAR, "'zzz' is not a known key, expected only name, unit, bar"),
     (MM + "name = 'My Beam'\n" + BAR, "name: got 'My Beam', expected a name of small letters"),
+    (MM + "name = 'lattice-dusk'\n" + BAR, "name: got 'lattice-dusk', .* ends in no variant's name"),
     (MM + "name = 'lattice'\n" + BAR, "name: got 'lattice', .* is none of .*lattice"),
     (MM + "name = 'meshes'\n" + BAR, "name: got 'meshes'"),
     (MM + "name = 'scenes'\n" + BAR, "name: got 'scenes'"),
