@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -17,6 +18,9 @@ _CACHES = tempfile.TemporaryDirectory(prefix="rebar-test-caches-")
 os.environ.update(HF_HOME=_CACHES.name, XDG_CACHE_HOME=_CACHES.name, HF_HUB_OFFLINE="1")
 
 from rebar_depth_bench import SubmissionWriter, load  # noqa: E402
+
+# A shell that runs the tests in the background ignores this signal, and processes that they start would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 TINY = ("--width", "160", "--height", "90", "--samples", "1")
 TINY_VIEWS = 9

@@ -40,7 +40,7 @@ def test_the_dataset_cards_yaml_lists_what_is_there(tiny_root: Path) -> None:
     assert [config["config_name"] for config in metadata["configs"]] == ["lattice", "lattice-orbit"]
     for config in metadata["configs"]:
         pattern = config["data_files"][0]["path"]
-        assert list(tiny_root.glob(pattern)) == sorted(tiny_root.glob(f"{config['config_name']}/*.parquet"))
+        assert sorted(tiny_root.glob(pattern)) == sorted(tiny_root.glob(f"{config['config_name']}/*.parquet"))
     counts = {info["config_name"]: info["splits"][0]["num_examples"] for info in metadata["dataset_info"]}
     assert counts == {"lattice": 9, "lattice-orbit": 2}
 
