@@ -19,7 +19,7 @@ os.environ.update(HF_HOME=_CACHES.name, XDG_CACHE_HOME=_CACHES.name, HF_HUB_OFFL
 
 from rebar_depth_bench import SubmissionWriter, load  # noqa: E402
 
-# A shell that runs the tests in the background ignores this signal, and processes that they start would inherit that.
+# A shell that runs the tests in the background ignores this signal; what they start would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 TINY = ("--width", "160", "--height", "90", "--samples", "1")
