@@ -182,6 +182,11 @@ def argument_parser() -> argparse.ArgumentParser:
         metavar="NAME",
         help=f"another look, told in the config's name: {', '.join(VARIANTS)}",
     )
+    _add_commands(parser)
+    return parser
+
+
+def _add_commands(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="command", metavar="{audit,export}")
     checking = commands.add_parser("audit", help="check a dataset folder and its ground truth")
     checking.add_argument("root", metavar="ROOT", help="the dataset folder")
@@ -201,4 +206,3 @@ def argument_parser() -> argparse.ArgumentParser:
         "--config", nargs="+", action="extend", metavar="NAME", help="which configs (default: all)"
     )
     exporting.add_argument("--views", type=int, metavar="N", help="N views spread evenly over those of the folder")
-    return parser
