@@ -46,7 +46,7 @@ class PhysicsSpec:
     """Steel on steel and paper, and when it counts as at rest.
 
     ``air_m`` is kept free round each stirrup; MuJoCo adds up the two of a contact. A hundred ``noslip_iterations``
-    stop the creep of soft friction: with 20 a heap crept by 3.7 um a second, with 100 by less than 0.1 um.
+    stop the creep of soft friction: with 20 a heap kept creeping by micrometres a second.
     """
 
     timestep_s: float = 0.001

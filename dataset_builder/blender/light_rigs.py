@@ -18,7 +18,7 @@ def _even(colour: Colour, strength: float) -> Sky:
 
 LABORATORY_LIGHT: Mapping[str | None, LightRig] = {
     None: LightRig(
-        # One lamp and a bright sky: a second lamp from the side cost 3 dB on steel at 16 samples.
+        # One lamp and a bright sky: a second lamp from the side made steel noisier.
         _even((0.86, 0.93, 1.0), 0.80),
         (Panel("ceiling-panel", (-0.35, 0.45, 1.9), (0.0, 0.05, 0.0), (0.9, 0.45), 62.0, WARM),),
     ),

@@ -6,7 +6,6 @@ Blender runs in a process of its own, ``python -m tests.builder.test_appearance 
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -24,9 +23,8 @@ from dataset_builder.raycast import RayCaster
 from dataset_builder.specs import AppearanceSpec, BoardSpec, ColourSpec, LatticeSpec, SceneSpec
 from rebar_depth_bench.cameras import ideal_K, look_at, pixel_rays
 from rebar_depth_bench.errors import InputError
+from tests.builder.probe import run_probe
 from tests.builder.test_occluders import cage
-
-REPOSITORY = Path(__file__).parents[2]
 
 EYES = {
     azimuth: Camera(
@@ -116,11 +114,7 @@ def test_names_that_go_are_let_through() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("appearance")
-    command = [sys.executable, "-m", "tests.builder.test_appearance", str(path)]
-    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=1800, check=False)
-    assert finished.returncode == 0, finished.stderr
-    return path
+    return run_probe("tests.builder.test_appearance", tmp_path_factory.mktemp("appearance"))
 
 
 @pytest.fixture(scope="module")

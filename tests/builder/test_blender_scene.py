@@ -7,7 +7,6 @@ tiny pictures of a small lattice into FOLDER; the tests look at what it left the
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -27,13 +26,13 @@ from dataset_builder.protocols import aim_rig
 from dataset_builder.raycast import RayCaster
 from dataset_builder.specs import BoardSpec, ColourSpec, LatticeSpec, SceneSpec
 from rebar_depth_bench.cameras import ideal_K, look_at, pixel_rays, project, transform
+from tests.builder.probe import run_probe
 
 pytestmark = pytest.mark.render
 
 SCENE = SceneSpec("small", LatticeSpec(pitch_m=0.05), BoardSpec(), seed=3)
 BARS = 12
 TARGET_M = np.array([0.0, 0.0, 0.05])
-REPOSITORY = Path(__file__).parents[2]
 
 LOW = Camera(ideal_K(128, 72), np.zeros(5), aim_rig(np.array([0.20, -0.24, 0.15]), TARGET_M, 0.12), 128, 72)
 ODD = Camera(
@@ -124,11 +123,7 @@ def _save_mesh(path: Path, mesh: WorldMesh) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("blender")
-    command = [sys.executable, "-m", "tests.builder.test_blender_scene", str(path)]
-    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=1800, check=False)
-    assert finished.returncode == 0, finished.stderr
-    return path
+    return run_probe("tests.builder.test_blender_scene", tmp_path_factory.mktemp("blender"))
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ Blender runs in a process of its own, ``python -m tests.builder.test_distorted_c
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -25,12 +24,12 @@ from dataset_builder.protocols import aim_rig
 from dataset_builder.raycast import RayCaster
 from dataset_builder.specs import BoardSpec, ColourSpec, LatticeSpec, SceneSpec
 from rebar_depth_bench.cameras import look_at, pixel_rays, project, transform
+from tests.builder.probe import run_probe
 
 pytestmark = pytest.mark.render
 
 SCENE = SceneSpec("small", LatticeSpec(pitch_m=0.05), BoardSpec(), seed=3)
 TARGET_M = np.array([0.0, 0.0, 0.05])
-REPOSITORY = Path(__file__).parents[2]
 
 _EYES = rig_cameras(zed_rig(160, 90, "raw"), aim_rig(np.array([0.20, -0.24, 0.15]), TARGET_M, 0.12))
 LEFT, RIGHT = _EYES["left"], _EYES["right"]
@@ -77,11 +76,7 @@ def probe(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("blender")
-    command = [sys.executable, "-m", "tests.builder.test_distorted_camera", str(path)]
-    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=1800, check=False)
-    assert finished.returncode == 0, finished.stderr
-    return path
+    return run_probe("tests.builder.test_distorted_camera", tmp_path_factory.mktemp("blender"))
 
 
 @pytest.fixture(scope="module")
