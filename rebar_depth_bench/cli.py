@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import datasets
 from rich.console import Console
 from rich.table import Table as RichTable
 
+from rebar_depth_bench.comparison import compare
+from rebar_depth_bench.comparison_table import comparison_csv, print_comparison
 from rebar_depth_bench.console import ProgressBars, run_command
 from rebar_depth_bench.demo import DEMO_FOLDER, DEMO_VIEWS, run_demo
 from rebar_depth_bench.errors import SubmissionError
@@ -41,6 +44,22 @@ def _score(options: argparse.Namespace) -> None:
     if options.html:
         write_report(result, options.archive, options.data, options.html)
     print_table(result, Console())
+
+
+def _compare(options: argparse.Namespace) -> None:
+    with ProgressBars() as bars:
+        first, *others = (
+            score(archive, options.data, workers=options.workers, progress=bars.update)
+            for archive in (options.first, *options.others)
+        )
+    comparisons = [compare(first, other) for other in others]
+    if options.json:
+        content = [comparison.to_dict() for comparison in comparisons]
+        write_text(options.json, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    if options.csv:
+        write_text(options.csv, comparison_csv(comparisons))
+    for comparison in comparisons:
+        print_comparison(comparison, Console())
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -88,6 +107,14 @@ def argument_parser() -> argparse.ArgumentParser:
     scoring.add_argument("--html", type=Path, metavar="FILE", help="write a self-contained report")
     scoring.add_argument("--csv", type=Path, metavar="FILE", help="write the tables as CSV")
     scoring.add_argument("--workers", type=int, metavar="N", help="threads (default: one a core)")
+
+    comparing = _command(commands, "compare", _compare, "paired differences of submissions, with intervals")
+    comparing.add_argument("first", metavar="A", help="the archive that the others are compared with")
+    comparing.add_argument("others", metavar="B", nargs="+", help="one or more archives")
+    comparing.add_argument("--data", required=True, metavar="ROOT", help="dataset folder or Hub repository id")
+    comparing.add_argument("--json", type=Path, metavar="FILE", help="write the differences as JSON")
+    comparing.add_argument("--csv", type=Path, metavar="FILE", help="write the differences as CSV")
+    comparing.add_argument("--workers", type=int, metavar="N", help="threads (default: one a core)")
 
     _archive_and_data(_command(commands, "check", _check, "say everything that is wrong with an archive"))
     _command(commands, "methods", _methods, "list the methods that come with the bench")

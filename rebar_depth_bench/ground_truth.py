@@ -81,8 +81,8 @@ def _read_cache(cached: Path) -> ConfigTruth:
         view_ids=tuple(outline["view_ids"]),
         starts=tuple(outline["starts"]),
         medians_m=tuple(outline["medians_m"]),
-        index=np.load(cached / "index.npy", mmap_mode="r"),
-        depth_m=np.load(cached / "depth_m.npy", mmap_mode="r"),
+        index=np.asarray(np.load(cached / "index.npy", mmap_mode="r")),
+        depth_m=np.asarray(np.load(cached / "depth_m.npy", mmap_mode="r")),
     )
 
 

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from rebar_depth_bench.bootstrap import Interval, Resampling, interval, resample
 from rebar_depth_bench.metrics import DepthMetrics
 from rebar_depth_bench.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
 
 SIGNIFICANT_DIGITS = 12
 """Numbers are written with this many digits: sums may differ in their last bits between processors."""
+
+_INTERVAL_DIGITS = 6
+_METRICS = ("abs_rel", "rmse_cm", "mae_cm", "delta1")
+SCALE = "scale_median"
 
 
 @dataclass(frozen=True)
@@ -29,9 +38,29 @@ class ViewScore:
     within_mm: Mapping[int, float]
 
 
+def _metric(alignment: str, name: str) -> Callable[[ViewScore], float | None]:
+    return lambda view: getattr(getattr(view, alignment), name, None)
+
+
+def _within(tolerance_mm: int) -> Callable[[ViewScore], float | None]:
+    return lambda view: view.within_mm[tolerance_mm]
+
+
+VIEW_NUMBERS: Mapping[str, Callable[[ViewScore], float | None]] = {
+    "coverage": lambda view: view.coverage,
+    **{f"{alignment}.{name}": _metric(alignment, name) for alignment in ("native", "scaled") for name in _METRICS},
+    SCALE: lambda view: view.scale,
+    **{f"within_mm.{tolerance_mm}": _within(tolerance_mm) for tolerance_mm in WITHIN_MM},
+}
+"""What a view contributes to each number of a table; None where it has no value."""
+
+
 @dataclass(frozen=True)
 class Table:
-    """One config's numbers: means over its views, the median of their scales."""
+    """One config's numbers: means over its views, the median of their scales.
+
+    ``intervals`` has the 95 % block bootstrap interval of each of ``VIEW_NUMBERS``, None where there is none.
+    """
 
     views: int
     views_scored: int
@@ -41,6 +70,7 @@ class Table:
     scaled: DepthMetrics | None
     scale_median: float | None
     within_mm: Mapping[int, float | None]
+    intervals: Mapping[str, Interval | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -92,7 +122,36 @@ def tabulate(views: Sequence[ViewScore]) -> Table:
         scaled=scaled,
         scale_median=median([view.scale for view in with_value if view.scale is not None]) if with_value else None,
         within_mm={t: _mean([view.within_mm[t] for view in views]) for t in WITHIN_MM},
+        intervals=view_intervals(views) if views else dict.fromkeys(VIEW_NUMBERS),
     )
+
+
+def view_intervals(views: Sequence[ViewScore]) -> dict[str, Interval | None]:
+    """Return the 95 % interval of every number of the table that these views make."""
+    estimates = estimate_draws(views, resample(protocol_indices([view.view_id for view in views])))
+    return {name: interval(estimates[:, k]) for k, name in enumerate(VIEW_NUMBERS)}
+
+
+def estimate_draws(views: Sequence[ViewScore], resampling: Resampling) -> Float64[ndarray, "draws k"]:
+    """Return the ``VIEW_NUMBERS`` of the table that each resample of the views makes; NaN where undefined."""
+    values = view_numbers(views)
+    draws = resampling.means(values)
+    scale = list(VIEW_NUMBERS).index(SCALE)
+    present = np.flatnonzero(~np.isnan(values[:, scale]))
+    draws[:, scale] = resampling.percentile(values[present, scale], present, 50)
+    return draws
+
+
+def view_numbers(views: Sequence[ViewScore]) -> Float64[ndarray, "n k"]:
+    """Return the ``VIEW_NUMBERS`` of each view, NaN where it has no value."""
+    rows = [[get(view) for get in VIEW_NUMBERS.values()] for view in views]
+    return np.array(rows, dtype=np.float64).reshape(len(views), len(VIEW_NUMBERS))
+
+
+def protocol_indices(view_ids: Sequence[str]) -> list[int]:
+    """Return each view's index in its full protocol, which its id ends with; its place where an id does not."""
+    tails = [view_id.rpartition("/")[2] for view_id in view_ids]
+    return [int(tail) for tail in tails] if all(map(str.isdecimal, tails)) else list(range(len(tails)))
 
 
 def badness(view: ViewScore) -> float:
@@ -115,8 +174,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _mean_metrics(metrics: Sequence[DepthMetrics]) -> DepthMetrics | None:
-    names = ("abs_rel", "rmse_cm", "mae_cm", "delta1")
-    means = {name: _mean([getattr(one, name) for one in metrics]) for name in names}
+    means = {name: _mean([getattr(one, name) for one in metrics]) for name in _METRICS}
     if any(mean is None for mean in means.values()):
         return None
     return DepthMetrics(**{name: mean for name, mean in means.items() if mean is not None})
@@ -126,47 +184,58 @@ def _is_finite(metrics: DepthMetrics | None) -> bool:
     return metrics is not None and all(math.isfinite(value) for value in vars(metrics).values())
 
 
-def _number(value: float | None) -> float | None:
+def rounded(value: float | None, digits: int = SIGNIFICANT_DIGITS) -> float | None:
     """Return a number as it is written: None where undefined."""
     if value is None or not math.isfinite(value):
         return None
-    return float(f"{value:.{SIGNIFICANT_DIGITS}g}")
+    return float(f"{value:.{digits}g}")
 
 
 def _metrics_dict(metrics: DepthMetrics | None) -> dict[str, float | None]:
     if metrics is None:
-        return dict.fromkeys(("abs_rel", "rmse_cm", "mae_cm", "delta1"))
+        return dict.fromkeys(_METRICS)
     return {
-        "abs_rel": _number(metrics.abs_rel),
-        "rmse_cm": _number(metrics.rmse_cm),
-        "mae_cm": _number(metrics.mae_cm),
-        "delta1": _number(metrics.delta1),
+        "abs_rel": rounded(metrics.abs_rel),
+        "rmse_cm": rounded(metrics.rmse_cm),
+        "mae_cm": rounded(metrics.mae_cm),
+        "delta1": rounded(metrics.delta1),
     }
 
 
 def _within_dict(within_mm: Mapping[int, float | None] | Mapping[int, float]) -> dict[str, float | None]:
-    return {str(tolerance): _number(share) for tolerance, share in within_mm.items()}
+    return {str(tolerance): rounded(share) for tolerance, share in within_mm.items()}
 
 
 def _table_dict(table: Table) -> dict[str, Any]:
     return {
         "views": table.views,
         "views_scored": table.views_scored,
-        "coverage": _number(table.coverage),
+        "coverage": rounded(table.coverage),
         "ranked": table.ranked,
         "native": _metrics_dict(table.native),
         "scaled": _metrics_dict(table.scaled),
-        "scale_median": _number(table.scale_median),
+        "scale_median": rounded(table.scale_median),
         "within_mm": _within_dict(table.within_mm),
+        "ci95": _intervals_dict(table.intervals),
     }
+
+
+def _intervals_dict(intervals: Mapping[str, Interval | None]) -> dict[str, Any]:
+    """Return the intervals nested as the table's own numbers are."""
+    nested: dict[str, Any] = {}
+    for name, ends in intervals.items():
+        group, _, key = name.rpartition(".")
+        target = nested.setdefault(group, {}) if group else nested
+        target[key] = None if ends is None else [rounded(end, _INTERVAL_DIGITS) for end in ends]
+    return nested
 
 
 def _view_dict(view: ViewScore) -> dict[str, Any]:
     return {
         "view_id": view.view_id,
         "scored_px": view.scored_px,
-        "coverage": _number(view.coverage),
-        "scale": _number(view.scale),
+        "coverage": rounded(view.coverage),
+        "scale": rounded(view.scale),
         "native": _metrics_dict(view.native),
         "scaled": _metrics_dict(view.scaled),
         "within_mm": _within_dict(view.within_mm),

@@ -14,7 +14,7 @@ from numpy import ndarray
 from rebar_depth_bench.errors import InputError, SubmissionError
 from rebar_depth_bench.folder import DatasetFolder, open_folder
 from rebar_depth_bench.ground_truth import ViewTruth, config_truth
-from rebar_depth_bench.metrics import depth_metrics, is_prediction, median_scale, shares_within
+from rebar_depth_bench.metrics import depth_metrics, is_prediction, median, median_scale, shares_within
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.protocol import WITHIN_MM
 from rebar_depth_bench.result import Result, ViewScore, tabulate
@@ -61,28 +61,24 @@ def score(
 
 def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewScore:
     """Return the numbers of one view's prediction (planar depth, metres) on the view's scored pixels."""
-    gathered = prediction_m.ravel()[truth.index]
-    valid = is_prediction(gathered)
-    if valid.all():
-        p_m, z_m, z_median_m = gathered.astype(np.float64), truth.depth_m.astype(np.float64), truth.median_m
-    else:
-        p_m, z_m = gathered[valid].astype(np.float64), truth.depth_m[valid].astype(np.float64)
-        z_median_m = float(np.median(z_m)) if len(z_m) else 0.0
+    p_m, z_m, z_median_m = prediction_m.ravel().take(truth.index.astype(np.intp)), truth.depth_m, truth.median_m
+    valid = is_prediction(p_m)
+    if not valid.all():
+        p_m, z_m = p_m[valid], z_m[valid]
+        z_median_m = median(z_m) if len(z_m) else 0.0
     scored_px = len(truth.index)
-    within_mm = shares_within(np.abs(p_m - z_m), scored_px, WITHIN_MM)
+    within_mm = shares_within(p_m, z_m, scored_px, WITHIN_MM)
     coverage = len(p_m) / scored_px
     if not len(p_m):
         return ViewScore(truth.view_id, scored_px, coverage, None, None, None, within_mm)
     scale = median_scale(p_m, z_median_m)
-    with np.errstate(over="ignore"):
-        scaled_m = scale * p_m
     return ViewScore(
         view_id=truth.view_id,
         scored_px=scored_px,
         coverage=coverage,
         scale=scale,
         native=depth_metrics(p_m, z_m),
-        scaled=depth_metrics(scaled_m, z_m),
+        scaled=depth_metrics(p_m, z_m, scale),
         within_mm=within_mm,
     )
 

@@ -61,7 +61,7 @@ def result_csv(result: Result) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(_csv_header())
-    writer.writerows([_csv_cell(value) for value in row] for row in rows)
+    writer.writerows([csv_cell(value) for value in row] for row in rows)
     return out.getvalue()
 
 
@@ -198,7 +198,8 @@ def _csv_row(content: dict[str, Any], name: str, table: dict[str, Any]) -> list[
     ]
 
 
-def _csv_cell(value: str | float | bool | None) -> str:
+def csv_cell(value: str | float | bool | None) -> str:
+    """Return a value as a CSV cell: empty for None, no formula, no control characters."""
     if value is None:
         return ""
     if isinstance(value, str):

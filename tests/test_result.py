@@ -88,6 +88,7 @@ def test_json_has_the_contracts_keys_and_units() -> None:
         "scaled",
         "scale_median",
         "within_mm",
+        "ci95",
     ]
     assert table["native"] == {"abs_rel": 0.25, "rmse_cm": 0.25, "mae_cm": 0.25, "delta1": 0.5}
     assert list(table["within_mm"]) == ["3", "5", "10", "20"]

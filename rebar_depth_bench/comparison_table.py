@@ -1,0 +1,127 @@
+"""A comparison as a table in the terminal and as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+
+from rich import box
+from rich.console import Console
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from rebar_depth_bench import wording
+from rebar_depth_bench.bootstrap import MIN_VIEWS, RING_VIEWS
+from rebar_depth_bench.comparison import Comparison, Difference
+from rebar_depth_bench.protocol import WITHIN_MM
+from rebar_depth_bench.result import SCALE
+from rebar_depth_bench.table import csv_cell
+
+_METRIC_KEYS = ("abs_rel", "rmse_cm", "mae_cm", "delta1")
+_METRIC_DECIMALS = (4, 2, 2, 3)
+
+
+def _titles() -> dict[str, tuple[str, int, float]]:
+    """Return each number's title, decimals and factor from value to what is shown."""
+    titles = {"coverage": ("coverage, % ↑", 1, 100.0)}
+    for alignment in ("native", "scaled"):
+        for key, (name, unit, better), decimals in zip(
+            _METRIC_KEYS, wording.METRIC_HEADS, _METRIC_DECIMALS, strict=True
+        ):
+            title = f"{alignment} {name}{f', {unit}' if unit else ''} {better}"
+            titles[f"{alignment}.{key}"] = (title, decimals, 1.0)
+    titles[SCALE] = ("scale s, median", 3, 1.0)
+    return titles | {f"within_mm.{t}": (f"within {t} mm, % ↑", 1, 100.0) for t in WITHIN_MM}
+
+
+TITLES: Mapping[str, tuple[str, int, float]] = _titles()
+
+
+def print_comparison(comparison: Comparison, console: Console) -> None:
+    """Print a table per config: both submissions, the paired difference, its interval and what it says."""
+    first, other = (wording.printable(one.method) for one in comparison.stamp.archives)
+    console.print(Text(f"B: {other}, against A: {first}", style="bold"))
+    console.print(Text(_stamps(comparison), style="dim"))
+    for config, rows in comparison.configs.items():
+        console.print()
+        console.print(Text(f"{wording.printable(config)}, {_views_note(rows)}", style="italic"))
+        console.print(_table(rows))
+    console.print()
+    console.print(
+        Text(
+            f"B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
+            f"({RING_VIEWS} steps of the protocol); none with fewer than {MIN_VIEWS} views. B is called better or "
+            "worse where the interval leaves out zero. Of many comparisons one in twenty does so by chance."
+        )
+    )
+
+
+def comparison_csv(comparisons: list[Comparison]) -> str:
+    r"""Return comparisons as tidy CSV: a row per pair, config and number, with the stamps; ``\n`` ends."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    stamps = ("protocol", "dataset_digest", "software_version", "first_sha256", "other_sha256")
+    numbers = ("views", "first", "other", "difference", "low", "high", "verdict")
+    writer.writerow(["first_method", "other_method", "config", "number", *numbers, *stamps])
+    for comparison in comparisons:
+        content = comparison.to_dict()
+        first, other = content["submissions"]
+        for config, rows in content["configs"].items():
+            for row in rows:
+                cells = [first["method"], other["method"], config, row["name"]]
+                cells += [row[key] for key in ("views", "first", "other", "difference")]
+                cells += [*(row["ci95"] or (None, None)), row["verdict"]]
+                cells += [content["protocol"], content["dataset"]["digest"], content["software"]["version"]]
+                writer.writerow([csv_cell(cell) for cell in (*cells, first["sha256"], other["sha256"])])
+    return out.getvalue()
+
+
+def _stamps(comparison: Comparison) -> str:
+    content = comparison.to_dict()
+    dataset = content["dataset"]
+    archives = (
+        f"{letter} {wording.short_digest(one['sha256'])}"
+        for letter, one in zip("AB", content["submissions"], strict=True)
+    )
+    return (
+        f"protocol {content['protocol']}, dataset {wording.printable(dataset['version'])} "
+        f"({wording.short_digest(dataset['digest'])}), archives {', '.join(archives)}, "
+        f"software {content['software']['version']}"
+    )
+
+
+def _views_note(rows: Sequence[Difference]) -> str:
+    counts = sorted({one.views for one in rows})
+    if len(counts) == 1:
+        return f"{counts[0]} views"
+    return f"{counts[-1]} views; errors and scale on the {counts[0]} where both have a prediction"
+
+
+def _table(rows: Sequence[Difference]) -> RichTable:
+    table = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table.add_column("number", no_wrap=True)
+    for heading in ("A", "B", "B - A", "95 % interval"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("B is")
+    for one in rows:
+        table.add_row(*map(Text, _cells(one)))
+    return table
+
+
+def _cells(one: Difference) -> list[str]:
+    title, decimals, factor = TITLES[one.name]
+    first, other = (_number(value, decimals, factor) for value in (one.first, one.other))
+    change = _signed(one.difference, decimals, factor)
+    ends = one.interval
+    between = wording.DASH if ends is None else " to ".join(_signed(end, decimals, factor) for end in ends)
+    return [title, first, other, change, between, one.verdict]
+
+
+def _number(value: float | None, decimals: int, factor: float) -> str:
+    return wording.number(None if value is None else factor * value, decimals)
+
+
+def _signed(value: float | None, decimals: int, factor: float) -> str:
+    text = _number(value, decimals, factor)
+    return f"+{text}" if value is not None and value > 0 and text != wording.DASH else text
