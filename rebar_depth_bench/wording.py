@@ -19,6 +19,10 @@ NATIVE_TITLE = "native (no alignment)"
 SCALED_TITLE = "scaled (oracle median scale per view, s = median(z)/median(p))"
 WITHIN_TITLE = "within t mm (native): share of all scored pixels with |p - z| <= t"
 
+INTERVAL_NOTE = (
+    "Small figures: 95 % interval, block bootstrap over views (other views of the same scene, not other scenes)."
+)
+
 METRIC_HEADS = (("AbsRel", "", "↓"), ("RMSE", "cm", "↓"), ("MAE", "cm", "↓"), ("δ1", "", "↑"))
 """Name, unit and better direction of each number that ``metric_cells`` spells."""
 
@@ -64,6 +68,27 @@ def scale_cell(scale: float | None) -> str:
 def within_cells(within_mm: Mapping[int, float | None] | Mapping[int, float]) -> list[str]:
     """Return the shares within 3, 5, 10 and 20 mm, per cent."""
     return [percent(within_mm[tolerance]) for tolerance in WITHIN_MM]
+
+
+def interval_cell(interval: tuple[float, float] | None, decimals: int, factor: float = 1.0) -> str:
+    """Return a 95 % interval times ``factor`` as low – high, empty where there is none."""
+    if interval is None or not all(math.isfinite(end) for end in interval):
+        return ""
+    low, high = (number(end * factor, decimals) for end in interval)
+    return f"{low} – {high}"
+
+
+def coverage_interval_cell(interval: tuple[float, float] | None) -> str:
+    """Return the 95 % interval of a coverage in per cent, both ends rounded down as the coverage is."""
+    if interval is None or not all(math.isfinite(end) for end in interval):
+        return ""
+    return " – ".join(coverage_percent(end) for end in interval)
+
+
+def metric_interval_cells(intervals: Mapping[str, tuple[float, float] | None], alignment: str) -> list[str]:
+    """Return the intervals of what ``metric_cells`` spells, with as many decimals; ``native`` or ``scaled``."""
+    decimals = {"abs_rel": 4, "rmse_cm": 2, "mae_cm": 2, "delta1": 3}
+    return [interval_cell(intervals.get(f"{alignment}.{name}"), places) for name, places in decimals.items()]
 
 
 def printable(text: str, limit: int = 200) -> str:

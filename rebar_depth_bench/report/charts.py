@@ -9,24 +9,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from rebar_depth_bench.report.axis import LogAxis, decade_axis, label, unit_axis
+from rebar_depth_bench.report.svg import WIDTH, svg_figure, svg_text
 from rebar_depth_bench.result import Table, ViewScore
 from rebar_depth_bench.wording import number, printable, scale_cell
-
-WIDTH = 460
-"""View box width: small enough that 13 px text stays readable when a phone shrinks the chart."""
 
 _LEFT, _RIGHT = 14.0, WIDTH - 14.0
 _ROW = 50
 _GOLDEN = 0.6180339887498949
+_BOTH = ("native.abs_rel", "scaled.abs_rel")
 
 
 def alignment_chart(tables: Mapping[str, Table]) -> Markup:
-    """Return AbsRel per config, native (disc) joined to scaled (ring), on a logarithmic axis."""
+    """Return AbsRel per config, native (disc) joined to scaled (ring), with intervals, on a logarithmic axis."""
     both = {name: (table.native, table.scaled) for name, table in tables.items()}
     values = [metrics.abs_rel for pair in both.values() for metrics in pair if metrics]
+    values += [end for table in tables.values() for key in _BOTH for end in table.intervals.get(key) or ()]
     axis = decade_axis(values, _LEFT, _RIGHT)
     rows = []
     for index, (name, (native, scaled)) in enumerate(both.items()):
@@ -38,12 +38,13 @@ def alignment_chart(tables: Mapping[str, Table]) -> Markup:
         numbers = f"{number(native.abs_rel, 4)} → {number(scaled.abs_rel, 4)} scaled"
         rows.append(_row_title(name, numbers, y))
         rows.append(f'<path class="link" d="M{x[0]:.1f} {y}H{x[1]:.1f}"/>')
+        rows += [_interval_bar(tables[name].intervals.get(key), axis, y, key.partition(".")[0]) for key in _BOTH]
         rows.append(f'<circle class="native fill" cx="{x[0]:.1f}" cy="{y}" r="6"/>')
         rows.append(f'<circle class="scaled ring" cx="{x[1]:.1f}" cy="{y}" r="5"/>')
     bottom = _row_y(len(both)) - 20
     body = _vertical_grid(axis, bottom) + "".join(rows)
     description = "AbsRel of each config, native and after the oracle scale: " + _spoken(tables, _both_errors)
-    return _svg("Native and scaled AbsRel by config", description, bottom + 22, body)
+    return svg_figure("Native and scaled AbsRel by config", description, bottom + 22, body)
 
 
 def scale_chart(tables: Mapping[str, Table], views: Mapping[str, Sequence[ViewScore]]) -> Markup:
@@ -62,7 +63,7 @@ def scale_chart(tables: Mapping[str, Table], views: Mapping[str, Sequence[ViewSc
         "Scale factor s = median(z)/median(p) of every view: 1 is metric, below 1 the prediction is too far. "
         + _spoken(tables, lambda table: f"median {scale_cell(table.scale_median)}")
     )
-    return _svg(
+    return svg_figure(
         "Scale factor of each view", description, bottom + 22, _vertical_grid(axis, bottom) + "".join(rows)
     )
 
@@ -78,17 +79,10 @@ def views_chart(config: str, views: Sequence[ViewScore]) -> Markup:
     missing = "".join(f"M{at:.1f} 8v10" for at, v in zip(x, views, strict=True) if v.native is None)
     body = _horizontal_grid(axis, left) + _dots(scaled, "scaled points") + _dots(native, "native points")
     body += f'<path class="missing" d="{missing}"/>' if missing else ""
-    body += _text(left + 6, bottom + 18, "first view") + _text(_RIGHT, bottom + 18, "last view", "end")
+    body += svg_text(left + 6, bottom + 18, "first view") + svg_text(_RIGHT, bottom + 18, "last view", "end")
     without = sum(view.native is None for view in views)
     description = f"AbsRel of the {len(views)} views of {printable(config)}, {without} without any prediction."
-    return _svg(f"AbsRel by view, {printable(config)}", description, bottom + 26, body)
-
-
-def _svg(title: str, description: str, height: float, body: str) -> Markup:
-    return Markup(
-        f'<svg class="chart" role="img" viewBox="0 0 {WIDTH} {height:g}">'
-        f"<title>{escape(title)}</title><desc>{escape(description)}</desc>{body}</svg>"
-    )
+    return svg_figure(f"AbsRel by view, {printable(config)}", description, bottom + 26, body)
 
 
 def _row_y(index: int) -> int:
@@ -97,16 +91,12 @@ def _row_y(index: int) -> int:
 
 def _row_title(name: str, numbers: str, y: float) -> str:
     """Return a row's name on the left and its numbers on the right, above the row's marks."""
-    return _text(_LEFT, y - 17, printable(name), "start name") + _text(_RIGHT, y - 17, numbers, "end")
-
-
-def _text(x: float, y: float, content: str, classes: str = "start") -> str:
-    return f'<text class="{classes}" x="{x:g}" y="{y:g}">{escape(content)}</text>'
+    return svg_text(_LEFT, y - 17, printable(name), "start name") + svg_text(_RIGHT, y - 17, numbers, "end")
 
 
 def _vertical_grid(axis: LogAxis, bottom: float) -> str:
     lines = "".join(f"M{axis.at(tick):.1f} 10V{bottom:g}" for tick in axis.ticks())
-    labels = "".join(_text(round(axis.at(t), 1), bottom + 15, label(t), _anchor(axis, t)) for t in axis.ticks())
+    labels = "".join(svg_text(round(axis.at(t), 1), bottom + 15, label(t), _anchor(axis, t)) for t in axis.ticks())
     return f'<path class="axis" d="{lines}"/>{labels}'
 
 
@@ -120,7 +110,7 @@ def _anchor(axis: LogAxis, tick: float) -> str:
 
 def _horizontal_grid(axis: LogAxis, left: float) -> str:
     lines = "".join(f"M{left:g} {axis.at(tick):.1f}H{_RIGHT:g}" for tick in axis.ticks())
-    labels = "".join(_text(left - 6, round(axis.at(t) + 4, 1), label(t), "end") for t in axis.ticks())
+    labels = "".join(svg_text(left - 6, round(axis.at(t) + 4, 1), label(t), "end") for t in axis.ticks())
     return f'<path class="axis" d="{lines}"/>{labels}'
 
 
@@ -135,6 +125,14 @@ def _median_mark(scale: float | None, axis: LogAxis, y: float) -> str:
     if scale is None or not math.isfinite(scale):
         return ""
     return f'<path class="median" d="M{axis.at(scale):.1f} {y - 12}v24"/>'
+
+
+def _interval_bar(interval: tuple[float, float] | None, axis: LogAxis, y: float, kind: str) -> str:
+    """Return a config's interval as a broad pale bar behind its mark."""
+    if interval is None:
+        return ""
+    low, high = (axis.at(end) for end in interval)
+    return f'<path class="{kind} interval" d="M{low:.1f} {y}H{high:.1f}"/>'
 
 
 def _both_errors(table: Table) -> str:

@@ -1,11 +1,12 @@
-"""A result as one self-contained HTML page: no scripts, no requests, the same bytes for the same input.
+"""A result as one self-contained HTML page: no requests, complete without its script, same input, same bytes.
 
-Every text that comes from an archive or a dataset passes ``printable`` and jinja's escaping.
+The script sorts tables and shows views one at a time. Every text that comes from an archive or a dataset passes
+``printable`` and jinja's escaping. Sections are templates of their own, ``part_*.html.j2``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -14,28 +15,18 @@ from markupsafe import Markup
 from rebar_depth_bench import wording
 from rebar_depth_bench.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
+from rebar_depth_bench.published import load_published
 from rebar_depth_bench.report import charts
-from rebar_depth_bench.report.panels import ViewImages, ViewPanels, colour_bar_uri, view_images
-from rebar_depth_bench.result import Result, Table, ViewScore, badness
+from rebar_depth_bench.report.browser import ShownView, counted, shown_views
+from rebar_depth_bench.report.panels import ViewPanels, colour_bar_uri
+from rebar_depth_bench.report.paper import paper_scenes
+from rebar_depth_bench.report.rows import Row, table_row, view_row
+from rebar_depth_bench.report.scripts import inline_script
+from rebar_depth_bench.result import Result, ViewScore, badness
 from rebar_depth_bench.submission import config_of
 
 WORST_SHOWN = 10
 """Views of a config that are listed at once; the others are folded away."""
-
-
-@dataclass(frozen=True)
-class _Row:
-    """One config or one view, spelled: the cells of both tables."""
-
-    name: str
-    views: str
-    coverage: str
-    ranked: bool
-    reasons: str
-    native: list[str]
-    scaled: list[str]
-    scale: str
-    within: list[str]
 
 
 @dataclass(frozen=True)
@@ -44,33 +35,20 @@ class _Config:
 
     name: str
     chart: Markup
-    worst: list[_Row]
-    all: list[_Row]
+    worst: list[Row]
+    all: list[Row]
     views: int
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """One panel view: its numbers, its images and what their colour bars say."""
+def render_report(result: Result, panels: Iterable[ViewPanels], *, title: str | None = None) -> str:
+    """Return the report of ``result`` with the images of each of ``panels``, config by config, worst first.
 
-    row: _Row
-    images: ViewImages
-    near: str
-    far: str
-    predicted: str
-    off_scale: bool
-    native_limit: str
-    scaled_limit: str
-
-
-def render_report(result: Result, panels: Sequence[ViewPanels], *, title: str | None = None) -> str:
-    """Return the report of ``result`` with one row of images for each of ``panels``.
-
-    ``title`` defaults to the method's name. The page needs no network and runs no script.
+    ``panels`` may come in any order and is gone through once: only the encoded images stay in memory.
+    ``title`` defaults to the method's name.
     """
     views = _views_by_config(result)
-    configs = [_config(name, views[name]) for name in result.tables]
-    rows = [_table_row(name, table) for name, table in result.tables.items()]
+    shown = shown_views(panels, list(result.tables))
+    script = inline_script("sortable.js", "browser.js")
     return (
         _environment()
         .get_template("report.html.j2")
@@ -79,21 +57,56 @@ def render_report(result: Result, panels: Sequence[ViewPanels], *, title: str | 
             method=wording.printable(result.method),
             stamps=_stamps(result),
             protocol=PROTOCOL,
-            min_coverage=f"{MIN_RANKED_COVERAGE * 100:.0f}",
+            script=script.text,
+            policy=script.policy,
             metric_heads=wording.METRIC_HEADS,
             tolerances=WITHIN_MM,
             dash_note=wording.DASH_NOTE,
-            dash_in_results=_any_dash(rows),
-            dash_in_views=_any_dash([row for one in configs for row in one.worst]),
-            rows=rows,
-            alignment_chart=charts.alignment_chart(result.tables),
-            scale_chart=charts.scale_chart(result.tables, views),
-            configs=configs,
-            panels=[_shown(view) for view in panels],
-            depth_bar=colour_bar_uri(DEPTH_COLOURS[::-1]),
-            error_bar=colour_bar_uri(ERROR_COLOURS),
+            min_coverage=f"{MIN_RANKED_COVERAGE * 100:.0f}",
+            **_results(result, views),
+            **_paper(result),
+            **_browser(shown, views),
+            **_every_view(result, views),
         )
     )
+
+
+def _results(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
+    """Return what ``part_results.html.j2`` shows."""
+    rows = [table_row(name, table) for name, table in result.tables.items()]
+    return {
+        "rows": rows,
+        "dash_in_results": any(row.has_dash() for row in rows),
+        "interval_note": wording.INTERVAL_NOTE if any(row.has_interval() for row in rows) else "",
+        "alignment_chart": charts.alignment_chart(result.tables),
+        "scale_chart": charts.scale_chart(result.tables, views),
+    }
+
+
+def _paper(result: Result) -> dict[str, object]:
+    """Return what ``part_paper.html.j2`` shows."""
+    published = load_published()
+    return {
+        "paper_scenes": paper_scenes(result),
+        "paper_title": published.title,
+        "paper_part": published.parts["synthetic"],
+    }
+
+
+def _browser(shown: Sequence[ShownView], views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
+    """Return what ``part_browser.html.j2`` shows."""
+    return {
+        "shown": shown,
+        "shown_counts": counted(shown, {name: len(scores) for name, scores in views.items()}),
+        "depth_bar": colour_bar_uri(DEPTH_COLOURS[::-1]),
+        "error_bar": colour_bar_uri(ERROR_COLOURS),
+    }
+
+
+def _every_view(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
+    """Return what ``part_views.html.j2`` shows."""
+    configs = [_config(name, views[name]) for name in result.tables]
+    return {"configs": configs, "dash_in_views": any(row.has_dash() for one in configs for row in one.worst)}
 
 
 def _environment() -> Environment:
@@ -129,62 +142,7 @@ def _config(name: str, views: Sequence[ViewScore]) -> _Config:
     return _Config(
         name=wording.printable(name),
         chart=charts.views_chart(name, views),
-        worst=[_view_row(view) for view in worst],
-        all=[_view_row(view) for view in views] if len(views) > WORST_SHOWN else [],
+        worst=[view_row(view) for view in worst],
+        all=[view_row(view) for view in views] if len(views) > WORST_SHOWN else [],
         views=len(views),
     )
-
-
-def _table_row(name: str, table: Table) -> _Row:
-    return _Row(
-        name=wording.printable(name),
-        views=f"{table.views_scored}/{table.views}",
-        coverage=wording.coverage_percent(table.coverage),
-        ranked=table.ranked,
-        reasons="; ".join(wording.unranked_reasons(table)),
-        native=wording.metric_cells(table.native),
-        scaled=wording.metric_cells(table.scaled),
-        scale=wording.scale_cell(table.scale_median),
-        within=wording.within_cells(table.within_mm),
-    )
-
-
-def _view_row(view: ViewScore) -> _Row:
-    return _Row(
-        name=wording.printable(view.view_id),
-        views=f"{view.scored_px:,}".replace(",", "\N{NARROW NO-BREAK SPACE}"),
-        coverage=wording.coverage_percent(view.coverage),
-        ranked=True,
-        reasons="",
-        native=wording.metric_cells(view.native),
-        scaled=wording.metric_cells(view.scaled),
-        scale=wording.scale_cell(view.scale),
-        within=wording.within_cells(view.within_mm),
-    )
-
-
-def _any_dash(rows: Sequence[_Row]) -> bool:
-    return wording.has_dash([*row.native, *row.scaled, row.scale, row.coverage, *row.within] for row in rows)
-
-
-def _shown(view: ViewPanels) -> _Shown:
-    images = view_images(view)
-    predicted = images.predicted_m
-    return _Shown(
-        row=_view_row(view.score),
-        images=images,
-        near=_metres(images.near_m),
-        far=_metres(images.far_m),
-        predicted=f"{_metres(predicted[0])} to {_metres(predicted[1])}" if predicted else "",
-        off_scale=predicted is not None and (predicted[0] > images.far_m or predicted[1] < images.near_m),
-        native_limit=_centimetres(images.native_limit_cm),
-        scaled_limit=_centimetres(images.scaled_limit_cm),
-    )
-
-
-def _metres(value: float) -> str:
-    return f"{value:#.3g} m" if 0.01 <= abs(value) < 1000 else f"{value:.3g} m"
-
-
-def _centimetres(value: float | None) -> str:
-    return "" if value is None else f"{value:g} cm"

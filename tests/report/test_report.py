@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import hashlib
 import io
 import math
 import re
@@ -96,8 +97,8 @@ def test_hostile_names_stay_text() -> None:
     hostile = result(scored("<b>x/0000"), method=HOSTILE)
     rendered = render_report(hostile, [panels("<b>x/0000")], title="<i>mine</i>")
     page = _Page(rendered)
-    assert not page.named("script")
-    benign = _Page(render_report(result(scored("lattice/0000")), [panels()], title="mine"))
+    assert len(page.named("script")) == 1, "the page's own"
+    benign = _Page(render_report(result(scored("beam/0000")), [panels("beam/0000")], title="mine"))
     assert len(page.named("b")) == len(benign.named("b"))
     assert "<b>x" not in rendered
     assert "<i>mine" not in rendered
@@ -106,22 +107,42 @@ def test_hostile_names_stay_text() -> None:
     assert "\u202e" not in rendered
 
 
-def test_the_page_asks_nothing_of_the_network_and_runs_nothing() -> None:
+def test_the_page_asks_nothing_of_the_network_and_runs_one_script_that_its_policy_names() -> None:
     rendered = render_report(result(scored("lattice/0000")), [panels()])
     page = _Page(rendered)
-    assert not re.search(r"https?://|<script|<link|<iframe|@import|url\(|javascript:", rendered)
+    assert not re.search(
+        r"https?://|<link|<iframe|@import|url\(|javascript:|fetch|import\(|XMLHttp|innerHTML", rendered
+    )
+    scripts = re.findall(r"<script[^>]*>(.*?)</script>", rendered, re.DOTALL)
+    assert len(scripts) == len(page.named("script")) == 1
+    assert page.named("script") == [{}], "inline: no source"
+    digest = base64.b64encode(hashlib.sha256(scripts[0].encode()).digest()).decode()
     assert len(page.named("img")) == 5 + 4, "five panels, four colour bars"
     assert all((image["src"] or "").startswith("data:image/") for image in page.named("img"))
     assert not [name for _, attributes in page.tags for name in attributes if name.startswith("on")]
     policy = [meta for meta in page.named("meta") if meta.get("http-equiv") == "Content-Security-Policy"]
-    assert policy[0]["content"] == "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+    assert policy[0]["content"] == (
+        f"default-src 'none'; script-src 'sha256-{digest}'; img-src data:; style-src 'unsafe-inline'"
+    )
+
+
+def test_the_page_is_complete_without_its_script() -> None:
+    views = [scored(f"lattice/{index:04d}", abs_rel=0.1 * (index + 1)) for index in range(3)]
+    page = _Page(render_report(result(*views), [panels(view.view_id, view) for view in views]))
+    assert len(page.named("article")) == 3
+    assert [tags for tags in page.named("div") if tags.get("class") == "controls"] == [
+        {"class": "controls", "hidden": None}
+    ], "buttons that do nothing do not show"
+    hidden = [attributes for name, attributes in page.tags if "hidden" in attributes and name != "div"]
+    assert hidden == []
+    assert "3 of 3 views of lattice" in page.text
 
 
 def test_the_page_is_well_formed_and_described() -> None:
     page = _Page(render_report(result(scored("lattice/0000"), scored("pile/0000")), [panels()]))
     assert len(page.named("h1")) == 1
     assert page.named("html") == [{"lang": "en"}]
-    assert len(page.named("svg")) == len(page.named("desc")) == 4
+    assert len(page.named("svg")) == len(page.named("desc")) == 6
     alts = [image["alt"] for image in page.named("img")]
     assert sum(bool(alt) for alt in alts) == 5
     assert len({alt for alt in alts if alt}) == 5
