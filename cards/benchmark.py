@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+from typing import Any
+
 from cards.templates import render
+from rebar_depth_bench.bootstrap import DRAWS, MIN_VIEWS, RING_VIEWS
+from rebar_depth_bench.extended.evaluation import FAMILIES, ONCE, Family
+from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
+from rebar_depth_bench.extended.tolerances import PROFILES
 from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.protocol import DELTA1_RATIO, MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
+
+_STEP = re.compile(r"(?<=_)\d[\d.]*(?:-[\d.]+)?(?=(?:mm|pct|m|px)$)")
+"""The tolerance, threshold or bin that a measure's name ends with."""
 
 
 def benchmark_card() -> str:
@@ -16,4 +27,34 @@ def benchmark_card() -> str:
         min_ranked_coverage=MIN_RANKED_COVERAGE,
         within_mm=WITHIN_MM,
         methods=[method.info for method in METHODS.values()],
+        draws=DRAWS,
+        ring_views=RING_VIEWS,
+        min_views=MIN_VIEWS,
+        extended_protocol=EXTENDED_PROTOCOL,
+        families=[_family_rows(family) for family in FAMILIES.values()],
+        profiles=PROFILES,
     )
+
+
+def _family_rows(family: Family) -> dict[str, Any]:
+    taken = "once" if family.alignments == (ONCE,) else "native and scaled"
+    alike: dict[str, list[Measure]] = {}
+    for measure in family.measures:
+        alike.setdefault(_STEP.sub("N", measure.name), []).append(measure)
+    return {"title": family.title, "taken": taken, "rows": [_row(name, same) for name, same in alike.items()]}
+
+
+def _row(name: str, measures: Sequence[Measure]) -> dict[str, str]:
+    """Return one row for measures that differ by a tolerance or a bin alone, which it calls N."""
+    first, definition = measures[0], measures[0].definition
+    step = _STEP.search(first.name)
+    if step is not None:
+        steps = ", ".join(found[0] for one in measures if (found := _STEP.search(one.name)))
+        definition = f"{definition.replace(f' {step[0]} ', ' N ', 1)}; N = {steps}"
+    return {
+        "name": name,
+        "unit": first.unit,
+        "better": first.better,
+        "statistic": first.statistic,
+        "definition": definition.replace("|", r"\|"),
+    }

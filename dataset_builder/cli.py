@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dataset_builder.appearance import VARIANTS
-from dataset_builder.configs import CONFIGS, LATTICE_CONFIGS, BuildRequest
+from dataset_builder.configs import CONFIGS, LATTICE_CONFIGS, SWEEPS, BuildRequest
 from rebar_depth_bench.console import ProgressBars, run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
@@ -141,7 +141,7 @@ def argument_parser() -> argparse.ArgumentParser:
         nargs="+",
         action="extend",
         metavar="NAME",
-        help=f"which configs (default: all): {', '.join(CONFIGS)}",
+        help=f"which configs: {', '.join(CONFIGS)} (all these by default), or {', '.join(SWEEPS)}",
     )
     parser.add_argument("--views", type=int, metavar="N", help="N views spread evenly over each full protocol")
     parser.add_argument("--width", type=int, default=BuildRequest.width, help="pixels (default: %(default)s)")

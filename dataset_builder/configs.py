@@ -21,6 +21,7 @@ from dataset_builder.specs import (
     RigSpec,
     RingSpec,
     SceneSpec,
+    SweepSpec,
 )
 from rebar_depth_bench.errors import InputError
 
@@ -45,8 +46,24 @@ PIER_DOME = DomeSpec(
 LATTICE_RING = RingSpec(radius_m=0.325, elevation_deg=35.0, azimuths=100)
 
 
+def geometric_sweep(nearest_m: float, farthest_m: float, elevation_deg: float) -> SweepSpec:
+    """Return 96 views: 8 directions at each of 12 distances in equal ratios, rounded to the millimetre."""
+    steps = 11
+    ratio = farthest_m / nearest_m
+    radii_m = tuple(round(nearest_m * ratio ** (step / steps), 3) for step in range(steps + 1))
+    return SweepSpec(radii_m, elevation_deg, azimuths=8)
+
+
 def _lattice_scene(markers: int = 6, name: str = "lattice") -> SceneSpec:
     return SceneSpec(name=name, assembly=LatticeSpec(), board=BoardSpec(markers=markers))
+
+
+def _pile_scene() -> SceneSpec:
+    return SceneSpec("pile", PileSpec(), BoardSpec())
+
+
+def _pier_scene() -> SceneSpec:
+    return SceneSpec("pier", PierSpec(), None, "outdoors")
 
 
 CONFIGS: Mapping[str, Callable[[], ConfigSpec]] = {
@@ -55,9 +72,21 @@ CONFIGS: Mapping[str, Callable[[], ConfigSpec]] = {
     "lattice-zed": lambda: ConfigSpec("lattice-zed", _lattice_scene(), LATTICE_DOME, zed_rig()),
     "lattice-zed-raw": lambda: ConfigSpec("lattice-zed-raw", _lattice_scene(), LATTICE_DOME, zed_rig(grid="raw")),
     "lattice-12": lambda: ConfigSpec("lattice-12", _lattice_scene(12, "lattice-12"), LATTICE_DOME),
-    "pile": lambda: ConfigSpec("pile", SceneSpec("pile", PileSpec(), BoardSpec()), PILE_DOME),
-    "pier": lambda: ConfigSpec("pier", SceneSpec("pier", PierSpec(), None, "outdoors"), PIER_DOME),
+    "pile": lambda: ConfigSpec("pile", _pile_scene(), PILE_DOME),
+    "pier": lambda: ConfigSpec("pier", _pier_scene(), PIER_DOME),
 }
+"""The contract's seven: what is built where no config is named."""
+
+SWEEPS: Mapping[str, Callable[[], ConfigSpec]] = {
+    "lattice-distance": lambda: ConfigSpec("lattice-distance", _lattice_scene(), geometric_sweep(0.22, 1.6, 40.0)),
+    "pile-distance": lambda: ConfigSpec("pile-distance", _pile_scene(), geometric_sweep(0.50, 2.2, 45.0)),
+    "pier-distance": lambda: ConfigSpec("pier-distance", _pier_scene(), geometric_sweep(5.0, 17.0, 7.0)),
+}
+"""Sweeps of distance, for ``rebar-bench study distance``; built where they are named.
+
+They start where the steel fills the frame and end where the laboratory does, or where bars lose their interior
+pixels.
+"""
 LATTICE_CONFIGS = tuple(name for name in CONFIGS if name.startswith("lattice"))
 """Where ``--mesh`` takes the place of the rods."""
 
@@ -118,9 +147,10 @@ class BuildRequest:
 
 
 def _known_config(name: str) -> ConfigSpec:
-    if name not in CONFIGS:
-        raise InputError(f"no config {name!r}, expected one of {', '.join(CONFIGS)}")
-    return CONFIGS[name]()
+    known = {**CONFIGS, **SWEEPS}
+    if name not in known:
+        raise InputError(f"no config {name!r}, expected one of {', '.join(known)}")
+    return known[name]()
 
 
 def view_id(config: str, index: int) -> str:

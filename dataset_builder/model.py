@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float64, Int32, UInt16
 from numpy import ndarray
 
+from rebar_depth_bench.bars import Bar as Bar
+
 NOT_STEEL = 0
 """The bar id of every surface that is not reinforcement."""
 
@@ -20,16 +22,6 @@ STEEL = "steel"
 
 ESTIMATED = "imported"
 """The role of a bar whose axis and diameter were estimated from its surface."""
-
-
-@dataclass(frozen=True)
-class Bar:
-    """One reinforcing bar: its id (1 and up), what it does, its nominal diameter and its centreline."""
-
-    bar_id: int
-    role: str
-    diameter_m: float
-    axis_m: tuple[tuple[float, float, float], ...]
 
 
 @dataclass(frozen=True, eq=False)

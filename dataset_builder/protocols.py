@@ -8,28 +8,33 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.specs import DomeSpec, RigSpec, RingSpec
+from dataset_builder.specs import ProtocolSpec, RigSpec, RingSpec, SweepSpec
 from rebar_depth_bench.cameras import look_at, rigid
 
 GOLDEN_TURN_DEG = 360.0 * (5**0.5 - 1) / 2
 """Each ring of a dome starts this much further round, so that no two rings repeat each other's azimuths."""
 
 
-def poses(
-    protocol: DomeSpec | RingSpec, target_m: Float64[ndarray, 3], rig: RigSpec
-) -> list[Float64[ndarray, "4 4"]]:
+def poses(protocol: ProtocolSpec, target_m: Float64[ndarray, 3], rig: RigSpec) -> list[Float64[ndarray, "4 4"]]:
     """Return the left camera's ``cam_from_world`` of every view of the full protocol, in order."""
     return [aim_rig(target_m + direction, target_m, rig.baseline_m) for direction in offsets_m(protocol)]
 
 
-def offsets_m(protocol: DomeSpec | RingSpec) -> list[Float64[ndarray, 3]]:
+def offsets_m(protocol: ProtocolSpec) -> list[Float64[ndarray, 3]]:
     """Return the left camera's centre relative to the target, view by view.
 
     A dome runs shell by shell, ring by ring, azimuth by azimuth: neighbours in order are neighbours in space.
+    A sweep runs from distance to distance and starts half a step off the x axis: square cages are seen askew.
     """
     if isinstance(protocol, RingSpec):
         return [
             _spherical(protocol.radius_m, protocol.elevation_deg, 360.0 * k / protocol.azimuths)
+            for k in range(protocol.azimuths)
+        ]
+    if isinstance(protocol, SweepSpec):
+        return [
+            _spherical(radius_m, protocol.elevation_deg, 360.0 * (k + 0.5) / protocol.azimuths)
+            for radius_m in protocol.radii_m
             for k in range(protocol.azimuths)
         ]
     rings = [(radius_m, elevation) for radius_m in protocol.radii_m for elevation in protocol.elevations_deg]

@@ -16,14 +16,14 @@ from numpy import ndarray
 from dataset_builder.assemblies import aim_point_m, check_fits, make_assembly
 from dataset_builder.assemblies.cage_file import cage_file_spec
 from dataset_builder.assemblies.mesh_door import mesh_file_spec
-from dataset_builder.configs import CONFIGS, LATTICE_DOME
+from dataset_builder.configs import CONFIGS, LATTICE_DOME, SWEEPS
 from dataset_builder.model import Assembly
 from dataset_builder.protocols import offsets_m
 from dataset_builder.scene_toml import SceneToml, name_kind, read_scene_toml
 from dataset_builder.specs import AssemblySpec, BoardSpec, ConfigSpec, DomeSpec, SceneSpec
 from rebar_depth_bench.errors import InputError
 
-TAKEN_NAMES = (*CONFIGS, "meshes", "pictures", "scenes")
+TAKEN_NAMES = (*CONFIGS, *SWEEPS, "meshes", "pictures", "scenes")
 """Names a scene cannot have: the other configs' and those of what else the dataset folder holds."""
 
 NEAREST_PER_REACH = 2.5

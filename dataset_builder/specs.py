@@ -128,6 +128,19 @@ class RingSpec:
 
 
 @dataclass(frozen=True)
+class SweepSpec:
+    """A sweep of distances: the same directions at each of ``radii_m``, so that distance alone changes."""
+
+    radii_m: tuple[float, ...]
+    elevation_deg: float
+    azimuths: int
+    kind: str = "sweep"
+
+
+ProtocolSpec = DomeSpec | RingSpec | SweepSpec
+
+
+@dataclass(frozen=True)
 class RigSpec:
     """A stereo rig and the grid it is seen on.
 
@@ -158,6 +171,6 @@ class ConfigSpec:
 
     name: str
     scene: SceneSpec
-    protocol: DomeSpec | RingSpec
+    protocol: ProtocolSpec
     rig: RigSpec = field(default_factory=RigSpec)
     colour: ColourSpec = field(default_factory=ColourSpec)

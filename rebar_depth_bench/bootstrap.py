@@ -50,6 +50,20 @@ class Resampling:
         usable = (present.sum(axis=0) >= MIN_VIEWS) & ~np.isinf(values).any(axis=0)
         return np.where(usable, means, np.nan)
 
+    def pooled_means(
+        self, samples: Float64[ndarray, " m"], view: Int64[ndarray, " m"]
+    ) -> Float64[ndarray, " draws"]:
+        """Return in each resample the mean of finite samples pooled over views; ``view`` says whose each is.
+
+        NaN where a resample has no sample, and everywhere with too few views (``MIN_VIEWS``).
+        """
+        views = self.counts.shape[1]
+        totals = np.stack([np.bincount(view, weights, views) for weights in (samples, np.ones(len(samples)))], 1)
+        sums = self.counts @ totals
+        with np.errstate(invalid="ignore", divide="ignore"):
+            means = sums[:, 0] / sums[:, 1]
+        return means if len(np.unique(view)) >= MIN_VIEWS else np.full(len(means), np.nan)
+
     def percentile(
         self, samples: Float64[ndarray, " m"], view: Int64[ndarray, " m"], percent: float
     ) -> Float64[ndarray, " draws"]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from rebar_depth_bench.bootstrap import Interval, interval, resample
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.numbers import rounded
 from rebar_depth_bench.protocol import PROTOCOL
 from rebar_depth_bench.result import (
     SCALE,
@@ -22,7 +23,6 @@ from rebar_depth_bench.result import (
     ViewScore,
     estimate_draws,
     protocol_indices,
-    rounded,
 )
 from rebar_depth_bench.stamp import ArchiveStamp, Stamp
 from rebar_depth_bench.submission import config_of

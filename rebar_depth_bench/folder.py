@@ -81,6 +81,13 @@ class DatasetFolder:
         rig = self.config(config)["rig"]
         return int(rig["height"]), int(rig["width"])
 
+    def file(self, name: str) -> Path:
+        """Return a file of the folder on this machine, fetched first if it is a Hub repository's.
+
+        Raises ``DatasetError`` if it is not there.
+        """
+        return _file(self.root, name)
+
     def expected_views(self) -> dict[str, tuple[int, int]]:
         """Return every view id of the folder with its (height, width)."""
         return {view.view_id: self.grid(config) for config in self.configs for view in self.views(config)}
@@ -122,16 +129,20 @@ def _check_configs(path: Path, configs: object) -> None:
 
 def _manifest_path(root: str) -> Path:
     folder = Path(root)
-    if folder.is_dir():
-        path = folder / MANIFEST
-        if not path.is_file():
-            raise DatasetError(f"{root}: has no {MANIFEST}, expected a folder finished by rebar-build")
-        return path
-    if folder.exists() or not _HUB_ID.fullmatch(root):
+    if not folder.is_dir() and (folder.exists() or not _HUB_ID.fullmatch(root)):
         raise DatasetError(f"{root}: no such folder, expected a dataset folder or a Hub repository id")
+    return _file(root, MANIFEST)
+
+
+def _file(root: str, name: str) -> Path:
+    if Path(root).is_dir():
+        path = Path(root) / name
+        if not path.is_file():
+            raise DatasetError(f"{root}: has no {name}, expected a folder finished by rebar-build")
+        return path
     try:
-        return Path(hf_hub_download(root, MANIFEST, repo_type="dataset"))
+        return Path(hf_hub_download(root, name, repo_type="dataset"))
     except (EntryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError) as error:
         raise DatasetError(
-            f"{root}: no such folder, and as a Hub repository its {MANIFEST} cannot be had: {error}"
+            f"{root}: no such folder, and as a Hub repository its {name} cannot be had: {error}"
         ) from None

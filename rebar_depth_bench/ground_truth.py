@@ -6,15 +6,12 @@ later score maps into memory.
 
 from __future__ import annotations
 
-import json
+import hashlib
 import os
-import shutil
-import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from jaxtyping import Float32, UInt32
@@ -23,8 +20,9 @@ from numpy import ndarray
 from rebar_depth_bench.dataset import iterate
 from rebar_depth_bench.digests import eye_digest
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.files import sync
+from rebar_depth_bench.flat_cache import FlatCache, ViewArrays, open_cache
 from rebar_depth_bench.folder import DatasetFolder, ViewRecord
+from rebar_depth_bench.metrics import median
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.protocol import PROTOCOL, scored_pixels
 
@@ -45,111 +43,89 @@ class ViewTruth:
 
 
 @dataclass(frozen=True, eq=False)
-class ConfigTruth:
-    """A config's views in the protocol, in order; a view without a scored pixel is not among them."""
+class ConfigTruth(Sequence[ViewTruth]):
+    """The views of a config in the protocol, in order, each read when it is asked for."""
 
-    view_ids: tuple[str, ...]
-    starts: tuple[int, ...]
-    medians_m: tuple[float, ...]
-    index: UInt32[ndarray, " n"]
-    depth_m: Float32[ndarray, " n"]
+    cache: FlatCache
 
-    def __iter__(self) -> Iterator[ViewTruth]:
-        """Yield the views."""
-        bounds = pairwise(self.starts)
-        for view_id, (start, end), median_m in zip(self.view_ids, bounds, self.medians_m, strict=True):
-            yield ViewTruth(view_id, self.index[start:end], self.depth_m[start:end], median_m)
+    @property
+    def view_ids(self) -> tuple[str, ...]:
+        """The views' ids, in order."""
+        return self.cache.view_ids
+
+    def __len__(self) -> int:
+        return len(self.cache)
+
+    @overload
+    def __getitem__(self, place: int) -> ViewTruth: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> list[ViewTruth]: ...
+
+    def __getitem__(self, place: int | slice) -> ViewTruth | list[ViewTruth]:
+        if isinstance(place, slice):
+            return [self[one] for one in range(*place.indices(len(self)))]
+        view = self.cache.view(range(len(self))[place])
+        return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], float(view.note))
 
 
 def config_truth(folder: DatasetFolder, config: str, progress: Progress = silent) -> ConfigTruth:
-    """Return a config's scored pixels, from the cache or else from the dataset, checked against its manifest.
+    """Return the views of a config in the protocol, from the cache or else from the dataset.
 
-    Raises ``DatasetError`` naming the view whose ground truth is not the one the manifest's digest stands for.
+    A view without a scored pixel is not among them. Raises ``DatasetError`` naming the view whose ground truth is
+    not the one that the manifest's digest stands for.
     """
-    cached = _cache_path(folder, config)
-    try:
-        return _read_cache(cached)
-    except (OSError, ValueError, KeyError):
-        shutil.rmtree(cached, ignore_errors=True)  # not there, or damaged
-    _fill_cache(folder, config, cached, progress)
-    return _read_cache(cached)
-
-
-def _read_cache(cached: Path) -> ConfigTruth:
-    outline = json.loads((cached / "views.json").read_text())
-    return ConfigTruth(
-        view_ids=tuple(outline["view_ids"]),
-        starts=tuple(outline["starts"]),
-        medians_m=tuple(outline["medians_m"]),
-        index=np.asarray(np.load(cached / "index.npy", mmap_mode="r")),
-        depth_m=np.asarray(np.load(cached / "depth_m.npy", mmap_mode="r")),
+    cache = open_cache(
+        cache_path(folder, config, PROTOCOL),
+        {"index": np.uint32, "depth_m": np.float32},
+        lambda: _views(folder, config, progress),
+        outdated=cache_names(config, PROTOCOL),
     )
+    return ConfigTruth(cache)
 
 
-def _cache_path(folder: DatasetFolder, config: str) -> Path:
-    """Return where a config's scored pixels are kept: in the folder itself, or the user's cache for others."""
+def cache_path(folder: DatasetFolder, config: str, protocol: str, also: str = "") -> Path:
+    """Return where a config's pixels by a protocol are kept: in the folder itself, or in the user's cache.
+
+    ``also`` is the hex SHA-256 of anything but the views that the pixels depend on.
+    """
     digest = str(folder.config(config)["ground_truth_digest"]).removeprefix("sha256:")
+    if also:
+        digest = hashlib.sha256(f"{digest} {also}".encode()).hexdigest()
     local = folder.local
     if local is not None and os.access(local, os.W_OK):
         base = local / CACHE_FOLDER
     else:
         base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "rebar-depth-bench"
-    return base / f"{PROTOCOL}-{config}-{digest[:_DIGEST_CHARACTERS]}"
+    return base / f"{protocol}-{config}-{digest[:_DIGEST_CHARACTERS]}"
 
 
-def _fill_cache(folder: DatasetFolder, config: str, target: Path, progress: Progress) -> None:
-    """Write the flat arrays beside the target and rename them into place, view by view: memory stays flat."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    for outdated in target.parent.glob(f"{PROTOCOL}-{config}-{'?' * _DIGEST_CHARACTERS}"):
-        shutil.rmtree(outdated, ignore_errors=True)
-    temporary = Path(tempfile.mkdtemp(prefix=".filling-", dir=target.parent))
-    try:
-        outline = _write_arrays(folder, config, temporary, progress)
-        (temporary / "views.json").write_text(json.dumps(outline))
-        for path in (*temporary.iterdir(), temporary):
-            sync(path)
-        temporary.rename(target)
-    except OSError:
-        if not target.is_dir():  # else another process was faster, with the same bytes
-            raise
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+def cache_names(config: str, protocol: str) -> str:
+    """Return the pattern of the names that ``cache_path`` may give, whatever the digest."""
+    return f"{protocol}-{config}-{'?' * _DIGEST_CHARACTERS}"
 
 
-def _write_arrays(
-    folder: DatasetFolder, config: str, into: Path, progress: Progress
-) -> dict[str, list[str] | list[int] | list[float]]:
+def checked_rows(
+    folder: DatasetFolder, config: str, progress: Progress, what: str
+) -> Iterator[tuple[dict[str, Any], UInt32[ndarray, " n"]]]:
+    """Yield every row of a config with its scored pixels, held against the manifest's digests.
+
+    Raises ``DatasetError`` naming the view that is not the manifest's, or how many are missing at the end.
+    """
     records = {view.view_id: view for view in folder.views(config)}
-    total = sum(view.scored_px for view in records.values())
-    index = _new_array(into / "index.npy", np.uint32, total)
-    depth_m = _new_array(into / "depth_m.npy", np.float32, total)
-    view_ids: list[str] = []
-    starts = [0]
-    medians_m: list[float] = []
-    rows = iterate(folder.root, config, _TRUTH_COLUMNS)
-    for done, row in enumerate(rows, start=1):
-        record = records.pop(row["view_id"], None)
-        pixels = _checked_pixels(row, record, folder.root)
-        if len(pixels):
-            end = starts[-1] + len(pixels)
-            index[starts[-1] : end] = pixels
-            scored_m = row["left_depth"].ravel()[pixels]
-            depth_m[starts[-1] : end] = scored_m
-            medians_m.append(float(np.median(scored_m.astype(np.float64))))
-            view_ids.append(row["view_id"])
-            starts.append(end)
-        progress(f"ground truth of {config}", done, done + len(records))
+    total = len(records)
+    for done, row in enumerate(iterate(folder.root, config, _TRUTH_COLUMNS), start=1):
+        yield row, _checked_pixels(row, records.pop(row["view_id"], None), folder.root)
+        progress(f"{what} of {config}", done, total)
     if records:
         raise DatasetError(f"{folder.root}: {config} lacks {len(records)} views, among them {min(records)}")
-    index.flush()
-    depth_m.flush()
-    return {"view_ids": view_ids, "starts": starts, "medians_m": medians_m}
 
 
-def _new_array(path: Path, dtype: type, length: int) -> np.memmap[Any, Any]:
-    """Return a .npy file mapped for writing; it holds at least one value, for nothing cannot be mapped."""
-    mapped: np.memmap[Any, Any] = np.lib.format.open_memmap(path, "w+", dtype, (max(length, 1),))  # type: ignore[no-untyped-call]
-    return mapped
+def _views(folder: DatasetFolder, config: str, progress: Progress) -> Iterator[ViewArrays]:
+    for row, pixels in checked_rows(folder, config, progress, "ground truth"):
+        if len(pixels):
+            depth_m = row["left_depth"].ravel()[pixels]
+            yield ViewArrays(row["view_id"], {"index": pixels, "depth_m": depth_m}, median(depth_m))
 
 
 def _checked_pixels(row: dict[str, ndarray], record: ViewRecord | None, root: str) -> UInt32[ndarray, " n"]:

@@ -14,13 +14,11 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from rebar_depth_bench.bootstrap import Interval, Resampling, interval, resample
+from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.metrics import DepthMetrics
+from rebar_depth_bench.numbers import INTERVAL_DIGITS, rounded
 from rebar_depth_bench.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
 
-SIGNIFICANT_DIGITS = 12
-"""Numbers are written with this many digits: sums may differ in their last bits between processors."""
-
-_INTERVAL_DIGITS = 6
 _METRICS = ("abs_rel", "rmse_cm", "mae_cm", "delta1")
 SCALE = "scale_median"
 
@@ -84,9 +82,11 @@ class Result:
     software_version: str
     tables: Mapping[str, Table]
     views: Sequence[ViewScore]
+    extended: ExtendedResult | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the contract's JSON object."""
+        """Return the contract's JSON object; extended measures, where there are any, stand at its end."""
+        extended = {} if self.extended is None else {"extended": self.extended.to_dict()}
         return {
             "protocol": PROTOCOL,
             "dataset": {"digest": self.dataset_digest, "version": self.dataset_version},
@@ -94,6 +94,7 @@ class Result:
             "software": {"version": self.software_version},
             "tables": {name: _table_dict(table) for name, table in self.tables.items()},
             "views": [_view_dict(view) for view in self.views],
+            **extended,
         }
 
     def to_json(self) -> bytes:
@@ -184,13 +185,6 @@ def _is_finite(metrics: DepthMetrics | None) -> bool:
     return metrics is not None and all(math.isfinite(value) for value in vars(metrics).values())
 
 
-def rounded(value: float | None, digits: int = SIGNIFICANT_DIGITS) -> float | None:
-    """Return a number as it is written: None where undefined."""
-    if value is None or not math.isfinite(value):
-        return None
-    return float(f"{value:.{digits}g}")
-
-
 def _metrics_dict(metrics: DepthMetrics | None) -> dict[str, float | None]:
     if metrics is None:
         return dict.fromkeys(_METRICS)
@@ -226,7 +220,7 @@ def _intervals_dict(intervals: Mapping[str, Interval | None]) -> dict[str, Any]:
     for name, ends in intervals.items():
         group, _, key = name.rpartition(".")
         target = nested.setdefault(group, {}) if group else nested
-        target[key] = None if ends is None else [rounded(end, _INTERVAL_DIGITS) for end in ends]
+        target[key] = None if ends is None else [rounded(end, INTERVAL_DIGITS) for end in ends]
     return nested
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.errors import InputError, SubmissionError
 from rebar_depth_bench.folder import DatasetFolder, open_folder
-from rebar_depth_bench.ground_truth import ViewTruth, config_truth
+from rebar_depth_bench.ground_truth import ConfigTruth, ViewTruth, config_truth
 from rebar_depth_bench.metrics import depth_metrics, is_prediction, median, median_scale, shares_within
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.protocol import WITHIN_MM
@@ -93,20 +94,21 @@ def _score_all(
     scores: dict[str, list[ViewScore]] = {}
     for config in folder.configs:
         if config in present:
-            truths = list(config_truth(folder, config, progress))
-            outcomes = pool.map(lambda truth: _outcome(submission, truth), truths)
+            truths = config_truth(folder, config, progress)
+            outcomes = pool.map(partial(_outcome, submission, truths), range(len(truths)))
             scored = list(_watched(outcomes, f"scoring {config}", len(truths), progress))
             scores[config] = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
             problems += [outcome for outcome in scored if isinstance(outcome, str)]
-            unread.difference_update(truth.view_id for truth in truths)
+            unread.difference_update(truths.view_ids)
     problems += _problems_out_of_protocol(submission, unread)
     if problems:
         raise SubmissionError(str(submission.path), problems)
     return scores
 
 
-def _outcome(submission: SubmissionReader, truth: ViewTruth) -> ViewScore | str:
+def _outcome(submission: SubmissionReader, truths: ConfigTruth, place: int) -> ViewScore | str:
     """Return a view's score, or the sentence that says what is wrong with its entry."""
+    truth = truths[place]
     try:
         return score_view(truth, submission.read(truth.view_id))
     except EntryError as error:

@@ -56,12 +56,18 @@ def result_csv(result: Result) -> str:
     Undefined numbers are empty. A text that a spreadsheet would run as a formula gets a leading apostrophe,
     and control characters in it become U+FFFD.
     """
-    content = result.to_dict()
-    rows = [_csv_row(content, name, table) for name, table in content["tables"].items()]
+    return results_csv([result])
+
+
+def results_csv(results: Sequence[Result]) -> str:
+    """Return the tables of several results as one CSV, as ``result_csv`` spells them."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(_csv_header())
-    writer.writerows([csv_cell(value) for value in row] for row in rows)
+    for result in results:
+        content = result.to_dict()
+        rows = [_csv_row(content, name, table) for name, table in content["tables"].items()]
+        writer.writerows([csv_cell(value) for value in row] for row in rows)
     return out.getvalue()
 
 

@@ -112,7 +112,7 @@ def unranked_reasons(table: Table) -> list[str]:
         reasons.append("no views")
     missing = table.views - table.views_scored
     if missing:
-        reasons.append(f"{missing} of {table.views} {_plural('view', table.views)} without any prediction")
+        reasons.append(f"{missing} of {table.views} {plural('view', table.views)} without any prediction")
     if table.coverage is not None and table.coverage < MIN_RANKED_COVERAGE:
         reasons.append(f"coverage {coverage_percent(table.coverage)} % is below {MIN_RANKED_COVERAGE * 100:.0f} %")
     if any(_overflowed(metrics) for metrics in (table.native, table.scaled)):
@@ -125,7 +125,8 @@ def has_dash(rows: Iterable[Iterable[str]]) -> bool:
     return any(cell == DASH for row in rows for cell in row)
 
 
-def _plural(noun: str, count: int) -> str:
+def plural(noun: str, count: int) -> str:
+    """Return an English noun for that many of it."""
     return noun if count == 1 else f"{noun}s"
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from dataset_builder.appearance import VARIANTS
 from dataset_builder.cli import argument_parser as build_parser
-from dataset_builder.configs import CONFIGS
+from dataset_builder.configs import CONFIGS, SWEEPS
 from rebar_depth_bench.cli import argument_parser as bench_parser
 from rebar_depth_bench.methods import METHODS
 
@@ -50,7 +50,12 @@ def test_the_python_shown_runs(tiny_root: Path, tmp_path: Path, monkeypatch: pyt
 
 def test_tables_name_every_config_variant_and_method() -> None:
     readme = Path("README.md").read_text()
-    assert set(re.findall(r"^\| `([\w-]+)` \|", readme, flags=re.MULTILINE)) == {*CONFIGS, *METHODS, *VARIANTS}
+    assert set(re.findall(r"^\| `([\w-]+)` \|", readme, flags=re.MULTILINE)) == {
+        *CONFIGS,
+        *SWEEPS,
+        *METHODS,
+        *VARIANTS,
+    }
     assert all(f"| `{variant.name}` | {variant.words} |" in readme for variant in VARIANTS.values())
 
 

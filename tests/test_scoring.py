@@ -185,7 +185,7 @@ def test_a_damaged_ground_truth_is_named(
 def test_a_damaged_cache_is_made_anew(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
     archive = archive_of(tiny_truth)
     before = score(archive, tiny_root).to_json()
-    for name in ("views.json", "index.npy"):
+    for name in ("views.json", "index"):
         cached = next(tiny_root.glob(f"{CACHE_FOLDER}/rebar-1-lattice-*/{name}"))
         cached.write_bytes(cached.read_bytes()[:20])
         assert score(archive, tiny_root).to_json() == before

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-from dataset_builder.specs import BoardSpec, DomeSpec, RigSpec, RingSpec
+from dataset_builder.specs import BoardSpec, DomeSpec, ProtocolSpec, RigSpec, RingSpec, SweepSpec
 from rebar_depth_bench.calibration import Lens, StereoCalibration
 from rebar_depth_bench.errors import DatasetError
 
 _Spec = TypeVar("_Spec")
-_PROTOCOLS: Mapping[str, Callable[..., DomeSpec | RingSpec]] = {"dome": DomeSpec, "ring": RingSpec}
+_PROTOCOLS: Mapping[str, Callable[..., ProtocolSpec]] = {"dome": DomeSpec, "ring": RingSpec, "sweep": SweepSpec}
 
 
-def protocol_spec(config: str, entry: Mapping[str, Any]) -> DomeSpec | RingSpec:
+def protocol_spec(config: str, entry: Mapping[str, Any]) -> ProtocolSpec:
     """Return the camera protocol of a config's manifest entry; raise ``DatasetError`` if it holds none."""
     return _read(config, "protocol", entry, _protocol)
 
@@ -38,7 +38,7 @@ def _read(config: str, what: str, holder: Mapping[str, Any], maker: Callable[[An
         ) from None
 
 
-def _protocol(values: Mapping[str, Any]) -> DomeSpec | RingSpec:
+def _protocol(values: Mapping[str, Any]) -> ProtocolSpec:
     return _PROTOCOLS[values["kind"]](**_with_tuples(values))
 
 

@@ -1,0 +1,31 @@
+"""``rebar-bench predict``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rebar_depth_bench.commands.arguments import add_data
+from rebar_depth_bench.console import ProgressBars
+from rebar_depth_bench.methods import METHODS, find_method
+from rebar_depth_bench.predict import predict
+
+SUMMARY = "run a method over a dataset into an archive"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    parser.add_argument("method", metavar="METHOD", help=", ".join(METHODS))
+    add_data(parser)
+    parser.add_argument("--out", required=True, type=Path, metavar="ARCHIVE", help="the zip to write")
+    parser.add_argument(
+        "--config", nargs="+", action="extend", metavar="NAME", help="which configs (default: all of the folder)"
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Predict and print where the archive is."""
+    method = find_method(options.method)
+    with ProgressBars() as bars:
+        predict(method, options.data, options.out, configs=options.config, progress=bars.update)
+    print(options.out)

@@ -1,0 +1,160 @@
+"""What a measuring tape would go along: the straight runs of a scene's bars, and which of them are neighbours.
+
+Frames: world, metres. Truth only; no submission is looked at here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int16, Int64, UInt16
+from numpy import ndarray
+
+from rebar_depth_bench.bars import Bar
+from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.extended.parallel_runs import nearest_parallel_m, parallels, side_by_side
+
+STRAIGHT_DEG = 1.0
+"""A run ends where the centreline leaves the run's first direction by more than this."""
+
+MIN_RUN = 4.0
+"""A straight piece of at least this many diameters is a run; shorter ones belong to bends."""
+
+MAX_REACH_M = 0.050
+"""A fitted axis further from its place than this is not that bar, however lonely the bar stands."""
+
+SURFACE_RADII = (0.8, 2.0)
+"""A point of a run's side is this many nominal radii off its axis: ribs are, the flat cut ends are not."""
+
+MAX_RUNS = int(np.iinfo(np.int16).max)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A straight piece of a bar's centreline, from ``start_m`` to ``end_m``, and the bar's nominal diameter."""
+
+    bar_id: int
+    diameter_m: float
+    start_m: tuple[float, float, float]
+    end_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class CageTruth:
+    """A scene's runs, and the pairs of them that stand side by side.
+
+    ``neighbours`` holds indices into ``runs``, the lower one first: see ``side_by_side``. ``reach_m`` is for each
+    run half the distance to the nearest parallel one, at most ``MAX_REACH_M``: an axis found further away than
+    that is taken for another bar.
+    """
+
+    runs: tuple[Run, ...]
+    neighbours: Int64[ndarray, "m 2"]
+    reach_m: Float64[ndarray, " r"]
+
+    @cached_property
+    def start_m(self) -> Float64[ndarray, "r 3"]:
+        """Where each run starts, world, metres."""
+        return np.array([run.start_m for run in self.runs], dtype=np.float64).reshape(-1, 3)
+
+    @cached_property
+    def end_m(self) -> Float64[ndarray, "r 3"]:
+        """Where each run ends, world, metres."""
+        return np.array([run.end_m for run in self.runs], dtype=np.float64).reshape(-1, 3)
+
+    @cached_property
+    def diameter_m(self) -> Float64[ndarray, " r"]:
+        """The nominal diameter of each run's bar, metres."""
+        return np.array([run.diameter_m for run in self.runs], dtype=np.float64)
+
+    @cached_property
+    def bar_id(self) -> Int64[ndarray, " r"]:
+        """The bar that each run belongs to."""
+        return np.array([run.bar_id for run in self.runs], dtype=np.int64)
+
+
+def cage_truth(bars: Iterable[Bar]) -> CageTruth:
+    """Return the straight runs of a scene's bars and their neighbours.
+
+    Raises ``DatasetError`` where there are more runs than 16 bits can number.
+    """
+    runs = tuple(run for bar in bars for run in _straight_runs(bar))
+    if len(runs) > MAX_RUNS:
+        raise DatasetError(f"the bars have {len(runs)} straight runs, expected up to {MAX_RUNS}")
+    start_m = np.array([run.start_m for run in runs], dtype=np.float64).reshape(-1, 3)
+    end_m = np.array([run.end_m for run in runs], dtype=np.float64).reshape(-1, 3)
+    diameter_m = np.array([run.diameter_m for run in runs], dtype=np.float64)
+    bar_id = np.array([run.bar_id for run in runs], dtype=np.int64)
+    found = parallels(start_m, end_m, diameter_m)
+    reach_m = np.minimum(nearest_parallel_m(found) / 2, MAX_REACH_M)
+    return CageTruth(runs, side_by_side(found, bar_id, diameter_m), reach_m)
+
+
+def assign_runs(
+    points_m: Float64[ndarray, "n 3"], bar_id: UInt16[ndarray, " n"], cage: CageTruth
+) -> Int16[ndarray, " n"]:
+    """Return for each true surface point (world, metres) the run of its own bar that it lies on, -1 for none.
+
+    A point lies on a run if it stands over it (its foot on the axis is between the run's ends) and is
+    ``SURFACE_RADII`` off the axis; of several runs the one with the nearest axis takes it. So bends, hooks' curves
+    and the flat ends of bars are on no run. Raises ``ValueError`` where the two arrays differ in length.
+    """
+    if points_m.shape != (len(bar_id), 3):
+        raise ValueError(f"points_m has shape {points_m.shape}, expected ({len(bar_id)}, 3) as bar_id has")
+    assigned = np.full(len(bar_id), -1, dtype=np.int16)
+    nearest_m = np.full(len(bar_id), np.inf)
+    order = np.argsort(bar_id, kind="stable")
+    first, last = (np.searchsorted(bar_id[order], cage.bar_id, side) for side in ("left", "right"))
+    for run in np.flatnonzero(last > first):
+        rows = order[first[run] : last[run]]
+        on, away_m = _stands_on(points_m[rows], cage, int(run))
+        taken = on & (away_m < nearest_m[rows])
+        assigned[rows[taken]] = run
+        nearest_m[rows[taken]] = away_m[taken]
+    return assigned
+
+
+def _stands_on(
+    points_m: Float64[ndarray, "k 3"], cage: CageTruth, run: int
+) -> tuple[Bool[ndarray, " k"], Float64[ndarray, " k"]]:
+    """Return which points lie on a run's side, and how far all are from its axis (metres)."""
+    line_m = cage.end_m[run] - cage.start_m[run]
+    length_m = np.linalg.norm(line_m)
+    direction = line_m / length_m
+    from_start_m = points_m - cage.start_m[run]
+    along_m = from_start_m @ direction
+    away_m = np.linalg.norm(from_start_m - along_m[:, None] * direction, axis=1)
+    radii = away_m / (cage.diameter_m[run] / 2)
+    slack_m = 1e-6  # depth is float32
+    over = (along_m >= -slack_m) & (along_m <= length_m + slack_m)
+    return over & (radii >= SURFACE_RADII[0]) & (radii <= SURFACE_RADII[1]), away_m
+
+
+def _straight_runs(bar: Bar) -> Iterator[Run]:
+    """Yield the straight pieces of a bar that are long enough, from its first point to its last."""
+    points_m = np.array(bar.axis_m)
+    moved = np.linalg.norm(np.diff(points_m, axis=0), axis=1) > 0
+    points_m = points_m[np.concatenate([[True], moved])]
+    for first, last in _straight_pieces(points_m):
+        start_m, end_m = points_m[first], points_m[last]
+        if np.linalg.norm(end_m - start_m) >= MIN_RUN * bar.diameter_m:
+            yield Run(bar.bar_id, bar.diameter_m, _as_point(start_m), _as_point(end_m))
+
+
+def _straight_pieces(points_m: Float64[ndarray, "n 3"]) -> Iterator[tuple[int, int]]:
+    """Yield (first, last) point of each stretch whose segments all keep to its first one's direction."""
+    steps_m = np.diff(points_m, axis=0)
+    directions = steps_m / np.linalg.norm(steps_m, axis=1, keepdims=True)
+    least_cosine = np.cos(np.deg2rad(STRAIGHT_DEG))
+    first = 0
+    for segment in range(1, len(directions) + 1):
+        if segment == len(directions) or directions[first] @ directions[segment] < least_cosine:
+            yield first, segment
+            first = segment
+
+
+def _as_point(point_m: Float64[ndarray, " 3"]) -> tuple[float, float, float]:
+    return (float(point_m[0]), float(point_m[1]), float(point_m[2]))

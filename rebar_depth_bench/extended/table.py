@@ -1,0 +1,110 @@
+"""Extended measures as text: a table per config in the terminal, and tidy CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Mapping
+
+from rich import box
+from rich.console import Console
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from rebar_depth_bench import wording
+from rebar_depth_bench.bootstrap import Interval
+from rebar_depth_bench.extended.evaluation import FAMILIES, Family
+from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
+from rebar_depth_bench.extended.result import Estimate, ExtendedResult, ExtendedTable
+from rebar_depth_bench.numbers import INTERVAL_DIGITS, rounded
+from rebar_depth_bench.result import Result
+from rebar_depth_bench.table import csv_cell
+
+NOT_TOLD = "not told"
+"""Stands for a capability whose p95 is of what was not found."""
+
+_ARROWS: Mapping[str, str] = {"lower": " ↓", "higher": " ↑", "": ""}
+
+
+def print_extended(extended: ExtendedResult, console: Console) -> None:
+    """Print every measure that has a value, native beside scaled, with its interval."""
+    for config, table in extended.tables.items():
+        console.print()
+        console.print(Text(f"{wording.printable(config)}, {EXTENDED_PROTOCOL}, {table.views} views", style="bold"))
+        grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
+        grid.add_column("", no_wrap=True)
+        for heading in ("native", "95 %", "scaled", "95 %"):
+            grid.add_column(heading, justify="right", no_wrap=True)
+        for family in FAMILIES.values():
+            rows = [(measure, cells(table, family, measure)) for measure in family.measures]
+            known = [(measure, shown) for measure, shown in rows if any(cell != wording.DASH for cell in shown)]
+            if known:
+                grid.add_section()
+                grid.add_row(Text(family.title, style="italic"))
+            for measure, shown in known:
+                grid.add_row(Text(f"  {heading_of(measure)}"), *map(Text, shown))
+        console.print(grid)
+    note = "One number in the first column: no scale changes it, or it brings its own alignment."
+    not_told = f"{NOT_TOLD}: more than 5 % were not found." if _not_told(extended) else ""
+    console.print(Text(" ".join(filter(None, (note, not_told, "Definitions: cards/BENCHMARK.md.")))))
+
+
+def heading_of(measure: Measure) -> str:
+    """Return a measure's title with unit and better direction."""
+    unit = f", {measure.unit}" if measure.unit else ""
+    return f"{measure.title}{unit}{_ARROWS[measure.better]}"
+
+
+def cells(table: ExtendedTable, family: Family, measure: Measure) -> list[str]:
+    """Return value and interval of a measure, native and scaled; the last two are empty where it is taken once."""
+    shown: list[str] = []
+    for alignment in family.alignments:
+        one = table.numbers[alignment][measure.name]
+        told = one.value is not None or not one.samples
+        shown += [spelled(one.value, measure) if told else NOT_TOLD, _between(one.interval, measure)]
+    return shown + [""] * (4 - len(shown))
+
+
+def spelled(value: float | None, measure: Measure) -> str:
+    """Return a measure's value in its unit, to four significant digits or a dash."""
+    if value is None:
+        return wording.DASH
+    shown = 100 * value if measure.unit == "%" else value
+    return f"{shown:.1f}" if measure.unit == "%" else f"{shown:.4g}"
+
+
+def extended_csv(result: Result) -> str:
+    r"""Return the extended tables as tidy CSV: a row per config, alignment and measure; ``\n`` ends."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    head = ["method", "config", "alignment", "measure", "unit", "statistic", "value", "low", "high", "samples"]
+    stamps = ["protocol", "dataset_digest", "submission_sha256", "software_version"]
+    writer.writerow(head + stamps)
+    if result.extended is not None:
+        stamp = [EXTENDED_PROTOCOL, result.dataset_digest, result.submission_sha256, result.software_version]
+        for config, alignment, measure, one in _numbers(result.extended):
+            low, high = one.interval or (None, None)
+            named = [result.method, config, alignment, measure.name, measure.unit, measure.statistic]
+            numbers = [
+                rounded(one.value),
+                rounded(low, INTERVAL_DIGITS),
+                rounded(high, INTERVAL_DIGITS),
+                one.samples,
+            ]
+            writer.writerow([csv_cell(cell) for cell in (*named, *numbers, *stamp)])
+    return out.getvalue()
+
+
+def _numbers(extended: ExtendedResult) -> Iterator[tuple[str, str, Measure, Estimate]]:
+    for config, table in extended.tables.items():
+        for alignment, measures in extended.measures.items():
+            for measure in measures:
+                yield config, alignment, measure, table.numbers[alignment][measure.name]
+
+
+def _not_told(extended: ExtendedResult) -> bool:
+    return any(one.value is None and one.samples for _, _, _, one in _numbers(extended))
+
+
+def _between(ends: Interval | None, measure: Measure) -> str:
+    return wording.DASH if ends is None else " to ".join(spelled(end, measure) for end in ends)

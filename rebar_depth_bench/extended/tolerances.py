@@ -1,0 +1,99 @@
+"""Tolerances of reinforcement inspection, as named profiles, and how a method's error compares with them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+ErrorKind = Literal["spacing", "layer", "cover"]
+"""Which error a tolerance is held against: see ``inspection``."""
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """One line of a profile: an error of this ``kind`` passes if its absolute value is at most ``limit_mm``."""
+
+    key: str
+    kind: ErrorKind
+    limit_mm: float
+    title: str
+
+
+@dataclass(frozen=True)
+class ToleranceProfile:
+    """The tolerances of one standard, and where the figures are from, in words to show beside them."""
+
+    name: str
+    title: str
+    source: str
+    tolerances: tuple[Tolerance, ...]
+
+
+GB_50204 = ToleranceProfile(
+    name="gb50204",
+    title="GB 50204",
+    source="GB 50204 (acceptance of concrete works, China), placing of bars; figures from a secondary source",
+    tolerances=(
+        Tolerance("gb50204_spacing", "spacing", 10.0, "bar spacing"),
+        Tolerance("gb50204_stirrup_spacing", "spacing", 20.0, "stirrup spacing"),
+        Tolerance("gb50204_layers", "layer", 5.0, "distance of layers"),
+        Tolerance("gb50204_cover_slab", "cover", 3.0, "cover, slabs and walls"),
+        Tolerance("gb50204_cover_beam", "cover", 5.0, "cover, beams and columns"),
+    ),
+)
+
+EN_13670_CLASS_1 = ToleranceProfile(
+    name="en13670_class1",
+    title="EN 13670, class 1",
+    source="EN 13670 (execution of concrete structures), cover, plus side, tolerance class 1, growing with the "
+    "depth of the section; figures from a secondary source; held against errors of either sign",
+    tolerances=(
+        Tolerance("en13670_class1_cover_shallow", "cover", 10.0, "cover, shallow sections"),
+        Tolerance("en13670_class1_cover_medium", "cover", 15.0, "cover, medium sections"),
+        Tolerance("en13670_class1_cover_deep", "cover", 25.0, "cover, deep sections"),
+    ),
+)
+
+EN_13670_CLASS_2 = ToleranceProfile(
+    name="en13670_class2",
+    title="EN 13670, class 2",
+    source="EN 13670 (execution of concrete structures), cover, plus side, tolerance class 2, growing with the "
+    "depth of the section; figures from a secondary source; held against errors of either sign",
+    tolerances=(
+        Tolerance("en13670_class2_cover_shallow", "cover", 5.0, "cover, shallow sections"),
+        Tolerance("en13670_class2_cover_medium", "cover", 10.0, "cover, medium sections"),
+        Tolerance("en13670_class2_cover_deep", "cover", 20.0, "cover, deep sections"),
+    ),
+)
+
+PROFILES: tuple[ToleranceProfile, ...] = (GB_50204, EN_13670_CLASS_1, EN_13670_CLASS_2)
+
+
+def pass_sample(tolerance: Tolerance) -> str:
+    """Return the name of the 0/1 sample, and of its measure, that says what passes a tolerance."""
+    return f"pass_{tolerance.key}"
+
+
+def p95_measure(kind: ErrorKind) -> str:
+    """Return the name of the measure whose p95 a tolerance of this kind is compared with."""
+    return f"{kind}_p95_mm"
+
+
+CAPABILITIES: tuple[tuple[Tolerance, str], ...] = tuple(
+    (tolerance, p95_measure(tolerance.kind)) for profile in PROFILES for tolerance in profile.tolerances
+)
+"""Each tolerance with the measure that ``capability`` divides it by."""
+
+
+def capability(tolerance_mm: float, p95_mm: float) -> float:
+    """Return tolerance / p95 of the absolute error: 1 or more where 95 % of what is measured stays within it.
+
+    inf for a p95 of 0. Raises ``ValueError`` for a tolerance that is not positive and finite, or a p95 that is
+    negative or NaN.
+    """
+    if not 0 < tolerance_mm < math.inf:
+        raise ValueError(f"tolerance_mm is {tolerance_mm}, expected a positive length")
+    if not p95_mm >= 0:
+        raise ValueError(f"p95_mm is {p95_mm}, expected 0 or more")
+    return tolerance_mm / p95_mm if p95_mm > 0 else math.inf

@@ -1,0 +1,40 @@
+"""The studies by name, and their place under ``rebar-bench study``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+from rebar_depth_bench.studies import anchor, distance, kitti, pseudo_reference
+
+
+class Study(Protocol):
+    """What a study's module has: one line, its arguments, and how it runs."""
+
+    SUMMARY: str
+
+    @property
+    def add_arguments(self) -> Callable[[argparse.ArgumentParser], None]:
+        """Add the study's arguments to its parser."""
+
+    @property
+    def run(self) -> Callable[[argparse.Namespace], None]:
+        """Run the study: results to standard output, progress to standard error; raises ``RebarDepthError``."""
+
+
+STUDIES: Mapping[str, Study] = {
+    "anchor": anchor,
+    "distance": distance,
+    "pseudo-reference": pseudo_reference,
+    "kitti": kitti,
+}
+
+
+def add_study_commands(parser: argparse.ArgumentParser) -> None:
+    """Add a command for each study to the parser of ``rebar-bench study``; each sets ``run`` to its own."""
+    commands = parser.add_subparsers(required=True, metavar="NAME")
+    for name, study in STUDIES.items():
+        command = commands.add_parser(name, help=study.SUMMARY, description=study.SUMMARY)
+        study.add_arguments(command)
+        command.set_defaults(run=study.run)

@@ -1,0 +1,66 @@
+"""A small real capture: blank stereo pairs and a calibration, and depth maps of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+WIDTH, HEIGHT = 64, 36
+VIEWS = 24
+CONF = """\
+[LEFT_CAM_HD]
+fx=701.88
+fy=701.70
+cx=641.285
+cy=344.1835
+k1=-0.175286
+k2=0.0283094
+
+[RIGHT_CAM_HD]
+fx=700.965
+fy=701.11
+cx=633.515
+cy=359.3135
+k1=-0.172795
+k2=0.0265223
+
+[STEREO]
+Baseline=119.978
+CV_HD=0.00624
+RX_HD=-0.000917
+RZ_HD=0.00077
+"""
+
+Depth = NDArray[Any]
+
+
+def write_capture(root: Path, views: int = VIEWS, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
+    """Write a capture and return its folder."""
+    for eye in ("left", "right"):
+        (root / eye).mkdir(parents=True)
+        for view in range(views):
+            Image.new("L", size).save(root / eye / f"{view:06d}.png")
+    (root / "calibration.conf").write_text(CONF)
+    return root
+
+
+def exact_depth(view: int) -> Depth:
+    """A slope with a box before it, another in each view, metres."""
+    rng = np.random.default_rng(view)
+    depth_m = np.linspace(0.8, 3.0, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) * rng.uniform(0.7, 1.3)
+    depth_m[8:20, 10:40] = rng.uniform(0.4, 0.7)
+    return depth_m.astype(np.float32)
+
+
+def write_depths(folder: Path, depths: dict[int, Depth], method: str | None = None) -> Path:
+    """Write depth maps by view as a folder of .npy and return it."""
+    folder.mkdir()
+    for view, depth_m in depths.items():
+        np.save(folder / f"{view:06d}.npy", depth_m.astype(np.float32))
+    if method is not None:
+        (folder / "submission.json").write_text(f'{{"method": "{method}"}}')
+    return folder
