@@ -12,13 +12,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from rebar_depth_bench.errors import InputError, SubmissionError
+from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.folder import DatasetFolder, open_folder
 from rebar_depth_bench.ground_truth import ConfigTruth, ViewTruth, config_truth
-from rebar_depth_bench.metrics import depth_metrics, is_prediction, median, median_scale, shares_within
+from rebar_depth_bench.metrics import aligned_metrics, is_prediction, median, median_scale
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.protocol import WITHIN_MM
 from rebar_depth_bench.result import Result, ViewScore, tabulate
+from rebar_depth_bench.streaming import ordered_map
 from rebar_depth_bench.submission import EntryError, SubmissionReader, config_of, open_submission
 from rebar_depth_bench.version import software_version
 
@@ -38,17 +39,15 @@ def score(
     Raises ``SubmissionError`` with every problem if any part of the archive is at fault, ``DatasetError`` if the
     folder is.
     """
-    if workers is not None and workers < 1:
-        raise InputError(f"workers is {workers}, expected 1 or more")
     folder = open_folder(root)
     with (
         open_submission(archive, folder.expected_views()) as submission,
-        ThreadPoolExecutor((workers or os.cpu_count() or 1) + 1) as pool,
+        ThreadPoolExecutor(1) as pool,
     ):
         if submission.meta is None or submission.structure_problems:
             raise SubmissionError(str(archive), list(submission.problems()))
         sha256 = pool.submit(submission.sha256)
-        scores = _score_all(submission, folder, pool, progress)
+        scores = _score_all(submission, folder, workers, progress)
         return Result(
             method=submission.meta.method,
             submission_sha256=sha256.result(),
@@ -68,24 +67,24 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
         p_m, z_m = p_m[valid], z_m[valid]
         z_median_m = median(z_m) if len(z_m) else 0.0
     scored_px = len(truth.index)
-    within_mm = shares_within(p_m, z_m, scored_px, WITHIN_MM)
     coverage = len(p_m) / scored_px
     if not len(p_m):
-        return ViewScore(truth.view_id, scored_px, coverage, None, None, None, within_mm)
+        return ViewScore(truth.view_id, scored_px, coverage, None, None, None, dict.fromkeys(WITHIN_MM, 0.0))
     scale = median_scale(p_m, z_median_m)
+    (native, scaled), within = aligned_metrics(p_m, z_m, (1.0, scale), WITHIN_MM)
     return ViewScore(
         view_id=truth.view_id,
         scored_px=scored_px,
         coverage=coverage,
         scale=scale,
-        native=depth_metrics(p_m, z_m),
-        scaled=depth_metrics(p_m, z_m, scale),
-        within_mm=within_mm,
+        native=native,
+        scaled=scaled,
+        within_mm={tolerance_mm: count / scored_px for tolerance_mm, count in within.items()},
     )
 
 
 def _score_all(
-    submission: SubmissionReader, folder: DatasetFolder, pool: ThreadPoolExecutor, progress: Progress
+    submission: SubmissionReader, folder: DatasetFolder, workers: int | None, progress: Progress
 ) -> dict[str, list[ViewScore]]:
     """Score every view of the archive, or raise with all that is wrong with it and score nothing."""
     present = {config_of(view_id) for view_id in submission.view_ids}
@@ -95,7 +94,7 @@ def _score_all(
     for config in folder.configs:
         if config in present:
             truths = config_truth(folder, config, progress)
-            outcomes = pool.map(partial(_outcome, submission, truths), range(len(truths)))
+            outcomes = ordered_map(partial(_outcome, submission, truths), range(len(truths)), workers)
             scored = list(_watched(outcomes, f"scoring {config}", len(truths), progress))
             scores[config] = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
             problems += [outcome for outcome in scored if isinstance(outcome, str)]

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from rebar_depth_bench.metrics import depth_metrics, is_prediction, median, median_scale, shares_within
+from rebar_depth_bench.metrics import aligned_metrics, depth_metrics, is_prediction, median, median_scale
 
 DEPTHS = hnp.arrays(np.float64, st.integers(1, 40), elements=st.floats(0.05, 50.0))
 
@@ -78,9 +78,9 @@ def test_bounds_and_order(pair: tuple[np.ndarray, np.ndarray]) -> None:
     found = depth_metrics(p, z)
     assert 0.0 <= found.delta1 <= 1.0
     assert 0.0 <= found.mae_cm <= found.rmse_cm * (1 + 1e-12)
-    shares = shares_within(p, z, len(z), (3, 5, 10, 20))
-    assert list(shares.values()) == sorted(shares.values())
-    assert all(0.0 <= share <= 1.0 for share in shares.values())
+    _, counts = aligned_metrics(p, z, (1.0,), (3, 5, 10, 20))
+    assert list(counts.values()) == sorted(counts.values())
+    assert all(0 <= count <= len(z) for count in counts.values())
 
 
 @given(DEPTHS, st.integers(0, 2**32 - 1))
@@ -92,12 +92,14 @@ def test_order_of_pixels_does_not_matter(z: np.ndarray, seed: int) -> None:
     assert median_scale(p, 1.0) == median_scale(p[order], 1.0)
 
 
-def test_tolerance_counts_missing_pixels_as_failures() -> None:
-    error_m = np.array([0.0, 0.003, 0.0031, 0.02])
-    assert shares_within(error_m, np.zeros(4), 8, (3, 20)) == {3: 2 / 8, 20: 4 / 8}
+def test_a_tolerance_includes_its_end_and_goes_by_the_first_scale() -> None:
+    z = np.array([4.0, 2.0**-9, 1.0, 0.5])
+    p = z + np.array([0.0, 0.003, 0.0031, 0.015])  # 2^-9 takes 0.003 without rounding it up
+    assert abs(p[1] - z[1]) == 0.003
+    assert aligned_metrics(p, z, (1.0, 9.0), (3, 20))[1] == {3: 2, 20: 4}
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 8191, 8192, 8193, 40_000, 40_001])
+@pytest.mark.parametrize("count", [1, 2, 3, 16383, 16384, 16385, 60_001])
 @pytest.mark.parametrize("kind", ["smooth", "sorted", "equal", "two values", "misleading sample"])
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 def test_the_median_is_numpys(count: int, kind: str, dtype: type) -> None:
@@ -110,7 +112,7 @@ def test_the_median_is_numpys(count: int, kind: str, dtype: type) -> None:
     elif kind == "two values":
         values = np.where(rng.random(count) < 0.5, 0.3, 4.0)
     elif kind == "misleading sample":
-        values[:: max(count // 512, 1)] = 16.5  # the very pixels that a sample would take
+        values[:: max(count // 4096, 1)] = 16.5  # the very pixels that a sample would take
     values = values.astype(dtype)
     assert median(values) == np.median(values.astype(np.float64))
 
@@ -125,8 +127,9 @@ def test_a_view_of_many_parts_has_the_numbers_of_one() -> None:
     assert found.rmse_cm == pytest.approx(100 * np.sqrt(np.mean(error_m**2)), rel=1e-12)
     assert found.mae_cm == pytest.approx(100 * np.mean(error_m), rel=1e-12)
     assert found.delta1 == np.mean(np.maximum(0.9 * p / z, z / (0.9 * p)) < 1.25)
-    within = shares_within(p, z, 100_000, (5, 20))
-    assert within == {t: np.count_nonzero(np.abs(p - z) <= t / 1000) / 100_000 for t in (5, 20)}
+    both, within = aligned_metrics(p, z, (1.0, 0.9), (5, 20))
+    assert within == {t: np.count_nonzero(np.abs(p - z) <= t / 1000) for t in (5, 20)}
+    assert both == [depth_metrics(p, z), found]
 
 
 def test_what_is_a_prediction() -> None:

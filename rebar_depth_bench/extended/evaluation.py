@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ from rebar_depth_bench.folder import open_folder
 from rebar_depth_bench.metrics import is_prediction
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.result import Result, protocol_indices
+from rebar_depth_bench.streaming import ordered_map
 from rebar_depth_bench.submission import SubmissionReader, open_submission
 
 ONCE, NATIVE, SCALED = "once", "native", "scaled"
@@ -113,15 +114,11 @@ def score_extended(
     measures = measures_by_alignment()
     tables: dict[str, ExtendedTable] = {}
     views: list[ExtendedView] = []
-    with (
-        open_submission(archive, folder.expected_views()) as submission,
-        ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool,
-    ):
+    with open_submission(archive, folder.expected_views()) as submission:
         for config in result.tables:
             steel = steel_config(folder, config, progress)
-            outcomes = pool.map(
-                lambda place, steel=steel: _view(submission, steel.view(place), steel, scales), range(len(steel))
-            )
+            work = partial(_view, submission, steel, scales)
+            outcomes = ordered_map(work, range(len(steel)), workers)
             found = []
             for done, view in enumerate(outcomes, start=1):
                 found.append(view)
@@ -132,8 +129,9 @@ def score_extended(
 
 
 def _view(
-    submission: SubmissionReader, truth: SteelTruth, steel: SteelConfig, scales: Mapping[str, float | None]
+    submission: SubmissionReader, steel: SteelConfig, scales: Mapping[str, float | None], place: int
 ) -> ExtendedView:
+    truth = steel.view(place)
     prediction_m = submission.read(truth.view_id)
     return ExtendedView(truth.view_id, view_samples(prediction_m, truth, steel, scales[truth.view_id]))
 

@@ -20,7 +20,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.truth import SteelTruth
-from rebar_depth_bench.metrics import DepthMetrics, depth_metrics, is_prediction, shares_within
+from rebar_depth_bench.metrics import DepthMetrics, aligned_metrics, is_prediction
 from rebar_depth_bench.protocol import WITHIN_MM
 
 _ERRORS = tuple(field.name for field in fields(DepthMetrics))
@@ -48,14 +48,14 @@ def _scores(prefix: str, p_m: Float64[ndarray, " n"], truth: SteelTruth, pixels:
     predicted = pixels & is_prediction(p_m)
     p_valid_m, z_m = p_m[predicted], truth.depth_m[predicted].astype(np.float64)
     numbers: dict[str, float] = {}
-    if len(p_valid_m):
-        found = depth_metrics(p_valid_m, z_m)
-        numbers.update((name, getattr(found, name)) for name in _ERRORS)
     total = int(np.count_nonzero(pixels))
     if total:
         numbers["coverage"] = len(p_valid_m) / total
-        within = shares_within(p_valid_m, z_m, total, WITHIN_MM)
-        numbers.update((f"within_{t}mm", share) for t, share in within.items())
+        numbers.update((f"within_{t}mm", 0.0) for t in WITHIN_MM)
+    if len(p_valid_m):
+        [found], within = aligned_metrics(p_valid_m, z_m, (1.0,), WITHIN_MM)
+        numbers.update((name, getattr(found, name)) for name in _ERRORS)
+        numbers.update((f"within_{t}mm", count / total) for t, count in within.items())
     return {
         f"{prefix}_{name}": np.array([numbers[name]] if name in numbers else [], np.float64) for name in _NUMBERS
     }

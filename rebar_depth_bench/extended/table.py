@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 
 from rich import box
 from rich.console import Console
+from rich.padding import Padding
 from rich.table import Table as RichTable
 from rich.text import Text
 
@@ -32,7 +33,7 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
         console.print()
         console.print(Text(f"{wording.printable(config)}, {EXTENDED_PROTOCOL}, {table.views} views", style="bold"))
         grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
-        grid.add_column("", no_wrap=True)
+        grid.add_column("", overflow="fold")  # names give way, numbers never
         for heading in ("native", "95 %", "scaled", "95 %"):
             grid.add_column(heading, justify="right", no_wrap=True)
         for family in FAMILIES.values():
@@ -42,10 +43,10 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
                 grid.add_section()
                 grid.add_row(Text(family.title, style="italic"))
             for measure, shown in known:
-                grid.add_row(Text(f"  {heading_of(measure)}"), *map(Text, shown))
+                grid.add_row(Padding(heading_of(measure), (0, 0, 0, 2)), *map(Text, shown))
         console.print(grid)
     note = "One number in the first column: no scale changes it, or it brings its own alignment."
-    not_told = f"{NOT_TOLD}: more than 5 % were not found." if _not_told(extended) else ""
+    not_told = f"{NOT_TOLD}: 5 % or more were not found." if _not_told(extended) else ""
     console.print(Text(" ".join(filter(None, (note, not_told, "Definitions: cards/BENCHMARK.md.")))))
 
 
@@ -65,12 +66,11 @@ def cells(table: ExtendedTable, family: Family, measure: Measure) -> list[str]:
     return shown + [""] * (4 - len(shown))
 
 
-def spelled(value: float | None, measure: Measure) -> str:
-    """Return a measure's value in its unit, to four significant digits or a dash."""
+def spelled(value: float | None, measure: Measure, digits: int = 4) -> str:
+    """Return a measure's value in its unit: a share with one decimal, else significant digits, or a dash."""
     if value is None:
         return wording.DASH
-    shown = 100 * value if measure.unit == "%" else value
-    return f"{shown:.1f}" if measure.unit == "%" else f"{shown:.4g}"
+    return f"{100 * value:.1f}" if measure.unit == "%" else f"{value:.{digits}g}"
 
 
 def extended_csv(result: Result) -> str:
@@ -107,4 +107,4 @@ def _not_told(extended: ExtendedResult) -> bool:
 
 
 def _between(ends: Interval | None, measure: Measure) -> str:
-    return wording.DASH if ends is None else " to ".join(spelled(end, measure) for end in ends)
+    return wording.DASH if ends is None else " to ".join(spelled(end, measure, 3) for end in ends)

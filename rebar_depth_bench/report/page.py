@@ -18,6 +18,7 @@ from rebar_depth_bench.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
 from rebar_depth_bench.published import load_published
 from rebar_depth_bench.report import charts
 from rebar_depth_bench.report.browser import ShownView, counted, shown_views
+from rebar_depth_bench.report.extended import extended_section
 from rebar_depth_bench.report.panels import ViewPanels, colour_bar_uri
 from rebar_depth_bench.report.paper import paper_scenes
 from rebar_depth_bench.report.rows import Row, table_row, view_row
@@ -65,6 +66,7 @@ def render_report(result: Result, panels: Iterable[ViewPanels], *, title: str | 
             min_coverage=f"{MIN_RANKED_COVERAGE * 100:.0f}",
             **_results(result, views),
             **_paper(result),
+            **_extended(result),
             **_browser(shown, views),
             **_every_view(result, views),
         )
@@ -91,6 +93,11 @@ def _paper(result: Result) -> dict[str, object]:
         "paper_title": published.title,
         "paper_part": published.parts["synthetic"],
     }
+
+
+def _extended(result: Result) -> dict[str, object]:
+    """Return what ``part_extended.html.j2`` shows, None where the archive was scored without."""
+    return {"extended": None if result.extended is None else extended_section(result.extended)}
 
 
 def _browser(shown: Sequence[ShownView], views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:

@@ -6,6 +6,7 @@ import argparse
 import math
 import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -103,7 +104,7 @@ def study_anchor(
     with opened(archive, folder, progress) as submission:
         name = one_config(submission, folder, config)
         truths = config_truth(folder, name, progress)
-        found = map_views(submission, truths, view_ratio, f"ratios of {name}", progress)
+        found = map_views(submission, truths, len(truths), view_ratio, f"ratios of {name}", progress)
         ratios = np.array([one.ratio for one in found if one.ratio is not None])
         possible = [k for k in sorted(set(counts)) if k <= len(ratios)]
         if not possible:
@@ -113,10 +114,9 @@ def study_anchor(
             )
         drawn = [drawn_scales(ratios, k, draws, seed) for k in possible]
         scales = np.concatenate([[given_scale, np.median(ratios)], *drawn])
-        predicted = [truth for truth, one in zip(truths, found, strict=True) if one.ratio is not None]
-        errors = mean_errors(
-            map_views(submission, predicted, lambda view: errors_at(view, scales), f"errors of {name}", progress)
-        )
+        predicted = (truth for truth, one in zip(truths, found, strict=True) if one.ratio is not None)
+        work = partial(errors_at, scales=scales)
+        errors = mean_errors(map_views(submission, predicted, len(ratios), work, f"errors of {name}", progress))
         stamp = archive_stamp(submission, folder)
     given, all_views, *rest = map(ScaledArchive, scales.tolist(), errors.abs_rel.tolist(), errors.rmse_cm.tolist())
     per_k = tuple(tuple(rest[start : start + draws]) for start in range(0, len(rest), draws))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TypeVar
@@ -20,6 +19,7 @@ from rebar_depth_bench.metrics import is_prediction
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.protocol import PROTOCOL
 from rebar_depth_bench.stamp import ArchiveStamp, Stamp
+from rebar_depth_bench.streaming import ordered_map
 from rebar_depth_bench.submission import SubmissionReader, config_of, open_submission
 
 T = TypeVar("T")
@@ -74,18 +74,18 @@ def one_config(submission: SubmissionReader, folder: DatasetFolder, wanted: str 
 
 def map_views(
     submission: SubmissionReader,
-    truths: Sequence[ViewTruth],
+    truths: Iterable[ViewTruth],
+    total: int,
     make: Callable[[ViewPairs], T],
     what: str,
     progress: Progress = silent,
 ) -> list[T]:
-    """Return ``make`` of every view's pairs, in order, computed on all cores; one view a core is in memory."""
+    """Return ``make`` of the pairs of ``total`` views, in order, computed on all cores, few views in memory."""
     made: list[T] = []
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        outcomes = pool.map(lambda truth: make(pairs(truth, submission.read(truth.view_id))), truths)
-        for done, one in enumerate(outcomes, start=1):
-            progress(what, done, len(truths))
-            made.append(one)
+    outcomes = ordered_map(lambda truth: make(pairs(truth, submission.read(truth.view_id))), truths, None)
+    for done, one in enumerate(outcomes, start=1):
+        progress(what, done, total)
+        made.append(one)
     return made
 
 

@@ -22,6 +22,7 @@ from rebar_depth_bench.console import ProgressBars
 from rebar_depth_bench.errors import InputError, SubmissionError
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.stamp import ArchiveStamp, Stamp
+from rebar_depth_bench.streaming import ordered_map
 from rebar_depth_bench.studies.depth_source import DepthSource, open_depths
 from rebar_depth_bench.studies.kitti_metrics import CROPS, ImageScore, score_image
 from rebar_depth_bench.studies.kitti_page import csv_rows, study_page
@@ -36,7 +37,6 @@ from rebar_depth_bench.studies.kitti_truth import (
     read_truth,
 )
 from rebar_depth_bench.studies.outputs import add_output_arguments, write_outputs
-from rebar_depth_bench.studies.streaming import ordered_map
 from rebar_depth_bench.submission import EntryError
 from rebar_depth_bench.submission.decode import FORMATS
 from rebar_depth_bench.submission.sources import FileSource

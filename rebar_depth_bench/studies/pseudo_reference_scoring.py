@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.streaming import ordered_map
 from rebar_depth_bench.studies.depth_source import DepthSource
 from rebar_depth_bench.studies.full_frame import (
     Agreement,
@@ -23,7 +24,6 @@ from rebar_depth_bench.studies.full_frame import (
     reference_pixels,
     usable,
 )
-from rebar_depth_bench.studies.streaming import ordered_map
 from rebar_depth_bench.submission import EntryError
 
 EXACT = "exact"

@@ -47,7 +47,9 @@ class FileSource:
         if length < _SMALLEST_MAPPING:
             return _exactly(memoryview(os.pread(self._fd, length, offset)), length)
         lead = offset % mmap.ALLOCATIONGRANULARITY
-        mapped = mmap.mmap(self._fd, lead + length, access=mmap.ACCESS_READ, offset=offset - lead)
+        # Populated at once: a fault for every page would take as long as reading what they hold.
+        flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)
+        mapped = mmap.mmap(self._fd, lead + length, flags, mmap.PROT_READ, offset=offset - lead)
         return memoryview(mapped)[lead:]
 
     def sha256(self) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.studies.streaming import ordered_map
+from rebar_depth_bench.streaming import ordered_map
 
 
 @pytest.mark.parametrize("workers", [None, 1, 3])
