@@ -38,8 +38,8 @@ def _measure(title: str, tolerance: Tolerance, p95: Measure) -> Measure:
         title=f"{title}: {tolerance.limit_mm:g} mm / p95",
         unit="",
         better="higher",
-        definition=f"Capability, {tolerance.limit_mm:g} mm / {p95.name}: 1 or more where 95 % of all judged stay within "
-        f"the tolerance; not told where that p95 is {MISS_MM:g} mm, of what was not found.",
+        definition=f"Capability: {tolerance.limit_mm:g} mm / {p95.name}; 1 or more where 95 % of all judged stay "
+        f"within the tolerance, not told where that p95 is {MISS_MM:g} mm, of what was not found.",
         convert=partial(told_capability, tolerance.limit_mm),
     )
 

@@ -27,6 +27,7 @@ from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from rebar_depth_bench.extended.measures import Measure, Samples
+from rebar_depth_bench.extended.thinning import thinned
 from rebar_depth_bench.extended.truth import SteelTruth
 from rebar_depth_bench.metrics import is_prediction
 
@@ -51,16 +52,10 @@ class TrueCloud:
 
 def true_cloud(truth: SteelTruth) -> TrueCloud:
     """Return the thinned true points of a view's interior; the same for every prediction of the view."""
-    position = thinned(np.flatnonzero(truth.interior))
+    position = thinned(np.flatnonzero(truth.interior), MAX_POINTS)
     rays = np.concatenate([truth.rays[position], np.ones((len(position), 1))], axis=1)
     points_m = rays * truth.depth_m[position, None].astype(np.float64)
     return TrueCloud(position, rays, points_m, _tree(points_m))
-
-
-def thinned(position: Int64[ndarray, " n"]) -> Int64[ndarray, " m"]:
-    """Return at most ``MAX_POINTS`` of the positions, evenly strided: of n, the m at floor(i n / m)."""
-    count = min(len(position), MAX_POINTS)
-    return np.asarray(position[np.arange(count) * len(position) // max(count, 1)])
 
 
 def cloud_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth, cloud: TrueCloud | None = None) -> Samples:

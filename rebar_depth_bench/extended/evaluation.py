@@ -24,6 +24,7 @@ from rebar_depth_bench.extended import (
 )
 from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, ExtendedView, tabulate_extended
+from rebar_depth_bench.extended.seen_runs import seen_runs
 from rebar_depth_bench.extended.steel import SteelConfig, steel_config
 from rebar_depth_bench.extended.truth import SteelTruth
 from rebar_depth_bench.folder import open_folder
@@ -58,7 +59,8 @@ def _clouds(predictions: Predictions, truth: SteelTruth, _: SteelConfig) -> list
 
 
 def _inspection(predictions: Predictions, truth: SteelTruth, config: SteelConfig) -> list[Samples]:
-    return [inspection.inspection_samples(p_m, truth, config.cage) for p_m in predictions]
+    seen = seen_runs(truth, config.cage)
+    return [inspection.inspection_samples(p_m, truth, config.cage, seen) for p_m in predictions]
 
 
 def _profile(predictions: Predictions, truth: SteelTruth, config: SteelConfig) -> list[Samples]:

@@ -56,16 +56,19 @@ class _Pairs:
     normal: Float64[ndarray, "m 3"]
 
 
-def inspection_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth, cage: CageTruth) -> Samples:
+def inspection_samples(
+    p_m: Float64[ndarray, " n"], truth: SteelTruth, cage: CageTruth, seen: SeenRuns | None = None
+) -> Samples:
     """Return what inspection finds in one view's prediction; ``MEASURES`` says what each sample is.
 
     ``p_m`` are predicted planar depths on ``truth.index`` in metres; a value that is not finite and > 0 is no
-    prediction. Lengths of the samples depend on the truth alone, but for those of found bars only
-    (``..._error_mm``, ``axis_offset_mm``, ``axis_tilt_deg``). Raises ``ValueError`` for another length of ``p_m``.
+    prediction. ``seen`` saves working out ``seen_runs(truth, cage)`` again. Lengths of the samples depend on the
+    truth alone, but for those of found bars only (``..._error_mm``, ``axis_offset_mm``, ``axis_tilt_deg``). Raises
+    ``ValueError`` for another length of ``p_m``.
     """
     if p_m.shape != truth.index.shape:
         raise ValueError(f"p_m has shape {p_m.shape}, expected {truth.index.shape} as truth.index has")
-    seen = seen_runs(truth, cage)
+    seen = seen or seen_runs(truth, cage)
     points_m, predicted = _predicted_points_m(p_m, seen)
     start_m = _start_m(points_m, predicted, seen)
     fits = fit_cylinders(points_m, predicted, start_m, seen.half_m, seen.diameter_m / 2, seen.wide)

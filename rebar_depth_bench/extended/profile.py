@@ -10,11 +10,15 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples
+from rebar_depth_bench.extended.thinning import thinned
 from rebar_depth_bench.extended.truth import SteelTruth
 from rebar_depth_bench.metrics import is_prediction, median
 
 DISTANCE_EDGES_M = (0.2, 0.25, 0.3, 0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0)
 WIDTH_EDGES_PX = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0)
+
+MAX_PIXELS = 16_000
+"""A view's interior is thinned to this many: bins need no more."""
 
 MIN_PIXELS = 50
 """A view has a value in a bin from this many predicted pixels on."""
@@ -29,7 +33,8 @@ def profile_samples(
     Interior pixels with a prediction count; a bin holds its lower edge. s of a bin is median(z / p) over its
     pixels. A bar's width is fx d / z, pixels.
     """
-    pixels = truth.interior & is_prediction(p_m)
+    kept = thinned(np.flatnonzero(truth.interior), MAX_PIXELS)
+    pixels = kept[is_prediction(p_m[kept])]
     z, p = truth.depth_m[pixels].astype(np.float64), p_m[pixels]
     with np.errstate(over="ignore"):
         ratio, error = z / p, np.abs(p - z) / z

@@ -45,9 +45,10 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
             for measure, shown in known:
                 grid.add_row(Padding(heading_of(measure), (0, 0, 0, 2)), *map(Text, shown))
         console.print(grid)
+    if any(one.value is None and one.samples for _, _, _, one in _numbers(extended)):
+        console.print(Text(f"{NOT_TOLD}: 5 % or more were not found."))
     note = "One number in the first column: no scale changes it, or it brings its own alignment."
-    not_told = f"{NOT_TOLD}: 5 % or more were not found." if _not_told(extended) else ""
-    console.print(Text(" ".join(filter(None, (note, not_told, "Definitions: cards/BENCHMARK.md.")))))
+    console.print(Text(f"{note} Definitions: cards/BENCHMARK.md."))
 
 
 def heading_of(measure: Measure) -> str:
@@ -100,10 +101,6 @@ def _numbers(extended: ExtendedResult) -> Iterator[tuple[str, str, Measure, Esti
         for alignment, measures in extended.measures.items():
             for measure in measures:
                 yield config, alignment, measure, table.numbers[alignment][measure.name]
-
-
-def _not_told(extended: ExtendedResult) -> bool:
-    return any(one.value is None and one.samples for _, _, _, one in _numbers(extended))
 
 
 def _between(ends: Interval | None, measure: Measure) -> str:

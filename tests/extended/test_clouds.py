@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 from rebar_depth_bench.extended import clouds
-from rebar_depth_bench.extended.clouds import MAX_POINTS, TOLERANCES_MM, cloud_samples, thinned, true_cloud
+from rebar_depth_bench.extended.clouds import MAX_POINTS, TOLERANCES_MM, cloud_samples, true_cloud
+from rebar_depth_bench.extended.thinning import thinned
 from rebar_depth_bench.extended.truth import SteelTruth
 from tests.extended.thin_scenes import random_prediction, random_truth, steel_truth, with_holes
 
@@ -114,8 +115,8 @@ def test_shares_grow_with_the_tolerance(seed: int) -> None:
 
 
 def test_thinning_is_even_and_the_same_for_both_clouds() -> None:
-    assert np.array_equal(thinned(np.arange(7) * 3), np.arange(7) * 3)
-    kept = thinned(np.arange(MAX_POINTS * 5 // 2))
+    assert np.array_equal(thinned(np.arange(7) * 3, MAX_POINTS), np.arange(7) * 3)
+    kept = thinned(np.arange(MAX_POINTS * 5 // 2), MAX_POINTS)
     assert len(kept) == MAX_POINTS
     assert set(np.diff(kept)) == {2, 3}
     truth = steel_truth(np.full((90, 90), 0.5), np.ones((90, 90), np.uint16))
