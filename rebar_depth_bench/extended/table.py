@@ -15,6 +15,7 @@ from rich.text import Text
 from rebar_depth_bench import wording
 from rebar_depth_bench.bootstrap import Interval
 from rebar_depth_bench.extended.evaluation import FAMILIES, Family
+from rebar_depth_bench.extended.inspection_measures import MISS_MM
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.result import Estimate, ExtendedResult, ExtendedTable
 from rebar_depth_bench.numbers import INTERVAL_DIGITS, rounded
@@ -24,17 +25,24 @@ from rebar_depth_bench.table import csv_cell
 NOT_TOLD = "not told"
 """Stands for a capability whose p95 is of what was not found."""
 
+MISSED = "missed"
+"""Stands for an error of ``MISS_MM``: that of what was not found."""
+
+_INTERVALS_FROM = 100
+"""Narrower consoles show no intervals: names would take three lines each."""
+
 _ARROWS: Mapping[str, str] = {"lower": " ↓", "higher": " ↑", "": ""}
 
 
 def print_extended(extended: ExtendedResult, console: Console) -> None:
-    """Print every measure that has a value, native beside scaled, with its interval."""
+    """Print every measure that has a value, native beside scaled, with its interval where the console is wide."""
+    wide = console.width >= _INTERVALS_FROM
     for config, table in extended.tables.items():
         console.print()
         console.print(Text(f"{wording.printable(config)}, {EXTENDED_PROTOCOL}, {table.views} views", style="bold"))
         grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
         grid.add_column("", overflow="fold")  # names give way, numbers never
-        for heading in ("native", "95 %", "scaled", "95 %"):
+        for heading in ("native", "95 %", "scaled", "95 %") if wide else ("native", "scaled"):
             grid.add_column(heading, justify="right", no_wrap=True)
         for family in FAMILIES.values():
             rows = [(measure, cells(table, family, measure)) for measure in family.measures]
@@ -43,10 +51,15 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
                 grid.add_section()
                 grid.add_row(Text(family.title, style="italic"))
             for measure, shown in known:
-                grid.add_row(Padding(heading_of(measure), (0, 0, 0, 2)), *map(Text, shown))
+                grid.add_row(Padding(heading_of(measure), (0, 0, 0, 2)), *map(Text, shown if wide else shown[::2]))
         console.print(grid)
-    if any(one.value is None and one.samples for _, _, _, one in _numbers(extended)):
+    numbers = [(measure, one) for _, _, measure, one in _numbers(extended)]
+    if any(is_miss(one, measure) for measure, one in numbers):
+        console.print(Text(f"{MISSED}: the error of what was not found, {MISS_MM:g} mm in CSV and JSON."))
+    if any(one.value is None and one.samples for _, one in numbers):
         console.print(Text(f"{NOT_TOLD}: 5 % or more were not found."))
+    if not wide:
+        console.print(Text(f"Intervals: in CSV, JSON and the report, and here from {_INTERVALS_FROM} columns on."))
     note = "One number in the first column: no scale changes it, or it brings its own alignment."
     console.print(Text(f"{note} Definitions: cards/BENCHMARK.md."))
 
@@ -62,9 +75,17 @@ def cells(table: ExtendedTable, family: Family, measure: Measure) -> list[str]:
     shown: list[str] = []
     for alignment in family.alignments:
         one = table.numbers[alignment][measure.name]
-        told = one.value is not None or not one.samples
-        shown += [spelled(one.value, measure) if told else NOT_TOLD, _between(one.interval, measure)]
+        if is_miss(one, measure):
+            shown += [MISSED, wording.DASH]
+        else:
+            told = one.value is not None or not one.samples
+            shown += [spelled(one.value, measure) if told else NOT_TOLD, _between(one.interval, measure)]
     return shown + [""] * (4 - len(shown))
+
+
+def is_miss(one: Estimate, measure: Measure) -> bool:
+    """Return whether an error's value is the one that stands for what was not found."""
+    return measure.sample.endswith("_judged_mm") and measure.convert is None and one.value == MISS_MM
 
 
 def spelled(value: float | None, measure: Measure, digits: int = 4) -> str:

@@ -20,7 +20,6 @@ from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable
 from rebar_depth_bench.extended.table import NOT_TOLD
 from rebar_depth_bench.extended.tolerances import PROFILES, Tolerance, ToleranceProfile, pass_sample
 from rebar_depth_bench.report.extended_rows import (
-    MISSED,
     Meaning,
     MeasureRow,
     estimate_cell,

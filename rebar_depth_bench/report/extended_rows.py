@@ -7,18 +7,14 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from rebar_depth_bench.extended.inspection_measures import MISS_MM
 from rebar_depth_bench.extended.measures import Measure
 from rebar_depth_bench.extended.result import Estimate, ExtendedTable
-from rebar_depth_bench.extended.table import NOT_TOLD
+from rebar_depth_bench.extended.table import MISSED, NOT_TOLD, is_miss
 from rebar_depth_bench.report.rows import Cell
 from rebar_depth_bench.wording import DASH, number
 
 _DECIMALS: Mapping[str, int] = {"mm": 2, "cm": 2, "m": 3, "%": 1, "": 4}
 _RATIO_DECIMALS = 2
-MISSED = "missed"
-"""Stands for an error of ``MISS_MM``: that of what was not found."""
-
 _ARROWS: Mapping[str, str] = {"lower": "↓", "higher": "↑", "": ""}
 _STEP = re.compile(r"\d[\d.]*(?:-[\d.]+)?(?= (?:mm|%|m|px)(?!\w))")
 """The tolerance, threshold or bin in a measure's title: a number with a unit."""
@@ -65,11 +61,6 @@ def estimate_cell(one: Estimate, measure: Measure) -> Cell:
         told = one.interval is not None and one.interval[0] < one.interval[1]
         return Cell(MISSED, one.value, _between(one.interval, factor, decimals) if told else "")
     return Cell(_signed(one.value * factor, decimals), one.value, _between(one.interval, factor, decimals))
-
-
-def is_miss(one: Estimate, measure: Measure) -> bool:
-    """Return whether an error's value is the one that stands for what was not found."""
-    return measure.sample.endswith("_judged_mm") and measure.convert is None and one.value == MISS_MM
 
 
 def meanings(measures: Iterable[Measure]) -> list[Meaning]:
