@@ -17,7 +17,7 @@ from rebar_depth_bench.extended.inspection_measures import MISS_MM
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.profile import AXES, bin_names
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable
-from rebar_depth_bench.extended.table import NOT_TOLD
+from rebar_depth_bench.extended.table import MISSED, NOT_TOLD
 from rebar_depth_bench.extended.tolerances import PROFILES, Tolerance, ToleranceProfile, pass_sample
 from rebar_depth_bench.report.extended_rows import (
     Meaning,
