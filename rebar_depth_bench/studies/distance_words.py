@@ -66,7 +66,7 @@ def page(study: DistanceStudy) -> StudyPage:
     return StudyPage(
         study="distance",
         title=f"{method} over distance: native, and scaled by an oracle median per view",
-        lead=" ".join([_slope_sentence(study.slopes[-1]), *_reversal(study.bins)]),
+        lead=" ".join([_slope_sentence(study.slopes[-1]), *_reversal(study.slopes[-1], study.bins)]),
         stamps=study.stamp.lines(),
         figures=(_scale_figure(study), _error_figure(study)),
         tables=(_slope_table(study.slopes), _bin_table(study.bins)),
@@ -88,8 +88,11 @@ def _slope_sentence(slope: Slope) -> str:
     return f"{name}: {power} {between}: twice the distance, {wording.number(2**value, 3)} times the scale."
 
 
-def _reversal(bins: Sequence[Bin]) -> list[str]:
-    """Return a sentence where near bins need s below 1 and far ones above, or the other way round."""
+def _reversal(slope: Slope, bins: Sequence[Bin]) -> list[str]:
+    """Return a sentence where near bins surely need s on one side of 1 and far ones on the other."""
+    interval = slope.slope.interval
+    if interval is None or interval[0] <= 0 <= interval[1]:
+        return []
     known = sorted((one.distance_m, one.scale.value) for one in bins if one.scale.value is not None)
     if not known or not min(s for _, s in known) < 1 < max(s for _, s in known):
         return []
