@@ -9,16 +9,17 @@ millimetre where depth is exact.
 from __future__ import annotations
 
 import sys
-import tempfile
-from pathlib import Path
 
 import numpy as np
 
 import rebar_depth_bench as rdb
 from benchmarks.timing import print_markdown
-from rebar_depth_bench.extended.evaluation import NATIVE, ONCE, score_extended
+from rebar_depth_bench.extended.evaluation import NATIVE, ONCE, measures_by_alignment, view_samples
+from rebar_depth_bench.extended.result import ExtendedView, tabulate_extended
+from rebar_depth_bench.extended.steel import steel_config
 from rebar_depth_bench.folder import open_folder
 
+COLUMNS = ["view_id", "left_depth"]
 PERFECT = ("boundary_f1", "cloud_f_1mm", "layer_confusion", "full_mask_abs_rel", "shifted_rmse_cm")
 BARS = ("bars_found", "pass_gb50204_cover_slab")
 SAMPLES = (
@@ -31,29 +32,25 @@ SAMPLES = (
 
 
 def main(root: str, *configs: str) -> None:
-    names = configs or open_folder(root).configs
-    with tempfile.TemporaryDirectory() as scratch:
-        archive = Path(scratch) / "truth.zip"
-        with rdb.SubmissionWriter(archive, method="truth") as writer:
-            for config in names:
-                for row in rdb.load(root, config, columns=["view_id", "left_depth"]):
-                    writer.add(row["view_id"], row["left_depth"])
-        extended = score_extended(rdb.score(archive, root), archive, root)
-    numbers = {name: {**table.numbers[ONCE], **table.numbers[NATIVE]} for name, table in extended.tables.items()}
-    print_markdown(
-        ["config", "views", *PERFECT, *BARS],
-        [
-            (name, extended.tables[name].views, *(f"{of[one].value:g}" for one in (*PERFECT, *BARS)))
-            for name, of in numbers.items()
-        ],
-    )
-    print("\nmm, over all bars or pairs judged: median / 95th percentile / largest, and how many\n")
-    rows = []
-    for name in extended.tables:
-        views = [view.samples[NATIVE] for view in extended.views if view.view_id.startswith(f"{name}/")]
-        pooled = [np.concatenate([view[one] for view in views]) for one in SAMPLES]
-        rows.append((name, *map(_spread, pooled)))
-    print_markdown(["config", *SAMPLES], rows)
+    folder = open_folder(root)
+    measures = measures_by_alignment()
+    perfect, bars = [], []
+    for config in configs or folder.configs:
+        steel = steel_config(folder, config)
+        depth_m = {row["view_id"]: row["left_depth"] for row in rdb.load(root, config, columns=COLUMNS)}
+        truths = [steel.view(place) for place in range(len(steel))]
+        views = [
+            ExtendedView(truth.view_id, view_samples(depth_m[truth.view_id], truth, steel, 1.0))
+            for truth in truths
+        ]
+        table = tabulate_extended(views, range(len(views)), measures)
+        numbers = {**table.numbers[ONCE], **table.numbers[NATIVE]}
+        perfect.append((config, len(views), *(f"{numbers[one].value:g}" for one in (*PERFECT, *BARS))))
+        pooled = [np.concatenate([view.samples[NATIVE][one] for view in views]) for one in SAMPLES]
+        bars.append((config, *map(_spread, pooled)))
+    print_markdown(["config", "views", *PERFECT, *BARS], perfect)
+    print("\nmm, over all bars or pairs judged: median / 95th percentile / largest (how many)\n")
+    print_markdown(["config", *SAMPLES], bars)
 
 
 def _spread(values: np.ndarray) -> str:

@@ -53,24 +53,26 @@ class Resampling:
     def pooled_means(
         self, samples: Float64[ndarray, " m"], view: Int64[ndarray, " m"]
     ) -> Float64[ndarray, " draws"]:
-        """Return in each resample the mean of finite samples pooled over views; ``view`` says whose each is.
+        """Return in each resample the mean of samples pooled over views; ``view`` says whose each sample is.
 
-        NaN where a resample has no sample, and everywhere with too few views (``MIN_VIEWS``).
+        NaN where a resample has no sample, and everywhere with too few views (``MIN_VIEWS``) or an infinity.
         """
+        if len(np.unique(view)) < MIN_VIEWS or not np.isfinite(samples).all():
+            return np.full(len(self.counts), np.nan)
         views = self.counts.shape[1]
         totals = np.stack([np.bincount(view, weights, views) for weights in (samples, np.ones(len(samples)))], 1)
         sums = self.counts @ totals
         with np.errstate(invalid="ignore", divide="ignore"):
             means = sums[:, 0] / sums[:, 1]
-        return means if len(np.unique(view)) >= MIN_VIEWS else np.full(len(means), np.nan)
+        return np.asarray(means)
 
     def percentile(
         self, samples: Float64[ndarray, " m"], view: Int64[ndarray, " m"], percent: float
     ) -> Float64[ndarray, " draws"]:
         """Return in each resample a percentile of samples pooled over views; ``view`` says whose each sample is.
 
-        That is the smallest sample with at least that share of samples at or below it; where the share is met
-        exactly, the mean of it and the next (so the median of an even count is the mean of the middle two).
+        That is the smallest sample with at least that share of samples at or below it; of a median where the share
+        is met exactly, the mean of it and the next.
         NaN where a resample has no sample, and everywhere with too few views (``MIN_VIEWS``) or an infinity.
         """
         if len(np.unique(view)) < MIN_VIEWS or not np.isfinite(samples).all():
@@ -127,5 +129,7 @@ def _weighted_percentile(
     below = np.cumsum(weights, axis=1)
     wanted = below[:, -1] * percent / 100
     lower = ordered[np.minimum((below < wanted[:, None]).sum(axis=1), len(ordered) - 1)]
+    if percent != 50:
+        return np.where(below[:, -1] > 0, lower, np.nan)
     upper = ordered[np.minimum((below <= wanted[:, None]).sum(axis=1), len(ordered) - 1)]
     return np.where(below[:, -1] > 0, (lower + upper) / 2, np.nan)

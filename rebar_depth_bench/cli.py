@@ -9,6 +9,7 @@ from typing import Protocol
 import datasets
 
 from rebar_depth_bench.commands import check, compare, demo, methods, predict, score, table
+from rebar_depth_bench.commands.outputs import check_outputs
 from rebar_depth_bench.console import run_command
 from rebar_depth_bench.studies.registry import add_study_commands
 from rebar_depth_bench.version import software_version
@@ -45,7 +46,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-bench``; return its exit status."""
     options = argument_parser().parse_args(arguments)
     datasets.disable_progress_bars()
-    return run_command(lambda: options.run(options))
+    return run_command(lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> None:
+    check_outputs(vars(options))
+    options.run(options)
 
 
 def argument_parser() -> argparse.ArgumentParser:

@@ -7,14 +7,14 @@ than the two intervals by themselves, and only it says whether one submission is
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
 from rebar_depth_bench.bootstrap import Interval, interval, resample
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.numbers import rounded
+from rebar_depth_bench.numbers import INTERVAL_DIGITS, rounded
 from rebar_depth_bench.protocol import PROTOCOL
 from rebar_depth_bench.result import (
     SCALE,
@@ -27,7 +27,7 @@ from rebar_depth_bench.result import (
 from rebar_depth_bench.stamp import ArchiveStamp, Stamp
 from rebar_depth_bench.submission import config_of
 
-Verdict = Literal["better", "worse", "undecided", ""]
+Verdict = Literal["better", "worse", "undecided", "not ranked", ""]
 
 _OF_ALL_VIEWS = ("coverage", "within_mm.")
 _HIGHER_IS_BETTER = ("coverage", "native.delta1", "scaled.delta1", "within_mm.")
@@ -37,8 +37,9 @@ _HIGHER_IS_BETTER = ("coverage", "native.delta1", "scaled.delta1", "within_mm.")
 class Difference:
     """One number of both submissions on the same views, and ``other - first`` with its 95 % interval.
 
-    ``verdict`` says how the other does: "undecided" where the interval holds zero or there is none, "" for
-    the scale factor, where neither direction is better.
+    ``verdict`` says how the other does: "undecided" where the interval holds zero or there is none, "not ranked"
+    for errors where either submission is not ranked, for an error over the pixels one chose to predict is no
+    merit; "" for the scale factor, where neither direction is better.
     """
 
     name: str
@@ -84,8 +85,18 @@ def compare(first: Result, other: Result) -> Comparison:
     archives = [ArchiveStamp(one.method, one.submission_sha256) for one in (first, other)]
     return Comparison(
         stamp=Stamp(PROTOCOL, first.dataset_digest, first.dataset_version, archives),
-        configs={config: _differences(_views(first, config), _views(other, config)) for config in shared},
+        configs={config: _of_config(first, other, config) for config in shared},
     )
+
+
+def _of_config(first: Result, other: Result, config: str) -> list[Difference]:
+    found = _differences(_views(first, config), _views(other, config))
+    if first.tables[config].ranked and other.tables[config].ranked:
+        return found
+    return [
+        one if one.name == SCALE or one.name.startswith(_OF_ALL_VIEWS) else replace(one, verdict="not ranked")
+        for one in found
+    ]
 
 
 def _views(result: Result, config: str) -> dict[str, ViewScore]:
@@ -134,6 +145,6 @@ def _difference_dict(one: Difference) -> dict[str, Any]:
         "first": rounded(one.first),
         "other": rounded(one.other),
         "difference": rounded(one.difference),
-        "ci95": None if one.interval is None else [rounded(end) for end in one.interval],
+        "ci95": None if one.interval is None else [rounded(end, INTERVAL_DIGITS) for end in one.interval],
         "verdict": one.verdict,
     }

@@ -50,9 +50,11 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
     console.print()
     console.print(
         Text(
-            f"B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
+            "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
             f"({RING_VIEWS} steps of the protocol); none with fewer than {MIN_VIEWS} views. B is called better or "
-            "worse where the interval leaves out zero. Of many comparisons one in twenty does so by chance."
+            "worse where the interval leaves out zero. Of many comparisons one in twenty does so by chance. "
+            "Errors of a submission that is not ranked (coverage below 95 %, or a view without prediction) are "
+            "not judged."
         )
     )
 

@@ -1,7 +1,7 @@
 """The ground truth a score needs, and nothing more: each view's scored pixels and their depth.
 
 It is gathered once per config and kept next to the dataset under the dataset's digest, as flat arrays that a
-later score maps into memory.
+later score reads view by view.
 """
 
 from __future__ import annotations
@@ -53,6 +53,11 @@ class ConfigTruth(Sequence[ViewTruth]):
         """The views' ids, in order."""
         return self.cache.view_ids
 
+    @property
+    def medians_m(self) -> tuple[float, ...]:
+        """The median true depth of each view's scored pixels, metres."""
+        return tuple(float(note) for note in self.cache.notes)
+
     def __len__(self) -> int:
         return len(self.cache)
 
@@ -96,7 +101,8 @@ def cache_path(folder: DatasetFolder, config: str, protocol: str, also: str = ""
     if local is not None and os.access(local, os.W_OK):
         base = local / CACHE_FOLDER
     else:
-        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "rebar-depth-bench"
+        user = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "rebar-depth-bench"
+        base = user / hashlib.sha256(str(folder.root).encode()).hexdigest()[:16]  # datasets share names of configs
     return base / f"{protocol}-{config}-{digest[:_DIGEST_CHARACTERS]}"
 
 

@@ -84,7 +84,7 @@ def median(values: Float[ndarray, " n"]) -> float:
     inside, below = _middle_part(values, *ranks) if count >= 4 * _SAMPLE else (values, 0)
     places = [rank - below for rank in ranks]
     low, high = np.partition(inside, places)[places].astype(np.float64)
-    return float(low + (high - low) / 2)
+    return float(low if low == high else low + (high - low) / 2)
 
 
 def is_prediction(p_m: Float[ndarray, " n"]) -> Bool[ndarray, " n"]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 from rich import box
 from rich.console import Console
@@ -16,6 +18,17 @@ from rebar_depth_bench.result import Result, Table
 from rebar_depth_bench.version import software_version
 
 _HEADS = ("RMSE, cm ↓", "AbsRel ↓", "AbsRel_s ↓", "s")
+
+
+def told_apart(results: Sequence[Result]) -> list[Result]:
+    """Return the results, those of one method's name with the first digits of their archive's digest behind it."""
+    names = Counter(result.method for result in results)
+    return [
+        replace(result, method=f"{result.method} ({result.submission_sha256[:8]})")
+        if names[result.method] > 1
+        else result
+        for result in results
+    ]
 
 
 def print_paper_table(results: Sequence[Result], console: Console, *, published: bool) -> None:
@@ -48,7 +61,7 @@ def print_paper_table(results: Sequence[Result], console: Console, *, published:
 
 def _table(rows: Sequence[tuple[str, Table]], scene: str | None) -> RichTable:
     grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    grid.add_column("", no_wrap=True)
+    grid.add_column("", overflow="fold")  # names give way, numbers never
     for head in _HEADS:
         grid.add_column(head, justify="right", no_wrap=True)
     for method, table in rows:

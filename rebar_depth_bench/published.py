@@ -103,6 +103,10 @@ class Published:
     anchor: PublishedAnchor
 
 
+_TABLE_I_CONFIGS: Mapping[str, str] = {"lattice": "lattice", "pile": "pile", "pier": "pier"}
+"""Rings, other optics, sweeps, other looks and users' own cages are other pictures: no row is theirs."""
+
+
 def load_published() -> Published:
     """Return the numbers that ship with the package."""
     return read_published(files("rebar_depth_bench").joinpath(_FILE).read_text(encoding="utf-8"))
@@ -115,9 +119,8 @@ def published_rows(scene: str) -> tuple[PublishedRow, ...]:
 
 
 def paper_scene(config: str) -> str | None:
-    """Return which of the paper's scenes a config shows (its name's first part), None if none of them."""
-    scene = config.partition("-")[0]
-    return scene if scene in load_published().scenes else None
+    """Return which scene of Table I a config shows under the paper's cameras, None if none of them."""
+    return _TABLE_I_CONFIGS.get(config)
 
 
 def read_published(text: str) -> Published:

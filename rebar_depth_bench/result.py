@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
@@ -21,6 +22,7 @@ from rebar_depth_bench.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
 
 _METRICS = ("abs_rel", "rmse_cm", "mae_cm", "delta1")
 SCALE = "scale_median"
+_INDEX = re.compile("[0-9]{4}")
 
 
 @dataclass(frozen=True)
@@ -150,9 +152,11 @@ def view_numbers(views: Sequence[ViewScore]) -> Float64[ndarray, "n k"]:
 
 
 def protocol_indices(view_ids: Sequence[str]) -> list[int]:
-    """Return each view's index in its full protocol, which its id ends with; its place where an id does not."""
+    """Return each view's index in its full protocol, the four digits its id ends with; else every view's place."""
     tails = [view_id.rpartition("/")[2] for view_id in view_ids]
-    return [int(tail) for tail in tails] if all(map(str.isdecimal, tails)) else list(range(len(tails)))
+    if all(_INDEX.fullmatch(tail) for tail in tails) and tails == sorted(tails):
+        return [int(tail) for tail in tails]
+    return list(range(len(tails)))
 
 
 def badness(view: ViewScore) -> float:

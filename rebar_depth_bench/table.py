@@ -46,7 +46,7 @@ def print_table(result: Result, console: Console) -> None:
         for group in groups:
             if group.title:
                 _print_line(console, group.title, style="italic")
-        _print_whole(console, _rich_table(names, groups))
+        print_whole(console, _rich_table(names, groups))
     _print_notes(result, console)
 
 
@@ -88,7 +88,7 @@ def _print_line(console: Console, line: str, style: str = "") -> None:
     console.print(Text(line, style=style))
 
 
-def _print_whole(console: Console, table: RichTable) -> None:
+def print_whole(console: Console, table: RichTable) -> None:
     """Print a table at its own width even where the console is narrower: rich would cut numbers."""
     width = _width(table, console)
     options = console.options.update(width=width, max_width=width)

@@ -7,6 +7,7 @@ import io
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +76,17 @@ def test_a_submission_against_itself_differs_by_nothing() -> None:
         assert {one.verdict for one in rows} == {"undecided", ""}
 
 
+def test_an_error_over_chosen_pixels_is_no_merit() -> None:
+    """One keeps only its surest fifth: smaller errors, but it is not ranked and so not better."""
+    every, chosen = result_of(np.full(20, 0.3)), result_of(np.full(20, 0.1))
+    views = [replace(view, coverage=0.2) for view in chosen.views]
+    chosen = replace(chosen, tables={"lattice": tabulate(views)}, views=views)
+    assert not chosen.tables["lattice"].ranked
+    assert difference(every, chosen).verdict == "not ranked"
+    assert difference(chosen, every, "scaled.delta1").verdict == "not ranked"
+    assert difference(every, chosen, "coverage").verdict == "worse"
+
+
 def test_errors_are_compared_where_both_have_a_prediction_and_shares_everywhere() -> None:
     errors = np.linspace(0.1, 0.9, 20)
     holes = errors.copy()
@@ -82,6 +94,7 @@ def test_errors_are_compared_where_both_have_a_prediction_and_shares_everywhere(
     first, other = result_of(errors), result_of(holes)
     assert difference(first, other).views == 15
     assert difference(first, other).difference == 0
+    assert difference(first, other).verdict == "not ranked"
     assert difference(first, other, "coverage").views == 20
     assert difference(first, other, "coverage").verdict == "worse"
     assert difference(first, other, "within_mm.20").verdict == "worse"

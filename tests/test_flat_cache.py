@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.flat_cache import ViewArrays, open_cache
 
 DTYPES = {"index": np.uint32, "inside": np.bool_}
@@ -71,3 +73,38 @@ def test_a_failed_fill_leaves_nothing_and_a_new_cache_takes_the_old_ones_place(t
     open_cache(tmp_path / "d-1", DTYPES, lambda: views(2), outdated="d-*")
     open_cache(tmp_path / "c-2", DTYPES, lambda: views(3), outdated="c-*")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c-2", "d-1"]
+
+
+def test_readers_keep_what_they_opened(tmp_path: Path) -> None:
+    cache = open_cache(tmp_path / "c-1", DTYPES, lambda: views(4), outdated="c-*")
+    shutil.rmtree(tmp_path / "c-1")
+    assert cache.view(3).arrays["index"].tolist() == [30, 31, 32]
+
+
+def test_values_that_changed_since_they_were_written_are_refused(tmp_path: Path) -> None:
+    open_cache(tmp_path / "c-1", DTYPES, lambda: views(4), outdated="c-*")
+    file = tmp_path / "c-1" / "index"
+    content = bytearray(file.read_bytes())
+    content[-4] ^= 1
+    file.write_bytes(content)
+    cache = open_cache(tmp_path / "c-1", DTYPES, never, outdated="c-*")
+    assert cache.view(2).arrays["index"].tolist() == [20, 21]
+    with pytest.raises(
+        DatasetError, match=r"c-1: the cached values of lattice/0003 are damaged; delete this folder"
+    ):
+        cache.view(3)
+
+
+@pytest.mark.parametrize(
+    "outline", ["[]", "{}", '{"view_ids": ["a"], "starts": [], "checksums": [], "notes": []}', "null", "1"]
+)
+def test_an_outline_that_is_nonsense_is_written_anew(tmp_path: Path, outline: str) -> None:
+    open_cache(tmp_path / "c-1", DTYPES, lambda: views(2), outdated="c-*")
+    (tmp_path / "c-1" / "views.json").write_text(outline)
+    assert len(open_cache(tmp_path / "c-1", DTYPES, lambda: views(2), outdated="c-*")) == 2
+
+
+def test_a_place_that_cannot_be_written_is_said_in_words(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(DatasetError, match="the cache of ground truth cannot be written: File exists"):
+        open_cache(tmp_path / "file" / "c-1", DTYPES, lambda: views(2), outdated="c-*")

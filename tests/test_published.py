@@ -81,7 +81,7 @@ def test_every_part_says_where_it_stands_and_that_others_measured_it() -> None:
 @pytest.mark.parametrize(
     ("config", "scene"),
     [
-        *(("lattice", "lattice"), ("lattice-zed-raw", "lattice"), ("pile", "pile"), ("pier-dusk", "pier")),
+        *(("lattice", "lattice"), ("lattice-zed-raw", None), ("pile", "pile"), ("pier-dusk", None)),
         *(("lattices", None), ("my-lattice", None), ("beam", None), ("", None)),
     ],
 )

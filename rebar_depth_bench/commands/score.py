@@ -9,6 +9,7 @@ from rich.console import Console
 
 from rebar_depth_bench.commands.arguments import add_archive, add_data, add_file, add_workers
 from rebar_depth_bench.console import ProgressBars
+from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.evaluation import score_extended
 from rebar_depth_bench.extended.table import extended_csv, print_extended
 from rebar_depth_bench.files import write_bytes, write_text
@@ -44,6 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Score, write what is asked for, print the tables."""
+    if options.html_views < 0:
+        raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
     with ProgressBars() as bars:
         result = score(options.archive, options.data, workers=options.workers, progress=bars.update)
         if options.extended or options.extended_csv:

@@ -10,7 +10,7 @@ from rebar_depth_bench.commands.arguments import add_data, add_file, add_workers
 from rebar_depth_bench.console import ProgressBars
 from rebar_depth_bench.files import write_text
 from rebar_depth_bench.latex import latex_table
-from rebar_depth_bench.paper_table import print_paper_table
+from rebar_depth_bench.paper_table import print_paper_table, told_apart
 from rebar_depth_bench.scoring import score
 from rebar_depth_bench.table import results_csv
 
@@ -35,6 +35,7 @@ def run(options: argparse.Namespace) -> None:
             score(archive, options.data, workers=options.workers, progress=bars.update)
             for archive in options.archives
         ]
+    results = told_apart(results)
     published = not options.no_published
     if options.latex:
         write_text(options.latex, latex_table(results, published=published, intervals=options.intervals))

@@ -29,7 +29,8 @@ MAX_REACH_M = 0.050
 SURFACE_RADII = (0.8, 2.0)
 """A point of a run's side is this many nominal radii off its axis: ribs are, the flat cut ends are not."""
 
-MAX_RUNS = int(np.iinfo(np.int16).max)
+MAX_RUNS = 5000
+"""Runs are compared pair by pair, in memory that grows with the square of their number: 0.8 GB at this many."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class CageTruth:
 def cage_truth(bars: Iterable[Bar]) -> CageTruth:
     """Return the straight runs of a scene's bars and their neighbours.
 
-    Raises ``DatasetError`` where there are more runs than 16 bits can number.
+    Raises ``DatasetError`` where there are more than ``MAX_RUNS``.
     """
     runs = tuple(run for bar in bars for run in _straight_runs(bar))
     if len(runs) > MAX_RUNS:

@@ -125,12 +125,14 @@ _KINDS = (
     (
         "accuracy",
         "Cloud accuracy",
-        "share of interior pixels whose predicted point is within {t} mm of a true point; a missing one is not",
+        f"share of interior pixels (at most {MAX_POINTS} a view, evenly) whose predicted point is within {{t}} mm of "
+        "a true point; a missing one is not",
     ),
     (
         "completeness",
         "Cloud completeness",
-        "share of interior pixels whose true point is within {t} mm of a predicted point",
+        f"share of interior pixels (at most {MAX_POINTS} a view, evenly) whose true point is within {{t}} mm of "
+        "a predicted point",
     ),
     (
         "f",

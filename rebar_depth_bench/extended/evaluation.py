@@ -23,7 +23,14 @@ from rebar_depth_bench.extended import (
     profile,
 )
 from rebar_depth_bench.extended.measures import Measure, Samples
-from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, ExtendedView, tabulate_extended
+from rebar_depth_bench.extended.result import (
+    ExtendedResult,
+    ExtendedTable,
+    ExtendedView,
+    ViewNumbers,
+    tabulate_extended,
+    view_numbers,
+)
 from rebar_depth_bench.extended.seen_runs import seen_runs
 from rebar_depth_bench.extended.steel import SteelConfig, steel_config
 from rebar_depth_bench.extended.truth import SteelTruth
@@ -115,7 +122,7 @@ def score_extended(
     scales = {view.view_id: view.scale for view in result.views}
     measures = measures_by_alignment()
     tables: dict[str, ExtendedTable] = {}
-    views: list[ExtendedView] = []
+    views: list[ViewNumbers] = []
     with open_submission(archive, folder.expected_views()) as submission:
         for config in result.tables:
             steel = steel_config(folder, config, progress)
@@ -126,7 +133,7 @@ def score_extended(
                 found.append(view)
                 progress(f"extended measures of {config}", done, len(steel))
             tables[config] = tabulate_extended(found, protocol_indices([view.view_id for view in found]), measures)
-            views += found
+            views += [view_numbers(view, measures) for view in found]
     return ExtendedResult(measures, tables, views)
 
 

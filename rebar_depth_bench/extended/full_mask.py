@@ -62,7 +62,7 @@ def _scores(prefix: str, p_m: Float64[ndarray, " n"], truth: SteelTruth, pixels:
 
 
 _NUMBERS = (*_ERRORS, "coverage", *(f"within_{t}mm" for t in WITHIN_MM))
-_TITLES = {"abs_rel": ("AbsRel", ""), "rmse_cm": ("RMSE", "cm"), "mae_cm": ("MAE", "cm"), "delta1": ("δ1", "%")}
+_TITLES = {"abs_rel": ("AbsRel", ""), "rmse_cm": ("RMSE", "cm"), "mae_cm": ("MAE", "cm"), "delta1": ("δ1", "")}
 _REGIONS = {
     "full_mask": ("whole mask", "steel pixels, rim included"),
     "interior": ("interior", "interior steel pixels"),

@@ -22,11 +22,13 @@ Statistic = Literal["mean", "median", "std", "p95"]
 def percentile(values: Float64[ndarray, " n"], percent: int) -> float:
     """Return the smallest of one or more values with at least that share of them at or below it.
 
-    Where the share is met exactly, the mean of it and the next, as ``Resampling.percentile`` takes it. Infinite
-    values are the largest.
+    Of a median where the share is met exactly, the mean of it and the next, as ``Resampling.percentile`` takes it.
+    Infinite values are the largest.
     """
     ordered = np.sort(values)
     lower = float(ordered[-(-len(ordered) * percent // 100) - 1])
+    if percent != 50:
+        return lower
     upper = float(ordered[min(len(ordered) * percent // 100, len(ordered) - 1)])
     return lower if lower == upper else (lower + upper) / 2
 
@@ -44,7 +46,7 @@ STATISTICS: Mapping[Statistic, Callable[[Float64[ndarray, " n"]], float]] = {
 class Measure:
     """A number of a table: ``statistic`` of the samples called ``sample``, pooled over a config's views.
 
-    ``better`` is "lower" or "higher" only where a missing prediction can never improve the number, else "".
+    ``better`` is "lower" or "higher" only where a missing pixel fails, or a bar that is not found does; else "".
     ``unit`` is "mm", "cm", "%" (samples are shares 0 to 1 and shown times 100), "m" or "". ``definition`` is one
     sentence with the formula. ``convert``, where given, makes the number from the statistic: it falls as the
     statistic grows, and is None where a statistic says no more than that something was missed.

@@ -30,10 +30,18 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class ExtendedView:
-    """One view's samples by alignment (a key of ``ALIGNMENTS``) and name."""
+    """One view's samples by alignment and name, as tables are made of them."""
 
     view_id: str
     samples: Mapping[str, Samples]
+
+
+@dataclass(frozen=True)
+class ViewNumbers:
+    """One view's numbers by alignment and measure: what is kept of a view once its config has a table."""
+
+    view_id: str
+    numbers: Mapping[str, Mapping[str, float | None]]
 
 
 @dataclass(frozen=True)
@@ -50,22 +58,24 @@ class ExtendedResult:
 
     measures: Mapping[str, Sequence[Measure]]
     tables: Mapping[str, ExtendedTable]
-    views: Sequence[ExtendedView]
+    views: Sequence[ViewNumbers]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the ``extended`` object of the result's JSON."""
         return {
             "protocol": EXTENDED_PROTOCOL,
             "tables": {name: _table_dict(table) for name, table in self.tables.items()},
-            "views": [self._view_dict(view) for view in self.views],
+            "views": [_view_dict(view) for view in self.views],
         }
 
-    def _view_dict(self, view: ExtendedView) -> dict[str, Any]:
-        numbers = {
-            alignment: {one.name: rounded(view_value(view, alignment, one)) for one in measures}
-            for alignment, measures in self.measures.items()
-        }
-        return {"view_id": view.view_id, **numbers}
+
+def view_numbers(view: ExtendedView, measures: Mapping[str, Sequence[Measure]]) -> ViewNumbers:
+    """Return the measures of one view by itself, None where it has no sample."""
+    numbers = {
+        alignment: {one.name: view_value(view, alignment, one) for one in of_alignment}
+        for alignment, of_alignment in measures.items()
+    }
+    return ViewNumbers(view.view_id, numbers)
 
 
 def view_value(view: ExtendedView, alignment: str, measure: Measure) -> float | None:
@@ -133,6 +143,14 @@ def _draws(
         means, squares = (resampling.pooled_means(from_mean**power, view) for power in (1, 2))
         return np.asarray(np.sqrt(np.maximum(squares - means**2, 0.0)))
     return resampling.percentile(samples, view, {"median": 50, "p95": 95}[measure.statistic])
+
+
+def _view_dict(view: ViewNumbers) -> dict[str, Any]:
+    numbers = {
+        alignment: {name: rounded(value) for name, value in of_alignment.items()}
+        for alignment, of_alignment in view.numbers.items()
+    }
+    return {"view_id": view.view_id, **numbers}
 
 
 def _table_dict(table: ExtendedTable) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Iterator, Mapping
 
 from rich import box
@@ -27,6 +28,9 @@ NOT_TOLD = "not told"
 
 MISSED = "missed"
 """Stands for an error of ``MISS_MM``: that of what was not found."""
+
+_ROUNDING = 1e-12
+"""What is smaller came from rounding and is shown as 0."""
 
 _INTERVALS_FROM = 100
 """Narrower consoles show no intervals: names would take three lines each."""
@@ -90,8 +94,9 @@ def is_miss(one: Estimate, measure: Measure) -> bool:
 
 def spelled(value: float | None, measure: Measure, digits: int = 4) -> str:
     """Return a measure's value in its unit: a share with one decimal, else significant digits, or a dash."""
-    if value is None:
+    if value is None or not math.isfinite(value):
         return wording.DASH
+    value = value if abs(value) >= _ROUNDING else 0.0
     return f"{100 * value:.1f}" if measure.unit == "%" else f"{value:.{digits}g}"
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from rebar_depth_bench import wording
@@ -23,6 +22,7 @@ from rebar_depth_bench.report.panels import ViewPanels, colour_bar_uri
 from rebar_depth_bench.report.paper import paper_scenes
 from rebar_depth_bench.report.rows import Row, table_row, view_row
 from rebar_depth_bench.report.scripts import inline_script
+from rebar_depth_bench.report.templates import environment
 from rebar_depth_bench.result import Result, ViewScore, badness
 from rebar_depth_bench.submission import config_of
 
@@ -51,7 +51,7 @@ def render_report(result: Result, panels: Iterable[ViewPanels], *, title: str | 
     shown = shown_views(panels, list(result.tables))
     script = inline_script("sortable.js", "browser.js")
     return (
-        _environment()
+        environment()
         .get_template("report.html.j2")
         .render(
             title=wording.printable(title if title is not None else result.method),
@@ -114,17 +114,6 @@ def _every_view(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dic
     """Return what ``part_views.html.j2`` shows."""
     configs = [_config(name, views[name]) for name in result.tables]
     return {"configs": configs, "dash_in_views": any(row.has_dash() for one in configs for row in one.worst)}
-
-
-def _environment() -> Environment:
-    return Environment(
-        loader=PackageLoader("rebar_depth_bench", "report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
 
 
 def _stamps(result: Result) -> list[tuple[str, str]]:

@@ -85,9 +85,13 @@ class ChartWords:
     y: str
 
 
+_MOST = 1e12
+"""Larger values are drawn at the end of an axis."""
+
+
 def zero_axis(values: Sequence[float], start: float, end: float) -> LinearAxis:
     """Return a linear axis over the finite ``values`` and 0, with a margin on either side."""
-    finite = [value for value in values if math.isfinite(value)]
+    finite = [min(max(value, -_MOST), _MOST) for value in values if math.isfinite(value)]
     low, high = min([0.0, *finite]), max([0.0, *finite])
     margin = 0.08 * (high - low) or 1e-6
     return LinearAxis(low - margin, high + margin, start, end)
@@ -95,8 +99,8 @@ def zero_axis(values: Sequence[float], start: float, end: float) -> LinearAxis:
 
 def span_axis(values: Sequence[float], start: float, end: float) -> LogAxis:
     """Return a logarithmic axis over the finite positive ``values``, with a margin on either side."""
-    positive = [value for value in values if math.isfinite(value) and value > 0] or [1.0]
-    low, high = max(min(positive), 1e-12), min(max(positive), 1e12)
+    positive = [min(max(value, 1 / _MOST), _MOST) for value in values if math.isfinite(value) and value > 0]
+    low, high = min(positive, default=1.0), max(positive, default=1.0)
     margin = max((high / low) ** 0.04, 1.02) if high > low else 1.5
     return LogAxis(low / margin, high * margin, start, end)
 

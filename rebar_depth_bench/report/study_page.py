@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+
+from rebar_depth_bench.report.templates import environment
 
 
 @dataclass(frozen=True)
@@ -50,15 +51,4 @@ class StudyPage:
 
 def render_study(page: StudyPage) -> str:
     """Return the page as HTML; it follows the reader's light or dark and needs no network."""
-    return _environment().get_template("study.html.j2").render(page=page)
-
-
-def _environment() -> Environment:
-    return Environment(
-        loader=PackageLoader("rebar_depth_bench", "report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
+    return environment().get_template("study.html.j2").render(page=page)

@@ -33,7 +33,7 @@ SUMMARY = "how many views of known depth give a whole archive its scale"
 
 DRAWS = 24
 COUNTS = (1, 2, 3, 5, 10, 20, 30, 50, 100, 150, 200, 300)
-MAX_DRAWS = 10_000
+MAX_DRAWS = 1000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -106,7 +106,8 @@ def _chosen(archive: str | os.PathLike[str], result: Result, configs: Sequence[s
 
 
 def _points(result: Result, folder: DatasetFolder, config: str) -> list[ViewPoint]:
-    distances_m = {truth.view_id: truth.median_m for truth in config_truth(folder, config)}
+    truths = config_truth(folder, config)
+    distances_m = dict(zip(truths.view_ids, truths.medians_m, strict=True))
     views = [view for view in result.views if view.view_id in distances_m]
     indices = protocol_indices([view.view_id for view in views])
     return [

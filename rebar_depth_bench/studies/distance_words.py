@@ -79,7 +79,8 @@ def _slope_sentence(slope: Slope) -> str:
     name = "All configs together" if slope.config == ALL else wording.printable(slope.config)
     if value is None:
         return f"{name}: no slope, for its views with a prediction are too few or all about as far."
-    power = f"s grows as distance to the power {wording.number(value, 3)}"
+    verb = "falls" if value < 0 else "grows"
+    power = f"s {verb} as distance to the power {wording.number(value, 3)}"
     if interval is None:
         return f"{name}: {power}, from too few views for an interval."
     between = f"(95 % interval {_interval(interval, 3)})"

@@ -128,8 +128,11 @@ def _improved_depth(file: TruthFile) -> Float32[ndarray, "h w"]:
 
 def _png_shape(path: Path) -> tuple[int, int]:
     """Return (H, W) from a PNG's first bytes."""
-    with path.open("rb") as stream:
-        head = stream.read(24)
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(24)
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from None
     width, height = struct.unpack(">2I", head[16:24]) if len(head) == 24 and head[12:16] == b"IHDR" else (0, 0)
     if not (0 < width <= _LARGEST_SIDE and 0 < height <= _LARGEST_SIDE):
         raise DatasetError(f"{path}: says {height} x {width} pixels, expected a PNG of 1 to {_LARGEST_SIDE} each")

@@ -12,18 +12,13 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
-from rich.measure import Measurement
-from rich.segment import Segments
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from rebar_depth_bench import wording
 from rebar_depth_bench.files import write_bytes, write_text
 from rebar_depth_bench.numbers import rounded
 from rebar_depth_bench.report.study_page import PageTable, StudyPage, render_study
-
-_UNBOUNDED = 10_000
-_FORMULA_STARTS = ("=", "+", "-", "@")
+from rebar_depth_bench.table import csv_cell, print_whole
 
 
 def add_output_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,7 +57,7 @@ def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerows(rows[:1])
-    writer.writerows([_csv_cell(_rounded(value)) for value in row.values()] for row in rows)
+    writer.writerows([csv_cell(_rounded(value)) for value in row.values()] for row in rows)
     return out.getvalue()
 
 
@@ -73,17 +68,10 @@ def print_page(page: StudyPage, console: Console) -> None:
     for table in page.tables:
         console.print()
         console.print(Text(table.caption, style="italic"))
-        _print_whole(console, _rich_table(table))
+        print_whole(console, _rich_table(table))
     console.print()
     for note in page.notes:
         console.print(Text(note))
-
-
-def _print_whole(console: Console, table: RichTable) -> None:
-    unbounded = console.options.update(max_width=_UNBOUNDED)
-    width = Measurement.get(console, unbounded, table).maximum
-    options = console.options.update(width=width, max_width=width)
-    console.print(Segments(list(console.render(table, options))), soft_wrap=True, end="")
 
 
 def _rich_table(table: PageTable) -> RichTable:
@@ -104,12 +92,3 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_rounded(one) for one in value]
     return value
-
-
-def _csv_cell(value: Any) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, str):
-        clean = wording.printable(value, limit=_UNBOUNDED)
-        return f"'{clean}" if clean.startswith(_FORMULA_STARTS) else clean
-    return json.dumps(value)

@@ -186,7 +186,7 @@ def _notes(result: PseudoReferenceResult) -> list[str]:
         "z: the reference, p: the prediction. Scored are pixels of the whole frame where both are finite, > 0 and "
         f"within {result.allowed.words()}. Means over views; s: median over views of median(z)/median(p).",
         f"Ratio: AbsRel here over AbsRel against {first}. Intervals: block bootstrap over views.",
-        "A prediction that is missing or out of range never helps: it lowers the coverage, and a method that "
+        "A prediction that is missing or out of range lowers the coverage and no error: a method that "
         "covers less than 95 % of a reference's pixels, or nothing in a view, is shown and not ranked.",
     ]
     if any(one.exact for one in result.references):

@@ -25,6 +25,7 @@ from rebar_depth_bench.extended.result import (
     ExtendedView,
     converted,
     tabulate_extended,
+    view_numbers,
     view_value,
 )
 from rebar_depth_bench.extended.table import extended_csv, print_extended
@@ -153,7 +154,9 @@ def test_a_view_by_itself_has_its_own() -> None:
 def extended_of(filled: list[dict[str, np.ndarray]]) -> ExtendedResult:
     views = [view(100 * index, one) for index, one in enumerate(filled)]
     table = tabulate_extended(views, [100 * index for index in range(len(views))], measures_by_alignment())
-    return ExtendedResult(measures_by_alignment(), {"lattice": table}, views)
+    return ExtendedResult(
+        measures_by_alignment(), {"lattice": table}, [view_numbers(one, measures_by_alignment()) for one in views]
+    )
 
 
 def test_json_and_csv_have_it() -> None:

@@ -13,7 +13,13 @@ from rebar_depth_bench.extended.capabilities import MEASURES as CAPABILITY_MEASU
 from rebar_depth_bench.extended.evaluation import FAMILIES, NATIVE, SCALED, measures_by_alignment
 from rebar_depth_bench.extended.inspection_measures import MISS_MM
 from rebar_depth_bench.extended.measures import Measure, Statistic
-from rebar_depth_bench.extended.result import Estimate, ExtendedResult, ExtendedView, tabulate_extended
+from rebar_depth_bench.extended.result import (
+    Estimate,
+    ExtendedResult,
+    ExtendedView,
+    tabulate_extended,
+    view_numbers,
+)
 from rebar_depth_bench.extended.tolerances import PROFILES
 from rebar_depth_bench.report.extended import FIRST, extended_section
 from rebar_depth_bench.report.extended_rows import estimate_cell, meanings
@@ -69,7 +75,9 @@ def extended_of(*configs: str, levels: dict[str, float] | None = None, views: in
         for config in configs
     }
     tables = {config: tabulate_extended(found, INDICES[:views], measures) for config, found in by_config.items()}
-    return ExtendedResult(measures, tables, [one for found in by_config.values() for one in found])
+    return ExtendedResult(
+        measures, tables, [view_numbers(one, measures) for found in by_config.values() for one in found]
+    )
 
 
 def scored_with(extended: ExtendedResult | None, *configs: str) -> Result:

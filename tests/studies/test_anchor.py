@@ -136,7 +136,7 @@ def test_one_of_several_configs_must_be_named(tiny_truth: Depths, tiny_root: Pat
         (("--given-scale", "0"), "--given-scale is 0, expected a finite number above 0"),
         (("--given-scale", "nan"), "--given-scale is nan, expected a finite number above 0"),
         (("--k", "0", "3"), "--k has 0, expected 1 or more"),
-        (("--draws", "0"), "--draws is 0, expected 1 to 10000"),
+        (("--draws", "0"), "--draws is 0, expected 1 to 1000"),
         (("--seed", "-1"), "--seed is -1, expected 0 to"),
         ((), "no such folder"),
     ],
