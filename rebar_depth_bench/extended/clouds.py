@@ -125,14 +125,14 @@ _KINDS = (
     (
         "accuracy",
         "Cloud accuracy",
-        f"share of interior pixels (at most {MAX_POINTS} a view, evenly) whose predicted point is within {{t}} mm of "
-        "a true point; a missing one is not",
+        f"share of interior pixels (at most {MAX_POINTS} a view, evenly) whose predicted point is within {{t}} mm "
+        "of a true point; a missing one is not",
     ),
     (
         "completeness",
         "Cloud completeness",
-        f"share of interior pixels (at most {MAX_POINTS} a view, evenly) whose true point is within {{t}} mm of "
-        "a predicted point",
+        f"share of interior pixels (at most {MAX_POINTS} a view, evenly) whose true point is within {{t}} mm "
+        "of a predicted point",
     ),
     (
         "f",
