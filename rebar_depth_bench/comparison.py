@@ -27,7 +27,7 @@ from rebar_depth_bench.result import (
 from rebar_depth_bench.stamp import ArchiveStamp, Stamp
 from rebar_depth_bench.submission import config_of
 
-Verdict = Literal["better", "worse", "undecided", "not ranked", ""]
+Verdict = Literal["better", "worse", "equal", "undecided", "not ranked", ""]
 
 _OF_ALL_VIEWS = ("coverage", "within_mm.")
 _HIGHER_IS_BETTER = ("coverage", "native.delta1", "scaled.delta1", "within_mm.")
@@ -37,9 +37,9 @@ _HIGHER_IS_BETTER = ("coverage", "native.delta1", "scaled.delta1", "within_mm.")
 class Difference:
     """One number of both submissions on the same views, and ``other - first`` with its 95 % interval.
 
-    ``verdict`` says how the other does: "undecided" where the interval holds zero or there is none, "not ranked"
-    for errors where either submission is not ranked, for an error over the pixels one chose to predict is no
-    merit; "" for the scale factor, where neither direction is better.
+    ``verdict`` says how the other does: "equal" where all views agree, "undecided" where the interval holds zero
+    or there is none, "not ranked" for errors where either submission is not ranked, for an error over the pixels
+    one chose to predict is no merit; "" for the scale factor, where neither direction is better.
     """
 
     name: str
@@ -133,6 +133,8 @@ def _estimate(name: str, views: Sequence[ViewScore]) -> float | None:
 def _verdict(name: str, ends: Interval | None) -> Verdict:
     if name == SCALE:
         return ""
+    if ends == (0.0, 0.0):
+        return "equal"
     if ends is None or ends[0] <= 0.0 <= ends[1]:
         return "undecided"
     return "better" if (ends[0] > 0) == name.startswith(_HIGHER_IS_BETTER) else "worse"

@@ -73,7 +73,7 @@ def test_a_submission_against_itself_differs_by_nothing() -> None:
     for rows in compare(same, same).configs.values():
         assert [one.name for one in rows] == list(VIEW_NUMBERS)
         assert all(one.difference == 0 and one.interval == (0, 0) for one in rows)
-        assert {one.verdict for one in rows} == {"undecided", ""}
+        assert {one.verdict for one in rows} == {"equal", ""}
 
 
 def test_an_error_over_chosen_pixels_is_no_merit() -> None:

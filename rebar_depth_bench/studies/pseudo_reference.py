@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
+from rebar_depth_bench import wording
 from rebar_depth_bench.console import ProgressBars
 from rebar_depth_bench.errors import InputError, problem_summary
 from rebar_depth_bench.folder import DatasetFolder, open_folder
@@ -122,7 +123,8 @@ def pseudo_reference_study(
     Methods and references are archives in the submission format or folders of depth files
     (``depth_source.open_depths``). The first reference is what the others' ratios and rankings are held against.
 
-    Raises ``DatasetError`` or ``InputError`` for the data, ``SubmissionError`` for a refused archive or folder.
+    Raises ``DatasetError`` or ``InputError`` for the data, a refused archive or folder, or a reference that has no
+    depth in range.
     """
     on = _open_data(data, config)
     with ExitStack() as stack:
@@ -139,13 +141,15 @@ def pseudo_reference_study(
         )
         _refuse(outcomes, sources)
         stamps = [ArchiveStamp(name, source.sha256()) for name, source in sources.items()]
+    held_against = _references(outcomes, by_reference)
+    _refuse_empty(held_against, allowed)
     digest, version = (None, None) if on.folder is None else (on.folder.digest, on.folder.version)
     return PseudoReferenceResult(
         stamp=Stamp(PROTOCOL, digest, version, stamps),
         data=on.name,
         camera=None if on.capture is None else on.capture.camera_words(),
         allowed=allowed,
-        references=_references(outcomes, by_reference),
+        references=held_against,
         rows=_rows(outcomes),
         agreements=_agreements(outcomes),
     )
@@ -201,6 +205,15 @@ def _references(outcomes: Sequence[FrameOutcome], pseudo: Mapping[str, DepthSour
         Reference(name, name not in pseudo, len(values), sum(value > 0 for value in values), _mean(values) or 0.0)
         for name, values in shares.items()
     ]
+
+
+def _refuse_empty(references: Sequence[Reference], allowed: DepthRange) -> None:
+    empty = [one.name for one in references if one.views_with == 0]
+    if empty:
+        raise InputError(
+            f"{', '.join(map(wording.printable, empty))}: no pixel of any view is {allowed.words()}, "
+            "expected some to score against"
+        )
 
 
 def _rows(outcomes: Sequence[FrameOutcome]) -> list[Row]:

@@ -239,6 +239,10 @@ def damaged(folder: Path) -> None:
     ("change", "words"),
     [
         ({"--near": "3", "--far": "2"}, "the range is 3.0 to 2.0 m, expected 0 <= near < far"),
+        (
+            {"--near": "500", "--far": "600"},
+            "no pixel of any view is 500 to 600 m, expected",
+        ),
         ({"--data": "nowhere"}, "nowhere: no such folder"),
         ({"--config": "lattice"}, "is a capture, expected no --config (found 'lattice')"),
         ({"--reference": "nothing.zip"}, "does not exist"),
