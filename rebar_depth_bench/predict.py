@@ -1,15 +1,26 @@
-"""Run a method over a dataset folder into a submission archive."""
+"""Run a method over a dataset folder into a submission archive; stopped and run again, it goes on."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import platform
+import shutil
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
-from rebar_depth_bench.dataset import iterate
-from rebar_depth_bench.folder import open_folder
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from rebar_depth_bench.dataset import decode_row, load_undecoded
+from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.folder import DatasetFolder, open_folder
 from rebar_depth_bench.methods import Method
+from rebar_depth_bench.predicted_views import PredictedViews
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
+from rebar_depth_bench.version import software_version
 
 
 def predict(
@@ -22,18 +33,61 @@ def predict(
 ) -> None:
     """Predict every view of the named configs (default: all) and write the archive, whole or not at all.
 
-    Raises ``DatasetError`` for an unknown folder or config, ``MethodError`` for what the method lacks.
+    Each view is kept beside the archive until all are there: after an interruption the same call predicts the
+    missing ones only. ``submission.json`` records the seconds each view took.
+
+    Raises ``DatasetError`` for an unknown folder or config, ``MethodError`` for what the method lacks or returns.
     """
     folder = open_folder(root)
     names = tuple(dict.fromkeys(configs or folder.configs))
     totals = {name: len(folder.views(name)) for name in names}
+    target = Path(archive)
+    key = {
+        "method": vars(method.info),
+        "dataset": {name: folder.config(name)["ground_truth_digest"] for name in names},
+        "software": software_version(),
+    }
+    views = PredictedViews.open(target.with_name(f".{target.name}.views"), key)
     run = method.load()
+    for name in names:
+        done = [view.view_id for view in folder.views(name) if view.view_id in views]
+        for count, row in enumerate(_missing(method, folder, name, set(done)), start=len(done) + 1):
+            start = time.perf_counter()
+            depth_m = _checked(method, row["view_id"], run(row), folder.grid(name))
+            views.put(row["view_id"], depth_m, time.perf_counter() - start)
+            progress(f"{method.info.name} on {name}", count, totals[name])
+    _write(method, target, views, [view.view_id for name in names for view in folder.views(name)])
+    shutil.rmtree(views.path)
+
+
+def _missing(method: Method, folder: DatasetFolder, config: str, done: set[str]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of the views that are not done; the others are passed over undecoded."""
+    columns = ("view_id", *method.info.columns)
+    for row in load_undecoded(folder.root, config, streaming=True, columns=columns):
+        if row["view_id"] not in done:
+            yield decode_row(row)
+
+
+def _checked(method: Method, view_id: str, depth_m: object, grid: tuple[int, int]) -> Float[ndarray, "h w"]:
+    array = np.asarray(depth_m)
+    if array.shape != grid or array.dtype.kind != "f":
+        raise MethodError(
+            f"{method.info.name}: {view_id}: the method returned {array.dtype} of shape {array.shape}, expected "
+            f"float metres of shape {grid}"
+        )
+    return array
+
+
+def _write(method: Method, archive: Path, views: PredictedViews, view_ids: Sequence[str]) -> None:
     info = method.info
+    runtime = {"unit": "seconds", "python": platform.python_version(), "machine": platform.machine()}
     with SubmissionWriter(
-        archive, method=info.name, description=info.summary, uses_intrinsics=info.uses_intrinsics
+        archive,
+        method=info.name,
+        description=info.summary,
+        uses_intrinsics=info.uses_intrinsics,
+        runtime=runtime,
     ) as writer:
-        for name in names:
-            rows = iterate(root, name, ("view_id", *info.columns))
-            for done, row in enumerate(rows, start=1):
-                writer.add(row["view_id"], run(row))
-                progress(f"{info.name} on {name}", done, totals[name])
+        for view_id in view_ids:
+            depth_m, seconds = views.get(view_id)
+            writer.add(view_id, depth_m, round(seconds, 4))

@@ -14,7 +14,7 @@ from dataset_builder.appearance import VARIANTS
 from dataset_builder.cli import argument_parser as build_parser
 from dataset_builder.configs import CONFIGS, SWEEPS
 from rebar_depth_bench.cli import argument_parser as bench_parser
-from rebar_depth_bench.methods import METHODS
+from rebar_depth_bench.methods import METHODS, find_method
 
 PAGES = [Path("README.md"), Path("CONTRIBUTING.md"), Path("ARCHITECTURE.md"), Path("cards/BENCHMARK.md")]
 PARSERS: dict[str, ArgumentParser] = {"rebar-build": build_parser(), "rebar-bench": bench_parser()}
@@ -46,6 +46,16 @@ def test_the_python_shown_runs(tiny_root: Path, tmp_path: Path, monkeypatch: pyt
     assert (tmp_path / "submission.zip").is_file()
     batch = next(iter(names["loader"]))  # type: ignore[call-overload]
     assert {"rgb", "depth", "mask", "K", "poses", "view_id", "right_rgb", "baseline_m"} <= set(batch)
+
+
+def test_the_template_of_a_method_is_one(tmp_path: Path) -> None:
+    [template] = blocks(Path("README.md"), "py")
+    path = tmp_path / "my_model.py"
+    path.write_text(f"load_my_model = lambda: lambda rgb, K: rgb[..., 0] * K[0, 0]\n{template}")
+    method = find_method(f"{path}:METHOD")
+    row = {"left_rgb": np.full((2, 3, 3), 2.0), "left_K": 5 * np.eye(3)}
+    assert method.load()(row).tolist() == [[10.0] * 3] * 2
+    assert set(method.info.columns) == set(row)
 
 
 def test_tables_name_every_config_variant_and_method() -> None:

@@ -7,7 +7,8 @@ import argparse
 from rich.console import Console
 from rich.table import Table
 
-from rebar_depth_bench.methods import METHODS
+from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.methods import all_methods
 
 SUMMARY = "list the methods that come with the bench"
 
@@ -20,9 +21,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(_: argparse.Namespace) -> None:
     """Print what each method does, needs and costs."""
     table = Table(title="Methods")
-    for heading in ("method", "what it does", "needs", "source", "licence"):
+    table.add_column("method", no_wrap=True)
+    for heading in ("what it does", "needs", "source", "licence"):
         table.add_column(heading, overflow="fold")
-    for method in METHODS.values():
+    for name, method in all_methods().items():
+        if isinstance(method, MethodError):
+            table.add_row(name, f"cannot be used: {method}", "", "", "")
+            continue
         info = method.info
-        table.add_row(info.name, info.summary, ", ".join(info.columns), info.source, info.licence)
+        table.add_row(name, info.summary, ", ".join(info.columns), info.source, info.licence)
     Console().print(table)

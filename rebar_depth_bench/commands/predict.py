@@ -15,7 +15,8 @@ SUMMARY = "run a method over a dataset into an archive"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    parser.add_argument("method", metavar="METHOD", help=", ".join(METHODS))
+    names = f"{', '.join(METHODS)}, an installed package's, or a file's: my_model.py:METHOD"
+    parser.add_argument("method", metavar="METHOD", help=names)
     add_data(parser)
     parser.add_argument("--out", required=True, type=Path, metavar="ARCHIVE", help="the zip to write")
     parser.add_argument(

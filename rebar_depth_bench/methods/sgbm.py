@@ -9,12 +9,12 @@ TIP 2014, guided by the left picture, with left-right consistency as confidence 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.errors import MethodError
@@ -30,34 +30,64 @@ MIN_PARALLAX_PX = 1.0
 WLS_LAMBDA = 8000.0
 WLS_SIGMA_COLOUR = 2.5
 _FIXED_POINT = 16.0
+AGREEMENT_PX = 2.0
+"""Left and right disparities of one point are the same to this; a bar and what is behind it differ by far more."""
 
 
-def _load() -> Predictor:
-    try:
-        import cv2
-        import cv2.ximgproc
+def _loader(*, checked: bool) -> Callable[[], Predictor]:
+    def load() -> Predictor:
+        try:
+            import cv2
+            import cv2.ximgproc
 
-        from rebar_depth_bench import raw_stereo
-    except ImportError as error:
-        raise MethodError(
-            f"sgbm needs OpenCV with ximgproc ({error}): pip install 'rebar-depth-bench[methods]'"
-        ) from None
-    return lambda row: (_predict if raw_stereo.is_rectified(row) else _predict_raw)(cv2, row)
+            from rebar_depth_bench import raw_stereo
+        except ImportError as error:
+            raise MethodError(
+                f"sgbm needs OpenCV with ximgproc ({error}): pip install 'rebar-depth-bench[methods]'"
+            ) from None
+        return lambda row: (_predict if raw_stereo.is_rectified(row) else _predict_raw)(cv2, row, checked)
+
+    return load
 
 
-def _predict_raw(cv2: ModuleType, row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+def _predict_raw(cv2: ModuleType, row: Mapping[str, Any], checked: bool) -> Float32[ndarray, "h w"]:
     from rebar_depth_bench import raw_stereo
 
     pair = raw_stereo.rectified_pair(row)
-    disparity_px = filtered_disparity_px(cv2, pair.left_rgb, pair.right_rgb)
+    disparity_px = _disparity_px(cv2, pair.left_rgb, pair.right_rgb, checked)
     depth_m = disparity_to_depth_m(disparity_px, pair.K, pair.K, pair.baseline_m)
     depth_m[~raw_stereo.matched_in_right(pair, disparity_px)] = np.nan
     return raw_stereo.raw_depth_m(pair, depth_m)
 
 
-def _predict(cv2: ModuleType, row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
-    disparity_px = filtered_disparity_px(cv2, row["left_rgb"], row["right_rgb"])
+def _predict(cv2: ModuleType, row: Mapping[str, Any], checked: bool) -> Float32[ndarray, "h w"]:
+    disparity_px = _disparity_px(cv2, row["left_rgb"], row["right_rgb"], checked)
     return disparity_to_depth_m(disparity_px, row["left_K"], row["right_K"], row["baseline_m"])
+
+
+def _disparity_px(
+    cv2: ModuleType, left_rgb: UInt8[ndarray, "h w 3"], right_rgb: UInt8[ndarray, "h w 3"], checked: bool
+) -> Float32[ndarray, "h w"]:
+    """Return the left view's disparity, pixels; <= 0 where there is none, or none that the right view confirms."""
+    left_px, right_px = filtered_disparities_px(cv2, left_rgb, right_rgb)
+    return np.where(confirmed(left_px, right_px), left_px, np.float32(0)) if checked else left_px
+
+
+def confirmed(left_px: Float32[ndarray, "h w"], right_px: Float32[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Tell where the right view's disparity at a left pixel's match is the same to ``AGREEMENT_PX``.
+
+    Both are disparities in pixels, the match of left column x is x - disparity, rounded; <= 0 means none.
+    """
+    width = left_px.shape[1]
+    match = np.rint(np.arange(width, dtype=np.float64) - left_px).astype(np.int64)
+    found_px = np.take_along_axis(right_px, np.clip(match, 0, width - 1), axis=1)
+    return np.asarray(
+        (match >= 0)
+        & (match < width)
+        & (left_px > 0)
+        & (found_px > 0)
+        & (np.abs(left_px - found_px) <= AGREEMENT_PX)
+    )
 
 
 def disparity_to_depth_m(
@@ -79,17 +109,19 @@ def disparity_to_depth_m(
     return depth_m
 
 
-def filtered_disparity_px(
+def filtered_disparities_px(
     cv2: ModuleType, left_rgb: UInt8[ndarray, "h w 3"], right_rgb: UInt8[ndarray, "h w 3"]
-) -> Float32[ndarray, "h w"]:
-    """Return the left view's disparity, pixels; <= 0 where there is none.
+) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
+    """Return the left view's disparity, filtered, and the right view's, as matched; pixels, <= 0 where none.
 
-    OpenCV answers only right of ``numDisparities`` columns, so both pictures are padded by as many.
+    OpenCV answers only right of ``numDisparities`` columns, and for the right view only left of as many: both
+    pictures are padded by them on either side.
     """
     width = left_rgb.shape[1]
     search_px = int(-(-width * SEARCH_SHARE_OF_WIDTH // 16) * 16)
     left, right = (
-        cv2.copyMakeBorder(picture, 0, 0, search_px, 0, cv2.BORDER_REPLICATE) for picture in (left_rgb, right_rgb)
+        cv2.copyMakeBorder(picture, 0, 0, search_px, search_px, cv2.BORDER_REPLICATE)
+        for picture in (left_rgb, right_rgb)
     )
     matcher = cv2.StereoSGBM_create(
         minDisparity=0,
@@ -104,14 +136,19 @@ def filtered_disparity_px(
     wls = cv2.ximgproc.createDisparityWLSFilter(matcher)
     wls.setLambda(WLS_LAMBDA)
     wls.setSigmaColor(WLS_SIGMA_COLOUR)
-    filtered = wls.filter(matcher.compute(left, right), left, None, right_matcher.compute(right, left))
-    return np.asarray(filtered[:, search_px:], np.float32) / np.float32(_FIXED_POINT)
+    of_right = right_matcher.compute(right, left)
+    of_left = wls.filter(matcher.compute(left, right), left, None, of_right)
+    scale = np.float32(_FIXED_POINT)
+    left_px, right_px = (
+        np.asarray(one[:, search_px : search_px + width], np.float32) / scale for one in (of_left, of_right)
+    )
+    return left_px, -right_px
 
 
-SGBM = Method(
-    MethodInfo(
-        name="sgbm",
-        summary="OpenCV semi-global matching, 3-way, with a weighted-least-squares filter, on the stereo pair",
+def _method(name: str, summary: str, *, checked: bool) -> Method:
+    info = MethodInfo(
+        name=name,
+        summary=summary,
         columns=(
             *("left_rgb", "right_rgb", "left_K", "right_K", "left_distortion", "right_distortion"),
             *("left_cam_from_world", "right_cam_from_world", "baseline_m"),
@@ -119,6 +156,18 @@ SGBM = Method(
         uses_intrinsics=True,
         source="OpenCV StereoSGBM and ximgproc",
         licence="Apache-2.0",
-    ),
-    _load,
+    )
+    return Method(info, _loader(checked=checked))
+
+
+SGBM = _method(
+    "sgbm",
+    "OpenCV semi-global matching and weighted-least-squares filter on the stereo pair; no answer where the "
+    "two views disagree",
+    checked=True,
+)
+SGBM_FILLED = _method(
+    "sgbm-filled",
+    "the same, with an answer everywhere: where the views disagree the filter fills in",
+    checked=False,
 )

@@ -1,0 +1,163 @@
+"""Methods from anywhere, run into an archive: found, refused in words, interrupted, taken up again."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rebar_depth_bench import score
+from rebar_depth_bench.cli import main
+from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.methods import METHODS, all_methods, find_method
+from rebar_depth_bench.predict import predict
+
+OWN = """
+import time
+import numpy as np
+from rebar_depth_bench.methods import Method, MethodInfo
+
+def load():
+    def run(row):
+        assert set(row) == {"view_id", "left_rgb", "left_K"}
+        time.sleep(SECONDS)
+        with open(LOG, "a") as log:
+            print(row["view_id"], file=log)
+        return np.full(row["left_rgb"].shape[:2], row["left_K"][0, 0] / 200, np.float32)
+    return run
+
+METHOD = Method(MethodInfo("own", "a test", ("left_rgb", "left_K"), True, "here", "MIT"), load)
+NOTHING = "no method"
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    """A user's file with a method that notes the views it is asked for."""
+    return write_own(tmp_path, 0.0)
+
+
+def write_own(folder: Path, seconds: float) -> Path:
+    path = folder / "own.py"
+    path.write_text(OWN.replace("SECONDS", str(seconds)).replace("LOG", repr(str(folder / "log"))))
+    return path
+
+
+def runtime_of(archive: Path) -> dict[str, dict[str, float]]:
+    with zipfile.ZipFile(archive) as source:
+        found: dict[str, dict[str, float]] = json.loads(source.read("submission.json"))["runtime"]
+    return found
+
+
+def test_a_users_file_is_a_method(own: Path, tiny_root: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "own.zip"
+    command = ["predict", f"{own}:METHOD", "--data", str(tiny_root), "--config", "lattice", "--out", str(archive)]
+    assert main(command) == 0
+    result = score(archive, tiny_root)
+    assert result.method == "own"
+    assert result.tables["lattice"].ranked
+    seconds = runtime_of(archive)["seconds"]
+    assert list(seconds) == (tmp_path / "log").read_text().split()
+    assert all(0 <= value < 60 for value in seconds.values())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["log", "own.py", "own.zip"]
+
+
+def test_an_interrupted_prediction_goes_on_with_the_missing_views(tiny_root: Path, tmp_path: Path) -> None:
+    own, archive = write_own(tmp_path, 0.5), tmp_path / "own.zip"
+    command = [sys.executable, "-m", "rebar_depth_bench", "predict", f"{own}:METHOD", "--config", "lattice"]
+    command += ["--data", str(tiny_root), "--out", str(archive)]
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert running.stderr is not None
+    while "3 of 9" not in running.stderr.readline():
+        pass
+    running.send_signal(signal.SIGINT)
+    _, complaint = running.communicate(timeout=60)
+    assert running.returncode == 1
+    assert "interrupted" in complaint
+    assert "Traceback" not in complaint
+    assert not archive.exists()
+    before = (tmp_path / "log").read_text().split()
+    assert subprocess.run(command, check=False, capture_output=True).returncode == 0
+    after = (tmp_path / "log").read_text().split()
+    assert len(set(after)) == 9
+    assert len(after) - 9 <= 1, "only the view that was interrupted is predicted again"
+    assert after[: len(before)] == before
+    assert len(runtime_of(archive)["seconds"]) == 9
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_views_of_another_run_are_not_taken_for_this_ones(own: Path, tiny_root: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "out.zip"
+    left_over = tmp_path / ".out.zip.views"
+    (left_over / "lattice-orbit").mkdir(parents=True)
+    (left_over / "key.json").write_text("{}")
+    view_id = score_views(tiny_root)[0]
+    np.savez(left_over / f"{view_id}.npz", depth_m=np.full((90, 160), 99.0), seconds=0.0)
+    predict(find_method(f"{own}:METHOD"), tiny_root, archive, configs=["lattice-orbit"])
+    assert view_id in (tmp_path / "log").read_text()
+
+
+def score_views(root: Path) -> list[str]:
+    manifest = json.loads((root / "manifest.json").read_text())
+    return [view["view_id"] for view in manifest["configs"]["lattice-orbit"]["views"]]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("magic", "no method 'magic', expected one of sgbm, sgbm-filled, constant, or a file's like my_model.py"),
+        ("nowhere.py:METHOD", "nowhere.py: no such file"),
+        ("OWN:NOTHING", "is str, expected a rebar_depth_bench.methods.Method"),
+        ("OWN:ABSENT", "is NoneType, expected"),
+        ("BROKEN:METHOD", "cannot be imported: ZeroDivisionError: division by zero"),
+    ],
+)
+def test_what_is_no_method_is_said_in_words(name: str, words: str, own: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.py"
+    broken.write_text("1 / 0")
+    with pytest.raises(MethodError, match=re.escape(words)):
+        find_method(name.replace("OWN", str(own)).replace("BROKEN", str(broken)))
+
+
+@pytest.mark.parametrize("returned", ["np.ones((3, 4))", "np.ones((90, 160), int)", "None"])
+def test_a_wrong_answer_is_refused_at_once(returned: str, own: Path, tiny_root: Path, tmp_path: Path) -> None:
+    text = own.read_text()
+    own.write_text(re.sub(r"return np\.full.*", f"return {returned}", text))
+    with pytest.raises(MethodError, match=r"own: lattice.* returned .*, expected float metres of"):
+        predict(find_method(f"{own}:METHOD"), tiny_root, tmp_path / "x.zip", configs=["lattice-orbit"])
+    assert len((tmp_path / "log").read_text().split()) == 1
+    assert not (tmp_path / "x.zip").exists()
+
+
+def test_an_installed_package_offers_its_methods(
+    own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site = tmp_path / "site"
+    info = site / "stranger-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
+    lines = [
+        "[rebar_depth_bench.methods]",
+        "theirs = own_copy:METHOD",
+        "bad = own_copy:NOTHING",
+        "gone = nowhere:X",
+    ]
+    (info / "entry_points.txt").write_text("\n".join(lines))
+    (site / "own_copy.py").write_text(own.read_text())
+    monkeypatch.syspath_prepend(str(site))
+    assert find_method("theirs").info.licence == "MIT"
+    found = all_methods()
+    assert list(found)[: len(METHODS)] == list(METHODS)
+    assert isinstance(found["bad"], MethodError)
+    assert "cannot be imported: ModuleNotFoundError" in str(found["gone"])
+    assert main(["methods"]) == 0
+    listed = capsys.readouterr().out
+    assert "theirs" in listed
+    assert "cannot be" in listed
