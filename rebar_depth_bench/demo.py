@@ -27,10 +27,11 @@ DEMO_VIEWS = 6
 DEMO_SAMPLES = 8
 """Half of what a build takes by default: the denoiser bears it, and the demo takes half the time."""
 DEMO_CONFIG = "lattice"
+DEMO_METHODS = ("sgbm", "sgbm-filled", "constant")
 
 
 def run_demo(out: Path, views: int) -> None:
-    """Build ``views`` lattice views in ``out``, run every method that needs no weights, score and report each.
+    """Build ``views`` lattice views in ``out``, run three methods, score and report each.
 
     Run again it goes on where it stopped. Raises ``InputError`` where the build extra is missing.
     """
@@ -38,7 +39,8 @@ def run_demo(out: Path, views: int) -> None:
     _say(f"rendering {views} stereo views of the lattice at 1280 x 720 into {data}")
     _build(data, views)
     reports = []
-    for name, method in METHODS.items():
+    for name in DEMO_METHODS:
+        method = METHODS[name]
         archive = out / f"{name}.zip"
         _say(f"predicting with {name}: {method.info.summary}")
         with ProgressBars() as bars:

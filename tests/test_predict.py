@@ -112,7 +112,10 @@ def score_views(root: Path) -> list[str]:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("magic", "no method 'magic', expected one of sgbm, sgbm-filled, constant, or a file's like my_model.py"),
+        (
+            "magic",
+            "no method 'magic', expected one of sgbm, sgbm-filled, constant, noisy-truth, truth, or a file's",
+        ),
         ("nowhere.py:METHOD", "nowhere.py: no such file"),
         ("OWN:NOTHING", "is str, expected a rebar_depth_bench.methods.Method"),
         ("OWN:ABSENT", "is NoneType, expected"),
@@ -161,3 +164,18 @@ def test_an_installed_package_offers_its_methods(
     listed = capsys.readouterr().out
     assert "theirs" in listed
     assert "cannot be" in listed
+
+
+def test_controls_that_know_the_answer_score_as_they_should(tiny_root: Path, tmp_path: Path) -> None:
+    tables = {}
+    for name in ("truth", "noisy-truth"):
+        predict(find_method(name), tiny_root, tmp_path / f"{name}.zip", configs=["lattice"])
+        tables[name] = score(tmp_path / f"{name}.zip", tiny_root).tables["lattice"]
+    assert tables["truth"].native is not None
+    assert tables["truth"].native.abs_rel == 0
+    noisy = tables["noisy-truth"]
+    assert noisy.native is not None
+    assert noisy.scaled is not None
+    assert noisy.scale_median == pytest.approx(0.8, rel=2e-3)
+    assert noisy.native.abs_rel == pytest.approx(0.25, rel=0.01)
+    assert noisy.scaled.abs_rel == pytest.approx(0.01 * (2 / np.pi) ** 0.5, rel=0.05)  # of a Gaussian

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from rebar_depth_bench.commands.arguments import add_data
@@ -15,7 +16,10 @@ SUMMARY = "run a method over a dataset into an archive"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    names = f"{', '.join(METHODS)}, an installed package's, or a file's: my_model.py:METHOD"
+    names = (
+        f"{', '.join(METHODS)}, an installed package's, or one from elsewhere: my_model.py:METHOD, my_model.toml "
+        "(an ONNX model), hf:ORG/NAME (a checkpoint of transformers)"
+    )
     parser.add_argument("method", metavar="METHOD", help=names)
     add_data(parser)
     parser.add_argument("--out", required=True, type=Path, metavar="ARCHIVE", help="the zip to write")
@@ -27,6 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Predict and print where the archive is."""
     method = find_method(options.method)
+    info = method.info
+    print(f"{info.name}: {info.summary}; from {info.source}; licence {info.licence}", file=sys.stderr)
     with ProgressBars() as bars:
         predict(method, options.data, options.out, configs=options.config, progress=bars.update)
     print(options.out)

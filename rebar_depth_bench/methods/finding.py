@@ -1,7 +1,8 @@
-"""Where methods come from: the bench, an installed package's entry point, or a file of the user's.
+"""Where methods come from: the bench, an installed package's entry point, a checkpoint, or a file of the user's.
 
-A package offers its methods as entry points of the group ``rebar_depth_bench.methods``; a file is named with the
-method in it, ``my_model.py:METHOD``.
+A package offers its methods as entry points of the group ``rebar_depth_bench.methods``; a Python file is named with
+the method in it, ``my_model.py:METHOD``; a TOML file describes an ONNX model; ``hf:`` names a checkpoint of
+``transformers``.
 """
 
 from __future__ import annotations
@@ -16,29 +17,41 @@ from types import ModuleType
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.constant import CONSTANT
 from rebar_depth_bench.methods.method import Method
+from rebar_depth_bench.methods.onnx_model import onnx_method
 from rebar_depth_bench.methods.sgbm import SGBM, SGBM_FILLED
+from rebar_depth_bench.methods.transformers_depth import DEPTH_PRO, PREFIX, hf_method
+from rebar_depth_bench.methods.truth import NOISY_TRUTH, TRUTH
 
 GROUP = "rebar_depth_bench.methods"
 
-METHODS: Mapping[str, Method] = {method.info.name: method for method in (SGBM, SGBM_FILLED, CONSTANT)}
+METHODS: Mapping[str, Method] = {
+    method.info.name: method for method in (SGBM, SGBM_FILLED, DEPTH_PRO, CONSTANT, NOISY_TRUTH, TRUTH)
+}
 """Those that come with the bench."""
 
 
 def find_method(name: str) -> Method:
-    """Return a method by its name, or from a file by ``path.py:NAME``.
+    """Return a method by its name, from a file by ``path.py:NAME`` or ``path.toml``, or by ``hf:ORG/NAME``.
 
     Raises ``MethodError`` for an unknown one, and where a file or package cannot be imported or holds none.
     """
+    if name.startswith(PREFIX):
+        return hf_method(name.removeprefix(PREFIX))
     path, colon, attribute = name.rpartition(":")
     if colon and path.endswith(".py"):
         return _checked(name, getattr(_module(Path(path)), attribute, None))
+    if name.endswith(".toml"):
+        return onnx_method(Path(name))
     if name in METHODS:
         return METHODS[name]
     offered = _offered()
     if name in offered:
         return _loaded(offered[name])
     known = ", ".join((*METHODS, *offered))
-    raise MethodError(f"no method {name!r}, expected one of {known}, or a file's like my_model.py:METHOD")
+    raise MethodError(
+        f"no method {name!r}, expected one of {known}, or a file's like my_model.py:METHOD or "
+        "my_model.toml, or hf:ORG/NAME"
+    )
 
 
 def all_methods() -> dict[str, Method | MethodError]:
