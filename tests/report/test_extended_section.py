@@ -26,8 +26,9 @@ from rebar_depth_bench.report.extended_rows import estimate_cell, meanings
 from rebar_depth_bench.report.page import render_report
 from rebar_depth_bench.result import Result
 
-from .pages import Page, panels
+from .pages import Page
 from .results import HOSTILE, result, scored
+from .test_report import panels
 
 VIEWS = 6
 INDICES = [100 * index for index in range(VIEWS)]
