@@ -26,8 +26,9 @@ from rebar_depth_bench.report.extended_rows import estimate_cell, meanings
 from rebar_depth_bench.report.page import render_report
 from rebar_depth_bench.result import Result
 
+from .pages import Page
 from .results import HOSTILE, result, scored
-from .test_report import _Page, panels
+from .test_report import panels
 
 VIEWS = 6
 INDICES = [100 * index for index in range(VIEWS)]
@@ -106,7 +107,7 @@ def cells_of(page: str, label: str, name: str) -> list[str]:
     table = re.search(rf'<table[^>]* aria-label="{re.escape(label)}">.*?</table>', page, re.DOTALL)
     assert table, label
     rows = [
-        [_Page(cell).text.strip() for cell in re.findall(r"<t[hd].*?</t[hd]>", row)]
+        [Page(cell).text.strip() for cell in re.findall(r"<t[hd].*?</t[hd]>", row)]
         for row in re.findall(r"<tr>.*?</tr>", table[0], re.DOTALL)
     ]
     return next(cells[1:] for cells in rows if cells[0] == name)
@@ -141,7 +142,7 @@ def test_inspection_stands_open_with_native_beside_scaled(rendered: str, lattice
 def test_what_is_missed_is_said_and_not_shown_as_a_length(rendered: str) -> None:
     layer = cells_of(rendered, "lattice: Inspection, bar by bar", "layer distance: p95 error mm\xa0↓")
     assert layer == ["missed", "50.00 50.00 – 50.00", "24"]
-    assert "missed: 100 mm, which stands for what was not found." in _Page(rendered).text
+    assert "missed: 100 mm, which stands for what was not found." in Page(rendered).text
 
 
 def test_tolerances_stand_with_pass_rate_capability_and_source(rendered: str, lattice: ExtendedResult) -> None:
@@ -156,7 +157,7 @@ def test_tolerances_stand_with_pass_rate_capability_and_source(rendered: str, la
         assert one.interval is not None
         assert cell == f"{one.value:.2f} {one.interval[0]:.2f} – {one.interval[1]:.2f}"
     assert cells_of(rendered, label, "GB 50204 distance of layers")[3:] == ["not told", "0.10 0.10 – 0.10"]
-    text = _Page(rendered).text
+    text = Page(rendered).text
     assert "not told: 5 % or more were not found" in text
     assert all(profile.source in text for profile in PROFILES)
     assert "ACI" not in section_of(rendered)
@@ -180,7 +181,7 @@ def test_families_are_folded_and_every_number_can_be_looked_up(rendered: str) ->
     assert "<details open" not in section
     for key in ("full_mask", "boundary", "layers", "clouds", "alignment"):
         assert f"<summary>{FAMILIES[key].title} <" in section
-    page = _Page(rendered)
+    page = Page(rendered)
     for measure in (*FAMILIES["layers"].measures, *FAMILIES["alignment"].measures):
         assert re.sub(r"\s+", " ", measure.definition) in page.text, measure.name
     assert "title=" not in section, "reached by touch and keyboard, not by hovering"
@@ -219,7 +220,7 @@ def test_configs_without_anything_to_say_and_with_too_few_views() -> None:
 
 def test_the_page_nests_and_names_stay_text() -> None:
     name = HOSTILE.replace("/", "")
-    page = _Page(render_report(scored_with(extended_of("lattice", name), "lattice", name), [panels()]))
+    page = Page(render_report(scored_with(extended_of("lattice", name), "lattice", name), [panels()]))
     assert len(page.named("script")) == 1
     assert "\x1b" not in page.text
     ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]

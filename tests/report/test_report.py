@@ -6,7 +6,6 @@ import hashlib
 import io
 import math
 import re
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -27,43 +26,8 @@ from rebar_depth_bench.report.panels import (
 )
 from rebar_depth_bench.result import ViewScore
 
+from .pages import Page
 from .results import HOSTILE, overflowed, result, scored, unpredicted
-
-VOID = {"meta", "img", "br", "path", "circle"}
-
-
-class _Page(HTMLParser):
-    """Fails where tags do not nest, and collects what the tests ask for."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__(convert_charrefs=True)
-        self.open: list[str] = []
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.words: list[str] = []
-        self.feed(page)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.words.append(data)
-
-    def named(self, tag: str) -> list[dict[str, str | None]]:
-        return [attributes for name, attributes in self.tags if name == tag]
-
-    @property
-    def text(self) -> str:
-        return re.sub(r"[ \n]+", " ", " ".join(self.words))
 
 
 def panels(view_id: str = "lattice/0000", score: ViewScore | None = None, factor: float = 1.6) -> ViewPanels:
@@ -81,7 +45,7 @@ def _decoded(uri: str) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 
 
 def test_numbers_stamps_and_alignment_are_on_the_page() -> None:
-    page = _Page(render_report(result(scored("lattice/0000"), unpredicted("pile/0000")), [panels()]))
+    page = Page(render_report(result(scored("lattice/0000"), unpredicted("pile/0000")), [panels()]))
     for stated in (
         *("0.7500", "20.09", "18.71", "0.123", "0.0613", "1.52", "1.17", "0.988", "0.625"),
         *("1.2", "4.6", "7.9", "13.6"),
@@ -96,9 +60,9 @@ def test_numbers_stamps_and_alignment_are_on_the_page() -> None:
 def test_hostile_names_stay_text() -> None:
     hostile = result(scored("<b>x/0000"), method=HOSTILE)
     rendered = render_report(hostile, [panels("<b>x/0000")], title="<i>mine</i>")
-    page = _Page(rendered)
+    page = Page(rendered)
     assert len(page.named("script")) == 1, "the page's own"
-    benign = _Page(render_report(result(scored("beam/0000")), [panels("beam/0000")], title="mine"))
+    benign = Page(render_report(result(scored("beam/0000")), [panels("beam/0000")], title="mine"))
     assert len(page.named("b")) == len(benign.named("b"))
     assert "<b>x" not in rendered
     assert "<i>mine" not in rendered
@@ -109,7 +73,7 @@ def test_hostile_names_stay_text() -> None:
 
 def test_the_page_asks_nothing_of_the_network_and_runs_one_script_that_its_policy_names() -> None:
     rendered = render_report(result(scored("lattice/0000")), [panels()])
-    page = _Page(rendered)
+    page = Page(rendered)
     assert not re.search(
         r"https?://|<link|<iframe|@import|url\(|javascript:|fetch|import\(|XMLHttp|innerHTML", rendered
     )
@@ -128,7 +92,7 @@ def test_the_page_asks_nothing_of_the_network_and_runs_one_script_that_its_polic
 
 def test_the_page_is_complete_without_its_script() -> None:
     views = [scored(f"lattice/{index:04d}", abs_rel=0.1 * (index + 1)) for index in range(3)]
-    page = _Page(render_report(result(*views), [panels(view.view_id, view) for view in views]))
+    page = Page(render_report(result(*views), [panels(view.view_id, view) for view in views]))
     assert len(page.named("article")) == 3
     assert [tags for tags in page.named("div") if tags.get("class") == "controls"] == [
         {"class": "controls", "hidden": None}
@@ -139,7 +103,7 @@ def test_the_page_is_complete_without_its_script() -> None:
 
 
 def test_the_page_is_well_formed_and_described() -> None:
-    page = _Page(render_report(result(scored("lattice/0000"), scored("pile/0000")), [panels()]))
+    page = Page(render_report(result(scored("lattice/0000"), scored("pile/0000")), [panels()]))
     assert len(page.named("h1")) == 1
     assert page.named("html") == [{"lang": "en"}]
     assert len(page.named("svg")) == len(page.named("desc")) == 6
@@ -156,7 +120,7 @@ def test_same_input_same_bytes() -> None:
 
 
 def test_no_panels_no_section() -> None:
-    page = _Page(render_report(result(scored("lattice/0000")), []))
+    page = Page(render_report(result(scored("lattice/0000")), []))
     assert not page.named("article")
     assert not page.named("img")
 
@@ -164,19 +128,19 @@ def test_no_panels_no_section() -> None:
 def test_the_worst_views_come_first_and_all_views_follow_in_protocol_order() -> None:
     views = [scored(f"lattice/{index:04d}", abs_rel=0.1 * (index % 7 + 1)) for index in range(WORST_SHOWN + 5)]
     views[3] = unpredicted("lattice/0003")
-    page = _Page(render_report(result(*views), []))
+    page = Page(render_report(result(*views), []))
     ids = re.findall(r"lattice/\d{4}", page.text)
     assert ids[:3] == ["lattice/0003", "lattice/0006", "lattice/0013"]
     assert ids[WORST_SHOWN:] == [view.view_id for view in views]
     assert len(page.named("details")) == 1
-    assert not _Page(render_report(result(*views[:WORST_SHOWN]), [])).named("details")
+    assert not Page(render_report(result(*views[:WORST_SHOWN]), [])).named("details")
 
 
 def test_overflow_and_zero_errors_render() -> None:
     perfect = dataclasses.replace(scored("lattice/0000"), native=None, scaled=None, scale=None)
     exact = scored("lattice/0001", abs_rel=0.0, scale=1.0)
     shown = result(overflowed("pier/0000"), perfect, exact)
-    text = _Page(render_report(shown, [panels(factor=1e30), panels(factor=math.nan)])).text
+    text = Page(render_report(shown, [panels(factor=1e30), panels(factor=math.nan)])).text
     assert "is not ranked: a number overflowed." in text
     assert "nothing to compare: no prediction on scored pixels" in text
     assert "off the scale" in text

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from html.parser import HTMLParser
 
 import pytest
 from hypothesis import given
@@ -26,45 +25,11 @@ from rebar_depth_bench.report.study_charts import (
 )
 from rebar_depth_bench.report.study_page import PageFigure, PageTable, StudyPage, render_study
 
+from .pages import Page
 from .results import HOSTILE
 
-VOID = {"meta", "path", "circle"}
 WORDS = ChartWords("Title", "Described", "x of it", "y of it")
 X_AXIS, Y_AXIS = LogAxis(1.0, 100.0, LEFT, RIGHT), LinearAxis(-1.0, 1.0, HEIGHT, TOP)
-
-
-class _Page(HTMLParser):
-    """Fails where tags do not nest."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__(convert_charrefs=True)
-        self.open: list[str] = []
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.words: list[str] = []
-        self.feed(page)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.words.append(data)
-
-    @property
-    def text(self) -> str:
-        return re.sub(r"\s+", " ", " ".join(self.words))
-
-    def count(self, tag: str) -> int:
-        return sum(name == tag for name, _ in self.tags)
 
 
 def study_page(words: str = "plain") -> StudyPage:
@@ -82,7 +47,7 @@ def study_page(words: str = "plain") -> StudyPage:
 
 
 def test_everything_is_on_the_page() -> None:
-    page = _Page(render_study(study_page()))
+    page = Page(render_study(study_page()))
     for stated in ("plain: one scale for all", "lead plain", "rebar-1", "sha256:12", "Figure plain", "note plain"):
         assert stated in page.text
     assert (page.count("h1"), page.count("svg"), page.count("table"), page.count("td")) == (1, 1, 1, 2)
@@ -90,7 +55,7 @@ def test_everything_is_on_the_page() -> None:
 
 def test_hostile_words_stay_text() -> None:
     rendered = render_study(study_page(HOSTILE))
-    hostile, plain = _Page(rendered), _Page(render_study(study_page()))
+    hostile, plain = Page(rendered), Page(render_study(study_page()))
     assert [tag for tag, _ in hostile.tags] == [tag for tag, _ in plain.tags]
     assert "<script" not in rendered
     assert hostile.text.count("<script") >= 10
@@ -98,7 +63,7 @@ def test_hostile_words_stay_text() -> None:
 
 def test_the_page_asks_nothing_of_the_network_and_runs_nothing() -> None:
     rendered = render_study(study_page())
-    page = _Page(rendered)
+    page = Page(rendered)
     assert not re.search(r"https?://|<script|<link|<iframe|@import|url\(|javascript:", rendered)
     assert not [name for _, attributes in page.tags for name in attributes if name.startswith("on")]
     assert "default-src 'none'" in rendered
