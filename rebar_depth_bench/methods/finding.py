@@ -1,7 +1,7 @@
 """Where methods come from: the bench, an installed package's entry point, a checkpoint, or a file of the user's.
 
-A package offers its methods as entry points of the group ``rebar_depth_bench.methods``; a Python file is named with
-the method in it, ``my_model.py:METHOD``; a TOML file describes an ONNX model; ``hf:`` names a checkpoint of
+A package offers its methods as entry points of the group ``rebar_depth_bench.methods``; a Python file is named
+with the method in it, ``my_model.py:METHOD``; a TOML file describes an ONNX model; ``hf:`` names a checkpoint of
 ``transformers``.
 """
 
