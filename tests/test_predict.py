@@ -114,7 +114,7 @@ def score_views(root: Path) -> list[str]:
     [
         (
             "magic",
-            "no method 'magic', expected one of sgbm, sgbm-filled, constant, noisy-truth, truth, or a file's",
+            "no method 'magic', expected one of sgbm, sgbm-filled, ",
         ),
         ("nowhere.py:METHOD", "nowhere.py: no such file"),
         ("OWN:NOTHING", "is str, expected a rebar_depth_bench.methods.Method"),
