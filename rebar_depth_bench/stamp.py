@@ -40,6 +40,15 @@ class Stamp:
             "software": {"version": software_version()},
         }
 
+    def csv_cells(self) -> dict[str, str | None]:
+        """Return the stamp of a study of one archive as the cells that end each of its CSV rows."""
+        return {
+            "dataset_digest": self.dataset_digest,
+            "dataset_version": self.dataset_version,
+            "submission_sha256": self.archives[0].sha256,
+            "software_version": software_version(),
+        }
+
     def lines(self) -> list[tuple[str, str]]:
         """Return the stamp as (what, value) in words, safe to print."""
         dataset = []

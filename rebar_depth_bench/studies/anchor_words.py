@@ -59,10 +59,7 @@ def rows(study: AnchorStudy) -> list[dict[str, Any]]:
             "given_abs_rel": study.given.abs_rel,
             "given_rmse_cm": study.given.rmse_cm,
             **{f"{name}_{key}": value for name in _SPREADS for key, value in asdict(getattr(row, name)).items()},
-            "dataset_digest": stamp.dataset_digest,
-            "dataset_version": stamp.dataset_version,
-            "submission_sha256": stamp.archives[0].sha256,
-            "software_version": stamp.to_dict()["software"]["version"],
+            **stamp.csv_cells(),
         }
         for row, draws in zip(study.rows, study.draws, strict=True)
     ]

@@ -51,10 +51,7 @@ def rows(study: DistanceStudy) -> list[dict[str, Any]]:
             "scale_max": one.scale_range[1] if one.scale_range else None,
             **_estimate("native_abs_rel", one.native_abs_rel),
             **_estimate("scaled_abs_rel", one.scaled_abs_rel),
-            "dataset_digest": stamp.dataset_digest,
-            "dataset_version": stamp.dataset_version,
-            "submission_sha256": stamp.archives[0].sha256,
-            "software_version": stamp.to_dict()["software"]["version"],
+            **stamp.csv_cells(),
         }
         for one in study.bins
     ]
