@@ -10,7 +10,6 @@ from dataset_builder.optics import zed_rig
 from dataset_builder.specs import (
     AppearanceSpec,
     AssemblySpec,
-    BoardSpec,
     ColourSpec,
     ConfigSpec,
     DomeSpec,
@@ -23,6 +22,7 @@ from dataset_builder.specs import (
     SceneSpec,
     SweepSpec,
 )
+from rebar_depth_bench.board import BoardSpec
 from rebar_depth_bench.errors import InputError
 
 LATTICE_DOME = DomeSpec(

@@ -20,7 +20,8 @@ from dataset_builder.configs import CONFIGS, LATTICE_DOME, SWEEPS
 from dataset_builder.model import Assembly
 from dataset_builder.protocols import offsets_m
 from dataset_builder.scene_toml import SceneToml, name_kind, read_scene_toml
-from dataset_builder.specs import AssemblySpec, BoardSpec, ConfigSpec, DomeSpec, SceneSpec
+from dataset_builder.specs import AssemblySpec, ConfigSpec, DomeSpec, SceneSpec
+from rebar_depth_bench.board import BoardSpec
 from rebar_depth_bench.errors import InputError
 
 TAKEN_NAMES = (*CONFIGS, *SWEEPS, "meshes", "pictures", "scenes")

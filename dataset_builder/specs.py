@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from rebar_depth_bench.board import BoardSpec
 from rebar_depth_bench.calibration import StereoCalibration
 
 
@@ -69,17 +70,6 @@ class MeshFileSpec:
     sha256: str
     unit_m: float
     kind: str = "mesh-file"
-
-
-@dataclass(frozen=True)
-class BoardSpec:
-    """An A3 sheet, long side along world x, centred on the origin, with ArUco markers round the assembly."""
-
-    width_m: float = 0.420
-    height_m: float = 0.297
-    markers: int = 6
-    marker_side_m: float = 0.050
-    dictionary: str = "DICT_4X4_50"
 
 
 AssemblySpec = LatticeSpec | PileSpec | PierSpec | CageFileSpec | MeshFileSpec

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,25 +16,26 @@ from numpy import ndarray
 from rebar_depth_bench.dataset import decode_row, load_undecoded
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.folder import DatasetFolder, open_folder
-from rebar_depth_bench.methods import Method
-from rebar_depth_bench.predicted_views import PredictedViews
+from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor
+from rebar_depth_bench.predicted_views import PredictedViews, Preparation
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
 from rebar_depth_bench.version import software_version
 
 
 def predict(
-    method: Method,
+    method: AnyMethod,
     root: str | Path,
     archive: str | Path,
     *,
     configs: Sequence[str] | None = None,
     progress: Progress = silent,
-) -> None:
+) -> dict[str, Preparation]:
     """Predict every view of the named configs (default: all) and write the archive, whole or not at all.
 
     Each view is kept beside the archive until all are there: after an interruption the same call predicts the
-    missing ones only. ``submission.json`` records the seconds each view took.
+    missing ones only. ``submission.json`` records the seconds each view took, and of a method that sees all views
+    of a config at once its notes on each, which are returned too.
 
     Raises ``DatasetError`` for an unknown folder or config, ``MethodError`` for what the method lacks or returns.
     """
@@ -47,20 +48,46 @@ def predict(
         "dataset": {name: folder.config(name)["ground_truth_digest"] for name in names},
         "software": software_version(),
     }
+    if isinstance(method, MultiViewMethod):
+        for name in names:
+            method.check(ConfigViews(folder, name))
     views = PredictedViews.open(target.with_name(f".{target.name}.views"), key)
-    run = method.load()
+    predictor = _predictors(method, folder, views, progress)
     for name in names:
         done = [view.view_id for view in folder.views(name) if view.view_id in views]
+        if len(done) == totals[name]:
+            continue
+        run = predictor(name)
         for count, row in enumerate(_missing(method, folder, name, set(done)), start=len(done) + 1):
             start = time.perf_counter()
             depth_m = _checked(method, row["view_id"], run(row), folder.grid(name))
             views.put(row["view_id"], depth_m, time.perf_counter() - start)
             progress(f"{method.info.name} on {name}", count, totals[name])
-    _write(method, target, views, [view.view_id for name in names for view in folder.views(name)])
+    prepared = {name: found for name in names if (found := views.get_preparation(name))}
+    _write(method, target, views, [view.view_id for name in names for view in folder.views(name)], prepared)
     shutil.rmtree(views.path)
+    return prepared
 
 
-def _missing(method: Method, folder: DatasetFolder, config: str, done: set[str]) -> Iterator[dict[str, Any]]:
+def _predictors(
+    method: AnyMethod, folder: DatasetFolder, views: PredictedViews, progress: Progress
+) -> Callable[[str], Predictor]:
+    """Return what makes a config's predictor: a method of single views is loaded once for all of them."""
+    if isinstance(method, Method):
+        run = method.load()
+        return lambda _: run
+
+    def prepare(config: str) -> Predictor:
+        start = time.perf_counter()
+        prepared = method.prepare(ConfigViews(folder, config), views.work(config), progress)
+        if views.get_preparation(config) is None:  # a run that goes on finds most of the work done
+            views.put_preparation(config, Preparation(prepared.notes, round(time.perf_counter() - start, 1)))
+        return prepared.predict
+
+    return prepare
+
+
+def _missing(method: AnyMethod, folder: DatasetFolder, config: str, done: set[str]) -> Iterator[dict[str, Any]]:
     """Yield the rows of the views that are not done; the others are passed over undecoded."""
     columns = ("view_id", *method.info.columns)
     for row in load_undecoded(folder.root, config, streaming=True, columns=columns):
@@ -68,7 +95,7 @@ def _missing(method: Method, folder: DatasetFolder, config: str, done: set[str])
             yield decode_row(row)
 
 
-def _checked(method: Method, view_id: str, depth_m: object, grid: tuple[int, int]) -> Float[ndarray, "h w"]:
+def _checked(method: AnyMethod, view_id: str, depth_m: object, grid: tuple[int, int]) -> Float[ndarray, "h w"]:
     array = np.asarray(depth_m)
     if array.shape != grid or array.dtype.kind != "f":
         raise MethodError(
@@ -78,15 +105,28 @@ def _checked(method: Method, view_id: str, depth_m: object, grid: tuple[int, int
     return array
 
 
-def _write(method: Method, archive: Path, views: PredictedViews, view_ids: Sequence[str]) -> None:
+def _write(
+    method: AnyMethod,
+    archive: Path,
+    views: PredictedViews,
+    view_ids: Sequence[str],
+    prepared: dict[str, Preparation],
+) -> None:
     info = method.info
-    runtime = {"unit": "seconds", "python": platform.python_version(), "machine": platform.machine()}
+    runtime: dict[str, Any] = {
+        "unit": "seconds",
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+    }
+    if prepared:
+        runtime["preparing"] = {config: found.seconds for config, found in prepared.items()}
     with SubmissionWriter(
         archive,
         method=info.name,
         description=info.summary,
         uses_intrinsics=info.uses_intrinsics,
         runtime=runtime,
+        notes={config: found.notes for config, found in prepared.items()} or None,
     ) as writer:
         for view_id in view_ids:
             depth_m, seconds = views.get(view_id)

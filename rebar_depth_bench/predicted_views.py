@@ -20,6 +20,14 @@ _KEY = "key.json"
 
 
 @dataclass(frozen=True)
+class Preparation:
+    """What a method that sees a whole config found on the way, plain JSON values, and how long it took."""
+
+    notes: Mapping[str, Any]
+    seconds: float
+
+
+@dataclass(frozen=True)
 class PredictedViews:
     """A folder with a file per predicted view, each whole or not there."""
 
@@ -55,5 +63,23 @@ class PredictedViews:
         with np.load(self._file(view_id), allow_pickle=False) as kept:
             return kept["depth_m"], float(kept["seconds"])
 
+    def work(self, config: str) -> Path:
+        """Return a config's folder for what a method keeps between interruptions, made if it is not there."""
+        folder = self.path / f"{config}.work"
+        folder.mkdir(exist_ok=True)
+        return folder
+
+    def put_preparation(self, config: str, preparation: Preparation) -> None:
+        """Keep what preparing a config found."""
+        write_text(self._preparation(config), json.dumps(vars(preparation)))
+
+    def get_preparation(self, config: str) -> Preparation | None:
+        """Return what preparing a config found, None where it never came to an end."""
+        path = self._preparation(config)
+        return Preparation(**json.loads(path.read_text())) if path.is_file() else None
+
     def _file(self, view_id: str) -> Path:
         return self.path / f"{view_id}.npz"
+
+    def _preparation(self, config: str) -> Path:
+        return self.path / f"{config}.json"

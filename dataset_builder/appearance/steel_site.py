@@ -10,9 +10,9 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.appearance.bar_space import Capsules
-from dataset_builder.board import marker_corners_m
 from dataset_builder.model import Assembly, Bar, Part
 from dataset_builder.specs import SceneSpec
+from rebar_depth_bench.board import marker_corners_m
 
 GAP_M = 5e-4
 """Things stand this far above the ground, and no surface of theirs lies in another's."""

@@ -10,9 +10,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.assemblies.pile import Pose, placed_m
-from dataset_builder.board import MARKER_MODULES, marker_corners_m
 from dataset_builder.shapes.bending import resampled_m
-from dataset_builder.specs import BoardSpec
+from rebar_depth_bench.board import MARKER_MODULES, BoardSpec, marker_corners_m
 
 _SAMPLE_M = 0.002
 """Centrelines are looked at this finely when it is asked what they cover."""

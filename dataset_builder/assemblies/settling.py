@@ -35,7 +35,8 @@ from dataset_builder.assemblies.heap import (
 )
 from dataset_builder.assemblies.pile import RIBS, Pose, placed_m, stirrup_line_m
 from dataset_builder.shapes.bar_mesh import outer_radius_m
-from dataset_builder.specs import BoardSpec, PileSpec
+from dataset_builder.specs import PileSpec
+from rebar_depth_bench.board import BoardSpec
 from rebar_depth_bench.console import run_command
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.files import write_text

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-from dataset_builder.specs import BoardSpec, DomeSpec, ProtocolSpec, RigSpec, RingSpec, SweepSpec
+from dataset_builder.specs import DomeSpec, ProtocolSpec, RigSpec, RingSpec, SweepSpec
+from rebar_depth_bench.board import BoardSpec
 from rebar_depth_bench.calibration import Lens, StereoCalibration
 from rebar_depth_bench.errors import DatasetError
 

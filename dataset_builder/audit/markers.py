@@ -19,23 +19,18 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.audit.views import AuditedEye
-from dataset_builder.board import MARKER_MODULES, marker_corners_m
 from dataset_builder.optics import Camera
-from dataset_builder.specs import BoardSpec
+from rebar_depth_bench.aruco import Corners, detected_corners_px
+from rebar_depth_bench.board import MARKER_MODULES, BoardSpec, marker_corners_m
 from rebar_depth_bench.cameras import project, transform
 
 LEAST_WIDTH_PX = 24.0
 """A marker whose shorter side or width across is less, by distance or slant, is not asked for: 4 px a module."""
 _FLAT_M = 0.001
-_REFINEMENT_PX = 4
-_REFINEMENT_MODULES = 0.8
-
-Corners = dict[int, Float64[ndarray, "4 2"]]
-"""A marker's corners by its id, pixels, in OpenCV's order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,25 +66,6 @@ def projected_corners_px(camera: Camera, corners_m: Mapping[int, Float64[ndarray
         in_front = bool((points_cam[:, 2] > 0).all())
         found[marker] = project(camera.K, points_cam, camera.distortion) if in_front else np.full((4, 2), np.nan)
     return found
-
-
-def detected_corners_px(rgb: UInt8[ndarray, "h w 3"], dictionary: str) -> Corners:
-    """Return what OpenCV's detector finds in a picture: corners in pixels, centres at integers, by id.
-
-    An id that is found twice is left out.
-    """
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    parameters.cornerRefinementWinSize = _REFINEMENT_PX
-    parameters.relativeCornerRefinmentWinSize = _REFINEMENT_MODULES
-    parameters.cornerRefinementMaxIterations = 100
-    parameters.cornerRefinementMinAccuracy = 0.001
-    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    corners, ids, _ = cv2.aruco.ArucoDetector(known, parameters).detectMarkers(grey)
-    names = [] if ids is None else ids.ravel().tolist()
-    once = {name for name in names if names.count(name) == 1}
-    return {name: quad[0].astype(np.float64) for name, quad in zip(names, corners, strict=True) if name in once}
 
 
 def inset_directions(quads_px: Float64[ndarray, "n 4 2"]) -> Float64[ndarray, "n 4 2"]:

@@ -14,7 +14,7 @@ from numpy import ndarray
 from dataset_builder.appearance import LIGHT, THINGS, of_slot
 from dataset_builder.model import ESTIMATED, Bar
 from dataset_builder.optics import Camera
-from dataset_builder.specs import BoardSpec
+from rebar_depth_bench.board import BoardSpec
 from rebar_depth_bench.cameras import inverse_rigid, pixel_rays, transform
 from rebar_depth_bench.schema import EYES
 

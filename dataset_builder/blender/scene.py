@@ -19,7 +19,8 @@ from dataset_builder.blender.materials import STEEL_LOOKS, material, paper, surf
 from dataset_builder.board import board_texture
 from dataset_builder.model import NOT_STEEL, Assembly, Mesh, Part
 from dataset_builder.shapes.solids import box
-from dataset_builder.specs import BoardSpec, SceneSpec
+from dataset_builder.specs import SceneSpec
+from rebar_depth_bench.board import BoardSpec
 
 BAR_ID = "bar_id"
 """The custom property that carries an object's bar id."""

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from jaxtyping import Float32
 from numpy import ndarray
+
+from rebar_depth_bench.methods.config_views import ConfigViews
+from rebar_depth_bench.progress import Progress
 
 Predictor = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]
 """From a decoded row to the left view's planar depth, metres, on the left grid; NaN where it has no answer."""
@@ -15,7 +19,10 @@ Predictor = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]
 
 @dataclass(frozen=True)
 class MethodInfo:
-    """What people should know of a method before they run it or read its numbers."""
+    """What people should know of a method before they run it or read its numbers.
+
+    ``unexercised`` says what of it never ran where it was written: weights or hardware that were not there.
+    """
 
     name: str
     summary: str
@@ -23,6 +30,7 @@ class MethodInfo:
     uses_intrinsics: bool
     source: str
     licence: str
+    unexercised: str = ""
 
 
 @dataclass(frozen=True)
@@ -31,3 +39,29 @@ class Method:
 
     info: MethodInfo
     load: Callable[[], Predictor]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A predictor made from all views of a config, and what was found on the way, as plain JSON values."""
+
+    predict: Predictor
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class MultiViewMethod:
+    """A method that sees all views of a config before it answers for any of them.
+
+    ``check(views)`` raises ``MethodError`` for a config that cannot serve it (one without a board, say) or where
+    a package is missing; it is asked of every config before work begins. ``prepare(views, work, progress)`` makes
+    the predictor; what it leaves in the folder ``work`` is there again when an interrupted run goes on. The
+    predictor's rows hold ``view_id`` and ``info.columns``.
+    """
+
+    info: MethodInfo
+    prepare: Callable[[ConfigViews, Path, Progress], Prepared]
+    check: Callable[[ConfigViews], None]
+
+
+AnyMethod = Method | MultiViewMethod

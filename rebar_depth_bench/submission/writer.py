@@ -37,7 +37,7 @@ class SubmissionWriter:
     The archive appears under its name on a clean exit only; after an exception in the block whatever
     stood there before is untouched. Entries are stored, which reads fastest; ``compress=True`` deflates
     them (about 100 times slower to write, 10 times slower to read, a fifth smaller), and the bytes then
-    also depend on the zlib in use.
+    also depend on the zlib in use. ``notes`` is what the method has to say of itself; no score depends on it.
     """
 
     def __init__(
@@ -49,6 +49,7 @@ class SubmissionWriter:
         url: str | None = None,
         uses_intrinsics: bool | None = None,
         runtime: Mapping[str, object] | None = None,
+        notes: Mapping[str, object] | None = None,
         compress: bool = False,
     ) -> None:
         """Raise ``InputError`` for metadata that a reader would refuse."""
@@ -60,6 +61,7 @@ class SubmissionWriter:
             "url": url,
             "uses_intrinsics": uses_intrinsics,
             "runtime": None if runtime is None else dict(runtime),
+            "notes": None if notes is None else dict(notes),
         }
         _check_metadata(self._metadata)
         self._seconds: dict[str, float] = {}

@@ -23,7 +23,8 @@ from dataset_builder.protocols import aim_rig
 from dataset_builder.raycast import EyeTruth, RayCaster
 from dataset_builder.shapes.bar_mesh import plain_bar_mesh
 from dataset_builder.shapes.bending import bent_line_m
-from dataset_builder.specs import BoardSpec, RigSpec
+from dataset_builder.specs import RigSpec
+from rebar_depth_bench.board import BoardSpec
 from rebar_depth_bench.calibration import Lens, StereoCalibration
 from rebar_depth_bench.cameras import inverse_rigid, pixel_rays, transform
 

@@ -20,7 +20,8 @@ from dataset_builder.model import Assembly
 from dataset_builder.optics import Camera
 from dataset_builder.protocols import aim_rig
 from dataset_builder.raycast import RayCaster
-from dataset_builder.specs import AppearanceSpec, BoardSpec, ColourSpec, LatticeSpec, SceneSpec
+from dataset_builder.specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
+from rebar_depth_bench.board import BoardSpec
 from rebar_depth_bench.cameras import ideal_K, look_at, pixel_rays
 from rebar_depth_bench.errors import InputError
 from tests.builder.probe import run_probe

@@ -23,7 +23,8 @@ from dataset_builder.audit.cameras import (
 from dataset_builder.audit.manifest_specs import board_spec, protocol_spec, rig_spec
 from dataset_builder.optics import Camera, rig_cameras
 from dataset_builder.protocols import poses
-from dataset_builder.specs import BoardSpec, DomeSpec, RingSpec
+from dataset_builder.specs import DomeSpec, RingSpec
+from rebar_depth_bench.board import BoardSpec
 from rebar_depth_bench.cameras import right_of_rig
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.folder import open_folder

@@ -17,7 +17,7 @@ from dataset_builder.audit.markers import (
 )
 from dataset_builder.audit.report import Check
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
-from dataset_builder.board import marker_corners_m
+from rebar_depth_bench.board import marker_corners_m
 from tests.builder.audit_scene import BOARD, RIGS, config, view, with_baseline, with_K_shift
 
 GRID = pytest.mark.parametrize("rig", RIGS)

@@ -16,7 +16,7 @@ from dataset_builder.audit.photometric import best_shift_px, photometric_verdict
 from dataset_builder.audit.report import Check
 from dataset_builder.audit.views import AuditedConfig, AuditedView, RayMemory, audited_view
 from dataset_builder.bars_table import read_bars
-from dataset_builder.specs import BoardSpec
+from rebar_depth_bench.board import BoardSpec
 from rebar_depth_bench.folder import open_folder
 from tests.builder.audit_scene import RIGS, config, view, with_baseline, with_depth, with_K_shift
 

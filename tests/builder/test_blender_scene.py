@@ -19,12 +19,12 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.assemblies.lattice import lattice_assembly
-from dataset_builder.board import marker_corners_m
 from dataset_builder.model import WorldMesh
 from dataset_builder.optics import Camera
 from dataset_builder.protocols import aim_rig
 from dataset_builder.raycast import RayCaster
-from dataset_builder.specs import BoardSpec, ColourSpec, LatticeSpec, SceneSpec
+from dataset_builder.specs import ColourSpec, LatticeSpec, SceneSpec
+from rebar_depth_bench.board import BoardSpec, marker_corners_m
 from rebar_depth_bench.cameras import ideal_K, look_at, pixel_rays, project, transform
 from tests.builder.probe import run_probe
 

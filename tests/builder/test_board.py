@@ -10,8 +10,8 @@ import pytest
 from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
-from dataset_builder.board import board_texture, marker_corners_m
-from dataset_builder.specs import BoardSpec
+from dataset_builder.board import board_texture
+from rebar_depth_bench.board import BoardSpec, marker_corners_m
 
 PX_PER_M = 6000.0
 FOOTPRINT_M = 0.05

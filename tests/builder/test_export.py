@@ -17,15 +17,14 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dataset_builder.bars_table import read_bars
-from dataset_builder.board import marker_corners_m
 from dataset_builder.export import export
 from dataset_builder.export.colmap import cameras_txt, images_txt, points_txt, quaternion_wxyz
 from dataset_builder.export.nerfstudio import transforms_json
 from dataset_builder.export.pictures import depth_exr, depth_mm_png
 from dataset_builder.export.views import CameraView
 from dataset_builder.optics import Camera
-from dataset_builder.specs import BoardSpec
 from rebar_depth_bench import load
+from rebar_depth_bench.board import BoardSpec, marker_corners_m
 from rebar_depth_bench.cameras import camera_centre, inverse_rigid, look_at, project, rigid, transform
 
 Rows = dict[str, dict[str, Any]]

@@ -26,7 +26,6 @@ from dataset_builder.assemblies.pier import pier_assembly
 from dataset_builder.assemblies.pile import pile_assembly
 from dataset_builder.blender.laboratory import laboratory
 from dataset_builder.blender.outdoors import CLEAR_M, SLAB_HALF_M, outdoors
-from dataset_builder.board import marker_corners_m
 from dataset_builder.configs import LATTICE_DOME, LATTICE_RING, PIER_DOME, PILE_DOME
 from dataset_builder.model import NOT_STEEL, Assembly, Bar, Mesh, Part
 from dataset_builder.optics import rig_cameras
@@ -35,13 +34,13 @@ from dataset_builder.shapes.bar_mesh import outer_radius_m, plain_bar_mesh
 from dataset_builder.specs import (
     AppearanceSpec,
     AssemblySpec,
-    BoardSpec,
     LatticeSpec,
     PierSpec,
     PileSpec,
     RigSpec,
     SceneSpec,
 )
+from rebar_depth_bench.board import BoardSpec, marker_corners_m
 from rebar_depth_bench.cameras import camera_centre
 
 FREE_STANDING = ("formwork", "clutter", "shadows")

@@ -20,10 +20,10 @@ from dataset_builder.assemblies import make_assembly
 from dataset_builder.assemblies import pile as pile_module
 from dataset_builder.assemblies.pile import RIBS, STATES, pile_assembly, settled_poses
 from dataset_builder.assemblies.stirrup import SELF_GAP_M, hook_extension_m, stirrup_centreline_m
-from dataset_builder.board import marker_corners_m
 from dataset_builder.model import Assembly
 from dataset_builder.shapes.bar_mesh import outer_radius_m
-from dataset_builder.specs import BoardSpec, PileSpec
+from dataset_builder.specs import PileSpec
+from rebar_depth_bench.board import BoardSpec, marker_corners_m
 from rebar_depth_bench.errors import MeshError
 
 SPEC = PileSpec()

@@ -24,7 +24,8 @@ from dataset_builder.protocols import offsets_m
 from dataset_builder.scene_file import NEAREST_PER_REACH, scene_config
 from dataset_builder.scene_toml import read_scene_toml
 from dataset_builder.shapes.bar_mesh import outer_radius_m
-from dataset_builder.specs import BoardSpec, CageFileSpec, DomeSpec, LatticeSpec, MeshFileSpec, RingSpec
+from dataset_builder.specs import CageFileSpec, DomeSpec, LatticeSpec, MeshFileSpec, RingSpec
+from rebar_depth_bench.board import BoardSpec
 from rebar_depth_bench.errors import InputError, MeshError
 from rebar_depth_bench.ply import write_mesh_ply
 

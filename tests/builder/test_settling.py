@@ -16,7 +16,8 @@ import pytest
 
 from dataset_builder.assemblies.heap import DropSpec, drop_poses, free_markers
 from dataset_builder.assemblies.pile import STATES, Pose, placed_m, settled_poses, stirrup_line_m
-from dataset_builder.specs import BoardSpec, PileSpec
+from dataset_builder.specs import PileSpec
+from rebar_depth_bench.board import BoardSpec
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'rebar-depth-bench[physics]'")
 
