@@ -30,6 +30,14 @@ class EyeTruth:
     bars: UInt16[ndarray, "h w"]
 
 
+@dataclass(frozen=True, eq=False)
+class RayHits:
+    """Where rays meet the mesh: range along the ray, metres (infinity: nowhere), and cosine of incidence (0)."""
+
+    range_m: Float64[ndarray, " n"]
+    cos_incidence: Float64[ndarray, " n"]
+
+
 class RayCaster:
     """A scene's mesh, ready to be cast against from any camera."""
 
@@ -70,8 +78,26 @@ class RayCaster:
             bars=bars.reshape(shape),
         )
 
+    def hits(self, origins_m: Float64[ndarray, "n 3"], directions: Float64[ndarray, "n 3"]) -> RayHits:
+        """Return where each ray meets the mesh first; world frame, directions of any length.
+
+        As exact as ``cast``. The cosine is that of the angle to the face's normal, either side. A ray so much
+        along a face that its plane lies behind the origin or nowhere meets nothing.
+        """
+        face = self._first_face(origins_m, directions)
+        hit = np.flatnonzero(face != _MISS)
+        normal, along = self._normal[face[hit]], directions[hit]
+        cross = np.einsum("ij,ij->i", normal, along)
+        towards = self._plane[face[hit]] - np.einsum("ij,ij->i", normal, origins_m[hit])
+        met = cross * towards > 0
+        hit, cross, length = hit[met], cross[met], np.linalg.norm(along[met], axis=1)
+        range_m, cos_incidence = np.full(len(face), np.inf), np.zeros(len(face))
+        range_m[hit] = towards[met] / cross * length
+        cos_incidence[hit] = np.abs(cross) / (length * np.linalg.norm(normal[met], axis=1))
+        return RayHits(range_m, cos_incidence)
+
     def _first_face(
-        self, centre_m: Float64[ndarray, 3], directions: Float64[ndarray, "n 3"]
+        self, centre_m: Float64[ndarray, "*n 3"], directions: Float64[ndarray, "n 3"]
     ) -> Int32[ndarray, " n"]:
         origins = np.broadcast_to((centre_m - self._origin_m).astype(np.float32), directions.shape)
         found: Int32[ndarray, " n"] = self._scene.run(

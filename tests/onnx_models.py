@@ -10,7 +10,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from rebar_depth_bench.methods import Predictor, find_method
+from rebar_depth_bench.methods import Predictor
+from tests.predictors import loaded
 
 Shape = Sequence[int | str | None]
 OPEN: Shape = ("n", 3, "h", "w")
@@ -69,7 +70,7 @@ def described(folder: Path, given: str = PLAIN, returned: str = DEPTH, top: str 
 
 def run(path: Path, rgb: np.ndarray, fx: float | None = None) -> np.ndarray:
     """Load the method of a TOML file and return its depth of one picture, metres."""
-    predictor: Predictor = find_method(str(path)).load()
+    predictor: Predictor = loaded(str(path))
     row: dict[str, Any] = {"left_rgb": rgb}
     if fx is not None:
         row["left_K"] = np.array([[fx, 0.0, 9.0], [0.0, 7.0 * fx, 5.0], [0.0, 0.0, 1.0]])

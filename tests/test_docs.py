@@ -15,6 +15,7 @@ from dataset_builder.cli import argument_parser as build_parser
 from dataset_builder.configs import CONFIGS, SWEEPS
 from rebar_depth_bench.cli import argument_parser as bench_parser
 from rebar_depth_bench.methods import METHODS, find_method
+from tests.predictors import loaded
 
 PAGES = [Path("README.md"), Path("CONTRIBUTING.md"), Path("ARCHITECTURE.md"), Path("cards/BENCHMARK.md")]
 PARSERS: dict[str, ArgumentParser] = {"rebar-build": build_parser(), "rebar-bench": bench_parser()}
@@ -54,7 +55,7 @@ def test_the_template_of_a_method_is_one(tmp_path: Path) -> None:
     path.write_text(f"load_my_model = lambda: lambda rgb, K: rgb[..., 0] * K[0, 0]\n{template}")
     method = find_method(f"{path}:METHOD")
     row = {"left_rgb": np.full((2, 3, 3), 2.0), "left_K": 5 * np.eye(3)}
-    assert method.load()(row).tolist() == [[10.0] * 3] * 2
+    assert loaded(method)(row).tolist() == [[10.0] * 3] * 2
     assert set(method.info.columns) == set(row)
 
 

@@ -14,6 +14,7 @@ from onnx import TensorProto, helper
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import find_method
 from tests.onnx_models import DEPTH, OPEN, PLAIN, described, fixed, mixer, run, write_model
+from tests.predictors import loaded
 
 IDENTITY = helper.make_node("ReduceMean", ["x"], ["y"], axes=[1])
 SUM = helper.make_node("Sum", ["x", "k"], ["y"])
@@ -110,7 +111,7 @@ def test_a_model_that_does_not_fit_is_refused_when_it_is_loaded(case: CASE, tmp_
     write_model(tmp_path, **{"input_shape": OPEN, **model})
     method = find_method(str(described(tmp_path, given, returned)))
     with pytest.raises(MethodError, match=re.escape(words)) as caught:
-        method.load()
+        loaded(method)
     assert "model.onnx: " in str(caught.value)
 
 
@@ -119,7 +120,7 @@ def test_a_smaller_answer_needs_to_be_said(tmp_path: Path) -> None:
     with pytest.raises(
         MethodError, match=re.escape("(1, 2, 3), expected 4 x 6 or [output] at_input_size = false")
     ):
-        find_method(str(described(tmp_path))).load()
+        loaded(str(described(tmp_path)))
 
 
 def test_one_of_several_outputs_is_taken_by_name_or_place(tmp_path: Path) -> None:
@@ -134,7 +135,7 @@ def test_one_of_several_outputs_is_taken_by_name_or_place(tmp_path: Path) -> Non
 def test_a_file_that_is_no_model_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "model.onnx").write_bytes(b"not a model at all")
     with pytest.raises(MethodError, match=r"model\.onnx: onnxruntime cannot open this model: "):
-        find_method(str(described(tmp_path))).load()
+        loaded(str(described(tmp_path)))
     assert capsys.readouterr().err == ""
 
 
@@ -143,4 +144,4 @@ def test_without_onnxruntime_one_sentence_names_the_extra(tmp_path: Path, monkey
     method = find_method(str(described(tmp_path)))
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(MethodError, match=re.escape("pip install 'rebar-depth-bench[onnx]'")):
-        method.load()
+        loaded(method)

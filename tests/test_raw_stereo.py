@@ -14,6 +14,7 @@ from rebar_depth_bench import raw_stereo
 from rebar_depth_bench.calibration import lens_distortion, lens_K, read_calibration, right_from_left
 from rebar_depth_bench.cameras import ideal_K, inverse_rigid, pixel_rays, right_of_rig, rigid
 from rebar_depth_bench.methods import find_method
+from tests.predictors import loaded
 from tests.test_calibration import SHIPPED
 
 WIDTH, HEIGHT = 480, 270
@@ -65,7 +66,7 @@ def raw_row() -> dict[str, Any]:
 def relative_error(row: dict[str, Any]) -> Float64[ndarray, "h w"]:
     """Return sgbm's depth over the plane's, less one; only columns that the right eye sees as well."""
     method = find_method("sgbm")
-    predicted_m = method.load()({name: row[name] for name in method.info.columns})
+    predicted_m = loaded(method)({name: row[name] for name in method.info.columns})
     assert predicted_m.shape == (HEIGHT, WIDTH)
     assert predicted_m.dtype == np.float32
     return np.asarray(predicted_m / row["depth_m"] - 1)[:, WIDTH // 3 :]
@@ -160,5 +161,5 @@ def test_a_rectified_row_is_matched_as_it_is() -> None:
         "right_cam_from_world": right_of_rig(LEFT, 0.12),
         "baseline_m": 0.12,
     }
-    depth_m = find_method("sgbm").load()(row)
+    depth_m = loaded("sgbm")(row)
     assert np.nanmedian(depth_m) == pytest.approx(K[0, 0] * 0.12 / shift_px, rel=5e-3)

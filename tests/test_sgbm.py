@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.sgbm import AGREEMENT_PX, confirmed
+from tests.predictors import loaded
 
 
 def test_by_hand() -> None:
@@ -52,7 +52,7 @@ def test_what_only_one_eye_sees_has_no_answer(where: str) -> None:
         "right_cam_from_world": moved,
         "baseline_m": 0.12,
     }
-    checked, filled = (find_method(name).load()(row) for name in ("sgbm", "sgbm-filled"))
+    checked, filled = (loaded(name)(row) for name in ("sgbm", "sgbm-filled"))
     truth = np.full((60, 200), 700 * 0.12 / 8)
     if where == "bar":
         truth[:, 100:120] = 700 * 0.12 / 30

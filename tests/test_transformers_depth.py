@@ -23,6 +23,7 @@ from rebar_depth_bench.methods import METHODS, find_method
 from rebar_depth_bench.methods.depth_families import FAMILIES, Output, canonical_to_depth_m, depth_m
 from rebar_depth_bench.methods.depth_tensors import PREPARATIONS
 from rebar_depth_bench.methods.transformers_depth import hf_method
+from tests.predictors import loaded
 from tests.tiny_depth_models import LAST_LAYER, MODELS, save
 
 H, W = 90, 160
@@ -49,7 +50,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def test_every_family_answers_on_the_left_grid_the_same_each_time(folders: dict[str, Path], kind: str) -> None:
     method = find_method(f"hf:{folders[kind]}")
     asked = {name: row()[name] for name in method.info.columns}
-    first, second = method.load()(asked), method.load()(asked)
+    first, second = loaded(method)(asked), loaded(method)(asked)
     assert first.shape == (H, W)
     assert first.dtype == np.float32
     assert np.array_equal(first, second, equal_nan=True)

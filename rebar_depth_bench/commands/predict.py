@@ -28,11 +28,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def in_words(value: object) -> str:
+    """Return a note's plain JSON value in one line for people."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key.replace('_', ' ')} {in_words(one)}" for key, one in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(in_words, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
 def run(options: argparse.Namespace) -> None:
     """Predict and print where the archive is."""
     method = find_method(options.method)
     info = method.info
     print(f"{info.name}: {info.summary}; from {info.source}; licence {info.licence}", file=sys.stderr)
     with ProgressBars() as bars:
-        predict(method, options.data, options.out, configs=options.config, progress=bars.update)
+        prepared = predict(method, options.data, options.out, configs=options.config, progress=bars.update)
+    for config, found in prepared.items():
+        for key, value in found.notes.items():
+            print(f"{config}: {key.replace('_', ' ')}: {in_words(value)}", file=sys.stderr)
     print(options.out)

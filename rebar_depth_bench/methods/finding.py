@@ -2,41 +2,70 @@
 
 A package offers its methods as entry points of the group ``rebar_depth_bench.methods``; a Python file is named
 with the method in it, ``my_model.py:METHOD``; a TOML file describes an ONNX model; ``hf:`` names a checkpoint of
-``transformers``.
+``transformers``, ``NAME:FOLDER`` a folder with the weights of one of the paper's other networks (``LOCATED``).
 """
 
 from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
 
 from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.methods.board_plane import BOARD_PLANE
 from rebar_depth_bench.methods.constant import CONSTANT
-from rebar_depth_bench.methods.method import Method
+from rebar_depth_bench.methods.depth_anything_3 import DEPTH_ANYTHING_3, depth_anything_3_method
+from rebar_depth_bench.methods.foundation_stereo import FOUNDATION_STEREO, foundation_stereo_method
+from rebar_depth_bench.methods.method import AnyMethod, Method, MultiViewMethod
+from rebar_depth_bench.methods.metric3d import METRIC3D, metric3d_method
+from rebar_depth_bench.methods.multi_view import (
+    COLMAP_ANCHORED,
+    COLMAP_ARUCO,
+    SWEEP_ANCHORED,
+    SWEEP_ARUCO,
+)
 from rebar_depth_bench.methods.onnx_model import onnx_method
 from rebar_depth_bench.methods.sgbm import SGBM, SGBM_FILLED
 from rebar_depth_bench.methods.transformers_depth import DEPTH_PRO, PREFIX, hf_method
 from rebar_depth_bench.methods.truth import NOISY_TRUTH, TRUTH
+from rebar_depth_bench.methods.unidepth import UNIDEPTH, unidepth_method
 
 GROUP = "rebar_depth_bench.methods"
 
-METHODS: Mapping[str, Method] = {
-    method.info.name: method for method in (SGBM, SGBM_FILLED, DEPTH_PRO, CONSTANT, NOISY_TRUTH, TRUTH)
+METHODS: Mapping[str, AnyMethod] = {
+    method.info.name: method
+    for method in (
+        *(SGBM, SGBM_FILLED, FOUNDATION_STEREO),
+        *(DEPTH_PRO, METRIC3D, UNIDEPTH, DEPTH_ANYTHING_3),
+        *(COLMAP_ARUCO, COLMAP_ANCHORED, SWEEP_ARUCO, SWEEP_ANCHORED),
+        *(CONSTANT, BOARD_PLANE, NOISY_TRUTH, TRUTH),
+    )
 }
 """Those that come with the bench."""
 
+LOCATED: Mapping[str, Callable[[Path], Method]] = {
+    "depth-anything-3": depth_anything_3_method,
+    "foundation-stereo": foundation_stereo_method,
+    "metric3d": metric3d_method,
+    "unidepth": unidepth_method,
+}
+"""Those that take their weights, or code and weights, from a folder: ``NAME:FOLDER``."""
 
-def find_method(name: str) -> Method:
-    """Return a method by its name, from a file by ``path.py:NAME`` or ``path.toml``, or by ``hf:ORG/NAME``.
+
+def find_method(name: str) -> AnyMethod:
+    """Return a method by its name, from a file by ``path.py:NAME`` or ``path.toml``, from a folder by
+    ``NAME:FOLDER`` (``LOCATED``), or by ``hf:ORG/NAME``.
 
     Raises ``MethodError`` for an unknown one, and where a file or package cannot be imported or holds none.
     """
     if name.startswith(PREFIX):
         return hf_method(name.removeprefix(PREFIX))
+    known_as, _, place = name.partition(":")
+    if place and known_as in LOCATED:
+        return LOCATED[known_as](Path(place).expanduser())
     path, colon, attribute = name.rpartition(":")
     if colon and path.endswith(".py"):
         return _checked(name, getattr(_module(Path(path)), attribute, None))
@@ -50,13 +79,13 @@ def find_method(name: str) -> Method:
     known = ", ".join((*METHODS, *offered))
     raise MethodError(
         f"no method {name!r}, expected one of {known}, or a file's like my_model.py:METHOD or "
-        "my_model.toml, or hf:ORG/NAME"
+        f"my_model.toml, or hf:ORG/NAME, or a folder for one of {', '.join(LOCATED)}: NAME:FOLDER"
     )
 
 
-def all_methods() -> dict[str, Method | MethodError]:
+def all_methods() -> dict[str, AnyMethod | MethodError]:
     """Return every method by name; of a package whose method cannot be loaded, why."""
-    found: dict[str, Method | MethodError] = dict(METHODS)
+    found: dict[str, AnyMethod | MethodError] = dict(METHODS)
     for name, entry in _offered().items():
         try:
             found[name] = _loaded(entry)
@@ -69,7 +98,7 @@ def _offered() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in METHODS}
 
 
-def _loaded(entry: EntryPoint) -> Method:
+def _loaded(entry: EntryPoint) -> AnyMethod:
     try:
         value = entry.load()
     except Exception as error:  # whatever a stranger's module raises when it is imported
@@ -94,8 +123,8 @@ def _module(path: Path) -> ModuleType:
     return module
 
 
-def _checked(name: str, value: object) -> Method:
-    if not isinstance(value, Method):
+def _checked(name: str, value: object) -> AnyMethod:
+    if not isinstance(value, Method | MultiViewMethod):
         raise MethodError(f"{name}: is {type(value).__name__}, expected a rebar_depth_bench.methods.Method")
     return value
 

@@ -9,15 +9,15 @@ TIP 2014, guided by the left picture, with left-right consistency as confidence 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from types import ModuleType
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.methods.disparity import STEREO_COLUMNS, stereo_depth_m
 from rebar_depth_bench.methods.method import Method, MethodInfo, Predictor
 
 BLOCK_PX = 3
@@ -26,7 +26,6 @@ SEARCH_SHARE_OF_WIDTH = 0.5
 SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 96, 600
 """Per pixel of a block: higher than OpenCV's examples, for bars repeat and their background is plain."""
 PRE_FILTER_CAP = 63
-MIN_PARALLAX_PX = 1.0
 WLS_LAMBDA = 8000.0
 WLS_SIGMA_COLOUR = 2.5
 _FIXED_POINT = 16.0
@@ -39,30 +38,13 @@ def _loader(*, checked: bool) -> Callable[[], Predictor]:
         try:
             import cv2
             import cv2.ximgproc
-
-            from rebar_depth_bench import raw_stereo
         except ImportError as error:
             raise MethodError(
                 f"sgbm needs OpenCV with ximgproc ({error}): pip install 'rebar-depth-bench[methods]'"
             ) from None
-        return lambda row: (_predict if raw_stereo.is_rectified(row) else _predict_raw)(cv2, row, checked)
+        return lambda row: stereo_depth_m(row, lambda left, right: _disparity_px(cv2, left, right, checked))
 
     return load
-
-
-def _predict_raw(cv2: ModuleType, row: Mapping[str, Any], checked: bool) -> Float32[ndarray, "h w"]:
-    from rebar_depth_bench import raw_stereo
-
-    pair = raw_stereo.rectified_pair(row)
-    disparity_px = _disparity_px(cv2, pair.left_rgb, pair.right_rgb, checked)
-    depth_m = disparity_to_depth_m(disparity_px, pair.K, pair.K, pair.baseline_m)
-    depth_m[~raw_stereo.matched_in_right(pair, disparity_px)] = np.nan
-    return raw_stereo.raw_depth_m(pair, depth_m)
-
-
-def _predict(cv2: ModuleType, row: Mapping[str, Any], checked: bool) -> Float32[ndarray, "h w"]:
-    disparity_px = _disparity_px(cv2, row["left_rgb"], row["right_rgb"], checked)
-    return disparity_to_depth_m(disparity_px, row["left_K"], row["right_K"], row["baseline_m"])
 
 
 def _disparity_px(
@@ -88,25 +70,6 @@ def confirmed(left_px: Float32[ndarray, "h w"], right_px: Float32[ndarray, "h w"
         & (found_px > 0)
         & (np.abs(left_px - found_px) <= AGREEMENT_PX)
     )
-
-
-def disparity_to_depth_m(
-    disparity_px: Float32[ndarray, "h w"],
-    left_K: Float64[ndarray, "3 3"],
-    right_K: Float64[ndarray, "3 3"],
-    baseline_m: float,
-) -> Float32[ndarray, "h w"]:
-    """Return z = fx * B / (disparity - (cx_left - cx_right)); NaN where the parallax is below a pixel.
-
-    There a depth is worth nothing: half a pixel more or less halves or doubles it. A pixel whose match would lie
-    left of the right picture has no match: NaN as well.
-    """
-    columns = np.arange(disparity_px.shape[1], dtype=np.float64)
-    parallax_px = disparity_px - (left_K[0, 2] - right_K[0, 2])
-    matched = (disparity_px > 0) & (parallax_px >= MIN_PARALLAX_PX) & (columns - disparity_px >= 0)
-    depth_m = np.full(disparity_px.shape, np.nan, np.float32)
-    depth_m[matched] = left_K[0, 0] * baseline_m / parallax_px[matched]
-    return depth_m
 
 
 def filtered_disparities_px(
@@ -149,10 +112,7 @@ def _method(name: str, summary: str, *, checked: bool) -> Method:
     info = MethodInfo(
         name=name,
         summary=summary,
-        columns=(
-            *("left_rgb", "right_rgb", "left_K", "right_K", "left_distortion", "right_distortion"),
-            *("left_cam_from_world", "right_cam_from_world", "baseline_m"),
-        ),
+        columns=STEREO_COLUMNS,
         uses_intrinsics=True,
         source="OpenCV StereoSGBM and ximgproc",
         licence="Apache-2.0",

@@ -1,0 +1,105 @@
+"""Reference results: every method that runs on a plain CPU with nothing fetched, on a stated subset of every scene.
+
+``python -m cards.reference OUT`` renders the subset into OUT/dataset, runs the methods into OUT/NAME.zip, scores them
+and writes ``cards/reference.json``, from which the benchmark card's table is made. Hours on two cores; stopped and run
+again, it goes on: what stands in OUT is taken as it is.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import zipfile
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from dataset_builder.cli import main as rebar_build
+from rebar_depth_bench import score
+from rebar_depth_bench.cli import main as rebar_bench
+from rebar_depth_bench.files import write_text
+from rebar_depth_bench.submission.metadata import METADATA_NAME
+
+RESULTS = Path(__file__).parent / "reference.json"
+
+
+@dataclass(frozen=True)
+class Subset:
+    """What is rendered of each config: so many of its views, spread evenly, so large, with so many samples."""
+
+    views: int = 72
+    width: int = 640
+    height: int = 360
+    samples: int = 4
+
+
+SUBSET = Subset()
+WITH_BOARD = ("lattice", "pile")
+ALL = (*WITH_BOARD, "pier")
+
+RUNS: Mapping[str, tuple[str, ...]] = {
+    "sgbm": ALL,
+    "sgbm-filled": ALL,
+    "sweep-aruco": WITH_BOARD,
+    "sweep-anchored": ALL,
+    "lidar-survey": ALL,
+    "lidar-mobile": ALL,
+    "constant": ALL,
+    "board-plane": WITH_BOARD,
+    "noisy-truth": ALL,
+    "truth": ALL,
+}
+"""Which method runs on which configs: those without a board cannot serve all."""
+
+
+def main(out: Path) -> int:
+    """Make what is missing and write the results; return the exit status."""
+    root = out / "dataset"
+    size = ("--width", SUBSET.width, "--height", SUBSET.height, "--samples", SUBSET.samples)
+    build = ("--out", root, "--config", *ALL, "--views", SUBSET.views, *size)
+    if status := rebar_build(list(map(str, build))):
+        return status
+    for method, configs in RUNS.items():
+        archive = out / f"{method}.zip"
+        predict = ("predict", method, "--data", root, "--out", archive, "--config", *configs)
+        if not archive.is_file() and (status := rebar_bench(list(map(str, predict)))):
+            return status
+    results = {method: _result(out / f"{method}.zip", root) for method in RUNS}
+    found = {"command": "python -m cards.reference OUT", "subset": asdict(SUBSET), "results": results}
+    write_text(RESULTS, json.dumps(found, indent=1, allow_nan=False) + "\n")
+    return 0
+
+
+def _result(archive: Path, root: Path) -> dict[str, Any]:
+    """Return a result's JSON without its views, and the archive's own account of time and cameras."""
+    result = {key: value for key, value in score(archive, root).to_dict().items() if key != "views"}
+    with zipfile.ZipFile(archive) as source:
+        told = json.loads(source.read(METADATA_NAME))
+    seconds = told["runtime"]["seconds"].values()
+    return {
+        **result,
+        "notes": told.get("notes"),
+        "seconds": {
+            "a_view": round(statistics.median(seconds), 3),
+            "preparing": told["runtime"].get("preparing"),
+        },
+    }
+
+
+def reference_rows() -> list[dict[str, Any]]:
+    """Return the rows of the card's table from the stored results: a config, a method, its numbers."""
+    stored = json.loads(RESULTS.read_text())
+    return [
+        {"config": config, "method": method, **result["tables"][config]}
+        for config in ALL
+        for method, result in stored["results"].items()
+        if config in result["tables"]
+    ]
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: python -m cards.reference OUT")
+    sys.exit(main(Path(sys.argv[1])))

@@ -1,0 +1,60 @@
+"""Dense depth with COLMAP's PatchMatch stereo. It needs CUDA: ``pycolmap-cuda12`` in place of ``pycolmap``.
+
+Never run where it was written, which has no CUDA; only the reader of its depth maps is tested.
+Source: J. L. Schoenberger et al., "Pixelwise View Selection for Unstructured Multi-View Stereo", ECCV 2016.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float32
+from numpy import ndarray
+
+from rebar_depth_bench.errors import MethodError
+
+_HEADER = re.compile(rb"(\d{1,6})&(\d{1,6})&(\d)&")
+_HEADER_BYTES = 24
+
+
+def require_cuda() -> None:
+    """Raise ``MethodError`` where COLMAP was built without CUDA."""
+    if not pycolmap.has_cuda:
+        raise MethodError(
+            "COLMAP's PatchMatch stereo needs CUDA, which this pycolmap was built without: on a machine with an "
+            "NVIDIA GPU, pip install pycolmap-cuda12 in its place; on a CPU use sweep-aruco or sweep-anchored"
+        )
+
+
+def patch_match(images: Path, model: Path, work: Path) -> Path:
+    """Run PatchMatch with its geometric consistency on a sparse model; return the folder of its depth maps.
+
+    What an interrupted run has done is kept by COLMAP itself: views whose maps are there are passed over.
+    """
+    dense = work / "dense"
+    if not (dense / "stereo" / "fusion.cfg").is_file():
+        pycolmap.undistort_images(dense, model, images)
+    pycolmap.patch_match_stereo(dense)
+    return dense / "stereo" / "depth_maps"
+
+
+def read_depth_map(path: Path) -> Float32[ndarray, "h w"]:
+    """Return a depth map of COLMAP's ``.bin``, in the reconstruction's unit, NaN where it has none.
+
+    The format is the text ``WIDTH&HEIGHT&CHANNELS&`` and then float32, little-endian, row by row, plane by plane.
+    Raises ``MethodError`` for any other file.
+    """
+    data = path.read_bytes()
+    header = _HEADER.match(data[:_HEADER_BYTES])
+    width, height, channels = (int(number) for number in header.groups()) if header else (0, 0, 0)
+    body = data[header.end() :] if header else b""
+    if channels != 1 or len(body) != 4 * width * height:
+        raise MethodError(
+            f"{path}: is no depth map of COLMAP: {len(data)} bytes that start with {data[:_HEADER_BYTES]!r}, "
+            "expected WIDTH&HEIGHT&1& and as many float32"
+        )
+    depth = np.frombuffer(body, "<f4").reshape(height, width)
+    return np.where(depth > 0, depth, np.float32(np.nan))

@@ -1,0 +1,99 @@
+"""Metres from triangulated markers: exact on exact corners, a wrong one left out, too few refused in words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from rebar_depth_bench.aruco import Corners
+from rebar_depth_bench.board import BoardSpec, marker_corners_m
+from rebar_depth_bench.cameras import ideal_K, look_at, project, transform
+from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.methods.multiview.pose_report import pose_report
+from rebar_depth_bench.methods.multiview.scale import board_fit, triangulated
+from rebar_depth_bench.methods.multiview.similarity import Similarity
+
+K = ideal_K(1280, 720)
+BOARD = BoardSpec()
+TRUTH = {
+    f"{k:04d}.png": look_at(
+        np.array([0.5 * np.cos(turn), 0.5 * np.sin(turn), 0.3 + 0.02 * k]), np.array([0.0, 0.0, 0.05])
+    )
+    for k, turn in enumerate(np.radians(np.arange(0, 120, 15)))
+}
+
+
+def reconstruction(unit_m: float, turn: tuple[float, float, float]) -> tuple[dict[str, np.ndarray], Similarity]:
+    """The true cameras in another frame and unit, and the way back to metres."""
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    away = Similarity(1 / unit_m, rotation, np.array([3.0, -1.0, 2.0]))
+    back = Similarity(unit_m, rotation.T, -unit_m * rotation.T @ away.translation)
+    return {name: away.pose(pose) for name, pose in TRUTH.items()}, back
+
+
+def seen_corners() -> dict[str, Corners]:
+    return {
+        name: {marker: project(K, transform(pose, corners)) for marker, corners in marker_corners_m(BOARD).items()}
+        for name, pose in TRUTH.items()
+    }
+
+
+@given(st.floats(0.01, 50.0), st.tuples(*[st.floats(-3.0, 3.0)] * 3))
+def test_exact_corners_give_the_exact_scale_and_the_cameras_in_the_boards_frame(
+    unit_m: float, turn: tuple[float, float, float]
+) -> None:
+    poses, back = reconstruction(unit_m, turn)
+    fit = board_fit(seen_corners(), poses, K, BOARD)
+    assert fit.metric.scale == pytest.approx(unit_m, rel=1e-8)
+    assert fit.metric.translation == pytest.approx(back.translation, abs=1e-6 * max(unit_m, 1))
+    assert fit.markers == tuple(range(6))
+    assert fit.rms_m < 1e-8
+    told = pose_report(poses, TRUTH, fit.metric)
+    assert abs(told["scale_error_percent"]) < 1e-4
+    assert told["centre_error_mm"]["largest"] < 1e-3
+    assert told["rotation_error_deg"]["largest"] < 1e-3
+
+
+def test_the_report_tells_a_scale_that_is_off_and_cameras_that_are() -> None:
+    """With a scale 2 % too large about the origin every centre is off by 2 % of its distance from it."""
+    poses, _ = reconstruction(0.07, (0.1, 0.2, 0.3))
+    right = board_fit(seen_corners(), poses, K, BOARD).metric
+    wrong = Similarity(1.02 * right.scale, right.rotation, 1.02 * right.translation)
+    told = pose_report(poses, TRUTH, wrong)
+    distances_m = [np.linalg.norm(pose[:3, :3].T @ pose[:3, 3]) for pose in TRUTH.values()]
+    assert told["scale_error_percent"] == pytest.approx(2.0, abs=1e-3)
+    assert told["centre_error_mm"]["largest"] == pytest.approx(20 * max(distances_m), rel=1e-3)
+    assert told["cameras_compared"] == "in the board's frame"
+    alone = pose_report(poses, TRUTH, 1.02 * right.scale)
+    assert alone["scale_error_percent"] == pytest.approx(2.0, abs=1e-3)
+    assert alone["centre_error_mm"]["largest"] < 1e-3
+    assert alone["cameras_compared"] == "after the best similarity"
+
+
+def test_a_wrong_corner_in_one_view_is_left_out() -> None:
+    poses, _ = reconstruction(0.07, (0.1, 0.2, 0.3))
+    corners = seen_corners()
+    name = next(iter(corners))
+    corners[name] = {marker: quad + np.array([9.0, -7.0]) for marker, quad in corners[name].items()}
+    fit = board_fit(corners, poses, K, BOARD)
+    assert fit.metric.scale == pytest.approx(0.07, rel=1e-6)
+
+
+def test_views_that_look_the_same_way_triangulate_nothing() -> None:
+    pose = look_at(np.array([0.5, 0.0, 0.3]), np.zeros(3))
+    pixel = project(K, transform(pose, np.zeros(3)))
+    assert triangulated([pixel] * 4, [pose] * 4, K) is None
+    poses = list(TRUTH.values())
+    assert triangulated([project(K, transform(one, np.zeros(3))) for one in poses[:2]], poses[:2], K) is None
+    found = triangulated([project(K, transform(one, np.zeros(3))) for one in poses], poses, K)
+    assert found == pytest.approx(np.zeros(3), abs=1e-9)
+
+
+def test_too_few_markers_are_refused_in_words() -> None:
+    poses, _ = reconstruction(1.0, (0.0, 0.0, 0.0))
+    corners = {name: {3: found[3]} for name, found in seen_corners().items()}
+    with pytest.raises(MethodError, match=r"of the board's 6 markers 1 can be triangulated .*expected at least 2"):
+        board_fit(corners, poses, K, BOARD)

@@ -1,0 +1,81 @@
+"""Files of the Hub: fetched once with a word first, then from its cache in silence, or a reason why not."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from tests.stand_in_models import unidepth_weights
+from tests.test_checkpoints import COMMIT, Hub
+
+ASK = """
+import sys
+from rebar_depth_bench.console import run_command
+from rebar_depth_bench.methods.hub_folders import hub_folder
+
+def run():
+    print(hub_folder(sys.argv[1], ("config.json", "model.safetensors"), "mine:FOLDER").name)
+
+sys.exit(run_command(run))
+"""
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Serve a model with a file that nobody asks for; yield the address and what was asked."""
+    folder, asked = unidepth_weights(tmp_path / "model"), list[str]()
+    (folder / "pytorch_model.bin").write_bytes(b"the same once more")
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Hub, folder, asked))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}", asked
+    server.shutdown()
+    server.server_close()
+
+
+def ask(repository: str, home: Path, endpoint: str, offline: str) -> subprocess.CompletedProcess[str]:
+    settings = {
+        "HF_HOME": str(home),
+        "HF_ENDPOINT": endpoint,
+        "HF_HUB_OFFLINE": offline,
+        "HF_HUB_DISABLE_XET": "1",
+    }
+    quiet = {"HF_HUB_DISABLE_PROGRESS_BARS": "1", "HF_HUB_DISABLE_TELEMETRY": "1", "NO_PROXY": "127.0.0.1"}
+    command = [sys.executable, "-c", ASK, repository]
+    environment = os.environ | settings | quiet
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_fetched_once_and_then_from_the_cache(hub: tuple[str, list[str]], tmp_path: Path) -> None:
+    endpoint, asked = hub
+    first = ask("org/model", tmp_path / "home", endpoint, offline="0")
+    assert (first.returncode, first.stdout) == (0, f"{COMMIT}\n"), first.stderr
+    assert f"org/model: fetching config.json and model.safetensors from {endpoint}\n" in first.stderr
+    assert any("model.safetensors" in request for request in asked)
+    assert not any("pytorch_model.bin" in request for request in asked)
+    del asked[:]
+    second = ask("org/model", tmp_path / "home", endpoint, offline="1")
+    assert (second.returncode, second.stdout) == (0, f"{COMMIT}\n"), second.stderr
+    assert "fetching" not in second.stderr
+    assert asked == []
+    [weights] = tmp_path.glob("home/hub/models--*/snapshots/*/model.safetensors")
+    weights.unlink()
+    third = ask("org/model", tmp_path / "home", endpoint, offline="1")
+    assert third.returncode == 2
+    assert "HF_HUB_OFFLINE is set: unset it, or fetch them elsewhere and name their folder: mine:F" in third.stderr
+
+
+def test_what_the_hub_does_not_have(hub: tuple[str, list[str]], tmp_path: Path) -> None:
+    endpoint, _ = hub
+    finished = ask("org/other", tmp_path / "home", endpoint, offline="0")
+    assert finished.returncode == 2
+    assert f"org/other: cannot be fetched from {endpoint}: RepositoryNotFoundError" in finished.stderr
+    assert "or a local copy: mine:FOLDER" in finished.stderr
+    assert "Traceback" not in finished.stderr
