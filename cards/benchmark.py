@@ -6,13 +6,18 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+from cards.reference_table import reference_context
 from cards.templates import render
+from dataset_builder.lidar import LIDAR_MOBILE, LIDAR_SURVEY
 from rebar_depth_bench.bootstrap import DRAWS, MIN_VIEWS, RING_VIEWS
 from rebar_depth_bench.extended.evaluation import FAMILIES, ONCE, Family
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.tolerances import PROFILES
-from rebar_depth_bench.methods import METHODS
+from rebar_depth_bench.methods import METHODS, AnyMethod
 from rebar_depth_bench.protocol import DELTA1_RATIO, MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
+
+SCANNERS: Sequence[AnyMethod] = (LIDAR_SURVEY, LIDAR_MOBILE)
+"""Those that the builder offers by entry points."""
 
 _STEP = re.compile(r"(?<=_)\d[\d.]*(?:-[\d.]+)?(?=(?:mm|pct|m|px)$)")
 """The tolerance, threshold or bin that a measure's name ends with."""
@@ -26,7 +31,8 @@ def benchmark_card() -> str:
         delta1_ratio=DELTA1_RATIO,
         min_ranked_coverage=MIN_RANKED_COVERAGE,
         within_mm=WITHIN_MM,
-        methods=[method.info for method in METHODS.values()],
+        methods=[*METHODS.values(), *SCANNERS],
+        **reference_context(),
         draws=DRAWS,
         ring_views=RING_VIEWS,
         min_views=MIN_VIEWS,

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cards.benchmark import SCANNERS
 from dataset_builder.appearance import VARIANTS
 from dataset_builder.cli import argument_parser as build_parser
 from dataset_builder.configs import CONFIGS, SWEEPS
@@ -65,6 +66,7 @@ def test_tables_name_every_config_variant_and_method() -> None:
         *CONFIGS,
         *SWEEPS,
         *METHODS,
+        *(method.info.name for method in SCANNERS),
         *VARIANTS,
     }
     assert all(f"| `{variant.name}` | {variant.words} |" in readme for variant in VARIANTS.values())

@@ -8,7 +8,9 @@ import signal
 import subprocess
 import sys
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +18,17 @@ import pytest
 from rebar_depth_bench import score
 from rebar_depth_bench.cli import main
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods import METHODS, all_methods, find_method
+from rebar_depth_bench.methods import (
+    METHODS,
+    ConfigViews,
+    MethodInfo,
+    MultiViewMethod,
+    Prepared,
+    all_methods,
+    find_method,
+)
 from rebar_depth_bench.predict import predict
+from rebar_depth_bench.progress import Progress
 
 OWN = """
 import time
@@ -179,3 +190,68 @@ def test_controls_that_know_the_answer_score_as_they_should(tiny_root: Path, tmp
     assert noisy.scale_median == pytest.approx(0.8, rel=2e-3)
     assert noisy.native.abs_rel == pytest.approx(0.25, rel=0.01)
     assert noisy.scaled.abs_rel == pytest.approx(0.01 * (2 / np.pi) ** 0.5, rel=0.05)  # of a Gaussian
+
+
+def whole_config(log: list[str], *, unfit: str = "") -> MultiViewMethod:
+    """Answers with the number of views that its config has; notes what it was asked for."""
+
+    def check(views: ConfigViews) -> None:
+        log.append(f"check {views.config}")
+        if views.config == unfit:
+            raise MethodError(f"{views.config}: does not fit")
+
+    def prepare(views: ConfigViews, work: Path, progress: Progress) -> Prepared:
+        log.append(f"prepare {views.config} {(work / 'kept').exists()}")
+        (work / "kept").touch()
+        progress("preparing", 1, 1)
+        counted = sum(row["left_K"].shape == (3, 3) for row in views.rows("left_K"))
+        assert counted == len(views.view_ids)
+
+        def run(row: Mapping[str, Any]) -> np.ndarray:
+            assert set(row) == {"view_id"}
+            log.append(row["view_id"])
+            return np.full(views.grid, counted, np.float32)
+
+        return Prepared(run, {"counted": counted})
+
+    return MultiViewMethod(MethodInfo("whole", "a test", (), False, "here", "MIT"), prepare, check)
+
+
+def test_a_method_of_all_views_is_prepared_once_a_config(tiny_root: Path, tmp_path: Path) -> None:
+    log: list[str] = []
+    archive = tmp_path / "whole.zip"
+    prepared = predict(whole_config(log), tiny_root, archive)
+    assert log[:3] == ["check lattice", "check lattice-orbit", "prepare lattice False"]
+    assert log.count("prepare lattice False") == log.count("prepare lattice-orbit False") == 1
+    assert len(log) == 4 + 9 + 2
+    assert {name: found.notes for name, found in prepared.items()} == {
+        "lattice": {"counted": 9},
+        "lattice-orbit": {"counted": 2},
+    }
+    with zipfile.ZipFile(archive) as source:
+        told = json.loads(source.read("submission.json"))
+    assert told["notes"] == {"lattice": {"counted": 9}, "lattice-orbit": {"counted": 2}}
+    assert set(told["runtime"]["preparing"]) == {"lattice", "lattice-orbit"}
+    assert score(archive, tiny_root).tables["lattice"].ranked
+
+
+def test_what_it_keeps_is_there_again_and_finished_configs_are_left_alone(tiny_root: Path, tmp_path: Path) -> None:
+    def stop(what: str, done: int, _: int) -> None:
+        if what == "whole on lattice-orbit" and done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        predict(whole_config([]), tiny_root, tmp_path / "whole.zip", progress=stop)
+    log: list[str] = []
+    prepared = predict(whole_config(log), tiny_root, tmp_path / "whole.zip")
+    assert log[2:] == ["prepare lattice-orbit True", score_views(tiny_root)[1]]
+    assert set(prepared) == {"lattice", "lattice-orbit"}
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.zip"]
+
+
+def test_a_config_that_does_not_fit_stops_the_run_before_it_begins(tiny_root: Path, tmp_path: Path) -> None:
+    log: list[str] = []
+    with pytest.raises(MethodError, match="lattice-orbit: does not fit"):
+        predict(whole_config(log, unfit="lattice-orbit"), tiny_root, tmp_path / "whole.zip")
+    assert log == ["check lattice", "check lattice-orbit"]
+    assert not list(tmp_path.iterdir())

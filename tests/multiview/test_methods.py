@@ -40,7 +40,7 @@ def work(orbit_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a run that was stopped at the fifth view leaves: ``sweep-aruco.zip`` is not there yet."""
     folder = tmp_path_factory.mktemp("sweep")
 
-    def stop(what: str, done: int, total: int) -> None:
+    def stop(what: str, done: int, _: int) -> None:
         if what == "sweep-aruco on lattice-orbit" and done == 5:
             raise KeyboardInterrupt
 

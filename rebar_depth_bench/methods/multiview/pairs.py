@@ -1,8 +1,8 @@
 """Which pictures to match with which: those that, by the board's markers, are turned little against each other.
 
-A lattice looks nearly the same after a quarter or half a turn. On 24 views of it, 512 x 288, opposite views match with
-up to 74 inliers, where neighbours 15 degrees apart have 85 to 177: no count of inliers keeps them apart at every size,
-and COLMAP registers views on the wrong side. Markers carry names, which steel does not.
+A lattice looks nearly the same after a quarter or half a turn. On 24 views of it, 512 x 288, opposite views match
+with up to 74 inliers, where neighbours 15 degrees apart have 85 to 177: no count of inliers keeps them apart at
+every size, and COLMAP registers views on the wrong side. Markers carry names, which steel does not.
 """
 
 from __future__ import annotations
