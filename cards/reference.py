@@ -50,7 +50,7 @@ RUNS: Mapping[str, tuple[str, ...]] = {
     "noisy-truth": ALL,
     "truth": ALL,
 }
-"""Which method runs on which configs. The pier has no board, and only there the truth anchors; the surveyor's scanner
+"""Which method runs on which configs. The pier has no board: only there the truth anchors. The surveyor's scanner
 has no answer on the lattice, and takes too long for all."""
 
 
