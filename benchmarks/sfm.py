@@ -19,7 +19,7 @@ from benchmarks.timing import machine, print_markdown
 from rebar_depth_bench.folder import open_folder
 from rebar_depth_bench.methods import ConfigViews
 from rebar_depth_bench.methods.multiview.pictures import write_pictures
-from rebar_depth_bench.methods.multiview.pose_report import pose_report, true_similarity
+from rebar_depth_bench.methods.multiview.pose_report import placed_report, scaled_report, true_similarity
 from rebar_depth_bench.methods.multiview.run import pictured_structure
 from rebar_depth_bench.methods.multiview.scale import board_fit
 
@@ -39,11 +39,11 @@ def main(root: str, config: str = "lattice-orbit") -> None:
         ("features, matches, mapping", f"{seconds:.1f} s"),
     ]
     true = true_similarity(structure.cam_from_sfm, pictures.cam_from_world)
-    found = pose_report(structure.cam_from_sfm, pictures.cam_from_world, true.scale)
+    found = scaled_report(structure.cam_from_sfm, pictures.cam_from_world, true.scale)
     rows += _told(found, "after the best similarity")
     if views.board is not None:
         fit = board_fit(pictures.markers, structure.cam_from_sfm, pictures.grid.K, views.board)
-        found = pose_report(structure.cam_from_sfm, pictures.cam_from_world, fit.metric)
+        found = placed_report(structure.cam_from_sfm, pictures.cam_from_world, fit.metric)
         rows += [
             ("markers", f"{len(fit.markers)} of {views.board.markers}, {1000 * fit.rms_m:.3f} mm rms"),
             ("scale from the board", f"{found['scale_error_percent']:+.4f} % off"),

@@ -8,16 +8,12 @@ from typing import Any
 
 from cards.reference_table import reference_context
 from cards.templates import render
-from dataset_builder.lidar import LIDAR_MOBILE, LIDAR_SURVEY
 from rebar_depth_bench.bootstrap import DRAWS, MIN_VIEWS, RING_VIEWS
 from rebar_depth_bench.extended.evaluation import FAMILIES, ONCE, Family
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.tolerances import PROFILES
-from rebar_depth_bench.methods import METHODS, AnyMethod
+from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, own_methods
 from rebar_depth_bench.protocol import DELTA1_RATIO, MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
-
-SCANNERS: Sequence[AnyMethod] = (LIDAR_SURVEY, LIDAR_MOBILE)
-"""Those that the builder offers by entry points."""
 
 _STEP = re.compile(r"(?<=_)\d[\d.]*(?:-[\d.]+)?(?=(?:mm|pct|m|px)$)")
 """The tolerance, threshold or bin that a measure's name ends with."""
@@ -31,7 +27,7 @@ def benchmark_card() -> str:
         delta1_ratio=DELTA1_RATIO,
         min_ranked_coverage=MIN_RANKED_COVERAGE,
         within_mm=WITHIN_MM,
-        methods=[*METHODS.values(), *SCANNERS],
+        methods=[_method_row(method) for method in own_methods().values()],
         **reference_context(),
         draws=DRAWS,
         ring_views=RING_VIEWS,
@@ -40,6 +36,14 @@ def benchmark_card() -> str:
         families=[_family_rows(family) for family in FAMILIES.values()],
         profiles=PROFILES,
     )
+
+
+def _method_row(method: AnyMethod) -> dict[str, str]:
+    info = method.info
+    name = f"`{info.name}`{' †' if info.reads_truth else ''}"
+    what = f"{info.summary} ({info.unexercised})" if info.unexercised else info.summary
+    needs = "all views of a config" if isinstance(method, MultiViewMethod) else ", ".join(info.columns)
+    return {"name": name, "what": what, "needs": needs, "licence": info.licence}
 
 
 def _family_rows(family: Family) -> dict[str, Any]:

@@ -39,8 +39,9 @@ def _row(method: str, result: Mapping[str, Any], config: str, table: Mapping[str
 
 def _seconds(result: Mapping[str, Any], config: str, views: int) -> str:
     """Return the seconds a view takes, with its share of what was prepared for all of them."""
-    preparing = result["seconds"]["preparing"] or {}
-    return f"{result['seconds']['a_view'] + preparing.get(config, 0.0) / views:.2g}"
+    spent = result["seconds"]
+    preparing = (spent["preparing"] or {}).get(config, 0.0)
+    return "-" if preparing is None else f"{spent['a_view'][config] + preparing / views:.2g}"
 
 
 def _number(value: float | None, digits: int, unit: str = "") -> str:

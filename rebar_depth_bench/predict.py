@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,19 +45,19 @@ def predict(
     target = Path(archive)
     key = {
         "method": vars(method.info),
-        "dataset": {name: folder.config(name)["ground_truth_digest"] for name in names},
+        "dataset": {name: [folder.config(name)[of] for of in ("key", "ground_truth_digest")] for name in names},
         "software": software_version(),
     }
     if isinstance(method, MultiViewMethod):
         for name in names:
             method.check(ConfigViews(folder, name))
+    loaded = method.load() if isinstance(method, Method) else None  # before anything is written
     views = PredictedViews.open(target.with_name(f".{target.name}.views"), key)
-    predictor = _predictors(method, folder, views, progress)
     for name in names:
         done = [view.view_id for view in folder.views(name) if view.view_id in views]
         if len(done) == totals[name]:
             continue
-        run = predictor(name)
+        run = loaded or _prepared(method, ConfigViews(folder, name), views, progress)
         for count, row in enumerate(_missing(method, folder, name, set(done)), start=len(done) + 1):
             start = time.perf_counter()
             depth_m = _checked(method, row["view_id"], run(row), folder.grid(name))
@@ -69,22 +69,17 @@ def predict(
     return prepared
 
 
-def _predictors(
-    method: AnyMethod, folder: DatasetFolder, views: PredictedViews, progress: Progress
-) -> Callable[[str], Predictor]:
-    """Return what makes a config's predictor: a method of single views is loaded once for all of them."""
-    if isinstance(method, Method):
-        run = method.load()
-        return lambda _: run
-
-    def prepare(config: str) -> Predictor:
-        start = time.perf_counter()
-        prepared = method.prepare(ConfigViews(folder, config), views.work(config), progress)
-        if views.get_preparation(config) is None:  # a run that goes on finds most of the work done
-            views.put_preparation(config, Preparation(prepared.notes, round(time.perf_counter() - start, 1)))
-        return prepared.predict
-
-    return prepare
+def _prepared(method: AnyMethod, config: ConfigViews, views: PredictedViews, progress: Progress) -> Predictor:
+    """Have a method look at all views of a config, and keep its notes."""
+    assert isinstance(method, MultiViewMethod)
+    work = views.work(config.config)
+    afresh = not any(work.iterdir())
+    start = time.perf_counter()
+    prepared = method.prepare(config, work, progress)
+    if views.get_preparation(config.config) is None:
+        seconds = round(time.perf_counter() - start, 1)
+        views.put_preparation(config.config, Preparation(prepared.notes, seconds if afresh else None))
+    return prepared.predict
 
 
 def _missing(method: AnyMethod, folder: DatasetFolder, config: str, done: set[str]) -> Iterator[dict[str, Any]]:

@@ -21,10 +21,13 @@ _KEY = "key.json"
 
 @dataclass(frozen=True)
 class Preparation:
-    """What a method that sees a whole config found on the way, plain JSON values, and how long it took."""
+    """What a method that sees a whole config found on the way, plain JSON values, and how long it took.
+
+    ``seconds`` is None where an interrupted run left part of the work done.
+    """
 
     notes: Mapping[str, Any]
-    seconds: float
+    seconds: float | None
 
 
 @dataclass(frozen=True)

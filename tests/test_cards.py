@@ -11,7 +11,7 @@ import yaml
 import rebar_depth_bench as rdb
 from cards import benchmark_card, dataset_card
 from cards.dataset import column_rows
-from rebar_depth_bench.methods import METHODS
+from rebar_depth_bench.methods import own_methods
 from rebar_depth_bench.schema import features
 
 
@@ -21,7 +21,7 @@ def test_the_benchmark_card_in_the_repository_is_up_to_date() -> None:
 
 def test_the_benchmark_card_names_every_method_and_rule() -> None:
     card = benchmark_card()
-    assert all(f"| `{name}` |" in card for name in METHODS)
+    assert all(f"| `{name}`" in card for name in own_methods())
     assert "max(p/z, z/p) < 1.25" in card
     assert "t = 3, 5, 10, 20 mm" in card
     assert "at least 0.95" in card

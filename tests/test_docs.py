@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cards.benchmark import SCANNERS
 from dataset_builder.appearance import VARIANTS
 from dataset_builder.cli import argument_parser as build_parser
 from dataset_builder.configs import CONFIGS, SWEEPS
 from rebar_depth_bench.cli import argument_parser as bench_parser
-from rebar_depth_bench.methods import METHODS, find_method
+from rebar_depth_bench.methods import find_method, own_methods
 from tests.predictors import loaded
 
 PAGES = [Path("README.md"), Path("CONTRIBUTING.md"), Path("ARCHITECTURE.md"), Path("cards/BENCHMARK.md")]
@@ -65,8 +64,7 @@ def test_tables_name_every_config_variant_and_method() -> None:
     assert set(re.findall(r"^\| `([\w-]+)` \|", readme, flags=re.MULTILINE)) == {
         *CONFIGS,
         *SWEEPS,
-        *METHODS,
-        *(method.info.name for method in SCANNERS),
+        *own_methods(),
         *VARIANTS,
     }
     assert all(f"| `{variant.name}` | {variant.words} |" in readme for variant in VARIANTS.values())

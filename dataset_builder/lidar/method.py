@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,6 +23,7 @@ from rebar_depth_bench.methods import ConfigViews, MethodInfo, MultiViewMethod, 
 from rebar_depth_bench.ply import read_mesh_ply
 from rebar_depth_bench.progress import Progress
 
+_DIGITS = 12
 _COLUMNS = ("left_K", "left_distortion", "left_cam_from_world")
 
 
@@ -58,8 +61,13 @@ def lidar_method(name: str, spec: ScannerSpec, what: str) -> MultiViewMethod:
         " known exactly; reads the scene's mesh: a simulation, no measurement of pictures; no answer below"
         f" {spec.min_range_m:g} m"
     )
-    info = MethodInfo(name, summary, _COLUMNS, True, "this project", "Apache-2.0")
+    source = f"this project, scanner {_digest(spec)}"  # two scanners of one name are two methods
+    info = MethodInfo(name, summary, _COLUMNS, True, source, "Apache-2.0", reads_truth=True)
     return MultiViewMethod(info, prepare, check)
+
+
+def _digest(spec: ScannerSpec) -> str:
+    return hashlib.sha256(json.dumps(spec.notes(), sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 
 LIDAR_SURVEY = lidar_method("lidar-survey", SURVEY, "surveyor's phase-shift class (FARO Focus S)")

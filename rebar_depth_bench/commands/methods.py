@@ -34,8 +34,10 @@ def run(_: argparse.Namespace) -> None:
             table.add_row(name, f"cannot be used: {method}", "", "")
             continue
         info = method.info
-        table.add_row(name, _what_it_does(method), _needs(info.columns), f"{info.source}\n{info.licence}")
+        shown = f"{name} †" if info.reads_truth else name
+        table.add_row(shown, _what_it_does(method), _needs(info.columns), f"{info.source}\n{info.licence}")
     Console().print(table)
+    Console().print("† is told some of the truth: its numbers stand for no instrument")
 
 
 def _what_it_does(method: AnyMethod) -> Text:

@@ -1,7 +1,7 @@
 """Methods by name: those that come with the bench, and anyone's."""
 
 from rebar_depth_bench.methods.config_views import ConfigViews
-from rebar_depth_bench.methods.finding import METHODS, all_methods, find_method
+from rebar_depth_bench.methods.finding import METHODS, all_methods, find_method, own_methods
 from rebar_depth_bench.methods.method import (
     AnyMethod,
     Method,
@@ -22,4 +22,5 @@ __all__ = [
     "Prepared",
     "all_methods",
     "find_method",
+    "own_methods",
 ]

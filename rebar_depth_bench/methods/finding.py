@@ -10,10 +10,12 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
 
+from rebar_depth_bench.digests import file_sha256
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.board_plane import BOARD_PLANE
 from rebar_depth_bench.methods.constant import CONSTANT
@@ -34,6 +36,8 @@ from rebar_depth_bench.methods.truth import NOISY_TRUTH, TRUTH
 from rebar_depth_bench.methods.unidepth import UNIDEPTH, unidepth_method
 
 GROUP = "rebar_depth_bench.methods"
+DISTRIBUTION = "rebar-depth-bench"
+_DIGITS = 16
 
 METHODS: Mapping[str, AnyMethod] = {
     method.info.name: method
@@ -68,7 +72,7 @@ def find_method(name: str) -> AnyMethod:
         return LOCATED[known_as](Path(place).expanduser())
     path, colon, attribute = name.rpartition(":")
     if colon and path.endswith(".py"):
-        return _checked(name, getattr(_module(Path(path)), attribute, None))
+        return _of_file(Path(path), _checked(name, getattr(_module(Path(path)), attribute, None)))
     if name.endswith(".toml"):
         return onnx_method(Path(name))
     if name in METHODS:
@@ -94,6 +98,12 @@ def all_methods() -> dict[str, AnyMethod | MethodError]:
     return found
 
 
+def own_methods() -> dict[str, AnyMethod]:
+    """Return the methods of this distribution by name: the bench's, and those its other packages offer."""
+    offered = {name: entry for name, entry in _offered().items() if entry.dist and entry.dist.name == DISTRIBUTION}
+    return {**METHODS, **{name: _loaded(entry) for name, entry in offered.items()}}
+
+
 def _offered() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in METHODS}
 
@@ -104,6 +114,12 @@ def _loaded(entry: EntryPoint) -> AnyMethod:
     except Exception as error:  # whatever a stranger's module raises when it is imported
         raise MethodError(f"{entry.name}: {entry.value} cannot be imported: {_words(error)}") from error
     return _checked(entry.name, value)
+
+
+def _of_file(path: Path, method: AnyMethod) -> AnyMethod:
+    """Name the file's digest in the source: a run that goes on does not mix what two versions answered."""
+    source = f"{method.info.source} ({path.name} sha256:{file_sha256(path)[:_DIGITS]})"
+    return replace(method, info=replace(method.info, source=source))
 
 
 def _module(path: Path) -> ModuleType:

@@ -21,7 +21,8 @@ Predictor = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]
 class MethodInfo:
     """What people should know of a method before they run it or read its numbers.
 
-    ``unexercised`` says what of it never ran where it was written: weights or hardware that were not there.
+    ``reads_truth``: it is told some of what it is asked, so its numbers stand for no instrument. ``unexercised``
+    says what of it never ran where it was written: weights or hardware that were not there.
     """
 
     name: str
@@ -30,6 +31,7 @@ class MethodInfo:
     uses_intrinsics: bool
     source: str
     licence: str
+    reads_truth: bool = False
     unexercised: str = ""
 
 

@@ -47,6 +47,7 @@ def _method(dense: str, anchoring: str) -> MultiViewMethod:
         uses_intrinsics=True,
         source="pycolmap" if dense == "colmap" else "pycolmap, and this project's plane sweep",
         licence="BSD-3-Clause" if dense == "colmap" else "BSD-3-Clause, Apache-2.0",
+        reads_truth=anchoring == "anchored",
         unexercised=_UNEXERCISED[dense],
     )
     return MultiViewMethod(info, prepare, lambda views: _run().check(views, dense, anchoring))

@@ -39,6 +39,7 @@ def _control(name: str, summary: str) -> MethodInfo:
         uses_intrinsics=False,
         source="this project",
         licence="Apache-2.0",
+        reads_truth=True,
     )
 
 

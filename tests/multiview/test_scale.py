@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from rebar_depth_bench.aruco import Corners
 from rebar_depth_bench.board import BoardSpec, marker_corners_m
-from rebar_depth_bench.cameras import ideal_K, look_at, project, transform
+from rebar_depth_bench.cameras import ideal_K, look_at, project, rigid, transform
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.multiview.pose_report import pose_report
+from rebar_depth_bench.methods.multiview.pose_report import placed_report, scaled_report
 from rebar_depth_bench.methods.multiview.scale import board_fit, triangulated
 from rebar_depth_bench.methods.multiview.similarity import Similarity
 
@@ -31,7 +31,14 @@ def reconstruction(unit_m: float, turn: tuple[float, float, float]) -> tuple[dic
     rotation = Rotation.from_rotvec(turn).as_matrix()
     away = Similarity(1 / unit_m, rotation, np.array([3.0, -1.0, 2.0]))
     back = Similarity(unit_m, rotation.T, -unit_m * rotation.T @ away.translation)
-    return {name: away.pose(pose) for name, pose in TRUTH.items()}, back
+    return {name: seen_from(away, pose) for name, pose in TRUTH.items()}, back
+
+
+def seen_from(moved: Similarity, pose: np.ndarray) -> np.ndarray:
+    """The rigid pose of a camera that a similarity has moved: its centre goes where a point goes."""
+    rotation = pose[:3, :3] @ moved.rotation.T
+    centre = moved.points(-pose[:3, :3].T @ pose[:3, 3])
+    return rigid(rotation, -rotation @ centre)
 
 
 def seen_corners() -> dict[str, Corners]:
@@ -51,7 +58,7 @@ def test_exact_corners_give_the_exact_scale_and_the_cameras_in_the_boards_frame(
     assert fit.metric.translation == pytest.approx(back.translation, abs=1e-6 * max(unit_m, 1))
     assert fit.markers == tuple(range(6))
     assert fit.rms_m < 1e-8
-    told = pose_report(poses, TRUTH, fit.metric)
+    told = placed_report(poses, TRUTH, fit.metric)
     assert abs(told["scale_error_percent"]) < 1e-4
     assert told["centre_error_mm"]["largest"] < 1e-3
     assert told["rotation_error_deg"]["largest"] < 1e-3
@@ -62,24 +69,47 @@ def test_the_report_tells_a_scale_that_is_off_and_cameras_that_are() -> None:
     poses, _ = reconstruction(0.07, (0.1, 0.2, 0.3))
     right = board_fit(seen_corners(), poses, K, BOARD).metric
     wrong = Similarity(1.02 * right.scale, right.rotation, 1.02 * right.translation)
-    told = pose_report(poses, TRUTH, wrong)
+    told = placed_report(poses, TRUTH, wrong)
     distances_m = [np.linalg.norm(pose[:3, :3].T @ pose[:3, 3]) for pose in TRUTH.values()]
     assert told["scale_error_percent"] == pytest.approx(2.0, abs=1e-3)
     assert told["centre_error_mm"]["largest"] == pytest.approx(20 * max(distances_m), rel=1e-3)
     assert told["cameras_compared"] == "in the board's frame"
-    alone = pose_report(poses, TRUTH, 1.02 * right.scale)
+    alone = scaled_report(poses, TRUTH, 1.02 * right.scale)
     assert alone["scale_error_percent"] == pytest.approx(2.0, abs=1e-3)
     assert alone["centre_error_mm"]["largest"] < 1e-3
     assert alone["cameras_compared"] == "after the best similarity"
 
 
-def test_a_wrong_corner_in_one_view_is_left_out() -> None:
+@pytest.mark.parametrize("off_px", [9.0, 200.0])
+def test_wrong_corners_in_one_view_are_left_out(off_px: float) -> None:
     poses, _ = reconstruction(0.07, (0.1, 0.2, 0.3))
     corners = seen_corners()
     name = next(iter(corners))
-    corners[name] = {marker: quad + np.array([9.0, -7.0]) for marker, quad in corners[name].items()}
+    corners[name] = {marker: quad + np.array([off_px, -off_px]) for marker, quad in corners[name].items()}
     fit = board_fit(corners, poses, K, BOARD)
     assert fit.metric.scale == pytest.approx(0.07, rel=1e-6)
+
+
+def test_views_registered_on_the_wrong_side_take_no_part() -> None:
+    """Two of eight cameras stand half a turn from where they are, as a symmetric lattice makes COLMAP put them."""
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    flipped = dict(TRUTH)
+    for name in list(TRUTH)[2:4]:
+        flipped[name] = TRUTH[name] @ half_turn
+    fit = board_fit(seen_corners(), flipped, K, BOARD)
+    assert fit.metric.scale == pytest.approx(1, rel=1e-6)
+    assert fit.markers == tuple(range(6))
+
+
+def test_a_camera_that_turns_on_one_spot_triangulates_nothing_and_one_on_a_slider_does() -> None:
+    point = np.array([0.0, 0.0, 2.0])
+    turning = [
+        rigid(Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix(), np.zeros(3)) for angle in (-0.2, 0.0, 0.2)
+    ]
+    sliding = [rigid(np.eye(3), np.array([x, 0.0, 0.0])) for x in (-0.3, 0.0, 0.3)]
+    seen = [[project(K, transform(pose, point)) for pose in poses] for poses in (turning, sliding)]
+    assert triangulated(seen[0], turning, K) is None
+    assert triangulated(seen[1], sliding, K) == pytest.approx(point, abs=1e-9)
 
 
 def test_views_that_look_the_same_way_triangulate_nothing() -> None:

@@ -1,4 +1,4 @@
-"""The similarity that lays a reconstruction on metres, and poses under it."""
+"""The similarity that lays a reconstruction on metres."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rebar_depth_bench.cameras import camera_centre, rigid, transform
-from rebar_depth_bench.methods.multiview.similarity import Similarity, rotation_deg, similarity
+from rebar_depth_bench.methods.multiview.similarity import rotation_deg, similarity
 
 ANGLE = st.floats(-3.0, 3.0)
 TURN = st.tuples(ANGLE, ANGLE, ANGLE)
@@ -30,16 +29,3 @@ def test_the_similarity_is_found_on_a_ring_and_on_a_dome(
     assert rotation_deg(found.rotation @ rotation.T) < 1e-6
     assert found.translation == pytest.approx([1.0, -2.0, 3.0], abs=1e-7 * max(scale, 1))
     assert found.points(source) == pytest.approx(target, abs=1e-7 * max(scale, 1))
-
-
-@given(TURN, TURN, st.floats(0.01, 100.0))
-def test_a_pose_under_a_similarity_sees_the_moved_points_scaled(
-    turn: tuple[float, float, float], camera_turn: tuple[float, float, float], scale: float
-) -> None:
-    """x_cam of a moved point is scale times what it was: directions stay, and the centre moves as a point does."""
-    moved = Similarity(scale, Rotation.from_rotvec(turn).as_matrix(), np.array([0.3, -0.1, 0.7]))
-    pose = rigid(Rotation.from_rotvec(camera_turn).as_matrix(), np.array([0.2, 0.1, 2.0]))
-    point = np.array([0.5, -0.4, 0.3])
-    after = moved.pose(pose)
-    assert transform(after, moved.points(point)) == pytest.approx(scale * transform(pose, point), abs=1e-9 * scale)
-    assert camera_centre(after) == pytest.approx(moved.points(camera_centre(pose)), abs=1e-9 * max(scale, 1))

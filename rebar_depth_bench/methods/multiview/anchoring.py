@@ -12,7 +12,7 @@ from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.config_views import ConfigViews
 from rebar_depth_bench.methods.multiview.dense import DepthReader
 from rebar_depth_bench.methods.multiview.pictures import LeftPictures
-from rebar_depth_bench.methods.multiview.pose_report import pose_report
+from rebar_depth_bench.methods.multiview.pose_report import placed_report, scaled_report
 from rebar_depth_bench.methods.multiview.scale import board_fit
 from rebar_depth_bench.methods.multiview.structure import Structure
 from rebar_depth_bench.protocol import interior
@@ -31,7 +31,8 @@ class Anchoring:
     """``check`` raises ``MethodError`` for a config that it cannot scale."""
 
     check: Callable[[ConfigViews], None]
-    scale: Callable[[ConfigViews, LeftPictures, Structure, DepthReader], Scaled]
+    scale: Callable[[ConfigViews, LeftPictures, Structure, Callable[[], DepthReader]], Scaled]
+    """Dense depth is made when it is asked for."""
 
 
 def _needs_board(views: ConfigViews) -> None:
@@ -42,8 +43,10 @@ def _needs_board(views: ConfigViews) -> None:
         )
 
 
-def _by_markers(views: ConfigViews, pictures: LeftPictures, structure: Structure, read: DepthReader) -> Scaled:
-    del read
+def _by_markers(
+    views: ConfigViews, pictures: LeftPictures, structure: Structure, reader: Callable[[], DepthReader]
+) -> Scaled:
+    del reader
     board = views.board
     assert board is not None
     fit = board_fit(pictures.markers, structure.cam_from_sfm, pictures.grid.K, board)
@@ -51,14 +54,16 @@ def _by_markers(views: ConfigViews, pictures: LeftPictures, structure: Structure
         "scale_from": f"ArUco markers of {board.marker_side_m:g} m, triangulated",
         "markers": list(fit.markers),
         "marker_rms_mm": round(1000 * fit.rms_m, 4),
-        **pose_report(structure.cam_from_sfm, pictures.cam_from_world, fit.metric),
+        **placed_report(structure.cam_from_sfm, pictures.cam_from_world, fit.metric),
     }
     return Scaled(fit.metric.scale, notes)
 
 
-def _by_truth(views: ConfigViews, pictures: LeftPictures, structure: Structure, read: DepthReader) -> Scaled:
+def _by_truth(
+    views: ConfigViews, pictures: LeftPictures, structure: Structure, reader: Callable[[], DepthReader]
+) -> Scaled:
     """Return the median over views of median(z / z_found) on the scored pixels (the paper, II.C)."""
-    ratios = []
+    ratios, read = [], reader()
     for row in views.rows("left_depth", "left_mask"):
         name = pictures.names[row["view_id"]]
         if name not in structure.cam_from_sfm:
@@ -73,7 +78,7 @@ def _by_truth(views: ConfigViews, pictures: LeftPictures, structure: Structure, 
     notes = {
         "scale_from": "the median of ground truth over depth found: not metric by itself",
         "views_anchored_with": len(ratios),
-        **pose_report(structure.cam_from_sfm, pictures.cam_from_world, scale_m),
+        **scaled_report(structure.cam_from_sfm, pictures.cam_from_world, scale_m),
     }
     return Scaled(scale_m, notes)
 

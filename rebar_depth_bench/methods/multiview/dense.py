@@ -11,9 +11,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
+from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.files import replacing
 from rebar_depth_bench.methods.multiview.consistency import consistent
 from rebar_depth_bench.methods.multiview.neighbours import depth_range, neighbours
@@ -41,7 +42,13 @@ class Dense:
 def _patch_match(pictures: LeftPictures, structure: Structure, work: Path, progress: Progress) -> DepthReader:
     progress("COLMAP: PatchMatch stereo", 0, len(structure.cam_from_sfm))
     maps = patch_match(pictures.folder, work / "model", work)
-    return lambda name: read_depth_map(maps / f"{name}.geometric.bin")
+    nothing = np.full((pictures.grid.height, pictures.grid.width), np.nan, np.float32)
+
+    def read(name: str) -> Float32[ndarray, "h w"]:
+        path = maps / f"{name}.geometric.bin"
+        return read_depth_map(path) if path.is_file() else nothing  # a view without neighbours has no map
+
+    return read
 
 
 def _plane_sweep(pictures: LeftPictures, structure: Structure, work: Path, progress: Progress) -> DepthReader:
@@ -72,12 +79,16 @@ def _swept(
     if not near or not len(structure.seen[name]):
         return np.full((pictures.grid.height, pictures.grid.width), np.nan, np.float32)
     view, *others = (
-        PosedPicture(
-            np.asarray(cv2.imread(str(pictures.folder / one), cv2.IMREAD_GRAYSCALE)), structure.cam_from_sfm[one]
-        )
-        for one in (name, *near)
+        PosedPicture(_grey(pictures.folder / one), structure.cam_from_sfm[one]) for one in (name, *near)
     )
     return sweep(view, others, pictures.grid.K, depth_range(structure, name), SWEEP)
+
+
+def _grey(path: Path) -> UInt8[ndarray, "h w"]:
+    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if grey is None:
+        raise MethodError(f"{path}: cannot be read")
+    return np.asarray(grey)
 
 
 DENSE: Mapping[str, Dense] = {

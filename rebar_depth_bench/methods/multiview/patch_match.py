@@ -32,9 +32,15 @@ def require_cuda() -> None:
 def patch_match(images: Path, model: Path, work: Path) -> Path:
     """Run PatchMatch with its geometric consistency on a sparse model; return the folder of its depth maps.
 
-    What an interrupted run has done is kept by COLMAP itself: views whose maps are there are passed over.
+    What an interrupted run has done is kept: COLMAP passes over views whose maps are there, damaged ones too, so
+    these are removed first.
     """
     dense = work / "dense"
+    for path in (dense / "stereo" / "depth_maps").glob("*.bin"):
+        try:
+            read_depth_map(path)
+        except MethodError:
+            path.unlink()
     if not (dense / "stereo" / "fusion.cfg").is_file():
         pycolmap.undistort_images(dense, model, images)
     pycolmap.patch_match_stereo(dense)

@@ -50,7 +50,8 @@ def write_pictures(views: ConfigViews, folder: Path) -> LeftPictures:
             )
         name = names[row["view_id"]] = row["view_id"].rpartition("/")[2] + ".png"
         rgb = pinhole_picture(row, grid)
-        cv2.imwrite(str(folder / name), rgb[..., ::-1])
+        if not cv2.imwrite(str(folder / name), rgb[..., ::-1]):
+            raise MethodError(f"{folder / name}: cannot be written")
         markers[name] = detected_corners_px(rgb, views.board.dictionary) if views.board else {}
         poses[name] = row["left_cam_from_world"]
     if grid is None:

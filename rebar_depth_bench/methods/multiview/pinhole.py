@@ -27,12 +27,12 @@ class PinholeGrid:
     height: int
     pixel: Int64[ndarray, "h w 2"] | None
 
-    def depth_on_left_grid(self, depth_m: Float32[ndarray, "hc wc"]) -> Float32[ndarray, "h w"]:
-        """Return depth on the camera's grid: each pixel takes the one canvas pixel its ray falls on."""
+    def depth_on_left_grid(self, depth: Float32[ndarray, "hc wc"]) -> Float32[ndarray, "h w"]:
+        """Return planar depth, in any unit, on the camera's grid: each pixel takes the pixel its ray falls on."""
         if self.pixel is None:
-            return depth_m
+            return depth
         column, row = np.moveaxis(self.pixel, -1, 0)
-        return np.asarray(depth_m[row, column])
+        return np.asarray(depth[row, column])
 
 
 def pinhole_grid(row: Mapping[str, Any], width: int, height: int) -> PinholeGrid:

@@ -147,7 +147,7 @@ def _agreement(
         score = _correlation(reference, source, homography, spec)
         second = np.maximum(second, np.minimum(first, score))
         first = np.maximum(first, score)
-    return np.asarray((first + second) / 2)
+    return first if len(sources) == 1 else np.asarray((first + second) / 2)
 
 
 def _correlation(

@@ -20,29 +20,37 @@ def true_similarity(cam_from_sfm: Poses, cam_from_world: Poses) -> Similarity:
     return similarity(_centres(cam_from_sfm, cam_from_sfm), _centres(cam_from_world, cam_from_sfm))
 
 
-def pose_report(cam_from_sfm: Poses, cam_from_world: Poses, metric: Similarity | float) -> dict[str, Any]:
-    """Return scale, centre and rotation errors of the cameras, as plain numbers.
+def placed_report(cam_from_sfm: Poses, cam_from_world: Poses, metric: Similarity) -> dict[str, Any]:
+    """Return errors of scale, centres and rotations under the similarity that was found to the board's frame."""
+    return {
+        **_scale_told(cam_from_sfm, cam_from_world, metric.scale),
+        "cameras_compared": "in the board's frame",
+        **_pose_errors(cam_from_sfm, cam_from_world, metric),
+    }
 
-    ``metric`` is the similarity that was found from the reconstruction to the world, or its scale alone where no
-    frame was: then cameras are laid on the true ones by the best similarity before they are compared.
-    """
-    truth = true_similarity(cam_from_sfm, cam_from_world)
-    scale = metric if isinstance(metric, float) else metric.scale
-    placed = truth if isinstance(metric, float) else metric
-    off_m = np.linalg.norm(
-        placed.points(_centres(cam_from_sfm, cam_from_sfm)) - _centres(cam_from_world, cam_from_sfm), axis=1
-    )
+
+def scaled_report(cam_from_sfm: Poses, cam_from_world: Poses, scale_m: float) -> dict[str, Any]:
+    """Return errors of a scale found alone, and of the cameras under the best similarity to the true ones."""
+    return {
+        **_scale_told(cam_from_sfm, cam_from_world, scale_m),
+        "cameras_compared": "after the best similarity",
+        **_pose_errors(cam_from_sfm, cam_from_world, true_similarity(cam_from_sfm, cam_from_world)),
+    }
+
+
+def _scale_told(cam_from_sfm: Poses, cam_from_world: Poses, scale_m: float) -> dict[str, float]:
+    true_m = true_similarity(cam_from_sfm, cam_from_world).scale
+    return {"scale_m": scale_m, "scale_error_percent": round(100 * (scale_m / true_m - 1), 4)}
+
+
+def _pose_errors(cam_from_sfm: Poses, cam_from_world: Poses, placed: Similarity) -> dict[str, dict[str, float]]:
+    found_m = placed.points(_centres(cam_from_sfm, cam_from_sfm))
+    off_m = np.linalg.norm(found_m - _centres(cam_from_world, cam_from_sfm), axis=1)
     turned_deg = [
         rotation_deg(cam_from_world[name][:3, :3] @ placed.rotation @ pose[:3, :3].T)
         for name, pose in cam_from_sfm.items()
     ]
-    return {
-        "scale_m": scale,
-        "scale_error_percent": round(100 * (scale / truth.scale - 1), 4),
-        "cameras_compared": "after the best similarity" if isinstance(metric, float) else "in the board's frame",
-        "centre_error_mm": _spread(1000 * off_m),
-        "rotation_error_deg": _spread(np.array(turned_deg)),
-    }
+    return {"centre_error_mm": _spread(1000 * off_m), "rotation_error_deg": _spread(np.array(turned_deg))}
 
 
 def _centres(poses: Poses, names: Poses) -> Float64[ndarray, "n 3"]:

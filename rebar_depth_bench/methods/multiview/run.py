@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +44,9 @@ def prepare(views: ConfigViews, work: Path, progress: Progress, dense: str, anch
     """
     pictures = write_pictures(views, work / "images")
     structure = pictured_structure(views, pictures, work, progress)
-    read = DENSE[dense].run(pictures, structure, work, progress)
-    scaled = ANCHORINGS[anchoring].scale(views, pictures, structure, read)
+    reader = cache(lambda: DENSE[dense].run(pictures, structure, work, progress))
+    scaled = ANCHORINGS[anchoring].scale(views, pictures, structure, reader)  # markers fail before hours of depth
+    read = reader()
     notes = {
         "views_registered": len(structure.cam_from_sfm),
         "views": len(pictures.names),

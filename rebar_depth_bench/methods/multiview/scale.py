@@ -1,9 +1,10 @@
-"""From a reconstruction's unit to metres: by markers of known size, or by ground truth."""
+"""From a reconstruction's unit to metres by markers of known size."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float64
@@ -11,13 +12,14 @@ from numpy import ndarray
 
 from rebar_depth_bench.aruco import Corners
 from rebar_depth_bench.board import BoardSpec, marker_corners_m
-from rebar_depth_bench.cameras import project, transform
+from rebar_depth_bench.cameras import camera_centre, project, transform
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.multiview.similarity import Similarity, similarity
 
 LEAST_VIEWS = 3
 LEAST_ANGLE_DEG = 5.0
-"""A corner is triangulated from at least so many views, two of them at least so far apart in angle."""
+"""A corner is triangulated from at least so many views, two of whose rays meet at least at this angle."""
+MOST_PAIRS = 100
 OUTLIER_PX = 3.0
 LEAST_MARKERS = 2
 
@@ -67,55 +69,53 @@ def triangulated(
     poses: Sequence[Float64[ndarray, "4 4"]],
     K: Float64[ndarray, "3 3"],
 ) -> Float64[ndarray, " 3"] | None:
-    """Return the point that views see at these pixels; None where they are too few or too close together.
+    """Return the point that views see at these pixels; None where too few of them agree, or from one direction.
 
-    Linear triangulation (Hartley, Zisserman, "Multiple View Geometry", 12.2), rows divided by the depth found
-    before, so that pixels are minimised; then once more without the views that are off by ``OUTLIER_PX``.
+    The two views whose point most others see within ``OUTLIER_PX`` choose the views that count; a camera that was
+    registered on the wrong side of the scene takes no part. Linear triangulation (Hartley, Zisserman, "Multiple
+    View Geometry", 12.2), rows divided by the depth found before, so that pixels are minimised.
     """
-    kept = list(range(len(pixels)))
+    seen = list(zip(pixels, poses, strict=True))
+    kept = max((_agreeing(_point(pair, K), seen, K) for pair in _pairs(seen)), key=len, default=[])
     for _ in range(2):
-        if not _wide([poses[k] for k in kept]):
+        if len(kept) < LEAST_VIEWS:
             return None
-        point = _least_squares([pixels[k] for k in kept], [poses[k] for k in kept], K)
-        if point is None:
-            return None
-        kept = [k for k in kept if _error_px(point, pixels[k], poses[k], K) <= OUTLIER_PX]
-    return point if len(kept) >= LEAST_VIEWS else None
+        point = _point(kept, K)
+        kept = _agreeing(point, seen, K)
+    return point if len(kept) >= LEAST_VIEWS and _wide(point, kept) else None
 
 
-def _wide(poses: Sequence[Float64[ndarray, "4 4"]]) -> bool:
-    """Tell whether there are enough views, and two of them look in directions far enough apart."""
-    if len(poses) < LEAST_VIEWS:
-        return False
-    axes = np.array([pose[2, :3] for pose in poses])
-    return bool((axes @ axes.T).min() <= np.cos(np.radians(LEAST_ANGLE_DEG)))
+_Seen = tuple[Float64[ndarray, " 2"], Float64[ndarray, "4 4"]]
+"""A pixel, and the pose of the view that it is in."""
 
 
-def _least_squares(
-    pixels: Sequence[Float64[ndarray, " 2"]],
-    poses: Sequence[Float64[ndarray, "4 4"]],
-    K: Float64[ndarray, "3 3"],
-    steps: int = 3,
-) -> Float64[ndarray, " 3"] | None:
-    rows = np.array(
-        [P[:2] - np.outer(pixel, P[2]) for pixel, P in zip(pixels, _projections(K, poses), strict=True)]
-    )
-    depth_row = np.array([pose[2] for pose in poses])
-    weight = np.ones(len(poses))
+def _pairs(seen: Sequence[_Seen]) -> list[tuple[_Seen, _Seen]]:
+    """Return pairs of views, ``MOST_PAIRS`` at most, spread evenly over all."""
+    pairs = list(combinations(seen, 2))
+    return pairs[:: max(1, len(pairs) // MOST_PAIRS)]
+
+
+def _agreeing(point: Float64[ndarray, " 3"], seen: Sequence[_Seen], K: Float64[ndarray, "3 3"]) -> list[_Seen]:
+    return [(pixel, pose) for pixel, pose in seen if _error_px(point, pixel, pose, K) <= OUTLIER_PX]
+
+
+def _wide(point: Float64[ndarray, " 3"], seen: Sequence[_Seen]) -> bool:
+    """Tell whether two of the rays that meet in the point are far enough apart."""
+    rays = point - np.array([camera_centre(pose) for _, pose in seen])
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    return bool((rays @ rays.T).min() <= np.cos(np.radians(LEAST_ANGLE_DEG)))
+
+
+def _point(seen: Sequence[_Seen], K: Float64[ndarray, "3 3"], steps: int = 3) -> Float64[ndarray, " 3"]:
+    rows = np.array([np.outer(pixel, (K @ pose[:3])[2]) - (K @ pose[:3])[:2] for pixel, pose in seen])
+    depth_rows = np.array([pose[2] for _, pose in seen])
+    weight = np.ones(len(seen))
     for _ in range(steps):
         system = (rows * weight[:, None, None]).reshape(-1, 4)
         point = np.linalg.lstsq(system[:, :3], -system[:, 3], rcond=None)[0]
-        depths = depth_row[:, :3] @ point + depth_row[:, 3]
-        if not (depths > 0).all():
-            return None
-        weight = 1.0 / depths
+        depths = depth_rows[:, :3] @ point + depth_rows[:, 3]
+        weight = 1 / np.maximum(np.abs(depths), np.finfo(np.float32).eps)
     return np.asarray(point)
-
-
-def _projections(
-    K: Float64[ndarray, "3 3"], poses: Sequence[Float64[ndarray, "4 4"]]
-) -> list[Float64[ndarray, "3 4"]]:
-    return [K @ pose[:3] for pose in poses]
 
 
 def _error_px(

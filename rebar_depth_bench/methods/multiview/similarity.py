@@ -8,8 +8,6 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.cameras import rigid
-
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
@@ -22,11 +20,6 @@ class Similarity:
     def points(self, source: Float64[ndarray, "*n 3"]) -> Float64[ndarray, "*n 3"]:
         """Apply it to points."""
         return np.asarray(self.scale * source @ self.rotation.T + self.translation)
-
-    def pose(self, cam_from_source: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
-        """Return the rigid ``cam_from_target``, lengths in the target's unit, of a rigid ``cam_from_source``."""
-        rotation = cam_from_source[:3, :3] @ self.rotation.T
-        return rigid(rotation, self.scale * cam_from_source[:3, 3] - rotation @ self.translation)
 
 
 def similarity(source: Float64[ndarray, "n 3"], target: Float64[ndarray, "n 3"]) -> Similarity:

@@ -148,6 +148,7 @@ def _mapping() -> pycolmap.IncrementalPipelineOptions:
     options.mapper.abs_pose_refine_focal_length = False
     options.mapper.abs_pose_refine_extra_params = False
     options.random_seed = SEED
+    options.num_threads = 1  # with more, the same database gives other points from run to run
     return options
 
 

@@ -1,8 +1,8 @@
 """Reference results: every method that runs on a plain CPU with nothing fetched, on a subset of every scene.
 
-``python -m cards.reference OUT`` renders the subset into OUT/dataset, runs the methods into OUT/NAME.zip, scores
-them and writes ``cards/reference.json``, from which the benchmark card's table is made. Two cores take hours;
-stopped and run again, it goes on: what stands in OUT is taken as it is.
+``python -m benchmarks.reference OUT`` renders the subset into OUT/dataset, runs the methods into OUT/NAME.zip,
+scores them and writes ``cards/reference.json``, from which the benchmark card's table is made. Two cores take hours;
+stopped and run again, it goes on with the archives that are missing or older than the dataset.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from dataset_builder.cli import main as rebar_build
 from rebar_depth_bench import score
 from rebar_depth_bench.cli import main as rebar_bench
 from rebar_depth_bench.files import write_text
+from rebar_depth_bench.submission import config_of
 from rebar_depth_bench.submission.metadata import METADATA_NAME
 
 
@@ -64,12 +65,16 @@ def main(out: Path) -> int:
     for method, configs in RUNS.items():
         archive = out / f"{method}.zip"
         predict = ("predict", method, "--data", root, "--out", archive, "--config", *configs)
-        if not archive.is_file() and (status := rebar_bench(list(map(str, predict)))):
+        if _is_stale(archive, root) and (status := rebar_bench(list(map(str, predict)))):
             return status
     results = {method: _result(out / f"{method}.zip", root) for method in RUNS}
-    found = {"command": "python -m cards.reference OUT", "subset": asdict(SUBSET), "results": results}
+    found = {"command": "python -m benchmarks.reference OUT", "subset": asdict(SUBSET), "results": results}
     write_text(RESULTS, json.dumps(found, indent=1, allow_nan=False) + "\n")
     return 0
+
+
+def _is_stale(archive: Path, root: Path) -> bool:
+    return not archive.is_file() or archive.stat().st_mtime < (root / "manifest.json").stat().st_mtime
 
 
 def _result(archive: Path, root: Path) -> dict[str, Any]:
@@ -77,18 +82,22 @@ def _result(archive: Path, root: Path) -> dict[str, Any]:
     result = {key: value for key, value in score(archive, root).to_dict().items() if key != "views"}
     with zipfile.ZipFile(archive) as source:
         told = json.loads(source.read(METADATA_NAME))
-    seconds = told["runtime"]["seconds"].values()
+    seconds = told["runtime"]["seconds"]
     return {
         **result,
         "notes": told.get("notes"),
         "seconds": {
-            "a_view": round(statistics.median(seconds), 3),
+            "a_view": {config: _median(seconds, config) for config in result["tables"]},
             "preparing": told["runtime"].get("preparing"),
         },
     }
 
 
+def _median(seconds: Mapping[str, float], config: str) -> float:
+    return round(statistics.median(spent for view, spent in seconds.items() if config_of(view) == config), 3)
+
+
 if __name__ == "__main__":
     if len(sys.argv) != 2:
-        sys.exit("usage: python -m cards.reference OUT")
+        sys.exit("usage: python -m benchmarks.reference OUT")
     sys.exit(main(Path(sys.argv[1])))
