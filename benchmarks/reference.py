@@ -1,7 +1,7 @@
 """Reference results: every method that runs on a plain CPU with nothing fetched, on a subset of every scene.
 
 ``python -m benchmarks.reference OUT`` renders the subset into OUT/dataset, runs the methods into OUT/NAME.zip,
-scores them and writes ``cards/reference.json``, from which the benchmark card's table is made. Two cores take hours;
+scores them and writes ``cards/reference.json``, from which the benchmark card's table is made. It takes hours;
 stopped and run again, it goes on with the archives that are missing or older than the dataset.
 """
 

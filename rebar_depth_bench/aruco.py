@@ -46,8 +46,8 @@ def board_pose(
     """Return ``cam_from_world``, metres, from the board's markers found in a picture; None where there are none.
 
     All corners together: OpenCV's solver for planar points (IPPE), then Levenberg-Marquardt on pixels. Corners are
-    found about half a pixel inside the true ones (``dataset_builder.audit.markers``): with one marker of 80 px that
-    puts the camera 1 % too far, with six hardly anything.
+    found about half a pixel inside the true ones (``dataset_builder.audit.markers``): with one marker of 80 px
+    that puts the camera 1 % too far, with six hardly anything.
     """
     layout = marker_corners_m(board)
     seen = [marker for marker in layout if marker in corners_px]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -48,6 +48,7 @@ def seen_corners() -> dict[str, Corners]:
     }
 
 
+@settings(deadline=None, max_examples=30)
 @given(st.floats(0.01, 50.0), st.tuples(*[st.floats(-3.0, 3.0)] * 3))
 def test_exact_corners_give_the_exact_scale_and_the_cameras_in_the_boards_frame(
     unit_m: float, turn: tuple[float, float, float]
