@@ -24,6 +24,15 @@ def file_sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
+def files_digest(paths: Iterable[Path]) -> str:
+    """Return the hex SHA-256 over the names and SHA-256s of files, in the order given.
+
+    Their folders are left out: the same files elsewhere have the same digest. Raises ``OSError`` where one lacks.
+    """
+    lines = [f"{path.name} {file_sha256(path)}\n" for path in paths]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
 def eye_digest(
     depth_m: Float32[ndarray, "h w"],
     mask: Bool[ndarray, "h w"],

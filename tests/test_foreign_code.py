@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.foreign_code import filled, importable, in_words
+from rebar_depth_bench.methods.foreign_code import error_words, filled, importable
 
 torch: Any = importlib.import_module("torch")
 
@@ -44,13 +44,13 @@ def loud_and_broken() -> None:
 
 
 def test_what_strangers_raise_and_print(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(MethodError, match=r"^m: fails: ValueError: two lines$"), in_words("m", torch, "fails"):
+    with pytest.raises(MethodError, match=r"^m: fails: ValueError: two lines$"), error_words("m", torch, "fails"):
         loud_and_broken()
     told = capsys.readouterr()
     assert (told.out, told.err) == ("", "loud\n")
-    with pytest.raises(MethodError, match=r"^mine$"), in_words("m", torch, "fails"):
+    with pytest.raises(MethodError, match=r"^mine$"), error_words("m", torch, "fails"):
         raise MethodError("mine")
-    with pytest.raises(KeyboardInterrupt), in_words("m", torch, "fails"):
+    with pytest.raises(KeyboardInterrupt), error_words("m", torch, "fails"):
         raise KeyboardInterrupt
 
 

@@ -255,3 +255,39 @@ def test_a_config_that_does_not_fit_stops_the_run_before_it_begins(tiny_root: Pa
         predict(whole_config(log, unfit="lattice-orbit"), tiny_root, tmp_path / "whole.zip")
     assert log == ["check lattice", "check lattice-orbit"]
     assert not list(tmp_path.iterdir())
+
+
+def test_a_users_file_that_was_changed_is_another_method(own: Path) -> None:
+    before = find_method(f"{own}:METHOD").info
+    assert find_method(f"{own}:METHOD").info == before
+    own.write_text(own.read_text() + "# changed\n")
+    after = find_method(f"{own}:METHOD").info
+    assert after.name == before.name
+    assert after.source != before.source
+
+
+def test_a_dataset_rendered_otherwise_is_predicted_anew(own: Path, tiny_root: Path, tmp_path: Path) -> None:
+    """The ground truth of another light or sample count is the same; the pictures are not."""
+
+    def stop(_: str, done: int, __: int) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    def run(root: Path, progress: Progress) -> None:
+        predict(
+            find_method(f"{own}:METHOD"), root, tmp_path / "out.zip", configs=["lattice-orbit"], progress=progress
+        )
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tiny_root, stop)
+    other = tmp_path / "other"
+    other.mkdir()
+    for path in tiny_root.iterdir():
+        (other / path.name).symlink_to(path)
+    manifest = json.loads((tiny_root / "manifest.json").read_text())
+    manifest["configs"]["lattice-orbit"]["key"] = "another"
+    (other / "manifest.json").unlink()
+    (other / "manifest.json").write_text(json.dumps(manifest))
+    run(other, lambda *_: None)
+    first, second = score_views(tiny_root)
+    assert (tmp_path / "log").read_text().split() == [first, first, second]

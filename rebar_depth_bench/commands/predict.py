@@ -9,6 +9,7 @@ from pathlib import Path
 from rebar_depth_bench.commands.arguments import add_data
 from rebar_depth_bench.console import ProgressBars
 from rebar_depth_bench.methods import METHODS, find_method
+from rebar_depth_bench.methods.finding import LOCATED
 from rebar_depth_bench.predict import predict
 
 SUMMARY = "run a method over a dataset into an archive"
@@ -18,7 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     names = (
         f"{', '.join(METHODS)}, an installed package's, or one from elsewhere: my_model.py:METHOD, my_model.toml "
-        "(an ONNX model), hf:ORG/NAME (a checkpoint of transformers)"
+        "(an ONNX model), hf:ORG/NAME (a checkpoint of transformers), NAME:FOLDER (own weights of "
+        f"{', '.join(LOCATED)})"
     )
     parser.add_argument("method", metavar="METHOD", help=names)
     add_data(parser)

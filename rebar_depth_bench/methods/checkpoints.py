@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import sys
@@ -11,8 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rebar_depth_bench.digests import file_sha256
+from rebar_depth_bench.digests import files_digest
 from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.methods.hub_folders import HUB_ACCESS, announce, local_copy, snapshot, unavailable
 
 CONFIG, PREPROCESSOR = "config.json", "preprocessor_config.json"
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
@@ -47,7 +47,7 @@ def find_checkpoint(name_or_path: str) -> Checkpoint:
             f"{name_or_path}: no such folder, and no name of a model on the Hub, expected a folder with {CONFIG} "
             "or ORG/NAME"
         )
-    folder = _snapshot(name_or_path)
+    folder = snapshot(name_or_path, CONFIG, _instead(name_or_path))
     return Checkpoint(name_or_path, folder, name_or_path, f"commit {folder.name}", _json(folder / CONFIG))
 
 
@@ -79,8 +79,7 @@ def _weights(folder: Path) -> list[Path]:
 def _weights_digest(folder: Path) -> str:
     """Return the digest of the config, the pre-processing and the weights: what the answer depends on."""
     files = [folder / CONFIG, folder / PREPROCESSOR, *_weights(folder)]
-    lines = [f"{path.name} {file_sha256(path)}\n" for path in files if path.is_file()]
-    return "sha256:" + hashlib.sha256("".join(lines).encode()).hexdigest()
+    return f"sha256:{files_digest(path for path in files if path.is_file())}"
 
 
 def _json(path: Path) -> dict[str, Any]:
@@ -97,27 +96,11 @@ def _json(path: Path) -> dict[str, Any]:
     return value
 
 
-def _snapshot(repository: str) -> Path:
-    """Return the Hub's cached snapshot of a model's main branch, with at least ``config.json`` in it."""
-    from huggingface_hub import hf_hub_download
-    from huggingface_hub.errors import LocalEntryNotFoundError
-
-    try:
-        return Path(hf_hub_download(repository, CONFIG, local_files_only=True)).parent
-    except LocalEntryNotFoundError:
-        pass
-    _announce(repository, CONFIG)
-    try:
-        return Path(hf_hub_download(repository, CONFIG)).parent
-    except Exception as error:  # the Hub's client raises its own, httpx's and the system's
-        raise _unavailable(repository, error) from None
-
-
 def _fetch(repository: str, commit: str) -> None:
     """Fetch a commit's weights and settings into the Hub's cache, one kind of weights only."""
-    from huggingface_hub import HfApi, snapshot_download
+    from huggingface_hub import HfApi, constants, snapshot_download
 
-    _announce(repository, "the weights")
+    announce(repository, "the weights", constants.ENDPOINT, _instead(repository))
     try:
         files = HfApi().model_info(repository, revision=commit, files_metadata=True).siblings or []
         sizes = {file.rfilename: file.size or 0 for file in files if "/" not in file.rfilename}
@@ -125,27 +108,9 @@ def _fetch(repository: str, commit: str) -> None:
         wanted = [name for name in sizes if Path(name).match(weights) or name.endswith(".json")]
         print(f"{repository}: {sum(sizes[name] for name in wanted) / 1e6:.1f} MB", file=sys.stderr, flush=True)
         snapshot_download(repository, revision=commit, allow_patterns=wanted)
-    except Exception as error:
-        raise _unavailable(repository, error) from None
+    except Exception as error:  # the Hub's client raises its own, httpx's and the system's
+        raise unavailable(repository, constants.ENDPOINT, error, _instead(repository), HUB_ACCESS) from None
 
 
-def _announce(repository: str, what: str) -> None:
-    """Say what is fetched from where. Raises ``MethodError`` where ``HF_HUB_OFFLINE`` forbids it."""
-    from huggingface_hub import constants
-
-    if constants.HF_HUB_OFFLINE:
-        raise MethodError(
-            f"{repository}: {what} not in the Hub's cache, and HF_HUB_OFFLINE is set: unset it, or fetch the "
-            f"model elsewhere (hf download {repository} --local-dir FOLDER) and name its folder: hf:FOLDER"
-        )
-    print(f"{repository}: fetching {what} from {constants.ENDPOINT}", file=sys.stderr, flush=True)
-
-
-def _unavailable(repository: str, error: Exception) -> MethodError:
-    from huggingface_hub import constants
-
-    lines = str(error).strip().splitlines() or [""]
-    return MethodError(
-        f"{repository}: cannot be fetched from {constants.ENDPOINT}: {type(error).__name__}: {lines[0]}; expected "
-        "a public model there, or one that HF_TOKEN opens, or a local copy: hf:FOLDER"
-    )
+def _instead(repository: str) -> str:
+    return local_copy("hf", repository)

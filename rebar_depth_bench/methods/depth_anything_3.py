@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,21 +20,12 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.foreign_code import (
-    existing,
-    filled,
-    in_words,
-    package,
-    safetensors_names,
-    torch_for,
-    with_weights,
-)
-from rebar_depth_bench.methods.hub_folders import hub_folder
-from rebar_depth_bench.methods.method import Method, MethodInfo, Predictor
+from rebar_depth_bench.methods.foreign_code import error_words, filled, package, safetensors_names, torch_for
+from rebar_depth_bench.methods.hub_method import CONFIG, WEIGHTS, HubModel, listed_method
+from rebar_depth_bench.methods.method import MethodInfo, Predictor
 from rebar_depth_bench.methods.metric_conversions import da3_depth_m, da3_focal_px
 
 NAME, REPOSITORY = "depth-anything-3", "depth-anything/DA3METRIC-LARGE"
-FILES = ("config.json", "model.safetensors")
 PRESET = "da3metric-large"
 """Only this network's output becomes metres by the focal length: others are relative, or metres already."""
 SEED = 1
@@ -50,17 +40,6 @@ INFO = MethodInfo(
 )
 
 
-def depth_anything_3_method(folder: Path) -> Method:
-    """Return Depth Anything 3 Metric with the weights of a folder: ``config.json`` and ``model.safetensors``.
-
-    Raises ``MethodError`` for a folder without them, and for another model of the family.
-    """
-    existing(folder, NAME, FILES)
-    info = with_weights(INFO, folder.resolve().name, [folder / name for name in FILES])
-    _check_preset(folder)
-    return Method(info, lambda: load_predictor(folder))
-
-
 def load_predictor(folder: Path) -> Predictor:
     """Load the network of a folder, on the GPU if torch sees one.
 
@@ -68,14 +47,16 @@ def load_predictor(folder: Path) -> Predictor:
     """
     torch = torch_for(NAME)
     api = package("depth_anything_3.api", NAME, "pip install depth-anything-3")
-    _check_preset(folder)
-    with in_words(NAME, torch, f"{folder.name} cannot be loaded"):
+    with error_words(NAME, torch, f"{folder.name} cannot be loaded"):
         model = api.DepthAnything3.from_pretrained(str(folder), local_files_only=True)
-        model = filled(NAME, torch, model, safetensors_names(folder / FILES[1]))
+        model = filled(NAME, torch, model, safetensors_names(folder / WEIGHTS))
 
     def run(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         rgb, grid = row["left_rgb"], row["left_rgb"].shape[:2]
-        with in_words(NAME, torch, "fails on a picture"), torch.random.fork_rng(range(torch.cuda.device_count())):
+        with (
+            error_words(NAME, torch, "fails on a picture"),
+            torch.random.fork_rng(range(torch.cuda.device_count())),
+        ):
             torch.manual_seed(SEED)
             seen = np.asarray(model.inference([rgb]).depth, np.float32)
         if seen.ndim != 3 or len(seen) != 1:
@@ -92,11 +73,12 @@ def _on_left_grid(torch: Any, seen: Float32[ndarray, "h w"], grid: tuple[int, in
     return np.asarray(resized(torch.from_numpy(seen), grid, "bilinear").numpy())
 
 
-def _check_preset(folder: Path) -> None:
+def check_preset(folder: Path) -> None:
+    """Raise ``MethodError`` where a folder's ``config.json`` is that of another model of the family."""
     try:
-        preset = json.loads((folder / FILES[0]).read_text(encoding="utf-8")).get("model_name")
+        preset = json.loads((folder / CONFIG).read_text(encoding="utf-8")).get("model_name")
     except (OSError, ValueError, AttributeError) as error:
-        raise MethodError(f"{folder / FILES[0]}: cannot be read as a JSON object: {error}") from None
+        raise MethodError(f"{folder / CONFIG}: cannot be read as a JSON object: {error}") from None
     if preset != PRESET:
         raise MethodError(
             f"{NAME}:{folder}: config.json names model {preset!r}, expected {PRESET!r}: only its output becomes "
@@ -104,8 +86,6 @@ def _check_preset(folder: Path) -> None:
         )
 
 
-DEPTH_ANYTHING_3 = Method(
-    replace(INFO, summary=f"{INFO.summary}; own weights: {NAME}:FOLDER"),
-    lambda: load_predictor(hub_folder(REPOSITORY, FILES, f"{NAME}:FOLDER")),
-)
+DEPTH_ANYTHING_3_MODEL = HubModel(INFO, REPOSITORY, load_predictor, check_preset)
+DEPTH_ANYTHING_3 = listed_method(DEPTH_ANYTHING_3_MODEL)
 """The paper's Depth Anything 3 Metric. Its weights come from the Hub, or its cache, when it is loaded."""

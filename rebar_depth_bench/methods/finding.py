@@ -11,6 +11,7 @@ import importlib.util
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -19,10 +20,11 @@ from rebar_depth_bench.digests import file_sha256
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.board_plane import BOARD_PLANE
 from rebar_depth_bench.methods.constant import CONSTANT
-from rebar_depth_bench.methods.depth_anything_3 import DEPTH_ANYTHING_3, depth_anything_3_method
+from rebar_depth_bench.methods.depth_anything_3 import DEPTH_ANYTHING_3, DEPTH_ANYTHING_3_MODEL
 from rebar_depth_bench.methods.foundation_stereo import FOUNDATION_STEREO, foundation_stereo_method
+from rebar_depth_bench.methods.hub_method import folder_method, hub_method
 from rebar_depth_bench.methods.method import AnyMethod, Method, MultiViewMethod
-from rebar_depth_bench.methods.metric3d import METRIC3D, metric3d_method
+from rebar_depth_bench.methods.metric3d import METRIC3D, cached_metric3d_method, metric3d_method
 from rebar_depth_bench.methods.multi_view import (
     COLMAP_ANCHORED,
     COLMAP_ARUCO,
@@ -33,7 +35,7 @@ from rebar_depth_bench.methods.onnx_model import onnx_method
 from rebar_depth_bench.methods.sgbm import SGBM, SGBM_FILLED
 from rebar_depth_bench.methods.transformers_depth import DEPTH_PRO, PREFIX, hf_method
 from rebar_depth_bench.methods.truth import NOISY_TRUTH, TRUTH
-from rebar_depth_bench.methods.unidepth import UNIDEPTH, unidepth_method
+from rebar_depth_bench.methods.unidepth import UNIDEPTH, UNIDEPTH_MODEL
 
 GROUP = "rebar_depth_bench.methods"
 DISTRIBUTION = "rebar-depth-bench"
@@ -51,17 +53,27 @@ METHODS: Mapping[str, AnyMethod] = {
 """Those that come with the bench."""
 
 LOCATED: Mapping[str, Callable[[Path], Method]] = {
-    "depth-anything-3": depth_anything_3_method,
+    "depth-anything-3": partial(folder_method, DEPTH_ANYTHING_3_MODEL),
     "foundation-stereo": foundation_stereo_method,
     "metric3d": metric3d_method,
-    "unidepth": unidepth_method,
+    "unidepth": partial(folder_method, UNIDEPTH_MODEL),
 }
 """Those that take their weights, or code and weights, from a folder: ``NAME:FOLDER``."""
+
+RESOLVED: Mapping[str, Callable[[], Method]] = {
+    "depth-anything-3": partial(hub_method, DEPTH_ANYTHING_3_MODEL),
+    "metric3d": cached_metric3d_method,
+    "unidepth": partial(hub_method, UNIDEPTH_MODEL),
+}
+"""Those whose weights are looked up when they are asked for by their bare name: the commit or digest of what is
+run goes into their summary. Listing them looks nothing up."""
 
 
 def find_method(name: str) -> AnyMethod:
     """Return a method by its name, from a file by ``path.py:NAME`` or ``path.toml``, from a folder by
     ``NAME:FOLDER`` (``LOCATED``), or by ``hf:ORG/NAME``.
+
+    What says which weights these are may be fetched here, where no cache has it (``RESOLVED``, ``hf:``).
 
     Raises ``MethodError`` for an unknown one, and where a file or package cannot be imported or holds none.
     """
@@ -75,6 +87,8 @@ def find_method(name: str) -> AnyMethod:
         return _of_file(Path(path), _checked(name, getattr(_module(Path(path)), attribute, None)))
     if name.endswith(".toml"):
         return onnx_method(Path(name))
+    if name in RESOLVED:
+        return RESOLVED[name]()
     if name in METHODS:
         return METHODS[name]
     offered = _offered()

@@ -5,7 +5,6 @@ That code is run as it is; so is what a checkpoint of pickled Python may hold. W
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -14,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rebar_depth_bench.digests import file_sha256
+from rebar_depth_bench.digests import files_digest
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.method import MethodInfo
 
@@ -29,19 +28,17 @@ def with_weights(info: MethodInfo, label: str, files: Sequence[Path]) -> MethodI
 
     So other weights are another method, and a stopped prediction is not continued with them.
     """
-    lines = [f"{path.name} {file_sha256(path)}\n" for path in files]
-    digest = hashlib.sha256("".join(lines).encode()).hexdigest()
-    return replace(info, name=f"{info.name}:{label}", summary=f"{info.summary}; weights sha256:{digest}")
+    summary = f"{info.summary}; weights sha256:{files_digest(files)}"
+    return replace(info, name=f"{info.name}:{label}", summary=summary)
 
 
-def existing(folder: Path, name: str, holds: Sequence[str]) -> Path:
-    """Return a folder that holds these files. Raises ``MethodError`` for another."""
+def check_folder(folder: Path, name: str, holds: Sequence[str]) -> None:
+    """Raise ``MethodError`` unless a folder holds these files."""
     if not folder.is_dir():
         raise MethodError(f"{name}:{folder}: no such folder, expected one with {' and '.join(holds)}")
     for file in holds:
         if not (folder / file).is_file():
             raise MethodError(f"{name}:{folder}: no {file} in it, expected {' and '.join(holds)}")
-    return folder
 
 
 def package(module: str, method: str, install: str) -> Any:
@@ -59,7 +56,7 @@ def torch_for(method: str) -> Any:
 
 
 @contextmanager
-def in_words(method: str, torch: Any, doing: str) -> Iterator[None]:
+def error_words(method: str, torch: Any, doing: str) -> Iterator[None]:
     """Run an author's code: what it prints goes to standard error, what it raises becomes a ``MethodError``.
 
     Where torch sees no GPU and the code asks for CUDA, that is said.

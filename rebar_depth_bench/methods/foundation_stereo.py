@@ -4,8 +4,9 @@ Pictures go in as RGB of 0 to 255, their sides brought to multiples of 32 by rep
 in ``scripts/run_demo.py``. Where the match lies left of the right picture there is no answer, as in that script; a
 parallax below a pixel is none either.
 
-Never run here with the real network: its weights could not be fetched. When it is built, its code fetches that of
-DINOv2 (GitHub) and timm's ``edgenext_small`` (the Hub) unless their caches hold them: that is said first.
+Never run here with the real network: its weights could not be fetched. When it is built, its code may fetch that
+of DINOv2 (GitHub, which knows nothing of ``HF_HUB_OFFLINE``) and timm's ``edgenext_small`` (the Hub): where their
+caches hold nothing of the kind, that is said first.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.disparity import STEREO_COLUMNS, stereo_depth_m
 from rebar_depth_bench.methods.foreign_code import (
     device,
+    error_words,
     filled,
     importable,
-    in_words,
     package,
     torch_for,
     with_weights,
@@ -91,13 +92,9 @@ def load_predictor(found: Installation) -> Predictor:
     torch = torch_for(NAME)
     package("cv2", NAME, "pip install 'rebar-depth-bench[methods]'")
     yaml = package("yaml", NAME, "pip install pyyaml")
-    print(
-        f"{NAME}: its code fetches that of DINOv2 (https://github.com/facebookresearch/dinov2), which is then "
-        "run, and timm's edgenext_small (the Hub), unless they are in their caches",
-        file=sys.stderr,
-        flush=True,
-    )
-    with in_words(NAME, torch, f"{found.weights} cannot be loaded"), importable(found.clone):
+    if fetches := _may_fetch(torch):
+        print(f"{NAME}: its code may fetch {' and '.join(fetches)}", file=sys.stderr, flush=True)
+    with error_words(NAME, torch, f"{found.weights} cannot be loaded"), importable(found.clone):
         settings = _Settings(yaml.safe_load((found.weights / SETTINGS).read_text(encoding="utf-8")))
         settings.setdefault("vit_size", "vitl")
         code = importlib.import_module("core.foundation_stereo")
@@ -111,7 +108,7 @@ def load_predictor(found: Installation) -> Predictor:
         margins = margins_to_multiple((left.shape[0], left.shape[1]), STEP_PX)
         cuda = torch.cuda.is_available()
         with (
-            in_words(NAME, torch, "fails on a pair"),
+            error_words(NAME, torch, "fails on a pair"),
             torch.inference_mode(),
             torch.autocast("cuda", enabled=cuda),
         ):
@@ -124,6 +121,21 @@ def load_predictor(found: Installation) -> Predictor:
         return stereo_depth_m(row, match)
 
     return run
+
+
+def _may_fetch(torch: Any) -> list[str]:
+    """Return what its code asks for when it is built and no cache has anything of, in words."""
+    from huggingface_hub import constants
+
+    found = []
+    if not any(Path(torch.hub.get_dir()).glob("facebookresearch_dinov2_*")):
+        found.append(
+            "DINOv2's code (https://github.com/facebookresearch/dinov2, whatever HF_HUB_OFFLINE says), which is "
+            "then run,"
+        )
+    if not any(Path(constants.HF_HUB_CACHE).glob("models--timm--edgenext_small*")):
+        found.append("timm's edgenext_small (the Hub)")
+    return found
 
 
 def _pixels(torch: Any, rgb: UInt8[ndarray, "h w 3"]) -> Any:

@@ -1,4 +1,4 @@
-"""Files of the Hub as a local folder, never fetched silently: for models that are not of ``transformers``."""
+"""Models of the Hub as local folders, never fetched silently; the folder's name is the commit."""
 
 from __future__ import annotations
 
@@ -8,28 +8,54 @@ from pathlib import Path
 
 from rebar_depth_bench.errors import MethodError
 
+HUB_ACCESS = "a connection, HF_TOKEN for a model that is not public"
 
-def hub_folder(repository: str, files: Sequence[str], instead: str) -> Path:
-    """Return the folder of the Hub's cache that holds a model's files, fetched if it does not.
 
-    ``instead`` is what to name where they are in a folder of one's own, ``unidepth:FOLDER`` say.
+def snapshot(repository: str, file: str, instead: str) -> Path:
+    """Return the Hub's cached snapshot of a model's main branch, with at least ``file`` in it; named by its commit.
+
+    Only where the cache has none is ``file`` fetched, and said first. ``instead`` is what to name where the model
+    is in a folder of one's own (``local_copy``).
+
+    Raises ``MethodError`` where it is not to be had.
+    """
+    from huggingface_hub import constants, hf_hub_download
+    from huggingface_hub.errors import LocalEntryNotFoundError
+
+    try:
+        return Path(hf_hub_download(repository, file, local_files_only=True)).parent
+    except LocalEntryNotFoundError:
+        pass
+    announce(repository, file, constants.ENDPOINT, instead)
+    try:
+        return Path(hf_hub_download(repository, file)).parent
+    except Exception as error:  # the Hub's client raises its own, httpx's and the system's
+        raise unavailable(repository, constants.ENDPOINT, error, instead, HUB_ACCESS) from None
+
+
+def complete_snapshot(repository: str, folder: Path, files: Sequence[str], instead: str) -> None:
+    """Fetch what a snapshot lacks of ``files``, at its own commit, whatever the main branch is by now.
 
     Raises ``MethodError`` where they are not to be had.
     """
     from huggingface_hub import constants, snapshot_download
-    from huggingface_hub.errors import LocalEntryNotFoundError
 
+    lacking = [name for name in files if not (folder / name).is_file()]
+    if not lacking:
+        return
+    announce(repository, " and ".join(lacking), constants.ENDPOINT, instead)
     try:
-        folder = Path(snapshot_download(repository, allow_patterns=list(files), local_files_only=True))
-        if all((folder / name).is_file() for name in files):
-            return folder
-    except LocalEntryNotFoundError:
-        pass
-    announce(repository, " and ".join(files), constants.ENDPOINT, instead)
-    try:
-        return Path(snapshot_download(repository, allow_patterns=list(files)))
-    except Exception as error:  # the Hub's client raises its own, httpx's and the system's
-        raise unavailable(repository, constants.ENDPOINT, error, instead) from None
+        snapshot_download(repository, revision=folder.name, allow_patterns=lacking)
+    except Exception as error:
+        raise unavailable(repository, constants.ENDPOINT, error, instead, HUB_ACCESS) from None
+    for name in lacking:  # a file that the Hub does not list is passed over without a word
+        if not (folder / name).is_file():
+            raise MethodError(f"{repository}: no {name} at commit {folder.name}, expected {' and '.join(files)}")
+
+
+def local_copy(prefix: str, repository: str) -> str:
+    """Return how a copy of a model is made and named, for a method that takes ``PREFIX:FOLDER``."""
+    return f"{prefix}:FOLDER (hf download {repository} --local-dir FOLDER)"
 
 
 def announce(name: str, what: str, where: str, instead: str) -> None:
@@ -44,10 +70,12 @@ def announce(name: str, what: str, where: str, instead: str) -> None:
     print(f"{name}: fetching {what} from {where}", file=sys.stderr, flush=True)
 
 
-def unavailable(name: str, where: str, error: Exception, instead: str) -> MethodError:
-    """Return what to raise where something could not be fetched."""
+def unavailable(
+    name: str, where: str, error: Exception, instead: str, access: str = "a connection"
+) -> MethodError:
+    """Return what to raise where something could not be fetched; ``access`` is what that takes."""
     first = (str(error).strip().splitlines() or [""])[0]
     return MethodError(
-        f"{name}: cannot be fetched from {where}: {type(error).__name__}: {first}; expected a connection, or a "
-        f"local copy: {instead}"
+        f"{name}: cannot be fetched from {where}: {type(error).__name__}: {first}; expected {access}, or a local "
+        f"copy: {instead}"
     )

@@ -18,8 +18,16 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
+from rebar_depth_bench.digests import files_digest
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.foreign_code import device, existing, filled, in_words, torch_for, with_weights
+from rebar_depth_bench.methods.foreign_code import (
+    check_folder,
+    device,
+    error_words,
+    filled,
+    torch_for,
+    with_weights,
+)
 from rebar_depth_bench.methods.hub_folders import announce, unavailable
 from rebar_depth_bench.methods.method import Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.metric_conversions import (
@@ -56,7 +64,7 @@ def metric3d_method(folder: Path) -> Method:
 
     Raises ``MethodError`` for a folder without them.
     """
-    existing(folder, NAME, (HUBCONF,))
+    check_folder(folder, NAME, (HUBCONF,))
     places = (folder / CHECKPOINT, folder / "weight" / CHECKPOINT)
     checkpoint = next((place for place in places if place.is_file()), None)
     if checkpoint is None:
@@ -74,7 +82,7 @@ def load_predictor(folder: Path, checkpoint: Path) -> Predictor:
     Raises ``MethodError`` where torch, or what that code imports, is missing, or weights that fill the network.
     """
     torch = torch_for(NAME)
-    with in_words(NAME, torch, f"{folder.name} cannot be loaded"):
+    with error_words(NAME, torch, f"{folder.name} cannot be loaded"):
         model = torch.hub.load(str(folder), ENTRY, source="local", pretrain=False)
         weights = torch.load(checkpoint, map_location="cpu", weights_only=False)["model_state_dict"]
         model.load_state_dict(weights, strict=False)
@@ -83,7 +91,7 @@ def load_predictor(folder: Path, checkpoint: Path) -> Predictor:
     def run(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         grid = row["left_rgb"].shape[:2]
         fit = fit_keeping_ratio(grid, TARGET)
-        with in_words(NAME, torch, "fails on a picture"), torch.inference_mode():
+        with error_words(NAME, torch, "fails on a picture"), torch.inference_mode():
             found = model.inference({"input": network_input(row["left_rgb"], fit).to(device(torch))})[0]
             seen = found.float().cpu().reshape(found.shape[-2:])
         if tuple(seen.shape) != TARGET:
@@ -112,15 +120,21 @@ def _resized(torch: Any, planes: Any, grid: tuple[int, int]) -> Any:
     return torch.nn.functional.interpolate(planes, size=grid, mode="bilinear", align_corners=False)
 
 
-def _load_fetched() -> Predictor:
-    """Load from torch.hub's cache; what is not in it is fetched, and said first."""
+def cached_metric3d_method() -> Method:
+    """Return Metric3D v2 of torch.hub's cache; what is not in it is fetched, and said first.
+
+    torch.hub takes the main branch and keeps no commit of it: the summary names its folder, and the digests of the
+    Python files in it and of the checkpoint. They are not to be known before both are there.
+
+    Raises ``MethodError`` where torch is missing, or what is not to be had.
+    """
     torch = torch_for(NAME)
     cache = Path(torch.hub.get_dir())
     folder, checkpoint = cache / CACHED_AS, cache / "checkpoints" / CHECKPOINT
     if not (folder / HUBCONF).is_file():
         where = "https://github.com/YvanYin/Metric3D"
         announce(NAME, "its code, which is then run,", where, INSTEAD)
-        with in_words(NAME, torch, f"its code of {where} cannot be fetched or run; {INSTEAD}"):
+        with error_words(NAME, torch, f"its code of {where} cannot be fetched or run; {INSTEAD}"):
             torch.hub.load(REPOSITORY, ENTRY, pretrain=False, trust_repo=True)
     if not checkpoint.is_file():
         announce(NAME, "the weights", WEIGHTS_URL, INSTEAD)
@@ -129,8 +143,14 @@ def _load_fetched() -> Predictor:
             torch.hub.download_url_to_file(WEIGHTS_URL, str(checkpoint), progress=False)
         except OSError as error:
             raise unavailable(NAME, WEIGHTS_URL, error, INSTEAD) from None
-    return load_predictor(folder, checkpoint)
+    code = files_digest(sorted(folder.rglob("*.py")))
+    versions = f"code {CACHED_AS} sha256:{code}; weights sha256:{files_digest([checkpoint])}"
+    info = replace(INFO, summary=f"{INFO.summary}; {versions}")
+    return Method(info, lambda: load_predictor(folder, checkpoint))
 
 
-METRIC3D = Method(replace(INFO, summary=f"{INFO.summary}; own clone and weights: {NAME}:FOLDER"), _load_fetched)
+METRIC3D = Method(
+    replace(INFO, summary=f"{INFO.summary}; own clone and weights: {NAME}:FOLDER"),
+    lambda: cached_metric3d_method().load(),
+)
 """The paper's Metric3D v2. torch.hub fetches its code, which is run, and its weights when it is loaded."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.digests import file_sha256
+from rebar_depth_bench.digests import files_digest
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.method import Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.onnx_grid import input_tensor, on_picture, placement
@@ -92,7 +91,6 @@ def _digest(path: Path, model: Path) -> str:
     """Return a digest of the TOML file, the model and its external data: what lies beside it under its name."""
     try:
         beside = sorted(one for one in model.parent.iterdir() if one.name.startswith(model.name) and one.is_file())
-        digests = [file_sha256(part) for part in (path, *beside)]
+        return files_digest((path, *beside))[:_DIGITS]
     except OSError as error:
         raise MethodError(f"{error.filename}: cannot be read: {error.strerror}") from None
-    return hashlib.sha256(" ".join(digests).encode()).hexdigest()[:_DIGITS]

@@ -10,7 +10,6 @@ Read off ``unidepth/models/unidepthv2/unidepthv2.py`` of its repository.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,21 +18,12 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.foreign_code import (
-    existing,
-    filled,
-    in_words,
-    package,
-    safetensors_names,
-    torch_for,
-    with_weights,
-)
-from rebar_depth_bench.methods.hub_folders import hub_folder
-from rebar_depth_bench.methods.method import Method, MethodInfo, Predictor
+from rebar_depth_bench.methods.foreign_code import error_words, filled, package, safetensors_names, torch_for
+from rebar_depth_bench.methods.hub_method import WEIGHTS, HubModel, listed_method
+from rebar_depth_bench.methods.method import MethodInfo, Predictor
 from rebar_depth_bench.methods.metric_conversions import positive_or_nan
 
 NAME, REPOSITORY = "unidepth", "lpiccinelli/unidepth-v2-vitl14"
-FILES = ("config.json", "model.safetensors")
 INSTALL = "pip install 'unidepth @ git+https://github.com/lpiccinelli-eth/UniDepth'"
 INFO = MethodInfo(
     name=NAME,
@@ -46,16 +36,6 @@ INFO = MethodInfo(
 )
 
 
-def unidepth_method(folder: Path) -> Method:
-    """Return UniDepth v2 with the weights of a folder: ``config.json`` and ``model.safetensors``, as on the Hub.
-
-    Raises ``MethodError`` for a folder without them.
-    """
-    existing(folder, NAME, FILES)
-    info = with_weights(INFO, folder.resolve().name, [folder / name for name in FILES])
-    return Method(info, lambda: load_predictor(folder))
-
-
 def load_predictor(folder: Path) -> Predictor:
     """Load the network of a folder, on the GPU if torch sees one.
 
@@ -63,13 +43,13 @@ def load_predictor(folder: Path) -> Predictor:
     """
     torch = torch_for(NAME)
     models = package("unidepth.models", NAME, INSTALL)
-    with in_words(NAME, torch, f"{folder.name} cannot be loaded"):
+    with error_words(NAME, torch, f"{folder.name} cannot be loaded"):
         model = models.UniDepthV2.from_pretrained(str(folder), local_files_only=True)
-        model = filled(NAME, torch, model, safetensors_names(folder / FILES[1]))
+        model = filled(NAME, torch, model, safetensors_names(folder / WEIGHTS))
 
     def run(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         planes = torch.from_numpy(row["left_rgb"].transpose(2, 0, 1).copy())
-        with in_words(NAME, torch, "fails on a picture"), torch.inference_mode():
+        with error_words(NAME, torch, "fails on a picture"), torch.inference_mode():
             found = model.infer(planes)["depth"]
             depth_m = np.asarray(found.float().cpu().numpy())
         if depth_m.shape != (1, 1, *row["left_rgb"].shape[:2]):
@@ -82,8 +62,6 @@ def load_predictor(folder: Path) -> Predictor:
     return run
 
 
-UNIDEPTH = Method(
-    replace(INFO, summary=f"{INFO.summary}; own weights: {NAME}:FOLDER"),
-    lambda: load_predictor(hub_folder(REPOSITORY, FILES, f"{NAME}:FOLDER")),
-)
+UNIDEPTH_MODEL = HubModel(INFO, REPOSITORY, load_predictor)
+UNIDEPTH = listed_method(UNIDEPTH_MODEL)
 """The paper's UniDepth v2. Its weights come from the Hub, or its cache, when it is loaded."""
