@@ -23,6 +23,7 @@ from rebar_depth_bench.methods.multiview.pictures import LeftPictures
 from rebar_depth_bench.methods.multiview.plane_sweep import PosedPicture, SweepSpec, sweep
 from rebar_depth_bench.methods.multiview.structure import Structure
 from rebar_depth_bench.progress import Progress
+from rebar_depth_bench.streaming import ordered_map
 
 SWEEP = SweepSpec()
 CONFIRMATIONS = 1
@@ -55,12 +56,15 @@ def _plane_sweep(pictures: LeftPictures, structure: Structure, work: Path, progr
     folder = work / "sweep"
     folder.mkdir(exist_ok=True)
     near = neighbours(structure)
-    for done, name in enumerate(structure.cam_from_sfm, start=1):
+
+    def keep(name: str) -> None:
         kept = folder / f"{name}.npy"
         if not kept.is_file():
             depth = _swept(pictures, structure, name, near[name])
             with replacing(kept) as temporary, temporary.open("wb") as stream:
                 np.save(stream, depth)
+
+    for done, _ in enumerate(ordered_map(keep, list(structure.cam_from_sfm), None), start=1):
         progress("plane sweep", done, len(structure.cam_from_sfm))
 
     def read(name: str) -> Float32[ndarray, "h w"]:
