@@ -34,19 +34,9 @@ from dataset_builder.appearance import VARIANTS
 from dataset_builder.length_units import UNITS_M
 from dataset_builder.model import MAX_BARS
 from dataset_builder.specs import DomeSpec, RigSpec, RingSpec
-from dataset_builder.toml_table import (
-    FLAG,
-    LENGTH,
-    Kind,
-    Table,
-    list_of,
-    number,
-    number_between,
-    one_of,
-    text,
-    whole_number,
-)
+from dataset_builder.toml_kinds import DISTANCE, ELEVATION, LENGTH, POINT, Point, list_of
 from rebar_depth_bench.errors import InputError, problem_summary
+from rebar_depth_bench.toml_keys import FLAG, TABLE, Keys, Kind, text_that, whole_number, words
 
 ENVIRONMENTS = ("laboratory", "outdoors")
 SOURCES = ("bar", "mesh", "ifc")
@@ -54,8 +44,6 @@ MAX_VIEWS = 10_000
 """The number in a view's id has four digits."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
 _PICOMETRES = 12
-
-Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -89,7 +77,9 @@ def name_kind(taken: Collection[str]) -> Kind[str]:
     expected = "a name of small letters, digits and hyphens that starts with a letter or digit"
     if taken:
         expected += f", is none of {', '.join(taken)} and ends in no variant's name"
-    return text(expected, lambda name: bool(_NAME.fullmatch(name)) and name not in taken and not _is_variant(name))
+    return text_that(
+        expected, lambda name: bool(_NAME.fullmatch(name)) and name not in taken and not _is_variant(name)
+    )
 
 
 def _is_variant(name: str) -> bool:
@@ -103,7 +93,8 @@ def read_scene_toml(content: bytes, where: str, taken: Collection[str] = ()) -> 
     Raises ``InputError`` with every problem at once where it is no TOML, or any key is missing, unknown or wrong.
     """
     problems: list[str] = []
-    table = Table(_parsed(content, where), "", problems)
+    table = Keys(_parsed(content, where), "", problems)
+    table.only(("name", "unit", *SOURCES, "environment", "board", "cameras"))
     name = table.optional("name", name_kind(taken))
     unit_m = _unit_m(table)
     sources = {key: table.optional(key, kind) for key, kind in _SOURCE_KINDS.items()}
@@ -111,11 +102,10 @@ def read_scene_toml(content: bytes, where: str, taken: Collection[str] = ()) -> 
     if len(given) != 1:
         found = " and ".join(given) or "none of them"
         problems.append(f"{found} given, expected exactly one of [[bar]] tables, mesh and ifc")
-    environment = table.optional("environment", one_of(ENVIRONMENTS))
+    environment = table.optional("environment", words(*ENVIRONMENTS))
     board = table.optional("board", Kind("6, 12 or false", _markers))
-    cameras = table.optional("cameras", _TABLE)
-    protocol = None if cameras is None else _protocol(Table(cameras, "cameras.", problems), unit_m)
-    table.no_more()
+    cameras = table.optional("cameras", TABLE)
+    protocol = None if cameras is None else _protocol(Keys(cameras, "cameras.", problems), unit_m)
     bars = _bars(sources["bar"] or (), unit_m, problems)
     if problems:
         raise InputError(f"{where}: {problem_summary(problems)}")
@@ -131,10 +121,10 @@ def _parsed(content: bytes, where: str) -> dict[str, Any]:
         raise InputError(f"{where}: not a TOML file: {error}") from error
 
 
-def _unit_m(table: Table) -> float:
+def _unit_m(table: Keys) -> float:
     """Return metres per file unit; only a file that has no length of its own may leave the unit out."""
     needed = "ifc" not in table.values or "cameras" in table.values
-    unit = (table.required if needed else table.optional)("unit", one_of(tuple(UNITS_M)))
+    unit = (table.required if needed else table.optional)("unit", words(*UNITS_M))
     return UNITS_M[unit] if unit else 1.0
 
 
@@ -144,49 +134,44 @@ def _markers(value: object) -> int:
     raise ValueError
 
 
-def _table(value: object) -> Mapping[str, Any]:
-    if not isinstance(value, dict):
-        raise ValueError
-    return value
-
-
-_TABLE: Kind[Mapping[str, Any]] = Kind("a table", _table)
-_FILE = text("a path, relative to this file", lambda path: bool(path) and path.isprintable())
+_FILE = text_that("a path, relative to this file", lambda path: bool(path) and path.isprintable())
 _SOURCE_KINDS: Mapping[str, Kind[Any]] = {
-    "bar": list_of(_TABLE, "bar", f"1 to {MAX_BARS} tables, each under [[bar]]", most=MAX_BARS),
+    "bar": list_of(TABLE, "bar", f"1 to {MAX_BARS} tables, each under [[bar]]", most=MAX_BARS),
     "mesh": _FILE,
     "ifc": _FILE,
 }
-_DISTANCE = number_between(0.0, float("inf"), "a distance above 0")
-_ELEVATION = number_between(0.0, 89.0, "degrees above 0, up to 89")
 _AZIMUTHS = whole_number(1, 3600)
+_PROTOCOL_KEYS: Mapping[str, tuple[str, ...]] = {
+    "dome": ("kind", "radii", "elevations_deg", "azimuths"),
+    "ring": ("kind", "radius", "elevation_deg", "azimuths"),
+}
 
 
-def _protocol(table: Table, unit_m: float) -> DomeSpec | RingSpec | None:
+def _protocol(table: Keys, unit_m: float) -> DomeSpec | RingSpec | None:
     """Return the camera protocol of ``[cameras]``, or None where it has problems."""
-    kind = table.required("kind", one_of(("dome", "ring")))
+    kind = table.required("kind", words(*_PROTOCOL_KEYS))
+    if kind is not None:
+        table.only(_PROTOCOL_KEYS[kind])
     protocol: DomeSpec | RingSpec | None = None
     if kind == "dome":
-        radii = table.required("radii", list_of(_DISTANCE, "radius", "a list of distances above 0"))
-        rings = list_of(_ELEVATION, "elevation", "a list of degrees above 0, up to 89")
+        radii = table.required("radii", list_of(DISTANCE, "radius", "a list of distances above 0"))
+        rings = list_of(ELEVATION, "elevation", "a list of degrees above 0, up to 89")
         elevations_deg = table.required("elevations_deg", rings)
         azimuths = table.required("azimuths", _AZIMUTHS)
         if radii and elevations_deg and azimuths:
             protocol = DomeSpec(tuple(_metres(r, unit_m) for r in radii), elevations_deg, azimuths)
             _check_cameras(table, min(protocol.radii_m), len(radii) * len(elevations_deg) * azimuths)
     elif kind == "ring":
-        radius = table.required("radius", _DISTANCE)
-        elevation_deg = table.required("elevation_deg", _ELEVATION)
+        radius = table.required("radius", DISTANCE)
+        elevation_deg = table.required("elevation_deg", ELEVATION)
         azimuths = table.required("azimuths", _AZIMUTHS)
         if radius and elevation_deg and azimuths:
             protocol = RingSpec(_metres(radius, unit_m), elevation_deg, azimuths)
             _check_cameras(table, protocol.radius_m, azimuths)
-    if kind is not None:
-        table.no_more()
     return protocol
 
 
-def _check_cameras(table: Table, nearest_m: float, views: int) -> None:
+def _check_cameras(table: Keys, nearest_m: float, views: int) -> None:
     if nearest_m < RigSpec.baseline_m:
         table.problems.append(
             f"{table.where[:-1]}: the nearest stand {nearest_m:.4g} m from the aim point, expected at least the "
@@ -196,20 +181,12 @@ def _check_cameras(table: Table, nearest_m: float, views: int) -> None:
         table.problems.append(f"{table.where[:-1]}: {views} views asked for, expected at most {MAX_VIEWS}")
 
 
-_ROLE = text("a name of up to 60 letters", lambda role: role == role.strip() != "" and _is_name(role))
-_POINT = Kind("three numbers", lambda value: _point(value))
-_POINTS = list_of(_POINT, "point", "two or more points of three finite numbers each, [x, y, z]", least=2)
+_ROLE = text_that("a name of up to 60 letters", lambda role: role == role.strip() != "" and _is_name(role))
+_POINTS = list_of(POINT, "point", "two or more points of three finite numbers each, [x, y, z]", least=2)
 
 
 def _is_name(role: str) -> bool:
     return len(role) <= 60 and role.isprintable()
-
-
-def _point(value: object) -> Point:
-    if not isinstance(value, list) or len(value) != 3:
-        raise ValueError
-    x, y, z = (number(coordinate) for coordinate in value)
-    return x, y, z
 
 
 def _bars(tables: tuple[Mapping[str, Any], ...], unit_m: float, problems: list[str]) -> tuple[TomlBar, ...]:
@@ -229,7 +206,8 @@ def _bars(tables: tuple[Mapping[str, Any], ...], unit_m: float, problems: list[s
 
 
 def _bar_values(values: Mapping[str, Any], where: str, problems: list[str]) -> dict[str, Any]:
-    table = Table(values, where, problems)
+    table = Keys(values, where, problems)
+    table.only(("diameter", "points", "role", "id", "bend_diameter", "ribs"))
     found = {
         "diameter": table.required("diameter", LENGTH),
         "points": table.required("points", _POINTS),
@@ -238,7 +216,6 @@ def _bar_values(values: Mapping[str, Any], where: str, problems: list[str]) -> d
         "bend_diameter": table.optional("bend_diameter", LENGTH),
         "ribs": table.optional("ribs", FLAG),
     }
-    table.no_more()
     mandrel, diameter = found["bend_diameter"], found["diameter"]
     if isinstance(mandrel, float) and isinstance(diameter, float) and mandrel < diameter:
         problems.append(

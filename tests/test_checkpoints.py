@@ -150,16 +150,14 @@ def test_fetched_once_with_a_word_first_and_then_from_the_cache(
     weights.unlink()
     finished = run("hf:org/model", tmp_path, endpoint, offline="1")
     assert finished.returncode == 2
-    assert "org/model: the weights not in the Hub's cache, and HF_HUB_OFFLINE is set" in finished.stderr
+    assert "org/model: the weights not on this machine, and HF_HUB_OFFLINE is set" in finished.stderr
 
 
 def test_offline_and_not_in_the_cache(tmp_path: Path) -> None:
     finished = run("depth-pro", tmp_path, "http://127.0.0.1:9", offline="1")
     assert finished.returncode == 2
-    assert finished.stderr.startswith(
-        "error: apple/DepthPro-hf: config.json not in the Hub's cache, and HF_HUB_OFF"
-    )
-    assert "name its folder: hf:FOLDER" in finished.stderr
+    assert finished.stderr.startswith("error: apple/DepthPro-hf: config.json not on this machine, and HF_HUB_OFF")
+    assert "name their folder: hf:FOLDER (hf download apple/DepthPro-hf --local-dir FOLDER)\n" in finished.stderr
     assert "Traceback" not in finished.stderr
 
 
@@ -169,4 +167,5 @@ def test_what_the_hub_does_not_have(name: str, hub: tuple[str, list[str]], tmp_p
     finished = run(name, tmp_path, endpoint, offline="0")
     assert finished.returncode == 2
     assert f"cannot be fetched from {endpoint}: RepositoryNotFoundError" in finished.stderr
+    assert "expected a connection, HF_TOKEN for a model that is not public, or a local copy: hf" in finished.stderr
     assert "Traceback" not in finished.stderr

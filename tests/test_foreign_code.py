@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.foreign_code import error_words, filled, importable
+from rebar_depth_bench.methods.foreign_code import error_words, filled, importable, with_weights
+from rebar_depth_bench.methods.method import MethodInfo
 
 torch: Any = importlib.import_module("torch")
 
@@ -52,6 +55,22 @@ def test_what_strangers_raise_and_print(capsys: pytest.CaptureFixture[str]) -> N
         raise MethodError("mine")
     with pytest.raises(KeyboardInterrupt), error_words("m", torch, "fails"):
         raise KeyboardInterrupt
+
+
+def test_weights_are_told_by_names_and_content_and_not_by_their_place(tmp_path: Path) -> None:
+    """The digest is that of ``sha256sum``'s own words, name first."""
+    info = MethodInfo("m", "what", (), False, "", "")
+    digests = []
+    for place, one, other in (("1", b"x", b"y"), ("2", b"x", b"y"), ("3", b"y", b"x")):
+        (tmp_path / place).mkdir()
+        files = [tmp_path / place / "a.pth", tmp_path / place / "b.yaml"]
+        for file, content in zip(files, (one, other), strict=True):
+            file.write_bytes(content)
+        digests.append(with_weights(info, "mine", files))
+    x, y = (hashlib.sha256(content).hexdigest() for content in (b"x", b"y"))
+    expected = hashlib.sha256(f"a.pth {x}\nb.yaml {y}\n".encode()).hexdigest()
+    assert digests[0] == digests[1] == replace(info, name="m:mine", summary=f"what; weights sha256:{expected}")
+    assert digests[2] != digests[0]
 
 
 def test_the_path_is_as_before_afterwards(tmp_path: Path) -> None:

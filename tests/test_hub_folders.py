@@ -18,14 +18,23 @@ from tests.test_checkpoints import COMMIT, Hub
 
 ASK = """
 import sys
+from dataclasses import replace
 from rebar_depth_bench.console import run_command
-from rebar_depth_bench.methods.hub_folders import hub_folder
+from rebar_depth_bench.methods.hub_method import hub_method
+from rebar_depth_bench.methods.unidepth import UNIDEPTH_MODEL
+
+def show(folder):
+    print(*sorted(one.name for one in folder.iterdir()))
 
 def run():
-    print(hub_folder(sys.argv[1], ("config.json", "model.safetensors"), "mine:FOLDER").name)
+    method = hub_method(replace(UNIDEPTH_MODEL, repository=sys.argv[1], load=show))
+    print(method.info.name, method.info.summary.rpartition("; ")[2])
+    print("loading", file=sys.stderr, flush=True)
+    method.load()
 
 sys.exit(run_command(run))
 """
+TOLD = f"unidepth weights commit {COMMIT}\nconfig.json model.safetensors\n"
 
 
 @pytest.fixture
@@ -56,20 +65,28 @@ def ask(repository: str, home: Path, endpoint: str, offline: str) -> subprocess.
 def test_fetched_once_and_then_from_the_cache(hub: tuple[str, list[str]], tmp_path: Path) -> None:
     endpoint, asked = hub
     first = ask("org/model", tmp_path / "home", endpoint, offline="0")
-    assert (first.returncode, first.stdout) == (0, f"{COMMIT}\n"), first.stderr
-    assert f"org/model: fetching config.json and model.safetensors from {endpoint}\n" in first.stderr
-    assert any("model.safetensors" in request for request in asked)
+    assert (first.returncode, first.stdout) == (0, TOLD), first.stderr
+    before, _, after = first.stderr.partition("loading\n")
+    assert before == f"org/model: fetching config.json from {endpoint}\n", (
+        "what the commit is known by, and no more"
+    )
+    assert after == f"org/model: fetching model.safetensors from {endpoint}\n"
+    assert all(request.endswith("/config.json") for request in asked if "main" in request)
+    weights = {request for request in asked if "model.safetensors" in request}
+    assert f"GET /org/model/resolve/{COMMIT}/model.safetensors" in weights
+    assert all(COMMIT in request for request in weights), "not what the main branch is by now"
     assert not any("pytorch_model.bin" in request for request in asked)
     del asked[:]
     second = ask("org/model", tmp_path / "home", endpoint, offline="1")
-    assert (second.returncode, second.stdout) == (0, f"{COMMIT}\n"), second.stderr
+    assert (second.returncode, second.stdout) == (0, TOLD), second.stderr
     assert "fetching" not in second.stderr
     assert asked == []
-    [weights] = tmp_path.glob("home/hub/models--*/snapshots/*/model.safetensors")
-    weights.unlink()
+    [weights_file] = tmp_path.glob("home/hub/models--*/snapshots/*/model.safetensors")
+    weights_file.unlink()
     third = ask("org/model", tmp_path / "home", endpoint, offline="1")
     assert third.returncode == 2
-    assert "HF_HUB_OFFLINE is set: unset it, or fetch them elsewhere and name their folder: mine:F" in third.stderr
+    assert "error: org/model: model.safetensors not on this machine, and HF_HUB_OFFLINE is set" in third.stderr
+    assert "their folder: unidepth:FOLDER (hf download org/model --local-dir FOLDER)\n" in third.stderr
 
 
 def test_what_the_hub_does_not_have(hub: tuple[str, list[str]], tmp_path: Path) -> None:
@@ -77,5 +94,10 @@ def test_what_the_hub_does_not_have(hub: tuple[str, list[str]], tmp_path: Path) 
     finished = ask("org/other", tmp_path / "home", endpoint, offline="0")
     assert finished.returncode == 2
     assert f"org/other: cannot be fetched from {endpoint}: RepositoryNotFoundError" in finished.stderr
-    assert "or a local copy: mine:FOLDER" in finished.stderr
+    assert "or a local copy: unidepth:FOLDER" in finished.stderr
     assert "Traceback" not in finished.stderr
+    [weights] = tmp_path.glob("model/model.safetensors")
+    weights.unlink()
+    finished = ask("org/model", tmp_path / "home", endpoint, offline="0")
+    assert finished.returncode == 2
+    assert f"org/model: no model.safetensors at commit {COMMIT}, expected config.json and mo" in finished.stderr

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rebar_depth_bench.cli import main
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import find_method, onnx_toml
-from rebar_depth_bench.methods.toml_keys import Keys, Kind, choice, number, text, three_numbers, whole_number
+from rebar_depth_bench.toml_keys import Keys, Kind, choice, number, text, three_numbers, whole_number
 from tests.onnx_models import described, mixer
 
 HOSTILE = [
@@ -55,7 +55,7 @@ HOSTILE = [
     ("'depth'", "'canonical-depth'", "[output] focal_canonical_px is missing, expected a number from 1 to 100000"),
     ("'depth'", "'depth'\nfocal_canonical_px = 1000", 'meaning "depth", expected none: it is not used'),
     ("'depth'", "'depth'\nscale = 0", "[output] scale: got 0, expected a number above 0"),
-    ("'depth'", "'depth'\nscale = inf", "[output] scale: got inf, expected a number above 0"),
+    ("'depth'", "'depth'\nscale = inf", "[output] scale: got a number beyond 1e+09, expected a number above 0"),
     ("'depth'", "'depth'\nscale = '1'", "[output] scale: got '1', expected a number above 0"),
     ("'depth'", "'depth'\nmin_m = 3\nmax_m = 2", "[output] min_m: got 3, expected less than max_m, 2"),
     ("'depth'", "'depth'\nname = 'y'\nindex = 0", "[output] has name and index, expected one of them"),

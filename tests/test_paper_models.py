@@ -54,10 +54,13 @@ def test_a_wall_of_one_colour_is_at_its_metres(name: str, tmp_path: Path) -> Non
     assert np.array_equal(found, run(asked(name, row()))), "whatever else draws random numbers"
 
 
-def test_metric3ds_picture_is_that_of_opencv() -> None:
-    """Resized, put in the middle and normalised step by step with OpenCV, which rounds to whole numbers."""
-    rgb = cv2.GaussianBlur(row(np.mgrid[:H, :W][1])["left_rgb"], (7, 7), 2)
-    fit = fit_keeping_ratio((H, W), metric3d.TARGET)
+@pytest.mark.parametrize("grid", [(H, W), (720, 1280)])
+def test_metric3ds_picture_is_that_of_opencv(grid: tuple[int, int]) -> None:
+    """Made larger or smaller, put in the middle and normalised with OpenCV, which rounds to whole numbers."""
+    noise = np.random.default_rng(1).integers(0, 256, (*grid, 3), np.uint8)
+    noise[..., 0] = np.mgrid[: grid[0], : grid[1]][1] % 256
+    rgb = cv2.GaussianBlur(noise, (7, 7), 2)
+    fit = fit_keeping_ratio(grid, metric3d.TARGET)
     found = metric3d.network_input(rgb, fit).numpy()
     large = cv2.resize(rgb, (1064, 598), interpolation=cv2.INTER_LINEAR)
     whole = cv2.copyMakeBorder(large, 9, 9, 0, 0, cv2.BORDER_CONSTANT, value=(123.675, 116.28, 103.53))
@@ -65,6 +68,22 @@ def test_metric3ds_picture_is_that_of_opencv() -> None:
     off = np.abs(found[0].transpose(1, 2, 0) - expected) * 57
     assert off.max() < 1.1, "a step of 255 at most: OpenCV counts in 2048ths"
     assert off.mean() < 0.2
+
+
+def test_metric3d_on_the_benchmarks_own_grid(tmp_path: Path) -> None:
+    """1280 x 720 is made smaller, 1064 / 1280: a ramp comes back where it was, in metres of fx = 700."""
+    run = located("metric3d", tmp_path).load()
+    rows, columns = np.mgrid[:720, :1280]
+    for ramp in (rows / 3, columns / 6):
+        red = np.round(10 + ramp).astype(np.uint8)
+        rgb = np.stack([red, np.full_like(red, 90), np.full_like(red, 7)], axis=-1)
+        K = np.array([[700.0, 0, 639.5], [0, 700.0, 359.5], [0, 0, 1]])
+        found = run({"left_rgb": rgb, "left_K": K})
+        assert found.shape == (720, 1280)
+        seen = found / (GAIN * 700 * 0.83125 / 1000)
+        off = (seen - (10 + ramp))[3:-3, 3:-3]
+        assert np.abs(off).max() < 1.1, "the ramp's own steps, and the rounding of the resized picture"
+        assert np.abs(off.mean()) < 0.03, "half a row would be 0.17"
 
 
 def test_unidepth_is_not_given_the_camera() -> None:
@@ -183,19 +202,6 @@ def test_a_folder_of_weights_inside_a_clone_is_taken(tmp_path: Path) -> None:
     assert np.isfinite(loaded(method)(asked("foundation-stereo", row()))).any()
     with pytest.raises(MethodError, match=r"no model_best_bp2.pth in .*23-51-11, expected: git clone"):
         find_method(f"foundation-stereo:{clone}")
-
-
-def test_what_torchs_cache_holds_is_not_fetched_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    clone = stand_ins.metric3d_clone(tmp_path / "hub" / "yvanyin_metric3d_main")
-    weights = clone / "metric_depth_vit_small_800k.pth"
-    (tmp_path / "hub" / "checkpoints").mkdir()
-    weights.rename(tmp_path / "hub" / "checkpoints" / weights.name)
-    found = loaded("metric3d")(asked("metric3d", row()))
-    np.testing.assert_allclose(found, 200 * METRES_OF_RED["metric3d"], rtol=3e-3)
-    assert "fetching" not in capsys.readouterr().err
 
 
 def test_the_list_of_methods_tells_what_never_ran_and_what_sees_all_views(

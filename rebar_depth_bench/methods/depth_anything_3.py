@@ -4,8 +4,8 @@ The package resizes the picture (long side 504, both sides to multiples of 14); 
 grid bilinearly. Sky is left as the package fills it, from a random sample: torch's numbers are seeded for each
 view.
 
-Run here with the package's real classes (0.1.1) and a small random network; never with its weights, which could
-not be fetched.
+Run here with the package's own code (0.1.1, a stand-in for torchvision) and a small network of random numbers,
+which a test repeats where the package is installed; never with its weights, which could not be fetched.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ HUB_ACCESS = "a connection, HF_TOKEN for a model that is not public"
 
 
 def snapshot(repository: str, file: str, instead: str) -> Path:
-    """Return the Hub's cached snapshot of a model's main branch, with at least ``file`` in it; named by its commit.
+    """Return the Hub's cached snapshot of a model's main branch, with at least ``file``; its name is the commit.
 
     Only where the cache has none is ``file`` fetched, and said first. ``instead`` is what to name where the model
     is in a folder of one's own (``local_copy``).

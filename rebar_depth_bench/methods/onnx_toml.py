@@ -38,7 +38,8 @@ from pathlib import Path
 from typing import Any
 
 from rebar_depth_bench.errors import MethodError, problem_summary
-from rebar_depth_bench.methods.toml_keys import (
+from rebar_depth_bench.submission.metadata import MAX_METHOD_CHARACTERS
+from rebar_depth_bench.toml_keys import (
     FLAG,
     POSITIVE,
     TABLE,
@@ -50,7 +51,6 @@ from rebar_depth_bench.methods.toml_keys import (
     whole_number,
     words,
 )
-from rebar_depth_bench.submission.metadata import MAX_METHOD_CHARACTERS
 
 MAX_SIDE_PX = 8192
 MAX_BYTES = 1 << 20

@@ -116,7 +116,7 @@ def test_all_problems_come_at_once(tmp_path: Path) -> None:
         scene_config(written(tmp_path, content))
     head, *lines = str(refused.value).splitlines()
     assert head == f"{tmp_path}/my-beam.toml: 5 problems"
-    assert [line.split()[1] for line in lines] == ["unit:", "board:", "'foo'", "[[bar]]", "[[bar]]"]
+    assert [line.split()[1] for line in lines] == ["'foo'", "unit:", "board:", "[[bar]]", "[[bar]]"]
     with pytest.raises(InputError, match=r"40 problems(.|\n)*and 20 more"):
         scene_config(written(tmp_path, MM + "[[bar]]\n" * 20))
 
