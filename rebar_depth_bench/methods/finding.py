@@ -33,7 +33,7 @@ from rebar_depth_bench.methods.multi_view import (
 )
 from rebar_depth_bench.methods.onnx_model import onnx_method
 from rebar_depth_bench.methods.sgbm import SGBM, SGBM_FILLED
-from rebar_depth_bench.methods.transformers_depth import DEPTH_PRO, PREFIX, hf_method
+from rebar_depth_bench.methods.transformers_depth import DEPTH_PRO, PREFIX, depth_pro_method, hf_method
 from rebar_depth_bench.methods.truth import NOISY_TRUTH, TRUTH
 from rebar_depth_bench.methods.unidepth import UNIDEPTH, UNIDEPTH_MODEL
 
@@ -62,6 +62,7 @@ LOCATED: Mapping[str, Callable[[Path], Method]] = {
 
 RESOLVED: Mapping[str, Callable[[], Method]] = {
     "depth-anything-3": partial(hub_method, DEPTH_ANYTHING_3_MODEL),
+    "depth-pro": depth_pro_method,
     "metric3d": cached_metric3d_method,
     "unidepth": partial(hub_method, UNIDEPTH_MODEL),
 }

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -137,3 +138,9 @@ DEPTH_PRO = Method(
     lambda: load_predictor(find_checkpoint(DEPTH_PRO_CHECKPOINT)),
 )
 """The paper's Depth Pro. Its weights come from the Hub, or its cache, when it is loaded."""
+
+
+def depth_pro_method() -> Method:
+    """Return the paper's Depth Pro with the commit of its weights in the summary; raises as ``hf_method`` does."""
+    found = hf_method(DEPTH_PRO_CHECKPOINT)
+    return replace(found, info=replace(DEPTH_PRO.info, summary=found.info.summary))
