@@ -59,14 +59,14 @@ def rectified_pair(row: Mapping[str, Any]) -> RectifiedPair:
         pixel_rays(K, width, height, distortion) @ rotation.T
         for K, distortion, rotation in zip(Ks, distortions, _rotations(rectified), strict=True)
     ]
-    K, canvas = _canvas(rectified.K, [project(rectified.K, eye) for eye in rays])
+    K, size = canvas(rectified.K, [project(rectified.K, eye) for eye in rays])
     left, right = (
-        cv2.initUndistortRectifyMap(*eye, K, canvas, cv2.CV_32FC1)
+        cv2.initUndistortRectifyMap(*eye, K, size, cv2.CV_32FC1)
         for eye in zip(Ks, distortions, _rotations(rectified), strict=True)
     )
     return RectifiedPair(
-        left_rgb=_resampled(row["left_rgb"], left),
-        right_rgb=_resampled(row["right_rgb"], right),
+        left_rgb=resampled(row["left_rgb"], left),
+        right_rgb=resampled(row["right_rgb"], right),
         K=K,
         baseline_m=rectified.baseline_m,
         seen_by_right=(np.abs(right[0] - (width - 1) / 2) <= width / 2)
@@ -98,7 +98,7 @@ def _rotations(rectified: Rectification) -> tuple[Float64[ndarray, "3 3"], Float
     return rectified.R_left, rectified.R_right
 
 
-def _canvas(
+def canvas(
     K: Float64[ndarray, "3 3"], places_px: list[Float64[ndarray, "h w 2"]]
 ) -> tuple[Float64[ndarray, "3 3"], tuple[int, int]]:
     """Return K moved by whole pixels, and the width and height, so that all places lie on the canvas."""
@@ -110,6 +110,7 @@ def _canvas(
     return moved, (width, height)
 
 
-def _resampled(rgb: UInt8[ndarray, "h w 3"], maps: Any) -> UInt8[ndarray, "hc wc 3"]:
+def resampled(rgb: UInt8[ndarray, "h w 3"], maps: Any) -> UInt8[ndarray, "hc wc 3"]:
+    """Return a picture on another grid, bicubic, by OpenCV's two maps."""
     map_x, map_y = maps
     return np.asarray(cv2.remap(rgb, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))

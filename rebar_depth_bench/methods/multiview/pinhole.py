@@ -12,6 +12,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.cameras import pixel_rays, project
+from rebar_depth_bench.raw_stereo import canvas, resampled
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +41,9 @@ def pinhole_grid(row: Mapping[str, Any], width: int, height: int) -> PinholeGrid
     K, distortion = row["left_K"], row["left_distortion"]
     if not distortion.any():
         return PinholeGrid(K, width, height, None)
-    places_px = project(K, pixel_rays(K, width, height, distortion))
-    low, high = np.floor(places_px.min(axis=(0, 1))).astype(int), np.ceil(places_px.max(axis=(0, 1))).astype(int)
-    moved = K.copy()
-    moved[:2, 2] -= low
-    canvas_width, canvas_height = (high - low + 1).tolist()
-    return PinholeGrid(moved, canvas_width, canvas_height, np.rint(places_px - low).astype(np.int64))
+    rays = pixel_rays(K, width, height, distortion)
+    wide_K, (wide_width, wide_height) = canvas(K, [project(K, rays)])
+    return PinholeGrid(wide_K, wide_width, wide_height, np.rint(project(wide_K, rays)).astype(np.int64))
 
 
 def pinhole_picture(row: Mapping[str, Any], grid: PinholeGrid) -> UInt8[ndarray, "hc wc 3"]:
@@ -55,4 +53,4 @@ def pinhole_picture(row: Mapping[str, Any], grid: PinholeGrid) -> UInt8[ndarray,
     maps = cv2.initUndistortRectifyMap(
         row["left_K"], row["left_distortion"], np.eye(3), grid.K, (grid.width, grid.height), cv2.CV_32FC1
     )
-    return np.asarray(cv2.remap(row["left_rgb"], *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+    return resampled(row["left_rgb"], maps)
