@@ -50,8 +50,8 @@ RUNS: Mapping[str, tuple[str, ...]] = {
     "noisy-truth": ALL,
     "truth": ALL,
 }
-"""Which method runs on which configs. The pier has no board: only there the truth anchors. The lattice and the pile
-are below the scanner's least range. ``lidar-survey`` is left out: it takes about 25 s of a core for each view."""
+"""Which method runs on which configs. The pier has no board: only there the truth anchors. The others are nearer
+than the scanner's least range. ``lidar-survey`` is left out: it takes about 25 s of a core for each view."""
 
 
 def main(out: Path) -> int:
