@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-bench``; return its exit status."""
     options = argument_parser().parse_args(arguments)
     datasets.disable_progress_bars()
-    return run_command(lambda: _run(options))
+    return run_command(lambda: _run(options), interrupted=getattr(options, "interrupted", "interrupted"))
 
 
 def _run(options: argparse.Namespace) -> None:

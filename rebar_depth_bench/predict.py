@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import platform
 import shutil
+import sys
 import time
+import traceback
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +18,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench.dataset import decode_row, load_undecoded
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.errors import MethodError, RebarDepthError
 from rebar_depth_bench.folder import DatasetFolder, open_folder
-from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor
+from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
 from rebar_depth_bench.predicted_views import PredictedViews, Preparation
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
@@ -51,8 +55,10 @@ def predict(
     if isinstance(method, MultiViewMethod):
         for name in names:
             method.check(ConfigViews(folder, name))
-    loaded = method.load() if isinstance(method, Method) else None  # before anything is written
+    loaded = _loaded(method) if isinstance(method, Method) else None  # before anything is written
     views = PredictedViews.open(target.with_name(f".{target.name}.views"), key)
+    if len(views):
+        print(f"going on: {len(views)} views are in {views.path}; delete it to start over", file=sys.stderr)
     for name in names:
         done = [view.view_id for view in folder.views(name) if view.view_id in views]
         if len(done) == totals[name]:
@@ -60,13 +66,46 @@ def predict(
         run = loaded or _prepared(method, ConfigViews(folder, name), views, progress)
         for count, row in enumerate(_missing(method, folder, name, set(done)), start=len(done) + 1):
             start = time.perf_counter()
-            depth_m = _checked(method, row["view_id"], run(row), folder.grid(name))
+            with told(f"{method.info.name}: {row['view_id']}: the predictor, given {', '.join(row)}"):
+                found = run(row)
+            depth_m = _checked(method, row["view_id"], found, folder.grid(name))
             views.put(row["view_id"], depth_m, time.perf_counter() - start)
             progress(f"{method.info.name} on {name}", count, totals[name])
-    prepared = {name: found for name in names if (found := views.get_preparation(name))}
+    prepared = {name: kept for name in names if (kept := views.get_preparation(name))}
     _write(method, target, views, [view.view_id for name in names for view in folder.views(name)], prepared)
     shutil.rmtree(views.path)
     return prepared
+
+
+def _loaded(method: Method) -> Predictor:
+    with told(f"{method.info.name}: load"):
+        run = method.load()
+    if not callable(run):
+        raise MethodError(f"{method.info.name}: load returned {type(run).__name__}, expected a function of a row")
+    return run
+
+
+@contextmanager
+def told(what: str) -> Iterator[None]:
+    """Turn what a stranger's code raises in the block into a ``MethodError`` that says what, and where in it."""
+    try:
+        yield
+    except (RebarDepthError, KeyboardInterrupt):
+        raise
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{place.filename}:{place.lineno}"
+        raise MethodError(f"{what}: raised {type(error).__name__}: {error} ({where})") from error
+
+
+def _check_notes(method: AnyMethod, config: ConfigViews, prepared: Prepared) -> None:
+    for key, value in prepared.notes.items():
+        try:
+            json.dumps({key: value}, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise MethodError(
+                f"{method.info.name}: {config.config}: the note {key!r} is no plain JSON value: {error}"
+            ) from None
 
 
 def _prepared(method: AnyMethod, config: ConfigViews, views: PredictedViews, progress: Progress) -> Predictor:
@@ -75,7 +114,11 @@ def _prepared(method: AnyMethod, config: ConfigViews, views: PredictedViews, pro
     work = views.work(config.config)
     afresh = not any(work.iterdir())
     start = time.perf_counter()
-    prepared = method.prepare(config, work, progress)
+    with told(f"{method.info.name}: {config.config}: prepare"):
+        prepared = method.prepare(config, work, progress)
+    if not isinstance(prepared, Prepared):
+        raise MethodError(f"{method.info.name}: prepare returned {type(prepared).__name__}, expected a Prepared")
+    _check_notes(method, config, prepared)
     if views.get_preparation(config.config) is None:
         seconds = round(time.perf_counter() - start, 1)
         views.put_preparation(config.config, Preparation(prepared.notes, seconds if afresh else None))

@@ -53,6 +53,9 @@ class PredictedViews:
         write_text(path / _KEY, wanted)
         return cls(path)
 
+    def __len__(self) -> int:
+        return sum(1 for _ in self.path.glob("*/*.npz"))
+
     def __contains__(self, view_id: str) -> bool:
         return self._file(view_id).is_file()
 

@@ -27,7 +27,8 @@ def show(folder):
     print(*sorted(one.name for one in folder.iterdir()))
 
 def run():
-    method = hub_method(replace(UNIDEPTH_MODEL, repository=sys.argv[1], load=show))
+    package = sys.argv[2]
+    method = hub_method(replace(UNIDEPTH_MODEL, repository=sys.argv[1], package=package, load=show))
     print(method.info.name, method.info.summary.rpartition("; ")[2])
     print("loading", file=sys.stderr, flush=True)
     method.load()
@@ -49,7 +50,9 @@ def hub(tmp_path: Path) -> Iterator[tuple[str, list[str]]]:
     server.server_close()
 
 
-def ask(repository: str, home: Path, endpoint: str, offline: str) -> subprocess.CompletedProcess[str]:
+def ask(
+    repository: str, home: Path, endpoint: str, offline: str, package: str = "numpy"
+) -> subprocess.CompletedProcess[str]:
     settings = {
         "HF_HOME": str(home),
         "HF_ENDPOINT": endpoint,
@@ -57,9 +60,17 @@ def ask(repository: str, home: Path, endpoint: str, offline: str) -> subprocess.
         "HF_HUB_DISABLE_XET": "1",
     }
     quiet = {"HF_HUB_DISABLE_PROGRESS_BARS": "1", "HF_HUB_DISABLE_TELEMETRY": "1", "NO_PROXY": "127.0.0.1"}
-    command = [sys.executable, "-c", ASK, repository]
+    command = [sys.executable, "-c", ASK, repository, package]
     environment = os.environ | settings | quiet
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_without_the_package_nothing_is_fetched(hub: tuple[str, list[str]], tmp_path: Path) -> None:
+    endpoint, asked = hub
+    finished = ask("org/model", tmp_path / "home", endpoint, offline="0", package="no_such_package")
+    assert finished.returncode == 2
+    assert "unidepth needs no_such_package, which is not installed: pip install" in finished.stderr
+    assert asked == []
 
 
 def test_fetched_once_and_then_from_the_cache(hub: tuple[str, list[str]], tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -129,7 +130,7 @@ def score_views(root: Path) -> list[str]:
         ),
         ("nowhere.py:METHOD", "nowhere.py: no such file"),
         ("OWN:NOTHING", "is str, expected a rebar_depth_bench.methods.Method"),
-        ("OWN:ABSENT", "is NoneType, expected"),
+        ("OWN:ABSENT", "own.py: has no ABSENT, expected the name of a method in it"),
         ("BROKEN:METHOD", "cannot be imported: ZeroDivisionError: division by zero"),
     ],
 )
@@ -291,3 +292,41 @@ def test_a_dataset_rendered_otherwise_is_predicted_anew(own: Path, tiny_root: Pa
     run(other, lambda *_: None)
     first, second = score_views(tiny_root)
     assert (tmp_path / "log").read_text().split() == [first, first, second]
+
+
+WRONG = {
+    "load returned NoneType, expected a function of a row": "def load():\n    pass",
+    "load: raised FileNotFoundError: weights.pth": "def load():\n    raise FileNotFoundError('weights.pth')",
+    "lattice-orbit/0025: the predictor, given view_id, left_rgb: raised KeyError: 'left_depth'": (
+        "def load():\n    return lambda row: row['left_depth']"
+    ),
+}
+
+
+@pytest.mark.parametrize(("words", "code"), WRONG.items(), ids=["no predictor", "load", "predictor"])
+def test_what_a_users_code_raises_is_told_with_its_place(
+    words: str, code: str, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "wrong.py"
+    info = "MethodInfo('wrong', 'a test', ('left_rgb',), False, 'here', 'MIT')"
+    path.write_text(f"from rebar_depth_bench.methods import *\n{code}\nMETHOD = Method({info}, load)\n")
+    command = ["predict", f"{path}:METHOD", "--data", str(tiny_root), "--out", str(tmp_path / "out.zip")]
+    assert main([*command, "--config", "lattice-orbit"]) == 2
+    complaint = capsys.readouterr().err
+    assert f"error: wrong: {words}" in complaint
+    assert "Traceback" not in complaint
+    assert "raised" not in words or f"({path}:" in complaint
+
+
+def test_notes_that_are_no_json_are_refused_at_once(tiny_root: Path, tmp_path: Path) -> None:
+    log: list[str] = []
+    method = whole_config(log)
+    spoiled = replace(method, prepare=lambda *given: replace(method.prepare(*given), notes={"bad": float("nan")}))
+    with pytest.raises(MethodError, match="whole: lattice: the note 'bad' is no plain JSON value"):
+        predict(spoiled, tiny_root, tmp_path / "whole.zip")
+    assert log[-1].startswith("prepare")
+
+
+def test_columns_without_a_comma_are_refused() -> None:
+    with pytest.raises(TypeError, match="columns is the text 'left_rgb', expected a tuple of names"):
+        MethodInfo("mine", "a test", "left_rgb", False, "here", "MIT")  # type: ignore[arg-type]

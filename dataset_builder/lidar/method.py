@@ -58,8 +58,8 @@ def lidar_method(name: str, spec: ScannerSpec, what: str) -> MultiViewMethod:
 
     summary = (
         f"simulated laser scanner, {what}, {-1000 * spec.position_left_m[1]:.0f} mm above the left camera, pose"
-        " known exactly; reads the scene's mesh: a simulation, no measurement of pictures; no answer below"
-        f" {spec.min_range_m:g} m"
+        " known exactly; reads the scene's mesh: a simulation, no measurement of pictures; no answer at"
+        f" ranges below {spec.min_range_m:g} m"
     )
     source = f"this project, scanner {_digest(spec)}"  # two scanners of one name are two methods
     info = MethodInfo(name, summary, _COLUMNS, True, source, "Apache-2.0", reads_truth=True)

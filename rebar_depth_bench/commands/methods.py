@@ -35,7 +35,9 @@ def run(_: argparse.Namespace) -> None:
             continue
         info = method.info
         shown = f"{name} †" if info.reads_truth else name
-        table.add_row(shown, _what_it_does(method), _needs(info.columns), f"{info.source}\n{info.licence}")
+        table.add_row(
+            shown, _what_it_does(method), _needs(info.columns), f"{info.source}\nlicence: {info.licence}"
+        )
     Console().print(table)
     Console().print("† is told some of the truth: its numbers stand for no instrument")
 

@@ -22,6 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(an ONNX model), hf:ORG/NAME (a checkpoint of transformers), NAME:FOLDER (own weights of "
         f"{', '.join(LOCATED)})"
     )
+    parser.set_defaults(interrupted="interrupted; the same command goes on where it was")
     parser.add_argument("method", metavar="METHOD", help=names)
     add_data(parser)
     parser.add_argument("--out", required=True, type=Path, metavar="ARCHIVE", help="the zip to write")

@@ -29,6 +29,7 @@ NAME, REPOSITORY = "depth-anything-3", "depth-anything/DA3METRIC-LARGE"
 PRESET = "da3metric-large"
 """Only this network's output becomes metres by the focal length: others are relative, or metres already."""
 SEED = 1
+INSTALL = "pip install depth-anything-3"
 INFO = MethodInfo(
     name=NAME,
     summary="Depth Anything 3 Metric from one picture: depth in metres, the focal length given, as in the paper",
@@ -46,7 +47,7 @@ def load_predictor(folder: Path) -> Predictor:
     Raises ``MethodError`` where torch or the package is missing, or weights that fill the network.
     """
     torch = torch_for(NAME)
-    api = package("depth_anything_3.api", NAME, "pip install depth-anything-3")
+    api = package("depth_anything_3.api", NAME, INSTALL)
     with error_words(NAME, torch, f"{folder.name} cannot be loaded"):
         model = api.DepthAnything3.from_pretrained(str(folder), local_files_only=True)
         model = filled(NAME, torch, model, safetensors_names(folder / WEIGHTS))
@@ -86,6 +87,6 @@ def check_preset(folder: Path) -> None:
         )
 
 
-DEPTH_ANYTHING_3_MODEL = HubModel(INFO, REPOSITORY, load_predictor, check_preset)
+DEPTH_ANYTHING_3_MODEL = HubModel(INFO, REPOSITORY, "depth_anything_3", INSTALL, load_predictor, check_preset)
 DEPTH_ANYTHING_3 = listed_method(DEPTH_ANYTHING_3_MODEL)
 """The paper's Depth Anything 3 Metric. Its weights come from the Hub, or its cache, when it is loaded."""

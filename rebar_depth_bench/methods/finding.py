@@ -85,7 +85,10 @@ def find_method(name: str) -> AnyMethod:
         return LOCATED[known_as](Path(place).expanduser())
     path, colon, attribute = name.rpartition(":")
     if colon and path.endswith(".py"):
-        return _of_file(Path(path), _checked(name, getattr(_module(Path(path)), attribute, None)))
+        module = _module(Path(path))
+        if not hasattr(module, attribute):
+            raise MethodError(f"{path}: has no {attribute}, expected the name of a method in it")
+        return _of_file(Path(path), _checked(name, getattr(module, attribute)))
     if name.endswith(".toml"):
         return onnx_method(Path(name))
     if name in RESOLVED:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 
+from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.foreign_code import check_folder, with_weights
 from rebar_depth_bench.methods.hub_folders import complete_snapshot, local_copy, snapshot
 from rebar_depth_bench.methods.method import Method, MethodInfo, Predictor
@@ -33,6 +35,8 @@ class HubModel:
 
     info: MethodInfo
     repository: str
+    package: str
+    install: str
     load: Callable[[Path], Predictor]
     check: Callable[[Path], None] = any_config
 
@@ -44,6 +48,7 @@ def hub_method(model: HubModel) -> Method:
 
     Raises ``MethodError`` where it is not to be had.
     """
+    _require(model)  # before anything is fetched for nothing
     instead = local_copy(model.info.name, model.repository)
     folder = snapshot(model.repository, CONFIG, instead)
     model.check(folder)
@@ -53,6 +58,11 @@ def hub_method(model: HubModel) -> Method:
         return model.load(folder)
 
     return Method(replace(model.info, summary=f"{model.info.summary}; weights commit {folder.name}"), load)
+
+
+def _require(model: HubModel) -> None:
+    if find_spec(model.package) is None:
+        raise MethodError(f"{model.info.name} needs {model.package}, which is not installed: {model.install}")
 
 
 def folder_method(model: HubModel, folder: Path) -> Method:

@@ -34,6 +34,10 @@ class MethodInfo:
     reads_truth: bool = False
     unexercised: str = ""
 
+    def __post_init__(self) -> None:
+        if isinstance(self.columns, str):  # a forgotten comma
+            raise TypeError(f"columns is the text {self.columns!r}, expected a tuple of names")
+
 
 @dataclass(frozen=True)
 class Method:
@@ -57,8 +61,10 @@ class MultiViewMethod:
 
     ``check(views)`` raises ``MethodError`` for a config that cannot serve it (one without a board, say) or where
     a package is missing; it is asked of every config before work begins. ``prepare(views, work, progress)`` makes
-    the predictor; what it leaves in the folder ``work`` is there again when an interrupted run goes on. The
-    predictor's rows hold ``view_id`` and ``info.columns``.
+    the predictor from all views: ``views.rows("left_rgb", "left_K")`` yields them decoded, ``view_ids``, ``grid``,
+    ``board`` and ``mesh`` are there too; ``progress("what", done, total)`` tells how far it is. What it leaves in
+    the folder ``work`` is there again when an interrupted run goes on. The predictor's rows hold ``view_id`` and
+    ``info.columns``.
     """
 
     info: MethodInfo

@@ -133,7 +133,8 @@ DEPTH_PRO = Method(
         columns=_columns(Output.CANONICAL),
         uses_intrinsics=True,
         source=f"transformers, {DEPTH_PRO_CHECKPOINT}",
-        licence="Apple",
+        licence="Apple's own; it comes with the weights",
+        unexercised="never run with its real weights where this was written: they were not to be had",
     ),
     lambda: load_predictor(find_checkpoint(DEPTH_PRO_CHECKPOINT)),
 )

@@ -62,6 +62,6 @@ def load_predictor(folder: Path) -> Predictor:
     return run
 
 
-UNIDEPTH_MODEL = HubModel(INFO, REPOSITORY, load_predictor)
+UNIDEPTH_MODEL = HubModel(INFO, REPOSITORY, "unidepth", INSTALL, load_predictor)
 UNIDEPTH = listed_method(UNIDEPTH_MODEL)
 """The paper's UniDepth v2. Its weights come from the Hub, or its cache, when it is loaded."""
