@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rebar_depth_bench.methods import own_methods
+
 RESULTS = Path(__file__).parent / "reference.json"
 
 
@@ -26,6 +28,7 @@ def _row(method: str, result: Mapping[str, Any], config: str, table: Mapping[str
     interval = "" if low_high is None else f" ({_number(low_high[0], 3)}-{_number(low_high[1], 3)})"
     return {
         "method": method,
+        "mark": " †" if own_methods()[method].info.reads_truth else "",
         "coverage": _percent(table["coverage"]),
         "ranked": "yes" if table["ranked"] else "no",
         "abs_rel": _number(native.get("abs_rel"), 4) + interval,
