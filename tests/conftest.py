@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 # Before anything of ours is imported: libraries read these once.
 _CACHES = tempfile.TemporaryDirectory(prefix="rebar-test-caches-")
@@ -21,6 +22,10 @@ from rebar_depth_bench import SubmissionWriter, load  # noqa: E402
 
 # A shell that runs the tests in the background ignores this signal; what they start would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# No test is timed: a busy machine is no failure.
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 TINY = ("--width", "160", "--height", "90", "--samples", "1")
 TINY_VIEWS = 9

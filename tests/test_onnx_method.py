@@ -105,7 +105,7 @@ def test_no_value_at_all_makes_a_depth_out_of_bounds(values: list[float], meanin
     assert not known[~(np.array(values) > 0)].any()
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=15, deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=15)
 @given(sides=st.tuples(SIDES, SIDES, SIDES, SIDES), pad=st.booleans(), axis=st.integers(0, 1))
 def test_a_model_that_answers_with_its_own_coordinates_shows_where_pixels_come_from(
     sides: tuple[int, int, int, int], pad: bool, axis: int, tmp_path: Path

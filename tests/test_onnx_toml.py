@@ -148,7 +148,7 @@ def test_any_value_is_taken_or_is_one_sentence(value: object, kind: Kind[Any]) -
     assert all(problem.startswith("[t] key: got ") and "\n" not in problem for problem in problems)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
 @given(content=st.binary(max_size=200) | st.text(alphabet="[]\"'=.{}\n\\ab1,#", max_size=80).map(str.encode))
 def test_no_bytes_at_all_make_anything_but_words(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_bytes(content)

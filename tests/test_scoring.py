@@ -139,7 +139,7 @@ def test_one_bad_entry_refuses_the_whole_archive(
     assert all(any(view in problem for problem in caught.value.problems) for view in broken_views)
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0, 1.0), blank=st.sampled_from([0, -1, np.nan, np.inf]))
 def test_blanking_pixels_never_improves_what_ranks(seed: int, share: float, blank: float) -> None:
     """Removing predictions, even the worst ones on purpose, lowers ``within_mm`` or costs the rank."""

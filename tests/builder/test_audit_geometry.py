@@ -170,7 +170,7 @@ def test_points_far_outside_a_lens_do_not_land_in_the_frame() -> None:
     assert not behind.inside.any()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 9), st.sampled_from([0.1, 5.0]))
 def test_distance_from_a_polyline_is_that_of_the_nearest_segment(seed: int, corners: int, size_m: float) -> None:
     rng = np.random.default_rng(seed)

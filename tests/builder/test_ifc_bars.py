@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy import ndarray
 
@@ -131,7 +131,6 @@ def test_a_mirrored_map() -> None:
     np.testing.assert_allclose(ifc.axis_m()[1], (0.1, -0.03, 0.01), atol=1e-12)
 
 
-@settings(deadline=None)
 @given(
     turn=st.floats(0.02, 6.2), middle=st.floats(0.1, 0.9), radius=st.floats(1.0, 500.0),
     seed=st.integers(0, 1000),

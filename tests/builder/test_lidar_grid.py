@@ -16,7 +16,7 @@ LENS = np.array([-0.175, 0.028, 6.7e-5, -1.5e-4, 0.0])
 STEPS = st.floats(0.01, 0.1)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.floats(0.2, 20), STEPS, STEPS, st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.booleans())
 def test_a_wall_is_exact_and_covered_at_any_step(
     depth_m: float, across: float, up: float, right_m: float, down_m: float, distorted: bool
@@ -27,7 +27,7 @@ def test_a_wall_is_exact_and_covered_at_any_step(
     assert found == pytest.approx(np.full((HEIGHT, WIDTH), depth_m), rel=2e-7)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.floats(0.2, 1), st.floats(0.005, 0.05), st.floats(-0.35, 0.35), st.floats(-0.06, 0.06), st.booleans())
 @example(0.2, 0.05, 0.35, -0.06, False)
 @example(0.2, 0.05, -0.35, -0.06, False)

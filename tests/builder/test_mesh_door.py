@@ -289,7 +289,7 @@ SAMPLES |= {"a.stl": trimesh.exchange.stl.export_stl(RODS[0]), "b.ply": PLY.enco
 SAMPLES |= {"a.ply": trimesh.exchange.ply.export_ply(RODS[0])}
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(name=st.sampled_from(sorted(SAMPLES)), data=st.data())
 def test_any_damage_is_answered_in_words(
     tmp_path_factory: pytest.TempPathFactory, name: str, data: st.DataObject

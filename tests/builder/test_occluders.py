@@ -254,7 +254,7 @@ def test_clutter_stays_on_the_slab() -> None:
             assert np.abs(part.mesh.vertices_m[:, :2]).max() < SLAB_HALF_M
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(
     side_m=st.floats(0.08, 6.0),
     flatness=st.floats(0.15, 2.0),

@@ -211,7 +211,6 @@ def test_the_same_spec_gives_the_same_bytes(pier: Assembly) -> None:
 
 @settings(
     max_examples=15,
-    deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
     phases=[Phase.explicit, Phase.reuse, Phase.generate],  # shrinking would take minutes
 )

@@ -139,7 +139,7 @@ def resampled_m(line: Line) -> Line:
     return np.stack([np.interp(at_m, along_m, column) for column in line.T], axis=1)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     st.sampled_from([0.006, 0.008, 0.010, 0.012]),
     st.floats(0.2, 0.6),

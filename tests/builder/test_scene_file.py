@@ -138,7 +138,7 @@ def test_the_default_dome_is_the_lattices_and_grows_with_the_reach(tmp_path: Pat
     assert min(LATTICE_DOME.radii_m) == pytest.approx(NEAREST_PER_REACH * reach_m, rel=0.08)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(length=st.floats(3.0, 2500.0), across=st.floats(0.0, 2000.0))
 def test_the_default_dome_always_fits(
     length: float, across: float, tmp_path_factory: pytest.TempPathFactory

@@ -105,7 +105,7 @@ def test_no_points_and_no_sets_have_not_converged() -> None:
     assert none.offset_m.shape == (0, 2)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1e-9, 1e-3, 1.0, 1e3, 1e6, 1e150, 1e300]))
 def test_no_cloud_raises_or_warns(seed: int, size_m: float) -> None:
     points_m = size_m * np.random.default_rng(seed).standard_normal((30, 3))

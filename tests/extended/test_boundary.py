@@ -81,7 +81,7 @@ def dense_scores(p_m: ndarray, z_m: ndarray, steel: ndarray) -> dict[str, float]
     return {**f1, **{name: float(np.mean(values)) for name, values in means.items() if values}}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(SEEDS)
 def test_agrees_with_the_dense_formula_of_four_directions(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -95,7 +95,7 @@ def test_agrees_with_the_dense_formula_of_four_directions(seed: int) -> None:
     assert {name: value for name, value in found.items() if name != "boundary_missing"} == pytest.approx(expected)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(SEEDS, st.floats(0.001, 1.0))
 def test_no_hole_raises_any_score(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
@@ -107,7 +107,7 @@ def test_no_hole_raises_any_score(seed: int, share: float) -> None:
     assert after["boundary_missing"] >= before["boundary_missing"]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(SEEDS, st.integers(-40, 40))
 def test_does_not_depend_on_the_predictions_unit(seed: int, exponent: int) -> None:
     rng = np.random.default_rng(seed)
@@ -116,7 +116,7 @@ def test_does_not_depend_on_the_predictions_unit(seed: int, exponent: int) -> No
     assert scores(p_m * 2.0**exponent, truth) == scores(p_m, truth)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(SEEDS)
 def test_does_not_depend_on_how_the_picture_is_turned(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -134,7 +134,7 @@ def test_does_not_depend_on_how_the_picture_is_turned(seed: int) -> None:
     assert turned[0] == turned[1] == turned[2]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(SEEDS, st.lists(st.floats(0.0, 1.0), min_size=2, max_size=2))
 def test_flattening_loses_contours_and_invents_none(seed: int, flat: list[float]) -> None:
     """Every ratio to its power a <= 1: the larger a, the more contours stay, and all of them are right."""

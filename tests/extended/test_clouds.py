@@ -80,7 +80,7 @@ def every_pair(p_m: ndarray, truth: SteelTruth) -> dict[str, float]:
     return found
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(SEEDS)
 def test_agrees_with_every_pair(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -89,7 +89,7 @@ def test_agrees_with_every_pair(seed: int) -> None:
     assert scores(p_m, truth) == pytest.approx(every_pair(p_m, truth))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(SEEDS, st.floats(0.001, 1.0))
 def test_neither_holes_nor_points_far_away_raise_a_score(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
@@ -102,7 +102,7 @@ def test_neither_holes_nor_points_far_away_raise_a_score(seed: int, share: float
         assert all(after[name] <= before[name] for name in before)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(SEEDS)
 def test_shares_grow_with_the_tolerance(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -46,7 +46,7 @@ def test_golden_case_by_hand() -> None:
     assert found["interior_coverage"] == 1.0
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(SEEDS)
 def test_interior_numbers_are_those_of_rebar_1(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -66,7 +66,7 @@ def test_interior_numbers_are_those_of_rebar_1(seed: int) -> None:
     assert {t: found[f"interior_within_{t}mm"] for t in expected.within_mm} == expected.within_mm
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(SEEDS, st.floats(0.001, 1.0))
 def test_a_hole_raises_no_share(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)

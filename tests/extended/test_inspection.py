@@ -143,7 +143,7 @@ def test_what_is_left_out_fails() -> None:
     assert without_one["pass_gb50204_cover_beam"].sum() == 5
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0), st.floats(0.0, 0.03))
 def test_damage_never_helps(seed: int, left_out: float, noise_m: float) -> None:
     rng = np.random.default_rng(seed)
@@ -157,7 +157,7 @@ def test_damage_never_helps(seed: int, left_out: float, noise_m: float) -> None:
     assert twice["bar_found"].sum() <= once["bar_found"].sum()
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     st.tuples(*[st.floats(-3.0, 3.0)] * 3), st.tuples(*[st.floats(-20.0, 20.0)] * 3), st.permutations(range(1, 7))
 )

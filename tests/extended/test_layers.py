@@ -93,7 +93,7 @@ def plain_loop(depth_m: ndarray, bars: ndarray, row: int, column: int, gap_m: np
     return max(front, default=NAN), min(behind, default=NAN)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(SEEDS)
 def test_agrees_with_a_plain_loop(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -108,7 +108,7 @@ def test_agrees_with_a_plain_loop(seed: int) -> None:
     np.testing.assert_array_equal(found, np.array(expected, np.float32).reshape(-1, 2))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(SEEDS)
 def test_layers_turn_with_the_picture(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -165,7 +165,7 @@ def test_midway_is_not_confused_and_far_beyond_is() -> None:
     assert scores(np.array([np.inf, -1.0]), truth)["layer_confusion"] == 1.0  # both missing
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(SEEDS)
 def test_confusion_agrees_with_its_definition(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -181,7 +181,7 @@ def test_confusion_agrees_with_its_definition(seed: int) -> None:
     assert scores(p_m, truth)["layer_confusion"] == pytest.approx(confused / in_sight)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(SEEDS, st.floats(0.001, 1.0), st.floats(1.0, 3.0))
 def test_neither_holes_nor_going_further_astray_lower_confusion(seed: int, share: float, further: float) -> None:
     rng = np.random.default_rng(seed)

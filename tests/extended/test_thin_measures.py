@@ -48,7 +48,7 @@ def test_names_are_unique_and_words_are_there() -> None:
 
 
 @every_family
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.001, 1.0))
 def test_no_hole_improves_a_measure_that_has_a_better_side(
     sampled: Callable[..., Samples], measures: Sequence[Measure], seed: int, share: float

@@ -46,7 +46,7 @@ def camera_row() -> dict[str, Any]:
     return {"left_rgb": rgb, "left_K": K, "left_distortion": ZED_DISTORTION}
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(st.tuples(*[st.floats(-0.3, 0.3)] * 2), st.floats(0.2, 15.0))
 def test_depth_of_a_plane_comes_back_to_a_distorted_grid(slant: tuple[float, float], distance_m: float) -> None:
     """A plane n . x = d has depth d / n . ray on either grid; a pixel takes the canvas pixel next to its ray."""

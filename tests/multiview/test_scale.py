@@ -48,7 +48,7 @@ def seen_corners() -> dict[str, Corners]:
     }
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.floats(0.01, 50.0), st.tuples(*[st.floats(-3.0, 3.0)] * 3))
 def test_exact_corners_give_the_exact_scale_and_the_cameras_in_the_boards_frame(
     unit_m: float, turn: tuple[float, float, float]

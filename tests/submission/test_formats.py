@@ -32,7 +32,7 @@ def decode(suffix: str, data: bytes, shape: tuple[int, int], scale: float = 1.0)
     return FORMATS[suffix].decode(NAME + suffix, memoryview(data), shape, scale)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data(), code=st.sampled_from(["<f2", ">f2", "<f4", ">f4", "<f8", ">f8"]), fortran=st.booleans())
 def test_npy_and_npz_return_every_float_as_it_is(data: st.DataObject, code: str, fortran: bool) -> None:
     shape = data.draw(shapes)
@@ -58,7 +58,7 @@ def test_npy_headers_of_other_writers() -> None:
         np.testing.assert_array_equal(decode(".npy", npy_header(text) + DEPTH.tobytes(), SHAPE), DEPTH)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(data=st.data(), interlace=st.booleans(), scale=st.floats(1e-6, 1.0), level=st.sampled_from([0, 1, 9]))
 def test_png_is_value_times_scale(data: st.DataObject, interlace: bool, scale: float, level: int) -> None:
     units = data.draw(arrays.arrays(np.uint16, data.draw(shapes)))
