@@ -54,7 +54,8 @@ def predict(
     }
     if isinstance(method, MultiViewMethod):
         for name in names:
-            method.check(ConfigViews(folder, name))
+            with _told(f"{method.info.name}: {name}: check"):
+                method.check(ConfigViews(folder, name))
     loaded = _loaded(method) if isinstance(method, Method) else None  # before anything is written
     views = PredictedViews.open(target.with_name(f".{target.name}.views"), key)
     if len(views):
@@ -66,7 +67,7 @@ def predict(
         run = loaded or _prepared(method, ConfigViews(folder, name), views, progress)
         for count, row in enumerate(_missing(method, folder, name, set(done)), start=len(done) + 1):
             start = time.perf_counter()
-            with told(f"{method.info.name}: {row['view_id']}: the predictor, given {', '.join(row)}"):
+            with _told(f"{method.info.name}: {row['view_id']}: the predictor, given {', '.join(row)}"):
                 found = run(row)
             depth_m = _checked(method, row["view_id"], found, folder.grid(name))
             views.put(row["view_id"], depth_m, time.perf_counter() - start)
@@ -78,7 +79,7 @@ def predict(
 
 
 def _loaded(method: Method) -> Predictor:
-    with told(f"{method.info.name}: load"):
+    with _told(f"{method.info.name}: load"):
         run = method.load()
     if not callable(run):
         raise MethodError(f"{method.info.name}: load returned {type(run).__name__}, expected a function of a row")
@@ -86,11 +87,11 @@ def _loaded(method: Method) -> Predictor:
 
 
 @contextmanager
-def told(what: str) -> Iterator[None]:
+def _told(what: str) -> Iterator[None]:
     """Turn what a stranger's code raises in the block into a ``MethodError`` that says what, and where in it."""
     try:
         yield
-    except (RebarDepthError, KeyboardInterrupt):
+    except RebarDepthError:
         raise
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
@@ -114,7 +115,7 @@ def _prepared(method: AnyMethod, config: ConfigViews, views: PredictedViews, pro
     work = views.work(config.config)
     afresh = not any(work.iterdir())
     start = time.perf_counter()
-    with told(f"{method.info.name}: {config.config}: prepare"):
+    with _told(f"{method.info.name}: {config.config}: prepare"):
         prepared = method.prepare(config, work, progress)
     if not isinstance(prepared, Prepared):
         raise MethodError(f"{method.info.name}: prepare returned {type(prepared).__name__}, expected a Prepared")

@@ -327,6 +327,13 @@ def test_notes_that_are_no_json_are_refused_at_once(tiny_root: Path, tmp_path: P
     assert log[-1].startswith("prepare")
 
 
+def test_a_check_that_fails_by_accident_is_told(tiny_root: Path, tmp_path: Path) -> None:
+    method = replace(whole_config([]), check=lambda _: print(1 // 0))
+    with pytest.raises(MethodError, match="whole: lattice: check: raised ZeroDivisionError"):
+        predict(method, tiny_root, tmp_path / "whole.zip")
+    assert not list(tmp_path.iterdir())
+
+
 def test_columns_without_a_comma_are_refused() -> None:
     with pytest.raises(TypeError, match="columns is the text 'left_rgb', expected a tuple of names"):
         MethodInfo("mine", "a test", "left_rgb", False, "here", "MIT")  # type: ignore[arg-type]
