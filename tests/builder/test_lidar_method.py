@@ -47,7 +47,7 @@ def test_what_people_read_says_that_it_is_a_simulation(method: MultiViewMethod, 
     summary = method.info.summary
     assert "reads the scene's mesh: a simulation, no measurement of pictures" in summary
     assert "60 mm above the left camera, pose known exactly" in summary
-    assert f"no answer below {nearest}" in summary
+    assert f"no answer at ranges below {nearest}" in summary
     assert method.info.uses_intrinsics
 
 
