@@ -1,1 +1,1 @@
-"""The place of the leaderboard service, which stands on ``rebar_depth_bench`` and never on the builder."""
+"""The leaderboard: a service that takes prediction archives and scores them exactly as the command line does."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -179,13 +179,8 @@ def _width(table: RichTable, console: Console) -> int:
 
 
 def _csv_header() -> list[str]:
-    metrics = ("abs_rel", "rmse_cm", "mae_cm", "delta1")
     return [
-        *("protocol", "method", "config", "views", "views_scored", "coverage", "ranked"),
-        *(f"native_{name}" for name in metrics),
-        *(f"scaled_{name}" for name in metrics),
-        "scale_median",
-        *(f"within_{t}mm" for t in WITHIN_MM),
+        *("protocol", "method", "config", *number_heads()),
         *("dataset_digest", "dataset_version", "submission_sha256", "software_version"),
     ]
 
@@ -194,13 +189,32 @@ def _csv_row(content: dict[str, Any], name: str, table: dict[str, Any]) -> list[
     """Return one config's cells in the header's order, from the objects of the result's JSON."""
     return [
         *(content["protocol"], content["submission"]["method"], name),
+        *number_cells(table),
+        *(content["dataset"]["digest"], content["dataset"]["version"]),
+        *(content["submission"]["sha256"], content["software"]["version"]),
+    ]
+
+
+def number_heads() -> list[str]:
+    """Return the CSV's heads of a config's numbers."""
+    metrics = ("abs_rel", "rmse_cm", "mae_cm", "delta1")
+    return [
+        *("views", "views_scored", "coverage", "ranked"),
+        *(f"native_{name}" for name in metrics),
+        *(f"scaled_{name}" for name in metrics),
+        "scale_median",
+        *(f"within_{t}mm" for t in WITHIN_MM),
+    ]
+
+
+def number_cells(table: Mapping[str, Any]) -> list[Any]:
+    """Return a config's numbers, ``number_heads`` by ``number_heads``, from its table in the result's JSON."""
+    return [
         *(table[key] for key in ("views", "views_scored", "coverage", "ranked")),
         *table["native"].values(),
         *table["scaled"].values(),
         table["scale_median"],
         *table["within_mm"].values(),
-        *(content["dataset"]["digest"], content["dataset"]["version"]),
-        *(content["submission"]["sha256"], content["software"]["version"]),
     ]
 
 

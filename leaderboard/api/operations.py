@@ -1,0 +1,37 @@
+"""For operators: ``/healthz`` and ``/metrics``."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, HTTPException, Response
+from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+from sqlalchemy.exc import SQLAlchemyError
+
+from leaderboard.api.access import ServiceDep
+from leaderboard.api.models import Problem
+from leaderboard.meters import Meters
+from rebar_depth_bench.version import software_version
+
+router = APIRouter(tags=["operations"])
+
+
+@router.get("/healthz", responses={503: {"model": Problem, "description": "the database does not answer"}})
+def healthz(service: ServiceDep) -> dict[str, str]:
+    """Say that the service answers and its database does."""
+    try:
+        with service.database.read() as session:
+            session.connection().exec_driver_sql("SELECT 1")
+    except SQLAlchemyError as error:
+        raise HTTPException(503, f"the database does not answer: {type(error).__name__}") from None
+    return {"status": "ok", "version": software_version(), "dataset": service.folder.digest}
+
+
+@router.get(
+    "/metrics",
+    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+    response_class=Response,
+)
+def metrics(service: ServiceDep) -> Response:
+    """Return counters and gauges in Prometheus' text format."""
+    meters: Meters = service.meters
+    meters.read_queue(service.database)
+    return Response(generate_latest(meters.registry), media_type=CONTENT_TYPE_LATEST)

@@ -1,0 +1,124 @@
+"""``/api/v1/submissions``: upload, look up, publish, delete."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+from anyio import to_thread
+from fastapi import APIRouter, HTTPException, Path, Request, Response
+
+from leaderboard import submissions
+from leaderboard.api.access import OptionalToken, RequiredToken, ServiceDep
+from leaderboard.api.models import Problem, Problems, Publication, Submission, submission_model
+from leaderboard.intake import Refused, take_in
+from leaderboard.records import SubmissionRecord, TokenRecord
+from leaderboard.service import Service
+
+router = APIRouter(prefix="/api/v1/submissions", tags=["submissions"])
+
+SubmissionId = Annotated[str, Path(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9_-]+$")]
+_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["archive"],
+                    "properties": {"archive": {"type": "string", "format": "binary"}},
+                }
+            }
+        },
+    }
+}
+_REFUSALS: dict[int | str, dict[str, Any]] = {
+    401: {"model": Problem, "description": "no token, or an unknown one"},
+    413: {"model": Problem, "description": "the archive is too large"},
+    422: {"model": Problems, "description": "the archive is refused; the quota is not charged"},
+    429: {"model": Problem, "description": "too many requests, or the quota of the day is spent"},
+}
+_NOT_FOUND: dict[int | str, dict[str, Any]] = {404: {"model": Problem, "description": "no such submission"}}
+_OWNERS: dict[int | str, dict[str, Any]] = {
+    **_NOT_FOUND,
+    401: _REFUSALS[401],
+    403: {"model": Problem, "description": "another's submission"},
+}
+
+
+@router.post("", status_code=202, responses=_REFUSALS, openapi_extra=_BODY)
+async def upload(request: Request, service: ServiceDep, token: RequiredToken) -> Submission:
+    """Upload an archive. It is checked before it is accepted; once 202 is sent it is never lost."""
+    try:
+        record = await take_in(service, token, request.stream(), request.headers)
+    except Refused as refusal:
+        raise HTTPException(refusal.status, refusal.content) from None  # type: ignore[arg-type]
+    return submission_model(record, page_url(request, record))
+
+
+@router.get("/{submission_id}", responses={**_NOT_FOUND, 401: _REFUSALS[401]})
+def look_up(submission_id: SubmissionId, request: Request, service: ServiceDep, _: OptionalToken) -> Submission:
+    """Return a submission. Its id cannot be guessed: whoever has it may read, token or not."""
+    record = found(service, submission_id)
+    result = submissions.result_json(service.database, submission_id)
+    return submission_model(record, page_url(request, record), None if result is None else json.loads(result))
+
+
+@router.get(
+    "/{submission_id}/result.json",
+    responses={**_NOT_FOUND, 200: {"content": {"application/json": {"schema": {"type": "object"}}}}},
+    response_class=Response,
+)
+def result(submission_id: SubmissionId, service: ServiceDep) -> Response:
+    """Return the result, byte for byte what `rebar-bench score ARCHIVE --data ROOT --json FILE` writes."""
+    found(service, submission_id)
+    content = submissions.result_json(service.database, submission_id)
+    if content is None:
+        raise HTTPException(404, "the submission has no result")
+    return Response(content, media_type="application/json")
+
+
+@router.patch("/{submission_id}", responses=_OWNERS)
+def publish(
+    submission_id: SubmissionId, change: Publication, request: Request, service: ServiceDep, token: RequiredToken
+) -> Submission:
+    """Put a submission's rows on the board, or take them off; its owner only."""
+    record = owned(service, submission_id, token)
+    if service.settings.public == "always" and not change.public:
+        raise HTTPException(403, "every submission is public here")
+    submissions.change(service.database, submission_id, public=change.public)
+    record.public = change.public
+    return submission_model(record, page_url(request, record))
+
+
+@router.delete("/{submission_id}", status_code=204, responses=_OWNERS)
+async def delete(submission_id: SubmissionId, service: ServiceDep, token: RequiredToken) -> None:
+    """Delete a submission with its archive and results; its owner only. The quota is not given back."""
+
+    def remove() -> None:
+        owned(service, submission_id, token)
+        submissions.remove(service.database, submission_id)
+        service.archives.delete(submission_id)
+
+    await to_thread.run_sync(remove)
+
+
+def found(service: Service, submission_id: str) -> SubmissionRecord:
+    """Return a submission's record; 404 where there is none."""
+    record = submissions.find(service.database, submission_id)
+    if record is None:
+        raise HTTPException(404, "no such submission")
+    return record
+
+
+def owned(service: Service, submission_id: str, token: TokenRecord) -> SubmissionRecord:
+    """Return a submission's record; 403 where it is another's."""
+    record = found(service, submission_id)
+    if record.token_id != token.id:
+        raise HTTPException(403, "another's submission")
+    return record
+
+
+def page_url(request: Request, record: SubmissionRecord) -> str:
+    """Return the address of a submission's page."""
+    return str(request.url_for("submission_page", submission_id=record.id))

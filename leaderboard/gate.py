@@ -1,0 +1,87 @@
+"""Before and after every request: rate limits, security headers, a log line, a count."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import MutableMapping
+from typing import Any
+
+import structlog
+from limits import parse
+from limits.storage import MemoryStorage
+from limits.strategies import MovingWindowRateLimiter
+from starlette.datastructures import MutableHeaders
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from leaderboard.meters import Meters
+
+CONTENT_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "Content-Security-Policy": CONTENT_POLICY,
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+    "Referrer-Policy": "no-referrer",  # the address of a private submission is its key
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+}
+_READS = ("GET", "HEAD", "OPTIONS")
+_FREE = ("/healthz", "/metrics")
+_LOG = structlog.get_logger("http")
+
+
+class Gate:
+    """ASGI middleware. Addresses are the connection's; behind a proxy uvicorn takes them from its headers."""
+
+    def __init__(self, app: ASGIApp, *, reads: str, writes: str, meters: Meters) -> None:
+        self._app, self._meters = app, meters
+        self._limiter = MovingWindowRateLimiter(MemoryStorage())
+        self._reads, self._writes = parse(reads), parse(writes)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or refuse it with 429."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        start, status = time.perf_counter(), 500
+
+        async def send_dressed(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                _dress(message)
+            await send(message)
+
+        try:
+            if self._admits(scope):
+                await self._app(scope, receive, send_dressed)
+            else:
+                refusal = JSONResponse(
+                    {"detail": "too many requests from this address"}, 429, {"Retry-After": "60"}
+                )
+                await refusal(scope, receive, send_dressed)
+        finally:
+            self._note(scope, status, time.perf_counter() - start)
+
+    def _admits(self, scope: Scope) -> bool:
+        if scope["path"] in _FREE:
+            return True
+        limit, kind = (self._reads, "read") if scope["method"] in _READS else (self._writes, "write")
+        address = (scope.get("client") or ("unknown",))[0]
+        return self._limiter.hit(limit, kind, address)
+
+    def _note(self, scope: Scope, status: int, seconds: float) -> None:
+        route = getattr(scope.get("route"), "path", "none")  # never the path itself: it may hold a private id
+        self._meters.requests.labels(scope["method"], route, str(status)).inc()
+        self._meters.seconds.labels(scope["method"], route).observe(seconds)
+        _LOG.info("request", method=scope["method"], route=route, status=status, ms=round(1000 * seconds, 1))
+
+
+def _dress(message: MutableMapping[str, Any]) -> None:
+    headers = MutableHeaders(scope=message)
+    for name, value in HEADERS.items():
+        headers.setdefault(name, value)

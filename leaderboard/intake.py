@@ -1,0 +1,100 @@
+"""An upload's way in: received, checked, kept, queued. Only then is it accepted."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Mapping
+from typing import Any
+
+import structlog
+from anyio import to_thread
+
+from leaderboard import submissions
+from leaderboard.records import SubmissionRecord, TokenRecord
+from leaderboard.service import Service
+from leaderboard.submissions import QuotaSpent, Upload
+from leaderboard.upload import MOST_ELSE, Received, UploadError, receive
+from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN
+
+_LOG = structlog.get_logger("intake")
+
+
+class Refused(Exception):
+    """An upload is refused: the HTTP status, and the body that says why."""
+
+    def __init__(self, status: int, detail: str, problems: tuple[str, ...] = ()) -> None:
+        self.status = status
+        self.content: dict[str, Any] = {"detail": detail}
+        if status == 422:
+            self.content["problems"] = list(problems or (detail,))
+        super().__init__(detail)
+
+
+async def take_in(
+    service: Service, token: TokenRecord, body: AsyncIterator[bytes], headers: Mapping[str, str]
+) -> SubmissionRecord:
+    """Return the record of an accepted upload: archive and row are on disk by then. Raises ``Refused``.
+
+    A token without quota is told before its archive is read; only an accepted archive is charged.
+    """
+    settings = service.settings
+    if await to_thread.run_sync(_spent, service, token) >= settings.quota:
+        raise _quota_spent(settings.quota)
+    if int(headers.get("content-length", 0)) > settings.max_upload + MOST_ELSE:
+        raise Refused(413, f"the archive is larger than {settings.max_upload} bytes, the most this service takes")
+    try:
+        received = await receive(body, headers.get("content-type", ""), settings.spool, settings.max_upload)
+    except UploadError as error:
+        raise Refused(error.status, error.detail) from None
+    try:
+        return await _accepted(service, token, received)
+    finally:
+        received.path.unlink(missing_ok=True)
+
+
+async def _accepted(service: Service, token: TokenRecord, received: Received) -> SubmissionRecord:
+    verdict = await service.checker.check(received.path)
+    if isinstance(verdict, tuple):
+        _LOG.info("refused", token=token.name, problems=len(verdict))
+        raise Refused(422, _headline(verdict), shown(verdict))
+    submission_id = submissions.new_id()
+    upload = Upload(verdict, received.sha256, received.size)
+    public = service.settings.public == "always"
+
+    def keep() -> SubmissionRecord:
+        service.archives.put(submission_id, received.path)
+        try:
+            return submissions.accept(
+                service.database, submission_id, token, upload, service.settings.quota, public
+            )
+        except BaseException:
+            service.archives.delete(submission_id)
+            raise
+
+    try:
+        record = await to_thread.run_sync(keep)
+    except QuotaSpent:
+        raise _quota_spent(service.settings.quota) from None
+    _LOG.info("accepted", token=token.name, submission=submission_id[:6], bytes=received.size)
+    return record
+
+
+def shown(problems: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the problems that are told, and how many more there are."""
+    left_over = len(problems) - MAX_PROBLEMS_SHOWN
+    more = (f"... and {left_over} more",) if left_over > 0 else ()
+    return problems[:MAX_PROBLEMS_SHOWN] + more
+
+
+def _headline(problems: tuple[str, ...]) -> str:
+    return f"the archive is refused: {len(problems)} problem{'' if len(problems) == 1 else 's'}"
+
+
+def _spent(service: Service, token: TokenRecord) -> int:
+    with service.database.read() as session:
+        return submissions.spent_today(session, token.id)
+
+
+def _quota_spent(quota: int) -> Refused:
+    return Refused(
+        429, f"the {quota} submissions of this token's day (UTC) are made; refused archives were not counted"
+    )

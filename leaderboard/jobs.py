@@ -1,0 +1,122 @@
+"""The queue: a scorer leases a submission, renews the lease while it works, and ends it once.
+
+Every step is one conditional update, so that of two scorers that want the same job one gets it, and a scorer that
+was taken for dead cannot end what another has taken over.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from sqlalchemy import ColumnElement, and_, delete, or_, select, update
+from sqlalchemy.engine import CursorResult
+from sqlalchemy.orm import Session
+
+from leaderboard.database import Database
+from leaderboard.records import PictureRecord, ResultRecord, RowRecord, SubmissionRecord
+from leaderboard.submissions import FAILED, QUEUED, SCORED, SCORING
+
+MOST_ATTEMPTS = 5
+"""A submission whose scorer died so often fails; a service that is killed now and then stays below it."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What scoring came to: the result's JSON and error maps by view, or the reason why there is none."""
+
+    result: bytes | None = None
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
+    reason: str | None = None
+
+
+def claim(database: Database, scorer: str, lease_s: float) -> str | None:
+    """Lease the oldest waiting submission to ``scorer``; return its id, None where nothing waits."""
+    while True:
+        with database.write() as session:
+            now = time.time()
+            waiting = or_(
+                SubmissionRecord.status == QUEUED,
+                and_(SubmissionRecord.status == SCORING, SubmissionRecord.lease_until < now),
+            )
+            oldest = select(SubmissionRecord).where(waiting).order_by(SubmissionRecord.created_at).limit(1)
+            if database.waits_for_rows:
+                oldest = oldest.with_for_update(skip_locked=True)
+            record = session.scalar(oldest)
+            if record is None:
+                return None
+            if record.attempts < MOST_ATTEMPTS:
+                record.status, record.scorer = SCORING, scorer
+                record.lease_until, record.attempts = now + lease_s, record.attempts + 1
+                return record.id
+            record.status, record.finished_at = FAILED, now
+            record.reason = f"scoring was begun {record.attempts} times and never came to an end"
+
+
+def renew(database: Database, submission_id: str, scorer: str, lease_s: float) -> bool:
+    """Prolong a lease; return whether it is still the scorer's."""
+    with database.write() as session:
+        return _update(session, _leased(submission_id, scorer), {"lease_until": time.time() + lease_s})
+
+
+def give_back(database: Database, submission_id: str, scorer: str) -> None:
+    """Queue a leased submission again, as if it had never been tried: the scorer is told to stop."""
+    with database.write() as session:
+        values = {
+            "status": QUEUED,
+            "scorer": None,
+            "lease_until": None,
+            "attempts": SubmissionRecord.attempts - 1,
+        }
+        _update(session, _leased(submission_id, scorer), values)
+
+
+def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome) -> bool:
+    """End a submission if the lease is still the scorer's; return whether it was. All in one transaction."""
+    with database.write() as session:
+        values = {
+            "status": FAILED if outcome.result is None else SCORED,
+            "reason": outcome.reason,
+            "finished_at": time.time(),
+            "lease_until": None,
+        }
+        if not _update(session, _leased(submission_id, scorer), values):
+            return False
+        for table in (PictureRecord, RowRecord, ResultRecord):
+            session.execute(delete(table).where(table.submission_id == submission_id))
+        if outcome.result is not None:
+            session.add(ResultRecord(submission_id=submission_id, json=outcome.result))
+            session.add_all(_rows(submission_id, json.loads(outcome.result)["tables"]))
+        for view_id, webp in outcome.pictures.items():
+            session.add(PictureRecord(submission_id=submission_id, view_id=view_id, webp=webp))
+    return True
+
+
+def _rows(submission_id: str, tables: Mapping[str, Any]) -> list[RowRecord]:
+    return [
+        RowRecord(
+            submission_id=submission_id,
+            config=config,
+            ranked=table["ranked"],
+            abs_rel=(table["native"] or {}).get("abs_rel"),
+            json=json.dumps(table),
+        )
+        for config, table in tables.items()
+    ]
+
+
+def _leased(submission_id: str, scorer: str) -> ColumnElement[bool]:
+    return and_(
+        SubmissionRecord.id == submission_id,
+        SubmissionRecord.status == SCORING,
+        SubmissionRecord.scorer == scorer,
+    )
+
+
+def _update(session: Session, where: ColumnElement[bool], values: Mapping[str, Any]) -> bool:
+    changed = session.execute(update(SubmissionRecord).where(where).values(**values))
+    assert isinstance(changed, CursorResult)
+    return changed.rowcount == 1

@@ -1,0 +1,32 @@
+"""What is counted for Prometheus."""
+
+from __future__ import annotations
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from sqlalchemy import func, select
+
+from leaderboard.database import Database
+from leaderboard.records import SubmissionRecord
+from leaderboard.submissions import DELETED, FAILED, QUEUED, SCORED, SCORING
+
+
+class Meters:
+    """Counters and gauges in a registry of their own."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self.requests = Counter(
+            "rebar_requests_total", "Requests answered", ["method", "route", "status"], registry=self.registry
+        )
+        self.seconds = Histogram(
+            "rebar_request_seconds", "Time to answer", ["method", "route"], registry=self.registry
+        )
+        self._submissions = Gauge("rebar_submissions", "Submissions by status", ["status"], registry=self.registry)
+
+    def read_queue(self, database: Database) -> None:
+        """Read the number of submissions by status."""
+        query = select(SubmissionRecord.status, func.count()).group_by(SubmissionRecord.status)
+        with database.read() as session:
+            counts = dict(session.execute(query).tuples().all())
+        for status in (QUEUED, SCORING, SCORED, FAILED, DELETED):
+            self._submissions.labels(status).set(counts.get(status, 0))

@@ -1,0 +1,41 @@
+"""``rebar-leaderboard serve``: the web server, and the scorers beside it."""
+
+from __future__ import annotations
+
+import socket
+import sys
+
+import uvicorn
+
+from leaderboard.app import make_app
+from leaderboard.crew import Crew
+from leaderboard.service import open_service
+from leaderboard.settings import Settings
+from rebar_depth_bench.errors import InputError
+
+GRACE_S = 10
+
+
+def serve(settings: Settings) -> None:
+    """Serve until SIGTERM or SIGINT: answers under way are finished, jobs at hand are queued again."""
+    with open_service(settings) as service, _listen(settings) as listening:
+        config = uvicorn.Config(
+            make_app(service),
+            access_log=False,
+            log_level="warning",
+            timeout_graceful_shutdown=GRACE_S,
+            server_header=False,
+        )
+        host, port = listening.getsockname()[:2]
+        print(f"http://{host}:{port}", file=sys.stderr, flush=True)
+        with Crew(settings, settings.scorers):
+            uvicorn.Server(config).run(sockets=[listening])
+
+
+def _listen(settings: Settings) -> socket.socket:
+    """Return a listening socket. Raises ``InputError`` where the address is taken or not this machine's."""
+    try:
+        family = socket.getaddrinfo(settings.host, settings.port)[0][0]
+        return socket.create_server((settings.host, settings.port), family=family, backlog=512)
+    except OSError as error:
+        raise InputError(f"{settings.host}:{settings.port}: cannot listen there: {error.strerror}") from None

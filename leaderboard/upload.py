@@ -1,0 +1,143 @@
+"""A multipart upload, straight to disk: the archive never stands in memory, and no more of it than is allowed."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from anyio import to_thread
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+
+FIELD = "archive"
+BATCH = 1 << 20
+"""Bytes that are written at once, off the event loop."""
+MOST_ELSE = 64 << 10
+"""Bytes of everything in the body that is not the archive's content."""
+
+
+class UploadError(Exception):
+    """An upload is refused: the HTTP status and the sentence that says why."""
+
+    def __init__(self, status: int, detail: str) -> None:
+        self.status, self.detail = status, detail
+        super().__init__(detail)
+
+
+@dataclass(frozen=True)
+class Received:
+    """An archive as it came: the file, its SHA-256 and its size in bytes."""
+
+    path: Path
+    sha256: str
+    size: int
+
+
+@dataclass
+class _Spool:
+    """What the parser's callbacks write to: a part's headers, and the archive's bytes not yet on disk."""
+
+    header: bytearray = field(default_factory=bytearray)
+    value: bytearray = field(default_factory=bytearray)
+    is_archive: bool = False
+    archives: int = 0
+    else_bytes: int = 0
+    complete: bool = False
+    waiting: list[bytes] = field(default_factory=list)
+
+    def callbacks(self) -> dict[str, Callable[..., None]]:
+        return {
+            "on_part_begin": self.part_begin,
+            "on_header_field": self.header_field,
+            "on_header_value": self.header_value,
+            "on_header_end": self.header_end,
+            "on_part_data": self.part_data,
+            "on_end": self.end,
+        }
+
+    def part_begin(self) -> None:
+        self.is_archive = False
+        self.header.clear()
+        self.value.clear()
+
+    def header_field(self, data: bytes, start: int, end: int) -> None:
+        self.header += data[start:end]
+
+    def header_value(self, data: bytes, start: int, end: int) -> None:
+        self.value += data[start:end]
+
+    def header_end(self) -> None:
+        self.else_bytes += len(self.header) + len(self.value)
+        if bytes(self.header).lower() == b"content-disposition":
+            _, options = parse_options_header(bytes(self.value))
+            if options.get(b"name") == FIELD.encode():
+                self.is_archive = True
+                self.archives += 1
+        self.header.clear()
+        self.value.clear()
+
+    def part_data(self, data: bytes, start: int, end: int) -> None:
+        if self.is_archive:
+            self.waiting.append(data[start:end])
+        else:
+            self.else_bytes += end - start
+
+    def end(self) -> None:
+        self.complete = True
+
+
+async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, most: int) -> Received:
+    """Write the field ``archive`` of a multipart body into a new file below ``spool``.
+
+    Raises ``UploadError``, and leaves no file, for a body that is none (422) or an archive of more than ``most``
+    bytes (413).
+    """
+    kind, options = parse_options_header(content_type)
+    boundary = options.get(b"boundary")
+    if kind != b"multipart/form-data" or not boundary:
+        raise UploadError(422, f"the body is {content_type or 'nothing'!r}, expected multipart/form-data")
+    parts = _Spool()
+    handle, name = tempfile.mkstemp(dir=spool, suffix=".upload")
+    path, sha256, size = Path(name), hashlib.sha256(), 0
+    try:
+        parser = MultipartParser(boundary, parts.callbacks())  # type: ignore[arg-type]
+        with os.fdopen(handle, "wb") as file:
+
+            def flush() -> int:
+                batch = b"".join(parts.waiting)
+                parts.waiting.clear()
+                sha256.update(batch)
+                return file.write(batch)
+
+            async for chunk in stream:
+                parser.write(chunk)
+                _check(parts)
+                waiting = sum(map(len, parts.waiting))
+                if size + waiting > most:
+                    raise UploadError(413, f"the archive is larger than {most} bytes, the most this service takes")
+                if waiting >= BATCH:
+                    size += await to_thread.run_sync(flush)
+            parser.finalize()
+            size += await to_thread.run_sync(flush)
+        if not parts.complete or not parts.archives:
+            raise UploadError(
+                422, f"the body ends early or has no field {FIELD!r}, expected one with the zip in it"
+            )
+        return Received(path, sha256.hexdigest(), size)
+    except FormParserError as error:
+        path.unlink(missing_ok=True)
+        raise UploadError(422, f"the body is no multipart/form-data: {error}") from None
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+
+
+def _check(parts: _Spool) -> None:
+    if parts.archives > 1:
+        raise UploadError(422, f"the body has the field {FIELD!r} twice, expected once")
+    if parts.else_bytes > MOST_ELSE:
+        raise UploadError(422, f"the body has more than {MOST_ELSE} bytes beside the field {FIELD!r}")
