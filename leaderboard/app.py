@@ -15,7 +15,7 @@ from rebar_depth_bench.version import software_version
 DESCRIPTION = """Takes prediction archives and scores them exactly as `rebar-bench score` does.
 
 Upload with a bearer token; the archive is checked before it is accepted, and a refused one costs no quota. A
-submission's id cannot be guessed and opens it to whoever has it; its rows are on the board once its owner says so."""
+submission's id cannot be guessed and opens it to whoever has it, also while its rows are not on the board."""
 
 
 def make_app(service: Service) -> FastAPI:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import fsspec
@@ -35,7 +34,7 @@ class Archives:
             return
         target = Path(self._path(submission_id))
         sync(source)
-        if os.stat(source).st_dev == os.stat(target.parent).st_dev:
+        if source.stat().st_dev == target.parent.stat().st_dev:
             source.replace(target)
         else:
             part = target.with_suffix(".part")
@@ -60,10 +59,8 @@ class Archives:
 
     def delete(self, submission_id: str) -> None:
         """Remove an archive; one that is not there is no error."""
-        try:
+        with suppress(FileNotFoundError):
             self._files.rm_file(self._path(submission_id))
-        except FileNotFoundError:
-            pass
 
     def ids(self) -> set[str]:
         """Return the ids of all archives that are kept."""

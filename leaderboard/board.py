@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import false, select
 
 from leaderboard.database import Database
 from leaderboard.records import PictureRecord, RowRecord, SubmissionRecord, TokenRecord
@@ -38,14 +38,12 @@ def board(database: Database, config: str, viewer: TokenRecord | None = None) ->
 
     Public rows, and those of the token that asks; a row that is not public takes no rank from others.
     """
-    shown = SubmissionRecord.public
-    if viewer is not None:
-        shown = shown | (SubmissionRecord.token_id == viewer.id)
+    own = false() if viewer is None else SubmissionRecord.token_id == viewer.id
     query = (
         select(RowRecord, SubmissionRecord, TokenRecord.name)
         .join(SubmissionRecord, SubmissionRecord.id == RowRecord.submission_id)
         .join(TokenRecord, TokenRecord.id == SubmissionRecord.token_id)
-        .where(RowRecord.config == config, SubmissionRecord.status == SCORED, shown)
+        .where(RowRecord.config == config, SubmissionRecord.status == SCORED, SubmissionRecord.public | own)
         .order_by(RowRecord.ranked.desc(), RowRecord.abs_rel, SubmissionRecord.created_at)
     )
     with database.read() as session:

@@ -1,4 +1,4 @@
-"""Archives checked before they are accepted, in processes of their own: a reader that crashes takes nothing with it."""
+"""Archives checked before they are accepted, in processes of their own: one that crashes takes nothing with it."""
 
 from __future__ import annotations
 

@@ -59,8 +59,8 @@ def argument_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "rebar-leaderboard",
         description="A leaderboard that scores archives exactly as rebar-bench does.",
-        epilog="Every setting may also be given as REBAR_LEADERBOARD_NAME in the environment, or as name = value in "
-        "a TOML file (--settings); the command line wins over the file, the file over the environment.",
+        epilog="Every setting may also be given as REBAR_LEADERBOARD_NAME in the environment, or as name = value "
+        "in a TOML file (--settings); the command line wins over the file, the file over the environment.",
     )
     parser.add_argument("--version", action="version", version=software_version())
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")

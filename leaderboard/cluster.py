@@ -36,7 +36,8 @@ def cluster_score(settings: Settings) -> Iterator[Score]:
         try:
             while True:
                 try:
-                    return future.result(timeout=step_s)
+                    found: Outcome | None = future.result(timeout=step_s)
+                    return found
                 except TimeoutError:
                     if not go_on():
                         return None

@@ -11,14 +11,14 @@ from anyio import to_thread
 from leaderboard import submissions
 from leaderboard.records import SubmissionRecord, TokenRecord
 from leaderboard.service import Service
-from leaderboard.submissions import QuotaSpent, Upload
-from leaderboard.upload import MOST_ELSE, Received, UploadError, receive
+from leaderboard.submissions import QuotaSpentError, Upload
+from leaderboard.upload import MOST_ELSE, Received, UploadError, receive, too_large
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN
 
 _LOG = structlog.get_logger("intake")
 
 
-class Refused(Exception):
+class RefusedError(Exception):
     """An upload is refused: the HTTP status, and the body that says why."""
 
     def __init__(self, status: int, detail: str, problems: tuple[str, ...] = ()) -> None:
@@ -32,7 +32,7 @@ class Refused(Exception):
 async def take_in(
     service: Service, token: TokenRecord, body: AsyncIterator[bytes], headers: Mapping[str, str]
 ) -> SubmissionRecord:
-    """Return the record of an accepted upload: archive and row are on disk by then. Raises ``Refused``.
+    """Return the record of an accepted upload: archive and row are on disk by then. Raises ``RefusedError``.
 
     A token without quota is told before its archive is read; only an accepted archive is charged.
     """
@@ -40,11 +40,11 @@ async def take_in(
     if await to_thread.run_sync(_spent, service, token) >= settings.quota:
         raise _quota_spent(settings.quota)
     if int(headers.get("content-length", 0)) > settings.max_upload + MOST_ELSE:
-        raise Refused(413, f"the archive is larger than {settings.max_upload} bytes, the most this service takes")
+        raise RefusedError(413, too_large(settings.max_upload))
     try:
         received = await receive(body, headers.get("content-type", ""), settings.spool, settings.max_upload)
     except UploadError as error:
-        raise Refused(error.status, error.detail) from None
+        raise RefusedError(error.status, error.detail) from None
     try:
         return await _accepted(service, token, received)
     finally:
@@ -55,7 +55,7 @@ async def _accepted(service: Service, token: TokenRecord, received: Received) ->
     verdict = await service.checker.check(received.path)
     if isinstance(verdict, tuple):
         _LOG.info("refused", token=token.name, problems=len(verdict))
-        raise Refused(422, _headline(verdict), shown(verdict))
+        raise RefusedError(422, _headline(verdict), shown(verdict))
     submission_id = submissions.new_id()
     upload = Upload(verdict, received.sha256, received.size)
     public = service.settings.public == "always"
@@ -72,7 +72,7 @@ async def _accepted(service: Service, token: TokenRecord, received: Received) ->
 
     try:
         record = await to_thread.run_sync(keep)
-    except QuotaSpent:
+    except QuotaSpentError:
         raise _quota_spent(service.settings.quota) from None
     _LOG.info("accepted", token=token.name, submission=submission_id[:6], bytes=received.size)
     return record
@@ -94,7 +94,7 @@ def _spent(service: Service, token: TokenRecord) -> int:
         return submissions.spent_today(session, token.id)
 
 
-def _quota_spent(quota: int) -> Refused:
-    return Refused(
+def _quota_spent(quota: int) -> RefusedError:
+    return RefusedError(
         429, f"the {quota} submissions of this token's day (UTC) are made; refused archives were not counted"
     )

@@ -1,7 +1,7 @@
 """One archive, scored or checked in a process of its own, so that a poisoned one takes nothing else down.
 
-``python -m leaderboard.scoring_process`` reads a task as JSON from standard input and writes what it came to into the
-folder the task names: ``result.json``, ``problem.txt``, error maps.
+``python -m leaderboard.scoring_process`` reads a task as JSON from standard input and writes what it came to into
+the folder the task names: ``result.json``, ``problem.txt``, error maps.
 """
 
 from __future__ import annotations

@@ -27,12 +27,15 @@ class Settings(BaseSettings):
     port: int = Field(8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
     title: str = Field("Rebar depth leaderboard", description="the page's title")
     public: Literal["owner", "always"] = Field(
-        "owner", description="who puts a submission on the board: its owner, or every one is at once"
+        "always", description="whether every submission is on the board at once, or once its owner says so"
     )
     quota: int = Field(10, ge=0, description="accepted submissions a token may make in a day (UTC)")
     max_upload: int = Field(8 * GIB, gt=0, description="largest archive")
     error_maps: int = Field(
-        0, ge=0, le=100, description="views of a config, worst first, whose error maps are shown"
+        0,
+        ge=0,
+        le=100,
+        description="worst views of a config whose error maps are shown; they tell the truth to who has the prediction",
     )
     scorers: int = Field(1, ge=0, le=64, description="scoring processes that `serve` starts itself")
     cluster: str = Field("", description="address of a dask scheduler whose workers score")

@@ -18,7 +18,7 @@ QUEUED, SCORING, SCORED, FAILED, DELETED = "queued", "scoring", "scored", "faile
 DAY_S = 86400
 
 
-class QuotaSpent(Exception):
+class QuotaSpentError(Exception):
     """The token has made its submissions of the day."""
 
 
@@ -39,12 +39,12 @@ def new_id() -> str:
 def accept(
     database: Database, submission_id: str, token: TokenRecord, upload: Upload, quota: int, public: bool
 ) -> SubmissionRecord:
-    """Queue a submission whose archive is kept already; durable on return. Raises ``QuotaSpent``."""
+    """Queue a submission whose archive is kept already; durable on return. Raises ``QuotaSpentError``."""
     with database.write() as session:
         # The token's row is locked, so that two uploads at once do not both take the last place.
         session.execute(select(TokenRecord).where(TokenRecord.id == token.id).with_for_update())
         if spent_today(session, token.id) >= quota:
-            raise QuotaSpent
+            raise QuotaSpentError
         record = SubmissionRecord(
             id=submission_id,
             token_id=token.id,

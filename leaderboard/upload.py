@@ -118,7 +118,7 @@ async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, 
                 _check(parts)
                 waiting = sum(map(len, parts.waiting))
                 if size + waiting > most:
-                    raise UploadError(413, f"the archive is larger than {most} bytes, the most this service takes")
+                    raise UploadError(413, too_large(most))
                 if waiting >= BATCH:
                     size += await to_thread.run_sync(flush)
             parser.finalize()
@@ -134,6 +134,11 @@ async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, 
     except BaseException:
         path.unlink(missing_ok=True)
         raise
+
+
+def too_large(most: int) -> str:
+    """Return the sentence that refuses an archive of more than ``most`` bytes."""
+    return f"the archive is larger than {most} bytes, the most this service takes"
 
 
 def _check(parts: _Spool) -> None:

@@ -11,7 +11,7 @@ from fastapi import APIRouter, HTTPException, Path, Request, Response
 from leaderboard import submissions
 from leaderboard.api.access import OptionalToken, RequiredToken, ServiceDep
 from leaderboard.api.models import Problem, Problems, Publication, Submission, submission_model
-from leaderboard.intake import Refused, take_in
+from leaderboard.intake import RefusedError, take_in
 from leaderboard.records import SubmissionRecord, TokenRecord
 from leaderboard.service import Service
 
@@ -51,8 +51,8 @@ async def upload(request: Request, service: ServiceDep, token: RequiredToken) ->
     """Upload an archive. It is checked before it is accepted; once 202 is sent it is never lost."""
     try:
         record = await take_in(service, token, request.stream(), request.headers)
-    except Refused as refusal:
-        raise HTTPException(refusal.status, refusal.content) from None  # type: ignore[arg-type]
+    except RefusedError as refusal:
+        raise HTTPException(refusal.status, refusal.content) from None
     return submission_model(record, page_url(request, record))
 
 

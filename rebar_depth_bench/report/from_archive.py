@@ -38,11 +38,11 @@ def write_report(
     }
     folder = open_folder(root)
     with open_submission(archive, folder.expected_views()) as submission:
-        page = render_report(result, _all_panels(chosen, root, submission))
+        page = render_report(result, panels_of(chosen, root, submission))
     write_text(target, page)
 
 
-def _all_panels(
+def panels_of(
     chosen: Mapping[str, list[ViewScore]], root: str | Path, submission: SubmissionReader
 ) -> Iterator[ViewPanels]:
     """Yield the arrays of the chosen views one view at a time; rows of other views are streamed past undecoded."""

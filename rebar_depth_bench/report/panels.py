@@ -104,6 +104,15 @@ def view_images(view: ViewPanels) -> ViewImages:
     )
 
 
+def error_webp(view: ViewPanels) -> bytes:
+    """Return a view's native error map alone, WebP, reduced as the other panels are."""
+    step = max(1, round(view.truth_m.shape[1] / PANEL_WIDTH))
+    error_m = signed_error(view, 1.0)
+    limit_cm = error_limit_cm(error_m, scored_pixels(view.steel, view.truth_m))
+    steel, rgb = view.steel[::step, ::step], reduced_colour(view.rgb, step)
+    return _encoded(error_image(error_m[::step, ::step], steel, rgb, limit_cm))
+
+
 def depth_range(truth_m: Float32[ndarray, "h w"], scored: ndarray) -> tuple[float, float]:
     """Return (near, far), metres: robust range of true depth at flat indices ``scored``, a tenth wider."""
     values = truth_m.ravel()[scored] if scored.size else truth_m[truth_m > 0]
@@ -198,9 +207,14 @@ def _rounded_up(value: float) -> float:
 
 
 def _data_uri(image: UInt8[ndarray, "h w 3"], *, kind: str = "WEBP", lossless: bool = True) -> str:
+    encoded = _encoded(image, kind=kind, lossless=lossless)
+    return f"data:image/{kind.lower()};base64,{base64.b64encode(encoded).decode()}"
+
+
+def _encoded(image: UInt8[ndarray, "h w 3"], *, kind: str = "WEBP", lossless: bool = True) -> bytes:
     out = io.BytesIO()
     if kind == "PNG":
         Image.fromarray(image).save(out, "PNG", optimize=True)
     else:
         Image.fromarray(image).save(out, "WEBP", lossless=lossless, quality=70 if lossless else 80, method=4)
-    return f"data:image/{kind.lower()};base64,{base64.b64encode(out.getvalue()).decode()}"
+    return out.getvalue()
