@@ -35,7 +35,7 @@ class Settings(BaseSettings):
         0,
         ge=0,
         le=100,
-        description="worst views of a config whose error maps are shown; they tell the truth to who has the prediction",
+        description="worst views of a config shown as error maps, which tell the truth to whoever predicted",
     )
     scorers: int = Field(1, ge=0, le=64, description="scoring processes that `serve` starts itself")
     cluster: str = Field("", description="address of a dask scheduler whose workers score")

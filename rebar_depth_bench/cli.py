@@ -8,7 +8,7 @@ from typing import Protocol
 
 import datasets
 
-from rebar_depth_bench.commands import check, compare, demo, methods, predict, score, table
+from rebar_depth_bench.commands import check, compare, demo, methods, predict, score, submit, table
 from rebar_depth_bench.commands.outputs import check_outputs
 from rebar_depth_bench.console import run_command
 from rebar_depth_bench.studies.registry import add_study_commands
@@ -36,6 +36,7 @@ COMMANDS: Mapping[str, Command] = {
     "check": check,
     "methods": methods,
     "predict": predict,
+    "submit": submit,
     "demo": demo,
 }
 
