@@ -14,6 +14,8 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 FIELD = "archive"
+MOST_FIELD = 1 << 10
+"""Bytes of a text field that comes before the archive."""
 BATCH = 1 << 20
 """Bytes that are written at once, off the event loop."""
 MOST_ELSE = 64 << 10
@@ -38,29 +40,17 @@ class Received:
 
 
 @dataclass
-class _Spool:
-    """What the parser's callbacks write to: a part's headers, and the archive's bytes not yet on disk."""
+class _Parts:
+    """The parser's callbacks for the parts' headers: ``name`` is the field at hand, ``number`` its place."""
 
     header: bytearray = field(default_factory=bytearray)
     value: bytearray = field(default_factory=bytearray)
-    is_archive: bool = False
-    archives: int = 0
-    else_bytes: int = 0
-    complete: bool = False
-    waiting: list[bytes] = field(default_factory=list)
-
-    def callbacks(self) -> dict[str, Callable[..., None]]:
-        return {
-            "on_part_begin": self.part_begin,
-            "on_header_field": self.header_field,
-            "on_header_value": self.header_value,
-            "on_header_end": self.header_end,
-            "on_part_data": self.part_data,
-            "on_end": self.end,
-        }
+    name: bytes = b""
+    number: int = 0
 
     def part_begin(self) -> None:
-        self.is_archive = False
+        self.name = b""
+        self.number += 1
         self.header.clear()
         self.value.clear()
 
@@ -71,14 +61,41 @@ class _Spool:
         self.value += data[start:end]
 
     def header_end(self) -> None:
-        self.else_bytes += len(self.header) + len(self.value)
         if bytes(self.header).lower() == b"content-disposition":
-            _, options = parse_options_header(bytes(self.value))
-            if options.get(b"name") == FIELD.encode():
-                self.is_archive = True
-                self.archives += 1
+            self.name = parse_options_header(bytes(self.value))[1].get(b"name", b"")
         self.header.clear()
         self.value.clear()
+
+    def callbacks(self) -> dict[str, Callable[..., None]]:
+        return {
+            "on_part_begin": self.part_begin,
+            "on_header_field": self.header_field,
+            "on_header_value": self.header_value,
+            "on_header_end": self.header_end,
+        }
+
+
+@dataclass
+class _Spool(_Parts):
+    """What the parser's callbacks write to: the archive's bytes not yet on disk, and how much else there is."""
+
+    archives: int = 0
+    else_bytes: int = 0
+    complete: bool = False
+    waiting: list[bytes] = field(default_factory=list)
+
+    def callbacks(self) -> dict[str, Callable[..., None]]:
+        return {**super().callbacks(), "on_part_data": self.part_data, "on_end": self.end}
+
+    def header_end(self) -> None:
+        self.else_bytes += len(self.header) + len(self.value)
+        was_archive = self.is_archive
+        super().header_end()
+        self.archives += self.is_archive and not was_archive
+
+    @property
+    def is_archive(self) -> bool:
+        return self.name == FIELD.encode()
 
     def part_data(self, data: bytes, start: int, end: int) -> None:
         if self.is_archive:
@@ -90,16 +107,39 @@ class _Spool:
         self.complete = True
 
 
+@dataclass
+class _First(_Parts):
+    """What the parser's callbacks write to while the body's first part is read: its text."""
+
+    text: bytearray = field(default_factory=bytearray)
+    ended: bool = False
+
+    def callbacks(self) -> dict[str, Callable[..., None]]:
+        return {**super().callbacks(), "on_part_data": self.part_data, "on_part_end": self.part_end}
+
+    def header_end(self) -> None:
+        if not self.ended:
+            super().header_end()
+
+    def part_begin(self) -> None:
+        if not self.ended:
+            super().part_begin()
+
+    def part_data(self, data: bytes, start: int, end: int) -> None:
+        if not self.ended and len(self.text) <= MOST_FIELD:
+            self.text += data[start:end]
+
+    def part_end(self) -> None:
+        self.ended = True
+
+
 async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, most: int) -> Received:
     """Write the field ``archive`` of a multipart body into a new file below ``spool``.
 
     Raises ``UploadError``, and leaves no file, for a body that is none (422) or an archive of more than ``most``
     bytes (413).
     """
-    kind, options = parse_options_header(content_type)
-    boundary = options.get(b"boundary")
-    if kind != b"multipart/form-data" or not boundary:
-        raise UploadError(422, f"the body is {content_type or 'nothing'!r}, expected multipart/form-data")
+    boundary = boundary_of(content_type)
     parts = _Spool()
     handle, name = tempfile.mkstemp(dir=spool, suffix=".upload")
     path, sha256, size = Path(name), hashlib.sha256(), 0
@@ -134,6 +174,45 @@ async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, 
     except BaseException:
         path.unlink(missing_ok=True)
         raise
+
+
+async def leading_field(
+    stream: AsyncIterator[bytes], content_type: str, name: str
+) -> tuple[str, AsyncIterator[bytes]]:
+    """Return the text of a multipart body's first field, if that is ``name``, else "", and the whole body again.
+
+    So that who uploads is known before anything is kept. Raises ``UploadError`` (422) for a body that is none.
+    """
+    first = _First()
+    parser = MultipartParser(boundary_of(content_type), first.callbacks())  # type: ignore[arg-type]
+    chunks: list[bytes] = []
+    try:
+        async for chunk in stream:
+            chunks.append(chunk)
+            parser.write(chunk)
+            is_other = first.name not in (b"", name.encode())
+            if first.ended or is_other or len(first.text) > MOST_FIELD or sum(map(len, chunks)) > MOST_ELSE:
+                break
+    except FormParserError as error:
+        raise UploadError(422, f"the body is no multipart/form-data: {error}") from None
+    told = first.ended and first.name == name.encode() and len(first.text) <= MOST_FIELD
+    return (first.text.decode(errors="replace") if told else ""), _again(chunks, stream)
+
+
+async def _again(chunks: list[bytes], stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    while chunks:
+        yield chunks.pop(0)
+    async for chunk in stream:
+        yield chunk
+
+
+def boundary_of(content_type: str) -> bytes:
+    """Return the boundary of a multipart body; raise ``UploadError`` (422) for the type of another body."""
+    kind, options = parse_options_header(content_type)
+    boundary = options.get(b"boundary")
+    if kind != b"multipart/form-data" or not boundary:
+        raise UploadError(422, f"the body is {content_type or 'nothing'!r}, expected multipart/form-data")
+    return boundary
 
 
 def too_large(most: int) -> str:

@@ -31,7 +31,7 @@ WORST_SHOWN = 10
 
 
 @dataclass(frozen=True)
-class _Config:
+class ConfigViews:
     """One config's views: chart, the worst ones, and all of them in protocol order where these are more."""
 
     name: str
@@ -47,7 +47,7 @@ def render_report(result: Result, panels: Iterable[ViewPanels], *, title: str | 
     ``panels`` may come in any order and is gone through once: only the encoded images stay in memory.
     ``title`` defaults to the method's name.
     """
-    views = _views_by_config(result)
+    views = views_by_config(result)
     shown = shown_views(panels, list(result.tables))
     script = inline_script("sortable.js", "browser.js")
     return (
@@ -64,8 +64,8 @@ def render_report(result: Result, panels: Iterable[ViewPanels], *, title: str | 
             tolerances=WITHIN_MM,
             dash_note=wording.DASH_NOTE,
             min_coverage=f"{MIN_RANKED_COVERAGE * 100:.0f}",
-            **_results(result, views),
-            **_paper(result),
+            **results_part(result, views),
+            **paper_part(result),
             **_extended(result),
             **_browser(shown, views),
             **_every_view(result, views),
@@ -73,7 +73,7 @@ def render_report(result: Result, panels: Iterable[ViewPanels], *, title: str | 
     )
 
 
-def _results(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
+def results_part(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
     """Return what ``part_results.html.j2`` shows."""
     rows = [table_row(name, table) for name, table in result.tables.items()]
     return {
@@ -85,7 +85,7 @@ def _results(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[s
     }
 
 
-def _paper(result: Result) -> dict[str, object]:
+def paper_part(result: Result) -> dict[str, object]:
     """Return what ``part_paper.html.j2`` shows."""
     published = load_published()
     return {
@@ -126,16 +126,17 @@ def _stamps(result: Result) -> list[tuple[str, str]]:
     ]
 
 
-def _views_by_config(result: Result) -> Mapping[str, list[ViewScore]]:
+def views_by_config(result: Result) -> Mapping[str, list[ViewScore]]:
+    """Return the views of each config, in protocol order."""
     views: dict[str, list[ViewScore]] = {name: [] for name in result.tables}
     for view in result.views:
         views.setdefault(config_of(view.view_id), []).append(view)
     return views
 
 
-def _config(name: str, views: Sequence[ViewScore]) -> _Config:
+def _config(name: str, views: Sequence[ViewScore]) -> ConfigViews:
     worst = sorted(views, key=badness, reverse=True)[:WORST_SHOWN]
-    return _Config(
+    return ConfigViews(
         name=wording.printable(name),
         chart=charts.views_chart(name, views),
         worst=[view_row(view) for view in worst],

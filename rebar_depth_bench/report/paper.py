@@ -50,7 +50,7 @@ def _paper_scene(name: str, scene: PublishedScene, tables: Mapping[str, Table]) 
     letters = [_letters(index) for index in range(len(tables))]
     numbers = [str(index + 1) for index in range(len(scene.rows))]
     rows = [_own_row(*both) for both in zip(letters, tables.items(), strict=True)]
-    rows += [_published_row(*both) for both in zip(numbers, scene.rows, strict=True)]
+    rows += [published_row(*both) for both in zip(numbers, scene.rows, strict=True)]
     heading = scene.title if scene.title.lower() == name else f"{scene.title} ({name})"
     chart = scatter_chart(f"{heading}: native and scaled AbsRel", _points(rows, tables))
     return PaperScene(heading, scene.distance, chart, rows)
@@ -65,7 +65,8 @@ def _own_row(mark: str, config: tuple[str, Table]) -> PaperRow:
     return PaperRow(mark, row.name, False, False, [row.native[1], row.native[0], row.scaled[0], row.scale])
 
 
-def _published_row(mark: str, row: PublishedRow) -> PaperRow:
+def published_row(mark: str, row: PublishedRow) -> PaperRow:
+    """Return a published row as it is printed; ``mark`` names its point in a chart."""
     texts = (row.rmse_cm, row.abs_rel, row.abs_rel_scaled, row.scale)
     return PaperRow(mark, row.method, True, row.median_anchored, [Cell(text, float(text)) for text in texts])
 
@@ -78,10 +79,11 @@ def _points(rows: Iterable[PaperRow], tables: Mapping[str, Table]) -> list[Scatt
         found = {} if row.published else intervals[index]
         native, scaled = row.cells[1].value, row.cells[2].value
         if native is not None and scaled is not None:
-            ends = _finite(found.get("native.abs_rel")), _finite(found.get("scaled.abs_rel"))
+            ends = finite_ends(found.get("native.abs_rel")), finite_ends(found.get("scaled.abs_rel"))
             points.append(ScatterPoint(row.mark, row.name, native, scaled, row.published, *ends))
     return points
 
 
-def _finite(interval: tuple[float, float] | None) -> tuple[float, float] | None:
+def finite_ends(interval: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Return an interval that can be drawn, else None."""
     return interval if interval and all(map(math.isfinite, interval)) else None

@@ -1,5 +1,5 @@
 // Tables of class "sortable": a click, Enter or Space on a heading sorts by its column; the third press brings back
-// the order in which the rows came. Numbers are compared by data-value; a cell without one is missing wherever its
+// the order in which the rows came. Links in headings, which sort without this script, give way to it. Numbers are compared by data-value; a cell without one is missing wherever its
 // column has any, and missing cells come last in both directions. Without this script the table is a plain table.
 (() => {
   "use strict";
@@ -46,9 +46,9 @@
       const button = document.createElement("button");
       button.type = "button";
       button.title = "sort by this column";
-      button.append(...head.childNodes);
-      head.append(button);
-      head.setAttribute("aria-sort", "none");
+      button.append(...(head.querySelector("a") ?? head).childNodes);
+      head.replaceChildren(button);
+      if (!head.hasAttribute("aria-sort")) head.setAttribute("aria-sort", "none");
       button.addEventListener("click", () => {
         const direction = NEXT[head.getAttribute("aria-sort")];
         for (const [other] of heads) other.setAttribute("aria-sort", other === head ? direction : "none");

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import BaseLoader, ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 
-def environment() -> Environment:
-    """Return the environment that both the report and the studies' pages are rendered in."""
+def environment(*loaders: BaseLoader) -> Environment:
+    """Return the environment that pages are rendered in: templates of ``loaders``, then the report's."""
     return Environment(
-        loader=PackageLoader("rebar_depth_bench", "report"),
+        loader=ChoiceLoader([*loaders, PackageLoader("rebar_depth_bench", "report")]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

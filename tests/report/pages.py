@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from html.parser import HTMLParser
 
-VOID = {"meta", "img", "br", "path", "circle"}
+VOID = {"meta", "img", "br", "path", "circle", "link", "input"}
 
 
 class Page(HTMLParser):

@@ -1,0 +1,77 @@
+"""The pages' addresses."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
+from fastapi.responses import HTMLResponse
+
+from leaderboard.api.access import ServiceDep
+from leaderboard.api.submissions import SubmissionId, found
+from leaderboard.board import picture
+from leaderboard.page.boards import make_board, published_numbers
+from leaderboard.page.columns import NATIVE, SCALED, WITHIN, read_order
+from leaderboard.page.how_to import how_to_page
+from leaderboard.page.rendering import FRESH, PRIVATE, render
+from leaderboard.page.submission_view import submission_part
+
+router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
+
+MOST_AT_ONCE = 25
+"""Rows of a config where the page shows several: the others are a link away."""
+
+_Name = Annotated[str | None, Query(max_length=100)]
+_Part = Annotated[str, Path(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+
+
+@router.get("/", name="board_page")
+def board_page(request: Request, service: ServiceDep, config: _Name = None, sort: _Name = None) -> HTMLResponse:
+    """Show the boards of all configs, or the one that is asked for, in the order that is asked for."""
+    known = service.folder.configs
+    if config is not None and config not in known:
+        raise HTTPException(404, f"the dataset has no config {config!r}, expected one of {', '.join(known)}")
+    shown = known if config is None else (config,)
+    most = MOST_AT_ONCE if len(shown) > 1 else None
+    order = read_order(sort)
+    published = published_numbers()
+    return render(
+        request,
+        "board.html.j2",
+        configs=known,
+        chosen=config,
+        boards=[make_board(service.database, name, order, most) for name in shown],
+        columns={"native": NATIVE, "scaled": SCALED, "within": WITHIN},
+        paper_title=published.title,
+        paper_part=published.parts["synthetic"],
+    )
+
+
+@router.get("/submissions/{submission_id}", name="submission_page")
+def submission_page(
+    submission_id: SubmissionId, request: Request, service: ServiceDep, views: _Name = None
+) -> HTMLResponse:
+    """Show a submission to whoever has its address; ``views`` names the config whose views are all listed."""
+    record = found(service, submission_id)
+    shown = submission_part(service, record, views)
+    return render(request, "submission.html.j2", cache=_cache(record.public), **shown)
+
+
+@router.get("/submissions/{submission_id}/error-maps/{config}/{number}.webp", response_class=Response)
+def error_map(submission_id: SubmissionId, config: _Part, number: _Part, service: ServiceDep) -> Response:
+    """Return a view's error map, where the service keeps it."""
+    record = found(service, submission_id)
+    webp = picture(service.database, submission_id, f"{config}/{number}")
+    if webp is None:
+        raise HTTPException(404, "no error map of this view is kept")
+    return Response(webp, media_type="image/webp", headers={"Cache-Control": _cache(record.public)})
+
+
+@router.get("/how-to-submit", name="how_to_submit")
+def how_to_submit(request: Request) -> HTMLResponse:
+    """Show how to submit, and a form to do it with."""
+    return how_to_page(request)
+
+
+def _cache(public: bool) -> str:
+    return FRESH if public else PRIVATE
