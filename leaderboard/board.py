@@ -44,7 +44,7 @@ def board(database: Database, config: str, viewer: TokenRecord | None = None) ->
         .join(SubmissionRecord, SubmissionRecord.id == RowRecord.submission_id)
         .join(TokenRecord, TokenRecord.id == SubmissionRecord.token_id)
         .where(RowRecord.config == config, SubmissionRecord.status == SCORED, SubmissionRecord.public | own)
-        .order_by(RowRecord.ranked.desc(), RowRecord.abs_rel, SubmissionRecord.created_at)
+        .order_by(RowRecord.ranked.desc(), RowRecord.abs_rel.nulls_last(), SubmissionRecord.created_at)
     )
     with database.read() as session:
         found = session.execute(query).all()

@@ -27,6 +27,6 @@ class Meters:
         """Read the number of submissions by status."""
         query = select(SubmissionRecord.status, func.count()).group_by(SubmissionRecord.status)
         with database.read() as session:
-            counts = dict(session.execute(query).tuples().all())
+            counts = dict(row._tuple() for row in session.execute(query))
         for status in (QUEUED, SCORING, SCORED, FAILED, DELETED):
             self._submissions.labels(status).set(counts.get(status, 0))

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from leaderboard.limits import confine
-from rebar_depth_bench.errors import RebarDepthError
+from rebar_depth_bench.errors import RebarDepthError, SubmissionError, problem_summary
 
 RESULT, PROBLEM, PICTURES = "result.json", "problem.txt", "pictures"
 NO_MEMORY = "needs more memory than this service allows"
@@ -39,6 +39,8 @@ def main() -> int:
     confine(task.memory)
     try:
         _score(task)
+    except SubmissionError as error:  # without the archive's path, which is this machine's affair
+        (Path(task.out) / PROBLEM).write_text(problem_summary(error.problems))
     except RebarDepthError as error:
         (Path(task.out) / PROBLEM).write_text(str(error))
     except MemoryError:
