@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import structlog
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import Response
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from leaderboard.api import boards, operations, submissions
+from leaderboard.database import AWAY
+from leaderboard.drain import Drain
 from leaderboard.gate import Gate
+from leaderboard.intake import RefusedError
 from leaderboard.page import how_to, routes, static_files
-from leaderboard.page.refusals import refusal_page, wants_page
+from leaderboard.page.refusals import refusal
 from leaderboard.page.rendering import make_templates
 from leaderboard.service import Service
+from leaderboard.upload import MOST_ELSE
 from rebar_depth_bench.version import software_version
 
+DATABASE_AWAY = "the database does not answer; try again in a while"
+_LOG = structlog.get_logger("http")
 DESCRIPTION = """Takes prediction archives and scores them exactly as `rebar-bench score` does.
 
 Upload with a bearer token; the archive is checked before it is accepted, and a refused one costs no quota. A
@@ -36,22 +44,36 @@ def make_app(service: Service) -> FastAPI:
     app.add_middleware(Gate, reads=settings.reads, writes=settings.writes, meters=service.meters)
     for router in (submissions, boards, operations, routes, how_to, static_files):
         app.include_router(router.router)
+    app.add_middleware(Drain, most=settings.max_upload + MOST_ELSE)
     app.add_exception_handler(HTTPException, _refusal)
+    app.add_exception_handler(RefusedError, _refused)
+    app.add_exception_handler(ClientDisconnect, _gone)
+    for kind in AWAY:
+        app.add_exception_handler(kind, _away)
     app.add_exception_handler(RequestValidationError, _invalid)
     return app
 
 
+async def _refused(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RefusedError)
+    return refusal(request, error.status, error.detail, problems=error.problems)
+
+
 async def _refusal(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    if wants_page(request):
-        return refusal_page(request, error.status_code, str(error.detail))
-    content = error.detail if isinstance(error.detail, dict) else {"detail": error.detail}
-    return JSONResponse(content, error.status_code, error.headers)
+    return refusal(request, error.status_code, str(error.detail), error.headers)
 
 
 async def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     problems = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
-    if wants_page(request):
-        return refusal_page(request, 422, "\n".join(problems))
-    return JSONResponse({"detail": "the request is malformed", "problems": problems}, 422)
+    return refusal(request, 422, "the request is malformed", problems=problems)
+
+
+async def _away(request: Request, error: Exception) -> Response:
+    _LOG.warning("database away", error=type(error).__name__)
+    return refusal(request, 503, DATABASE_AWAY, {"Retry-After": "10"})
+
+
+async def _gone(_: Request, __: Exception) -> Response:
+    return Response(status_code=400)  # nobody reads it

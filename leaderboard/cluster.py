@@ -3,57 +3,59 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from leaderboard.archives import Archives
 from leaderboard.jobs import Outcome
-from leaderboard.scorer import Score, local_score
+from leaderboard.scorer import RENEWALS_PER_LEASE, AwayError, Score, local_score
 from leaderboard.settings import Settings
 from rebar_depth_bench.errors import InputError
 
 CONNECT_S = 10
 
 
-@contextmanager
-def cluster_score(settings: Settings) -> Iterator[Score]:
-    """Yield scoring that asks a dask worker; raises ``InputError`` where the scheduler does not answer."""
+def cluster_score(settings: Settings) -> Score:
+    """Return scoring that asks a dask worker, with a connection for each job: a scheduler may come and go.
+
+    Raises ``InputError`` where dask is not installed.
+    """
     try:
-        from distributed import Client, Future
+        from distributed import CancelledError, Client, KilledWorker
     except ImportError as error:
         raise InputError(
             f"a cluster needs dask ({error}): pip install 'rebar-depth-bench[server,cluster]'"
         ) from None
-    try:
-        client = Client(settings.cluster, timeout=CONNECT_S, set_as_default=False)
-    except OSError as error:
-        raise InputError(f"{settings.cluster}: no dask scheduler answers: {error}") from None
-    step_s = settings.lease / 4
 
     def score(submission_id: str, go_on: Callable[[], bool]) -> Outcome | None:
-        future: Future[Any] = client.submit(score_here, settings.model_dump_json(), submission_id, pure=False)
         try:
-            while True:
-                try:
-                    found: Outcome | None = future.result(timeout=step_s)
-                    return found
-                except TimeoutError:
-                    if not go_on():
-                        return None
-        finally:
-            future.cancel()
+            with Client(settings.cluster, timeout=CONNECT_S, set_as_default=False) as client:
+                job = client.submit(score_here, settings.model_dump_json(), submission_id, pure=False)
+                return _await(job, settings.lease / RENEWALS_PER_LEASE, go_on)
+        except KilledWorker:
+            return None  # several workers died of it
+        except (OSError, CancelledError) as error:
+            raise AwayError(f"{settings.cluster}: {error}") from None
 
-    with client:
-        yield score
+    return score
+
+
+def _await(job: Any, step_s: float, go_on: Callable[[], bool]) -> Outcome | None:
+    try:
+        while True:
+            try:
+                outcome: Outcome | None = job.result(timeout=step_s)
+                return outcome
+            except TimeoutError:
+                if not go_on():
+                    return None
+    finally:
+        job.cancel()
 
 
 def score_here(settings_json: str, submission_id: str) -> Outcome | None:
     """Score a submission on the machine that this runs on, in a process of its own."""
-    from leaderboard.archives import Archives
-
     settings = Settings.model_validate_json(settings_json)
-    with tempfile.TemporaryDirectory() as state:
-        own = settings.model_copy(update={"state": Path(state)})
-        own.spool.mkdir(parents=True)
-        return local_score(own, Archives(settings.archives_url))(submission_id, lambda: True)
+    with tempfile.TemporaryDirectory() as spool:
+        return local_score(settings, Archives(settings.archives_url), Path(spool))(submission_id, lambda: True)

@@ -10,13 +10,16 @@ from typing import Any
 from alembic import command
 from alembic.config import Config
 from sqlalchemy import Connection, Engine, create_engine, event
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+from sqlalchemy.exc import ArgumentError, InterfaceError, NoSuchModuleError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.orm import Session
 
 from rebar_depth_bench.errors import InputError
 
 MIGRATIONS = Path(__file__).parent / "migrations"
 BUSY_S = 30
+AWAY = (OperationalError, InterfaceError, PoolTimeoutError)
+"""What is raised while the database does not answer: it is down, is starting, or has no connection left."""
 _IMMEDIATE = "immediate"
 
 
@@ -49,14 +52,21 @@ class Database:
         return self._engine.dialect.name != "sqlite"
 
     def migrate(self) -> None:
-        """Bring the schema up to date; two services that start at once do it one after the other."""
+        """Bring the schema up to date; two services that start at once do it one after the other.
+
+        Raises ``InputError`` where the database does not answer.
+        """
         config = Config()
         config.set_main_option("script_location", str(MIGRATIONS))
-        with self._writer.begin() as connection:
-            if self.waits_for_rows:
-                connection.exec_driver_sql("SELECT pg_advisory_xact_lock(7241053)")
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+        try:
+            with self._writer.begin() as connection:
+                if self.waits_for_rows:
+                    connection.exec_driver_sql("SELECT pg_advisory_xact_lock(7241053)")
+                config.attributes["connection"] = connection
+                command.upgrade(config, "head")
+        except AWAY as error:
+            url = self._engine.url.render_as_string(hide_password=True)
+            raise InputError(f"{url}: the database does not answer: {getattr(error, 'orig', error)}") from None
 
     def close(self) -> None:
         """Give back all connections."""

@@ -11,10 +11,11 @@ from limits import parse
 from limits.storage import MemoryStorage
 from limits.strategies import MovingWindowRateLimiter
 from starlette.datastructures import MutableHeaders
-from starlette.responses import JSONResponse
+from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from leaderboard.meters import Meters
+from leaderboard.page.refusals import refusal
 
 CONTENT_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -29,6 +30,7 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
 }
+TOO_MANY = "too many requests from this address"
 _READS = ("GET", "HEAD", "OPTIONS")
 _FREE = ("/healthz", "/metrics")
 _LOG = structlog.get_logger("http")
@@ -60,10 +62,7 @@ class Gate:
             if self._admits(scope):
                 await self._app(scope, receive, send_dressed)
             else:
-                refusal = JSONResponse(
-                    {"detail": "too many requests from this address"}, 429, {"Retry-After": "60"}
-                )
-                await refusal(scope, receive, send_dressed)
+                await refusal(Request(scope), 429, TOO_MANY, {"Retry-After": "60"})(scope, receive, send_dressed)
         finally:
             self._note(scope, status, time.perf_counter() - start)
 

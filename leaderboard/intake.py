@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Mapping
-from typing import Any
 
 import structlog
 from anyio import to_thread
@@ -19,13 +18,11 @@ _LOG = structlog.get_logger("intake")
 
 
 class RefusedError(Exception):
-    """An upload is refused: the HTTP status, and the body that says why."""
+    """An upload is refused: the HTTP status, the sentence that says why, for an archive (422) every problem."""
 
     def __init__(self, status: int, detail: str, problems: tuple[str, ...] = ()) -> None:
-        self.status = status
-        self.content: dict[str, Any] = {"detail": detail}
-        if status == 422:
-            self.content["problems"] = list(problems or (detail,))
+        self.status, self.detail = status, detail
+        self.problems = (problems or (detail,)) if status == 422 else None
         super().__init__(detail)
 
 
@@ -42,7 +39,7 @@ async def take_in(
     if int(headers.get("content-length", 0)) > settings.max_upload + MOST_ELSE:
         raise RefusedError(413, too_large(settings.max_upload))
     try:
-        received = await receive(body, headers.get("content-type", ""), settings.spool, settings.max_upload)
+        received = await receive(body, headers.get("content-type", ""), service.spool, settings.max_upload)
     except UploadError as error:
         raise RefusedError(error.status, error.detail) from None
     try:
@@ -66,7 +63,7 @@ async def _accepted(service: Service, token: TokenRecord, received: Received) ->
             return submissions.accept(
                 service.database, submission_id, token, upload, service.settings.quota, public
             )
-        except BaseException:
+        except QuotaSpentError:  # whatever else goes wrong, the row may be there, and its archive must be
             service.archives.delete(submission_id)
             raise
 

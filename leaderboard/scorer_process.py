@@ -5,13 +5,16 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+from contextlib import closing
+from pathlib import Path
 
 from leaderboard.archives import Archives
 from leaderboard.database import Database
 from leaderboard.limits import die_with_parent
 from leaderboard.logs import set_up_logs
-from leaderboard.scorer import local_score, work
+from leaderboard.scorer import Score, local_score, work
 from leaderboard.settings import Settings
+from leaderboard.spool import own_spool
 
 
 def main() -> int:
@@ -27,18 +30,17 @@ def run_scorer(settings: Settings) -> None:
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    settings.spool.mkdir(parents=True, exist_ok=True)
-    database, archives = Database(settings.database_url), Archives(settings.archives_url)
-    try:
-        if settings.cluster:
-            from leaderboard.cluster import cluster_score
+    with own_spool(settings.spool) as spool, closing(Database(settings.database_url)) as database:
+        database.migrate()
+        work(database, settings, _score(settings, spool), stop)
 
-            with cluster_score(settings) as score:
-                work(database, settings, score, stop)
-        else:
-            work(database, settings, local_score(settings, archives), stop)
-    finally:
-        database.close()
+
+def _score(settings: Settings, spool: Path) -> Score:
+    if not settings.cluster:
+        return local_score(settings, Archives(settings.archives_url), spool)
+    from leaderboard.cluster import cluster_score
+
+    return cluster_score(settings)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
-"""What the routes share: settings, database, archives, the checker, meters, and the dataset's outline."""
+"""What the routes share: settings, dataset, database, archives, a spool for uploads, the checker, meters."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import structlog
 from sqlalchemy import select
@@ -16,6 +17,7 @@ from leaderboard.database import Database
 from leaderboard.meters import Meters
 from leaderboard.records import SubmissionRecord
 from leaderboard.settings import Settings
+from leaderboard.spool import own_spool
 from leaderboard.submissions import DELETED
 from rebar_depth_bench.folder import DatasetFolder, open_folder
 
@@ -32,36 +34,29 @@ class Service:
     folder: DatasetFolder
     database: Database
     archives: Archives
+    spool: Path
     checker: Checker
     meters: Meters
 
 
 @contextmanager
 def open_service(settings: Settings) -> Iterator[Service]:
-    """Open the database, brought up to date, and the archives, cleared of what uploads cut off have left.
+    """Open the database, brought up to date, and the archives, cleared of those that no submission knows.
 
     Raises ``InputError`` where the dataset, the database or the archives' place is at fault.
     """
     folder = open_folder(settings.data)
-    settings.spool.mkdir(parents=True, exist_ok=True)
-    database = Database(settings.database_url)
-    archives = Archives(settings.archives_url)
-    try:
+    with own_spool(settings.spool) as spool, closing(Database(settings.database_url)) as database:
+        archives = Archives(settings.archives_url)
         database.migrate()
-        clear(settings, database, archives)
+        clear(database, archives)
         with Checker(settings.data, settings.score_memory) as checker:
-            yield Service(settings, folder, database, archives, checker, Meters())
-    finally:
-        database.close()
+            yield Service(settings, folder, database, archives, spool, checker, Meters())
 
 
-def clear(settings: Settings, database: Database, archives: Archives) -> None:
-    """Remove spooled files that no upload writes to any more, and archives that no submission knows."""
+def clear(database: Database, archives: Archives) -> None:
+    """Remove archives that no submission knows, unless they came just now: their row may be under way."""
     now = time.time()
-    for path in settings.spool.glob("*.upload"):
-        if now - path.stat().st_mtime > ORPHAN_S:
-            path.unlink(missing_ok=True)
-            _LOG.info("cleared", spooled=path.name)
     with database.read() as session:
         known = set(session.scalars(select(SubmissionRecord.id).where(SubmissionRecord.status != DELETED)))
     for submission_id in archives.ids() - known:

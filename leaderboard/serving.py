@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 import sys
 
@@ -28,8 +29,16 @@ def serve(settings: Settings) -> None:
         )
         host, port = listening.getsockname()[:2]
         print(f"http://{host}:{port}", file=sys.stderr, flush=True)
+        server = uvicorn.Server(config)
+
+        def stop(*_: object) -> None:
+            server.should_exit = True
+
+        # uvicorn raises what it caught once more when it is done: the default would end us before the scorers stop.
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, stop)
         with Crew(settings, settings.scorers):
-            uvicorn.Server(config).run(sockets=[listening])
+            server.run(sockets=[listening])
 
 
 def _listen(settings: Settings) -> socket.socket:

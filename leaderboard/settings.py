@@ -59,7 +59,7 @@ class Settings(BaseSettings):
 
     @property
     def spool(self) -> Path:
-        """The folder of uploads that are not accepted yet."""
+        """The folder of what is under way: uploads that are not accepted yet, archives fetched to be scored."""
         return self.state.absolute() / "spool"
 
 

@@ -11,7 +11,7 @@ from fastapi import APIRouter, HTTPException, Path, Request, Response
 from leaderboard import submissions
 from leaderboard.api.access import OptionalToken, RequiredToken, ServiceDep
 from leaderboard.api.models import Problem, Problems, Publication, Submission, submission_model
-from leaderboard.intake import RefusedError, take_in
+from leaderboard.intake import take_in
 from leaderboard.records import SubmissionRecord, TokenRecord
 from leaderboard.service import Service
 
@@ -49,10 +49,7 @@ _OWNERS: dict[int | str, dict[str, Any]] = {
 @router.post("", status_code=202, responses=_REFUSALS, openapi_extra=_BODY)
 async def upload(request: Request, service: ServiceDep, token: RequiredToken) -> Submission:
     """Upload an archive. It is checked before it is accepted; once 202 is sent it is never lost."""
-    try:
-        record = await take_in(service, token, request.stream(), request.headers)
-    except RefusedError as refusal:
-        raise HTTPException(refusal.status, refusal.content) from None
+    record = await take_in(service, token, request.stream(), request.headers)
     return submission_model(record, page_url(request, record))
 
 

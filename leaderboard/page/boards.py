@@ -11,7 +11,6 @@ from markupsafe import Markup
 
 from leaderboard.database import Database
 from leaderboard.page.columns import Order, ordered
-from leaderboard.page.reading import read_table
 from leaderboard.page.spelling import Link, Moment, link, moment
 from leaderboard.page.standings import Standing, standings
 from rebar_depth_bench.published import Published, load_published, paper_scene
@@ -19,6 +18,7 @@ from rebar_depth_bench.report.paper import PaperRow, finite_ends, published_row
 from rebar_depth_bench.report.rows import Row, table_row
 from rebar_depth_bench.report.scatter import ScatterPoint, scatter_chart
 from rebar_depth_bench.result import Table
+from rebar_depth_bench.result_reading import read_table
 from rebar_depth_bench.wording import printable
 
 MOST_PLOTTED = 16

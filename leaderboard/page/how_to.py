@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Sequence
-from contextlib import suppress
 from urllib.parse import urlsplit
 
 from anyio import to_thread
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
-from starlette.requests import ClientDisconnect
 
 from leaderboard.api.access import ServiceDep
 from leaderboard.api.submissions import page_url
@@ -33,13 +31,10 @@ async def submit(request: Request, service: ServiceDep) -> Response:
     There is no cookie and no session: the token in the form is all that lets a request in, and another site's
     page does not know it. That is why the form needs no further token against forged requests.
     """
-    body = request.stream()
     try:
-        record = await _take_in(service, body, request)
+        record = await _take_in(service, request.stream(), request)
     except RefusedError as refusal:
-        await _discard(body, service.settings.max_upload)
-        problems = refusal.content.get("problems", [])
-        return how_to_page(request, refusal.status, str(refusal), problems)
+        return how_to_page(request, refusal.status, refusal.detail, refusal.problems or ())
     # A path alone: behind a proxy the form's policy would refuse another scheme than the browser's.
     return RedirectResponse(urlsplit(page_url(request, record)).path, 303)
 
@@ -80,13 +75,3 @@ async def _take_in(service: Service, body: AsyncIterator[bytes], request: Reques
     if token is None:
         raise RefusedError(401, "the token is unknown")
     return await take_in(service, token, whole, request.headers)
-
-
-async def _discard(body: AsyncIterator[bytes], most: int) -> None:
-    """Read what is left of a refused upload: a browser that is cut off while it sends shows no answer."""
-    read = 0
-    with suppress(ClientDisconnect):
-        async for chunk in body:
-            read += len(chunk)
-            if read > most:
-                return

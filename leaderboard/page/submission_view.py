@@ -10,7 +10,6 @@ from typing import Any
 from fastapi import HTTPException
 
 from leaderboard.board import picture_views
-from leaderboard.page.reading import read_scored
 from leaderboard.page.spelling import lines, link, moment, size
 from leaderboard.page.standings import queue_place, ranks, submitter
 from leaderboard.records import SubmissionRecord
@@ -23,6 +22,7 @@ from rebar_depth_bench.report.page import WORST_SHOWN, ConfigViews, paper_part, 
 from rebar_depth_bench.report.panels import PANEL_WIDTH, colour_bar_uri
 from rebar_depth_bench.report.rows import Row, view_row
 from rebar_depth_bench.result import Result, ViewScore, badness
+from rebar_depth_bench.result_reading import read_result
 from rebar_depth_bench.submission import config_of
 
 
@@ -63,7 +63,7 @@ def _scored(service: Service, record: SubmissionRecord, all_of: str | None) -> d
     data = result_json(service.database, record.id)
     if data is None:  # deleted a moment ago
         raise HTTPException(404, "no such submission")
-    result = read_scored(data)
+    result = read_result(data, record.id)
     views = views_by_config(result)
     configs = [_config(name, views[name], name == all_of) for name in result.tables]
     return {

@@ -15,13 +15,13 @@ from leaderboard.board import board
 from leaderboard.database import Database
 from leaderboard.page.boards import MOST_PLOTTED, make_board
 from leaderboard.page.columns import COLUMNS, RANK, Order, ordered, read_order
-from leaderboard.page.reading import read_scored
 from leaderboard.page.spelling import lines, link, moment, size
 from leaderboard.page.standings import queue_place, ranks, standings
 from leaderboard.records import ResultRecord, RowRecord, SubmissionRecord, TokenRecord
 from leaderboard.upload import MOST_FIELD, UploadError, leading_field
 from rebar_depth_bench.report.rows import table_row
 from rebar_depth_bench.result import tabulate
+from rebar_depth_bench.result_reading import read_result
 from tests.report.results import overflowed, result, scored, unpredicted
 
 ERRORS = [0.3, 0.1, 0.1, 2.0, 0.7, None, 0.05]
@@ -132,7 +132,7 @@ def test_a_heading_s_link_turns_the_order() -> None:
 
 def test_a_result_is_read_back_as_it_was() -> None:
     original = result(scored("lattice/0000"), unpredicted("lattice/0001"), overflowed("pile/0000"))
-    again = read_scored(original.to_json())
+    again = read_result(original.to_json(), "a result")
     assert again.to_json() == original.to_json()
     for config, table in original.tables.items():
         assert table_row(config, again.tables[config]).reasons == table_row(config, table).reasons

@@ -1,0 +1,38 @@
+"""Refusals that arrive: a client that is still sending when its upload is refused would see a cut connection."""
+
+from __future__ import annotations
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+
+class Drain:
+    """ASGI middleware. Before a refusal is sent, what the client still sends is read, ``most`` bytes of it."""
+
+    def __init__(self, app: ASGIApp, *, most: int) -> None:
+        self._app, self._most = app, most
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        # A client that waits for 100 Continue has sent nothing yet, and sends nothing once it is refused.
+        is_sending = "expect" not in Headers(scope=scope)
+        more = True
+
+        async def receive_watched() -> Message:
+            nonlocal is_sending, more
+            message = await receive()
+            is_sending = True
+            more = message["type"] == "http.request" and message.get("more_body", False)
+            return message
+
+        async def send_after(message: Message) -> None:
+            if message["type"] == "http.response.start" and message["status"] >= 400:
+                left = self._most
+                while more and is_sending and left > 0:
+                    left -= len((await receive_watched()).get("body", b""))
+            await send(message)
+
+        await self._app(scope, receive_watched, send_after)

@@ -1,0 +1,92 @@
+"""A real PostgreSQL server, from the binaries that the package ``pgserver`` carries."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+_UNPRIVILEGED = "nobody"
+"""PostgreSQL refuses to run as root; where the tests do, it runs as this user."""
+START_S = 60.0
+
+
+@dataclass
+class Postgres:
+    """A server that listens on a socket in its folder; ``url`` is as ``--db`` takes it."""
+
+    binaries: Path
+    folder: Path
+    process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def url(self) -> str:
+        return f"postgresql://board@/postgres?host={self.folder}"
+
+    def start(self) -> None:
+        """Start and wait until it answers."""
+        command = [self.binaries / "postgres", "-D", self.folder / "data", "-k", self.folder, "-h", ""]
+        with (self.folder / "log").open("ab") as log:
+            self.process = subprocess.Popen(command, stdout=log, stderr=log, user=_user(), start_new_session=True)
+        limit = time.monotonic() + START_S
+        while self._run("pg_isready", "-q", "-h", str(self.folder), check=False) != 0:
+            assert self.process.poll() is None, (self.folder / "log").read_text()[-2000:]
+            assert time.monotonic() < limit, (self.folder / "log").read_text()[-2000:]
+            time.sleep(0.05)
+
+    def kill(self) -> None:
+        """Kill the server and all its backends at once, as a power cut would."""
+        assert self.process is not None
+        os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+
+    def new_database(self, name: str) -> str:
+        """Make an empty database and return its URL."""
+        self._run("createdb", "-h", str(self.folder), "-U", "board", name)
+        return f"postgresql://board@/{name}?host={self.folder}"
+
+    def _run(self, program: str, *arguments: str, check: bool = True) -> int:
+        command = [self.binaries / program, *arguments]
+        return subprocess.run(command, check=check, user=_user(), capture_output=True, cwd="/").returncode
+
+
+@contextmanager
+def running_postgres() -> Iterator[Postgres]:
+    """Yield a server with an empty cluster of its own; stopped and removed at the end."""
+    folder = Path(tempfile.mkdtemp(prefix="pg", dir="/tmp"))  # a socket's path is at most 107 bytes long
+    try:
+        server = Postgres(_binaries(folder), folder)
+        if user := _user():
+            shutil.chown(folder, user)
+        server._run("initdb", "-D", str(folder / "data"), "-U", "board", "--auth=trust", "--encoding=UTF8")
+        server.start()
+        try:
+            yield server
+        finally:
+            server.kill()
+    finally:
+        shutil.rmtree(folder)
+
+
+def _binaries(folder: Path) -> Path:
+    """Return where the programs are: a copy that everybody may read where another user has to run them."""
+    spec = importlib.util.find_spec("pgserver")  # not imported: that warns of what it would use
+    assert spec is not None
+    assert spec.submodule_search_locations is not None
+    installed = Path(spec.submodule_search_locations[0]) / "pginstall"
+    if _user() is None:
+        return installed / "bin"
+    shutil.copytree(installed, folder / "installed")
+    return folder / "installed" / "bin"
+
+
+def _user() -> str | None:
+    return _UNPRIVILEGED if os.geteuid() == 0 else None
