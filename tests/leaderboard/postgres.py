@@ -10,7 +10,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,8 +45,12 @@ class Postgres:
     def kill(self) -> None:
         """Kill the server and all its backends at once, as a power cut would."""
         assert self.process is not None
-        os.killpg(self.process.pid, signal.SIGKILL)
+        backends = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        self.process.kill()
         self.process.wait()
+        for backend in backends:  # each leads a session of its own
+            with suppress(ProcessLookupError):
+                os.kill(int(backend), signal.SIGKILL)
 
     def new_database(self, name: str) -> str:
         """Make an empty database and return its URL."""
@@ -81,11 +85,12 @@ def _binaries(folder: Path) -> Path:
     spec = importlib.util.find_spec("pgserver")  # not imported: that warns of what it would use
     assert spec is not None
     assert spec.submodule_search_locations is not None
-    installed = Path(spec.submodule_search_locations[0]) / "pginstall"
-    if _user() is None:
-        return installed / "bin"
-    shutil.copytree(installed, folder / "installed")
-    return folder / "installed" / "bin"
+    package = Path(spec.submodule_search_locations[0])
+    if _user() is not None:
+        for name in ("pgserver", "pgserver.libs"):
+            shutil.copytree(package.parent / name, folder / name)
+        package = folder / "pgserver"
+    return package / "pginstall" / "bin"
 
 
 def _user() -> str | None:
