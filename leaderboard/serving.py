@@ -34,7 +34,7 @@ def serve(settings: Settings) -> None:
         def stop(*_: object) -> None:
             server.should_exit = True
 
-        # uvicorn raises what it caught once more when it is done: the default would end us before the scorers stop.
+        # uvicorn raises what it caught once more at its end: the default would end us before the scorers stop.
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, stop)
         with Crew(settings, settings.scorers):

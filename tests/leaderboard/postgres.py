@@ -33,9 +33,13 @@ class Postgres:
 
     def start(self) -> None:
         """Start and wait until it answers."""
-        command = [self.binaries / "postgres", "-D", self.folder / "data", "-k", self.folder, "-h", ""]
+        command = [
+            str(part) for part in (self.binaries / "postgres", "-D", self.folder / "data", "-k", self.folder)
+        ]
         with (self.folder / "log").open("ab") as log:
-            self.process = subprocess.Popen(command, stdout=log, stderr=log, user=_user(), start_new_session=True)
+            self.process = subprocess.Popen(
+                [*command, "-h", ""], stdout=log, stderr=log, user=_user(), start_new_session=True
+            )
         limit = time.monotonic() + START_S
         while self._run("pg_isready", "-q", "-h", str(self.folder), check=False) != 0:
             assert self.process.poll() is None, (self.folder / "log").read_text()[-2000:]
@@ -58,7 +62,7 @@ class Postgres:
         return f"postgresql://board@/{name}?host={self.folder}"
 
     def _run(self, program: str, *arguments: str, check: bool = True) -> int:
-        command = [self.binaries / program, *arguments]
+        command = [str(self.binaries / program), *arguments]
         return subprocess.run(command, check=check, user=_user(), capture_output=True, cwd="/").returncode
 
 
