@@ -14,6 +14,7 @@ from leaderboard.database import AWAY
 from leaderboard.drain import Drain
 from leaderboard.gate import Gate
 from leaderboard.intake import RefusedError
+from leaderboard.kept import new_shelf
 from leaderboard.page import how_to, routes, static_files
 from leaderboard.page.refusals import refusal
 from leaderboard.page.rendering import make_templates
@@ -40,6 +41,7 @@ def make_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     app.state.templates = make_templates()
+    app.state.shelf = new_shelf(service.database)
     settings = service.settings
     app.add_middleware(Gate, reads=settings.reads, writes=settings.writes, meters=service.meters)
     for router in (submissions, boards, operations, routes, how_to, static_files):
@@ -61,7 +63,15 @@ async def _refused(request: Request, error: Exception) -> Response:
 
 async def _refusal(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    return refusal(request, error.status_code, str(error.detail), error.headers)
+    headers = _allowed(request) if error.status_code == 405 else None
+    return refusal(request, error.status_code, str(error.detail), headers or error.headers)
+
+
+def _allowed(request: Request) -> dict[str, str] | None:
+    """Return the methods of the API's path at hand: Starlette names those of the path's first operation alone."""
+    paths = request.app.openapi()["paths"]
+    operations = paths.get(getattr(request.scope.get("route"), "path", ""))
+    return operations and {"Allow": ", ".join(sorted(method.upper() for method in operations))}
 
 
 async def _invalid(request: Request, error: Exception) -> Response:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
@@ -19,12 +22,18 @@ class Archives:
 
     def __init__(self, url: str) -> None:
         """Raise ``InputError`` for a URL that ``fsspec`` cannot reach."""
+        self._url = url
         try:
-            self._files, self._root = fsspec.core.url_to_fs(url)
-            self._files.makedirs(self._root, exist_ok=True)
-        except (ValueError, ImportError, OSError) as error:
-            raise InputError(f"{url}: archives cannot be kept there: {error}") from None
-        self._is_local = isinstance(self._files, LocalFileSystem)
+            files, self._root = fsspec.core.url_to_fs(url)
+            files.makedirs(self._root, exist_ok=True)
+        except Exception as error:  # every filesystem has a tree of errors of its own
+            raise InputError(f"{without_password(url)}: archives cannot be kept there: {error}") from None
+        self._is_local = isinstance(files, LocalFileSystem)
+
+    @property
+    def _files(self) -> Any:
+        """The filesystem as this thread may use it: no two share a connection, and none is kept until it dies."""
+        return fsspec.core.url_to_fs(self._url)[0]
 
     def put(self, submission_id: str, source: Path) -> None:
         """Take over a file. On the same disk it is renamed, elsewhere copied."""
@@ -46,31 +55,75 @@ class Archives:
 
     @contextmanager
     def local(self, submission_id: str, scratch: Path) -> Iterator[Path]:
-        """Yield the archive as a file of this machine, fetched into ``scratch`` where it is kept elsewhere."""
+        """Yield the archive as a file of this machine, fetched into ``scratch`` where it is kept elsewhere.
+
+        Raises ``FileNotFoundError`` for one that is not there.
+        """
         if self._is_local:
-            yield Path(self._path(submission_id))
+            path = Path(self._path(submission_id))
+            if not path.is_file():
+                raise FileNotFoundError(submission_id)
+            yield path
             return
-        fetched = scratch / f"{submission_id}.zip"
+        fetched, files = scratch / f"{submission_id}.zip", self._files
         try:
-            self._files.get_file(self._path(submission_id), str(fetched))
+            files.info(
+                self._path(submission_id)
+            )  # some filesystems have no error of their own for what is not there
+            files.get_file(self._path(submission_id), str(fetched))
             yield fetched
         finally:
             fetched.unlink(missing_ok=True)
 
     def delete(self, submission_id: str) -> None:
         """Remove an archive; one that is not there is no error."""
+        files = self._files
         with suppress(FileNotFoundError):
-            self._files.rm_file(self._path(submission_id))
+            files.info(self._path(submission_id))
+            files.rm_file(self._path(submission_id))
 
     def ids(self) -> set[str]:
         """Return the ids of all archives that are kept."""
-        found = self._files.ls(self._root, detail=False)
-        return {Path(name).stem for name in found if name.endswith(".zip")}
+        files = self._files
+        files.invalidate_cache()
+        try:
+            found = files.ls(self._root, detail=True)
+        except FileNotFoundError:  # where there are no folders, an empty one is none
+            return set()
+        names = [str(entry["name"]) for entry in found]
+        return {Path(name).stem for name in names if name.endswith(".zip")}
 
     def age_s(self, submission_id: str, now: float) -> float:
         """Return how long ago an archive was written; 0 where the store does not tell."""
-        told = self._files.info(self._path(submission_id))
-        return now - told["mtime"] if "mtime" in told else 0.0
+        time_s = written_s(self._files.info(self._path(submission_id)))
+        return 0.0 if time_s is None else now - time_s
 
     def _path(self, submission_id: str) -> str:
         return f"{self._root}/{submission_id}.zip"
+
+
+def without_password(url: str) -> str:
+    """Return a URL as it may be shown: without what stands before its host."""
+    return re.sub(r"://.*@", "://...@", url)
+
+
+_WRITTEN = ("mtime", "LastModified", "last_modified", "updated", "modify")
+"""What filesystems call the time of the last change: local and SFTP, S3, Azure, Google, FTP."""
+
+
+def written_s(info: Mapping[str, Any]) -> float | None:
+    """Return when a file was written, seconds since 1970, by what a filesystem tells of it; None if by nothing."""
+    told = next((info[name] for name in _WRITTEN if name in info), None)
+    if isinstance(told, str):
+        told = _time(told)
+    return told.timestamp() if isinstance(told, datetime) else told
+
+
+def _time(text: str) -> datetime | None:
+    """Read ISO 8601 or RFC 3659, YYYYMMDDHHMMSS with a fraction or without; both UTC."""
+    plain = re.fullmatch(r"(\d{8})(\d{6})(\.\d+)?", text)
+    try:
+        told = datetime.fromisoformat(f"{plain[1]}T{plain[2]}" if plain else text)
+    except ValueError:
+        return None
+    return told if told.tzinfo else told.replace(tzinfo=UTC)

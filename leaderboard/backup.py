@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+from contextlib import closing, suppress
 from pathlib import Path
 
 from sqlalchemy import select
@@ -24,28 +25,51 @@ def back_up(settings: Settings, target: Path) -> Path:
 
     The database goes first: archives that come later are no loss, for their submissions are not in the copy.
     ``target`` is a state folder by itself: ``serve --state target`` serves it. Raises ``InputError`` for
-    PostgreSQL, which ``pg_dump`` copies.
+    PostgreSQL, which ``pg_dump`` copies, for a database that is not there, and for a target that the service uses.
     """
     if not settings.database_url.startswith("sqlite:///"):
         raise InputError("the database is PostgreSQL: copy it with pg_dump, and the archives as files")
+    source = Path(settings.database_url.removeprefix("sqlite:///"))
+    if target.resolve() in (source.parent.resolve(), settings.state.resolve()):
+        raise InputError(f"{target}: the service itself uses this folder, expected another")
+    if not source.is_file():
+        raise InputError(f"{source}: there is no database, expected that of a service")
     kept = target / ARCHIVES
-    kept.mkdir(parents=True, exist_ok=True)
-    with replacing(target / DATABASE) as part:
-        source, copy = sqlite3.connect(settings.database_url.removeprefix("sqlite:///")), sqlite3.connect(part)
-        with source, copy:
-            source.backup(copy)
-        source.close()
-        copy.close()
+    try:
+        kept.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written: {error.strerror}") from None
+    _copy_database(source, target / DATABASE)
     archives = Archives(settings.archives_url)
-    database = Database(f"sqlite:///{(target / DATABASE).absolute()}")
-    with database.read() as session:
-        known = session.scalars(select(SubmissionRecord.id).where(SubmissionRecord.status != DELETED)).all()
-    database.close()
-    for submission_id in known:
-        if not (kept / f"{submission_id}.zip").is_file():
+    for submission_id in _known(target / DATABASE):
+        copy = kept / f"{submission_id}.zip"
+        # One that is gone was deleted after the database was copied.
+        if not copy.is_file():
             with (
+                suppress(FileNotFoundError),
                 archives.local(submission_id, target) as archive,
-                replacing(kept / f"{submission_id}.zip") as part,
+                replacing(copy) as part,
             ):
                 shutil.copyfile(archive, part)
     return target
+
+
+def _copy_database(source: Path, copy: Path) -> None:
+    with (
+        replacing(copy) as part,
+        closing(sqlite3.connect(f"{source.resolve().as_uri()}?mode=ro", uri=True)) as read,
+        closing(sqlite3.connect(part)) as written,
+    ):
+        try:
+            read.backup(written)
+        except sqlite3.DatabaseError as error:
+            raise InputError(f"{source}: cannot be read as a database: {error}") from None
+        for suffix in ("-wal", "-shm"):  # of an earlier copy that was served: no part of this one
+            Path(f"{copy}{suffix}").unlink(missing_ok=True)
+
+
+def _known(path: Path) -> list[str]:
+    with closing(Database(f"sqlite:///{path.absolute()}")) as database:
+        database.migrate()
+        with database.read() as session:
+            return list(session.scalars(select(SubmissionRecord.id).where(SubmissionRecord.status != DELETED)))

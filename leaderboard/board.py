@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
-from sqlalchemy import false, select
+from sqlalchemy import false, func, select
 
 from leaderboard.database import Database
 from leaderboard.records import PictureRecord, RowRecord, SubmissionRecord, TokenRecord
 from leaderboard.submissions import SCORED
+
+
+class StampedRow(Protocol):
+    """A row as its stamp sees it."""
+
+    @property
+    def submission_id(self) -> str:
+        """Whose it is."""
+
+    @property
+    def finished_at(self) -> float | None:
+        """When it was scored."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +41,58 @@ class BoardRow:
     url: str | None
     uses_intrinsics: bool | None
     created_at: float
+    finished_at: float | None
     public: bool
     table: Mapping[str, Any]
+
+
+_COLUMNS = (
+    RowRecord.ranked,
+    RowRecord.json,
+    SubmissionRecord.id,
+    RowRecord.config,
+    SubmissionRecord.method,
+    TokenRecord.name,
+    SubmissionRecord.url,
+    SubmissionRecord.uses_intrinsics,
+    SubmissionRecord.created_at,
+    SubmissionRecord.finished_at,
+    SubmissionRecord.public,
+)
+"""What is read for a row: records would take longer."""
+
+
+_IDS = func.aggregate_strings(RowRecord.submission_id, " ")
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """What a config's public rows are, in small: whose they are, and when the last of them was scored.
+
+    A row does not change unless it is scored anew, so that the same stamp means the same rows.
+    """
+
+    ids: frozenset[str] = frozenset()
+    newest: float = 0.0
+
+
+def stamps(database: Database) -> dict[str, Stamp]:
+    """Return the stamp of each config that has a public row, in one query that reads no tables."""
+    query = (
+        select(RowRecord.config, _IDS, func.max(SubmissionRecord.finished_at))
+        .join(SubmissionRecord, SubmissionRecord.id == RowRecord.submission_id)
+        .where(SubmissionRecord.status == SCORED, SubmissionRecord.public)
+        .group_by(RowRecord.config)
+    )
+    with database.read() as session:
+        found = session.execute(query).all()
+    return {config: Stamp(frozenset(ids.split(" ")), newest or 0.0) for config, ids, newest in found}
+
+
+def stamp_of(rows: Sequence[StampedRow]) -> Stamp:
+    """Return the stamp of a config's public rows."""
+    newest = max((row.finished_at or 0.0 for row in rows), default=0.0)
+    return Stamp(frozenset(row.submission_id for row in rows), newest)
 
 
 def board(database: Database, config: str, viewer: TokenRecord | None = None) -> list[BoardRow]:
@@ -40,7 +102,7 @@ def board(database: Database, config: str, viewer: TokenRecord | None = None) ->
     """
     own = false() if viewer is None else SubmissionRecord.token_id == viewer.id
     query = (
-        select(RowRecord, SubmissionRecord, TokenRecord.name)
+        select(*_COLUMNS)
         .join(SubmissionRecord, SubmissionRecord.id == RowRecord.submission_id)
         .join(TokenRecord, TokenRecord.id == SubmissionRecord.token_id)
         .where(RowRecord.config == config, SubmissionRecord.status == SCORED, SubmissionRecord.public | own)
@@ -49,10 +111,10 @@ def board(database: Database, config: str, viewer: TokenRecord | None = None) ->
     with database.read() as session:
         found = session.execute(query).all()
     rows, rank = [], 0
-    for row, submission, submitter in found:
-        counts = row.ranked and submission.public
+    for row in found:
+        counts = row.ranked and row.public
         rank += counts
-        rows.append(_row(row, submission, submitter, rank if counts else None))
+        rows.append(_row(row, rank if counts else None))
     return rows
 
 
@@ -81,16 +143,17 @@ def picture(database: Database, submission_id: str, view_id: str) -> bytes | Non
         return None if record is None else record.webp
 
 
-def _row(row: RowRecord, submission: SubmissionRecord, submitter: str, rank: int | None) -> BoardRow:
+def _row(found: Any, rank: int | None) -> BoardRow:
     return BoardRow(
         rank=rank,
-        submission_id=submission.id,
-        config=row.config,
-        method=submission.method,
-        submitter=submitter,
-        url=submission.url,
-        uses_intrinsics=submission.uses_intrinsics,
-        created_at=submission.created_at,
-        public=submission.public,
-        table=json.loads(row.json),
+        submission_id=found.id,
+        config=found.config,
+        method=found.method,
+        submitter=found.name,
+        url=found.url,
+        uses_intrinsics=found.uses_intrinsics,
+        created_at=found.created_at,
+        finished_at=found.finished_at,
+        public=found.public,
+        table=json.loads(found.json),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import multiprocessing
+import os
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -50,22 +51,18 @@ class Checker:
 
     async def _check_alone(self, archive: Path) -> Verdict:
         """Check in a pool of its own: a pool that broke does not tell which of its archives broke it."""
-        with ProcessPoolExecutor(1, _context(), _prepare, (self._memory,)) as alone:
+        with ProcessPoolExecutor(1, _context(), confine, (self._memory, os.getpid())) as alone:
             try:
                 return await asyncio.wrap_future(alone.submit(_check, str(archive), self._data))
             except BrokenProcessPool:
                 return (CRASHED,)
 
     def _new_pool(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(PROCESSES, _context(), _prepare, (self._memory,))
+        return ProcessPoolExecutor(PROCESSES, _context(), confine, (self._memory, os.getpid()))
 
 
 def _context() -> multiprocessing.context.SpawnContext:
     return multiprocessing.get_context("spawn")  # a fork would carry the server's threads' locks
-
-
-def _prepare(memory: int) -> None:
-    confine(memory)
 
 
 def _check(archive: str, data: str) -> Verdict:

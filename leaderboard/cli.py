@@ -11,7 +11,6 @@ from typing import Any
 from leaderboard.backup import back_up
 from leaderboard.database import Database
 from leaderboard.logs import set_up_logs
-from leaderboard.serving import serve
 from leaderboard.settings import Settings, read_settings
 from leaderboard.tokens import create_token
 from rebar_depth_bench.console import run_command
@@ -40,6 +39,8 @@ def _run(options: argparse.Namespace) -> None:
     settings = read_settings(options.settings, given)
     set_up_logs()
     if options.command == "serve":
+        from leaderboard.serving import serve  # takes seconds, which the other commands need not wait for
+
         serve(settings)
     elif options.command == "score":
         from leaderboard.scorer_process import run_scorer

@@ -9,7 +9,8 @@ from typing import Any
 
 from leaderboard.archives import Archives
 from leaderboard.jobs import Outcome
-from leaderboard.scorer import RENEWALS_PER_LEASE, AwayError, Score, local_score
+from leaderboard.logs import take_over_logs
+from leaderboard.scorer import IDLE_S, RENEWALS_PER_LEASE, AwayError, Score, local_score
 from leaderboard.settings import Settings
 from rebar_depth_bench.errors import InputError
 
@@ -28,11 +29,16 @@ def cluster_score(settings: Settings) -> Score:
             f"a cluster needs dask ({error}): pip install 'rebar-depth-bench[server,cluster]'"
         ) from None
 
+    take_over_logs("distributed")
+    told = settings_for_workers(settings).model_dump_json()
+    connect_s = min(CONNECT_S, settings.lease / 2)  # nobody renews the lease meanwhile
+    step_s = min(settings.lease / RENEWALS_PER_LEASE, IDLE_S)
+
     def score(submission_id: str, go_on: Callable[[], bool]) -> Outcome | None:
         try:
-            with Client(settings.cluster, timeout=CONNECT_S, set_as_default=False) as client:
-                job = client.submit(score_here, settings.model_dump_json(), submission_id, pure=False)
-                return _await(job, settings.lease / RENEWALS_PER_LEASE, go_on)
+            with Client(settings.cluster, timeout=connect_s, set_as_default=False) as client:
+                job = client.submit(score_here, told, submission_id, pure=False)
+                return _await(job, step_s, go_on)
         except KilledWorker:
             return None  # several workers died of it
         except (OSError, CancelledError) as error:
@@ -52,6 +58,17 @@ def _await(job: Any, step_s: float, go_on: Callable[[], bool]) -> Outcome | None
                     return None
     finally:
         job.cancel()
+
+
+def settings_for_workers(settings: Settings) -> Settings:
+    """Return what a worker has to know: paths from the root, for it runs elsewhere, and no database's password."""
+    archives = settings.archives_url
+    places = {
+        "data": str(Path(settings.data).absolute()) if Path(settings.data).is_dir() else settings.data,
+        "state": settings.state.absolute(),
+        "archives": archives if "://" in archives else str(Path(archives).absolute()),
+    }
+    return settings.model_copy(update={**places, "db": ""})
 
 
 def score_here(settings_json: str, submission_id: str) -> Outcome | None:

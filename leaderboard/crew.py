@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import threading
@@ -54,7 +55,7 @@ class Crew:
                 scorer.wait()
 
     def _start(self) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "leaderboard.scorer_process"]
+        command = [sys.executable, "-m", "leaderboard.scorer_process", str(os.getpid())]
         scorer = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
         assert scorer.stdin is not None
         try:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from anyio import move_on_after
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+SILENCE_S = 5.0
+
 
 class Drain:
-    """ASGI middleware. Before a refusal is sent, what the client still sends is read, ``most`` bytes of it."""
+    """ASGI middleware. Before a refusal is sent, what the client still sends is read, ``most`` bytes of it.
+
+    A client that falls silent, be it that it never sends what it has announced, is told after ``SILENCE_S``.
+    """
 
     def __init__(self, app: ASGIApp, *, most: int) -> None:
         self._app, self._most = app, most
@@ -32,7 +38,10 @@ class Drain:
             if message["type"] == "http.response.start" and message["status"] >= 400:
                 left = self._most
                 while more and is_sending and left > 0:
-                    left -= len((await receive_watched()).get("body", b""))
+                    with move_on_after(SILENCE_S) as silence:
+                        left -= len((await receive_watched()).get("body", b""))
+                    if silence.cancelled_caught:
+                        break
             await send(message)
 
         await self._app(scope, receive_watched, send_after)

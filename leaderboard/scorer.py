@@ -114,7 +114,14 @@ def local_score(settings: Settings, archives: Archives, spool: Path) -> Score:
         with tempfile.TemporaryDirectory(dir=spool) as scratch:
             try:
                 with archives.local(submission_id, Path(scratch)) as archive:
-                    task = Task(str(archive), settings.data, scratch, settings.score_memory, settings.error_maps)
+                    task = Task(
+                        archive=str(archive),
+                        data=settings.data,
+                        out=scratch,
+                        memory=settings.score_memory,
+                        error_maps=settings.error_maps,
+                        parent=os.getpid(),
+                    )
                     return _run(task, settings, go_on)
             except FileNotFoundError:
                 return Outcome(reason="the archive is no longer there")

@@ -18,8 +18,8 @@ from leaderboard.spool import own_spool
 
 
 def main() -> int:
-    """Score until told to stop."""
-    die_with_parent()
+    """Score until told to stop; the argument is the process that started this one."""
+    die_with_parent(int(sys.argv[1]))
     set_up_logs()
     run_scorer(Settings.model_validate_json(sys.stdin.read()))
     return 0

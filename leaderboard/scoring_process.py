@@ -20,13 +20,17 @@ NO_MEMORY = "needs more memory than this service allows"
 
 @dataclass(frozen=True)
 class Task:
-    """An archive to score against a dataset into a folder; memory in bytes; views of a config to draw maps of."""
+    """An archive to score against a dataset into a folder; memory in bytes; views of a config to draw maps of.
+
+    ``parent`` is the process that waits for it.
+    """
 
     archive: str
     data: str
     out: str
     memory: int
     error_maps: int
+    parent: int
 
     def to_json(self) -> bytes:
         """Return the task for the process's standard input."""
@@ -36,7 +40,7 @@ class Task:
 def main() -> int:
     """Score the task on standard input; return 0 if it came to an end, be it a problem in words."""
     task = Task(**json.load(sys.stdin))
-    confine(task.memory)
+    confine(task.memory, task.parent)
     try:
         _score(task)
     except SubmissionError as error:  # without the archive's path, which is this machine's affair

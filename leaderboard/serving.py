@@ -23,12 +23,14 @@ def serve(settings: Settings) -> None:
         config = uvicorn.Config(
             make_app(service),
             access_log=False,
+            log_config=None,  # its lines go the way of ours
             log_level="warning",
             timeout_graceful_shutdown=GRACE_S,
             server_header=False,
         )
         host, port = listening.getsockname()[:2]
-        print(f"http://{host}:{port}", file=sys.stderr, flush=True)
+        shown = f"[{host}]" if ":" in host else host
+        print(f"http://{shown}:{port}", file=sys.stderr, flush=True)
         server = uvicorn.Server(config)
 
         def stop(*_: object) -> None:
@@ -46,5 +48,6 @@ def _listen(settings: Settings) -> socket.socket:
     try:
         family = socket.getaddrinfo(settings.host, settings.port)[0][0]
         return socket.create_server((settings.host, settings.port), family=family, backlog=512)
-    except OSError as error:
-        raise InputError(f"{settings.host}:{settings.port}: cannot listen there: {error.strerror}") from None
+    except (OSError, UnicodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{settings.host}:{settings.port}: cannot listen there: {reason}") from None

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, ValidationError
+from limits import parse_many
+from pydantic import Field, ValidationError, field_validator
+from pydantic_core import ErrorDetails
 from pydantic_settings import BaseSettings, SettingsConfigDict
+from sqlalchemy import make_url
+from sqlalchemy.exc import ArgumentError
 
 from rebar_depth_bench.errors import InputError
 
@@ -45,6 +50,29 @@ class Settings(BaseSettings):
     reads: str = Field("600/minute", description="requests an address may make")
     writes: str = Field("60/minute", description="uploads and changes an address may make")
 
+    @field_validator("db")
+    @classmethod
+    def _is_database(cls, url: str) -> str:
+        wanted = "expected sqlite:///PATH or postgresql://USER:PASSWORD@HOST:PORT/NAME"
+        if url and not re.match(r"sqlite:///[^?]|postgresql(\+psycopg)?://", url):
+            raise ValueError(wanted)
+        try:
+            make_url(url or "sqlite:///x")
+        except (ArgumentError, ValueError):
+            raise ValueError(wanted) from None
+        return url
+
+    @field_validator("reads", "writes")
+    @classmethod
+    def _is_rate(cls, rate: str) -> str:
+        try:
+            (parsed,) = parse_many(rate)
+            if parsed.amount < 1 or parsed.multiples < 1:
+                raise ValueError
+        except ValueError:
+            raise ValueError("expected a rate such as 600/minute or 10/second") from None
+        return rate
+
     @property
     def database_url(self) -> str:
         """The database's URL as SQLAlchemy takes it."""
@@ -54,8 +82,8 @@ class Settings(BaseSettings):
 
     @property
     def archives_url(self) -> str:
-        """The URL of the folder of archives."""
-        return self.archives or (self.state.absolute() / "archives").as_uri()
+        """The URL of the folder of archives, as ``fsspec`` takes it: without escapes."""
+        return self.archives or f"file://{self.state.absolute() / 'archives'}"
 
     @property
     def spool(self) -> Path:
@@ -75,5 +103,19 @@ def read_settings(file: Path | None, given: dict[str, Any]) -> Settings:
     try:
         return Settings(**{**stored, **given})
     except ValidationError as error:
-        lines = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}, got {one['input']!r}" for one in error.errors()]
-        raise InputError("settings: " + "; ".join(lines)) from None
+        raise InputError("settings: " + "; ".join(_in_words(one) for one in error.errors())) from None
+
+
+_UNSHOWN = ("db", "archives")
+"""Settings that may hold a password."""
+
+
+def _in_words(error: ErrorDetails) -> str:
+    """Say what is wrong with a setting, and what it is, unless that may be a secret."""
+    name = ".".join(map(str, error["loc"]))
+    if error["type"] == "missing":
+        return f"{name}: is not given, expected {Settings.model_fields[name].description}"
+    if error["type"] == "extra_forbidden":
+        return f"{name}: there is no such setting"
+    message = error["msg"].removeprefix("Value error, ")
+    return f"{name}: {message}" + ("" if error["loc"][0] in _UNSHOWN else f", got {error['input']!r}")

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import structlog
 
+from rebar_depth_bench.errors import InputError
+
 _LOG = structlog.get_logger("spool")
 _ENTRANCE = "entrance.lock"
 
@@ -21,9 +23,12 @@ def own_spool(root: Path) -> Iterator[Path]:
     """Yield a new folder below ``root`` that is this process's alone, and remove it at the end.
 
     A lock says that its process lives; the kernel lets go of it however the process ends. Folders without a living
-    process are removed first.
+    process are removed first. Raises ``InputError`` where no folder can be made.
     """
-    root.mkdir(parents=True, exist_ok=True)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{root}: files cannot be kept there: {error.strerror}") from None
     folder = root / secrets.token_hex(8)
     with _locked(root / _ENTRANCE):  # nobody clears between the folder and its lock
         _clear(root)

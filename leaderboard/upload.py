@@ -77,10 +77,9 @@ class _Parts:
 
 @dataclass
 class _Spool(_Parts):
-    """What the parser's callbacks write to: the archive's bytes not yet on disk, and how much else there is."""
+    """What the parser's callbacks write to: the archive's bytes that are not yet on disk."""
 
     archives: int = 0
-    else_bytes: int = 0
     complete: bool = False
     waiting: list[bytes] = field(default_factory=list)
 
@@ -88,7 +87,6 @@ class _Spool(_Parts):
         return {**super().callbacks(), "on_part_data": self.part_data, "on_end": self.end}
 
     def header_end(self) -> None:
-        self.else_bytes += len(self.header) + len(self.value)
         was_archive = self.is_archive
         super().header_end()
         self.archives += self.is_archive and not was_archive
@@ -100,8 +98,6 @@ class _Spool(_Parts):
     def part_data(self, data: bytes, start: int, end: int) -> None:
         if self.is_archive:
             self.waiting.append(data[start:end])
-        else:
-            self.else_bytes += end - start
 
     def end(self) -> None:
         self.complete = True
@@ -142,7 +138,7 @@ async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, 
     boundary = boundary_of(content_type)
     parts = _Spool()
     handle, name = tempfile.mkstemp(dir=spool, suffix=".upload")
-    path, sha256, size = Path(name), hashlib.sha256(), 0
+    path, sha256, size, came = Path(name), hashlib.sha256(), 0, 0
     try:
         parser = MultipartParser(boundary, parts.callbacks())  # type: ignore[arg-type]
         with os.fdopen(handle, "wb") as file:
@@ -154,9 +150,10 @@ async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, 
                 return file.write(batch)
 
             async for chunk in stream:
+                came += len(chunk)
                 parser.write(chunk)
-                _check(parts)
                 waiting = sum(map(len, parts.waiting))
+                _check(parts, came - size - waiting)
                 if size + waiting > most:
                     raise UploadError(413, too_large(most))
                 if waiting >= BATCH:
@@ -220,8 +217,8 @@ def too_large(most: int) -> str:
     return f"the archive is larger than {most} bytes, the most this service takes"
 
 
-def _check(parts: _Spool) -> None:
+def _check(parts: _Spool, else_bytes: int) -> None:
     if parts.archives > 1:
         raise UploadError(422, f"the body has the field {FIELD!r} twice, expected once")
-    if parts.else_bytes > MOST_ELSE:
+    if else_bytes > MOST_ELSE:  # what stands before the first part or after the last counts too
         raise UploadError(422, f"the body has more than {MOST_ELSE} bytes beside the field {FIELD!r}")

@@ -13,12 +13,24 @@ import pytest
 from dataset_builder.appearance import VARIANTS
 from dataset_builder.cli import argument_parser as build_parser
 from dataset_builder.configs import CONFIGS, SWEEPS
+from leaderboard.cli import argument_parser as board_parser
+from leaderboard.settings import Settings
 from rebar_depth_bench.cli import argument_parser as bench_parser
 from rebar_depth_bench.methods import find_method, own_methods
 from tests.predictors import loaded
 
-PAGES = [Path("README.md"), Path("CONTRIBUTING.md"), Path("ARCHITECTURE.md"), Path("cards/BENCHMARK.md")]
-PARSERS: dict[str, ArgumentParser] = {"rebar-build": build_parser(), "rebar-bench": bench_parser()}
+PAGES = [
+    Path("README.md"),
+    Path("CONTRIBUTING.md"),
+    Path("ARCHITECTURE.md"),
+    Path("cards/BENCHMARK.md"),
+    Path("deploy/README.md"),
+]
+PARSERS: dict[str, ArgumentParser] = {
+    "rebar-build": build_parser(),
+    "rebar-bench": bench_parser(),
+    "rebar-leaderboard": board_parser(),
+}
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -27,7 +39,7 @@ def blocks(page: Path, language: str) -> list[str]:
 
 def commands() -> list[str]:
     lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
-    inline = re.findall(r"`(rebar-(?:build|bench) [^`\n]*)`", Path("README.md").read_text())
+    inline = re.findall(r"`(rebar-(?:build|bench|leaderboard) [^`\n]*)`", Path("README.md").read_text())
     return [line for line in [*lines, *inline] if line.startswith(tuple(PARSERS))]
 
 
@@ -57,6 +69,13 @@ def test_the_template_of_a_method_is_one(tmp_path: Path) -> None:
     row = {"left_rgb": np.full((2, 3, 3), 2.0), "left_K": 5 * np.eye(3)}
     assert loaded(method)(row).tolist() == [[10.0] * 3] * 2
     assert set(method.info.columns) == set(row)
+
+
+def test_every_setting_of_the_leaderboard_is_shown_with_its_default() -> None:
+    page = Path("deploy/README.md").read_text()
+    for name, field in Settings.model_fields.items():
+        default = "" if field.is_required() or field.default == "" else f"`{field.default}`"
+        assert f"| `{name}` | {default} | {field.description} |" in page
 
 
 def test_tables_name_every_config_variant_and_method() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import Depends, HTTPException, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
@@ -44,6 +44,9 @@ def required_token(token: Annotated[TokenRecord | None, Depends(optional_token)]
 def _unauthorised(detail: str) -> HTTPException:
     return HTTPException(401, detail, headers={"WWW-Authenticate": "Bearer"})
 
+
+WITHOUT_TOKEN: dict[str, Any] = {"security": [{}]}
+"""For the OpenAPI document: what takes a token may be done without one; FastAPI tells of the first half alone."""
 
 OptionalToken = Annotated[TokenRecord | None, Depends(optional_token)]
 RequiredToken = Annotated[TokenRecord, Depends(required_token)]

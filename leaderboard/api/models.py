@@ -72,7 +72,7 @@ class Submission(BaseModel):
 class Publication(BaseModel):
     """Whether a submission's rows are on the board."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"public": True}})
+    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"example": {"public": True}})
 
     public: bool
 

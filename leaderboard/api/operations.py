@@ -6,14 +6,14 @@ from fastapi import APIRouter, Response
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from leaderboard.api.access import ServiceDep
-from leaderboard.api.models import Problem
+from leaderboard.api.answers import AWAY
 from leaderboard.meters import Meters
 from rebar_depth_bench.version import software_version
 
-router = APIRouter(tags=["operations"])
+router = APIRouter(tags=["operations"], responses=AWAY)
 
 
-@router.get("/healthz", responses={503: {"model": Problem, "description": "the database does not answer"}})
+@router.get("/healthz")
 def healthz(service: ServiceDep) -> dict[str, str]:
     """Say that the service answers and its database does."""
     with service.database.read() as session:

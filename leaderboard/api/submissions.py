@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated, Any
+from typing import Annotated
 
 from anyio import to_thread
 from fastapi import APIRouter, HTTPException, Path, Request, Response
 
 from leaderboard import submissions
-from leaderboard.api.access import OptionalToken, RequiredToken, ServiceDep
+from leaderboard.api.access import WITHOUT_TOKEN, OptionalToken, RequiredToken, ServiceDep
+from leaderboard.api.answers import ANY_TIME, MALFORMED, NO_TOKEN, UNKNOWN_TOKEN, Answers
 from leaderboard.api.models import Problem, Problems, Publication, Submission, submission_model
 from leaderboard.intake import take_in
 from leaderboard.records import SubmissionRecord, TokenRecord
 from leaderboard.service import Service
 
-router = APIRouter(prefix="/api/v1/submissions", tags=["submissions"])
+router = APIRouter(prefix="/api/v1/submissions", tags=["submissions"], responses=ANY_TIME)
 
 SubmissionId = Annotated[str, Path(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9_-]+$")]
 _BODY = {
@@ -32,28 +33,26 @@ _BODY = {
         },
     }
 }
-_REFUSALS: dict[int | str, dict[str, Any]] = {
-    401: {"model": Problem, "description": "no token, or an unknown one"},
+_REFUSALS: Answers = {
+    **NO_TOKEN,
     413: {"model": Problem, "description": "the archive is too large"},
     422: {"model": Problems, "description": "the archive is refused; the quota is not charged"},
     429: {"model": Problem, "description": "too many requests, or the quota of the day is spent"},
 }
-_NOT_FOUND: dict[int | str, dict[str, Any]] = {404: {"model": Problem, "description": "no such submission"}}
-_OWNERS: dict[int | str, dict[str, Any]] = {
-    **_NOT_FOUND,
-    401: _REFUSALS[401],
-    403: {"model": Problem, "description": "another's submission"},
-}
+_NOT_FOUND: Answers = {404: {"model": Problem, "description": "no such submission"}, **MALFORMED}
+_OWNERS: Answers = {**NO_TOKEN, 403: {"model": Problem, "description": "another's submission"}, **_NOT_FOUND}
+_UNREADABLE: Answers = {400: {"model": Problem, "description": "the body is no UTF-8"}}
 
 
 @router.post("", status_code=202, responses=_REFUSALS, openapi_extra=_BODY)
-async def upload(request: Request, service: ServiceDep, token: RequiredToken) -> Submission:
+async def upload(request: Request, response: Response, service: ServiceDep, token: RequiredToken) -> Submission:
     """Upload an archive. It is checked before it is accepted; once 202 is sent it is never lost."""
     record = await take_in(service, token, request.stream(), request.headers)
+    response.headers["Location"] = request.url_for("look_up", submission_id=record.id).path
     return submission_model(record, page_url(request, record))
 
 
-@router.get("/{submission_id}", responses={**_NOT_FOUND, 401: _REFUSALS[401]})
+@router.get("/{submission_id}", responses={**UNKNOWN_TOKEN, **_NOT_FOUND}, openapi_extra=WITHOUT_TOKEN)
 def look_up(submission_id: SubmissionId, request: Request, service: ServiceDep, _: OptionalToken) -> Submission:
     """Return a submission. Its id cannot be guessed: whoever has it may read, token or not."""
     record = found(service, submission_id)
@@ -75,7 +74,7 @@ def result(submission_id: SubmissionId, service: ServiceDep) -> Response:
     return Response(content, media_type="application/json")
 
 
-@router.patch("/{submission_id}", responses=_OWNERS)
+@router.patch("/{submission_id}", responses={**_UNREADABLE, **_OWNERS})
 def publish(
     submission_id: SubmissionId, change: Publication, request: Request, service: ServiceDep, token: RequiredToken
 ) -> Submission:

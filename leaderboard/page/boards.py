@@ -9,6 +9,7 @@ from functools import lru_cache
 
 from markupsafe import Markup
 
+from leaderboard.board import Stamp, stamp_of
 from leaderboard.database import Database
 from leaderboard.page.columns import Order, ordered
 from leaderboard.page.spelling import Link, Moment, link, moment
@@ -42,8 +43,12 @@ class Line:
 
 @dataclass(frozen=True)
 class Board:
-    """A config's table and plot; ``rows`` is how many there are, of which ``lines`` are shown."""
+    """A config's table and plot; ``rows`` is how many there are, of which ``lines`` are shown.
 
+    ``stamp`` is that of the rows it was made of.
+    """
+
+    stamp: Stamp
     config: str
     order: Order
     rows: int
@@ -89,6 +94,7 @@ def make_board(database: Database, config: str, order: Order, most: int | None =
     published, distance = _published(config)
     points = tuple(_point(marks[place], spelled[place]) for place in marks)
     return Board(
+        stamp=stamp_of(found),
         config=printable(config),
         order=order,
         rows=len(found),

@@ -12,7 +12,8 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from leaderboard.api.access import ServiceDep
 from leaderboard.api.submissions import page_url
 from leaderboard.intake import RefusedError, take_in
-from leaderboard.page.rendering import FRESH, PRIVATE, render, service_address
+from leaderboard.kept import FRESH, PRIVATE
+from leaderboard.page.rendering import render, service_address
 from leaderboard.page.spelling import lines, size
 from leaderboard.records import SubmissionRecord
 from leaderboard.service import Service

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from fastapi import Request, Response
 from fastapi.responses import JSONResponse
 
-from leaderboard.page.rendering import PRIVATE, render
+from leaderboard.kept import PRIVATE
+from leaderboard.page.rendering import render
 from leaderboard.page.spelling import lines
 
 _TITLES = {404: "There is no such page", 405: "That cannot be done here", 422: "The address is malformed"}

@@ -9,17 +9,13 @@ from fastapi import Request
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment, PackageLoader
 
+from leaderboard.kept import FRESH
 from leaderboard.page.static_files import address
 from leaderboard.service import Service
 from rebar_depth_bench import wording
 from rebar_depth_bench.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
 from rebar_depth_bench.report.templates import environment
 from rebar_depth_bench.version import software_version
-
-FRESH = "no-cache"
-"""A page that all may see: kept, but asked for again each time."""
-PRIVATE = "no-store"
-"""A page that stands on no board: kept nowhere."""
 
 
 def make_templates() -> Environment:
@@ -37,10 +33,20 @@ def render(
     **shown: Any,
 ) -> HTMLResponse:
     """Return the page that a template makes of what is ``shown`` and of what every page shows."""
+    content = page_content(request, template, **shown)
+    return HTMLResponse(content, status_code, {"Cache-Control": cache, **(headers or {})})
+
+
+def page_content(request: Request, template: str, **shown: Any) -> bytes:
+    """Return the bytes of what ``render`` responds with, to be kept as long as ``place`` is the same."""
     service: Service = request.app.state.service
     templates: Environment = request.app.state.templates
-    content = templates.get_template(template).render({**_common(request, service), **shown})
-    return HTMLResponse(content, status_code, {"Cache-Control": cache, **(headers or {})})
+    return templates.get_template(template).render({**_common(request, service), **shown}).encode()
+
+
+def place(request: Request) -> str:
+    """Return all that pages take from the request itself, not from its address: where the service's root is."""
+    return str(request.scope.get("root_path", "").rstrip("/"))
 
 
 def service_address(request: Request) -> str:
@@ -49,7 +55,7 @@ def service_address(request: Request) -> str:
 
 
 def _common(request: Request, service: Service) -> dict[str, Any]:
-    root = request.scope.get("root_path", "").rstrip("/")
+    root = place(request)
     return {
         "root": root,
         "static": lambda name: root + address(name),

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
-from leaderboard.api.access import ServiceDep
+from leaderboard.api.access import ServiceDep, service_of
 from leaderboard.api.submissions import SubmissionId, found
 from leaderboard.board import picture
-from leaderboard.page.boards import make_board, published_numbers
+from leaderboard.kept import FRESH, PRIVATE, Made, answer, public_body, shelf_of
+from leaderboard.page.boards import Board, make_board, published_numbers
 from leaderboard.page.columns import NATIVE, SCALED, WITHIN, read_order
 from leaderboard.page.how_to import how_to_page
-from leaderboard.page.rendering import FRESH, PRIVATE, render
+from leaderboard.page.rendering import page_content, place, render
+from leaderboard.page.standings import ranks
 from leaderboard.page.submission_view import submission_part
+from leaderboard.submissions import SCORED
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
+HTML = "text/html; charset=utf-8"
 MOST_AT_ONCE = 25
 """Rows of a config where the page shows several: the others are a link away."""
 
@@ -26,35 +31,43 @@ _Part = Annotated[str, Path(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]
 
 
 @router.get("/", name="board_page")
-def board_page(request: Request, service: ServiceDep, config: _Name = None, sort: _Name = None) -> HTMLResponse:
+async def board_page(request: Request, config: _Name = None, sort: _Name = None) -> Response:
     """Show the boards of all configs, or the one that is asked for, in the order that is asked for."""
+    service = service_of(request)
     known = service.folder.configs
     if config is not None and config not in known:
         raise HTTPException(404, f"the dataset has no config {config!r}, expected one of {', '.join(known)}")
     shown = known if config is None else (config,)
     most = MOST_AT_ONCE if len(shown) > 1 else None
     order = read_order(sort)
-    published = published_numbers()
-    return render(
-        request,
-        "board.html.j2",
-        configs=known,
-        chosen=config,
-        boards=[make_board(service.database, name, order, most) for name in shown],
-        columns={"native": NATIVE, "scaled": SCALED, "within": WITHIN},
-        paper_title=published.title,
-        paper_part=published.parts["synthetic"],
-    )
+    asked = (board_page, place(request), config, order)
+
+    def make() -> Made:
+        boards = [make_board(service.database, name, order, most) for name in shown]
+        return (*asked, *(board.stamp for board in boards)), _board_content(request, known, config, boards)
+
+    body = await public_body(request, shown, asked, make)
+    return answer(request, body, HTML, {"Cache-Control": FRESH})
 
 
 @router.get("/submissions/{submission_id}", name="submission_page")
 def submission_page(
     submission_id: SubmissionId, request: Request, service: ServiceDep, views: _Name = None
-) -> HTMLResponse:
+) -> Response:
     """Show a submission to whoever has its address; ``views`` names the config whose views are all listed."""
     record = found(service, submission_id)
-    shown = submission_part(service, record, views)
-    return render(request, "submission.html.j2", cache=_cache(record.public), **shown)
+    if record.status != SCORED:
+        return render(request, "submission.html.j2", cache=PRIVATE, **submission_part(service, record, views))
+    placed = ranks(service.database, record)
+    seen = (record.id, record.finished_at, record.public, *sorted(placed.items()))
+    key = (submission_page, place(request), views, *seen)
+
+    def make() -> Made:
+        shown = submission_part(service, record, views, placed)
+        return key, page_content(request, "submission.html.j2", **shown)
+
+    body = shelf_of(request).bodies.get(key, make)
+    return answer(request, body, HTML, {"Cache-Control": _cache(record.public)})
 
 
 @router.get("/submissions/{submission_id}/error-maps/{config}/{number}.webp", response_class=Response)
@@ -71,6 +84,20 @@ def error_map(submission_id: SubmissionId, config: _Part, number: _Part, service
 def how_to_submit(request: Request) -> HTMLResponse:
     """Show how to submit, and a form to do it with."""
     return how_to_page(request)
+
+
+def _board_content(request: Request, known: Sequence[str], chosen: str | None, boards: Sequence[Board]) -> bytes:
+    published = published_numbers()
+    return page_content(
+        request,
+        "board.html.j2",
+        configs=known,
+        chosen=chosen,
+        boards=boards,
+        columns={"native": NATIVE, "scaled": SCALED, "within": WITHIN},
+        paper_title=published.title,
+        paper_part=published.parts["synthetic"],
+    )
 
 
 def _cache(public: bool) -> str:

@@ -25,6 +25,7 @@ class Standing:
     submitter: str
     url: str | None
     created_at: float
+    finished_at: float | None
     table: str
 
 
@@ -45,6 +46,7 @@ def standings(database: Database, config: str) -> list[Standing]:
         TokenRecord.name,
         SubmissionRecord.url,
         SubmissionRecord.created_at,
+        SubmissionRecord.finished_at,
         RowRecord.json,
     )
     query = (

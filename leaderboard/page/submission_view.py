@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,7 @@ from fastapi import HTTPException
 
 from leaderboard.board import picture_views
 from leaderboard.page.spelling import lines, link, moment, size
-from leaderboard.page.standings import queue_place, ranks, submitter
+from leaderboard.page.standings import queue_place, submitter
 from leaderboard.records import SubmissionRecord
 from leaderboard.service import Service
 from leaderboard.submissions import QUEUED, SCORED, SCORING, result_json
@@ -36,8 +36,10 @@ class ErrorMap:
     row: Row
 
 
-def submission_part(service: Service, record: SubmissionRecord, all_of: str | None) -> dict[str, Any]:
-    """Return what a submission's page shows, every view of the config ``all_of``."""
+def submission_part(
+    service: Service, record: SubmissionRecord, all_of: str | None, placed: Mapping[str, int] | None = None
+) -> dict[str, Any]:
+    """Return what a submission's page shows, its ranks by config, every view of the config ``all_of``."""
     database = service.database
     return {
         "id": record.id,
@@ -55,11 +57,13 @@ def submission_part(service: Service, record: SubmissionRecord, all_of: str | No
         "sha256": record.archive_sha256,
         "size": size(record.archive_bytes),
         "reason": lines(record.reason),
-        **(_scored(service, record, all_of) if record.status == SCORED else {"scored": False}),
+        **(_scored(service, record, all_of, placed or {}) if record.status == SCORED else {"scored": False}),
     }
 
 
-def _scored(service: Service, record: SubmissionRecord, all_of: str | None) -> dict[str, Any]:
+def _scored(
+    service: Service, record: SubmissionRecord, all_of: str | None, placed: Mapping[str, int]
+) -> dict[str, Any]:
     data = result_json(service.database, record.id)
     if data is None:  # deleted a moment ago
         raise HTTPException(404, "no such submission")
@@ -68,7 +72,7 @@ def _scored(service: Service, record: SubmissionRecord, all_of: str | None) -> d
     configs = [_config(name, views[name], name == all_of) for name in result.tables]
     return {
         "scored": True,
-        "ranks": ranks(service.database, record),
+        "ranks": placed,
         "configs": configs,
         "dash_in_views": any(row.has_dash() for one in configs for row in one.worst),
         "maps": _maps(service, record.id, result),

@@ -56,7 +56,7 @@ def parse_metadata(data: bytes) -> SubmissionMeta:
     values = _load_object(data)
     found = [
         *method_problems(values.get("method")),
-        *type_problems("description", values.get("description"), str),
+        *description_problems(values.get("description")),
         *url_problems(values.get("url")),
         *type_problems("uses_intrinsics", values.get("uses_intrinsics"), bool),
         *_scale_problems(values.get("depth_scale")),
@@ -111,6 +111,13 @@ def method_problems(method: object) -> list[str]:
     if len(method) > MAX_METHOD_CHARACTERS:
         return [f"method has {len(method)} characters, {expected}"]
     return []
+
+
+def description_problems(description: object) -> list[str]:
+    """Return what is wrong with a description: any text will do, but for NUL, which PostgreSQL does not keep."""
+    found = type_problems("description", description, str)
+    has_nul = isinstance(description, str) and "\0" in description
+    return [*found, *(["description has a NUL character, expected text without one"] if has_nul else [])]
 
 
 def url_problems(url: object) -> list[str]:

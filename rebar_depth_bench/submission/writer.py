@@ -17,7 +17,13 @@ import numpy as np
 
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.files import replacing
-from rebar_depth_bench.submission.metadata import METADATA_NAME, method_problems, type_problems, url_problems
+from rebar_depth_bench.submission.metadata import (
+    METADATA_NAME,
+    description_problems,
+    method_problems,
+    type_problems,
+    url_problems,
+)
 from rebar_depth_bench.submission.npy import Depth
 from rebar_depth_bench.submission.problems import show
 
@@ -172,7 +178,7 @@ def _padding(values_at: int) -> bytes:
 def _check_metadata(values: Mapping[str, object]) -> None:
     found = [
         *method_problems(values["method"]),
-        *type_problems("description", values["description"], str),
+        *description_problems(values["description"]),
         *url_problems(values["url"]),
         *type_problems("uses_intrinsics", values["uses_intrinsics"], bool),
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import pytest
 from playwright.sync_api import Browser, sync_playwright
 
 from rebar_depth_bench import SubmissionWriter, load
+from tests.leaderboard.postgres import Postgres, running_postgres
 from tests.leaderboard.serving import Server, make_token, running_server
 
 HOSTILE = "<script>alert(1)</script>\"'&amp;{{ 7 * 7 }}"
@@ -66,9 +68,30 @@ def write_archive(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.fixture(scope="session")
-def board(tiny_root: Path, write_archive: Write, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
+def postgres() -> Iterator[Postgres]:
+    """A PostgreSQL server for all tests."""
+    with running_postgres() as server:
+        yield server
+
+
+@pytest.fixture(scope="session", params=["sqlite", "postgresql"])
+def new_database(request: pytest.FixtureRequest) -> Callable[[], str]:
+    """Make empty databases, given as ``--db`` takes them: what stands on this runs on SQLite and on PostgreSQL."""
+    if request.param == "sqlite":
+        return lambda: ""
+    server: Postgres = request.getfixturevalue("postgres")
+    return lambda: server.new_database(f"board_{secrets.token_hex(4)}")
+
+
+@pytest.fixture(scope="session")
+def board(
+    tiny_root: Path,
+    write_archive: Write,
+    tmp_path_factory: pytest.TempPathFactory,
+    new_database: Callable[[], str],
+) -> Iterator[Shared]:
     """A server that scores, with a board of five submissions and error maps of two views."""
-    state = tmp_path_factory.mktemp("board") / "state"
+    db, state = new_database(), tmp_path_factory.mktemp("board") / "state"
     archives = {
         "good": write_archive("good", 1.01, url="https://example.org/good", description="plain words"),
         "near": write_archive("near", 0.8, uses_intrinsics=True),
@@ -76,7 +99,7 @@ def board(tiny_root: Path, write_archive: Write, tmp_path_factory: pytest.TempPa
         "holes": write_archive("holes", 1.0, 0.3),
         "hostile": write_archive(HOSTILE, 1.4, description=DESCRIPTION, url="https://example.org/?a=1&b=<i>"),
     }
-    with running_server(tiny_root, state, error_maps=2, quota=100, reads="60000/minute") as server:
+    with running_server(tiny_root, state, db=db, error_maps=2, quota=100, reads="60000/minute") as server:
         token = server.token("Müller & <Söhne>")
         ids = {name: server.accepted(path, token) for name, path in archives.items()}
         for submission_id in ids.values():
@@ -85,11 +108,16 @@ def board(tiny_root: Path, write_archive: Write, tmp_path_factory: pytest.TempPa
 
 
 @pytest.fixture(scope="session")
-def waiting(tiny_root: Path, write_archive: Write, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
+def waiting(
+    tiny_root: Path,
+    write_archive: Write,
+    tmp_path_factory: pytest.TempPathFactory,
+    new_database: Callable[[], str],
+) -> Iterator[Shared]:
     """A server that scores nothing, where owners publish: a failed, a scored and two queued submissions."""
-    state = tmp_path_factory.mktemp("waiting") / "state"
-    token = make_token(state, "bob")
-    common: dict[str, Any] = {"public": "owner", "error_maps": 1}
+    db, state = new_database(), tmp_path_factory.mktemp("waiting") / "state"
+    token = make_token(state, "bob", db)
+    common: dict[str, Any] = {"db": db, "public": "owner", "error_maps": 1}
     archive = write_archive("slow")
     with running_server(tiny_root, state, score_time=0.01, **common) as server:
         failed = server.accepted(archive, token)

@@ -28,11 +28,12 @@ class Server:
     url: str
     process: subprocess.Popen[str]
     state: Path
+    db: str = ""
     log: list[str] = field(default_factory=list)
 
-    def token(self, name: str, db: str = "") -> str:
+    def token(self, name: str) -> str:
         """Make a token as an operator does."""
-        return make_token(self.state, name, db)
+        return make_token(self.state, name, self.db)
 
     def submit(self, archive: Path, token: str) -> httpx2.Response:
         """Upload an archive through the API."""
@@ -54,7 +55,9 @@ class Server:
         """Wait until a submission is scored or failed, and return it."""
         limit = time.monotonic() + timeout_s
         while True:
-            found = httpx2.get(f"{self.url}/api/v1/submissions/{submission_id}", timeout=30).json()
+            answer = httpx2.get(f"{self.url}/api/v1/submissions/{submission_id}", timeout=30)
+            assert answer.status_code == 200, "\n".join([answer.text, *self.log[-60:]])
+            found = answer.json()
             if found["status"] in ENDED:
                 return dict(found)
             assert time.monotonic() < limit, f"still {found['status']} after {timeout_s} s: {self.log[-5:]}"
@@ -84,7 +87,7 @@ def running_server(
     reader = threading.Thread(target=_collect, args=(process, log), daemon=True)
     reader.start()
     try:
-        yield Server(_address(process, log), process, state, log)
+        yield Server(_address(process, log), process, state, str(settings.get("db", "")), log)
     finally:
         _stop(process)
         reader.join(10)

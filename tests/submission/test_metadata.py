@@ -37,6 +37,7 @@ def test_everything_optional_and_unknown_keys() -> None:
         ('{"method": "a\\u0000b"}', r"method is 'a\x00b', expected"),
         ('{"method": "' + "m" * 201 + '"}', "method has 201 characters, expected"),
         ('{"method": "m", "description": 3}', "description is a number, expected text"),
+        ('{"method": "m", "description": "a\\u0000b"}', "description has a NUL character, expected text without"),
         ('{"method": "m", "url": "javascript:alert(1)"}', "url is javascript:alert(1), expected an address"),
         ('{"method": "m", "url": "http://[::1"}', "url is http://[::1, expected"),
         ('{"method": "m", "url": true}', "url is true or false, expected text"),

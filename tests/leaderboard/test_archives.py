@@ -1,0 +1,191 @@
+"""Archives on a disk and at a real remote place, an FTP server in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import httpx2
+import pytest
+
+from leaderboard.archives import Archives, without_password, written_s
+from leaderboard.service import ORPHAN_S
+from rebar_depth_bench.errors import InputError
+from tests.leaderboard.conftest import Write
+from tests.leaderboard.serving import running_server
+from tests.leaderboard.watching import wait_until
+
+USER, PASSWORD = "keeper", "open-sesame"
+CONTENT = bytes(range(256)) * 1000
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where archives are kept: the URL as ``--archives`` takes it, and the folder that is behind it."""
+
+    url: str
+    folder: Path
+
+
+def answers(port: int) -> bool:
+    with socket.socket() as connection:
+        return connection.connect_ex(("127.0.0.1", port)) == 0
+
+
+@contextmanager
+def ftp_server(folder: Path) -> Iterator[str]:
+    """Run an FTP server over ``folder`` that only ``USER`` may write to; yield the URL of its root."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "pyftpdlib", "-i", "127.0.0.1", "-p", str(port), "-d", str(folder)]
+    process = subprocess.Popen(
+        [*command, "-w", "-u", USER, "-P", PASSWORD], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        wait_until(lambda: answers(port), "the FTP server listens")
+        yield f"ftp://{USER}:{PASSWORD}@127.0.0.1:{port}"
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture(scope="module")
+def ftp(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+    folder = tmp_path_factory.mktemp("ftp")
+    with ftp_server(folder) as url:
+        yield Place(url, folder)
+
+
+@pytest.fixture(params=["folder", "file URL", "ftp"])
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> Place:
+    """A place that does not exist yet, two folders deep."""
+    if request.param == "ftp":
+        ftp: Place = request.getfixturevalue("ftp")
+        return Place(f"{ftp.url}/{tmp_path.name}/kept", ftp.folder / tmp_path.name / "kept")
+    kept = tmp_path / "some where" / "kept"
+    return Place(str(kept) if request.param == "folder" else f"file://{kept}", kept)
+
+
+@pytest.fixture
+def new_file(tmp_path: Path) -> Callable[[], Path]:
+    def make() -> Path:
+        path = tmp_path / f"{time.monotonic_ns()}.upload"
+        path.write_bytes(CONTENT)
+        return path
+
+    return make
+
+
+def test_an_archive_is_kept_found_read_and_deleted(
+    place: Place, new_file: Callable[[], Path], tmp_path: Path
+) -> None:
+    archives, scratch = Archives(place.url), tmp_path / "scratch"
+    scratch.mkdir()
+    assert archives.ids() == set()
+    source = new_file()
+    archives.put("an-id_1", source)
+    assert not source.exists(), "an upload that is kept is no longer in the spool"
+    assert {path.name: path.read_bytes() for path in place.folder.iterdir()} == {"an-id_1.zip": CONTENT}
+    assert archives.ids() == Archives(place.url).ids() == {"an-id_1"}
+    with archives.local("an-id_1", scratch) as path:
+        assert path.read_bytes() == CONTENT
+    assert not list(scratch.iterdir())
+    archives.delete("an-id_1")
+    assert not list(place.folder.iterdir())
+    assert archives.ids() == set()
+
+
+def test_what_is_not_there_is_told_and_deleting_it_is_no_error(place: Place, tmp_path: Path) -> None:
+    archives = Archives(place.url)
+    archives.delete("never-was")
+    with pytest.raises(FileNotFoundError), archives.local("never-was", tmp_path):
+        pytest.fail("there is nothing to read")
+    assert not (tmp_path / "never-was.zip").exists()
+
+
+def test_the_age_is_the_files(place: Place, new_file: Callable[[], Path]) -> None:
+    archives, now = Archives(place.url), time.time()
+    archives.put("old", new_file())
+    assert archives.age_s("old", now) == pytest.approx(0, abs=60)
+    os.utime(place.folder / "old.zip", (now - 5000, now - 5000))
+    assert archives.age_s("old", now) == pytest.approx(5000, abs=1)
+
+
+def test_other_files_are_no_archives(place: Place) -> None:
+    archives = Archives(place.url)
+    (place.folder / "notes.txt").write_text("not ours")
+    (place.folder / "half.part").write_text("under way")
+    assert archives.ids() == set()
+
+
+def test_many_threads_keep_archives_at_once(place: Place, new_file: Callable[[], Path]) -> None:
+    archives = Archives(place.url)
+    names = [f"id-{number}" for number in range(12)]
+    with ThreadPoolExecutor(6) as threads:
+        list(threads.map(archives.put, names, [new_file() for _ in names]))
+    assert archives.ids() == set(names)
+    assert {path.read_bytes() for path in place.folder.iterdir()} == {CONTENT}
+
+
+def test_a_place_that_refuses_us_is_told_without_the_password(ftp: Place) -> None:
+    wrong = ftp.url.replace(PASSWORD, "wrong-sesame")
+    with pytest.raises(InputError, match="archives cannot be kept there") as refusal:
+        Archives(f"{wrong}/kept")
+    assert "sesame" not in str(refusal.value)
+    assert without_password("s3://bucket/archives") == "s3://bucket/archives"
+    assert without_password("ftp://a:b@c@host/x") == "ftp://...@host/x"
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"mtime": 1e9},
+        {"mtime": datetime.fromtimestamp(1e9, UTC)},  # SFTP
+        {"LastModified": datetime.fromtimestamp(1e9, UTC)},  # S3
+        {"updated": "2001-09-09T01:46:40.000Z"},  # Google
+        {"modify": "20010909014640"},  # FTP
+        {"modify": "20010909014640.000"},
+    ],
+)
+def test_the_ways_in_which_stores_tell_the_time(told: dict[str, object]) -> None:
+    assert written_s(told) == pytest.approx(1e9)
+
+
+@pytest.mark.parametrize("told", [{}, {"size": 3}, {"modify": "Nov 21 23:25"}])
+def test_stores_that_do_not_tell_the_time(told: dict[str, object]) -> None:
+    assert written_s(told) is None
+
+
+def test_a_service_keeps_its_archives_there_and_leaves_nothing(
+    tiny_root: Path, tmp_path: Path, write_archive: Write, ftp: Place
+) -> None:
+    state, kept = tmp_path / "state", ftp.folder / "service"
+    kept.mkdir()
+    for name, age_s in (("orphan", 2 * ORPHAN_S), ("young", 0.0)):
+        (kept / f"{name}.zip").write_bytes(CONTENT)
+        os.utime(kept / f"{name}.zip", (time.time() - age_s,) * 2)
+    archive = write_archive("small", configs=("lattice-orbit",))
+    with running_server(tiny_root, state, archives=f"{ftp.url}/service") as server:
+        assert [path.name for path in kept.iterdir()] == ["young.zip"], "archives of nobody are cleared once old"
+        (kept / "young.zip").unlink()
+        token = server.token("alice")
+        submission = server.accepted(archive, token)
+        assert (kept / f"{submission}.zip").read_bytes() == archive.read_bytes()
+        assert server.ended(submission)["status"] == "scored"
+        address, owner = f"{server.url}/api/v1/submissions/{submission}", {"Authorization": f"Bearer {token}"}
+        assert httpx2.delete(address, headers=owner, timeout=60).status_code == 204
+        assert not list(kept.iterdir())
+        assert not (state / "archives").exists()
+        wait_until(lambda: not list((state / "spool").glob("*/*")), "the spool is empty")
+        log = "\n".join(server.log)
+    assert PASSWORD not in log
+    assert sorted(path.name for path in (state / "spool").iterdir()) == ["entrance.lock"]

@@ -1,0 +1,151 @@
+"""What ``deploy/`` says is what the code knows: settings, commands, extras, images."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from leaderboard.cli import argument_parser
+from leaderboard.settings import Settings
+
+ROOT = Path(__file__).parents[2]
+COMPOSE, CONTAINERFILE = ROOT / "deploy/compose.yaml", ROOT / "deploy/Containerfile"
+README = (ROOT / "deploy/README.md").read_text()
+PREFIX = "REBAR_LEADERBOARD_"
+NO_SETTINGS = {"name", "token"}
+"""What stands for any setting's name, and what the client reads, in the README."""
+
+
+@pytest.fixture(scope="module")
+def compose() -> dict[str, Any]:
+    return dict(yaml.safe_load(COMPOSE.read_text()))
+
+
+def instructions(name: str) -> list[str]:
+    """The arguments of every instruction ``name`` of the Containerfile."""
+    return re.findall(rf"^{name} (.+)$", CONTAINERFILE.read_text(), re.MULTILINE)
+
+
+def environment_of(service: dict[str, Any]) -> dict[str, str]:
+    return {name: str(value) for name, value in service.get("environment", {}).items()}
+
+
+def image_environment() -> dict[str, str]:
+    return dict(pair.split("=", 1) for line in instructions("ENV") for pair in shlex.split(line))
+
+
+def test_every_setting_that_is_deployed_exists() -> None:
+    for file in sorted((ROOT / "deploy").iterdir()):
+        named = {name.lower() for name in re.findall(rf"{PREFIX}(\w+)", file.read_text())}
+        assert named, f"{file.name}: nothing is set"
+        allowed = NO_SETTINGS if file.suffix == ".md" else set()
+        assert named <= set(Settings.model_fields) | allowed, file.name
+
+
+def shell_lines(program: str) -> list[list[str]]:
+    """The README's commands of a program, as words without the program."""
+    blocks = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+    lines = [shlex.split(line, comments=True) for block in blocks for line in block.splitlines()]
+    return [words[1:] for words in lines if words and words[0] == program]
+
+
+def test_the_readmes_commands_are_understood() -> None:
+    commands = [argument_parser().parse_args(words).command for words in shell_lines("rebar-leaderboard")]
+    assert set(commands) == {"serve", "score", "token", "backup"}
+
+
+def test_the_readmes_table_of_settings_is_the_codes() -> None:
+    told = re.findall(r"^\| `(\w+)` \| (?:`(.*)`)? ?\| (.+) \|$", README, re.MULTILINE)
+    fields = Settings.model_fields.items()
+    expected = [
+        (name, "" if field.is_required() else str(field.default), field.description) for name, field in fields
+    ]
+    assert told == expected
+
+
+def test_extras_that_the_readme_installs_exist() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    installed = {
+        extra for found in re.findall(r"rebar-depth-bench\[([\w,]+)\]", README) for extra in found.split(",")
+    }
+    assert {"server", "postgresql"} <= installed <= set(extras)
+
+
+@pytest.mark.parametrize("service", ["web", "scorer"])
+def test_a_service_starts_with_sound_settings(
+    compose: dict[str, Any], service: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = {**image_environment(), **environment_of(compose["services"][service])}
+    for name, value in given.items():
+        monkeypatch.setenv(name, value.replace("${POSTGRES_PASSWORD}", "a-password"))
+    options = argument_parser().parse_args(compose["services"][service]["command"])
+    settings = Settings()  # type: ignore[call-arg]
+    assert options.command in ("serve", "score")
+    assert settings.database_url == "postgresql+psycopg://board:a-password@database/board"
+    assert settings.data == "/data"
+    assert settings.host == "0.0.0.0", "a container that listens to itself alone serves nobody"
+    assert settings.state == Path("/state")
+
+
+def test_the_web_server_leaves_scoring_to_the_scorers(compose: dict[str, Any]) -> None:
+    options = argument_parser().parse_args(compose["services"]["web"]["command"])
+    assert (options.command, options.scorers) == ("serve", "0")
+    assert compose["services"]["scorer"]["command"] == ["score"]
+
+
+def test_ports_volumes_and_database_agree(compose: dict[str, Any]) -> None:
+    services = compose["services"]
+    port = str(Settings.model_fields["port"].default)
+    assert services["web"]["ports"] == [f"{port}:{port}"]
+    assert instructions("EXPOSE") == [port]
+    assert f"127.0.0.1:{port}/healthz" in CONTAINERFILE.read_text()
+    assert services["scorer"]["ports"] == [], "scorers beside the web server cannot have its port"
+    for name in ("web", "scorer"):
+        mounted = {volume.rsplit(":", 1)[1] for volume in services[name]["volumes"]}
+        assert mounted == {"/state", "/data"}
+    declared = set(compose["volumes"])
+    used = {volume.split(":")[0] for service in services.values() for volume in service["volumes"]}
+    assert declared == {name for name in used if name.isidentifier()}
+    assert services["database"]["environment"]["POSTGRES_USER"] == "board"
+    assert services["database"]["environment"]["POSTGRES_DB"] == "board"
+
+
+def test_no_image_names_a_registry(compose: dict[str, Any]) -> None:
+    images = [service["image"] for service in compose["services"].values() if "image" in service]
+    images += instructions("FROM")
+    assert len(images) == 2
+    for image in images:
+        name, _, tag = image.partition(":")
+        assert re.fullmatch(r"[a-z0-9-]+", name), f"{image}: expected a plain name"
+        assert re.fullmatch(r"[\w.-]+", tag), f"{image}: expected a tag"
+
+
+def test_the_image_is_built_from_what_exists(compose: dict[str, Any]) -> None:
+    build = compose["services"]["web"]["build"]
+    assert (COMPOSE.parent / build["context"]).resolve() == ROOT
+    assert ROOT / build["dockerfile"] == CONTAINERFILE
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    (extras,) = re.findall(r"/source\[([\w,]+)\]", CONTAINERFILE.read_text())
+    assert set(extras.split(",")) <= set(project["optional-dependencies"])
+    (constraints,) = re.findall(r"--constraint /source/(\S+)", CONTAINERFILE.read_text())
+    assert (ROOT / constraints).is_file()
+    (entry,) = instructions("ENTRYPOINT")
+    assert json.loads(entry)[0] in project["scripts"]
+    (command,) = instructions("CMD")
+    assert argument_parser().parse_args(json.loads(command)).command == "serve"
+
+
+def test_commands_in_comments_name_files_that_exist() -> None:
+    commands = re.findall(r"^#   (.+)$", COMPOSE.read_text() + CONTAINERFILE.read_text(), re.MULTILINE)
+    files = [file for command in commands for file in re.findall(r"-f (\S+)", command)]
+    assert sorted(files) == ["deploy/Containerfile", "deploy/compose.yaml"]
+    assert all((ROOT / file).is_file() for file in files)
+    (scaled,) = re.findall(r"--scale (\w+)=", " ".join(commands))
+    assert scaled in yaml.safe_load(COMPOSE.read_text())["services"]

@@ -1,0 +1,247 @@
+"""Settings: where they come from, which wins, and what is said of those that are wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from leaderboard.archives import Archives
+from leaderboard.cli import GROUPS, argument_parser
+from leaderboard.settings import Settings, read_settings
+from rebar_depth_bench.errors import InputError
+
+PASSWORD = "Hunter2"
+PREFIX = "REBAR_LEADERBOARD_"
+FILES = {
+    "unknown": b"quotta = 3",
+    "secret": f'dbb = "postgresql://u:{PASSWORD}@h/x"'.encode(),
+    "list": f'db = ["postgresql://u:{PASSWORD}@h/x"]'.encode(),
+    "type": b'quota = "many"',
+    "malformed": b"port = = 1",
+    "latin": b'title = "\xe4"',
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command that must be refused, and what has to be in the words.
+
+    ``DATA`` stands for a dataset, ``HERE`` for a folder with ``FILES`` in it, ``TAKEN`` for a port.
+    """
+
+    words: str
+    options: str
+    command: str = "serve --data DATA --state HERE/state --port 0"
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+
+BARE = "serve --state HERE/state"
+CASES = {
+    "unknown key": Case("quotta: there is no such setting", "--settings HERE/unknown"),
+    "unknown key with a secret": Case("dbb: there is no such setting", "--settings HERE/secret"),
+    "wrong type": Case("quota: .*'many'", "--settings HERE/type"),
+    "wrong type of a secret": Case("db: ", "--settings HERE/list"),
+    "two at once": Case("port: .*quota: ", "--port x --quota -1"),
+    "wrong type in the environment": Case("lease: .*'soon'", "", environment={f"{PREFIX}LEASE": "soon"}),
+    "port too high": Case("port: .*65535.*65536", "--port 65536"),
+    "neither owner nor always": Case("public: .*'owner' or 'always'", "--public never"),
+    "malformed TOML": Case("malformed: cannot be read as TOML", "--settings HERE/malformed"),
+    "TOML that is not UTF-8": Case("latin: cannot be read as TOML", "--settings HERE/latin"),
+    "no TOML file": Case("none: cannot be read as TOML", "--settings HERE/none"),
+    "folder as TOML file": Case("cannot be read as TOML", "--settings HERE"),
+    "rate in words": Case("reads: expected a rate such as .*'many'", "--reads many"),
+    "rate of nothing": Case("writes: expected a rate", "--writes 0/minute"),
+    "two rates": Case("writes: expected a rate", "--writes 1/second;9/minute"),
+    "empty rate": Case("reads: expected a rate", "", environment={f"{PREFIX}READS": ""}),
+    "no data": Case("data: is not given", f"--db postgresql://u:{PASSWORD}@h/x", BARE),
+    "dataset missing": Case("no such folder", "--data HERE/none", BARE),
+    "dataset empty": Case("no manifest.json", "--data HERE", BARE),
+    "no URL": Case("db: expected sqlite", f"--db u:{PASSWORD}@h/x"),
+    "another database": Case("db: expected sqlite", f"--db mysql://u:{PASSWORD}@h/x"),
+    "database in memory": Case("db: expected sqlite", "--db sqlite://"),
+    "database's port": Case("db: expected sqlite", f"--db postgresql://u:{PASSWORD}@h:port/x"),
+    "database away": Case("does not answer", f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x"),
+    "database away, token": Case("not answer", f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x", "token me"),
+    "database away, score": Case(
+        "not answer", f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x", "score --data DATA --state HERE/state"
+    ),
+    "state is a file": Case("files cannot be kept there", "--state HERE/type"),
+    "port taken": Case("cannot listen there: Address already in use", "--port TAKEN"),
+    "not our address": Case("cannot listen there", "--host 192.0.2.1"),
+    "no address at all": Case("cannot listen there", f"--host {'x' * 70}"),
+    "unknown protocol": Case("Protocol not known: nope", f"--archives nope://u:{PASSWORD}@h/x"),
+    "archives away": Case("cannot be kept there", f"--archives ftp://u:{PASSWORD}@127.0.0.1:1/x"),
+    "archives in a file": Case("cannot be kept there", "--archives HERE/type/x"),
+    "backup of PostgreSQL": Case("pg_dump", f"--db postgresql://u:{PASSWORD}@h/x", "backup HERE/b"),
+    "backup of nothing": Case("there is no database", "--state HERE", "backup HERE/b"),
+    "backup into the state": Case("the service itself uses", "--state HERE", "backup HERE/none/.."),
+    "backup into the database": Case("itself uses", "--db sqlite:///HERE/x/b.sqlite", "backup HERE/x"),
+}
+
+_RUNNER = """
+import contextlib, io, json, os, signal, sys, traceback
+from leaderboard.archives import Archives
+from leaderboard.cli import main
+signal.signal(signal.SIGALRM, lambda *_: sys.exit("it was not refused and runs on"))
+answers = []
+for arguments, environment in json.load(sys.stdin):
+    said, clean = io.StringIO(), dict(os.environ)
+    os.environ.update(environment)
+    signal.alarm(30)
+    with contextlib.redirect_stderr(said):
+        try:
+            status = main(arguments)
+        except SystemExit as end:
+            status = end.code
+        except BaseException:
+            status = traceback.print_exc()
+    signal.alarm(0)
+    os.environ.clear()
+    os.environ.update(clean)
+    answers.append([status, said.getvalue()])
+json.dump(answers, sys.stdout)
+"""
+"""The real commands one after another, in a process of their own: each alone would take seconds to start."""
+
+
+@pytest.fixture(scope="module")
+def answers(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int | str | None, str]]:
+    """Exit status of every case, and what was said."""
+    here = tmp_path_factory.mktemp("settings")
+    for name, content in FILES.items():
+        (here / name).write_bytes(content)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        places = {"DATA": str(tiny_root), "HERE": str(here), "TAKEN": str(taken.getsockname()[1])}
+
+        def arguments(case: Case) -> list[str]:
+            words = f"{case.command} {case.options}".split()
+            return [re.sub("DATA|HERE|TAKEN", lambda found: places[found[0]], word) for word in words]
+
+        finished = subprocess.run(
+            [sys.executable, "-c", _RUNNER],
+            input=json.dumps([(arguments(case), case.environment) for case in CASES.values()]),
+            capture_output=True,
+            text=True,
+            timeout=120,
+            env={name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
+        )
+    assert finished.returncode == 0, finished.stderr
+    return dict(zip(CASES, json.loads(finished.stdout), strict=True))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_wrong_is_said_in_words(name: str, answers: dict[str, tuple[int | str | None, str]]) -> None:
+    status, said = answers[name]
+    assert status == 2, said
+    lines = [line for line in said.splitlines() if not line.startswith("{")]
+    assert lines[0].startswith("error: "), said
+    assert sum(line.startswith("error:") for line in lines) == 1
+    assert re.search(CASES[name].words, said), said
+    assert "Traceback" not in said
+    assert PASSWORD not in said
+
+
+def test_a_token_of_a_service_that_is_not_there_yet_makes_its_database(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "leaderboard", "token", "me", "--state", str(tmp_path / "new")]
+    finished = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert re.fullmatch(r"rdb_[\w-]{43}\n", finished.stdout), "the token alone goes to standard output"
+    assert (tmp_path / "new" / "leaderboard.sqlite").is_file()
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    (tmp_path / "board.toml").write_text('data = "from-file"\ntitle = "from file"\nquota = 7\n')
+    return tmp_path / "board.toml"
+
+
+def test_the_command_line_wins_over_the_file_and_the_file_over_the_environment(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("TITLE", "from environment"), ("QUOTA", "8"), ("LEASE", "9")):
+        monkeypatch.setenv(PREFIX + name, value)
+    settings = read_settings(file, {"title": "from command line"})
+    assert (settings.title, settings.quota, settings.lease) == ("from command line", 7, 9.0)
+    assert (settings.data, settings.port) == ("from-file", Settings.model_fields["port"].default)
+    assert read_settings(None, {"data": "x"}).title == "from environment"
+
+
+def given_for(name: str) -> str:
+    """A value that the setting takes and that is not its default."""
+    special = {
+        "db": "sqlite:///elsewhere.sqlite",
+        "public": "owner",
+        "reads": "3/second",
+        "writes": "4/second",
+        "state": "/elsewhere",
+    }
+    kind = Settings.model_fields[name].annotation
+    return special.get(name, "17" if kind in (int, float) else "something")
+
+
+@pytest.mark.parametrize("name", Settings.model_fields)
+def test_every_setting_is_taken_from_everywhere(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    value = given_for(name)
+    rest: dict[str, Any] = {} if name == "data" else {"data": "x"}
+    option = f"--{name.replace('_', '-')}"
+    parsed = getattr(argument_parser().parse_args(["serve", option, value]), name)
+    by_command = getattr(read_settings(None, {**rest, name: parsed}), name)
+    (tmp_path / "one.toml").write_text(f"{name} = {value if value.isdigit() else repr(value)}\n")
+    assert getattr(read_settings(tmp_path / "one.toml", rest), name) == by_command
+    monkeypatch.setenv(PREFIX + name.upper(), value)
+    assert getattr(read_settings(None, rest), name) == by_command
+    assert str(by_command) in (value, f"{value}.0")
+    assert Settings.model_fields[name].default != by_command
+
+
+@pytest.mark.parametrize("command", GROUPS)
+def test_help_shows_every_setting_with_its_default(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        argument_parser().parse_args([command, "--help"])
+    assert end.value.code == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    for name in GROUPS[command]:
+        default = Settings.model_fields[name].default
+        assert f"--{name.replace('_', '-')} " in shown
+        if default not in ("", None) and not Settings.model_fields[name].is_required():
+            assert f"(default: {default})" in shown, name
+    assert command != "serve" or set(GROUPS["serve"]) == set(Settings.model_fields)
+
+
+@pytest.mark.parametrize("rate", ["600/minute", "10/second", "1 per 2 hours", "5/day"])
+def test_rates_that_are_taken(rate: str) -> None:
+    assert read_settings(None, {"data": "x", "reads": rate}).reads == rate
+
+
+@pytest.mark.parametrize("url", ["postgresql://u:p@h:5432/x", "postgresql+psycopg://u@/x?host=/run/pg"])
+def test_postgresql_is_reached_by_psycopg(url: str) -> None:
+    reached = read_settings(None, {"data": "x", "db": url}).database_url
+    assert reached.startswith("postgresql+psycopg://")
+    assert reached.split("://")[1] == url.split("://")[1]
+
+
+@pytest.mark.parametrize("url", [f"postgres://u:{PASSWORD}@h/x", "sqlite:///", "sqlite:///?mode=memory"])
+def test_strange_database_urls_are_refused(url: str) -> None:
+    with pytest.raises(InputError, match="db: expected sqlite:///PATH or postgresql://") as refusal:
+        read_settings(None, {"data": "x", "db": url})
+    assert PASSWORD not in str(refusal.value)
+
+
+def test_all_is_kept_in_the_state_folder_whatever_its_name(tmp_path: Path) -> None:
+    settings = read_settings(None, {"data": "x", "state": tmp_path / "a st%20ate"})
+    archives = Archives(settings.archives_url)
+    (tmp_path / "one.zip").write_bytes(b"zip")
+    archives.put("one", tmp_path / "one.zip")
+    assert (tmp_path / "a st%20ate" / "archives" / "one.zip").is_file()
+    assert settings.database_url == f"sqlite:///{tmp_path}/a st%20ate/leaderboard.sqlite"

@@ -1,0 +1,50 @@
+"""What tests of a running service look at: its processes, its database, what comes true after a while."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Callable
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+SCORER = b"leaderboard.scorer_process"
+SCORING = b"leaderboard.scoring_process"
+"""What stands on the command lines of a scorer and of the process in which it scores one archive."""
+
+
+def wait_until(condition: Callable[[], object], what: str, within_s: float = 60.0) -> None:
+    """Wait until ``condition`` holds."""
+    limit = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < limit, f"not within {within_s} s: {what}"
+        time.sleep(0.05)
+
+
+def processes_below(pid: int, words: bytes) -> list[int]:
+    """Return the processes that ``pid`` and its children started and that have ``words`` on their command line."""
+    found = []
+    for child in _children(pid):
+        with suppress(OSError):
+            if words in Path(f"/proc/{child}/cmdline").read_bytes():
+                found.append(child)
+        found += processes_below(child, words)
+    return found
+
+
+def submission_row(state: Path, submission_id: str) -> dict[str, Any]:
+    """Return a submission's columns as they stand in the SQLite database of a state folder."""
+    with closing(sqlite3.connect(state / "leaderboard.sqlite")) as connection:
+        connection.row_factory = sqlite3.Row
+        query = "SELECT * FROM submissions WHERE id = ?"
+        return dict(connection.execute(query, (submission_id,)).fetchone())
+
+
+def _children(pid: int) -> list[int]:
+    found: list[int] = []
+    with suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            with suppress(OSError):
+                found += map(int, (task / "children").read_text().split())
+    return found
