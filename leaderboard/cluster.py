@@ -9,7 +9,6 @@ from typing import Any
 
 from leaderboard.archives import Archives
 from leaderboard.jobs import Outcome
-from leaderboard.logs import take_over_logs
 from leaderboard.scorer import IDLE_S, RENEWALS_PER_LEASE, AwayError, Score, local_score
 from leaderboard.settings import Settings
 from rebar_depth_bench.errors import InputError
@@ -29,7 +28,6 @@ def cluster_score(settings: Settings) -> Score:
             f"a cluster needs dask ({error}): pip install 'rebar-depth-bench[server,cluster]'"
         ) from None
 
-    take_over_logs("distributed")
     told = settings_for_workers(settings).model_dump_json()
     connect_s = min(CONNECT_S, settings.lease / 2)  # nobody renews the lease meanwhile
     step_s = min(settings.lease / RENEWALS_PER_LEASE, IDLE_S)

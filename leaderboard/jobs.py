@@ -34,7 +34,10 @@ class Outcome:
 
 
 def claim(database: Database, scorer: str, lease_s: float) -> str | None:
-    """Lease the oldest waiting submission to ``scorer``; return its id, None where nothing waits."""
+    """Lease the oldest waiting submission to ``scorer``; return its id, None where nothing waits.
+
+    What scorers died of waits behind what was tried less often, so that it holds nobody up.
+    """
     while True:
         with database.write() as session:
             now = time.time()
@@ -42,7 +45,8 @@ def claim(database: Database, scorer: str, lease_s: float) -> str | None:
                 SubmissionRecord.status == QUEUED,
                 and_(SubmissionRecord.status == SCORING, SubmissionRecord.lease_until < now),
             )
-            oldest = select(SubmissionRecord).where(waiting).order_by(SubmissionRecord.created_at).limit(1)
+            order = (SubmissionRecord.attempts, SubmissionRecord.created_at)
+            oldest = select(SubmissionRecord).where(waiting).order_by(*order).limit(1)
             if database.waits_for_rows:
                 oldest = oldest.with_for_update(skip_locked=True)
             record = session.scalar(oldest)

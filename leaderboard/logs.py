@@ -40,13 +40,5 @@ def set_up_logs() -> None:
     sys.excepthook = _ended
 
 
-def take_over_logs(prefix: str) -> None:
-    """Let the loggers below ``prefix``, which a library gave handlers of its own, go the way of all others."""
-    for name in list(logging.Logger.manager.loggerDict):
-        if name.split(".")[0] == prefix:
-            logging.getLogger(name).handlers.clear()
-            logging.getLogger(name).propagate = True
-
-
 def _ended(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     structlog.get_logger("process").critical("ended by an error", exc_info=(kind, error, trace))

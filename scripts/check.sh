@@ -4,6 +4,8 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 bin=$1
 
+command -v chromium >/dev/null || command -v google-chrome >/dev/null ||
+    echo "warning: no chromium on the PATH: the browser tests will fail; on Debian: apt-get install chromium" >&2
 "$bin/ruff" format --check .
 "$bin/ruff" check .
 "$bin/mypy"

@@ -41,10 +41,16 @@ _REFUSALS: Answers = {
 }
 _NOT_FOUND: Answers = {404: {"model": Problem, "description": "no such submission"}, **MALFORMED}
 _OWNERS: Answers = {**NO_TOKEN, 403: {"model": Problem, "description": "another's submission"}, **_NOT_FOUND}
+_ACCEPTED: Answers = {
+    202: {
+        "description": "accepted: file and row are on disk",
+        "headers": {"Location": {"description": "where to ask what became of it", "schema": {"type": "string"}}},
+    }
+}
 _UNREADABLE: Answers = {400: {"model": Problem, "description": "the body is no UTF-8"}}
 
 
-@router.post("", status_code=202, responses=_REFUSALS, openapi_extra=_BODY)
+@router.post("", status_code=202, responses={**_ACCEPTED, **_REFUSALS}, openapi_extra=_BODY)
 async def upload(request: Request, response: Response, service: ServiceDep, token: RequiredToken) -> Submission:
     """Upload an archive. It is checked before it is accepted; once 202 is sent it is never lost."""
     record = await take_in(service, token, request.stream(), request.headers)

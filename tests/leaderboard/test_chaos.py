@@ -15,11 +15,12 @@ import numpy as np
 import psutil
 import pytest
 
+from leaderboard.jobs import MOST_ATTEMPTS
 from tests.leaderboard.conftest import Write
 from tests.leaderboard.postgres import Postgres, running_postgres
 from tests.leaderboard.serving import Server, make_token, running_server
 
-KILLS = 9
+KILLS = 25
 """On each of the two databases."""
 UPLOADERS = 2
 PAUSE_S = (0.05, 1.5)
@@ -157,19 +158,24 @@ def test_every_accepted_submission_ends_once(service: Service, write_archive: Wr
         for thread in threads:
             thread.join()
     assert service.server is not None
-    expected = None
+    expected, failed = None, list[str]()
     for submission_id in uploads.accepted:
         ended = service.server.ended(submission_id, 300)
-        assert ended["status"] == "scored", ended["reason"]
+        if ended["status"] == "failed":
+            assert ended["reason"].startswith(f"scoring was begun {MOST_ATTEMPTS} times"), ended["reason"]
+            failed.append(submission_id)
+            continue
         expected = expected or ended["result"]
         assert ended["result"] == expected
+    assert len(failed) < len(uploads.accepted) / 2
     assert len(uploads.accepted) == len(set(uploads.accepted)) >= KILLS // 2
     assert set(uploads.answers) <= {202, 503}
     rows = httpx2.get(f"{service.url()}/api/v1/leaderboard?config=lattice-orbit", timeout=60).json()["rows"]
     shown = [row["id"] for row in rows]
     assert len(shown) == len(set(shown))
     # An upload whose answer was cut off may have been accepted: its row and archive are then as whole as others.
-    assert set(uploads.accepted) <= set(shown)
-    assert len(shown) - len(uploads.accepted) <= len(uploads.begun) - uploads.answers.count(202)
+    scored = set(uploads.accepted) - set(failed)
+    assert scored <= set(shown)
+    assert len(shown) - len(scored) <= len(uploads.begun) - uploads.answers.count(202)
     kept = {path.stem for path in (service.state / "archives").glob("*.zip")}
     assert set(shown) <= kept

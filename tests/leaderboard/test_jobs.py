@@ -100,13 +100,21 @@ def test_a_lease_that_ended_and_was_not_taken_is_renewed(database: Database, ali
 
 
 def test_what_kills_every_scorer_fails_and_the_next_is_had(database: Database, alice: TokenRecord) -> None:
-    bad, good = queue(database, alice, 2)
+    [bad] = queue(database, alice, 1)
     for _ in range(MOST_ATTEMPTS):
         assert jobs.claim(database, "s", 0.0) == bad
         time.sleep(0.01)
-    assert jobs.claim(database, "s", LEASE_S) == good
+    [good] = queue(database, alice, 1)
+    assert [jobs.claim(database, "s", LEASE_S) for _ in range(2)] == [good, None]
     assert record(database, bad).status == "failed"
     assert record(database, bad).reason == f"scoring was begun {MOST_ATTEMPTS} times and never came to an end"
+
+
+def test_what_a_scorer_died_of_waits_behind_the_others(database: Database, alice: TokenRecord) -> None:
+    bad, second, third = queue(database, alice, 3)
+    assert jobs.claim(database, "s", 0.0) == bad
+    time.sleep(0.01)
+    assert [jobs.claim(database, "s", LEASE_S) for _ in range(4)] == [second, third, bad, None]
 
 
 def test_what_is_given_back_costs_no_attempt(database: Database, alice: TokenRecord) -> None:
