@@ -18,7 +18,10 @@ from rebar_depth_bench.files import sync
 
 
 class Archives:
-    """Archives by submission id. ``put`` returns when the archive is durable."""
+    """Archives by submission id. ``put`` returns when the archive is durable.
+
+    All raise ``OSError`` where the place does not answer or has no room.
+    """
 
     def __init__(self, url: str) -> None:
         """Raise ``InputError`` for a URL that ``fsspec`` cannot reach."""
@@ -30,15 +33,24 @@ class Archives:
             raise InputError(f"{without_password(url)}: archives cannot be kept there: {error}") from None
         self._is_local = isinstance(files, LocalFileSystem)
 
-    @property
-    def _files(self) -> Any:
-        """The filesystem as this thread may use it: no two share a connection, and none is kept until it dies."""
-        return fsspec.core.url_to_fs(self._url)[0]
+    @contextmanager
+    def _files(self) -> Iterator[Any]:
+        """Yield the filesystem as this thread may use it: no two share a connection, none is kept until it dies.
+
+        Whatever goes wrong with it raises ``OSError``: every filesystem has a tree of errors of its own.
+        """
+        try:
+            yield fsspec.core.url_to_fs(self._url)[0]
+        except OSError:
+            raise
+        except Exception as error:
+            raise OSError(f"{without_password(self._url)}: {type(error).__name__}: {error}") from None
 
     def put(self, submission_id: str, source: Path) -> None:
         """Take over a file. On the same disk it is renamed, elsewhere copied."""
         if not self._is_local:
-            self._files.put_file(str(source), self._path(submission_id))
+            with self._files() as files:
+                files.put_file(str(source), self._path(submission_id))
             source.unlink()
             return
         target = Path(self._path(submission_id))
@@ -65,29 +77,27 @@ class Archives:
                 raise FileNotFoundError(submission_id)
             yield path
             return
-        fetched, files = scratch / f"{submission_id}.zip", self._files
+        fetched = scratch / f"{submission_id}.zip"
         try:
-            files.info(
-                self._path(submission_id)
-            )  # some filesystems have no error of their own for what is not there
-            files.get_file(self._path(submission_id), str(fetched))
+            with self._files() as files:
+                files.info(self._path(submission_id))  # some have no error of their own for what is not there
+                files.get_file(self._path(submission_id), str(fetched))
             yield fetched
         finally:
             fetched.unlink(missing_ok=True)
 
     def delete(self, submission_id: str) -> None:
         """Remove an archive; one that is not there is no error."""
-        files = self._files
-        with suppress(FileNotFoundError):
+        with suppress(FileNotFoundError), self._files() as files:
             files.info(self._path(submission_id))
             files.rm_file(self._path(submission_id))
 
     def ids(self) -> set[str]:
         """Return the ids of all archives that are kept."""
-        files = self._files
-        files.invalidate_cache()
         try:
-            found = files.ls(self._root, detail=True)
+            with self._files() as files:
+                files.invalidate_cache()
+                found = files.ls(self._root, detail=True)
         except FileNotFoundError:  # where there are no folders, an empty one is none
             return set()
         names = [str(entry["name"]) for entry in found]
@@ -95,7 +105,8 @@ class Archives:
 
     def age_s(self, submission_id: str, now: float) -> float:
         """Return how long ago an archive was written; 0 where the store does not tell."""
-        time_s = written_s(self._files.info(self._path(submission_id)))
+        with self._files() as files:
+            time_s = written_s(files.info(self._path(submission_id)))
         return 0.0 if time_s is None else now - time_s
 
     def _path(self, submission_id: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 from alembic import command
 from alembic.config import Config
 from sqlalchemy import Connection, Engine, create_engine, event
-from sqlalchemy.exc import ArgumentError, InterfaceError, NoSuchModuleError, OperationalError
+from sqlalchemy.exc import ArgumentError, DatabaseError, InterfaceError, NoSuchModuleError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.orm import Session
 
@@ -30,7 +30,7 @@ class Database:
         """Raise ``InputError`` for a URL that names no database."""
         try:
             self._engine = _engine(url)
-        except (ArgumentError, NoSuchModuleError, ImportError) as error:
+        except (ArgumentError, NoSuchModuleError, ImportError, OSError) as error:
             raise InputError(f"{_without_password(url)}: no database's URL: {error}") from None
         self._writer = self._engine.execution_options(**{_IMMEDIATE: True})
 
@@ -64,9 +64,10 @@ class Database:
                     connection.exec_driver_sql("SELECT pg_advisory_xact_lock(7241053)")
                 config.attributes["connection"] = connection
                 command.upgrade(config, "head")
-        except AWAY as error:
+        except (*AWAY, DatabaseError) as error:
             url = self._engine.url.render_as_string(hide_password=True)
-            raise InputError(f"{url}: the database does not answer: {getattr(error, 'orig', error)}") from None
+            reason = " ".join(str(getattr(error, "orig", error)).split())
+            raise InputError(f"{url}: the database does not answer: {reason}") from None
 
     def close(self) -> None:
         """Give back all connections."""
@@ -75,9 +76,11 @@ class Database:
 
 def _engine(url: str) -> Engine:
     if not url.startswith("sqlite"):
-        return create_engine(url, pool_pre_ping=True, pool_size=10, max_overflow=10)
+        return create_engine(url, hide_parameters=True, pool_pre_ping=True, pool_size=10, max_overflow=10)
     Path(url.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
-    engine = create_engine(url, connect_args={"timeout": BUSY_S}, pool_size=20, max_overflow=20)
+    engine = create_engine(
+        url, hide_parameters=True, connect_args={"timeout": BUSY_S}, pool_size=20, max_overflow=20
+    )
     event.listen(engine, "connect", _durable)
     event.listen(engine, "begin", _begin)
     return engine

@@ -125,6 +125,8 @@ def local_score(settings: Settings, archives: Archives, spool: Path) -> Score:
                     return _run(task, settings, go_on)
             except FileNotFoundError:
                 return Outcome(reason="the archive is no longer there")
+            except OSError as error:
+                raise AwayError(f"the archive cannot be had: {error}") from None
 
     return score
 

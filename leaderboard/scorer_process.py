@@ -15,14 +15,15 @@ from leaderboard.logs import set_up_logs
 from leaderboard.scorer import Score, local_score, work
 from leaderboard.settings import Settings
 from leaderboard.spool import own_spool
+from rebar_depth_bench.console import run_command
 
 
 def main() -> int:
     """Score until told to stop; the argument is the process that started this one."""
     die_with_parent(int(sys.argv[1]))
     set_up_logs()
-    run_scorer(Settings.model_validate_json(sys.stdin.read()))
-    return 0
+    settings = Settings.model_validate_json(sys.stdin.read())
+    return run_command(lambda: run_scorer(settings))
 
 
 def run_scorer(settings: Settings) -> None:

@@ -24,6 +24,14 @@ def children(pid: int) -> list[int]:
     ]
 
 
+def runs(pid: int) -> bool:
+    """Return whether a process runs: one that has ended and was not yet asked for its status does not."""
+    try:
+        return not re.search(r"^State:\s+[ZX]", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
+    except OSError:
+        return False
+
+
 def open_files(pid: int) -> int:
     """Return how many files, sockets and pipes a process holds open."""
     return len(list(Path(f"/proc/{pid}/fd").iterdir()))

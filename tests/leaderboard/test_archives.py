@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,8 +17,11 @@ from pathlib import Path
 import httpx2
 import pytest
 
+from leaderboard.app import ARCHIVES_AWAY
 from leaderboard.archives import Archives, without_password, written_s
+from leaderboard.scorer import AwayError, local_score
 from leaderboard.service import ORPHAN_S
+from leaderboard.settings import read_settings
 from rebar_depth_bench.errors import InputError
 from tests.leaderboard.conftest import Write
 from tests.leaderboard.serving import running_server
@@ -41,11 +44,14 @@ def answers(port: int) -> bool:
         return connection.connect_ex(("127.0.0.1", port)) == 0
 
 
-@contextmanager
-def ftp_server(folder: Path) -> Iterator[str]:
-    """Run an FTP server over ``folder`` that only ``USER`` may write to; yield the URL of its root."""
+def free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+        return int(free.getsockname()[1])
+
+
+@contextmanager
+def ftp_server(folder: Path, port: int) -> Iterator[str]:
+    """Run an FTP server over ``folder`` that only ``USER`` may write to; yield the URL of its root."""
     command = [sys.executable, "-m", "pyftpdlib", "-i", "127.0.0.1", "-p", str(port), "-d", str(folder)]
     process = subprocess.Popen(
         [*command, "-w", "-u", USER, "-P", PASSWORD], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -61,7 +67,7 @@ def ftp_server(folder: Path) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def ftp(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     folder = tmp_path_factory.mktemp("ftp")
-    with ftp_server(folder) as url:
+    with ftp_server(folder, free_port()) as url:
         yield Place(url, folder)
 
 
@@ -189,3 +195,30 @@ def test_a_service_keeps_its_archives_there_and_leaves_nothing(
         log = "\n".join(server.log)
     assert PASSWORD not in log
     assert sorted(path.name for path in (state / "spool").iterdir()) == ["entrance.lock"]
+
+
+def test_a_place_that_is_away_for_a_while_costs_nothing(
+    tiny_root: Path, tmp_path: Path, write_archive: Write
+) -> None:
+    state, port, archive = tmp_path / "state", free_port(), write_archive("small", configs=("lattice-orbit",))
+    (tmp_path / "ftp").mkdir()
+    with ExitStack() as stack:
+        away = stack.enter_context(ExitStack())
+        url = away.enter_context(ftp_server(tmp_path / "ftp", port))
+        server = stack.enter_context(running_server(tiny_root, state, archives=f"{url}/kept", quota=1, scorers=0))
+        token = server.token("alice")
+        away.close()
+        refused = server.submit(archive, token)
+        assert (refused.status_code, refused.json()["detail"]) == (503, ARCHIVES_AWAY)
+        stack.enter_context(ftp_server(tmp_path / "ftp", port))
+        submission = server.accepted(archive, token)
+        assert not list((state / "spool").glob("*/*.upload"))
+    settings = read_settings(None, {"data": str(tiny_root), "state": state, "archives": f"{url}/kept"})
+    with ftp_server(tmp_path / "ftp", port):
+        score = local_score(settings, Archives(settings.archives_url), tmp_path)
+    with pytest.raises(AwayError, match="the archive cannot be had"):
+        score(submission, lambda: True)
+    with ftp_server(tmp_path / "ftp", port):
+        outcome = score(submission, lambda: True)
+    assert outcome is not None
+    assert outcome.result is not None

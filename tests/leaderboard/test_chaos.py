@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,13 +14,14 @@ from typing import Any
 
 import httpx2
 import numpy as np
-import psutil
 import pytest
 
 from leaderboard.jobs import MOST_ATTEMPTS
 from tests.leaderboard.conftest import Write
 from tests.leaderboard.postgres import Postgres, running_postgres
+from tests.leaderboard.processes import descendants, runs
 from tests.leaderboard.serving import Server, make_token, running_server
+from tests.leaderboard.watching import SCORER, SCORING, processes_below, wait_until
 
 KILLS = 25
 """On each of the two databases."""
@@ -65,10 +68,7 @@ class Uploads:
     def wait_for(self, more: int) -> None:
         """Wait until so many more are accepted."""
         enough = len(self.accepted) + more
-        limit = time.monotonic() + WAIT_S
-        while len(self.accepted) < enough:
-            assert time.monotonic() < limit, f"nothing is accepted any more: {self.answers[-5:]}"
-            time.sleep(0.02)
+        wait_until(lambda: len(self.accepted) >= enough, f"{enough} uploads are accepted", WAIT_S)
 
 
 @dataclass
@@ -95,30 +95,21 @@ class Service:
     def kill_server(self) -> None:
         """Kill the server alone: what it started has to end by itself."""
         assert self.server is not None
-        children = psutil.Process(self.server.process.pid).children(recursive=True)
+        children = descendants(self.server.process.pid)
         self.server.process.kill()
         self.server.process.wait()
-        _, alive = psutil.wait_procs(children, timeout=30)
-        assert not alive, f"a killed server left {[one.cmdline() for one in alive]}"
+        wait_until(lambda: not any(map(runs, children)), "what a killed server started has ended")
         self.running.close()
         self.start()
 
     def kill_scorer(self, rng: np.random.Generator) -> None:
         """Kill one of the processes that score: a scorer, or what it started for an archive."""
         assert self.server is not None
-        everyone = psutil.Process(self.server.process.pid).children(recursive=True)
-        scoring = [one for one in everyone if self._scores(one)]
+        pid = self.server.process.pid
+        scoring = [*processes_below(pid, SCORER), *processes_below(pid, SCORING)]
         if scoring:
-            with suppress(psutil.NoSuchProcess):
-                scoring[rng.integers(len(scoring))].kill()
-
-    @staticmethod
-    def _scores(process: psutil.Process) -> bool:
-        with suppress(psutil.Error):
-            return any(
-                name in process.cmdline() for name in ("leaderboard.scorer_process", "leaderboard.scoring_process")
-            )
-        return False
+            with suppress(ProcessLookupError):
+                os.kill(scoring[rng.integers(len(scoring))], signal.SIGKILL)
 
     def kill_database(self) -> None:
         """Kill PostgreSQL with all its backends; SQLite is the server's own files, which die with it."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 import sqlite3
 import time
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 from typing import Any
+
+from tests.leaderboard.processes import descendants
 
 SCORER = b"leaderboard.scorer_process"
 SCORING = b"leaderboard.scoring_process"
@@ -24,13 +26,7 @@ def wait_until(condition: Callable[[], object], what: str, within_s: float = 60.
 
 def processes_below(pid: int, words: bytes) -> list[int]:
     """Return the processes that ``pid`` and its children started and that have ``words`` on their command line."""
-    found = []
-    for child in _children(pid):
-        with suppress(OSError):
-            if words in Path(f"/proc/{child}/cmdline").read_bytes():
-                found.append(child)
-        found += processes_below(child, words)
-    return found
+    return [one for one in descendants(pid) if words in _command_line(one)]
 
 
 def submission_row(state: Path, submission_id: str) -> dict[str, Any]:
@@ -41,10 +37,8 @@ def submission_row(state: Path, submission_id: str) -> dict[str, Any]:
         return dict(connection.execute(query, (submission_id,)).fetchone())
 
 
-def _children(pid: int) -> list[int]:
-    found: list[int] = []
-    with suppress(OSError):
-        for task in Path(f"/proc/{pid}/task").iterdir():
-            with suppress(OSError):
-                found += map(int, (task / "children").read_text().split())
-    return found
+def _command_line(pid: int) -> bytes:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return b""  # it has just ended
