@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, delete, or_, select, update
+from sqlalchemy import ColumnElement, and_, delete, func, or_, select, update
 from sqlalchemy.engine import CursorResult
 from sqlalchemy.orm import Session
 
@@ -80,23 +80,42 @@ def give_back(database: Database, submission_id: str, scorer: str) -> None:
 
 def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome) -> bool:
     """End a submission if the lease is still the scorer's; return whether it was. All in one transaction."""
+    found = None if outcome.result is None else json.loads(outcome.result)
+    values = {
+        "status": FAILED if found is None else SCORED,
+        "reason": outcome.reason,
+        "finished_at": time.time(),
+        "lease_until": None,
+        "dataset_digest": None if found is None else found["dataset"]["digest"],
+    }
     with database.write() as session:
-        values = {
-            "status": FAILED if outcome.result is None else SCORED,
-            "reason": outcome.reason,
-            "finished_at": time.time(),
-            "lease_until": None,
-        }
         if not _update(session, _leased(submission_id, scorer), values):
             return False
         for table in (PictureRecord, RowRecord, ResultRecord):
             session.execute(delete(table).where(table.submission_id == submission_id))
-        if outcome.result is not None:
+        if found is not None:
             session.add(ResultRecord(submission_id=submission_id, json=outcome.result))
-            session.add_all(_rows(submission_id, json.loads(outcome.result)["tables"]))
+            session.add_all(_rows(submission_id, found["tables"]))
         for view_id, webp in outcome.pictures.items():
             session.add(PictureRecord(submission_id=submission_id, view_id=view_id, webp=webp))
     return True
+
+
+def scored_against_another(database: Database, dataset_digest: str) -> int:
+    """Return how many submissions were scored against another dataset than this one."""
+    with database.read() as session:
+        return session.scalar(select(func.count()).where(_is_of_another(dataset_digest))) or 0
+
+
+def queue_again(database: Database, dataset_digest: str) -> None:
+    """Queue what was scored against another dataset than this one; its results stay until it is scored anew."""
+    with database.write() as session:
+        values = {"status": QUEUED, "attempts": 0, "finished_at": None}
+        session.execute(update(SubmissionRecord).where(_is_of_another(dataset_digest)).values(**values))
+
+
+def _is_of_another(dataset_digest: str) -> ColumnElement[bool]:
+    return and_(SubmissionRecord.status == SCORED, SubmissionRecord.dataset_digest != dataset_digest)
 
 
 def _rows(submission_id: str, tables: Mapping[str, Any]) -> list[RowRecord]:

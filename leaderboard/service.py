@@ -11,6 +11,7 @@ from pathlib import Path
 import structlog
 from sqlalchemy import select
 
+from leaderboard import jobs
 from leaderboard.archives import Archives
 from leaderboard.checking import Checker
 from leaderboard.database import Database
@@ -19,6 +20,7 @@ from leaderboard.records import SubmissionRecord
 from leaderboard.settings import Settings
 from leaderboard.spool import own_spool
 from leaderboard.submissions import DELETED
+from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.folder import DatasetFolder, open_folder
 
 ORPHAN_S = 3600.0
@@ -43,15 +45,28 @@ class Service:
 def open_service(settings: Settings) -> Iterator[Service]:
     """Open the database, brought up to date, and the archives, cleared of those that no submission knows.
 
-    Raises ``InputError`` where the dataset, the database or the archives' place is at fault.
+    Raises ``InputError`` where the dataset, the database or the archives' place is at fault, and where the board
+    has results of another dataset, unless these are to be scored again.
     """
     folder = open_folder(settings.data)
     with own_spool(settings.spool) as spool, closing(Database(settings.database_url)) as database:
         archives = Archives(settings.archives_url)
         database.migrate()
         clear(database, archives)
+        _hold_to(folder, database, settings.rescore)
         with Checker(settings.data, settings.score_memory) as checker:
             yield Service(settings, folder, database, archives, spool, checker, Meters())
+
+
+def _hold_to(folder: DatasetFolder, database: Database, rescore: bool) -> None:
+    """A board never mixes numbers of two datasets."""
+    others = jobs.scored_against_another(database, folder.digest)
+    if others and not rescore:
+        raise InputError(
+            f"{folder.root}: {others} submissions of this board were scored against another dataset, expected the "
+            f"same (this one is {folder.digest}); to score them again: --rescore true"
+        )
+    jobs.queue_again(database, folder.digest)
 
 
 def clear(database: Database, archives: Archives) -> None:

@@ -42,6 +42,7 @@ class Settings(BaseSettings):
         le=100,
         description="worst views of a config shown as error maps, which tell the truth to whoever predicted",
     )
+    rescore: bool = Field(False, description="score again what was scored against another dataset")
     scorers: int = Field(1, ge=0, le=64, description="scoring processes that `serve` starts itself")
     cluster: str = Field("", description="address of a dask scheduler whose workers score")
     score_time: float = Field(3600.0, gt=0, description="longest that scoring an archive may take")

@@ -81,9 +81,13 @@ def find(database: Database, submission_id: str) -> SubmissionRecord | None:
 
 def result_json(database: Database, submission_id: str) -> bytes | None:
     """Return a scored submission's result, byte for byte as the command line writes it."""
+    query = (
+        select(ResultRecord.json)
+        .join(SubmissionRecord, SubmissionRecord.id == ResultRecord.submission_id)
+        .where(ResultRecord.submission_id == submission_id, SubmissionRecord.status == SCORED)
+    )
     with database.read() as session:
-        record = session.get(ResultRecord, submission_id)
-        return None if record is None else record.json
+        return session.scalar(query)
 
 
 def change(database: Database, submission_id: str, **values: Any) -> None:
