@@ -23,7 +23,6 @@ from leaderboard.upload import MOST_ELSE
 from rebar_depth_bench.version import software_version
 
 DATABASE_AWAY = "the database does not answer; try again in a while"
-ARCHIVES_AWAY = "archives cannot be kept now; try again later"
 _LOG = structlog.get_logger("http")
 DESCRIPTION = """Takes prediction archives and scores them exactly as `rebar-bench score` does.
 
@@ -51,7 +50,6 @@ def make_app(service: Service) -> FastAPI:
     app.add_exception_handler(HTTPException, _refusal)
     app.add_exception_handler(RefusedError, _refused)
     app.add_exception_handler(ClientDisconnect, _gone)
-    app.add_exception_handler(OSError, _no_room)
     for kind in AWAY:
         app.add_exception_handler(kind, _away)
     app.add_exception_handler(RequestValidationError, _invalid)
@@ -60,7 +58,8 @@ def make_app(service: Service) -> FastAPI:
 
 async def _refused(request: Request, error: Exception) -> Response:
     assert isinstance(error, RefusedError)
-    return refusal(request, error.status, error.detail, problems=error.problems)
+    headers = {"Retry-After": "60"} if error.status == 503 else None
+    return refusal(request, error.status, error.detail, headers, error.problems)
 
 
 async def _refusal(request: Request, error: Exception) -> Response:
@@ -83,13 +82,8 @@ async def _invalid(request: Request, error: Exception) -> Response:
 
 
 async def _away(request: Request, error: Exception) -> Response:
-    _LOG.warning("database away", error=type(error).__name__)
+    _LOG.warning("database away", error=" ".join(str(getattr(error, "orig", error)).split()))
     return refusal(request, 503, DATABASE_AWAY, {"Retry-After": "10"})
-
-
-async def _no_room(request: Request, error: Exception) -> Response:
-    _LOG.error("archives away", error=str(error))
-    return refusal(request, 503, ARCHIVES_AWAY, {"Retry-After": "60"})
 
 
 async def _gone(_: Request, __: Exception) -> Response:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Iterator, Mapping
@@ -13,8 +14,13 @@ from typing import Any
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
+from leaderboard.wording import without_password
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.files import sync
+
+
+class GoneError(Exception):
+    """An archive is not there, though the place is."""
 
 
 class Archives:
@@ -35,15 +41,19 @@ class Archives:
 
     @contextmanager
     def _files(self) -> Iterator[Any]:
-        """Yield the filesystem as this thread may use it: no two share a connection, none is kept until it dies.
+        """Yield the filesystem as this thread may use it: no two share a connection.
 
         Whatever goes wrong with it raises ``OSError``: every filesystem has a tree of errors of its own.
         """
+        files = fsspec.core.url_to_fs(self._url)[0]
         try:
-            yield fsspec.core.url_to_fs(self._url)[0]
-        except OSError:
+            yield files
+        except FileNotFoundError:
             raise
         except Exception as error:
+            files.clear_instance_cache()  # its connection may be dead
+            if isinstance(error, OSError):
+                raise
             raise OSError(f"{without_password(self._url)}: {type(error).__name__}: {error}") from None
 
     def put(self, submission_id: str, source: Path) -> None:
@@ -54,14 +64,13 @@ class Archives:
             source.unlink()
             return
         target = Path(self._path(submission_id))
-        sync(source)
         if source.stat().st_dev == target.parent.stat().st_dev:
+            os.utime(source)  # its age counts from now on
+            sync(source)
             source.replace(target)
         else:
-            part = target.with_suffix(".part")
-            shutil.copyfile(source, part)
-            sync(part)
-            part.replace(target)
+            shutil.copyfile(source, target)
+            sync(target)
             source.unlink()
         sync(target.parent)
 
@@ -69,19 +78,24 @@ class Archives:
     def local(self, submission_id: str, scratch: Path) -> Iterator[Path]:
         """Yield the archive as a file of this machine, fetched into ``scratch`` where it is kept elsewhere.
 
-        Raises ``FileNotFoundError`` for one that is not there.
+        Raises ``GoneError`` for one that is not there.
         """
         if self._is_local:
             path = Path(self._path(submission_id))
             if not path.is_file():
-                raise FileNotFoundError(submission_id)
+                if path.parent.is_dir():
+                    raise GoneError(submission_id)
+                raise OSError(f"{path.parent}: there is no such folder")
             yield path
             return
         fetched = scratch / f"{submission_id}.zip"
         try:
-            with self._files() as files:
-                files.info(self._path(submission_id))  # some have no error of their own for what is not there
-                files.get_file(self._path(submission_id), str(fetched))
+            try:
+                with self._files() as files:
+                    files.info(self._path(submission_id))  # some have no error of their own for what is not there
+                    files.get_file(self._path(submission_id), str(fetched))
+            except FileNotFoundError:
+                raise GoneError(submission_id) from None
             yield fetched
         finally:
             fetched.unlink(missing_ok=True)
@@ -111,11 +125,6 @@ class Archives:
 
     def _path(self, submission_id: str) -> str:
         return f"{self._root}/{submission_id}.zip"
-
-
-def without_password(url: str) -> str:
-    """Return a URL as it may be shown: without what stands before its host."""
-    return re.sub(r"://.*@", "://...@", url)
 
 
 _WRITTEN = ("mtime", "LastModified", "last_modified", "updated", "modify")

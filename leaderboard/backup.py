@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+from collections.abc import Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 
 from sqlalchemy import select
 
-from leaderboard.archives import Archives
+from leaderboard.archives import Archives, GoneError
 from leaderboard.database import Database
 from leaderboard.records import SubmissionRecord
 from leaderboard.settings import Settings
@@ -36,22 +37,32 @@ def back_up(settings: Settings, target: Path) -> Path:
         raise InputError(f"{source}: there is no database, expected that of a service")
     kept = target / ARCHIVES
     try:
-        kept.mkdir(parents=True, exist_ok=True)
+        if target.is_dir() and any(target.iterdir()) and not (target / DATABASE).is_file():
+            raise InputError(f"{target}: holds other things, expected a new folder or an earlier backup")
+        target.mkdir(mode=0o700, parents=True, exist_ok=True)
+        kept.mkdir(exist_ok=True)
+        _copy_database(source, target / DATABASE)
+        _copy_archives(Archives(settings.archives_url), _known(target / DATABASE), kept)
     except OSError as error:
-        raise InputError(f"{target}: cannot be written: {error.strerror}") from None
-    _copy_database(source, target / DATABASE)
-    archives = Archives(settings.archives_url)
-    for submission_id in _known(target / DATABASE):
+        raise InputError(f"{target}: cannot be written: {error.strerror or error}") from None
+    return target
+
+
+def _copy_archives(archives: Archives, known: Sequence[str], kept: Path) -> None:
+    """Copy what is new, and remove what its owner has deleted."""
+    for path in kept.glob("*.zip"):
+        if path.stem not in known:
+            path.unlink()
+    for submission_id in known:
         copy = kept / f"{submission_id}.zip"
         # One that is gone was deleted after the database was copied.
         if not copy.is_file():
             with (
-                suppress(FileNotFoundError),
-                archives.local(submission_id, target) as archive,
+                suppress(GoneError),
+                archives.local(submission_id, kept.parent) as archive,
                 replacing(copy) as part,
             ):
                 shutil.copyfile(archive, part)
-    return target
 
 
 def _copy_database(source: Path, copy: Path) -> None:

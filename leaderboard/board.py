@@ -118,17 +118,6 @@ def board(database: Database, config: str, viewer: TokenRecord | None = None) ->
     return rows
 
 
-def submission_rows(database: Database, submission: SubmissionRecord) -> list[BoardRow]:
-    """Return a submission's own rows, a config each; their ranks are those of the board."""
-    query = select(RowRecord.config).where(RowRecord.submission_id == submission.id).order_by(RowRecord.config)
-    with database.read() as session:
-        configs = session.scalars(query).all()
-        token = session.get_one(TokenRecord, submission.token_id)
-    return [
-        row for config in configs for row in board(database, config, token) if row.submission_id == submission.id
-    ]
-
-
 def picture_views(database: Database, submission_id: str) -> list[str]:
     """Return the views whose error maps are kept."""
     query = select(PictureRecord.view_id).where(PictureRecord.submission_id == submission_id)

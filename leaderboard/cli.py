@@ -1,4 +1,4 @@
-"""``rebar-leaderboard``: serve, score, token, backup."""
+"""``rebar-leaderboard``: serve, score, token, remove, backup."""
 
 from __future__ import annotations
 
@@ -8,18 +8,22 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from leaderboard import submissions
+from leaderboard.archives import Archives
 from leaderboard.backup import back_up
 from leaderboard.database import Database
 from leaderboard.logs import set_up_logs
 from leaderboard.settings import Settings, read_settings
-from leaderboard.tokens import create_token
+from leaderboard.tokens import create_token, replace_token
 from rebar_depth_bench.console import run_command
+from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "serve": tuple(Settings.model_fields),
     "score": ("data", "state", "db", "archives", "cluster", "score_time", "score_memory", "lease", "error_maps"),
     "token": ("state", "db"),
+    "remove": ("state", "db", "archives"),
     "backup": ("state", "db", "archives"),
 }
 """Which settings each command takes; all may also stand in a file or the environment."""
@@ -38,6 +42,7 @@ def _run(options: argparse.Namespace) -> None:
         given["data"] = ""
     settings = read_settings(options.settings, given)
     set_up_logs()
+    _make_state(settings.state)
     if options.command == "serve":
         from leaderboard.serving import serve  # takes seconds, which the other commands need not wait for
 
@@ -49,10 +54,30 @@ def _run(options: argparse.Namespace) -> None:
     elif options.command == "token":
         database = Database(settings.database_url)
         database.migrate()
-        print(create_token(database, options.name))
+        make = replace_token if options.replace else create_token
+        print(make(database, options.name))
         print("It is shown this once; only its hash is kept.", file=sys.stderr)
+    elif options.command == "remove":
+        _remove(settings, options.id)
     else:
         print(back_up(settings, options.target))
+
+
+def _remove(settings: Settings, submission_id: str) -> None:
+    database = Database(settings.database_url)
+    database.migrate()
+    if submissions.find(database, submission_id) is None:
+        raise InputError(f"there is no submission {submission_id!r}")
+    submissions.remove(database, submission_id)
+    Archives(settings.archives_url).delete(submission_id)
+
+
+def _make_state(folder: Path) -> None:
+    """Make the state folder, for nobody else to read: ids in it are keys of submissions that are not public."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: files cannot be kept there: {error.strerror}") from None
 
 
 def argument_parser() -> argparse.ArgumentParser:
@@ -72,6 +97,9 @@ def argument_parser() -> argparse.ArgumentParser:
             _add_setting(command, setting)
         if name == "token":
             command.add_argument("name", metavar="NAME", help="whose it is; shown on the board")
+            command.add_argument("--replace", action="store_true", help="void the token that NAME has")
+        if name == "remove":
+            command.add_argument("id", metavar="ID", help="the submission, as its address has it")
         if name == "backup":
             command.add_argument("target", type=Path, metavar="FOLDER", help="a folder to write the backup into")
     return parser
@@ -81,6 +109,7 @@ _COMMANDS = {
     "serve": "serve the board, and score what is uploaded",
     "score": "score what is uploaded to a server that shares the database and the archives",
     "token": "make a token for a submitter and print it",
+    "remove": "delete a submission, whoever made it, with its archive and results",
     "backup": "copy database and archives into a folder while the service runs",
 }
 

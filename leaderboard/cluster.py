@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from leaderboard.archives import Archives
-from leaderboard.jobs import Outcome
-from leaderboard.scorer import IDLE_S, RENEWALS_PER_LEASE, AwayError, Score, local_score
+from leaderboard.jobs import Job, Outcome
+from leaderboard.local_scoring import local_score
+from leaderboard.scorer import IDLE_S, RENEWALS_PER_LEASE, AwayError, Score
 from leaderboard.settings import Settings
 from rebar_depth_bench.errors import InputError
 
@@ -21,41 +21,46 @@ def cluster_score(settings: Settings) -> Score:
 
     Raises ``InputError`` where dask is not installed.
     """
-    try:
-        from distributed import CancelledError, Client, KilledWorker
-    except ImportError as error:
-        raise InputError(
-            f"a cluster needs dask ({error}): pip install 'rebar-depth-bench[server,cluster]'"
-        ) from None
+    check_dask()
+    from distributed import CancelledError, Client, KilledWorker
 
     told = settings_for_workers(settings).model_dump_json()
     connect_s = min(CONNECT_S, settings.lease / 2)  # nobody renews the lease meanwhile
     step_s = min(settings.lease / RENEWALS_PER_LEASE, IDLE_S)
 
-    def score(submission_id: str, go_on: Callable[[], bool]) -> Outcome | None:
+    def score(job: Job, go_on: Callable[[], bool]) -> Outcome | None:
         try:
             with Client(settings.cluster, timeout=connect_s, set_as_default=False) as client:
-                job = client.submit(score_here, told, submission_id, pure=False)
-                return _await(job, step_s, go_on)
+                return _await(client.submit(score_here, told, job, pure=False), step_s, go_on)
         except KilledWorker:
             return None  # several workers died of it
-        except (OSError, CancelledError) as error:
-            raise AwayError(f"{settings.cluster}: {error}") from None
+        except (Exception, CancelledError) as error:  # the network's, and what a worker lacks
+            raise AwayError(f"{settings.cluster}: {type(error).__name__}: {error}") from None
 
     return score
 
 
-def _await(job: Any, step_s: float, go_on: Callable[[], bool]) -> Outcome | None:
+def check_dask() -> None:
+    """Raise ``InputError`` where dask is not installed."""
+    try:
+        import distributed  # noqa: F401
+    except ImportError as error:
+        raise InputError(
+            f"a cluster needs dask ({error}): pip install 'rebar-depth-bench[server,cluster]'"
+        ) from None
+
+
+def _await(future: Any, step_s: float, go_on: Callable[[], bool]) -> Outcome | None:
     try:
         while True:
             try:
-                outcome: Outcome | None = job.result(timeout=step_s)
+                outcome: Outcome | None = future.result(timeout=step_s)
                 return outcome
             except TimeoutError:
                 if not go_on():
                     return None
     finally:
-        job.cancel()
+        future.cancel()  # what runs already goes on, bounded by its time
 
 
 def settings_for_workers(settings: Settings) -> Settings:
@@ -69,8 +74,8 @@ def settings_for_workers(settings: Settings) -> Settings:
     return settings.model_copy(update={**places, "db": ""})
 
 
-def score_here(settings_json: str, submission_id: str) -> Outcome | None:
+def score_here(settings_json: str, job: Job) -> Outcome | None:
     """Score a submission on the machine that this runs on, in a process of its own."""
     settings = Settings.model_validate_json(settings_json)
     with tempfile.TemporaryDirectory() as spool:
-        return local_score(settings, Archives(settings.archives_url), Path(spool))(submission_id, lambda: True)
+        return local_score(settings, Path(spool))(job, lambda: True)

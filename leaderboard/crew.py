@@ -38,25 +38,33 @@ class Crew:
         self._watcher.join()
 
     def _watch(self) -> None:
-        scorers = [self._start() for _ in range(self._count)]
-        while not self._ended.wait(CHECK_S):
+        scorers: list[subprocess.Popen[bytes] | None] = [None] * self._count
+        while True:
             for place, scorer in enumerate(scorers):
-                if scorer.poll() is not None:
+                if scorer is not None and scorer.poll() is not None:
                     _LOG.warning("scorer died", status=scorer.returncode)
-                    if not self._ended.wait(RESTART_S):
-                        scorers[place] = self._start()
-        for scorer in scorers:
+                    self._ended.wait(RESTART_S)
+                if (scorer is None or scorer.returncode is not None) and not self._ended.is_set():
+                    scorers[place] = self._start()
+            if self._ended.wait(CHECK_S):
+                break
+        running = [scorer for scorer in scorers if scorer is not None]
+        for scorer in running:
             scorer.terminate()
-        for scorer in scorers:
+        for scorer in running:
             try:
                 scorer.wait(STOP_S)
             except subprocess.TimeoutExpired:
                 scorer.kill()
                 scorer.wait()
 
-    def _start(self) -> subprocess.Popen[bytes]:
+    def _start(self) -> subprocess.Popen[bytes] | None:
         command = [sys.executable, "-m", "leaderboard.scorer_process", str(os.getpid())]
-        scorer = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+        try:
+            scorer = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+        except OSError as error:  # the machine is out of memory or processes: later
+            _LOG.warning("scorer not started", error=str(error))
+            return None
         assert scorer.stdin is not None
         try:
             scorer.stdin.write(self._settings.model_dump_json().encode())

@@ -14,12 +14,15 @@ from sqlalchemy.exc import ArgumentError, DatabaseError, InterfaceError, NoSuchM
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.orm import Session
 
+from leaderboard.wording import without_password
 from rebar_depth_bench.errors import InputError
 
 MIGRATIONS = Path(__file__).parent / "migrations"
 BUSY_S = 30
 AWAY = (OperationalError, InterfaceError, PoolTimeoutError)
 """What is raised while the database does not answer: it is down, is starting, or has no connection left."""
+_PATIENCE = {"connect_timeout": 10, "tcp_user_timeout": 30_000}
+"""How long a PostgreSQL that is silent is waited for: seconds, milliseconds."""
 _IMMEDIATE = "immediate"
 
 
@@ -31,7 +34,7 @@ class Database:
         try:
             self._engine = _engine(url)
         except (ArgumentError, NoSuchModuleError, ImportError, OSError) as error:
-            raise InputError(f"{_without_password(url)}: no database's URL: {error}") from None
+            raise InputError(f"{without_password(url)}: no database's URL: {error}") from None
         self._writer = self._engine.execution_options(**{_IMMEDIATE: True})
 
     @contextmanager
@@ -76,7 +79,9 @@ class Database:
 
 def _engine(url: str) -> Engine:
     if not url.startswith("sqlite"):
-        return create_engine(url, hide_parameters=True, pool_pre_ping=True, pool_size=10, max_overflow=10)
+        return create_engine(
+            url, hide_parameters=True, connect_args=_PATIENCE, pool_pre_ping=True, pool_size=10, max_overflow=10
+        )
     Path(url.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
     engine = create_engine(
         url, hide_parameters=True, connect_args={"timeout": BUSY_S}, pool_size=20, max_overflow=20
@@ -98,8 +103,3 @@ def _durable(connection: Any, _: Any) -> None:
 def _begin(connection: Connection) -> None:
     immediate = connection.get_execution_options().get(_IMMEDIATE, False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
-
-
-def _without_password(url: str) -> str:
-    head, at, tail = url.rpartition("@")
-    return f"{head.split('://')[0]}://...@{tail}" if at else url

@@ -7,6 +7,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 SILENCE_S = 5.0
+MOST_S = 600.0
 
 
 class Drain:
@@ -37,11 +38,12 @@ class Drain:
         async def send_after(message: Message) -> None:
             if message["type"] == "http.response.start" and message["status"] >= 400:
                 left = self._most
-                while more and is_sending and left > 0:
-                    with move_on_after(SILENCE_S) as silence:
-                        left -= len((await receive_watched()).get("body", b""))
-                    if silence.cancelled_caught:
-                        break
+                with move_on_after(MOST_S):
+                    while more and is_sending and left > 0:
+                        with move_on_after(SILENCE_S) as silence:
+                            left -= len((await receive_watched()).get("body", b""))
+                        if silence.cancelled_caught:
+                            break
             await send(message)
 
         await self._app(scope, receive_watched, send_after)

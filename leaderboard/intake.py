@@ -12,8 +12,10 @@ from leaderboard.records import SubmissionRecord, TokenRecord
 from leaderboard.service import Service
 from leaderboard.submissions import QuotaSpentError, Upload
 from leaderboard.upload import MOST_ELSE, Received, UploadError, receive, too_large
-from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN
+from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, RebarDepthError
 
+AWAY = "the service cannot check or keep archives now; try again later"
+"""The dataset cannot be read, the disk is full, or the place of archives does not answer."""
 _LOG = structlog.get_logger("intake")
 
 
@@ -40,12 +42,15 @@ async def take_in(
         raise RefusedError(413, too_large(settings.max_upload))
     try:
         received = await receive(body, headers.get("content-type", ""), service.spool, settings.max_upload)
+        try:
+            return await _accepted(service, token, received)
+        finally:
+            await to_thread.run_sync(received.path.unlink, True)
     except UploadError as error:
         raise RefusedError(error.status, error.detail) from None
-    try:
-        return await _accepted(service, token, received)
-    finally:
-        received.path.unlink(missing_ok=True)
+    except (OSError, RebarDepthError) as error:
+        _LOG.error("cannot take uploads", error=str(error))
+        raise RefusedError(503, AWAY) from None
 
 
 async def _accepted(service: Service, token: TokenRecord, received: Received) -> SubmissionRecord:
@@ -54,7 +59,7 @@ async def _accepted(service: Service, token: TokenRecord, received: Received) ->
         _LOG.info("refused", token=token.name, problems=len(verdict))
         raise RefusedError(422, _headline(verdict), shown(verdict))
     submission_id = submissions.new_id()
-    upload = Upload(verdict, received.sha256, received.size)
+    upload = Upload(verdict, received.sha256, received.size, service.folder.digest)
     public = service.settings.public == "always"
 
     def keep() -> SubmissionRecord:
@@ -93,5 +98,5 @@ def _spent(service: Service, token: TokenRecord) -> int:
 
 def _quota_spent(quota: int) -> RefusedError:
     return RefusedError(
-        429, f"the {quota} submissions of this token's day (UTC) are made; refused archives were not counted"
+        429, f"this token has made its {quota} submissions of today (UTC); refused archives were not counted"
     )

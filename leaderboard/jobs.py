@@ -1,7 +1,7 @@
 """The queue: a scorer leases a submission, renews the lease while it works, and ends it once.
 
-Every step is one conditional update, so that of two scorers that want the same job one gets it, and a scorer that
-was taken for dead cannot end what another has taken over.
+Of two scorers that want the same job one gets it. Renewing and ending are one conditional update each, so that a
+scorer that was taken for dead cannot end what another has taken over.
 """
 
 from __future__ import annotations
@@ -25,6 +25,14 @@ MOST_ATTEMPTS = 5
 
 
 @dataclass(frozen=True)
+class Job:
+    """A submission to score, and the dataset that its archive was checked against."""
+
+    submission_id: str
+    dataset_digest: str
+
+
+@dataclass(frozen=True)
 class Outcome:
     """What scoring came to: the result's JSON and error maps by view, or the reason why there is none."""
 
@@ -34,17 +42,15 @@ class Outcome:
 
 
 def claim(database: Database, scorer: str, lease_s: float) -> str | None:
-    """Lease the oldest waiting submission to ``scorer``; return its id, None where nothing waits.
+    """Lease the oldest of those tried least to ``scorer``; return its id, None where nothing waits.
 
-    What scorers died of waits behind what was tried less often, so that it holds nobody up.
+    So what scorers died of holds nobody up.
     """
     while True:
         with database.write() as session:
             now = time.time()
-            waiting = or_(
-                SubmissionRecord.status == QUEUED,
-                and_(SubmissionRecord.status == SCORING, SubmissionRecord.lease_until < now),
-            )
+            is_free = or_(SubmissionRecord.lease_until.is_(None), SubmissionRecord.lease_until < now)
+            waiting = and_(SubmissionRecord.status.in_((QUEUED, SCORING)), is_free)
             order = (SubmissionRecord.attempts, SubmissionRecord.created_at)
             oldest = select(SubmissionRecord).where(waiting).order_by(*order).limit(1)
             if database.waits_for_rows:
@@ -66,13 +72,13 @@ def renew(database: Database, submission_id: str, scorer: str, lease_s: float) -
         return _update(session, _leased(submission_id, scorer), {"lease_until": time.time() + lease_s})
 
 
-def give_back(database: Database, submission_id: str, scorer: str) -> None:
-    """Queue a leased submission again, as if it had never been tried: the scorer is told to stop."""
+def give_back(database: Database, submission_id: str, scorer: str, wait_s: float = 0.0) -> None:
+    """Queue a leased submission again, as if it had not been tried; nobody has it for ``wait_s`` seconds."""
     with database.write() as session:
         values = {
             "status": QUEUED,
             "scorer": None,
-            "lease_until": None,
+            "lease_until": time.time() + wait_s if wait_s else None,
             "attempts": SubmissionRecord.attempts - 1,
         }
         _update(session, _leased(submission_id, scorer), values)
@@ -86,14 +92,13 @@ def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome
         "reason": outcome.reason,
         "finished_at": time.time(),
         "lease_until": None,
-        "dataset_digest": None if found is None else found["dataset"]["digest"],
     }
     with database.write() as session:
         if not _update(session, _leased(submission_id, scorer), values):
             return False
-        for table in (PictureRecord, RowRecord, ResultRecord):
-            session.execute(delete(table).where(table.submission_id == submission_id))
         if found is not None:
+            for table in (PictureRecord, RowRecord, ResultRecord):
+                session.execute(delete(table).where(table.submission_id == submission_id))
             session.add(ResultRecord(submission_id=submission_id, json=outcome.result))
             session.add_all(_rows(submission_id, found["tables"]))
         for view_id, webp in outcome.pictures.items():
@@ -101,21 +106,22 @@ def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome
     return True
 
 
-def scored_against_another(database: Database, dataset_digest: str) -> int:
-    """Return how many submissions were scored against another dataset than this one."""
+def count_of_another(database: Database, dataset_digest: str) -> int:
+    """Return how many submissions are of another dataset than this one."""
     with database.read() as session:
         return session.scalar(select(func.count()).where(_is_of_another(dataset_digest))) or 0
 
 
 def queue_again(database: Database, dataset_digest: str) -> None:
-    """Queue what was scored against another dataset than this one; its results stay until it is scored anew."""
+    """Queue the submissions of another dataset to be scored against this one; old results stay until then."""
     with database.write() as session:
-        values = {"status": QUEUED, "attempts": 0, "finished_at": None}
+        values = {"status": QUEUED, "attempts": 0, "finished_at": None, "dataset_digest": dataset_digest}
         session.execute(update(SubmissionRecord).where(_is_of_another(dataset_digest)).values(**values))
 
 
 def _is_of_another(dataset_digest: str) -> ColumnElement[bool]:
-    return and_(SubmissionRecord.status == SCORED, SubmissionRecord.dataset_digest != dataset_digest)
+    is_kept = SubmissionRecord.status.in_((QUEUED, SCORING, SCORED))
+    return and_(is_kept, SubmissionRecord.dataset_digest != dataset_digest)
 
 
 def _rows(submission_id: str, tables: Mapping[str, Any]) -> list[RowRecord]:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from anyio import to_thread
+from anyio import CapacityLimiter, to_thread
 from fastapi import Request, Response
 
 from leaderboard.board import Stamp, stamps
@@ -37,12 +37,12 @@ class Body:
 
 
 class KeptBodies:
-    """The bodies asked for last, ``most`` bytes of them. Threads share it; one at a time makes what is missing."""
+    """The bodies asked for last, ``most`` bytes of them. Threads share it."""
 
     def __init__(self, most: int = MOST_BYTES) -> None:
         self._bodies: OrderedDict[Key, Body] = OrderedDict()
         self._most, self._size = most, 0
-        self._lock, self._making = threading.Lock(), threading.Lock()
+        self._lock = threading.Lock()
 
     def get(self, key: Key, make: Callable[[], Made]) -> Body:
         """Return the body of ``key``; where it is not kept, ``make`` it.
@@ -51,13 +51,10 @@ class KeptBodies:
         """
         if body := self.found(key):
             return body
-        with self._making:  # who waits here finds it made
-            if body := self.found(key):
-                return body
-            made, content = make()
-            body = Body(content, f'"{hashlib.sha256(content).hexdigest()[:32]}"')
-            self._keep(made, body)
-            return body
+        made, content = make()
+        body = Body(content, f'"{hashlib.sha256(content).hexdigest()[:32]}"')
+        self._keep(made, body)
+        return body
 
     def found(self, key: Key) -> Body | None:
         """Return the body of ``key``, None where it is not kept."""
@@ -101,15 +98,16 @@ class SharedRead(Generic[T]):
 
 @dataclass(frozen=True)
 class Shelf:
-    """What the boards' routes share: the stamps as they are now, and the bodies made of them."""
+    """What the boards' routes share: the stamps as they are now, the bodies made of them, and who may make one."""
 
     stamps: SharedRead[dict[str, Stamp]]
     bodies: KeptBodies
+    makers: CapacityLimiter
 
 
 def new_shelf(database: Database) -> Shelf:
     """Return an empty shelf for the boards of a database."""
-    return Shelf(SharedRead(lambda: stamps(database)), KeptBodies())
+    return Shelf(SharedRead(lambda: stamps(database)), KeptBodies(), CapacityLimiter(1))
 
 
 def shelf_of(request: Request) -> Shelf:
@@ -126,9 +124,15 @@ async def public_body(request: Request, configs: Sequence[str], asked: Key, make
     shelf = shelf_of(request)
     now = await shelf.stamps.get()
     key = (*asked, *(now.get(name, Stamp()) for name in configs))
+    return await shelved(shelf, key, make)
+
+
+async def shelved(shelf: Shelf, key: Key, make: Callable[[], Made]) -> Body:
+    """Return the body of ``key``, made where it is not kept; of many who want the same, one makes it."""
     if body := shelf.bodies.found(key):
         return body
-    return await to_thread.run_sync(shelf.bodies.get, key, make)
+    # One at a time: who waits, and takes no thread meanwhile, finds it made.
+    return await to_thread.run_sync(shelf.bodies.get, key, make, limiter=shelf.makers)
 
 
 def answer(request: Request, body: Body, media_type: str, headers: Mapping[str, str]) -> Response:

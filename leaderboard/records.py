@@ -46,7 +46,7 @@ class SubmissionRecord(Base):
     attempts: Mapped[int] = mapped_column(Integer)
     scorer: Mapped[str | None] = mapped_column(String(64))
     lease_until: Mapped[float | None] = mapped_column(Float)
-    dataset_digest: Mapped[str | None] = mapped_column(String(100))
+    dataset_digest: Mapped[str] = mapped_column(String(100))
 
 
 class ResultRecord(Base):

@@ -8,14 +8,21 @@ import threading
 from contextlib import closing
 from pathlib import Path
 
-from leaderboard.archives import Archives
+import structlog
+
 from leaderboard.database import Database
 from leaderboard.limits import die_with_parent
+from leaderboard.local_scoring import local_score
 from leaderboard.logs import set_up_logs
-from leaderboard.scorer import Score, local_score, work
+from leaderboard.scorer import Score, work
 from leaderboard.settings import Settings
 from leaderboard.spool import own_spool
+from leaderboard.wording import without_password
 from rebar_depth_bench.console import run_command
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.version import software_version
+
+_LOG = structlog.get_logger("scorer")
 
 
 def main() -> int:
@@ -31,14 +38,18 @@ def run_scorer(settings: Settings) -> None:
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    with own_spool(settings.spool) as spool, closing(Database(settings.database_url)) as database:
+    url = settings.database_url
+    if url.startswith("sqlite:///") and not Path(url.removeprefix("sqlite:///")).is_file():
+        raise InputError(f"{url}: there is no database, expected that of a server")
+    with own_spool(settings.spool) as spool, closing(Database(url)) as database:
         database.migrate()
+        _LOG.info("waiting for submissions", database=without_password(url), version=software_version())
         work(database, settings, _score(settings, spool), stop)
 
 
 def _score(settings: Settings, spool: Path) -> Score:
     if not settings.cluster:
-        return local_score(settings, Archives(settings.archives_url), spool)
+        return local_score(settings, spool)
     from leaderboard.cluster import cluster_score
 
     return cluster_score(settings)

@@ -46,7 +46,7 @@ def open_service(settings: Settings) -> Iterator[Service]:
     """Open the database, brought up to date, and the archives, cleared of those that no submission knows.
 
     Raises ``InputError`` where the dataset, the database or the archives' place is at fault, and where the board
-    has results of another dataset, unless these are to be scored again.
+    has submissions of another dataset, unless these are to be scored again.
     """
     folder = open_folder(settings.data)
     with own_spool(settings.spool) as spool, closing(Database(settings.database_url)) as database:
@@ -60,20 +60,27 @@ def open_service(settings: Settings) -> Iterator[Service]:
 
 def _hold_to(folder: DatasetFolder, database: Database, rescore: bool) -> None:
     """A board never mixes numbers of two datasets."""
-    others = jobs.scored_against_another(database, folder.digest)
+    others = jobs.count_of_another(database, folder.digest)
     if others and not rescore:
         raise InputError(
-            f"{folder.root}: {others} submissions of this board were scored against another dataset, expected the "
-            f"same (this one is {folder.digest}); to score them again: --rescore true"
+            f"{folder.root}: {others} submissions of this board are of another dataset, expected the same "
+            f"(this one is {folder.digest}); to score them against this one: --rescore true"
         )
     jobs.queue_again(database, folder.digest)
 
 
 def clear(database: Database, archives: Archives) -> None:
-    """Remove archives that no submission knows, unless they came just now: their row may be under way."""
+    """Remove archives that no submission knows, unless they came just now: their row may be under way.
+
+    A database without any submission is likely not the one that these archives belong to.
+    """
     now = time.time()
     with database.read() as session:
-        known = set(session.scalars(select(SubmissionRecord.id).where(SubmissionRecord.status != DELETED)))
+        rows = session.execute(select(SubmissionRecord.id, SubmissionRecord.status)).all()
+    known = {submission_id for submission_id, status in rows if status != DELETED}
+    if not rows:
+        _LOG.info("nothing cleared", reason="the database has no submissions")
+        return
     for submission_id in archives.ids() - known:
         if archives.age_s(submission_id, now) > ORPHAN_S:
             archives.delete(submission_id)

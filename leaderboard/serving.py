@@ -6,19 +6,26 @@ import signal
 import socket
 import sys
 
+import structlog
 import uvicorn
 
 from leaderboard.app import make_app
+from leaderboard.cluster import check_dask
 from leaderboard.crew import Crew
 from leaderboard.service import open_service
 from leaderboard.settings import Settings
+from leaderboard.wording import without_password
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.version import software_version
 
 GRACE_S = 10
+_LOG = structlog.get_logger("server")
 
 
 def serve(settings: Settings) -> None:
     """Serve until SIGTERM or SIGINT: answers under way are finished, jobs at hand are queued again."""
+    if settings.cluster:
+        check_dask()
     with open_service(settings) as service, _listen(settings) as listening:
         config = uvicorn.Config(
             make_app(service),
@@ -39,8 +46,11 @@ def serve(settings: Settings) -> None:
         # uvicorn raises what it caught once more at its end: the default would end us before the scorers stop.
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, stop)
+        told = {"version": software_version(), "dataset": service.folder.digest, "scorers": settings.scorers}
+        _LOG.info("serving", database=without_password(settings.database_url), **told)
         with Crew(settings, settings.scorers):
             server.run(sockets=[listening])
+        _LOG.info("stopped")
 
 
 def _listen(settings: Settings) -> socket.socket:

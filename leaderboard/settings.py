@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from limits import parse_many
-from pydantic import Field, ValidationError, field_validator
+from pydantic import ByteSize, Field, ValidationError, field_validator
 from pydantic_core import ErrorDetails
 from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import make_url
@@ -20,7 +20,7 @@ GIB = 1 << 30
 
 
 class Settings(BaseSettings):
-    """Every setting, with its default. Sizes are bytes, times seconds."""
+    """Every setting, with its default. Sizes are bytes (8GiB does too), times seconds."""
 
     model_config = SettingsConfigDict(env_prefix="REBAR_LEADERBOARD_", extra="forbid", frozen=True)
 
@@ -32,21 +32,23 @@ class Settings(BaseSettings):
     port: int = Field(8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
     title: str = Field("Rebar depth leaderboard", description="the page's title")
     public: Literal["owner", "always"] = Field(
-        "always", description="whether every submission is on the board at once, or once its owner says so"
+        "always", description="always: every submission is on the board at once; owner: once its owner says so"
     )
     quota: int = Field(10, ge=0, description="accepted submissions a token may make in a day (UTC)")
-    max_upload: int = Field(8 * GIB, gt=0, description="largest archive")
+    max_upload: ByteSize = Field(ByteSize(8 * GIB), gt=0, description="largest archive")
     error_maps: int = Field(
         0,
         ge=0,
         le=100,
         description="worst views of a config shown as error maps, which tell the truth to whoever predicted",
     )
-    rescore: bool = Field(False, description="score again what was scored against another dataset")
+    rescore: bool = Field(False, description="score again, against this dataset, what was submitted for another")
     scorers: int = Field(1, ge=0, le=64, description="scoring processes that `serve` starts itself")
     cluster: str = Field("", description="address of a dask scheduler whose workers score")
     score_time: float = Field(3600.0, gt=0, description="longest that scoring an archive may take")
-    score_memory: int = Field(4 * GIB, gt=0, description="most memory that scoring an archive may take")
+    score_memory: ByteSize = Field(
+        ByteSize(4 * GIB), gt=0, description="most memory that scoring an archive may take"
+    )
     lease: float = Field(20.0, gt=0, description="a scorer that is silent for so long has lost its job")
     reads: str = Field("600/minute", description="requests an address may make")
     writes: str = Field("60/minute", description="uploads and changes an address may make")

@@ -25,16 +25,16 @@ def own_spool(root: Path) -> Iterator[Path]:
     A lock says that its process lives; the kernel lets go of it however the process ends. Folders without a living
     process are removed first. Raises ``InputError`` where no folder can be made.
     """
+    folder = root / secrets.token_hex(8)
     try:
         root.mkdir(parents=True, exist_ok=True)
+        with _locked(root / _ENTRANCE):  # nobody clears between the folder and its lock
+            _clear(root)
+            folder.mkdir()
+            life = os.open(_lock_of(folder), os.O_RDWR | os.O_CREAT, 0o600)
+            fcntl.flock(life, fcntl.LOCK_EX)
     except OSError as error:
         raise InputError(f"{root}: files cannot be kept there: {error.strerror}") from None
-    folder = root / secrets.token_hex(8)
-    with _locked(root / _ENTRANCE):  # nobody clears between the folder and its lock
-        _clear(root)
-        folder.mkdir()
-        life = os.open(_lock_of(folder), os.O_RDWR | os.O_CREAT, 0o600)
-        fcntl.flock(life, fcntl.LOCK_EX)
     try:
         yield folder
     finally:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import secrets
 import time
 from dataclasses import dataclass
-from typing import Any
 
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
@@ -24,11 +23,15 @@ class QuotaSpentError(Exception):
 
 @dataclass(frozen=True)
 class Upload:
-    """A checked archive that is about to be accepted: what it says of itself, its SHA-256 and size in bytes."""
+    """A checked archive that is about to be accepted.
+
+    What it says of itself, its SHA-256, its size in bytes, and the digest of the dataset that it fits.
+    """
 
     meta: SubmissionMeta
     sha256: str
     size: int
+    dataset_digest: str
 
 
 def new_id() -> str:
@@ -58,6 +61,7 @@ def accept(
             public=public,
             created_at=time.time(),
             attempts=0,
+            dataset_digest=upload.dataset_digest,
         )
         session.add(record)
     return record
@@ -90,20 +94,20 @@ def result_json(database: Database, submission_id: str) -> bytes | None:
         return session.scalar(query)
 
 
-def change(database: Database, submission_id: str, **values: Any) -> None:
-    """Change columns of a submission."""
+def publish(database: Database, submission_id: str, public: bool) -> None:
+    """Put a submission's rows on the board, or take them off."""
     with database.write() as session:
-        record = session.get_one(SubmissionRecord, submission_id)
-        for name, value in values.items():
-            setattr(record, name, value)
+        session.get_one(SubmissionRecord, submission_id).public = public
 
 
 def remove(database: Database, submission_id: str) -> None:
     """Delete a submission, its rows, result and pictures; what is left counts for the quota and says nothing."""
     with database.write() as session:
+        record = session.get_one(
+            SubmissionRecord, submission_id, with_for_update=True
+        )  # no scorer ends it meanwhile
         for table in (PictureRecord, RowRecord, ResultRecord):
             session.execute(delete(table).where(table.submission_id == submission_id))
-        record = session.get_one(SubmissionRecord, submission_id)
         record.status, record.public = DELETED, False
         record.method, record.archive_sha256 = "", ""
         record.description = record.url = record.reason = None

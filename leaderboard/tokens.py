@@ -26,7 +26,18 @@ def create_token(database: Database, name: str) -> str:
         with database.write() as session:
             session.add(TokenRecord(name=name, sha256=digest(token), created_at=time.time()))
     except IntegrityError:
-        raise InputError(f"there is a token for {name!r} already, expected another name") from None
+        raise InputError(f"there is a token for {name!r} already, expected another name, or --replace") from None
+    return token
+
+
+def replace_token(database: Database, name: str) -> str:
+    """Return a new token for ``name``; the old one is void. Raises ``InputError`` where there is none."""
+    token = PREFIX + secrets.token_urlsafe(32)
+    with database.write() as session:
+        record = session.scalar(select(TokenRecord).where(TokenRecord.name == name))
+        if record is None:
+            raise InputError(f"there is no token for {name!r}, expected the name of one")
+        record.sha256 = digest(token)
     return token
 
 

@@ -50,6 +50,9 @@ async def board_page(request: Request, config: _Name = None, sort: _Name = None)
     return answer(request, body, HTML, {"Cache-Control": FRESH})
 
 
+router.add_api_route("/", board_page, methods=["HEAD"])
+
+
 @router.get("/submissions/{submission_id}", name="submission_page")
 def submission_page(
     submission_id: SubmissionId, request: Request, service: ServiceDep, views: _Name = None
@@ -60,6 +63,7 @@ def submission_page(
         return render(request, "submission.html.j2", cache=PRIVATE, **submission_part(service, record, views))
     placed = ranks(service.database, record)
     seen = (record.id, record.finished_at, record.public, *sorted(placed.items()))
+    views = views if views in service.folder.configs else None
     key = (submission_page, place(request), views, *seen)
 
     def make() -> Made:

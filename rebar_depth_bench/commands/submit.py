@@ -38,13 +38,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Upload, wait, print."""
+    if options.no_wait and options.json:
+        raise InputError("--no-wait and --json: there is no result yet, expected one of the two")
     with Leaderboard(options.url, _token(options.token_file)) as leaderboard, ProgressBars() as bars:
         accepted = leaderboard.submit(Path(options.archive), bars.update)
         print(accepted["url"], file=sys.stderr, flush=True)
         if options.no_wait:
             print(accepted["id"])
             return
-        found = leaderboard.wait(accepted["id"], bars.update)
+        try:
+            found = leaderboard.wait(accepted["id"], bars.update)
+        except KeyboardInterrupt:
+            print("it is accepted and goes on without you; its address is above", file=sys.stderr)
+            raise
         if found["status"] == "failed":
             raise InputError(f"{options.archive}: scoring failed: {found['reason']}")
         result = leaderboard.result(accepted["id"])

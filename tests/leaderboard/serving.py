@@ -95,6 +95,25 @@ def running_server(
         process.stderr.close()
 
 
+@contextmanager
+def running_scorer(root: Path, state: Path) -> Iterator[list[str]]:
+    """Run ``rebar-leaderboard score`` until the block ends; yield the lines that it writes."""
+    command = [*_COMMAND, "score", "--data", str(root), "--state", str(state), "--lease", "2"]
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True, env=_environment({})
+    )
+    log: list[str] = []
+    reader = threading.Thread(target=_collect, args=(process, log), daemon=True)
+    reader.start()
+    try:
+        yield log
+    finally:
+        _stop(process)
+        reader.join(10)
+        assert process.stderr is not None
+        process.stderr.close()
+
+
 _COMMAND = [sys.executable, "-m", "leaderboard"]
 
 

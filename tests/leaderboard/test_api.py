@@ -152,7 +152,7 @@ def test_the_quota_holds_for_uploads_at_once_and_deleting_gives_nothing_back(own
     assert call(owners, "DELETE", f"{API}/{accepted[0]}", token).status_code == 204
     refused = owners.submit(small, token)
     assert refused.status_code == 429
-    assert refused.json()["detail"].startswith(f"the {OWNERS_QUOTA} submissions of this token's day")
+    assert refused.json()["detail"].startswith(f"this token has made its {OWNERS_QUOTA} submissions of today")
     assert owners.submit(small, other).status_code == 202
     assert {owners.ended(one)["status"] for one in accepted[1:]} == {"scored"}
     kept = {path.stem for path in (owners.state / "archives").glob("*.zip")}
@@ -242,6 +242,12 @@ def test_no_answer_is_without_security_headers(board: Shared) -> None:
         assert headers["x-content-type-options"] == "nosniff"
         assert headers["referrer-policy"] == "no-referrer"
         assert "server" not in headers
+
+
+@pytest.mark.parametrize("path", ["/", "/healthz"])
+def test_a_monitor_may_ask_for_the_head_alone(board: Shared, path: str) -> None:
+    answer = call(board.server, "HEAD", path)
+    assert (answer.status_code, answer.content) == (200, b"")
 
 
 def test_an_address_that_asks_too_often_is_held_back(tiny_root: Path, tmp_path: Path) -> None:

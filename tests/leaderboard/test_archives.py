@@ -17,12 +17,16 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from leaderboard.app import ARCHIVES_AWAY
-from leaderboard.archives import Archives, without_password, written_s
-from leaderboard.scorer import AwayError, local_score
+from leaderboard.archives import Archives, GoneError, written_s
+from leaderboard.intake import AWAY as INTAKE_AWAY
+from leaderboard.jobs import Job
+from leaderboard.local_scoring import local_score
+from leaderboard.scorer import AwayError
 from leaderboard.service import ORPHAN_S
 from leaderboard.settings import read_settings
+from leaderboard.wording import without_password
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.folder import open_folder
 from tests.leaderboard.conftest import Write
 from tests.leaderboard.serving import running_server
 from tests.leaderboard.watching import wait_until
@@ -113,7 +117,7 @@ def test_an_archive_is_kept_found_read_and_deleted(
 def test_what_is_not_there_is_told_and_deleting_it_is_no_error(place: Place, tmp_path: Path) -> None:
     archives = Archives(place.url)
     archives.delete("never-was")
-    with pytest.raises(FileNotFoundError), archives.local("never-was", tmp_path):
+    with pytest.raises(GoneError), archives.local("never-was", tmp_path):
         pytest.fail("there is nothing to read")
     assert not (tmp_path / "never-was.zip").exists()
 
@@ -209,16 +213,15 @@ def test_a_place_that_is_away_for_a_while_costs_nothing(
         token = server.token("alice")
         away.close()
         refused = server.submit(archive, token)
-        assert (refused.status_code, refused.json()["detail"]) == (503, ARCHIVES_AWAY)
+        assert (refused.status_code, refused.json()["detail"]) == (503, INTAKE_AWAY)
         stack.enter_context(ftp_server(tmp_path / "ftp", port))
         submission = server.accepted(archive, token)
         assert not list((state / "spool").glob("*/*.upload"))
     settings = read_settings(None, {"data": str(tiny_root), "state": state, "archives": f"{url}/kept"})
+    score, job = local_score(settings, tmp_path), Job(submission, open_folder(str(tiny_root)).digest)
+    with pytest.raises(AwayError, match="Connection refused"):
+        score(job, lambda: True)
     with ftp_server(tmp_path / "ftp", port):
-        score = local_score(settings, Archives(settings.archives_url), tmp_path)
-    with pytest.raises(AwayError, match="the archive cannot be had"):
-        score(submission, lambda: True)
-    with ftp_server(tmp_path / "ftp", port):
-        outcome = score(submission, lambda: True)
+        outcome = score(job, lambda: True)
     assert outcome is not None
     assert outcome.result is not None

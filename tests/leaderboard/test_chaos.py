@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
@@ -80,6 +82,7 @@ class Service:
     postgres: Postgres | None
     running: ExitStack = field(default_factory=ExitStack)
     server: Server | None = None
+    logs: list[list[str]] = field(default_factory=list)
 
     @property
     def db(self) -> str:
@@ -88,6 +91,12 @@ class Service:
     def start(self) -> None:
         self.running = ExitStack()
         self.server = self.running.enter_context(running_server(self.root, self.state, db=self.db, **SETTINGS))
+        self.logs.append(self.server.log)
+
+    def times_ended(self) -> Counter[str]:
+        """Return how often each submission, by the start of its id, was ended by a scorer of any server's."""
+        events = [json.loads(line) for log in self.logs for line in log if line.startswith("{")]
+        return Counter(event["submission"] for event in events if event["event"] == "ended")
 
     def url(self) -> str:
         return "http://127.0.0.1:9" if self.server is None else self.server.url
@@ -158,13 +167,15 @@ def test_every_accepted_submission_ends_once(service: Service, write_archive: Wr
             continue
         expected = expected or ended["result"]
         assert ended["result"] == expected
-    assert len(failed) < len(uploads.accepted) / 2
-    assert len(uploads.accepted) == len(set(uploads.accepted)) >= KILLS // 2
+    assert len(failed) <= len(uploads.accepted) / 10
+    assert len(uploads.accepted) >= KILLS // 2
     assert set(uploads.answers) <= {202, 503}
     rows = httpx2.get(f"{service.url()}/api/v1/leaderboard?config=lattice-orbit", timeout=60).json()["rows"]
     shown = [row["id"] for row in rows]
-    assert len(shown) == len(set(shown))
     # An upload whose answer was cut off may have been accepted: its row and archive are then as whole as others.
+    times = service.times_ended()
+    assert set(times.values()) == {1}
+    assert len(times) >= len(shown) / 2  # a scorer that is killed at once after the commit says nothing
     scored = set(uploads.accepted) - set(failed)
     assert scored <= set(shown)
     assert len(shown) - len(scored) <= len(uploads.begun) - uploads.answers.count(202)

@@ -91,12 +91,24 @@ def test_a_token_that_is_missing_or_wrong(
     assert "Traceback" not in sent.stderr
 
 
-@pytest.mark.parametrize("url", ["http://127.0.0.1:9", "no address", "ftp://127.0.0.1/", "http://[", ""])
-def test_a_service_that_is_not_there(write_archive: Write, url: str) -> None:
+@pytest.mark.parametrize(
+    ("url", "status"),
+    [("http://127.0.0.1:9", 1), ("localhost:80", 2), ("no address", 2), ("ftp://127.0.0.1/", 2), ("http://[", 2)],
+)
+def test_a_service_that_is_not_there(write_archive: Write, url: str, status: int) -> None:
     sent = run("submit", write_archive("x"), "--url", url, token="rdb_x")
-    assert sent.returncode in (1, 2)
+    assert sent.returncode == status
     assert sent.stderr.splitlines()[-1].startswith("error: ")
     assert "Traceback" not in sent.stderr
+
+
+@pytest.mark.parametrize(("path", "token"), [("", "rdb_wrong"), ("/nope", None)])
+def test_what_is_wrong_is_told_before_anything_is_sent(
+    board: Shared, write_archive: Write, path: str, token: str | None
+) -> None:
+    sent = run("submit", write_archive("x"), "--url", f"{board.url}{path}", token=token or board.token)
+    assert sent.returncode == 2
+    assert "uploading" not in sent.stderr
 
 
 def test_what_fails_says_why_and_the_quota_is_told(strict: Server, write_archive: Write) -> None:
@@ -107,7 +119,7 @@ def test_what_fails_says_why_and_the_quota_is_told(strict: Server, write_archive
     assert "scoring failed: scoring took longer than the 0.01 s this service allows" in failed.stderr
     again = run("submit", small, "--url", strict.url, token=token)
     assert again.returncode == 2
-    assert "the 1 submissions of this token's day (UTC) are made" in again.stderr
+    assert "this token has made its 1 submissions of today (UTC)" in again.stderr
 
 
 def test_an_archive_that_is_too_large_is_told(strict: Server, tmp_path: Path) -> None:

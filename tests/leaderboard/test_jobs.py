@@ -18,7 +18,8 @@ from leaderboard.jobs import MOST_ATTEMPTS, Outcome
 from leaderboard.records import SubmissionRecord, TokenRecord
 from leaderboard.settings import read_settings
 from leaderboard.submissions import QuotaSpentError, Upload
-from leaderboard.tokens import create_token, find_token
+from leaderboard.tokens import create_token, find_token, replace_token
+from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.submission import SubmissionMeta
 from tests.report.results import result, scored
 
@@ -43,7 +44,7 @@ def alice(database: Database) -> TokenRecord:
 def queue(database: Database, token: TokenRecord, count: int, quota: int = 1000) -> list[str]:
     ids = [submissions.new_id() for _ in range(count)]
     for submission_id in ids:
-        upload = Upload(SubmissionMeta("m"), "0" * 64, 5)
+        upload = Upload(SubmissionMeta("m"), "0" * 64, 5, "sha256:0")
         submissions.accept(database, submission_id, token, upload, quota, True)
     return ids
 
@@ -168,3 +169,23 @@ def test_a_token_is_found_by_itself_alone(database: Database) -> None:
     assert [find_token(database, other) for other in (token[:-1], token + "x", token.lower(), "", "bob")] == [
         None
     ] * 5
+
+
+def test_what_had_to_wait_lets_others_go_first(database: Database, alice: TokenRecord) -> None:
+    first, second = queue(database, alice, 2)
+    assert jobs.claim(database, "s", LEASE_S) == first
+    jobs.give_back(database, first, "s", wait_s=0.2)
+    assert [jobs.claim(database, "s", LEASE_S) for _ in range(2)] == [second, None]
+    time.sleep(0.3)
+    assert jobs.claim(database, "s", LEASE_S) == first
+
+
+def test_a_token_that_is_replaced_is_void(database: Database) -> None:
+    old = create_token(database, "bob")
+    new = replace_token(database, "bob")
+    assert find_token(database, old) is None
+    found = find_token(database, new)
+    assert found is not None
+    assert found.name == "bob"
+    with pytest.raises(InputError, match="there is no token for 'eve'"):
+        replace_token(database, "eve")

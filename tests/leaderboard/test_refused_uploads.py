@@ -49,7 +49,7 @@ class Refusing:
             "unknown token, chunked": Refusal(401, "the token is unknown", "nobody's", large, True),
             "too large": Refusal(413, too_large, self.fresh, large),
             "too large, chunked": Refusal(413, too_large, self.fresh, large, True),
-            "no quota": Refusal(429, "the 1 submissions of this token's day (UTC) are made", self.spent, small),
+            "no quota": Refusal(429, "this token has made its 1 submissions of today (UTC)", self.spent, small),
             "no quota, large": Refusal(429, "the 1 submissions of this token's day", self.spent, large, True),
         }
 
@@ -147,7 +147,7 @@ def test_a_refusal_reaches_a_client_that_is_still_sending(
 
 def test_a_client_that_waits_for_continue_sends_nothing_when_it_is_refused(refusing: Refusing) -> None:
     lines = ("Authorization: Bearer nobody's", f"Content-Type: {MULTIPART}", "Content-Length: 1000000000")
-    with connect(refusing.server.url, timeout_s=3) as connection:
+    with connect(refusing.server.url, timeout_s=30) as connection:
         connection.sendall(head(API, (*lines, "Expect: 100-continue")))
         answer = answer_of(connection)
     assert answer.status == 401

@@ -11,7 +11,9 @@ from pathlib import Path
 import httpx2
 
 from benchmarks.synthetic_dataset import write_archive, write_dataset
-from tests.leaderboard.serving import Server, running_server
+from leaderboard.intake import AWAY
+from tests.leaderboard.serving import Server, running_scorer, running_server
+from tests.leaderboard.watching import submission_row, wait_until
 
 
 def shown(server: Server) -> list[tuple[str, int]]:
@@ -48,7 +50,7 @@ def test_another_dataset_is_refused_until_it_is_scored_again(
     ]
     refused = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=60, check=False)
     assert refused.returncode == 2
-    assert "2 submissions of this board were scored against another dataset" in refused.stderr
+    assert "2 submissions of this board are of another dataset" in refused.stderr
     assert "--rescore true" in refused.stderr
     assert "Traceback" not in refused.stderr
     with running_server(second, state, db=db, rescore=True, scorers=0) as server:
@@ -62,3 +64,33 @@ def test_another_dataset_is_refused_until_it_is_scored_again(
         assert [one["dataset"]["digest"] for one in after] == [digest, digest]
         assert [one["tables"] for one in after] == [one["tables"] for one in before]
         assert shown(server) == ranks
+
+
+def test_a_scorer_with_another_dataset_scores_nothing_and_costs_nothing(tmp_path: Path) -> None:
+    state, archive = tmp_path / "state", tmp_path / "archive.zip"
+    first, second = tmp_path / "first", tmp_path / "second"
+    write_dataset(first, ["lattice"], 2)
+    write_dataset(second, ["lattice", "pile"], 2)
+    write_archive(archive, ["lattice"], 2, "m", 1)
+    with running_server(first, state, scorers=0) as server:
+        one = server.accepted(archive, server.token("alice"))
+        with running_scorer(second, state) as log:
+            wait_until(lambda: any("given back" in line for line in log), "the job is given back")
+        assert any("expected sha256:" in line for line in log)
+        assert (submission_row(state, one)["status"], submission_row(state, one)["attempts"]) == ("queued", 0)
+        with running_scorer(first, state):
+            assert server.ended(one)["status"] == "scored"
+
+
+def test_a_dataset_that_is_away_fails_nobody(tmp_path: Path) -> None:
+    root, state, archive = tmp_path / "root", tmp_path / "state", tmp_path / "archive.zip"
+    write_dataset(root, ["lattice"], 2)
+    write_archive(archive, ["lattice"], 2, "m", 1)
+    with running_server(root, state, lease=2) as server:
+        token = server.token("alice")
+        root.rename(tmp_path / "elsewhere")
+        refused = server.submit(archive, token)
+        assert (refused.status_code, refused.json()["detail"]) == (503, AWAY)
+        (tmp_path / "elsewhere").rename(root)
+        one = server.accepted(archive, token)
+        assert server.ended(one)["status"] == "scored"

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import ByteSize
 
 from leaderboard.archives import Archives
 from leaderboard.cli import GROUPS, argument_parser
@@ -183,9 +184,10 @@ def given_for(name: str) -> str:
         "reads": "3/second",
         "writes": "4/second",
         "state": "/elsewhere",
+        "rescore": "true",
     }
     kind = Settings.model_fields[name].annotation
-    return special.get(name, "17" if kind in (int, float) else "something")
+    return special.get(name, "17" if kind in (int, float, ByteSize) else "something")
 
 
 @pytest.mark.parametrize("name", Settings.model_fields)
@@ -201,7 +203,7 @@ def test_every_setting_is_taken_from_everywhere(
     assert getattr(read_settings(tmp_path / "one.toml", rest), name) == by_command
     monkeypatch.setenv(PREFIX + name.upper(), value)
     assert getattr(read_settings(None, rest), name) == by_command
-    assert str(by_command) in (value, f"{value}.0")
+    assert str(by_command).lower() in (value, f"{value}.0")
     assert Settings.model_fields[name].default != by_command
 
 
@@ -245,3 +247,9 @@ def test_all_is_kept_in_the_state_folder_whatever_its_name(tmp_path: Path) -> No
     archives.put("one", tmp_path / "one.zip")
     assert (tmp_path / "a st%20ate" / "archives" / "one.zip").is_file()
     assert settings.database_url == f"sqlite:///{tmp_path}/a st%20ate/leaderboard.sqlite"
+
+
+def test_sizes_may_have_units() -> None:
+    assert read_settings(None, {"data": "x", "max_upload": "3GiB"}).max_upload == 3 << 30
+    with pytest.raises(InputError, match=r"score_memory: .*, got '4 heaps'"):
+        read_settings(None, {"data": "x", "score_memory": "4 heaps"})

@@ -39,7 +39,7 @@ def upgrade() -> None:
         sa.Column("attempts", sa.Integer(), nullable=False),
         sa.Column("scorer", sa.String(length=64), nullable=True),
         sa.Column("lease_until", sa.Float(), nullable=True),
-        sa.Column("dataset_digest", sa.String(length=100), nullable=True),
+        sa.Column("dataset_digest", sa.String(length=100), nullable=False),
         sa.ForeignKeyConstraint(
             ["token_id"],
             ["tokens.id"],
