@@ -35,8 +35,8 @@ class Upload:
 
 
 def new_id() -> str:
-    """Return an id that nobody can guess: it opens a submission that is not public."""
-    return secrets.token_urlsafe(16)
+    """Return an id that nobody can guess: it opens a submission that is not public. A command takes it as it is."""
+    return secrets.token_hex(16)
 
 
 def accept(

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from leaderboard.board import BoardRow
 from leaderboard.records import SubmissionRecord
 
-_ID = "m3Zk0vX1q9c2b7RtYw5uLA"
+_ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
 
 
 class Problem(BaseModel):
