@@ -35,7 +35,7 @@ class Upload:
 
 
 def new_id() -> str:
-    """Return an id that nobody can guess: it opens a submission that is not public. A command takes it as it is."""
+    """Return an id that nobody can guess, for it opens a submission that is not public, and any command takes."""
     return secrets.token_hex(16)
 
 
