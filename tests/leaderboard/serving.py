@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -79,34 +79,32 @@ def running_server(
     The process leads a group of its own, so that what it started ends with it whatever happens.
     """
     options = [part for name, value in settings.items() for part in (f"--{name.replace('_', '-')}", str(value))]
-    command = [*_COMMAND, "serve", "--data", str(root), "--state", str(state), "--port", "0", *options]
-    process = subprocess.Popen(
-        command, stderr=subprocess.PIPE, text=True, start_new_session=True, env=_environment(environment or {})
-    )
-    log: list[str] = []
-    reader = threading.Thread(target=_collect, args=(process, log), daemon=True)
-    reader.start()
-    try:
+    arguments = ["serve", "--data", str(root), "--state", str(state), "--port", "0", *options]
+    with _started(arguments, environment or {}) as (process, log):
         yield Server(_address(process, log), process, state, str(settings.get("db", "")), log)
-    finally:
-        _stop(process)
-        reader.join(10)
-        assert process.stderr is not None
-        process.stderr.close()
 
 
 @contextmanager
 def running_scorer(root: Path, state: Path) -> Iterator[list[str]]:
     """Run ``rebar-leaderboard score`` until the block ends; yield the lines that it writes."""
-    command = [*_COMMAND, "score", "--data", str(root), "--state", str(state), "--lease", "2"]
+    with _started(["score", "--data", str(root), "--state", str(state), "--lease", "2"], {}) as (_, log):
+        yield log
+
+
+@contextmanager
+def _started(
+    arguments: Sequence[str], environment: Mapping[str, str]
+) -> Iterator[tuple[subprocess.Popen[str], list[str]]]:
+    """Run a command until the block ends; yield its process, and its lines as they come."""
+    command = [*_COMMAND, *arguments]
     process = subprocess.Popen(
-        command, stderr=subprocess.PIPE, text=True, start_new_session=True, env=_environment({})
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True, env=_environment(environment)
     )
     log: list[str] = []
     reader = threading.Thread(target=_collect, args=(process, log), daemon=True)
     reader.start()
     try:
-        yield log
+        yield process, log
     finally:
         _stop(process)
         reader.join(10)
