@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,17 +18,18 @@ import httpx2
 import pytest
 
 from leaderboard.archives import Archives, GoneError, written_s
+from leaderboard.database import Database
 from leaderboard.intake import AWAY as INTAKE_AWAY
 from leaderboard.jobs import Job
 from leaderboard.local_scoring import local_score
 from leaderboard.scorer import AwayError
-from leaderboard.service import ORPHAN_S
+from leaderboard.service import ORPHAN_S, clear
 from leaderboard.settings import read_settings
 from leaderboard.wording import without_password
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.folder import open_folder
 from tests.leaderboard.conftest import Write
-from tests.leaderboard.serving import running_server
+from tests.leaderboard.serving import make_token, running_server
 from tests.leaderboard.watching import wait_until
 
 USER, PASSWORD = "keeper", "open-sesame"
@@ -179,20 +180,23 @@ def test_a_service_keeps_its_archives_there_and_leaves_nothing(
     tiny_root: Path, tmp_path: Path, write_archive: Write, ftp: Place
 ) -> None:
     state, kept = tmp_path / "state", ftp.folder / "service"
-    kept.mkdir()
+    archive, settings = write_archive("small", configs=("lattice-orbit",)), {"archives": f"{ftp.url}/service"}
+    token = make_token(state, "alice")
+    with running_server(tiny_root, state, scorers=0, **settings) as server:  # type: ignore[arg-type]
+        first = server.accepted(archive, token)
     for name, age_s in (("orphan", 2 * ORPHAN_S), ("young", 0.0)):
         (kept / f"{name}.zip").write_bytes(CONTENT)
         os.utime(kept / f"{name}.zip", (time.time() - age_s,) * 2)
-    archive = write_archive("small", configs=("lattice-orbit",))
-    with running_server(tiny_root, state, archives=f"{ftp.url}/service") as server:
-        assert [path.name for path in kept.iterdir()] == ["young.zip"], "archives of nobody are cleared once old"
+    with running_server(tiny_root, state, **settings) as server:  # type: ignore[arg-type]
+        kept_names = {path.name for path in kept.iterdir()}
+        assert kept_names == {"young.zip", f"{first}.zip"}, "archives of nobody are cleared once old"
         (kept / "young.zip").unlink()
-        token = server.token("alice")
-        submission = server.accepted(archive, token)
-        assert (kept / f"{submission}.zip").read_bytes() == archive.read_bytes()
-        assert server.ended(submission)["status"] == "scored"
-        address, owner = f"{server.url}/api/v1/submissions/{submission}", {"Authorization": f"Bearer {token}"}
-        assert httpx2.delete(address, headers=owner, timeout=60).status_code == 204
+        second = server.accepted(archive, token)
+        assert (kept / f"{second}.zip").read_bytes() == archive.read_bytes()
+        for submission in (first, second):
+            assert server.ended(submission)["status"] == "scored"
+            address, owner = f"{server.url}/api/v1/submissions/{submission}", {"Authorization": f"Bearer {token}"}
+            assert httpx2.delete(address, headers=owner, timeout=60).status_code == 204
         assert not list(kept.iterdir())
         assert not (state / "archives").exists()
         wait_until(lambda: not list((state / "spool").glob("*/*")), "the spool is empty")
@@ -225,3 +229,13 @@ def test_a_place_that_is_away_for_a_while_costs_nothing(
         outcome = score(job, lambda: True)
     assert outcome is not None
     assert outcome.result is not None
+
+
+def test_a_database_that_knows_nothing_clears_nothing(tmp_path: Path) -> None:
+    archives, old = Archives(str(tmp_path / "kept")), tmp_path / "kept" / "old.zip"
+    old.write_bytes(CONTENT)
+    os.utime(old, (0, 0))
+    with closing(Database(f"sqlite:///{tmp_path / 'db.sqlite'}")) as database:
+        database.migrate()
+        clear(database, archives)
+    assert old.is_file()
