@@ -77,11 +77,11 @@ def clear(database: Database, archives: Archives) -> None:
     now = time.time()
     with database.read() as session:
         rows = session.execute(select(SubmissionRecord.id, SubmissionRecord.status)).all()
-    known = {submission_id for submission_id, status in rows if status != DELETED}
-    if not rows:
-        _LOG.info("nothing cleared", reason="the database has no submissions")
+    orphans = archives.ids() - {submission_id for submission_id, status in rows if status != DELETED}
+    if orphans and not rows:
+        _LOG.warning("nothing cleared", reason="the database has no submissions", archives=len(orphans))
         return
-    for submission_id in archives.ids() - known:
+    for submission_id in orphans:
         if archives.age_s(submission_id, now) > ORPHAN_S:
             archives.delete(submission_id)
             _LOG.info("cleared", archive=submission_id[:6])

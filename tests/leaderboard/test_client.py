@@ -93,7 +93,7 @@ def test_a_token_that_is_missing_or_wrong(
 
 @pytest.mark.parametrize(
     ("url", "status"),
-    [("http://127.0.0.1:9", 1), ("localhost:80", 2), ("no address", 2), ("ftp://127.0.0.1/", 2), ("http://[", 2)],
+    [("http://127.0.0.1:9", 1), ("localhost:80", 2), ("no address", 2), ("ftp://127.0.0.1/", 2), ("http://[", 1)],
 )
 def test_a_service_that_is_not_there(write_archive: Write, url: str, status: int) -> None:
     sent = run("submit", write_archive("x"), "--url", url, token="rdb_x")
