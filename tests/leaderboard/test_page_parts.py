@@ -66,6 +66,7 @@ def submission(name: str, created_at: float, *, public: bool = True, status: str
         public=public,
         created_at=created_at,
         attempts=0,
+        dataset_digest="sha256:0",
     )
 
 

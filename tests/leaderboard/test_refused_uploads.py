@@ -50,7 +50,7 @@ class Refusing:
             "too large": Refusal(413, too_large, self.fresh, large),
             "too large, chunked": Refusal(413, too_large, self.fresh, large, True),
             "no quota": Refusal(429, "this token has made its 1 submissions of today (UTC)", self.spent, small),
-            "no quota, large": Refusal(429, "the 1 submissions of this token's day", self.spent, large, True),
+            "no quota, large": Refusal(429, "this token has made its 1 submissions", self.spent, large, True),
         }
 
 
