@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.timing import machine, print_markdown
-from dataset_builder.build import build
-from dataset_builder.configs import CONFIGS, BuildRequest
-from dataset_builder.protocols import offsets_m
-from dataset_builder.shards import VIEWS_PER_SHARD
+from dataset_builder.build.build import build
+from dataset_builder.build.shards import VIEWS_PER_SHARD
+from dataset_builder.config.catalog import CONFIGS, BuildRequest
+from dataset_builder.config.trajectories import offsets_m
 
 SCENES = ("lattice", "pile", "pier")
 STAGES = ("colour", "truth", "encode", "scene", "write")

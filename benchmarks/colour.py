@@ -16,16 +16,16 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.timing import machine, print_markdown
-from dataset_builder.assemblies import aim_point_m, make_assembly
-from dataset_builder.blender.evaluated import evaluated_world_mesh
+from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
 from dataset_builder.blender.render import configure_colour, render_colour
 from dataset_builder.blender.scene import build_scene
-from dataset_builder.configs import BuildRequest
-from dataset_builder.optics import rig_cameras
-from dataset_builder.protocols import poses, subset
-from dataset_builder.raycast import RayCaster
-from dataset_builder.specs import ColourSpec
-from rebar_depth_bench.cameras import ideal_K, pixel_rays
+from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.config.rigs import rig_cameras
+from dataset_builder.config.specs import ColourSpec
+from dataset_builder.config.trajectories import poses, subset
+from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from dataset_builder.scene.raycast import RayCaster
+from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
 
 REFERENCE = ColourSpec(samples=256, prefilter="ACCURATE")
 """Denoised: the noise left in 256 raw samples would hide what is better than it."""

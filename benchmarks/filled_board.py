@@ -18,12 +18,12 @@ from typing import Any
 
 from sqlalchemy import func, select
 
-from leaderboard import jobs, submissions
-from leaderboard.database import Database
-from leaderboard.jobs import Outcome
-from leaderboard.records import SubmissionRecord, TokenRecord
-from leaderboard.submissions import QUEUED, SCORED, SCORING, Upload
-from leaderboard.tokens import create_token, find_token
+from leaderboard.db import jobs, submissions
+from leaderboard.db.engine import Database
+from leaderboard.db.jobs import Outcome
+from leaderboard.db.models import SubmissionRecord, TokenRecord
+from leaderboard.db.submissions import QUEUED, SCORED, SCORING, Upload
+from leaderboard.db.tokens import create_token, find_token
 from rebar_depth_bench.submission import SubmissionMeta
 
 START_S = 120.0

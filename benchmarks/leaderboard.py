@@ -26,10 +26,10 @@ from benchmarks.filled_board import Served, fill, new_tokens, running_server
 from benchmarks.http_load import Plan, Tally, run_load
 from benchmarks.synthetic_dataset import write_archive, write_dataset
 from benchmarks.timing import machine, print_markdown
-from leaderboard.database import Database
+from leaderboard.db.engine import Database
+from leaderboard.db.submissions import SCORED
 from leaderboard.settings import read_settings
-from leaderboard.submissions import SCORED
-from rebar_depth_bench.folder import open_folder
+from rebar_depth_bench.data.manifest import open_folder
 
 CONFIGS, VIEWS = ("lattice", "pile"), 24
 SEED = 7

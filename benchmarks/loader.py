@@ -12,8 +12,7 @@ import datasets
 
 import rebar_depth_bench as rdb
 from benchmarks.timing import machine, median_seconds, print_markdown
-from rebar_depth_bench.dataset import decode_row
-from rebar_depth_bench.schema import features
+from rebar_depth_bench.data.dataset import decode_row, features
 
 REPEATS = 7
 

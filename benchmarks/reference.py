@@ -16,11 +16,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from cards.reference_table import RESULTS
+from cards.benchmark import RESULTS
 from dataset_builder.cli import main as rebar_build
 from rebar_depth_bench import score
-from rebar_depth_bench.cli import main as rebar_bench
-from rebar_depth_bench.files import write_text
+from rebar_depth_bench.atomic_io import write_text
+from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.submission import config_of
 from rebar_depth_bench.submission.metadata import METADATA_NAME
 

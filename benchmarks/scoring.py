@@ -26,13 +26,13 @@ import torch
 
 import rebar_depth_bench as rdb
 from benchmarks.timing import machine, median_seconds, print_markdown
-from rebar_depth_bench.extended.evaluation import FAMILIES, SCALED, Family
-from rebar_depth_bench.extended.steel import SteelConfig, steel_config
-from rebar_depth_bench.extended.truth import SteelTruth
-from rebar_depth_bench.folder import open_folder
-from rebar_depth_bench.ground_truth import config_truth
-from rebar_depth_bench.protocol import interior
-from rebar_depth_bench.scoring import score_view
+from rebar_depth_bench.data.ground_truth import config_truth
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.extended.evaluate import FAMILIES, SCALED, Family
+from rebar_depth_bench.extended.ground_truth import SteelConfig, steel_config
+from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.scoring.protocol import interior
+from rebar_depth_bench.scoring.score import score_view
 from rebar_depth_bench.submission import SubmissionReader, open_submission
 
 REPEATS = 15

@@ -16,12 +16,12 @@ from pathlib import Path
 import pycolmap
 
 from benchmarks.timing import machine, print_markdown
-from rebar_depth_bench.folder import open_folder
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods import ConfigViews
-from rebar_depth_bench.methods.multiview.pictures import write_pictures
-from rebar_depth_bench.methods.multiview.pose_report import placed_report, scaled_report, true_similarity
-from rebar_depth_bench.methods.multiview.run import pictured_structure
-from rebar_depth_bench.methods.multiview.scale import board_fit
+from rebar_depth_bench.methods.multiview.images import write_pictures
+from rebar_depth_bench.methods.multiview.metric_scale import board_fit
+from rebar_depth_bench.methods.multiview.pipeline import pictured_structure
+from rebar_depth_bench.methods.multiview.pose_errors import placed_report, scaled_report, true_similarity
 
 
 def main(root: str, config: str = "lattice-orbit") -> None:

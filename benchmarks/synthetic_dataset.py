@@ -12,10 +12,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dataset_builder.rows import Eye, View, encode_view
+from dataset_builder.build.shards import Eye, View, encode_view
 from rebar_depth_bench import SubmissionWriter
-from rebar_depth_bench.folder import FORMAT, MANIFEST, ViewRecord
-from rebar_depth_bench.protocol import PROTOCOL
+from rebar_depth_bench.data.manifest import FORMAT, MANIFEST, ViewRecord
+from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 HEIGHT, WIDTH = 90, 160
 BASELINE_M = 0.12

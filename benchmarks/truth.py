@@ -14,10 +14,10 @@ import numpy as np
 
 import rebar_depth_bench as rdb
 from benchmarks.timing import print_markdown
-from rebar_depth_bench.extended.evaluation import NATIVE, ONCE, measures_by_alignment, view_samples
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.extended.evaluate import NATIVE, ONCE, measures_by_alignment, view_samples
+from rebar_depth_bench.extended.ground_truth import steel_config
 from rebar_depth_bench.extended.result import ExtendedView, tabulate_extended
-from rebar_depth_bench.extended.steel import steel_config
-from rebar_depth_bench.folder import open_folder
 
 COLUMNS = ["view_id", "left_depth"]
 PERFECT = ("boundary_f1", "cloud_f_1mm", "layer_confusion", "full_mask_abs_rel", "shifted_rmse_cm")

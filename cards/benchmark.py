@@ -1,19 +1,71 @@
-"""The benchmark card: what is measured, by which rules, with which limits. Its numbers come from the code."""
+"""The benchmark card: what is measured, by which rules, with which limits. Its numbers come from the code.
+
+The benchmark card's tables of reference results, from the stored JSON.
+"""
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from cards.reference_table import reference_context
 from cards.templates import render
-from rebar_depth_bench.bootstrap import DRAWS, MIN_VIEWS, RING_VIEWS
-from rebar_depth_bench.extended.evaluation import FAMILIES, ONCE, Family
+from rebar_depth_bench.extended.evaluate import FAMILIES, ONCE, Family
+from rebar_depth_bench.extended.inspection.tolerances import PROFILES
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
-from rebar_depth_bench.extended.tolerances import PROFILES
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, own_methods
-from rebar_depth_bench.protocol import DELTA1_RATIO, MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
+from rebar_depth_bench.scoring.bootstrap import DRAWS, MIN_VIEWS, RING_VIEWS
+from rebar_depth_bench.scoring.protocol import DELTA1_RATIO, MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
+
+RESULTS = Path(__file__).parent / "reference.json"
+
+
+def reference_context() -> dict[str, Any]:
+    """Return what the card's template shows: the command, the subset, and each config's rows in words."""
+    stored = json.loads(RESULTS.read_text())
+    tables: dict[str, list[dict[str, str]]] = {}
+    for method, result in stored["results"].items():
+        for config, table in result["tables"].items():
+            tables.setdefault(config, []).append(_reference_row(method, result, config, table))
+    return {"command": stored["command"], "subset": stored["subset"], "reference": tables}
+
+
+def _reference_row(
+    method: str, result: Mapping[str, Any], config: str, table: Mapping[str, Any]
+) -> dict[str, str]:
+    native, scaled = table["native"] or {}, table["scaled"] or {}
+    low_high = (table.get("ci95") or {}).get("native", {}).get("abs_rel")
+    interval = "" if low_high is None else f" ({_number(low_high[0], 3)}-{_number(low_high[1], 3)})"
+    return {
+        "method": method,
+        "mark": " †" if own_methods()[method].info.reads_truth else "",
+        "coverage": _percent(table["coverage"]),
+        "ranked": "yes" if table["ranked"] else "no",
+        "abs_rel": _number(native.get("abs_rel"), 4) + interval,
+        "rmse": _number(native.get("rmse_cm"), 2, " cm"),
+        "scaled": _number(scaled.get("abs_rel"), 4),
+        "scale": _number(table["scale_median"], 3),
+        "within": _percent(table["within_mm"]["5"]),
+        "seconds": _seconds(result, config, table["views"]),
+    }
+
+
+def _seconds(result: Mapping[str, Any], config: str, views: int) -> str:
+    """Return the seconds a view takes, with its share of what was prepared for all of them."""
+    spent = result["seconds"]
+    preparing = (spent["preparing"] or {}).get(config, 0.0)
+    return "-" if preparing is None else f"{spent['a_view'][config] + preparing / views:.2g}"
+
+
+def _number(value: float | None, digits: int, unit: str = "") -> str:
+    return "-" if value is None else f"{value:.{digits}f}{unit}"
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"
+
 
 _STEP = re.compile(r"(?<=_)\d[\d.]*(?:-[\d.]+)?(?=(?:mm|pct|m|px)$)")
 """The tolerance, threshold or bin that a measure's name ends with."""

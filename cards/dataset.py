@@ -11,7 +11,7 @@ from datasets.info import DatasetInfosDict
 from huggingface_hub import DatasetCardData
 
 from cards.templates import render
-from rebar_depth_bench.schema import COLUMN_MEANINGS, column_kind, features
+from rebar_depth_bench.data.dataset import COLUMN_MEANINGS, column_kind, features
 
 SPLIT = "test"
 _OPTICS = {

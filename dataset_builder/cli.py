@@ -11,15 +11,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dataset_builder.appearance import VARIANTS
-from dataset_builder.configs import CONFIGS, LATTICE_CONFIGS, SWEEPS, BuildRequest
-from rebar_depth_bench.console import ProgressBars, run_command
+from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, SWEEPS, BuildRequest
+from dataset_builder.scene.variants import VARIANTS
+from rebar_depth_bench.cli.console import ProgressBars, run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
 
 if TYPE_CHECKING:
-    from dataset_builder.build import BuildSummary
-    from dataset_builder.renderers import Renderer
+    from dataset_builder.build.build import BuildSummary
+    from dataset_builder.build.local_renderer import Renderer
 
 _EXTRA = ("bpy", "cv2", "embreex", "trimesh")
 
@@ -43,7 +43,7 @@ def _check_extra() -> None:
 
 def _build(options: argparse.Namespace) -> None:
     _check_extra()
-    from dataset_builder.build import build
+    from dataset_builder.build.build import build
 
     if options.out is None:
         raise InputError("--out ROOT is missing: the dataset folder to build")
@@ -66,8 +66,8 @@ def _build(options: argparse.Namespace) -> None:
 
 def _request(options: argparse.Namespace) -> BuildRequest:
     """Return what the options ask for; own scenes come alone unless configs are named."""
-    from dataset_builder.assemblies.mesh_door import mesh_file_spec
-    from dataset_builder.scene_file import scene_config
+    from dataset_builder.config.scene_file import scene_config
+    from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
 
     default = () if options.scene else LATTICE_CONFIGS if options.mesh else CONFIGS
     return BuildRequest(
@@ -91,7 +91,7 @@ def _cluster(address: str | None) -> AbstractContextManager[Renderer | None]:
         raise InputError(
             "not installed: distributed; --cluster needs it: pip install 'rebar-depth-bench[cluster]'"
         )
-    from dataset_builder.cluster import on_cluster
+    from dataset_builder.build.dask_renderer import on_cluster
 
     return on_cluster(address)
 

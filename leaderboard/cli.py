@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from leaderboard import submissions
-from leaderboard.archives import Archives
-from leaderboard.backup import back_up
-from leaderboard.database import Database
-from leaderboard.logs import set_up_logs
+from leaderboard.db import submissions
+from leaderboard.db.engine import Database
+from leaderboard.db.tokens import create_token, replace_token
+from leaderboard.log_setup import set_up_logs
 from leaderboard.settings import Settings, read_settings
-from leaderboard.tokens import create_token, replace_token
-from rebar_depth_bench.console import run_command
+from leaderboard.storage.archive_store import Archives
+from leaderboard.storage.backup import back_up
+from rebar_depth_bench.cli.console import run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
 
@@ -44,11 +44,11 @@ def _run(options: argparse.Namespace) -> None:
     set_up_logs()
     _make_state(settings.state)
     if options.command == "serve":
-        from leaderboard.serving import serve  # takes seconds, which the other commands need not wait for
+        from leaderboard.web.server import serve
 
         serve(settings)
     elif options.command == "score":
-        from leaderboard.scorer_process import run_scorer
+        from leaderboard.scoring.__main__ import run_scorer
 
         run_scorer(settings)
     elif options.command == "token":

@@ -6,18 +6,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rebar_depth_bench.dataset import load
-    from rebar_depth_bench.errors import (
-        DatasetError,
-        InputError,
-        MethodError,
-        RebarDepthError,
-        SubmissionError,
-    )
-    from rebar_depth_bench.result import Result, Table, ViewScore
-    from rebar_depth_bench.scoring import score
+    from rebar_depth_bench.data.dataset import load
+    from rebar_depth_bench.data.torch_loader import torch_loader
+    from rebar_depth_bench.errors import DatasetError, InputError, MethodError, RebarDepthError, SubmissionError
+    from rebar_depth_bench.scoring.result import Result, Table, ViewScore
+    from rebar_depth_bench.scoring.score import score
     from rebar_depth_bench.submission import SubmissionWriter
-    from rebar_depth_bench.torch_data import torch_loader
 
 __all__ = [
     "DatasetError",
@@ -35,13 +29,13 @@ __all__ = [
 ]
 
 _HOMES = {
-    "load": "dataset",
-    "score": "scoring",
-    "torch_loader": "torch_data",
+    "load": "data.dataset",
+    "score": "scoring.score",
+    "torch_loader": "data.torch_loader",
     "SubmissionWriter": "submission",
-    "Result": "result",
-    "Table": "result",
-    "ViewScore": "result",
+    "Result": "scoring.result",
+    "Table": "scoring.result",
+    "ViewScore": "scoring.result",
 }
 
 

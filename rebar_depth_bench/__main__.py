@@ -1,6 +1,6 @@
 """``python -m rebar_depth_bench`` is ``rebar-bench``."""
 
-from rebar_depth_bench.cli import main
+from rebar_depth_bench.cli.main import main
 
 if __name__ == "__main__":
     raise SystemExit(main())

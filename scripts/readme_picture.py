@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.colormap import DEPTH_COLOURS, positions
+from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, positions
 
 PANEL = (640, 360)
 VIEW = 0

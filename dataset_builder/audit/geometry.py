@@ -11,8 +11,8 @@ from numpy import ndarray
 
 from dataset_builder.audit.report import Check
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
-from dataset_builder.model import Bar
-from rebar_depth_bench.board import BoardSpec
+from dataset_builder.scene.model import Bar
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 MAX_AXIS_RATIO = 1.2
 """Ribs stand out of the nominal radius by at most this factor."""

@@ -21,10 +21,10 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
-from dataset_builder.audit.epipolar import landed_in
 from dataset_builder.audit.report import Check
+from dataset_builder.audit.stereo_consistency import landed_in
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
-from rebar_depth_bench.cameras import camera_centre
+from rebar_depth_bench.geometry.cameras import camera_centre
 
 MAX_SHIFT_PX, SHIFT_NOISE_PX = 0.1, 6.0
 """Of all views together: the second over the root of their pixels comes on top. Good renders: under 0.05 px at

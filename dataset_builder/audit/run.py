@@ -1,32 +1,63 @@
-"""``audit``: every check of a dataset folder, in one pass over its rows."""
+"""``audit``: every check of a dataset folder, in one pass over its rows.
+
+The checks that every view of a config goes through, in the order of the report.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dataset_builder.audit.cameras import (
     ExpectedView,
     aim_point_of,
+    board_spec,
     camera_problems,
     expected_views,
+    projection_verdict,
     protocol_problems,
+    view_projection_error_px,
 )
-from dataset_builder.audit.checks import VIEW_CHECKS
-from dataset_builder.audit.files import check_digests, check_files
-from dataset_builder.audit.manifest_specs import board_spec
+from dataset_builder.audit.cycles_depth import cycles_difference_m, cycles_verdict
+from dataset_builder.audit.files import array_problems, check_digests, check_files, row_problems
+from dataset_builder.audit.geometry import axis_verdict, board_verdict, largest_axis_excess, largest_board_error
+from dataset_builder.audit.markers import marker_verdict, view_markers
+from dataset_builder.audit.photometric import photometric_verdict, view_fit
 from dataset_builder.audit.report import AuditReport, Check
-from dataset_builder.audit.rows import array_problems, row_problems
-from dataset_builder.audit.second_renderer import cycles_difference_m, cycles_verdict
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, RayMemory, audited_view
-from dataset_builder.bars_table import BARS, read_bars
-from dataset_builder.protocols import subset
-from rebar_depth_bench.dataset import iterate
+from dataset_builder.audit.stereo_consistency import epipolar_verdict, view_epipolar_counts
+from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView, RayMemory, audited_view
+from dataset_builder.build.bars_table import BARS, read_bars
+from dataset_builder.config.trajectories import subset
+from rebar_depth_bench.data.dataset import features, iterate
+from rebar_depth_bench.data.manifest import DatasetFolder, ViewRecord, open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
-from rebar_depth_bench.folder import DatasetFolder, ViewRecord, open_folder
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.schema import features
+
+
+@dataclass(frozen=True)
+class ViewCheck:
+    """``measure`` takes a view's figures, ``verdict`` holds all of them against a bound.
+
+    ``views`` of a config, spread evenly, are measured; all of them where it is None.
+    """
+
+    measure: Callable[[AuditedConfig, AuditedView], Any]
+    verdict: Callable[[AuditedConfig, Sequence[Any]], Check]
+    views: int | None = None
+
+
+VIEW_CHECKS: tuple[ViewCheck, ...] = (
+    ViewCheck(largest_axis_excess, axis_verdict),
+    ViewCheck(largest_board_error, board_verdict),
+    ViewCheck(view_epipolar_counts, epipolar_verdict),
+    # All views of a config have the same lenses, which another check holds to the last digit.
+    ViewCheck(view_projection_error_px, projection_verdict, views=12),
+    ViewCheck(view_fit, photometric_verdict),
+    ViewCheck(view_markers, marker_verdict),
+)
+
 
 _NOT_AUDITED = {"left_preview"}
 

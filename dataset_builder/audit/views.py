@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 from numpy import ndarray
 
-from dataset_builder.appearance import LIGHT, THINGS, of_slot
-from dataset_builder.model import ESTIMATED, Bar
-from dataset_builder.optics import Camera
-from rebar_depth_bench.board import BoardSpec
-from rebar_depth_bench.cameras import inverse_rigid, pixel_rays, transform
-from rebar_depth_bench.schema import EYES
+from dataset_builder.config.rigs import Camera
+from dataset_builder.scene.model import ESTIMATED, Bar
+from dataset_builder.scene.variants import LIGHT, THINGS, of_slot
+from rebar_depth_bench.data.dataset import EYES
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
+from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, transform
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ def _runner(task: object) -> Callable[[Any, Report], None]:
     """Return the function that runs a task. Imported late: by now Blender's prints go to the log."""
     from dataset_builder.blender.depth_task import run_depth_task
     from dataset_builder.blender.render_task import run_render_task
-    from dataset_builder.tasks import DepthTask, RenderTask
+    from dataset_builder.build.blender_process import DepthTask, RenderTask
 
     runners: Mapping[type, Callable[[Any, Report], None]] = {
         RenderTask: run_render_task,

@@ -12,10 +12,10 @@ import numpy as np
 
 from dataset_builder.blender.render import configure_colour, render_depth
 from dataset_builder.blender.scene import add_object, mesh_data
-from dataset_builder.model import NOT_STEEL, Mesh, Part
-from dataset_builder.specs import ColourSpec
-from dataset_builder.tasks import DepthTask
-from rebar_depth_bench.ply import read_mesh_ply
+from dataset_builder.build.blender_process import DepthTask
+from dataset_builder.config.specs import ColourSpec
+from dataset_builder.scene.mesh_ply import read_mesh_ply
+from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
 
 
 def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None]) -> None:

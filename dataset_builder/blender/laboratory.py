@@ -8,8 +8,8 @@ the room costs no further bounces.
 
 from __future__ import annotations
 
-from dataset_builder.model import NOT_STEEL, Mesh, Part
-from dataset_builder.shapes.solids import Point, box, cylinder, turned_box
+from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
+from dataset_builder.scene.shapes.solids import Point, box, cylinder, turned_box
 
 SHEET_THICKNESS_M = 0.0003
 BENCH_TOP_M = -SHEET_THICKNESS_M - 0.0001

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from dataset_builder.blender.nodes import Colour, Shader
+from dataset_builder.blender.shader_nodes import Colour, Shader
 
 RUST, PATTERN, TONE = "rust_amount", "pattern_shift_m", "scale_tone"
 """Custom properties of a steel object that its material reads."""

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.model import NOT_STEEL, Mesh, Part
-from dataset_builder.shapes.solids import about_z, box, joined, placed, turned_box
+from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
+from dataset_builder.scene.shapes.solids import about_z, box, joined, placed, turned_box
 
 CLEAR_M = 19.0
 SLAB_HALF_M = 3.2

@@ -15,10 +15,10 @@ from numpy import ndarray
 from PIL import Image
 
 from dataset_builder.blender.camera import place_camera
-from dataset_builder.optics import Camera
-from dataset_builder.specs import ColourSpec
-from rebar_depth_bench.cameras import pixel_rays
+from dataset_builder.config.rigs import Camera
+from dataset_builder.config.specs import ColourSpec
 from rebar_depth_bench.errors import BuildError
+from rebar_depth_bench.geometry.cameras import pixel_rays
 
 DEPTH_CHANNEL = "ViewLayer.Depth.Z"
 NOTHING_HIT_M = 1e9

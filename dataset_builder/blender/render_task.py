@@ -1,10 +1,16 @@
-"""Renders the views of one shard: colour by Cycles, ground truth by ray casting the meshes Cycles renders."""
+"""Renders the views of one shard: colour by Cycles, ground truth by ray casting the meshes Cycles renders.
+
+Where the seconds of a build go.
+"""
 
 from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Mapping
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,24 +19,44 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.assemblies import aim_point_m, make_assembly
-from dataset_builder.blender.evaluated import evaluated_world_mesh
+from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
 from dataset_builder.blender.render import configure_colour, render_colour
 from dataset_builder.blender.scene import build_scene
-from dataset_builder.configs import view_id
-from dataset_builder.model import WorldMesh
-from dataset_builder.optics import rig_cameras
-from dataset_builder.protocols import poses
-from dataset_builder.raycast import RayCaster
-from dataset_builder.rows import Eye, View, encode_view
-from dataset_builder.shards import Staging, stage_row
-from dataset_builder.specs import ConfigSpec
-from dataset_builder.stopwatch import Stopwatch
-from dataset_builder.tasks import RenderTask
-from rebar_depth_bench.cameras import pixel_rays
-from rebar_depth_bench.digests import file_sha256
+from dataset_builder.build.blender_process import RenderTask
+from dataset_builder.build.shards import Eye, Staging, View, encode_view, stage_row
+from dataset_builder.config.catalog import view_id
+from dataset_builder.config.rigs import rig_cameras
+from dataset_builder.config.specs import ConfigSpec
+from dataset_builder.config.trajectories import poses
+from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from dataset_builder.scene.mesh_ply import write_mesh_ply
+from dataset_builder.scene.model import WorldMesh
+from dataset_builder.scene.raycast import RayCaster
+from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError
-from rebar_depth_bench.ply import write_mesh_ply
+from rebar_depth_bench.geometry.cameras import pixel_rays
+
+
+class Stopwatch:
+    """Adds up wall-clock seconds by stage until they are taken."""
+
+    def __init__(self) -> None:
+        self._seconds: defaultdict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def timing(self, stage: str) -> Iterator[None]:
+        """Add the time spent in the block to ``stage``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._seconds[stage] += time.perf_counter() - start
+
+    def take(self) -> dict[str, float]:
+        """Return the seconds since the last call, by stage, and start again from zero."""
+        taken = dict(self._seconds)
+        self._seconds.clear()
+        return taken
 
 
 def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None]) -> None:

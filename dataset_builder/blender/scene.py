@@ -1,26 +1,46 @@
-"""Builds the scene in Blender's open file: steel, board, room. World frame, metres."""
+"""Builds the scene in Blender's open file: steel, board, room. World frame, metres.
+
+What a scene stands in: the surfaces round the steel, and the light on them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import bpy
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.appearance import LIGHT, STEEL, check_variants, one_of_slot
-from dataset_builder.appearance.occluders import occluders
-from dataset_builder.blender.environments import ENVIRONMENTS
-from dataset_builder.blender.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M
-from dataset_builder.blender.lighting import add_light
+from dataset_builder.blender.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M, laboratory
+from dataset_builder.blender.lights import LABORATORY_LIGHT, OUTDOOR_LIGHT, LightRig, add_light
 from dataset_builder.blender.materials import STEEL_LOOKS, material, paper, surface_variation
-from dataset_builder.board import board_texture
-from dataset_builder.model import NOT_STEEL, Assembly, Mesh, Part
-from dataset_builder.shapes.solids import box
-from dataset_builder.specs import SceneSpec
-from rebar_depth_bench.board import BoardSpec
+from dataset_builder.blender.outdoors import outdoors
+from dataset_builder.config.specs import SceneSpec
+from dataset_builder.scene.board_texture import board_texture
+from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
+from dataset_builder.scene.shapes.solids import box
+from dataset_builder.scene.variants import LIGHT, STEEL, check_variants, one_of_slot
+from dataset_builder.scene.variants.props import occluders
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
+
+
+@dataclass(frozen=True)
+class Environment:
+    """A place: its surfaces (world frame, none of them steel), and its light by light variant (None: as it is)."""
+
+    parts: Callable[[], tuple[Part, ...]]
+    light: Mapping[str | None, LightRig]
+    floor_m: float
+    """Height of the surface that a board lies on."""
+
+
+ENVIRONMENTS: Mapping[str, Environment] = {
+    "laboratory": Environment(laboratory, LABORATORY_LIGHT, BENCH_TOP_M),
+    "outdoors": Environment(outdoors, OUTDOOR_LIGHT, 0.0),
+}
+
 
 BAR_ID = "bar_id"
 """The custom property that carries an object's bar id."""

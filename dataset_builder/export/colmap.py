@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.config.rigs import Camera
 from dataset_builder.export.views import CameraView
-from dataset_builder.model import Bar
-from dataset_builder.optics import Camera
-from dataset_builder.shapes.bending import resampled_m
+from dataset_builder.scene.model import Bar
+from dataset_builder.scene.shapes.bending import resampled_m
 
 HALF_PIXEL = 0.5
 POINTS_WANTED = 10_000

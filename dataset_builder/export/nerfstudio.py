@@ -3,23 +3,35 @@
 Source: nerfstudio's documentation, "Data conventions", and its ``Nerfstudio`` data parser. Cameras look along -z
 with y up (OpenGL); a pixel's coordinates are those of its centre, the first being (0.5, 0.5): its
 ``get_image_coords`` adds 0.5, and it takes 0.5 off cx and cy before it calls OpenCV. k1 k2 k3 p1 p2 are OpenCV's.
+
+JSON that people can read: a short head, then a long list with one entry a line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.config.rigs import Camera
 from dataset_builder.export.colmap import HALF_PIXEL
-from dataset_builder.export.json_lines import json_lines
-from dataset_builder.export.pictures import MILLIMETRE_M, PICTURES
+from dataset_builder.export.images import MILLIMETRE_M, PICTURES
 from dataset_builder.export.views import CameraView
-from dataset_builder.optics import Camera
-from rebar_depth_bench.cameras import inverse_rigid
+from rebar_depth_bench.geometry.cameras import inverse_rigid
+
+_EMPTY_END = "[]\n}"
+
+
+def json_lines(head: Mapping[str, Any], name: str, entries: Sequence[Mapping[str, Any]]) -> str:
+    """Return ``head`` as a JSON object with one more member ``name``: the list of ``entries``, a line each."""
+    outline = json.dumps({**head, name: []}, indent=1, allow_nan=False).removesuffix(_EMPTY_END)
+    lines = ",\n".join(json.dumps(entry, allow_nan=False) for entry in entries)
+    return f"{outline}[\n{lines}\n]}}\n"
+
 
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from dataset_builder.bars_table import BARS, read_bars
+from dataset_builder.build.bars_table import BARS, read_bars
+from dataset_builder.config.trajectories import subset
 from dataset_builder.export.colmap import cameras_txt, images_txt, points_txt
-from dataset_builder.export.descriptions import cameras_json, readme_txt
+from dataset_builder.export.images import PICTURES
+from dataset_builder.export.metadata import cameras_json, readme_txt
 from dataset_builder.export.nerfstudio import transforms_json
-from dataset_builder.export.pictures import PICTURES
 from dataset_builder.export.target import export_target
 from dataset_builder.export.views import CameraView, StoredView, stored_views
-from dataset_builder.model import Bar
-from dataset_builder.protocols import subset
+from dataset_builder.scene.model import Bar
+from rebar_depth_bench.atomic_io import write_bytes, write_text
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
-from rebar_depth_bench.files import write_bytes, write_text
-from rebar_depth_bench.folder import DatasetFolder, open_folder
 from rebar_depth_bench.progress import Progress, silent
 
 _FOLDER_NAME = re.compile(r"\w[\w.-]*")

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from rebar_depth_bench.atomic_io import write_text
+from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.files import write_text
-from rebar_depth_bench.folder import DatasetFolder
 
 MARKER = "export.json"
 FORMAT = "rebar-depth-export-1"

@@ -10,12 +10,11 @@ import numpy as np
 import pyarrow as pa
 from datasets.exceptions import DatasetGenerationError, DatasetsError
 
-from dataset_builder.optics import Camera
-from rebar_depth_bench.dataset import decode_row, load_undecoded
-from rebar_depth_bench.digests import eye_digest
+from dataset_builder.config.rigs import Camera
+from rebar_depth_bench.data.dataset import EYES, decode_row, load_undecoded
+from rebar_depth_bench.data.digests import eye_digest
+from rebar_depth_bench.data.manifest import DatasetFolder, ViewRecord
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.folder import DatasetFolder, ViewRecord
-from rebar_depth_bench.schema import EYES
 
 _CAMERA_KINDS = ("K", "distortion", "cam_from_world")
 _TRUTH_KINDS = ("depth", "mask", "bars", *_CAMERA_KINDS)

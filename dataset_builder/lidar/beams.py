@@ -14,7 +14,7 @@ from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from dataset_builder.lidar.scanner import ScannerSpec
-from rebar_depth_bench.cameras import transform
+from rebar_depth_bench.geometry.cameras import transform
 
 NEAREST_M = 0.1
 """Surfaces nearer than this are not looked for, whatever a scanner's least range: parallax grows without end."""

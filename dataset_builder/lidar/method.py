@@ -13,14 +13,14 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from dataset_builder.lidar.beams import sector_of
-from dataset_builder.lidar.left_grid import LeftCamera, left_depth_m
-from dataset_builder.lidar.scan import noise_generator, scan
+from dataset_builder.lidar.project import LeftCamera, left_depth_m
 from dataset_builder.lidar.scanner import MOBILE, SURVEY, ScannerSpec
-from dataset_builder.model import WorldMesh
-from rebar_depth_bench.cameras import pixel_rays
+from dataset_builder.lidar.simulate import noise_generator, scan
+from dataset_builder.scene.mesh_ply import read_mesh_ply
+from dataset_builder.scene.model import WorldMesh
 from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.methods import ConfigViews, MethodInfo, MultiViewMethod, Prepared
-from rebar_depth_bench.ply import read_mesh_ply
 from rebar_depth_bench.progress import Progress
 
 _DIGITS = 12
@@ -39,7 +39,7 @@ def lidar_method(name: str, spec: ScannerSpec, what: str) -> MultiViewMethod:
             raise MethodError(f"{name} needs embreex to cast rays: pip install 'rebar-depth-bench[build]'")
 
     def prepare(views: ConfigViews, _: Path, progress: Progress) -> Prepared:
-        from dataset_builder.raycast import RayCaster
+        from dataset_builder.scene.raycast import RayCaster
 
         progress(f"{name}: the mesh of {views.config}", 0, 1)
         caster = RayCaster(WorldMesh(*read_mesh_ply(views.mesh)))

@@ -13,8 +13,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples
-from rebar_depth_bench.extended.truth import SteelTruth
-from rebar_depth_bench.metrics import depth_metrics, is_prediction, median, median_scale
+from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.scoring.metrics import depth_metrics, is_prediction, median, median_scale
 
 _NUMBERS = (("abs_rel", "AbsRel", ""), ("rmse_cm", "RMSE", "cm"), ("mae_cm", "MAE", "cm"), ("delta1", "δ1", ""))
 

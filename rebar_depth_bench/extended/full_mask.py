@@ -19,9 +19,9 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples
-from rebar_depth_bench.extended.truth import SteelTruth
-from rebar_depth_bench.metrics import DepthMetrics, aligned_metrics, is_prediction
-from rebar_depth_bench.protocol import WITHIN_MM
+from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.scoring.metrics import DepthMetrics, aligned_metrics, is_prediction
+from rebar_depth_bench.scoring.protocol import WITHIN_MM
 
 _ERRORS = tuple(field.name for field in fields(DepthMetrics))
 

@@ -1,4 +1,7 @@
-"""How extended measures are named: a view yields samples, a measure is a statistic of them."""
+"""How extended measures are named: a view yields samples, a measure is a statistic of them.
+
+Fewer pixels, evenly, where a measure does not need all of them.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 EXTENDED_PROTOCOL = "rebar-extended-1"
@@ -64,3 +67,9 @@ class Measure:
     def number(self, statistic: float) -> float | None:
         """Return the measure's number from the statistic of its samples; None where that tells none."""
         return statistic if self.convert is None else self.convert(statistic)
+
+
+def thinned(position: Int64[ndarray, " n"], most: int) -> Int64[ndarray, " m"]:
+    """Return at most ``most`` of the positions, evenly strided: of n, the m at floor(i n / m)."""
+    count = min(len(position), most)
+    return np.asarray(position[np.arange(count) * len(position) // max(count, 1)])

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.bootstrap import Interval, Resampling, interval, resample
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
-from rebar_depth_bench.numbers import INTERVAL_DIGITS, rounded
+from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample
+from rebar_depth_bench.scoring.rounding import INTERVAL_DIGITS, rounded
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from rebar_depth_bench.digests import file_sha256
-from rebar_depth_bench.errors import SubmissionError
+from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.errors import SubmissionError, show_shape
 from rebar_depth_bench.submission import EntryError, ExpectedViews, SubmissionMeta, open_submission
-from rebar_depth_bench.submission.decode import FORMATS, Depth
+from rebar_depth_bench.submission.formats import FORMATS, Depth
 from rebar_depth_bench.submission.metadata import METADATA_NAME, MetadataError, parse_metadata
-from rebar_depth_bench.submission.problems import show_shape
 
 _NAMES = "<view_id>, or its part after the slash, with one of " + ", ".join(FORMATS)
 

@@ -6,7 +6,10 @@ import argparse
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from rebar_depth_bench.studies import anchor, distance, kitti, pseudo_reference
+from rebar_depth_bench.studies.distance import command as distance
+from rebar_depth_bench.studies.kitti import command as kitti
+from rebar_depth_bench.studies.pseudo_reference import command as pseudo_reference
+from rebar_depth_bench.studies.scale_anchor import command as anchor
 
 
 class Study(Protocol):

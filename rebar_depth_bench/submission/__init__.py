@@ -1,8 +1,8 @@
 """Submission archives: writing them, checking them, and reading predictions out of them."""
 
-from rebar_depth_bench.submission.layout import ExpectedViews, config_of
+from rebar_depth_bench.errors import EntryError
+from rebar_depth_bench.submission.entries import ExpectedViews, config_of
 from rebar_depth_bench.submission.metadata import SubmissionMeta
-from rebar_depth_bench.submission.problems import EntryError
 from rebar_depth_bench.submission.reader import SubmissionReader, check_archive, open_submission
 from rebar_depth_bench.submission.writer import SubmissionWriter
 

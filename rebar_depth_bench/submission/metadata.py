@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 from urllib.parse import urlsplit
 
-from rebar_depth_bench.submission.problems import show
+from rebar_depth_bench.errors import show
 
 METADATA_NAME = "submission.json"
 MAX_METADATA_BYTES = 4 * 1024 * 1024

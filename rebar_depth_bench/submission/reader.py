@@ -10,15 +10,13 @@ from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import Self
 
+from rebar_depth_bench.errors import EntryError
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.submission.decode import FORMATS, Depth
-from rebar_depth_bench.submission.layout import ExpectedViews, lay_out, size_limit
+from rebar_depth_bench.submission.entries import ExpectedViews, lay_out, size_limit
+from rebar_depth_bench.submission.formats import FORMATS, Depth
 from rebar_depth_bench.submission.metadata import METADATA_NAME, MetadataError, SubmissionMeta, parse_metadata
-from rebar_depth_bench.submission.problems import EntryError
-from rebar_depth_bench.submission.sources import ByteSource, FileSource
-from rebar_depth_bench.submission.zip_checks import CheckedEntry, check_entries, has_bad_name
-from rebar_depth_bench.submission.zip_data import read_data
-from rebar_depth_bench.submission.zip_directory import DirectoryError, read_directory
+from rebar_depth_bench.submission.zip_directory import ByteSource, DirectoryError, FileSource, read_directory
+from rebar_depth_bench.submission.zip_entries import CheckedEntry, check_entries, has_bad_name, read_data
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,8 @@ from typing import BinaryIO, Self
 
 import numpy as np
 
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.files import replacing
+from rebar_depth_bench.atomic_io import replacing
+from rebar_depth_bench.errors import InputError, show
 from rebar_depth_bench.submission.metadata import (
     METADATA_NAME,
     description_problems,
@@ -24,8 +24,7 @@ from rebar_depth_bench.submission.metadata import (
     type_problems,
     url_problems,
 )
-from rebar_depth_bench.submission.npy import Depth
-from rebar_depth_bench.submission.problems import show
+from rebar_depth_bench.submission.numpy_formats import Depth
 
 _VIEW_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}/[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _EPOCH = (1980, 1, 1, 0, 0, 0)

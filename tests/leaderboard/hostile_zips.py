@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.submission.zips import Array, Record, build, deflated, npy, npy_header, npz, png
+from tests.bench.submission.zips import Array, Record, build, deflated, npy, npy_header, npz, png
 
 EXTREMES = (0, 1, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFE, 0xFFFFFFFF)
 META = b'{"method": "hostile", "depth_scale": 0.001}'

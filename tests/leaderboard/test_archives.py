@@ -17,17 +17,17 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from leaderboard.archives import Archives, GoneError, written_s
-from leaderboard.database import Database
-from leaderboard.intake import AWAY as INTAKE_AWAY
-from leaderboard.jobs import Job
-from leaderboard.local_scoring import local_score
-from leaderboard.scorer import AwayError
-from leaderboard.service import ORPHAN_S, clear
+from leaderboard.db.engine import Database
+from leaderboard.db.jobs import Job
+from leaderboard.redact import without_password
+from leaderboard.scoring.subprocess_backend import local_score
+from leaderboard.scoring.worker import AwayError
 from leaderboard.settings import read_settings
-from leaderboard.wording import without_password
+from leaderboard.storage.archive_store import Archives, GoneError, written_s
+from leaderboard.uploads.accept import AWAY as INTAKE_AWAY
+from leaderboard.web.context import ORPHAN_S, clear
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.folder import open_folder
 from tests.leaderboard.conftest import Write
 from tests.leaderboard.serving import make_token, running_server
 from tests.leaderboard.watching import wait_until

@@ -18,7 +18,7 @@ import httpx2
 import numpy as np
 import pytest
 
-from leaderboard.jobs import MOST_ATTEMPTS
+from leaderboard.db.jobs import MOST_ATTEMPTS
 from tests.leaderboard.conftest import Write
 from tests.leaderboard.postgres import Postgres, running_postgres
 from tests.leaderboard.processes import descendants, runs

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from rebar_depth_bench.client import Leaderboard, ServiceError
 from rebar_depth_bench.errors import InputError, SubmissionError
+from rebar_depth_bench.leaderboard_client import Leaderboard, ServiceError
 from tests.leaderboard.conftest import Shared, Write
 from tests.leaderboard.serving import Server, running_server
 

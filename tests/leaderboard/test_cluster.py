@@ -12,7 +12,7 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from leaderboard.cluster import settings_for_workers
+from leaderboard.scoring.dask_backend import settings_for_workers
 from leaderboard.settings import Settings
 from tests.leaderboard.conftest import Write
 from tests.leaderboard.dask_cluster import Cluster, new_cluster

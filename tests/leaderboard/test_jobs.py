@@ -11,17 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from leaderboard import jobs, submissions
-from leaderboard.board import board
-from leaderboard.database import Database
-from leaderboard.jobs import MOST_ATTEMPTS, Outcome
-from leaderboard.records import SubmissionRecord, TokenRecord
+from leaderboard.db import jobs, submissions
+from leaderboard.db.engine import Database
+from leaderboard.db.jobs import MOST_ATTEMPTS, Outcome
+from leaderboard.db.models import SubmissionRecord, TokenRecord
+from leaderboard.db.rankings import board
+from leaderboard.db.submissions import QuotaSpentError, Upload
+from leaderboard.db.tokens import create_token, find_token, replace_token
 from leaderboard.settings import read_settings
-from leaderboard.submissions import QuotaSpentError, Upload
-from leaderboard.tokens import create_token, find_token, replace_token
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.submission import SubmissionMeta
-from tests.report.results import result, scored
+from tests.bench.reporting.results import result, scored
 
 LEASE_S = 60.0
 

@@ -18,19 +18,18 @@ from fastapi import FastAPI
 
 from benchmarks.filled_board import varied
 from benchmarks.synthetic_dataset import write_dataset
-from leaderboard import jobs, submissions
-from leaderboard.app import make_app
-from leaderboard.board import BoardRow, Stamp, board, stamp_of, stamps
-from leaderboard.database import Database
-from leaderboard.jobs import Outcome
-from leaderboard.kept import Body, KeptBodies, Made, SharedRead, Shelf, shelved
-from leaderboard.page.standings import standings
-from leaderboard.service import open_service
+from leaderboard.db import jobs, submissions
+from leaderboard.db.engine import Database
+from leaderboard.db.jobs import Outcome
+from leaderboard.db.rankings import BoardRow, Stamp, board, stamp_of, stamps, standings
+from leaderboard.db.submissions import Upload
+from leaderboard.db.tokens import create_token, find_token
 from leaderboard.settings import read_settings
-from leaderboard.submissions import Upload
-from leaderboard.tokens import create_token, find_token
+from leaderboard.web.app import make_app
+from leaderboard.web.cache import Body, KeptBodies, Made, SharedRead, Shelf, shelved
+from leaderboard.web.context import open_service
 from rebar_depth_bench.submission import SubmissionMeta
-from tests.report.results import result, scored
+from tests.bench.reporting.results import result, scored
 
 CONFIGS = ("lattice", "pile")
 BOARD, API, CSV = (

@@ -16,10 +16,10 @@ from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import Column, Engine, MetaData, String, create_engine, inspect
 
-from leaderboard.database import MIGRATIONS, Database
-from leaderboard.records import Base
+from leaderboard.db.engine import MIGRATIONS, Database
+from leaderboard.db.models import Base
+from leaderboard.db.tokens import create_token, find_token
 from leaderboard.settings import Settings
-from leaderboard.tokens import create_token, find_token
 
 _MIGRATE = """
 import sys

@@ -11,18 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from leaderboard.board import board
-from leaderboard.database import Database
-from leaderboard.page.boards import MOST_PLOTTED, make_board
-from leaderboard.page.columns import COLUMNS, RANK, Order, ordered, read_order
-from leaderboard.page.spelling import lines, link, moment, size
-from leaderboard.page.standings import queue_place, ranks, standings
-from leaderboard.records import ResultRecord, RowRecord, SubmissionRecord, TokenRecord
-from leaderboard.upload import MOST_FIELD, UploadError, leading_field
-from rebar_depth_bench.report.rows import table_row
-from rebar_depth_bench.result import tabulate
-from rebar_depth_bench.result_reading import read_result
-from tests.report.results import overflowed, result, scored, unpredicted
+from leaderboard.db.engine import Database
+from leaderboard.db.models import ResultRecord, RowRecord, SubmissionRecord, TokenRecord
+from leaderboard.db.rankings import board, queue_place, ranks, standings
+from leaderboard.uploads.multipart import MOST_FIELD, UploadError, leading_field
+from leaderboard.web.pages.leaderboard import COLUMNS, MOST_PLOTTED, RANK, Order, make_board, ordered, read_order
+from leaderboard.web.pages.rendering import lines, link, moment, size
+from rebar_depth_bench.reporting.html.rows import table_row
+from rebar_depth_bench.scoring.result import tabulate
+from rebar_depth_bench.scoring.result_io import read_result
+from tests.bench.reporting.results import overflowed, result, scored, unpredicted
 
 ERRORS = [0.3, 0.1, 0.1, 2.0, 0.7, None, 0.05]
 UNRANKED, HIDDEN = (5, 6), (1,)

@@ -11,8 +11,8 @@ from typing import Any
 import httpx2
 import pytest
 
+from tests.bench.reporting.pages import Page
 from tests.leaderboard.conftest import HOSTILE, Shared, Write
-from tests.report.pages import Page
 
 BROWSER = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx2
 
 from benchmarks.synthetic_dataset import write_archive, write_dataset
-from leaderboard.intake import AWAY
+from leaderboard.uploads.accept import AWAY
 from tests.leaderboard.serving import Server, running_scorer, running_server
 from tests.leaderboard.watching import submission_row, wait_until
 

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 from pydantic import ByteSize
 
-from leaderboard.archives import Archives
 from leaderboard.cli import GROUPS, argument_parser
 from leaderboard.settings import Settings, read_settings
+from leaderboard.storage.archive_store import Archives
 from rebar_depth_bench.errors import InputError
 
 PASSWORD = "Hunter2"

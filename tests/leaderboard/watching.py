@@ -11,8 +11,8 @@ from typing import Any
 
 from tests.leaderboard.processes import descendants
 
-SCORER = b"leaderboard.scorer_process"
-SCORING = b"leaderboard.scoring_process"
+SCORER = b"leaderboard.scoring\0"
+SCORING = b"leaderboard.scoring.sandbox"
 """What stands on the command lines of a scorer and of the process in which it scores one archive."""
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.cameras import inverse_rigid
+from rebar_depth_bench.geometry.cameras import inverse_rigid
 
 BAD = np.float32(-2)
 """Below every correlation."""

@@ -1,0 +1,196 @@
+"""Lights a scene: a sky, the sun, panels and spots. None of them is a surface, so none has depth.
+
+What a place's light is made of, as it is and in each variant, is told in ``light_rigs``.
+
+The light of each place, as it is and in each light variant: plain tables of lamps and skies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import radians
+
+import bpy
+from mathutils import Vector
+
+from dataset_builder.blender.shader_nodes import Colour, Socket, Tree
+from dataset_builder.scene.variants import SHADOWS, SUN_FROM
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Sky:
+    """What rays meet that meet nothing: ``horizon`` fades to ``zenith``; one colour where they are the same."""
+
+    horizon: Colour
+    zenith: Colour
+    strength: float
+    clouds: bool = False
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A rectangular light of ``size_m`` at ``at_m``, facing ``towards_m`` (world, metres)."""
+
+    name: str
+    at_m: Point
+    towards_m: Point
+    size_m: tuple[float, float]
+    power_w: float
+    colour: Colour
+
+
+@dataclass(frozen=True)
+class Sun:
+    """A light as from infinity: the direction it comes from, its soft edge and its strength (W / m2)."""
+
+    from_direction: Point
+    angle_deg: float
+    strength: float
+    colour: Colour
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A lamp that throws a cone, of ``radius_m``, at ``at_m``, facing ``towards_m`` (world, metres)."""
+
+    at_m: Point
+    towards_m: Point
+    radius_m: float
+    cone_deg: float
+    power_w: float
+    colour: Colour
+
+
+@dataclass(frozen=True)
+class LightRig:
+    """All the light of a scene."""
+
+    sky: Sky
+    lamps: tuple[Panel | Sun | Spot, ...]
+
+
+def add_light(rig: LightRig) -> None:
+    """Light the open scene, which has no light yet."""
+    _add_sky(rig.sky)
+    for number, lamp in enumerate(rig.lamps):
+        if isinstance(lamp, Panel):
+            _add_panel(lamp)
+        elif isinstance(lamp, Sun):
+            _add_sun(lamp, f"sun-{number}")
+        else:
+            _add_spot(lamp, f"spot-{number}")
+
+
+def _add_sky(sky: Sky) -> None:
+    world = bpy.data.worlds.new("sky")
+    world.use_nodes = True
+    background = world.node_tree.nodes["Background"]
+    background.inputs["Color"].default_value = (*sky.horizon, 1.0)
+    background.inputs["Strength"].default_value = sky.strength
+    if sky.zenith != sky.horizon:
+        tree = Tree(world.node_tree)
+        world.node_tree.links.new(_gradient(tree, sky), background.inputs["Color"])
+    # So smooth a sky is found well enough by chance; lamps get all the shadow rays.
+    world.cycles.sampling_method = "NONE"
+    bpy.context.scene.world = world
+
+
+def _gradient(tree: Tree, sky: Sky) -> Socket:
+    """Return the sky's colour along a direction: most of the change lies low, as in clear air."""
+    direction = tree.direction()
+    height = tree.node("ShaderNodeSeparateXYZ", {0: direction}).outputs["Z"]
+    colour = tree.mix(
+        tree.remap(tree.power(tree.remap(height, 0, 1, 0, 1), 0.55), 0, 1, 0, 1), sky.horizon, sky.zenith
+    )
+    if sky.clouds:
+        veil = tree.step(tree.noise(tree.stretched(direction, (1.0, 1.0, 3.5)), 2.6, 3.0), 0.50, 0.80)
+        colour = tree.mix(tree.product(veil, tree.step(height, 0.02, 0.25)), colour, (0.86, 0.89, 0.93))
+    return colour
+
+
+def _add_panel(panel: Panel) -> None:
+    light = bpy.data.lights.new(panel.name, "AREA")
+    light.shape = "RECTANGLE"
+    light.size, light.size_y = panel.size_m
+    light.energy = panel.power_w
+    light.color = panel.colour
+    _hang(light, panel.at_m, Vector(panel.towards_m) - Vector(panel.at_m))
+
+
+def _add_sun(sun: Sun, name: str) -> None:
+    light = bpy.data.lights.new(name, "SUN")
+    light.angle = radians(sun.angle_deg)
+    light.energy = sun.strength
+    light.color = sun.colour
+    _hang(light, (0.0, 0.0, 0.0), -Vector(sun.from_direction))
+
+
+def _add_spot(spot: Spot, name: str) -> None:
+    light = bpy.data.lights.new(name, "SPOT")
+    light.shadow_soft_size = spot.radius_m
+    light.spot_size = radians(spot.cone_deg)
+    light.spot_blend = 0.35
+    light.energy = spot.power_w
+    light.color = spot.colour
+    _hang(light, spot.at_m, Vector(spot.towards_m) - Vector(spot.at_m))
+
+
+def _hang(light: bpy.types.Light, at_m: Point, direction: Vector) -> None:
+    added = bpy.data.objects.new(light.name, light)
+    added.location = at_m
+    # A light shines along its -z axis.
+    added.rotation_euler = direction.to_track_quat("-Z", "Y").to_euler()
+    added.visible_camera = False
+    bpy.context.scene.collection.objects.link(added)
+
+
+WARM, COOL, WHITE = (1.0, 0.93, 0.85), (0.82, 0.91, 1.0), (1.0, 0.98, 0.95)
+EMBER = (1.0, 0.60, 0.30)
+
+
+def _even(colour: Colour, strength: float) -> Sky:
+    return Sky(colour, colour, strength)
+
+
+LABORATORY_LIGHT: Mapping[str | None, LightRig] = {
+    None: LightRig(
+        # One lamp and a bright sky: a second lamp from the side made steel noisier.
+        _even((0.86, 0.93, 1.0), 0.80),
+        (Panel("ceiling-panel", (-0.35, 0.45, 1.9), (0.0, 0.05, 0.0), (0.9, 0.45), 62.0, WARM),),
+    ),
+    "dusk": LightRig(
+        _even((0.42, 0.55, 1.0), 0.13),
+        (Panel("window", (-1.9, -0.9, 0.9), (0.0, 0.0, 0.05), (1.1, 0.5), 14.0, EMBER),),
+    ),
+    "spotlight": LightRig(
+        _even((0.7, 0.8, 1.0), 0.05),
+        (Spot((-0.95, 0.10, 0.85), (0.0, 0.0, 0.03), 0.012, 62.0, 75.0, WHITE),),
+    ),
+    "backlight": LightRig(
+        _even((0.86, 0.93, 1.0), 0.07),
+        (Panel("low-window", (0.2, 2.0, 0.85), (0.0, 0.0, 0.05), (1.4, 0.6), 75.0, WHITE),),
+    ),
+    SHADOWS: LightRig(_even((0.80, 0.90, 1.0), 0.30), (Sun(SUN_FROM, 0.5, 3.6, WARM),)),
+}
+
+_DAY = Sky((0.70, 0.82, 0.95), (0.17, 0.35, 0.74), 0.80, clouds=True)
+
+OUTDOOR_LIGHT: Mapping[str | None, LightRig] = {
+    None: LightRig(_DAY, (Sun((-0.55, -0.45, 0.70), 1.2, 4.0, WARM),)),
+    "dusk": LightRig(
+        Sky((0.95, 0.52, 0.30), (0.10, 0.16, 0.38), 0.28, clouds=False),
+        (Sun((-0.85, -0.45, 0.16), 6.0, 0.55, EMBER),),
+    ),
+    "spotlight": LightRig(
+        Sky((0.05, 0.07, 0.12), (0.015, 0.022, 0.05), 0.4),
+        (Spot((-14.0, -19.0, 10.5), (0.0, 0.0, 2.6), 0.25, 34.0, 26_000.0, WHITE),),
+    ),
+    "backlight": LightRig(
+        Sky((0.90, 0.84, 0.74), (0.34, 0.46, 0.66), 0.42),
+        (Sun((0.22, 0.90, 0.30), 0.6, 4.2, WARM),),
+    ),
+    SHADOWS: LightRig(_DAY, (Sun(SUN_FROM, 0.5, 3.8, WARM),)),
+}

@@ -1,0 +1,1 @@
+"""Configs: scenes, camera trajectories, rigs, and the schema of scene files."""

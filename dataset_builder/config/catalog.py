@@ -1,0 +1,177 @@
+"""The configs this builder knows, by name, and how a request changes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from dataset_builder.config.rigs import zed_rig
+from dataset_builder.config.specs import (
+    AppearanceSpec,
+    AssemblySpec,
+    ColourSpec,
+    ConfigSpec,
+    DomeSpec,
+    LatticeSpec,
+    MeshFileSpec,
+    PierSpec,
+    PileSpec,
+    RigSpec,
+    RingSpec,
+    SceneSpec,
+    SweepSpec,
+)
+from dataset_builder.scene.variants import VARIANTS, check_variants
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
+
+LATTICE_DOME = DomeSpec(
+    radii_m=(0.22, 0.30, 0.35, 0.38, 0.40, 0.42, 0.43),
+    elevations_deg=(15.0, 27.0, 39.0, 51.0, 63.0, 75.0),
+    azimuths=12,
+)
+"""The paper's 504 views at 0.22-0.43 m; far shells lie closer, so that steel covers 4.5-7.2 % of the frame."""
+PILE_DOME = DomeSpec(
+    radii_m=(0.50, 0.57, 0.59, 0.62, 0.65, 0.67, 0.90),
+    elevations_deg=(28.0, 37.0, 46.0, 55.0, 64.0, 73.0),
+    azimuths=12,
+)
+"""The paper's 504 views at 0.50-0.90 m, above what stands on the bench; steel covers 4.5-7.2 % in two of three."""
+PIER_DOME = DomeSpec(
+    radii_m=(8.0, 11.0, 13.0, 14.5, 15.5, 16.25, 17.0),
+    elevations_deg=(-7.5, -1.0, 7.0, 17.0, 29.0, 44.0),
+    azimuths=12,
+)
+"""The paper's 504 views at 8-17 m: from a person's height, a mast and a drone."""
+LATTICE_RING = RingSpec(radius_m=0.325, elevation_deg=35.0, azimuths=100)
+
+
+def geometric_sweep(nearest_m: float, farthest_m: float, elevation_deg: float) -> SweepSpec:
+    """Return 96 views: 8 directions at each of 12 distances in equal ratios, rounded to the millimetre."""
+    steps = 11
+    ratio = farthest_m / nearest_m
+    radii_m = tuple(round(nearest_m * ratio ** (step / steps), 3) for step in range(steps + 1))
+    return SweepSpec(radii_m, elevation_deg, azimuths=8)
+
+
+def _lattice_scene(markers: int = 6, name: str = "lattice") -> SceneSpec:
+    return SceneSpec(name=name, assembly=LatticeSpec(), board=BoardSpec(markers=markers))
+
+
+def _pile_scene() -> SceneSpec:
+    return SceneSpec("pile", PileSpec(), BoardSpec())
+
+
+def _pier_scene() -> SceneSpec:
+    return SceneSpec("pier", PierSpec(), None, "outdoors")
+
+
+CONFIGS: Mapping[str, Callable[[], ConfigSpec]] = {
+    "lattice": lambda: ConfigSpec("lattice", _lattice_scene(), LATTICE_DOME),
+    "lattice-orbit": lambda: ConfigSpec("lattice-orbit", _lattice_scene(), LATTICE_RING),
+    "lattice-zed": lambda: ConfigSpec("lattice-zed", _lattice_scene(), LATTICE_DOME, zed_rig()),
+    "lattice-zed-raw": lambda: ConfigSpec("lattice-zed-raw", _lattice_scene(), LATTICE_DOME, zed_rig(grid="raw")),
+    "lattice-12": lambda: ConfigSpec("lattice-12", _lattice_scene(12, "lattice-12"), LATTICE_DOME),
+    "pile": lambda: ConfigSpec("pile", _pile_scene(), PILE_DOME),
+    "pier": lambda: ConfigSpec("pier", _pier_scene(), PIER_DOME),
+}
+"""The contract's seven: what is built where no config is named."""
+
+SWEEPS: Mapping[str, Callable[[], ConfigSpec]] = {
+    "lattice-distance": lambda: ConfigSpec("lattice-distance", _lattice_scene(), geometric_sweep(0.22, 1.6, 40.0)),
+    "pile-distance": lambda: ConfigSpec("pile-distance", _pile_scene(), geometric_sweep(0.50, 2.2, 45.0)),
+    "pier-distance": lambda: ConfigSpec("pier-distance", _pier_scene(), geometric_sweep(5.0, 17.0, 7.0)),
+}
+"""Sweeps of distance, for ``rebar-bench study distance``; built where they are named.
+
+They start where the steel fills the frame and end where the laboratory does, or where bars lose their interior
+pixels.
+"""
+LATTICE_CONFIGS = tuple(name for name in CONFIGS if name.startswith("lattice"))
+"""Where ``--mesh`` takes the place of the rods."""
+
+
+@dataclass(frozen=True)
+class BuildRequest:
+    """What a user asks of ``rebar-build``: which configs, how many views, at which size and quality.
+
+    ``scenes`` are configs of the user's own. ``mesh`` takes the place of the lattice's rods. ``variants`` are
+    names of ``appearance.VARIANTS``; configs and scenes that have any carry them in their names.
+    """
+
+    configs: tuple[str, ...] = tuple(CONFIGS)
+    views: int | None = None
+    width: int = RigSpec.width
+    height: int = RigSpec.height
+    samples: int = ColourSpec.samples
+    seed: int = 0
+    mesh: MeshFileSpec | None = None
+    variants: tuple[str, ...] = ()
+    scenes: tuple[ConfigSpec, ...] = ()
+
+    def config_specs(self) -> list[ConfigSpec]:
+        """Return the specs of everything requested; raise ``InputError`` for what is unknown or does not fit."""
+        check_variants(self.variants)
+        known = [_known_config(name) for name in dict.fromkeys(self.configs)]
+        specs = [self._requested(spec) for spec in (*known, *self.scenes)]
+        names = [spec.name for spec in specs]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise InputError(f"more than one config would be named {', '.join(twice)}: give a scene another name")
+        return specs
+
+    def _requested(self, spec: ConfigSpec) -> ConfigSpec:
+        variants = tuple(name for name in VARIANTS if name in self.variants)  # one look, one name
+        suffix = "".join(f"-{name}" for name in variants)
+        scene = replace(
+            spec.scene,
+            name=spec.scene.name + suffix,
+            assembly=self._assembly(spec),
+            appearance=AppearanceSpec(variants),
+            seed=self.seed,
+        )
+        return replace(
+            spec,
+            name=spec.name + suffix,
+            scene=scene,
+            rig=replace(spec.rig, width=self.width, height=self.height),
+            colour=replace(spec.colour, samples=self.samples),
+        )
+
+    def _assembly(self, spec: ConfigSpec) -> AssemblySpec:
+        if self.mesh is None:
+            return spec.scene.assembly
+        if not isinstance(spec.scene.assembly, LatticeSpec):
+            raise InputError(f"--mesh takes the place of the lattice's rods, but {spec.name} is no lattice")
+        return self.mesh
+
+
+def _known_config(name: str) -> ConfigSpec:
+    known = {**CONFIGS, **SWEEPS}
+    if name not in known:
+        raise InputError(f"no config {name!r}, expected one of {', '.join(known)}")
+    return known[name]()
+
+
+def view_id(config: str, index: int) -> str:
+    """Return the id of a view: its config and its index in the full protocol."""
+    return f"{config}/{index:04d}"
+
+
+def check_request(request: BuildRequest) -> None:
+    """Raise ``InputError`` naming every value of a request that cannot be built."""
+    limits: Sequence[tuple[str, int | None, int, int]] = (
+        ("--views", request.views, 1, 1_000_000),
+        ("--width", request.width, 16, 8192),
+        ("--height", request.height, 16, 8192),
+        ("--samples", request.samples, 1, 65_536),
+        ("--seed", request.seed, 0, 2**31 - 1),
+    )
+    wrong = [
+        f"{name} is {value}, expected {low} to {high}"
+        for name, value, low, high in limits
+        if value is not None and not low <= value <= high
+    ]
+    if wrong:
+        raise InputError("; ".join(wrong))
+    request.config_specs()

@@ -1,0 +1,115 @@
+"""From a rig's description to its two cameras, view by view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import resources
+from math import isclose
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from dataset_builder.config.specs import RigSpec
+from rebar_depth_bench.geometry.calibration import read_calibration
+from rebar_depth_bench.geometry.cameras import NOMINAL_HEIGHT, NOMINAL_WIDTH, ideal_K, right_of_rig, rigid
+from rebar_depth_bench.geometry.stereo_calibration import (
+    StereoCalibration,
+    calibrated_baseline_m,
+    lens_distortion,
+    lens_K,
+    right_from_left,
+    scaled,
+)
+
+ZED_CALIBRATION = "zed-hd720.conf"
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One eye: pinhole matrix (pixels), k1 k2 p1 p2 k3, pose and grid."""
+
+    K: Float64[ndarray, "3 3"]
+    distortion: Float64[ndarray, " 5"]
+    cam_from_world: Float64[ndarray, "4 4"]
+    width: int
+    height: int
+
+
+Pose = Float64[ndarray, "4 4"]
+
+
+def zed_rig(width: int = NOMINAL_WIDTH, height: int = NOMINAL_HEIGHT, grid: str = "rectified") -> RigSpec:
+    """Return the rig of the ZED unit that comes with the builder, on its ``raw`` or ``rectified`` grid.
+
+    The factory calibration is that of HD720; ``rig_cameras`` scales it to ``width`` x ``height``.
+    """
+    shipped = resources.files("dataset_builder.config").joinpath("calibrations", ZED_CALIBRATION)
+    with resources.as_file(shipped) as path:
+        calibration = read_calibration(path, NOMINAL_WIDTH, NOMINAL_HEIGHT)
+    return RigSpec(width, height, calibrated_baseline_m(calibration), calibration, grid)
+
+
+def rig_cameras(rig: RigSpec, cam_from_world: Float64[ndarray, "4 4"]) -> dict[str, Camera]:
+    """Return the left and right camera of a rig whose physical left camera stands on a protocol's pose.
+
+    On the ``raw`` grid the cameras are the lenses, distortion and all. On the ``rectified`` one they are the
+    parallel pinholes of ``rectification.rectify``, which stand in the same two points but are turned: the left
+    pose is then not the protocol's. A calibration of another grid is scaled to the rig's.
+
+    Raises ``ValueError`` for an unknown grid, a calibrated grid without a calibration or the other way round,
+    and a ``baseline_m`` that is not the calibration's.
+    """
+    if rig.grid not in GRIDS:
+        raise ValueError(f"no grid {rig.grid!r}, expected one of {', '.join(GRIDS)}")
+    return GRIDS[rig.grid](rig, cam_from_world)
+
+
+def _ideal_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
+    if rig.calibration is not None:
+        raise ValueError("a rig with a calibration is seen on grid 'raw' or 'rectified', not 'ideal'")
+    return _pinholes(rig, ideal_K(rig.width, rig.height), left)
+
+
+def _raw_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
+    calibration = _scaled_calibration(rig)
+    right = right_from_left(calibration) @ left
+    eyes = {"left": (calibration.left, left), "right": (calibration.right, right)}
+    return {
+        eye: Camera(lens_K(lens), lens_distortion(lens), pose, rig.width, rig.height)
+        for eye, (lens, pose) in eyes.items()
+    }
+
+
+def _rectified_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
+    from rebar_depth_bench.geometry.rectification import rectify
+
+    rectified = rectify(_scaled_calibration(rig))
+    return _pinholes(rig, rectified.K, rigid(rectified.R_left, np.zeros(3)) @ left)
+
+
+def _pinholes(rig: RigSpec, K: Float64[ndarray, "3 3"], left: Pose) -> dict[str, Camera]:
+    """Return two parallel pinholes, the right one exactly ``baseline_m`` along the left one's x axis."""
+    right = right_of_rig(left, rig.baseline_m)
+    return {
+        eye: Camera(K, np.zeros(5), pose, rig.width, rig.height)
+        for eye, pose in (("left", left), ("right", right))
+    }
+
+
+def _scaled_calibration(rig: RigSpec) -> StereoCalibration:
+    if rig.calibration is None:
+        raise ValueError(f"a rig on grid {rig.grid!r} needs a calibration")
+    baseline_m = calibrated_baseline_m(rig.calibration)
+    if not isclose(rig.baseline_m, baseline_m, rel_tol=1e-12):
+        raise ValueError(f"the rig's baseline_m is {rig.baseline_m}, its calibration's {baseline_m}")
+    return scaled(rig.calibration, rig.width, rig.height)
+
+
+GRIDS: Mapping[str, Callable[[RigSpec, Pose], dict[str, Camera]]] = {
+    "ideal": _ideal_cameras,
+    "raw": _raw_cameras,
+    "rectified": _rectified_cameras,
+}
+"""How a rig becomes cameras, by the name of its grid."""

@@ -1,0 +1,1 @@
+"""IFC import: reinforcing bars of a building model as bars and meshes."""

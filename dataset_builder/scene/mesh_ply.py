@@ -1,0 +1,165 @@
+"""The ground-truth mesh file ``meshes/<scene>.ply``: one fixed binary layout, read strictly.
+
+Binary little-endian PLY: float64 vertices, int32 triangles and a ``ushort`` bar id per triangle (0: not
+steel), in the world frame (right-handed, z up, board at z = 0), metres. Equal arrays give equal bytes.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, Int32, Integer, UInt16
+from numpy import ndarray
+
+from rebar_depth_bench.atomic_io import replacing
+from rebar_depth_bench.errors import DatasetError
+
+COMMENT = (
+    "comment rebar-depth-bench mesh: world frame, right-handed, z up, board at z = 0;"
+    " unit metre; bar_id 0 is not steel"
+)
+_HEADER = """\
+ply
+format binary_little_endian 1.0
+{comment}
+element vertex {vertices}
+property double x
+property double y
+property double z
+element face {faces}
+property list uchar int vertex_indices
+property ushort bar_id
+end_header
+"""
+_VERTEX = np.dtype([("xyz", "<f8", (3,))])
+_FACE = np.dtype([("corners", "u1"), ("index", "<i4", (3,)), ("bar_id", "<u2")])
+# Far above any header in this layout; a file without `end_header` is not searched to its end.
+_HEADER_LIMIT = 1 << 16
+# Ten digits reach past int32, the widest vertex index: more is nonsense and never becomes a number.
+_HEADER_PATTERN = re.compile(
+    r"ply\nformat binary_little_endian 1\.0\n"
+    r"element vertex (\d{1,10})\nproperty double x\nproperty double y\nproperty double z\n"
+    r"element face (\d{1,10})\nproperty list uchar int vertex_indices\nproperty ushort bar_id\nend_header\n",
+    re.ASCII,
+)
+_COMMENTS = re.compile(r"^(?:comment|obj_info)(?: [^\n]*)?\n", re.MULTILINE)
+
+MeshArrays = tuple[Float64[ndarray, "v 3"], Int32[ndarray, "n 3"], UInt16[ndarray, " n"]]
+"""Vertices in metres, triangles, and each triangle's bar id."""
+
+
+def write_mesh_ply(
+    path: str | os.PathLike[str],
+    vertices_m: Float64[ndarray, "v 3"],
+    faces: Integer[ndarray, "n 3"],
+    face_bar_id: Integer[ndarray, " n"],
+) -> None:
+    """Write a world-frame mesh in metres as the dataset's PLY; the file appears whole or not at all.
+
+    Raises ``ValueError`` where the arrays are no mesh: wrong shape, a coordinate that is not finite, a
+    corner that no vertex answers to, a bar id outside 0..65535.
+    """
+    _check_arrays(vertices_m, faces, face_bar_id)
+    header = _HEADER.format(comment=COMMENT, vertices=len(vertices_m), faces=len(faces))
+    vertex_rows = np.empty(len(vertices_m), _VERTEX)
+    vertex_rows["xyz"] = vertices_m
+    face_rows = np.empty(len(faces), _FACE)
+    face_rows["corners"] = 3
+    face_rows["index"] = faces
+    face_rows["bar_id"] = face_bar_id
+    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
+        file.writelines((header.encode("ascii"), vertex_rows.data, face_rows.data))
+
+
+def read_mesh_ply(path: str | os.PathLike[str]) -> MeshArrays:
+    """Return vertices (v x 3 float64, world metres), triangles (n x 3 int32) and bar ids (n uint16).
+
+    Raises ``DatasetError`` where the file cannot be read or differs from this layout in any way.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{path}: the mesh cannot be read: {error.strerror or error}") from error
+    return parse_mesh_ply(content, str(path))
+
+
+def has_mesh_ply_header(content: bytes) -> bool:
+    """Tell whether ``content`` opens with this layout's header, comments aside."""
+    return _match_header(content) is not None
+
+
+def parse_mesh_ply(content: bytes, where: str) -> MeshArrays:
+    """Return what ``read_mesh_ply`` returns, from a file's bytes; ``where`` names them in errors.
+
+    Nothing is allocated on the header's word alone. Raises ``DatasetError``.
+    """
+    header = _match_header(content)
+    if header is None:
+        raise DatasetError(
+            f"{where}: not a mesh of this dataset: found a file that starts with {content[:40]!r}, expected "
+            "a binary little-endian PLY with double x y z, int vertex_indices and ushort bar_id"
+        )
+    vertex_count, face_count, start = header
+    faces_start = start + vertex_count * _VERTEX.itemsize
+    expected = faces_start + face_count * _FACE.itemsize
+    if len(content) != expected:
+        raise DatasetError(
+            f"{where}: truncated or damaged: {len(content)} bytes found, {expected} expected for the "
+            f"{vertex_count} vertices and {face_count} triangles of its header"
+        )
+    vertices = np.frombuffer(content, _VERTEX, vertex_count, start)["xyz"].astype(np.float64)
+    rows = np.frombuffer(content, _FACE, face_count, faces_start)
+    _check_rows(vertices, rows, where)
+    return vertices, rows["index"].astype(np.int32), rows["bar_id"].astype(np.uint16)
+
+
+def _match_header(content: bytes) -> tuple[int, int, int] | None:
+    """Return vertex count, face count and the header's length, or None where the header is another's."""
+    end_mark = b"\nend_header\n"
+    end = content.find(end_mark, 0, _HEADER_LIMIT)
+    if not content.startswith(b"ply\n") or end < 0:
+        return None
+    length = end + len(end_mark)
+    # Comments say nothing about the layout, wherever they stand and in whatever encoding.
+    match = _HEADER_PATTERN.fullmatch(_COMMENTS.sub("", content[:length].decode("latin-1")))
+    return (int(match[1]), int(match[2]), length) if match else None
+
+
+def _check_rows(vertices: Float64[ndarray, "v 3"], rows: ndarray, where: str) -> None:
+    """Raise ``DatasetError`` where the body is no triangle mesh."""
+    not_triangles = np.flatnonzero(rows["corners"] != 3)
+    if len(not_triangles):
+        row = not_triangles[0]
+        raise DatasetError(f"{where}: face {row} has {rows['corners'][row]} corners, expected 3")
+    index = rows["index"]
+    outside = np.flatnonzero(((index < 0) | (index >= len(vertices))).any(axis=1))
+    if len(outside):
+        row = outside[0]
+        raise DatasetError(
+            f"{where}: face {row} names vertices {index[row].tolist()}, expected 0 to {len(vertices) - 1}"
+        )
+    not_finite = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if len(not_finite):
+        row = not_finite[0]
+        raise DatasetError(f"{where}: vertex {row} is {vertices[row].tolist()}, expected finite metres")
+
+
+def _check_arrays(vertices_m: ndarray, faces: ndarray, face_bar_id: ndarray) -> None:
+    """Raise ``ValueError`` where the arrays cannot be written in this layout."""
+    if vertices_m.ndim != 2 or vertices_m.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise ValueError(f"vertices {vertices_m.shape} and faces {faces.shape}: expected (v, 3) and (n, 3)")
+    if face_bar_id.shape != faces.shape[:1]:
+        raise ValueError(f"bar ids {face_bar_id.shape}: expected one for each of the {len(faces)} faces")
+    if faces.dtype.kind not in "iu" or face_bar_id.dtype.kind not in "iu":
+        raise ValueError(f"faces {faces.dtype} and bar ids {face_bar_id.dtype}: expected integers")
+    if not np.isfinite(vertices_m).all():
+        raise ValueError("a vertex is not finite: expected metres")
+    if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices_m)):
+        raise ValueError(
+            f"faces name vertices {faces.min()} to {faces.max()}: expected 0 to {len(vertices_m) - 1}"
+        )
+    if face_bar_id.size and not (face_bar_id.min() >= 0 and face_bar_id.max() <= np.iinfo(np.uint16).max):
+        raise ValueError(f"bar ids {face_bar_id.min()} to {face_bar_id.max()}: expected 0 to 65535")

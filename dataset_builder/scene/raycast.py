@@ -1,0 +1,114 @@
+"""Exact ground truth: rays through pixel centres, cast against the scene's mesh.
+
+Embree decides which triangle a ray meets first; the depth is then the ray's meeting with that triangle's
+plane in float64. Embree's own float32 distance is off by up to 29 um at 16 m (field measurement).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Bool, Float32, Float64, Int32, UInt16
+from numpy import ndarray
+
+from dataset_builder.scene.model import WorldMesh
+from rebar_depth_bench.errors import BuildError
+from rebar_depth_bench.geometry.cameras import inverse_rigid
+
+_MISS = -1
+
+
+@dataclass(frozen=True, eq=False)
+class EyeTruth:
+    """One eye's ground truth: planar depth (metres, 0 where no surface), steel mask, bar ids (0: no steel)."""
+
+    depth_m: Float32[ndarray, "h w"]
+    mask: Bool[ndarray, "h w"]
+    bars: UInt16[ndarray, "h w"]
+
+
+@dataclass(frozen=True, eq=False)
+class RayHits:
+    """Where rays meet the mesh: range along the ray, metres (infinity: nowhere), and cosine of incidence (0)."""
+
+    range_m: Float64[ndarray, " n"]
+    cos_incidence: Float64[ndarray, " n"]
+
+
+class RayCaster:
+    """A scene's mesh, ready to be cast against from any camera."""
+
+    def __init__(self, mesh: WorldMesh) -> None:
+        a, b, c = np.moveaxis(mesh.vertices_m[mesh.faces], 1, 0)
+        self._normal = np.cross(b - a, c - a)
+        self._plane = np.einsum("ij,ij->i", self._normal, a)
+        self._face_bar_id = mesh.face_bar_id
+        self._origin_m = mesh.vertices_m.mean(axis=0)
+        self._scene = EmbreeScene(robust=True)
+        TriangleMesh(
+            self._scene,
+            np.ascontiguousarray(mesh.vertices_m - self._origin_m, dtype=np.float32),
+            np.ascontiguousarray(mesh.faces, dtype=np.int32),
+        )
+
+    def cast(self, rays_cam: Float64[ndarray, "h w 3"], cam_from_world: Float64[ndarray, "4 4"]) -> EyeTruth:
+        """Cast one ray per pixel; ``rays_cam`` has z = 1 in the camera frame, so its parameter is planar depth.
+
+        Any grid will do: ideal, distorted or rectified. Nothing is ever resampled.
+        """
+        height, width, _ = rays_cam.shape
+        world_from_cam = inverse_rigid(cam_from_world)
+        directions = rays_cam.reshape(-1, 3) @ world_from_cam[:3, :3].T
+        centre_m = world_from_cam[:3, 3]
+        face = self._first_face(centre_m, directions)
+        hit = face != _MISS
+        depth_m = np.zeros(len(face))
+        depth_m[hit] = self._plane_depth_m(centre_m, directions[hit], face[hit])
+        if not (np.isfinite(depth_m) & (depth_m >= 0)).all():
+            raise BuildError("a ray meets the plane of the face it hit nowhere or behind the camera")
+        bars = np.zeros(len(face), np.uint16)
+        bars[hit] = self._face_bar_id[face[hit]]
+        shape = (height, width)
+        return EyeTruth(
+            depth_m=depth_m.astype(np.float32).reshape(shape),
+            mask=bars.reshape(shape) > 0,
+            bars=bars.reshape(shape),
+        )
+
+    def hits(self, origins_m: Float64[ndarray, "n 3"], directions: Float64[ndarray, "n 3"]) -> RayHits:
+        """Return where each ray meets the mesh first; world frame, directions of any length.
+
+        As exact as ``cast``. The cosine is that of the angle to the face's normal, either side. A ray so much
+        along a face that its plane lies behind the origin or nowhere meets nothing.
+        """
+        face = self._first_face(origins_m, directions)
+        hit = np.flatnonzero(face != _MISS)
+        normal, along = self._normal[face[hit]], directions[hit]
+        cross = np.einsum("ij,ij->i", normal, along)
+        towards = self._plane[face[hit]] - np.einsum("ij,ij->i", normal, origins_m[hit])
+        met = cross * towards > 0
+        hit, cross, length = hit[met], cross[met], np.linalg.norm(along[met], axis=1)
+        range_m, cos_incidence = np.full(len(face), np.inf), np.zeros(len(face))
+        range_m[hit] = towards[met] / cross * length
+        cos_incidence[hit] = np.abs(cross) / (length * np.linalg.norm(normal[met], axis=1))
+        return RayHits(range_m, cos_incidence)
+
+    def _first_face(
+        self, centre_m: Float64[ndarray, "*n 3"], directions: Float64[ndarray, "n 3"]
+    ) -> Int32[ndarray, " n"]:
+        origins = np.broadcast_to((centre_m - self._origin_m).astype(np.float32), directions.shape)
+        found: Int32[ndarray, " n"] = self._scene.run(
+            np.ascontiguousarray(origins), directions.astype(np.float32), query="INTERSECT"
+        )
+        return found
+
+    def _plane_depth_m(
+        self, centre_m: Float64[ndarray, 3], directions: Float64[ndarray, "n 3"], face: Int32[ndarray, " n"]
+    ) -> Float64[ndarray, " n"]:
+        """Return the ray parameter at which each ray meets its face's plane: n . (a - c) / n . d."""
+        normal = self._normal[face]
+        towards = self._plane[face] - normal @ centre_m
+        return np.asarray(towards / np.einsum("ij,ij->i", normal, directions))

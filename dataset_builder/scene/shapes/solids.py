@@ -1,0 +1,90 @@
+"""Plain solids as closed triangle meshes, counter-clockwise from outside; world frame, metres."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from dataset_builder.scene.model import Mesh
+
+Point = tuple[float, float, float]
+
+_BOX_FACES = [
+    [0, 3, 2], [0, 1, 3],  # x low
+    [4, 7, 5], [4, 6, 7],  # x high
+    [0, 5, 1], [0, 4, 5],  # y low
+    [2, 7, 6], [2, 3, 7],  # y high
+    [0, 6, 4], [0, 2, 6],  # z low
+    [1, 7, 3], [1, 5, 7],  # z high
+]  # fmt: skip
+
+
+def box(low_m: Point, high_m: Point) -> Mesh:
+    """Return the box between two opposite corners."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
+    low, high = np.array(low_m), np.array(high_m)
+    return Mesh(low + corners * (high - low), np.array(_BOX_FACES, dtype=np.int32))
+
+
+def turned_box(middle_m: Point, size_m: Point, turn_deg: float) -> Mesh:
+    """Return a box of ``size_m`` about ``middle_m``, turned about the vertical."""
+    half = np.array(size_m) / 2
+    upright = box((-half[0], -half[1], -half[2]), (half[0], half[1], half[2]))
+    return placed(upright, about_z(turn_deg), middle_m)
+
+
+def cylinder(foot_m: Point, radius_m: float, height_m: float, segments: int = 64) -> Mesh:
+    """Return an upright cylinder on ``foot_m``, the middle of its lower face."""
+    angle = np.arange(segments) * 2 * np.pi / segments
+    rim = radius_m * np.stack([np.cos(angle), np.sin(angle), np.zeros(segments)], axis=1)
+    up = np.array([0.0, 0.0, height_m])
+    vertices = np.array(foot_m) + np.concatenate([rim, rim + up, [np.zeros(3), up]])
+    here = np.arange(segments)
+    beside = (here + 1) % segments
+    faces = np.concatenate(
+        [
+            np.stack([here, beside, beside + segments], axis=1),
+            np.stack([here, beside + segments, here + segments], axis=1),
+            np.stack([np.full(segments, 2 * segments), beside, here], axis=1),
+            np.stack([np.full(segments, 2 * segments + 1), here + segments, beside + segments], axis=1),
+        ]
+    )
+    return Mesh(vertices, faces.astype(np.int32))
+
+
+def lathe(profile_m: Float64[ndarray, "n 2"], segments: int = 32) -> Mesh:
+    """Return the solid that a closed outline of (radius, height) points draws when it turns about the z axis.
+
+    The outline runs counter-clockwise with the radius to the right and the height up, its first point not
+    repeated; every radius is positive.
+    """
+    count = len(profile_m)
+    angle = np.arange(segments)[:, None] * 2 * np.pi / segments
+    radius, height = profile_m[:, 0], np.broadcast_to(profile_m[:, 1], (segments, count))
+    vertices = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1).reshape(-1, 3)
+    turn, point = (grid.ravel() for grid in np.meshgrid(np.arange(segments), np.arange(count), indexing="ij"))
+    here, up = turn * count + point, turn * count + (point + 1) % count
+    beside, beside_up = (np.roll(corner, -count) for corner in (here, up))
+    faces = np.concatenate([np.stack([here, beside, beside_up], 1), np.stack([here, beside_up, up], 1)])
+    return Mesh(vertices, faces.astype(np.int32))
+
+
+def placed(mesh: Mesh, world_from_local: Float64[ndarray, "3 3"], at_m: Point | Float64[ndarray, " 3"]) -> Mesh:
+    """Return ``mesh`` turned by a rotation matrix and then moved so that its origin is ``at_m``."""
+    return Mesh(mesh.vertices_m @ world_from_local.T + np.asarray(at_m), mesh.faces)
+
+
+def about_z(turn_deg: float) -> Float64[ndarray, "3 3"]:
+    """Return the rotation matrix of a turn about the vertical, counter-clockwise from above."""
+    cosine, sine = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
+def joined(meshes: Sequence[Mesh]) -> Mesh:
+    """Return several meshes as one, in order."""
+    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    return Mesh(np.concatenate([mesh.vertices_m for mesh in meshes]), np.concatenate(faces).astype(np.int32))

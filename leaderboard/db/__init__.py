@@ -1,0 +1,1 @@
+"""Database: models, engine, migrations, and queries of submissions, jobs and rankings."""

@@ -1,0 +1,1 @@
+"""Scoring of accepted archives: workers, the sandboxed scoring process, and dask."""

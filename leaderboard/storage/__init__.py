@@ -1,0 +1,1 @@
+"""Storage on disk and elsewhere: submission archives, work directories, backups."""

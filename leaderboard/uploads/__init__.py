@@ -1,0 +1,1 @@
+"""Uploads: multipart parsing, validation in a child process, acceptance."""

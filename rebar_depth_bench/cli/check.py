@@ -1,0 +1,29 @@
+"""``rebar-bench check``."""
+
+from __future__ import annotations
+
+import argparse
+
+from rebar_depth_bench.cli.arguments import add_archive, add_data
+from rebar_depth_bench.cli.console import ProgressBars
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.errors import SubmissionError
+from rebar_depth_bench.submission import check_archive
+
+SUMMARY = "say everything that is wrong with an archive"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    add_archive(parser)
+    add_data(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Check an archive; raise ``SubmissionError`` with every problem."""
+    expected = open_folder(options.data).expected_views()
+    with ProgressBars() as bars:
+        problems = check_archive(options.archive, expected, bars.update)
+    if problems:
+        raise SubmissionError(str(options.archive), problems)
+    print(f"{options.archive}: no problem found")

@@ -1,0 +1,44 @@
+"""``rebar-bench compare``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from rich.console import Console
+
+from rebar_depth_bench.atomic_io import write_text
+from rebar_depth_bench.cli.arguments import add_data, add_file, add_workers
+from rebar_depth_bench.cli.console import ProgressBars
+from rebar_depth_bench.reporting.comparison_tables import comparison_csv, print_comparison
+from rebar_depth_bench.scoring.comparison import compare
+from rebar_depth_bench.scoring.score import score
+
+SUMMARY = "paired differences of submissions, with intervals"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    parser.add_argument("first", metavar="A", help="the archive that the others are compared with")
+    parser.add_argument("others", metavar="B", nargs="+", help="one or more archives")
+    add_data(parser)
+    add_file(parser, "--json", "write the differences as JSON")
+    add_file(parser, "--csv", "write the differences as CSV")
+    add_workers(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Score all archives, compare each with the first, write and print the differences."""
+    with ProgressBars() as bars:
+        first, *others = (
+            score(archive, options.data, workers=options.workers, progress=bars.update)
+            for archive in (options.first, *options.others)
+        )
+    comparisons = [compare(first, other) for other in others]
+    if options.json:
+        content = [comparison.to_dict() for comparison in comparisons]
+        write_text(options.json, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    if options.csv:
+        write_text(options.csv, comparison_csv(comparisons))
+    for comparison in comparisons:
+        print_comparison(comparison, Console())

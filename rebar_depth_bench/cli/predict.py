@@ -1,0 +1,53 @@
+"""``rebar-bench predict``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from rebar_depth_bench.cli.arguments import add_data
+from rebar_depth_bench.cli.console import ProgressBars
+from rebar_depth_bench.methods import METHODS, find_method
+from rebar_depth_bench.methods.registry import LOCATED
+from rebar_depth_bench.methods.runner import predict
+
+SUMMARY = "run a method over a dataset into an archive"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    names = (
+        f"{', '.join(METHODS)}, an installed package's, or one from elsewhere: my_model.py:METHOD, my_model.toml "
+        "(an ONNX model), hf:ORG/NAME (a checkpoint of transformers), NAME:FOLDER (own weights of "
+        f"{', '.join(LOCATED)})"
+    )
+    parser.set_defaults(interrupted="interrupted; the same command goes on where it was")
+    parser.add_argument("method", metavar="METHOD", help=names)
+    add_data(parser)
+    parser.add_argument("--out", required=True, type=Path, metavar="ARCHIVE", help="the zip to write")
+    parser.add_argument(
+        "--config", nargs="+", action="extend", metavar="NAME", help="which configs (default: all of the folder)"
+    )
+
+
+def in_words(value: object) -> str:
+    """Return a note's plain JSON value in one line for people."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key.replace('_', ' ')} {in_words(one)}" for key, one in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(in_words, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Predict and print where the archive is."""
+    method = find_method(options.method)
+    info = method.info
+    print(f"{info.name}: {info.summary}; from {info.source}; licence {info.licence}", file=sys.stderr)
+    with ProgressBars() as bars:
+        prepared = predict(method, options.data, options.out, configs=options.config, progress=bars.update)
+    for config, found in prepared.items():
+        for key, value in found.notes.items():
+            print(f"{config}: {key.replace('_', ' ')}: {in_words(value)}", file=sys.stderr)
+    print(options.out)

@@ -1,0 +1,67 @@
+"""``rebar-bench score``."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+
+from rich.console import Console
+
+from rebar_depth_bench.atomic_io import write_bytes, write_text
+from rebar_depth_bench.cli.arguments import add_archive, add_data, add_file, add_workers
+from rebar_depth_bench.cli.console import ProgressBars
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.extended.evaluate import score_extended
+from rebar_depth_bench.reporting import VIEWS_SHOWN, write_report
+from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
+from rebar_depth_bench.reporting.tables import print_table, result_csv
+from rebar_depth_bench.scoring.score import score
+
+SUMMARY = "score a submission archive: native beside scaled"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    add_archive(parser)
+    add_data(parser)
+    add_file(parser, "--json", "write the result as JSON")
+    add_file(parser, "--html", "write a self-contained report")
+    parser.add_argument(
+        "--html-views",
+        type=int,
+        default=VIEWS_SHOWN,
+        metavar="N",
+        help="views of each config in pictures (default: %(default)s)",
+    )
+    add_file(parser, "--csv", "write the tables as CSV")
+    parser.add_argument(
+        "--extended",
+        action="store_true",
+        help="also boundary, point clouds, layers, inspection bar by bar, other alignments",
+    )
+    add_file(parser, "--extended-csv", "write these as CSV (implies --extended)")
+    add_workers(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Score, write what is asked for, print the tables."""
+    if options.html_views < 0:
+        raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
+    with ProgressBars() as bars:
+        result = score(options.archive, options.data, workers=options.workers, progress=bars.update)
+        if options.extended or options.extended_csv:
+            extended = score_extended(
+                result, options.archive, options.data, workers=options.workers, progress=bars.update
+            )
+            result = replace(result, extended=extended)
+    if options.json:
+        write_bytes(options.json, result.to_json())
+    if options.csv:
+        write_text(options.csv, result_csv(result))
+    if options.extended_csv:
+        write_text(options.extended_csv, extended_csv(result))
+    if options.html:
+        write_report(result, options.archive, options.data, options.html, views_shown=options.html_views)
+    print_table(result, Console())
+    if result.extended is not None:
+        print_extended(result.extended, Console())

@@ -1,0 +1,219 @@
+"""``load``: a config of a dataset folder through plain ``datasets``, its rows decoded to numpy.
+
+The columns of a dataset row and how ``datasets`` is told of them.
+
+All views of one config, as a method that needs more than one at once sees them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, overload
+
+import datasets
+import numpy as np
+import pyarrow as pa
+from datasets import Dataset, Features, Image, IterableDataset, List, Value
+from datasets.exceptions import DatasetGenerationError, DatasetsError
+
+from rebar_depth_bench.data import codecs
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
+
+EYES = ("left", "right")
+
+
+def _matrix(rows: int, columns: int) -> List:
+    return List(List(Value("float64"), length=columns), length=rows)
+
+
+def features(*, decode_images: bool = True) -> Features:
+    """Return the features of a row, in the order of the contract's table.
+
+    ``decode_images=False`` leaves image columns as their encoded bytes.
+    """
+    image = Image(decode=decode_images)
+    columns: dict[str, object] = {"view_id": Value("string")}
+    for kind, feature in (("rgb", image), ("depth", Value("binary")), ("mask", image), ("bars", image)):
+        columns |= {f"{eye}_{kind}": feature for eye in EYES}
+    columns["left_preview"] = image
+    columns |= {f"{eye}_K": _matrix(3, 3) for eye in EYES}
+    columns |= {f"{eye}_distortion": List(Value("float64"), length=5) for eye in EYES}
+    columns |= {f"{eye}_cam_from_world": _matrix(4, 4) for eye in EYES}
+    columns["baseline_m"] = Value("float64")
+    return Features(columns)
+
+
+COLUMN_MEANINGS: dict[str, str] = {
+    "view_id": "`<config>/<0000>`: the view's index in its full protocol, also when a subset is built",
+    "rgb": "lossless 8-bit colour, H x W, WebP",
+    "depth": "lossless float32 planar depth along the optical axis, metres, 0.0 where there is no surface; "
+    'TIFF, which `Image(mode="F")` of `datasets` reads too',
+    "mask": "1-bit: steel, rim included",
+    "bars": "16-bit: the bar's id as in `bars.parquet`, 0 where no steel",
+    "preview": "8-bit colour-mapped depth, for people and the Hub viewer",
+    "K": "3 x 3 pinhole matrix, pixels; pixel centres at integer coordinates",
+    "distortion": "k1 k2 p1 p2 k3 (OpenCV), zeros where the grid has none",
+    "cam_from_world": "4 x 4 rigid pose: `x_cam = cam_from_world @ x_world`; OpenCV axes, metres",
+    "baseline_m": "metres between the two camera centres; along the left one's x axis except on a raw grid",
+}
+"""What a column holds, by its name or its kind (the name without the eye)."""
+
+
+def column_kind(name: str) -> str:
+    """Return a column's kind: its name without the eye it belongs to."""
+    eye, _, kind = name.partition("_")
+    return kind if eye in EYES else name
+
+
+SPLIT = "test"
+
+
+def _image_bytes(decode: Callable[[bytes], Any]) -> Callable[[Mapping[str, Any]], Any]:
+    return lambda cell: decode(cell["bytes"])
+
+
+def _float64(cell: object) -> Any:
+    return np.asarray(cell, dtype=np.float64)
+
+
+_DECODERS: Mapping[str, Callable[[Any], Any]] = {
+    "rgb": _image_bytes(codecs.decode_rgb),
+    "depth": codecs.decode_depth,
+    "mask": _image_bytes(codecs.decode_mask),
+    "bars": _image_bytes(codecs.decode_bars),
+    "preview": _image_bytes(codecs.decode_rgb),
+    "K": _float64,
+    "distortion": _float64,
+    "cam_from_world": _float64,
+}
+"""How a cell of each kind of column is decoded; a column's kind is its name without the eye."""
+
+
+@overload
+def load(
+    root: str | Path, config: str, *, streaming: Literal[False] = False, columns: Sequence[str] | None = None
+) -> Dataset: ...
+
+
+@overload
+def load(
+    root: str | Path, config: str, *, streaming: Literal[True], columns: Sequence[str] | None = None
+) -> IterableDataset: ...
+
+
+def load(
+    root: str | Path, config: str, *, streaming: bool = False, columns: Sequence[str] | None = None
+) -> Dataset | IterableDataset:
+    """Load a config of a dataset folder or Hub repository.
+
+    Rows are dicts with the contract's columns decoded: colour uint8 H x W x 3, depth float32 H x W (planar,
+    metres, 0 where no surface), masks bool H x W, bar ids uint16 H x W, K float64 3 x 3 in pixels, distortion
+    float64 5, poses float64 4 x 4. ``columns`` keeps only the named ones, which saves decoding the others.
+    With ``streaming`` rows come one by one from an ``IterableDataset`` and nothing is copied to the cache.
+
+    Raises ``DatasetError`` for a folder, config or column that does not exist.
+    """
+    undecoded = load_undecoded(root, config, streaming=streaming, columns=columns)
+    if isinstance(undecoded, IterableDataset):
+        return undecoded.map(decode_row)
+    return undecoded.with_transform(decode_batch)
+
+
+def load_undecoded(
+    root: str | Path, config: str, *, streaming: bool, columns: Sequence[str] | None
+) -> Dataset | IterableDataset:
+    """Load a config whose image and depth cells are still bytes, for ``decode_row``. Raises as ``load`` does."""
+    open_folder(root).config(config)
+    kept = _checked_columns(columns)
+    try:
+        loaded = datasets.load_dataset(str(root), config, split=SPLIT, streaming=streaming)
+    except (DatasetsError, DatasetGenerationError, OSError, pa.ArrowException) as error:
+        raise DatasetError(f"{root}: config {config} cannot be loaded: {error}") from error
+    selected = loaded.select_columns(list(kept))
+    for name in kept:
+        if isinstance(selected.features[name], Image):
+            selected = selected.cast_column(name, Image(decode=False))  # a change of reading, not of data
+    return selected
+
+
+def iterate(root: str | Path, config: str, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield a config's decoded rows one by one, nothing cached. Raises ``DatasetError`` for damaged shards."""
+    rows = iter(load(root, config, streaming=True, columns=columns))
+    while True:
+        try:
+            row = next(rows)
+        except StopIteration:
+            return
+        except (OSError, pa.ArrowException, DatasetsError) as error:
+            raise DatasetError(f"{root}: config {config} cannot be read: {error}") from error
+        yield row
+
+
+def decode_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Decode the cells of one row whose images are still bytes."""
+    return {name: _decoder(name)(cell) for name, cell in row.items()}
+
+
+def decode_batch(batch: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
+    """Decode a dict of columns, as ``datasets`` hands it to a transform."""
+    return {name: [_decoder(name)(cell) for cell in cells] for name, cells in batch.items()}
+
+
+def _decoder(column: str) -> Callable[[Any], Any]:
+    return _DECODERS.get(column_kind(column), _as_it_is)
+
+
+def _as_it_is(cell: Any) -> Any:
+    return cell
+
+
+def _checked_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
+    known = tuple(features())
+    if columns is None:
+        return known
+    unknown = [name for name in columns if name not in known]
+    if unknown:
+        raise DatasetError(f"no column {', '.join(map(repr, unknown))}, expected some of {', '.join(known)}")
+    return tuple(columns)
+
+
+@dataclass(frozen=True)
+class ConfigViews:
+    """One config of a dataset folder."""
+
+    folder: DatasetFolder
+    config: str
+
+    @property
+    def view_ids(self) -> tuple[str, ...]:
+        """The views' ids, in order."""
+        return tuple(view.view_id for view in self.folder.views(self.config))
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """(height, width) of the pictures, pixels."""
+        return self.folder.grid(self.config)
+
+    @property
+    def board(self) -> BoardSpec | None:
+        """The board under the assembly, None where there is none. Raises ``DatasetError`` for a damaged one."""
+        board = self.folder.config(self.config)["scene"].get("board")
+        try:
+            return None if board is None else BoardSpec(**board)
+        except TypeError as error:
+            raise DatasetError(
+                f"{self.folder.root}: config {self.config}: the board is damaged: {error}"
+            ) from None
+
+    @property
+    def mesh(self) -> Path:
+        """The PLY file of the scene's mesh, which is ground truth. Raises ``DatasetError`` if it is not there."""
+        return self.folder.file(self.folder.config(self.config)["mesh"])
+
+    def rows(self, *columns: str) -> Iterator[dict[str, Any]]:
+        """Yield ``view_id`` and the named columns of every view, decoded, one by one, in order."""
+        return iterate(self.folder.root, self.config, ("view_id", *columns))

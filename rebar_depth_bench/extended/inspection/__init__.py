@@ -1,0 +1,1 @@
+"""Inspection measures: cylinders fitted to bars, spacings, tolerances."""

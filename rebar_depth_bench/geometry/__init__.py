@@ -1,0 +1,1 @@
+"""Camera geometry: projection, calibration, rectification, ArUco boards."""

@@ -1,0 +1,94 @@
+"""Factory calibration of a stereo camera: two lenses with distortion and the rigid motion between them.
+
+Read from a Stereolabs ``.conf`` file or from TOML; scaled to another grid of the same sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from rebar_depth_bench.errors import CalibrationError
+from rebar_depth_bench.geometry.calibration_formats import parse_conf, parse_toml
+from rebar_depth_bench.geometry.stereo_calibration import (
+    StereoCalibration,
+    check_invertible,
+    scaled,
+)
+
+MAX_FILE_BYTES = 1_000_000
+"""A calibration has a few kilobytes; what is larger is something else."""
+
+Parser = Callable[[str, int, int, list[str]], StereoCalibration | None]
+PARSERS: Mapping[str, Parser] = {".conf": parse_conf, ".toml": parse_toml}
+
+
+def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibration:
+    """Read a stereo calibration for a ``width`` x ``height`` grid, from ``.conf`` or ``.toml``.
+
+    ``.conf`` is Stereolabs' INI file: sections ``LEFT_CAM_2K``, ``_FHD``, ``_HD``, ``_VGA`` (and ``RIGHT_CAM_``)
+    with fx fy cx cy k1 k2 and, if given, p1 p2 k3; ``STEREO`` with Baseline, TY, TZ (millimetres; 0 where TY or
+    TZ is missing) and RX, CV, RZ (radians), each with the section's suffix or without. Read are the asked grid's
+    own sections, or else those nearest in shape and then in width, ``scaled`` as if both saw the same sensor area.
+    The motion is ``x_right = R x_left + T`` with R = Rodrigues(RX, CV, RZ) and T = -(Baseline, TY, TZ): the whole
+    vector is negated, which keeps it on the line that the vendor's rectification uses.
+
+    TOML, where ``K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` may stand for the four numbers, ``rotation`` may be
+    3 x 3, and ``baseline_m = 0.12`` may stand for ``translation_m = [-0.12, 0, 0]``::
+
+        width = 1280    # the grid the lenses belong to; the asked one where it is missing
+        height = 720
+
+        [left]
+        fx = 701.88
+        fy = 701.70
+        cx = 641.285    # pixel centres at integers
+        cy = 344.1835
+        distortion = [-0.175286, 0.0283094, 6.68e-5, -1.50e-4, 1e-10]    # k1 k2 p1 p2, and k3 if known
+
+        [right]
+        K = [[700.965, 0, 633.515], [0, 701.11, 359.3135], [0, 0, 1]]
+        distortion = [-0.172795, 0.0265223, 1.64e-4, 1.02e-5]
+
+        [stereo]        # x_right = R x_left + T
+        rotation = [-9.17e-4, 6.24e-3, 7.70e-4]    # Rodrigues vector, radians
+        translation_m = [-0.119978, 0.0, 0.0]
+
+    Raises ``CalibrationError`` with every problem found, each naming section and key, what stands there and what
+    was expected; also for a lens model that cannot be inverted all over the picture.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in PARSERS:
+        raise CalibrationError(str(path), [f"its name ends on {path.suffix!r}, expected {' or '.join(PARSERS)}"])
+    problems: list[str] = []
+    read = PARSERS[path.suffix.lower()](_text(path), width, height, problems)
+    if read is not None and not problems:
+        _check_rig(read, problems)
+    if read is None or problems:
+        raise CalibrationError(str(path), problems)
+    return scaled(read, width, height)
+
+
+def _text(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise CalibrationError(str(path), [f"it cannot be read: {error.strerror}"]) from error
+    if len(content) > MAX_FILE_BYTES:
+        raise CalibrationError(str(path), [f"it is larger than {MAX_FILE_BYTES} bytes, expected a calibration"])
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise CalibrationError(str(path), [f"it is no UTF-8 text: byte {error.start} is none of it"]) from error
+
+
+def _check_rig(calibration: StereoCalibration, problems: list[str]) -> None:
+    x_m, y_m, z_m = calibration.translation_m
+    if max(abs(y_m), abs(z_m)) > abs(x_m) / 2:
+        problems.append(f"the right eye stands {(-x_m, -y_m, -z_m)} m from the left, expected mostly along x")
+    for eye, lens in (("left", calibration.left), ("right", calibration.right)):
+        try:
+            check_invertible(lens, calibration.width, calibration.height)
+        except ValueError as error:
+            problems.append(f"the {eye} lens reaches no ray at the rim of its picture: {error}")

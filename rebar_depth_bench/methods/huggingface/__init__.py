@@ -1,0 +1,1 @@
+"""Depth checkpoints that run through ``transformers``."""

@@ -1,0 +1,1 @@
+"""Monocular networks that run through their authors' own packages."""

@@ -1,0 +1,1 @@
+"""Depth models stored as ONNX files and described by a TOML file."""

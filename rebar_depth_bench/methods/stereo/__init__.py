@@ -1,0 +1,1 @@
+"""Stereo methods: disparity on a rectified pair, converted to depth."""

@@ -1,0 +1,151 @@
+"""Inline SVG charts: native against scaled error, scale factors, error by view.
+
+Colours are the page's CSS classes (``native``, ``scaled``, ``axis``, ...), so that the charts follow light
+and dark. Many points of one kind are one path of zero-length round strokes: a tenth of the bytes of circles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+from markupsafe import Markup
+
+from rebar_depth_bench.reporting.charts.axes import (
+    WIDTH,
+    LogAxis,
+    decade_axis,
+    label,
+    svg_figure,
+    svg_text,
+    unit_axis,
+)
+from rebar_depth_bench.reporting.formatting import number, printable, scale_cell
+from rebar_depth_bench.scoring.result import Table, ViewScore
+
+_LEFT, _RIGHT = 14.0, WIDTH - 14.0
+_ROW = 50
+_GOLDEN = 0.6180339887498949
+_BOTH = ("native.abs_rel", "scaled.abs_rel")
+
+
+def alignment_chart(tables: Mapping[str, Table]) -> Markup:
+    """Return AbsRel per config, native (disc) joined to scaled (ring), with intervals, on a logarithmic axis."""
+    both = {name: (table.native, table.scaled) for name, table in tables.items()}
+    values = [metrics.abs_rel for pair in both.values() for metrics in pair if metrics]
+    values += [end for table in tables.values() for key in _BOTH for end in table.intervals.get(key) or ()]
+    axis = decade_axis(values, _LEFT, _RIGHT)
+    rows = []
+    for index, (name, (native, scaled)) in enumerate(both.items()):
+        y = _row_y(index)
+        if native is None or scaled is None:
+            rows.append(_row_title(name, "no prediction", y))
+            continue
+        x = [axis.at(metrics.abs_rel) for metrics in (native, scaled)]
+        numbers = f"{number(native.abs_rel, 4)} → {number(scaled.abs_rel, 4)} scaled"
+        rows.append(_row_title(name, numbers, y))
+        rows.append(f'<path class="link" d="M{x[0]:.1f} {y}H{x[1]:.1f}"/>')
+        rows += [_interval_bar(tables[name].intervals.get(key), axis, y, key.partition(".")[0]) for key in _BOTH]
+        rows.append(f'<circle class="native fill" cx="{x[0]:.1f}" cy="{y}" r="6"/>')
+        rows.append(f'<circle class="scaled ring" cx="{x[1]:.1f}" cy="{y}" r="5"/>')
+    bottom = _row_y(len(both)) - 20
+    body = _vertical_grid(axis, bottom) + "".join(rows)
+    description = "AbsRel of each config, native and after the oracle scale: " + _spoken(tables, _both_errors)
+    return svg_figure("Native and scaled AbsRel by config", description, bottom + 22, body)
+
+
+def scale_chart(tables: Mapping[str, Table], views: Mapping[str, Sequence[ViewScore]]) -> Markup:
+    """Return the scale factor of every view, a strip per config, with its median and the line s = 1."""
+    scales = {name: [v.scale for v in views.get(name, ()) if v.scale is not None] for name in tables}
+    axis = unit_axis([scale for strip in scales.values() for scale in strip], _LEFT, _RIGHT)
+    bottom = _row_y(len(tables)) - 20
+    rows = [f'<path class="one" d="M{axis.at(1.0):.1f} 14V{bottom}"/>']
+    for index, (name, strip) in enumerate(scales.items()):
+        y = _row_y(index)
+        points = [(axis.at(s), y - 9 + 18 * (i * _GOLDEN % 1)) for i, s in enumerate(strip)]
+        rows.append(_row_title(name, f"median s {scale_cell(tables[name].scale_median)}", y))
+        rows.append(_dots(points, "points"))
+        rows.append(_median_mark(tables[name].scale_median, axis, y))
+    description = (
+        "Scale factor s = median(z)/median(p) of every view: 1 is metric, below 1 the prediction is too far. "
+        + _spoken(tables, lambda table: f"median {scale_cell(table.scale_median)}")
+    )
+    return svg_figure(
+        "Scale factor of each view", description, bottom + 22, _vertical_grid(axis, bottom) + "".join(rows)
+    )
+
+
+def views_chart(config: str, views: Sequence[ViewScore]) -> Markup:
+    """Return AbsRel of every view in protocol order, native and scaled; views without prediction on top."""
+    top, bottom, left = 26.0, 170.0, 52.0
+    errors = [m.abs_rel for view in views for m in (view.native, view.scaled) if m]
+    axis = decade_axis(errors, bottom, top)
+    x = [left + 6 + (_RIGHT - left - 12) * (i + 0.5) / max(len(views), 1) for i in range(len(views))]
+    native = [(at, axis.at(v.native.abs_rel)) for at, v in zip(x, views, strict=True) if v.native]
+    scaled = [(at, axis.at(v.scaled.abs_rel)) for at, v in zip(x, views, strict=True) if v.scaled]
+    missing = "".join(f"M{at:.1f} 8v10" for at, v in zip(x, views, strict=True) if v.native is None)
+    body = _horizontal_grid(axis, left) + _dots(scaled, "scaled points") + _dots(native, "native points")
+    body += f'<path class="missing" d="{missing}"/>' if missing else ""
+    body += svg_text(left + 6, bottom + 18, "first view") + svg_text(_RIGHT, bottom + 18, "last view", "end")
+    without = sum(view.native is None for view in views)
+    description = f"AbsRel of the {len(views)} views of {printable(config)}, {without} without any prediction."
+    return svg_figure(f"AbsRel by view, {printable(config)}", description, bottom + 26, body)
+
+
+def _row_y(index: int) -> int:
+    return 42 + index * _ROW
+
+
+def _row_title(name: str, numbers: str, y: float) -> str:
+    """Return a row's name on the left and its numbers on the right, above the row's marks."""
+    return svg_text(_LEFT, y - 17, printable(name), "start name") + svg_text(_RIGHT, y - 17, numbers, "end")
+
+
+def _vertical_grid(axis: LogAxis, bottom: float) -> str:
+    lines = "".join(f"M{axis.at(tick):.1f} 10V{bottom:g}" for tick in axis.ticks())
+    labels = "".join(svg_text(round(axis.at(t), 1), bottom + 15, label(t), _anchor(axis, t)) for t in axis.ticks())
+    return f'<path class="axis" d="{lines}"/>{labels}'
+
+
+def _anchor(axis: LogAxis, tick: float) -> str:
+    """Return where a tick's label hangs so that none leaves the picture."""
+    x = axis.at(tick)
+    if x < _LEFT + 14:
+        return "start"
+    return "end" if x > _RIGHT - 14 else "middle"
+
+
+def _horizontal_grid(axis: LogAxis, left: float) -> str:
+    lines = "".join(f"M{left:g} {axis.at(tick):.1f}H{_RIGHT:g}" for tick in axis.ticks())
+    labels = "".join(svg_text(left - 6, round(axis.at(t) + 4, 1), label(t), "end") for t in axis.ticks())
+    return f'<path class="axis" d="{lines}"/>{labels}'
+
+
+def _dots(points: Sequence[tuple[float, float]], classes: str) -> str:
+    if not points:
+        return ""
+    path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
+    return f'<path class="{classes}" d="{path}"/>'
+
+
+def _median_mark(scale: float | None, axis: LogAxis, y: float) -> str:
+    if scale is None or not math.isfinite(scale):
+        return ""
+    return f'<path class="median" d="M{axis.at(scale):.1f} {y - 12}v24"/>'
+
+
+def _interval_bar(interval: tuple[float, float] | None, axis: LogAxis, y: float, kind: str) -> str:
+    """Return a config's interval as a broad pale bar behind its mark."""
+    if interval is None:
+        return ""
+    low, high = (axis.at(end) for end in interval)
+    return f'<path class="{kind} interval" d="M{low:.1f} {y}H{high:.1f}"/>'
+
+
+def _both_errors(table: Table) -> str:
+    native, scaled = (m.abs_rel if m else None for m in (table.native, table.scaled))
+    return f"native {number(native, 4)}, scaled {number(scaled, 4)}"
+
+
+def _spoken(tables: Mapping[str, Table], words: Callable[[Table], str]) -> str:
+    return "; ".join(f"{printable(name)}: {words(table)}" for name, table in tables.items()) + "."

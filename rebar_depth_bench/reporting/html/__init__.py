@@ -1,0 +1,1 @@
+"""HTML reports: pages, their sections, templates and scripts."""

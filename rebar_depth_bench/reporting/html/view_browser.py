@@ -1,0 +1,106 @@
+"""The views that the page shows in pictures: which of them, in what order, and what stands beside each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.reporting.formatting import printable
+from rebar_depth_bench.reporting.html.rows import Row, view_row
+from rebar_depth_bench.reporting.html.view_images import ViewImages, ViewPanels, view_images
+from rebar_depth_bench.scoring.result import ViewScore, badness
+from rebar_depth_bench.submission import config_of
+
+VIEWS_SHOWN = 12
+"""Views of a config in a page: about 150 kB each at 1280 x 720."""
+
+
+@dataclass(frozen=True)
+class ShownView:
+    """One view in pictures: its numbers, images and what their colour bars say; ``label`` names its thumbnail."""
+
+    config: str
+    label: str
+    row: Row
+    images: ViewImages
+    near: str
+    far: str
+    predicted: str
+    off_scale: bool
+    native_limit: str
+    scaled_limit: str
+
+
+@dataclass(frozen=True)
+class ShownCount:
+    """How many of a config's views are shown."""
+
+    config: str
+    shown: int
+    views: int
+
+    @property
+    def partly(self) -> bool:
+        """Return whether some of the views are not shown."""
+        return self.shown < self.views
+
+
+def views_to_show(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
+    """Return ``count`` views, worst first: half of them the very worst, the rest evenly from there to the best.
+
+    All where there are no more than ``count``; a view without a value is worst. Raises ``InputError`` where
+    ``count`` is negative.
+    """
+    if count < 0:
+        raise InputError(f"views to show: {count}, expected 0 or more of each config")
+    worst_first = sorted(views, key=badness, reverse=True)
+    if len(worst_first) <= count:
+        return worst_first
+    worst = (count + 1) // 2
+    rest, spread = worst_first[worst:], count - worst
+    return worst_first[:worst] + [rest[(n + 1) * len(rest) // spread - 1] for n in range(spread)]
+
+
+def shown_views(panels: Iterable[ViewPanels], configs: Sequence[str]) -> list[ShownView]:
+    """Return the encoded views: configs in the order of ``configs``, in each the worst view first."""
+    encoded = [(_order(view, configs), _shown(view)) for view in panels]
+    return [view for _, view in sorted(encoded, key=lambda pair: pair[0])]
+
+
+def counted(shown: Sequence[ShownView], views: Mapping[str, int]) -> list[ShownCount]:
+    """Return how many views are shown of each config that has any, from all configs' numbers of ``views``."""
+    names = [view.config for view in shown]
+    counts = [ShownCount(printable(name), names.count(printable(name)), total) for name, total in views.items()]
+    return [count for count in counts if count.shown]
+
+
+def _order(view: ViewPanels, configs: Sequence[str]) -> tuple[int, float, str]:
+    config = config_of(view.view_id)
+    return (configs.index(config) if config in configs else len(configs), -badness(view.score), view.view_id)
+
+
+def _shown(view: ViewPanels) -> ShownView:
+    images = view_images(view)
+    predicted = images.predicted_m
+    row = view_row(view.score)
+    return ShownView(
+        config=printable(config_of(view.view_id)),
+        label=f"{row.name}\n{row.native[0].text}",
+        row=row,
+        images=images,
+        near=_metres(images.near_m),
+        far=_metres(images.far_m),
+        predicted=f"{_metres(predicted[0])} to {_metres(predicted[1])}" if predicted else "",
+        off_scale=predicted is not None and (predicted[0] > images.far_m or predicted[1] < images.near_m),
+        native_limit=_centimetres(images.native_limit_cm),
+        scaled_limit=_centimetres(images.scaled_limit_cm),
+    )
+
+
+def _metres(value: float) -> str:
+    return f"{value:#.3g} m" if 0.01 <= abs(value) < 1000 else f"{value:.3g} m"
+
+
+def _centimetres(value: float | None) -> str:
+    return "" if value is None else f"{value:g} cm"

@@ -1,0 +1,220 @@
+"""The images of one view: colour, both depths on one scale, error as it stands and after scaling.
+
+Pure functions from arrays to encoded images; colours come from ``rebar_depth_bench.reporting.colormap``.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from numpy import ndarray
+from PIL import Image
+
+from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS, positions, robust_range
+from rebar_depth_bench.scoring.protocol import scored_pixels
+from rebar_depth_bench.scoring.result import ViewScore
+
+PANEL_WIDTH = 640
+"""Panels are reduced by a whole factor to about this many pixels."""
+
+_NO_DEPTH = ((136, 136, 136), (112, 112, 112))
+_NO_PREDICTION = ((240, 200, 0), (16, 16, 16))
+_HATCH_PX = 4
+_MAX_LIMIT_CM = 1e9
+_SLACK = 1e-6  # a float32 error of 30 cm is a little more than 30 cm
+_ROUND_STEPS = (1, 2, 3, 5, 7, 10)
+_BACKDROP_LEVELS = 16
+_BACKDROP_BRIGHTEST = 84
+
+
+@dataclass(frozen=True)
+class ViewPanels:
+    """What the report shows of one view; all arrays share H x W.
+
+    ``rgb`` uint8 H x W x 3; ``truth_m`` float32 metres, 0 where there is no surface; ``prediction_m``
+    float metres, not finite or <= 0 where there is none; ``steel`` bool, rim included; ``score`` the
+    view's numbers.
+    """
+
+    view_id: str
+    rgb: UInt8[ndarray, "h w 3"]
+    truth_m: Float32[ndarray, "h w"]
+    prediction_m: Float[ndarray, "h w"]
+    steel: Bool[ndarray, "h w"]
+    score: ViewScore
+
+    def __post_init__(self) -> None:
+        size = self.truth_m.shape
+        found = (self.rgb.shape[:2], self.prediction_m.shape, self.steel.shape)
+        if any(shape != size for shape in found):
+            raise ValueError(f"{self.view_id}: the images of a view must share H x W = {size}, found {found}")
+
+
+@dataclass(frozen=True)
+class ViewImages:
+    """The encoded panels of one view as data URIs, and the ranges that their colour bars state.
+
+    Depth colours run from ``near_m`` to ``far_m`` for truth and prediction alike; error colours from minus
+    to plus ``native_limit_cm`` or ``scaled_limit_cm`` (None where nothing can be shown).
+    ``predicted_m`` is the robust range of the prediction on scored pixels: it may lie off the colour bar.
+    """
+
+    width: int
+    height: int
+    colour: str
+    truth: str
+    prediction: str
+    native_error: str
+    scaled_error: str
+    near_m: float
+    far_m: float
+    predicted_m: tuple[float, float] | None
+    native_limit_cm: float | None
+    scaled_limit_cm: float | None
+
+
+def view_images(view: ViewPanels) -> ViewImages:
+    """Return a view's five panels, encoded, at about ``PANEL_WIDTH`` pixels wide."""
+    step = max(1, round(view.truth_m.shape[1] / PANEL_WIDTH))
+    scored = scored_pixels(view.steel, view.truth_m)
+    near_m, far_m = depth_range(view.truth_m, scored)
+    native_m = signed_error(view, 1.0)
+    scaled_m = signed_error(view, math.nan if view.score.scale is None else view.score.scale)
+    native_limit, scaled_limit = (error_limit_cm(error_m, scored) for error_m in (native_m, scaled_m))
+    rgb = reduced_colour(view.rgb, step)
+    steel = view.steel[::step, ::step]
+    return ViewImages(
+        width=rgb.shape[1],
+        height=rgb.shape[0],
+        colour=_data_uri(rgb, lossless=False),
+        truth=_data_uri(depth_image(view.truth_m[::step, ::step], near_m, far_m)),
+        prediction=_data_uri(depth_image(view.prediction_m[::step, ::step], near_m, far_m)),
+        native_error=_data_uri(error_image(native_m[::step, ::step], steel, rgb, native_limit)),
+        scaled_error=_data_uri(error_image(scaled_m[::step, ::step], steel, rgb, scaled_limit)),
+        near_m=near_m,
+        far_m=far_m,
+        predicted_m=predicted_range(view.prediction_m, scored),
+        native_limit_cm=native_limit,
+        scaled_limit_cm=scaled_limit,
+    )
+
+
+def error_webp(view: ViewPanels) -> bytes:
+    """Return a view's native error map alone, WebP, reduced as the other panels are."""
+    step = max(1, round(view.truth_m.shape[1] / PANEL_WIDTH))
+    error_m = signed_error(view, 1.0)
+    limit_cm = error_limit_cm(error_m, scored_pixels(view.steel, view.truth_m))
+    steel, rgb = view.steel[::step, ::step], reduced_colour(view.rgb, step)
+    return _encoded(error_image(error_m[::step, ::step], steel, rgb, limit_cm))
+
+
+def depth_range(truth_m: Float32[ndarray, "h w"], scored: ndarray) -> tuple[float, float]:
+    """Return (near, far), metres: robust range of true depth at flat indices ``scored``, a tenth wider."""
+    values = truth_m.ravel()[scored] if scored.size else truth_m[truth_m > 0]
+    if not values.size:
+        return 0.0, 1.0
+    near, far = robust_range(values.astype(np.float64))
+    margin = max(0.1 * (far - near), 0.01 * near)
+    return near - margin, far + margin
+
+
+def predicted_range(prediction_m: Float[ndarray, "h w"], scored: ndarray) -> tuple[float, float] | None:
+    """Return the robust range, metres, of valid predictions at the flat indices ``scored``; None of none."""
+    values = prediction_m.ravel()[scored].astype(np.float64)
+    values = values[np.isfinite(values) & (values > 0)]
+    return robust_range(values) if values.size else None
+
+
+def signed_error(view: ViewPanels, scale: float) -> Float64[ndarray, "h w"]:
+    """Return scale * prediction - truth, metres; NaN where either is missing or off the steel."""
+    prediction = view.prediction_m.astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        shown = view.steel & (view.truth_m > 0) & np.isfinite(prediction) & (prediction > 0)
+        error = scale * prediction - view.truth_m
+    return np.where(shown, error, np.nan)
+
+
+def error_limit_cm(error_m: Float64[ndarray, "h w"], scored: ndarray) -> float | None:
+    """Return the colour limit, cm: at least 95 % of the scored pixels' errors lie within; one round digit."""
+    errors = np.abs(error_m.ravel()[scored])
+    errors = errors[np.isfinite(errors)]
+    if not errors.size:
+        return None
+    reach_cm = 100 * float(np.sort(errors)[math.ceil(0.95 * errors.size) - 1])
+    return _rounded_up(min(max(reach_cm, 0.01), _MAX_LIMIT_CM))
+
+
+def depth_image(depth_m: Float[ndarray, "h w"], near_m: float, far_m: float) -> UInt8[ndarray, "h w 3"]:
+    """Return depth in colour, near bright and far dark, grey hatching where there is none."""
+    with np.errstate(invalid="ignore"):
+        present = np.isfinite(depth_m) & (depth_m > 0)
+    image = hatching(depth_m.shape, *_NO_DEPTH)
+    image[present] = DEPTH_COLOURS[positions(depth_m[present], far_m, near_m)]
+    return image
+
+
+def error_image(
+    error_m: Float64[ndarray, "h w"],
+    steel: Bool[ndarray, "h w"],
+    rgb: UInt8[ndarray, "h w 3"],
+    limit_cm: float | None,
+) -> UInt8[ndarray, "h w 3"]:
+    """Return signed error on steel in colour over the dimmed scene, hazard stripes where it is missing."""
+    image = _backdrop(rgb)
+    missing = steel & np.isnan(error_m)
+    image[missing] = hatching(steel.shape, *_NO_PREDICTION)[missing]
+    shown = steel & ~missing
+    if limit_cm is not None:
+        image[shown] = ERROR_COLOURS[positions(error_m[shown], -limit_cm / 100, limit_cm / 100)]
+    return image
+
+
+def hatching(
+    shape: tuple[int, ...], first: tuple[int, int, int], second: tuple[int, int, int]
+) -> UInt8[ndarray, "h w 3"]:
+    """Return diagonal stripes of two colours."""
+    rows, columns = np.indices(shape)
+    stripe = (rows + columns) // _HATCH_PX % 2
+    image: ndarray = np.array((first, second), dtype=np.uint8)[stripe]
+    return image
+
+
+def reduced_colour(rgb: UInt8[ndarray, "h w 3"], step: int) -> UInt8[ndarray, "h w 3"]:
+    """Return a photograph averaged over blocks of ``step`` x ``step``; maps are sampled, never averaged."""
+    return np.asarray(Image.fromarray(rgb).reduce(step))
+
+
+def colour_bar_uri(colours: UInt8[ndarray, "n 3"]) -> str:
+    """Return a map of colours as a data URI of one row of pixels, first colour on the left."""
+    return _data_uri(colours[None], kind="PNG")
+
+
+def _backdrop(rgb: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
+    """Return the scene in dark grey; few levels, because noise nobody looks at would double the file."""
+    grey = rgb.astype(np.int64) @ np.array([2, 5, 1]) // 8
+    dim = grey * _BACKDROP_LEVELS // 256 * _BACKDROP_BRIGHTEST // (_BACKDROP_LEVELS - 1)
+    return np.repeat(dim.astype(np.uint8)[..., None], 3, axis=2)
+
+
+def _rounded_up(value: float) -> float:
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(round(step * power, 6) for step in _ROUND_STEPS if step * power >= value * (1 - _SLACK))
+
+
+def _data_uri(image: UInt8[ndarray, "h w 3"], *, kind: str = "WEBP", lossless: bool = True) -> str:
+    encoded = _encoded(image, kind=kind, lossless=lossless)
+    return f"data:image/{kind.lower()};base64,{base64.b64encode(encoded).decode()}"
+
+
+def _encoded(image: UInt8[ndarray, "h w 3"], *, kind: str = "WEBP", lossless: bool = True) -> bytes:
+    out = io.BytesIO()
+    if kind == "PNG":
+        Image.fromarray(image).save(out, "PNG", optimize=True)
+    else:
+        Image.fromarray(image).save(out, "WEBP", lossless=lossless, quality=70 if lossless else 80, method=4)
+    return out.getvalue()

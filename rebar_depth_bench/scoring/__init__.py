@@ -1,0 +1,1 @@
+"""Scoring: protocol, metrics, bootstrap intervals, results and comparisons."""

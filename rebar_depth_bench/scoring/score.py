@@ -1,0 +1,133 @@
+"""``score``: an archive against a dataset folder, by protocol ``rebar-1``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from rebar_depth_bench.data.ground_truth import ConfigTruth, ViewTruth, config_truth
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.errors import SubmissionError
+from rebar_depth_bench.parallel import ordered_map
+from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.metrics import aligned_metrics, is_prediction, median, median_scale
+from rebar_depth_bench.scoring.protocol import WITHIN_MM
+from rebar_depth_bench.scoring.result import Result, ViewScore, tabulate
+from rebar_depth_bench.submission import EntryError, SubmissionReader, config_of, open_submission
+from rebar_depth_bench.version import software_version
+
+
+def score(
+    archive: str | os.PathLike[str],
+    root: str | Path,
+    *,
+    workers: int | None = None,
+    progress: Progress = silent,
+) -> Result:
+    """Score an archive against a dataset folder or Hub repository.
+
+    Views are scored on ``workers`` threads (default: one a core) straight from the archive; memory holds a few
+    views at a time. The result does not depend on the number of workers.
+
+    Raises ``SubmissionError`` with every problem if any part of the archive is at fault, ``DatasetError`` if the
+    folder is.
+    """
+    folder = open_folder(root)
+    with (
+        open_submission(archive, folder.expected_views()) as submission,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        if submission.meta is None or submission.structure_problems:
+            raise SubmissionError(str(archive), list(submission.problems()))
+        sha256 = pool.submit(submission.sha256)
+        scores = _score_all(submission, folder, workers, progress)
+        return Result(
+            method=submission.meta.method,
+            submission_sha256=sha256.result(),
+            dataset_digest=folder.digest,
+            dataset_version=folder.version,
+            software_version=software_version(),
+            tables={config: tabulate(views) for config, views in scores.items()},
+            views=[view for views in scores.values() for view in views],
+        )
+
+
+def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewScore:
+    """Return the numbers of one view's prediction (planar depth, metres) on the view's scored pixels."""
+    p_m, z_m, z_median_m = prediction_m.ravel().take(truth.index.astype(np.intp)), truth.depth_m, truth.median_m
+    valid = is_prediction(p_m)
+    if not valid.all():
+        p_m, z_m = p_m[valid], z_m[valid]
+        z_median_m = median(z_m) if len(z_m) else 0.0
+    scored_px = len(truth.index)
+    coverage = len(p_m) / scored_px
+    if not len(p_m):
+        return ViewScore(truth.view_id, scored_px, coverage, None, None, None, dict.fromkeys(WITHIN_MM, 0.0))
+    scale = median_scale(p_m, z_median_m)
+    (native, scaled), within = aligned_metrics(p_m, z_m, (1.0, scale), WITHIN_MM)
+    return ViewScore(
+        view_id=truth.view_id,
+        scored_px=scored_px,
+        coverage=coverage,
+        scale=scale,
+        native=native,
+        scaled=scaled,
+        within_mm={tolerance_mm: count / scored_px for tolerance_mm, count in within.items()},
+    )
+
+
+def _score_all(
+    submission: SubmissionReader, folder: DatasetFolder, workers: int | None, progress: Progress
+) -> dict[str, list[ViewScore]]:
+    """Score every view of the archive, or raise with all that is wrong with it and score nothing."""
+    present = {config_of(view_id) for view_id in submission.view_ids}
+    unread = set(submission.view_ids)
+    problems: list[str] = []
+    scores: dict[str, list[ViewScore]] = {}
+    for config in folder.configs:
+        if config in present:
+            truths = config_truth(folder, config, progress)
+            outcomes = ordered_map(partial(_outcome, submission, truths), range(len(truths)), workers)
+            scored = list(_watched(outcomes, f"scoring {config}", len(truths), progress))
+            scores[config] = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
+            problems += [outcome for outcome in scored if isinstance(outcome, str)]
+            unread.difference_update(truths.view_ids)
+    problems += _problems_out_of_protocol(submission, unread)
+    if problems:
+        raise SubmissionError(str(submission.path), problems)
+    return scores
+
+
+def _outcome(submission: SubmissionReader, truths: ConfigTruth, place: int) -> ViewScore | str:
+    """Return a view's score, or the sentence that says what is wrong with its entry."""
+    truth = truths[place]
+    try:
+        return score_view(truth, submission.read(truth.view_id))
+    except EntryError as error:
+        return error.problem
+
+
+def _problems_out_of_protocol(submission: SubmissionReader, view_ids: Iterable[str]) -> list[str]:
+    """Read the entries that no score looks at: a bad one is refused there too."""
+    problems = []
+    for view_id in sorted(view_ids):
+        try:
+            submission.read(view_id)
+        except EntryError as error:
+            problems.append(error.problem)
+    return problems
+
+
+def _watched(
+    outcomes: Iterable[ViewScore | str], what: str, total: int, progress: Progress
+) -> Iterator[ViewScore | str]:
+    for done, outcome in enumerate(outcomes, start=1):
+        progress(what, done, total)
+        yield outcome

@@ -1,0 +1,1 @@
+"""Distance study: scale and error against distance."""

@@ -1,0 +1,1 @@
+"""KITTI study: published metrics on the Eigen split."""

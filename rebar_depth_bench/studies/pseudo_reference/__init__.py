@@ -1,0 +1,1 @@
+"""Pseudo-reference study: full-frame scores against estimated depth."""

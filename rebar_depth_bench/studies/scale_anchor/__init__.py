@@ -1,0 +1,1 @@
+"""Scale-anchor study: scale from a few views of known depth."""

@@ -1,0 +1,163 @@
+"""The dataset folder through plain ``datasets`` and through the loader."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import datasets
+import numpy as np
+import pytest
+import torch
+
+import rebar_depth_bench as rdb
+from rebar_depth_bench.data.dataset import features, iterate
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.geometry.cameras import ideal_K, right_of_rig
+
+HEIGHT, WIDTH, VIEWS = 90, 160, 9
+
+
+def test_plain_datasets_loads_it(tiny_root: Path) -> None:
+    loaded = datasets.load_dataset(str(tiny_root), "lattice", split="test")
+    assert loaded.features == features()
+    assert len(loaded) == VIEWS
+    row = loaded[0]
+    assert row["left_rgb"].size == (WIDTH, HEIGHT)
+    assert row["left_mask"].mode == "1"
+    assert row["left_bars"].mode.startswith("I;16")
+    assert row["left_preview"].mode == "P"
+
+
+def test_view_ids_are_indices_of_the_full_protocol(tiny_root: Path) -> None:
+    found = rdb.load(tiny_root, "lattice", columns=["view_id"])["view_id"]
+    assert list(found) == [f"lattice/{(2 * i + 1) * 504 // 18:04d}" for i in range(VIEWS)]
+
+
+def test_rows_decode_to_the_contracts_arrays(tiny_root: Path) -> None:
+    row = rdb.load(tiny_root, "lattice")[4]
+    assert list(row) == list(features())
+    for eye in ("left", "right"):
+        for kind, dtype, shape in (
+            ("rgb", np.uint8, (HEIGHT, WIDTH, 3)),
+            ("depth", np.float32, (HEIGHT, WIDTH)),
+            ("mask", np.bool_, (HEIGHT, WIDTH)),
+            ("bars", np.uint16, (HEIGHT, WIDTH)),
+            ("K", np.float64, (3, 3)),
+            ("distortion", np.float64, (5,)),
+            ("cam_from_world", np.float64, (4, 4)),
+        ):
+            array = row[f"{eye}_{kind}"]
+            assert (array.dtype, array.shape) == (dtype, shape), f"{eye}_{kind}"
+        assert np.array_equal(row[f"{eye}_K"], ideal_K(WIDTH, HEIGHT))
+        assert np.array_equal(row[f"{eye}_mask"], row[f"{eye}_bars"] > 0)
+        assert 0.03 < row[f"{eye}_mask"].mean() < 0.3
+    assert row["baseline_m"] == 0.12
+    assert np.array_equal(row["right_cam_from_world"], right_of_rig(row["left_cam_from_world"], 0.12))
+
+
+def test_streaming_gives_the_same_rows(tiny_root: Path) -> None:
+    loaded = rdb.load(tiny_root, "lattice")
+    streamed = list(rdb.load(tiny_root, "lattice", streaming=True))
+    assert len(streamed) == VIEWS
+    for a, b in zip(loaded, streamed, strict=True):
+        assert list(a) == list(b)
+        for name in a:
+            assert np.array_equal(a[name], b[name]), name
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_torch_batches(tiny_root: Path, streaming: bool, num_workers: int) -> None:
+    ds = rdb.load(tiny_root, "lattice", streaming=streaming)  # type: ignore[call-overload]
+    seen: list[str] = []
+    for batch in rdb.torch_loader(ds, batch_size=4, num_workers=num_workers):
+        count = len(batch["view_id"])
+        assert batch["rgb"].shape == (count, 3, HEIGHT, WIDTH)
+        assert batch["depth"].shape == (count, 1, HEIGHT, WIDTH)
+        assert batch["mask"].shape == (count, 1, HEIGHT, WIDTH)
+        assert batch["K"].shape == (count, 3, 3)
+        assert batch["poses"].shape == (count, 4, 4)
+        types = [batch[key].dtype for key in ("rgb", "depth", "mask", "K", "poses")]
+        assert types == [torch.uint8, torch.float32, torch.bool, torch.float64, torch.float64]
+        seen += batch["view_id"]
+    assert sorted(seen) == sorted(rdb.load(tiny_root, "lattice", columns=["view_id"])["view_id"])
+
+
+def test_torch_batches_hold_the_rows_values(tiny_root: Path) -> None:
+    row = rdb.load(tiny_root, "lattice")[0]
+    batch = next(iter(rdb.torch_loader(rdb.load(tiny_root, "lattice"), stereo=True)))
+    assert np.array_equal(batch["rgb"][0].permute(1, 2, 0).numpy(), row["left_rgb"])
+    assert np.array_equal(batch["right_depth"][0, 0].numpy(), row["right_depth"])
+    assert np.array_equal(batch["right_poses"][0].numpy(), row["right_cam_from_world"])
+    assert batch["baseline_m"].tolist() == [0.12]
+
+
+def test_errors_in_words(tiny_root: Path, tmp_path: Path) -> None:
+    with pytest.raises(rdb.DatasetError, match=r"no config 'lattise', expected one of lattice, lattice-orbit"):
+        rdb.load(tiny_root, "lattise")
+    with pytest.raises(rdb.DatasetError, match=r"no column 'depth', expected some of view_id, left_rgb"):
+        rdb.load(tiny_root, "lattice", columns=["depth"])
+    with pytest.raises(rdb.DatasetError, match=r"has no manifest.json, expected a folder finished by rebar-build"):
+        rdb.load(tmp_path, "lattice")
+    with pytest.raises(rdb.DatasetError, match="no such folder"):
+        rdb.load(tmp_path / "missing", "lattice")
+
+
+def test_a_hub_repository_that_cannot_be_had_is_told_in_words() -> None:
+    with pytest.raises(rdb.DatasetError, match=r"as a Hub repository its manifest\.json cannot be had"):
+        rdb.load("nobody/nothing-here", "lattice")
+
+
+def test_manifest_knows_every_view(tiny_root: Path) -> None:
+    folder = open_folder(tiny_root)
+    assert folder.configs == ("lattice", "lattice-orbit")
+    assert len(folder.expected_views()) == VIEWS + 2
+    assert set(folder.expected_views().values()) == {(HEIGHT, WIDTH)}
+    assert folder.digest.startswith("sha256:")
+
+
+def test_loading_does_not_copy_the_dataset_again(tiny_root: Path) -> None:
+    ds = rdb.load(tiny_root, "lattice", columns=["view_id", "left_depth", "left_rgb"])
+    assert ds[0]["left_rgb"].dtype == np.uint8
+    assert ds.cache_files
+    assert not [file for file in ds.cache_files if "cache-" in Path(file["filename"]).name]
+
+
+@pytest.mark.parametrize("damage", ["truncated", "missing"])
+def test_a_damaged_shard_is_told_in_words(tiny_root: Path, tmp_path: Path, damage: str) -> None:
+    copy = tmp_path / "dataset"
+    shutil.copytree(tiny_root, copy, ignore=shutil.ignore_patterns(".rebar-cache"))
+    for shard in copy.glob("lattice/*.parquet"):
+        if damage == "missing":
+            shard.unlink()
+        else:
+            shard.write_bytes(shard.read_bytes()[:-100])
+    with pytest.raises(rdb.DatasetError, match=r"dataset: config lattice cannot be (loaded|read)"):
+        list(iterate(copy, "lattice", ["view_id"]))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda manifest: manifest.pop("configs"), "lacks configs"),
+        (lambda manifest: manifest.update(format="other"), "format is 'other', expected 'rebar-depth-dataset-1'"),
+        (lambda manifest: manifest.update(configs=[]), "configs is a list, expected an object"),
+        (lambda manifest: manifest["configs"]["lattice"].pop("views"), "config lattice lacks views"),
+        (
+            lambda manifest: manifest["configs"]["lattice"]["views"][0].pop("left"),
+            "a view of config lattice has not",
+        ),
+    ],
+)
+def test_a_damaged_manifest_is_told_in_words(
+    tiny_root: Path, tmp_path: Path, change: Callable[[dict[str, Any]], object], words: str
+) -> None:
+    manifest = json.loads((tiny_root / "manifest.json").read_text())
+    change(manifest)
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(rdb.DatasetError, match=words):
+        open_folder(tmp_path)

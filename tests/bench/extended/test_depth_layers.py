@@ -1,0 +1,212 @@
+"""Other layers in sight and their confusion: scenes by hand, a plain loop, and what no damage may do."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy import ndarray
+
+from rebar_depth_bench.extended.depth_layers import DIRECTIONS, RADII_PX, layer_samples, other_layers
+from rebar_depth_bench.extended.steel_truth import SteelTruth
+from tests.bench.extended.thin_scenes import (
+    random_pictures,
+    random_prediction,
+    random_truth,
+    steel_truth,
+    with_holes,
+)
+
+SEEDS = st.integers(0, 2**32 - 1)
+NAN = float("nan")
+
+
+def layers_at(depth_m: ndarray, bars: ndarray, row: int, column: int, gap_m: float) -> tuple[float, float]:
+    index = np.array([row * depth_m.shape[1] + column], np.uint32)
+    front_m, behind_m = other_layers(
+        depth_m.astype(np.float32), bars.astype(np.uint16), index, np.array([gap_m], np.float32)
+    )
+    return float(front_m[0]), float(behind_m[0])
+
+
+def cross() -> tuple[ndarray, ndarray]:
+    """Return an upright bar at 0.25 m in front of a level one at 0.5 m, before a board at 1 m."""
+    depth_m, bars = np.ones((64, 64)), np.zeros((64, 64), int)
+    depth_m[30:33], bars[30:33] = 0.5, 2
+    depth_m[:, 30:33], bars[:, 30:33] = 0.25, 1
+    return depth_m, bars
+
+
+def test_a_cross_by_hand() -> None:
+    depth_m, bars = cross()
+    assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((NAN, 0.5), nan_ok=True)
+    assert layers_at(depth_m, bars, 31, 55, 0.01) == pytest.approx((0.25, NAN), nan_ok=True)  # 24 px to the right
+    assert layers_at(depth_m, bars, 31, 60, 0.01) == pytest.approx((NAN, NAN), nan_ok=True)  # out of sight
+    assert layers_at(depth_m, bars, 31, 31, 0.25) == pytest.approx(
+        (NAN, NAN), nan_ok=True
+    )  # not by more than that
+    assert layers_at(depth_m, np.minimum(bars, 1), 2, 31, 0.01) == pytest.approx((NAN, NAN), nan_ok=True)
+
+
+def test_of_several_layers_the_nearest_counts() -> None:
+    depth_m, bars = cross()
+    for column, z_m in ((20, 0.5), (42, 0.375), (36, 0.125), (27, 0.1875)):
+        depth_m[:, column - 1 : column + 2], bars[:, column - 1 : column + 2] = z_m, column
+    assert layers_at(depth_m, bars, 10, 31, 0.01) == (0.1875, 0.375)
+
+
+def test_a_bar_that_runs_away_is_not_its_own_other_layer() -> None:
+    depth_m, bars = np.ones((64, 64)), np.zeros((64, 64), int)
+    depth_m[30:33], bars[30:33] = 0.25 + 0.005 * np.arange(64), 1
+    assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((NAN, NAN), nan_ok=True)
+    # Another bar crosses in front: that one is a layer, what is seen of the first bar behind it is not.
+    depth_m[:, 36:39], bars[:, 36:39] = 0.125, 2
+    assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((0.125, NAN), nan_ok=True)
+
+
+@pytest.mark.parametrize("between_m", [1.0, 0.0])
+def test_the_far_side_of_a_hoop_is_another_layer(between_m: float) -> None:
+    """The board, or nothing at all, is seen between them."""
+    depth_m, bars = np.full((64, 64), between_m), np.zeros((64, 64), int)
+    depth_m[30:33], bars[30:33] = 0.25, 1
+    depth_m[42:45], bars[42:45] = 0.5, 1
+    assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((NAN, 0.5), nan_ok=True)
+    assert layers_at(depth_m, bars, 43, 31, 0.01) == pytest.approx((0.25, NAN), nan_ok=True)
+
+
+def plain_loop(depth_m: ndarray, bars: ndarray, row: int, column: int, gap_m: np.float32) -> tuple[float, float]:
+    """Return front and behind of one pixel, written out."""
+    z_m, own = depth_m[row, column], bars[row, column]
+    front: list[float] = []
+    behind: list[float] = []
+    for step in range(DIRECTIONS):
+        between: list[float] = []
+        for radius in RADII_PX:
+            angle = 2 * math.pi * step / DIRECTIONS
+            y, x = row + round(radius * math.sin(angle)), column + round(radius * math.cos(angle))
+            if not (0 <= y < depth_m.shape[0] and 0 <= x < depth_m.shape[1]):
+                break
+            seen_m, same = depth_m[y, x], bars[y, x] == own
+            joined = same and not any(m == 0 or m > max(z_m, seen_m) for m in between)
+            if bars[y, x] and not joined:
+                (behind if seen_m > z_m + gap_m else front if seen_m < z_m - gap_m else []).append(float(seen_m))
+            if not same:
+                between.append(seen_m)
+    return max(front, default=NAN), min(behind, default=NAN)
+
+
+@settings(max_examples=20)
+@given(SEEDS)
+def test_agrees_with_a_plain_loop(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth_m, bars = random_pictures(rng, 40, 50)
+    bars[bars > 3] -= 2  # the same bar in several places
+    index = np.flatnonzero(bars)[:: int(rng.integers(5, 9))].astype(np.uint32)
+    gap_m = rng.uniform(0.001, 0.1, len(index)).astype(np.float32)
+    found = np.column_stack(other_layers(depth_m, bars, index, gap_m))
+    expected = [
+        plain_loop(depth_m, bars, i // 50, i % 50, gap) for i, gap in zip(index.tolist(), gap_m, strict=True)
+    ]
+    np.testing.assert_array_equal(found, np.array(expected, np.float32).reshape(-1, 2))
+
+
+@settings(max_examples=15)
+@given(SEEDS)
+def test_layers_turn_with_the_picture(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth_m, bars = random_pictures(rng, 40, 40)
+    pictures = []
+    for turned in (lambda a: a, np.fliplr, np.flipud, np.transpose):
+        here, ids = np.ascontiguousarray(turned(depth_m)), np.ascontiguousarray(turned(bars))
+        index = np.flatnonzero(ids).astype(np.uint32)
+        picture = np.full((2, 40, 40), np.nan, np.float32)
+        for layer, values in zip(
+            picture, other_layers(here, ids, index, np.full(len(index), 0.02, np.float32)), strict=True
+        ):
+            layer.ravel()[index] = values
+        pictures.append(np.stack([turned(layer) for layer in picture]))
+    for picture in pictures[1:]:
+        np.testing.assert_array_equal(picture, pictures[0])
+
+
+def test_no_steel_has_no_layers() -> None:
+    nothing = np.empty(0, np.uint32), np.empty(0, np.float32)
+    front_m, behind_m = other_layers(np.ones((4, 4), np.float32), np.zeros((4, 4), np.uint16), *nothing)
+    assert (len(front_m), len(behind_m)) == (0, 0)
+    assert front_m.dtype == behind_m.dtype == np.float32
+
+
+def scores(p_m: ndarray, truth: SteelTruth) -> dict[str, float]:
+    return {name: float(values[0]) for name, values in layer_samples(p_m, truth).items() if len(values)}
+
+
+def pixels(z_m: list[float], front_m: list[float], behind_m: list[float]) -> SteelTruth:
+    truth = steel_truth(
+        np.array([z_m]), np.ones((1, len(z_m)), np.uint16), np.array([front_m]), np.array([behind_m])
+    )
+    return replace(truth, interior=np.ones(len(z_m), bool))
+
+
+def test_confusion_by_hand() -> None:
+    truth = pixels([2.0] * 6, [1.0, 1.0, NAN, NAN, 1.0, NAN], [4.0, NAN, 4.0, 4.0, 4.0, NAN])
+    found = scores(np.array([1.4, 1.6, 2.9, 3.1, NAN, 9.0]), truth)
+    assert found == pytest.approx(
+        {
+            "layer_confusion": 3 / 5,  # the first, the fourth and the missing one
+            "layer_swallowed": 2 / 4,  # the fourth and the missing one, of those with a layer behind
+            "layer_pulled_forward": 2 / 3,  # the first and the missing one
+            "layers_in_sight": 5 / 6,
+        }
+    )
+
+
+def test_midway_is_not_confused_and_far_beyond_is() -> None:
+    truth = pixels([2.0, 2.0], [1.0, NAN], [NAN, 4.0])
+    assert scores(np.array([1.5, 3.0]), truth)["layer_confusion"] == 0.0
+    assert scores(np.array([5e-324, 1e308]), truth)["layer_confusion"] == 1.0
+    assert scores(np.array([np.inf, -1.0]), truth)["layer_confusion"] == 1.0  # both missing
+
+
+@settings(max_examples=40)
+@given(SEEDS)
+def test_confusion_agrees_with_its_definition(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = random_truth(rng)
+    p_m = random_prediction(rng, truth, holes=0.0)
+    confused = in_sight = 0
+    for p, z, front, behind, inside in zip(
+        p_m, truth.depth_m.astype(float), truth.front_m, truth.behind_m, truth.interior, strict=True
+    ):
+        others = [float(other) for other in (front, behind) if inside and not math.isnan(other)]
+        in_sight += bool(others)
+        confused += any(abs(p - other) < abs(p - z) for other in others)
+    assert scores(p_m, truth)["layer_confusion"] == pytest.approx(confused / in_sight)
+
+
+@settings(max_examples=40)
+@given(SEEDS, st.floats(0.001, 1.0), st.floats(1.0, 3.0))
+def test_neither_holes_nor_going_further_astray_lower_confusion(seed: int, share: float, further: float) -> None:
+    rng = np.random.default_rng(seed)
+    truth = random_truth(rng)
+    p_m = random_prediction(rng, truth)
+    before, holed = scores(p_m, truth), scores(with_holes(rng, p_m, share), truth)
+    z_m = truth.depth_m.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        astray = scores(np.where(p_m > 0, z_m + further * (p_m - z_m), p_m), truth)
+    for name in ("layer_confusion", "layer_swallowed", "layer_pulled_forward"):
+        assert holed[name] >= before[name]
+        assert astray[name] >= before[name]
+    assert holed["layers_in_sight"] == before["layers_in_sight"]
+
+
+def test_truth_confuses_nothing_and_no_layer_says_nothing() -> None:
+    truth = random_truth(np.random.default_rng(4))
+    assert scores(truth.depth_m.astype(np.float64), truth)["layer_confusion"] == 0.0
+    alone = steel_truth(np.ones((5, 5)), np.ones((5, 5), np.uint16))
+    assert scores(np.ones(25), alone) == {"layers_in_sight": 0.0}
+    bare = steel_truth(np.ones((2, 2)), np.ones((2, 2), np.uint16))
+    assert scores(np.ones(4), bare) == {}

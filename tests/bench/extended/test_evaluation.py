@@ -1,0 +1,176 @@
+"""Extended measures end to end, on a really rendered folder: truth is perfect, damage never helps."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from rebar_depth_bench import DatasetError, score
+from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.extended.evaluate import (
+    FAMILIES,
+    NATIVE,
+    ONCE,
+    SCALED,
+    measures_by_alignment,
+    score_extended,
+)
+from rebar_depth_bench.extended.ground_truth import steel_config, widened
+from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
+from rebar_depth_bench.extended.result import ExtendedResult
+from rebar_depth_bench.reporting.extended_tables import print_extended
+
+Depths = dict[str, np.ndarray]
+Archive = Callable[..., Path]
+
+
+def extended(archive: Path, root: Path, workers: int = 2) -> ExtendedResult:
+    return score_extended(score(archive, root), archive, root, workers=workers)
+
+
+def values(result: ExtendedResult, alignment: str) -> dict[str, float]:
+    numbers = result.tables["lattice"].numbers[alignment]
+    return {name: one.value for name, one in numbers.items() if one.value is not None}
+
+
+def test_every_measure_has_one_name_and_says_what_it_is() -> None:
+    for measures in measures_by_alignment().values():
+        names = [measure.name for measure in measures]
+        assert len(set(names)) == len(names)
+        assert all(measure.title and measure.definition for measure in measures)
+
+
+def test_truth_is_perfect_in_every_column(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+    result = extended(archive_of(tiny_truth), tiny_root)
+    once, native = values(result, ONCE), values(result, NATIVE)
+    assert native == values(result, SCALED)
+    assert once["scale_mean"] == 1.0
+    assert once["scale_spread"] == 0.0
+    for name in once:
+        if name.startswith(("log_scaled", "shifted", "silog", "boundary")):
+            ideal = (
+                1.0 if "delta1" in name or name.startswith(("boundary_f1", "boundary_p", "boundary_r")) else 0.0
+            )
+            assert once[name] == pytest.approx(ideal, abs=1e-9), name
+    for family in ("full_mask", "clouds", "layers"):
+        for measure in FAMILIES[family].measures:
+            if measure.name in native and measure.better:
+                assert native[measure.name] == (1.0 if measure.better == "higher" else 0.0), measure.name
+    assert all(value == 0 for name, value in native.items() if "abs_rel" in name)
+    assert native["kept_share"] < 1
+
+
+def test_a_known_factor_is_all_scale(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+    result = extended(archive_of({view: 2 * depth for view, depth in tiny_truth.items()}), tiny_root)
+    once = values(result, ONCE)
+    assert once["scale_mean"] == 0.5
+    assert once["scale_spread"] == pytest.approx(0, abs=1e-12)
+    assert once["scale_explains"] == 1.0
+    truth = extended(archive_of(tiny_truth, "truth.zip"), tiny_root)
+    assert values(result, SCALED) == values(truth, NATIVE)
+
+
+def test_missing_pixels_never_help(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+    """Half of all predictions, good and bad, are taken away: no measure that is better somewhere gains by it."""
+    rng = np.random.default_rng(4)
+    noisy = {
+        view: depth + rng.normal(0, 0.01, depth.shape).astype(np.float32) for view, depth in tiny_truth.items()
+    }
+    holes = {view: np.where(rng.random(depth.shape) < 0.5, np.nan, depth) for view, depth in noisy.items()}
+    whole, half = (extended(archive_of(one, f"{n}.zip"), tiny_root) for n, one in enumerate((noisy, holes)))
+    gains = {
+        measure.name: (before, after)
+        for measure in whole.measures[NATIVE]
+        if measure.better
+        and (before := values(whole, NATIVE).get(measure.name)) is not None
+        and (after := values(half, NATIVE).get(measure.name)) is not None
+        and (after > before) == (measure.better == "higher")
+        and after != before
+    }
+    assert gains == {}
+
+
+def test_workers_change_nothing_and_the_second_run_reads_the_cache(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive
+) -> None:
+    archive = archive_of({view: 1.05 * depth + np.float32(0.002) for view, depth in tiny_truth.items()})
+    one, four = (extended(archive, tiny_root, workers=workers).to_dict() for workers in (1, 4))
+    assert json.dumps(one) == json.dumps(four)
+
+
+def test_the_truth_behind_it_is_the_folders(tiny_root: Path, tiny_truth: Depths, tiny_masks: Depths) -> None:
+    steel = steel_config(open_folder(tiny_root), "lattice")
+    assert len(steel) == len(tiny_truth)
+    for place in range(len(steel)):
+        view = steel.view(place)
+        depth_m, mask = tiny_truth[view.view_id], tiny_masks[view.view_id]
+        assert np.array_equal(view.index, np.flatnonzero(widened(mask) & (depth_m > 0)))
+        assert np.array_equal(view.bar_id > 0, mask.ravel()[view.index])
+        assert np.array_equal(view.depth_m, depth_m.ravel()[view.index])
+        # Rays and pose bring points of the board, where no steel is, back to z = 0.
+        camera_m = view.depth_m[:, None] * np.column_stack([view.rays, np.ones(len(view.rays))])
+        world_m = (camera_m - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
+        assert abs(np.median(world_m[view.bar_id == 0, 2])) < 1e-6
+
+
+def test_widening_by_hand() -> None:
+    mask = np.zeros((4, 5), dtype=bool)
+    mask[0, 0] = mask[2, 3] = True
+    expected = ["11...", "11111", "..111", "..111"]
+    assert ["".join("1" if cell else "." for cell in row) for row in widened(mask)] == expected
+
+
+def test_the_command_writes_json_and_csv_with_stamps(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    archive = archive_of(tiny_truth)
+    out, table = tmp_path / "out.json", tmp_path / "out.csv"
+    command = ["score", str(archive), "--data", str(tiny_root), "--json", str(out), "--extended-csv", str(table)]
+    assert main(command) == 0
+    content = json.loads(out.read_text())
+    plain = score(archive, tiny_root).to_dict()
+    assert {key: value for key, value in content.items() if key != "extended"} == plain
+    assert content["extended"]["protocol"] == EXTENDED_PROTOCOL
+    assert len(content["extended"]["views"]) == len(tiny_truth)
+    rows = list(csv.DictReader(io.StringIO(table.read_text())))
+    assert len(rows) == sum(map(len, measures_by_alignment().values()))
+    assert {row["submission_sha256"] for row in rows} == {plain["submission"]["sha256"]}
+    f1 = next(row for row in rows if row["measure"] == "boundary_f1")
+    assert float(f1["value"]) == 1.0
+    assert "Boundary" in capsys.readouterr().out
+
+
+def test_the_table_keeps_to_100_columns(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+    console = Console(width=100, record=True, file=io.StringIO())
+    print_extended(extended(archive_of(tiny_truth), tiny_root), console)
+    text = console.export_text()
+    assert all(family.title in text for family in FAMILIES.values())
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_a_folder_without_bars_is_refused_in_words(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
+) -> None:
+    archive = archive_of(tiny_truth)
+    result = score(archive, tiny_root)
+    for item in tiny_root.iterdir():
+        if item.name != "bars.parquet":
+            (tmp_path / item.name).symlink_to(item)
+    with pytest.raises(DatasetError, match=r"has no bars\.parquet, expected a folder finished by rebar-build"):
+        score_extended(result, archive, tmp_path)
+
+
+def test_extended_measures_need_neither_torch_nor_opencv() -> None:
+    code = "import sys, rebar_depth_bench.extended.evaluate; print({'torch', 'cv2', 'bpy'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"

@@ -1,0 +1,78 @@
+"""Small synthetic views for the tests of thin-structure measures."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy import ndarray
+
+from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
+from rebar_depth_bench.scoring.protocol import interior
+
+HOLES = (np.nan, np.inf, -np.inf, 0.0, -1.0)
+"""What an archive may hold where it has no prediction."""
+
+
+def steel_truth(
+    depth_m: ndarray, bars: ndarray, front_m: ndarray | None = None, behind_m: ndarray | None = None
+) -> SteelTruth:
+    """Return the truth of a view from its whole pictures; layers are h x w, none by default."""
+    height, width = depth_m.shape
+    padded = np.pad(bars > 0, 1)
+    near = np.any([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)], axis=0)
+    index = np.flatnonzero(near & (depth_m > 0)).astype(np.uint32)
+    nothing = np.full(depth_m.shape, np.nan)
+    K = ideal_K(width, height)
+    return SteelTruth(
+        view_id="synthetic/0000",
+        height=height,
+        width=width,
+        K=K,
+        cam_from_world=np.eye(4),
+        index=index,
+        depth_m=depth_m.ravel()[index].astype(np.float32),
+        bar_id=bars.ravel()[index].astype(np.uint16),
+        interior=(interior(bars > 0) & (depth_m > 0)).ravel()[index],
+        rays=pixel_rays(K, width, height).reshape(-1, 3)[index, :2],
+        run=np.full(len(index), -1, np.int16),
+        front_m=(nothing if front_m is None else front_m).ravel()[index].astype(np.float32),
+        behind_m=(nothing if behind_m is None else behind_m).ravel()[index].astype(np.float32),
+    )
+
+
+def random_pictures(rng: np.random.Generator, height: int = 24, width: int = 31) -> tuple[ndarray, ndarray]:
+    """Return depth (float32, metres) and bar ids (uint16) of bars before a board, partly before nothing."""
+    depth_m = np.full((height, width), 0.9) + rng.uniform(0, 0.01, (height, width))
+    bars = np.zeros((height, width), np.uint16)
+    for bar in range(1, 6):
+        z_m, start, thickness = rng.uniform(0.2, 0.8), int(rng.integers(0, 20)), int(rng.integers(3, 7))
+        part = (slice(start, start + thickness), slice(None))[:: int(rng.choice([1, -1]))]
+        slope = rng.uniform(-0.003, 0.003) * np.add.outer(np.arange(height), np.arange(width))
+        nearer = np.zeros_like(bars, bool)
+        nearer[part] = (z_m + slope < depth_m)[part]
+        depth_m[nearer], bars[nearer] = (z_m + slope)[nearer], bar
+    nothing = (bars == 0) & (np.arange(width) < rng.integers(0, width))
+    depth_m[nothing] = 0.0
+    return depth_m.astype(np.float32), bars
+
+
+def random_truth(rng: np.random.Generator) -> SteelTruth:
+    """Return the truth of a random view, its other layers chosen at random."""
+    depth_m, bars = random_pictures(rng)
+    layers = [
+        np.where(rng.random(depth_m.shape) < 0.7, depth_m + sign * rng.uniform(0.01, 0.1), np.nan)
+        for sign in (-1, 1)
+    ]
+    return steel_truth(depth_m, bars, *layers)
+
+
+def random_prediction(rng: np.random.Generator, truth: SteelTruth, holes: float = 0.1) -> ndarray:
+    """Return truth with noise of all sizes, shifted by a random factor, and with a share of holes."""
+    spread = 10 ** rng.uniform(-4, -0.5, len(truth.index))
+    p_m = truth.depth_m * np.exp(rng.normal(0, spread)) * rng.choice([1.0, 1.01, 1.3])
+    return with_holes(rng, p_m, holes)
+
+
+def with_holes(rng: np.random.Generator, p_m: ndarray, share: float) -> ndarray:
+    """Return a prediction of which about a share of pixels is missing, in every way there is."""
+    return np.where(rng.random(len(p_m)) < share, rng.choice(HOLES, len(p_m)), p_m)

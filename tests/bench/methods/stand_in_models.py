@@ -1,0 +1,155 @@
+"""Stand-ins for networks that cannot be had here: the same public interface, the red channel as the answer.
+
+Their code is written into a folder by the test, as its authors' would lie there; nothing of it is the authors'. So
+what is tried is all that this project does around a network, and that alone: the picture it is given, the focal
+length, the margins, the way back to the left grid and the units.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from textwrap import dedent
+
+from rebar_depth_bench.methods.monocular.third_party import importable
+
+GAIN = 0.5
+"""What every stand-in multiplies its answer by: its only weight, and read from the checkpoint."""
+
+METRIC3D_HUBCONF = """
+    dependencies = ["torch"]
+    import torch
+
+    class Net(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.gain = torch.nn.Parameter(torch.zeros(()))
+
+        def inference(self, data):
+            pixels = data["input"]
+            assert pixels.shape == (1, 3, 616, 1064) and pixels.dtype == torch.float32
+            print("as talkative as the original")
+            red = pixels[:, :1] * 58.395 + 123.675
+            return self.gain * red, torch.ones_like(red), {}
+
+    def metric3d_vit_small(pretrain=False, **kwargs):
+        assert not pretrain
+        return Net()
+"""
+
+UNIDEPTH_MODELS = """
+    import torch
+    from huggingface_hub import PyTorchModelHubMixin
+
+    class UniDepthV2(torch.nn.Module, PyTorchModelHubMixin):
+        def __init__(self, config, **kwargs):
+            super().__init__()
+            self.gain = torch.nn.Parameter(torch.zeros(()))
+
+        def infer(self, rgb, camera=None, normalize=True):
+            assert rgb.dtype == torch.uint8 and rgb.ndim == 3 and rgb.shape[0] == 3 and camera is None
+            depth = self.gain * rgb[None, :1].float()
+            return {"depth": depth, "radius": 1.2 * depth, "intrinsics": torch.eye(3)[None]}
+"""
+
+DA3_API = """
+    from types import SimpleNamespace
+    import numpy as np
+    import torch
+    from huggingface_hub import PyTorchModelHubMixin
+    from PIL import Image
+
+    class DepthAnything3(torch.nn.Module, PyTorchModelHubMixin):
+        def __init__(self, model_name="da3-large", **kwargs):
+            super().__init__()
+            self.gain = torch.nn.Parameter(torch.zeros(()))
+
+        def inference(self, image, extrinsics=None, intrinsics=None, process_res=504):
+            [rgb] = image
+            assert isinstance(rgb, np.ndarray) and rgb.dtype == np.uint8
+            height, width = rgb.shape[:2]
+            scale = process_res / max(height, width)
+            w, h = (14 * round(side * scale / 14) for side in (width, height))
+            red = np.asarray(Image.fromarray(rgb[..., 0]).resize((w, h), Image.Resampling.BILINEAR), np.float32)
+            noise = 1e-3 * torch.rand(1).item()  # as the original's sample of the sky
+            return SimpleNamespace(depth=(self.gain.item() + noise) * red[None], intrinsics=None)
+"""
+
+FOUNDATION_STEREO = """
+    import torch
+
+    class FoundationStereo(torch.nn.Module):
+        def __init__(self, args):
+            super().__init__()
+            assert args.vit_size == "vitl" and args["max_disp"] == 416 and args.get("low_memory", 0) == 0
+            self.gain = torch.nn.Parameter(torch.zeros(()))
+
+        def forward(self, image1, image2, iters=12, flow_init=None, test_mode=False):
+            assert image1.shape == image2.shape and image1.dtype == torch.float32
+            assert image1.shape[2] % 32 == image1.shape[3] % 32 == 0
+            assert iters == 32 and test_mode and image1.max() > 1
+            return self.gain * image1[:, :1]
+"""
+
+
+def metric3d_clone(folder: Path, **weights: float) -> Path:
+    """Write a clone with a checkpoint in it."""
+    _write(folder / "hubconf.py", METRIC3D_HUBCONF)
+    _pickle(folder / "metric_depth_vit_small_800k.pth", "model_state_dict", weights)
+    return folder
+
+
+def unidepth_weights(folder: Path, **weights: float) -> Path:
+    """Write a folder as the Hub holds it."""
+    return _as_on_the_hub(folder, {"model": {}}, weights)
+
+
+def da3_weights(folder: Path, model_name: str = "da3metric-large", **weights: float) -> Path:
+    """Write a folder as the Hub holds it."""
+    return _as_on_the_hub(folder, {"model_name": model_name}, weights)
+
+
+def stereo_clone(folder: Path, **weights: float) -> Path:
+    """Write a clone with the folder 23-51-11 in it."""
+    _write(folder / "core" / "foundation_stereo.py", FOUNDATION_STEREO)
+    trained = folder / "pretrained_models" / "23-51-11"
+    trained.mkdir(parents=True)
+    (trained / "cfg.yaml").write_text("max_disp: 416\nhidden_dims: [128, 128, 128]\n")
+    _pickle(trained / "model_best_bp2.pth", "model", weights)
+    return folder
+
+
+@contextmanager
+def installed(site: Path) -> Iterator[Path]:
+    """Write the stand-ins of the installed packages, let them be imported, and forget them afterwards."""
+    _write(site / "unidepth" / "models.py", UNIDEPTH_MODELS)
+    _write(site / "depth_anything_3" / "api.py", DA3_API)
+    with importable(site):
+        importlib.invalidate_caches()
+        yield site
+    for name in [one for one in sys.modules if one.split(".")[0] in ("unidepth", "depth_anything_3", "core")]:
+        del sys.modules[name]
+
+
+def _write(path: Path, code: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(dedent(code))
+
+
+def _pickle(path: Path, key: str, weights: dict[str, float]) -> None:
+    torch = importlib.import_module("torch")
+    tensors = {name: torch.tensor(value) for name, value in (weights or {"gain": GAIN}).items()}
+    torch.save({key: tensors, "global_step": 1, "epoch": 1}, path)
+
+
+def _as_on_the_hub(folder: Path, config: dict[str, object], weights: dict[str, float]) -> Path:
+    torch = importlib.import_module("torch")
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps(config))
+    tensors = {name: torch.tensor(value) for name, value in (weights or {"gain": GAIN}).items()}
+    importlib.import_module("safetensors.torch").save_file(tensors, folder / "model.safetensors")
+    return folder

@@ -1,0 +1,153 @@
+"""A paper's network by its bare name: what says which weights these are is looked up in the caches, and told."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import huggingface_hub
+import numpy as np
+import pytest
+from huggingface_hub import constants
+
+from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.methods import METHODS, find_method
+from rebar_depth_bench.methods.registry import LOCATED, RESOLVED
+from tests.bench.methods import stand_in_models as stand_ins
+from tests.bench.methods.predictors import loaded
+from tests.bench.methods.stand_in_views import BUILDERS, asked, row
+
+COMMITS = ("0123456789abcdef0123456789abcdef01234567", "89abcdef0123456789abcdef0123456789abcdef")
+REPOSITORIES = {
+    "depth-anything-3": "depth-anything--DA3METRIC-LARGE",
+    "unidepth": "lpiccinelli--unidepth-v2-vitl14",
+}
+
+
+@pytest.fixture(autouse=True)
+def site(tmp_path: Path) -> Iterator[Path]:
+    """Put the stand-ins of the packages on the path, and take them off again."""
+    with stand_ins.installed(tmp_path / "site") as folder:
+        yield folder
+
+
+@pytest.fixture
+def hub_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache of the Hub's client."""
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+    return tmp_path / "hub"
+
+
+@pytest.fixture
+def torch_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache of torch.hub with Metric3D in it."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    hub = tmp_path / "torch" / "hub"
+    clone = stand_ins.metric3d_clone(hub / "yvanyin_metric3d_main")
+    (hub / "checkpoints").mkdir()
+    (clone / "metric_depth_vit_small_800k.pth").rename(hub / "checkpoints" / "metric_depth_vit_small_800k.pth")
+    return hub
+
+
+def cached(name: str, hub_cache: Path, commit: str, gain: float = 0.5) -> Path:
+    """Put a commit into the Hub's cache as its main branch."""
+    repository = hub_cache / f"models--{REPOSITORIES[name]}"
+    folder = BUILDERS[name](repository / "snapshots" / commit, gain=gain)
+    (repository / "refs").mkdir(exist_ok=True)
+    (repository / "refs" / "main").write_text(commit)
+    return folder
+
+
+@pytest.mark.parametrize("name", REPOSITORIES)
+def test_the_commit_of_the_weights_is_told_and_run(name: str, hub_cache: Path) -> None:
+    """A main branch that moves on makes another method, and does not change one that was found before."""
+    cached(name, hub_cache, COMMITS[0])
+    first = find_method(name)
+    cached(name, hub_cache, COMMITS[1], gain=2 * 0.5)
+    second = find_method(name)
+    for method, commit in ((first, COMMITS[0]), (second, COMMITS[1])):
+        assert method.info.name == name
+        assert method.info.summary.endswith(f"as in the paper; weights commit {commit}")
+        assert method.info.columns == METHODS[name].info.columns
+    ratio = loaded(second)(asked(name, row())) / loaded(first)(asked(name, row()))
+    np.testing.assert_allclose(ratio, 2, rtol=2e-3)
+    np.testing.assert_array_equal(loaded(METHODS[name])(asked(name, row())), loaded(second)(asked(name, row())))
+
+
+def test_weights_that_the_cache_lacks_are_missed_when_loaded(hub_cache: Path) -> None:
+    (cached("unidepth", hub_cache, COMMITS[0]) / "model.safetensors").unlink()
+    method = find_method("unidepth")
+    with pytest.raises(
+        MethodError, match=r"unidepth-v2-vitl14: model.safetensors not on this machine, and HF_HUB"
+    ):
+        loaded(method)
+
+
+def test_another_model_of_da3s_family_is_refused_at_once(hub_cache: Path) -> None:
+    folder = cached("depth-anything-3", hub_cache, COMMITS[0])
+    (folder / "config.json").write_text('{"model_name": "da3-large"}')
+    with pytest.raises(MethodError, match=r"names model 'da3-large', expected 'da3metric-large'"):
+        find_method("depth-anything-3")
+
+
+def test_metric3d_tells_the_digests_of_what_torchs_cache_holds(
+    torch_cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = find_method("metric3d")
+    assert first.info.name == "metric3d"
+    assert "; code yvanyin_metric3d_main sha256:" in first.info.summary
+    own = shutil.copytree(torch_cache / "yvanyin_metric3d_main", tmp_path / "own")
+    shutil.copy(torch_cache / "checkpoints" / "metric_depth_vit_small_800k.pth", own)
+    assert (
+        find_method(f"metric3d:{own}").info.summary.rpartition("; ")[2] == first.info.summary.rpartition("; ")[2]
+    )
+    np.testing.assert_allclose(loaded(first)(asked("metric3d", row())), 200 * 0.5 * 87.5 * 6.65 / 1000, rtol=3e-3)
+    assert "fetching" not in capsys.readouterr().err
+    (torch_cache / "yvanyin_metric3d_main" / "mono").mkdir()
+    (torch_cache / "yvanyin_metric3d_main" / "mono" / "model.py").write_text("")
+    second = find_method("metric3d")
+    stand_ins.metric3d_clone(tmp_path / "other", gain=2.0)
+    shutil.copy(tmp_path / "other" / "metric_depth_vit_small_800k.pth", torch_cache / "checkpoints")
+    assert len({first.info, second.info, find_method("metric3d").info}) == 3, "other code, other weights"
+    assert str(tmp_path) not in repr(second.info)
+
+
+def test_listing_looks_nothing_up(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise AssertionError("asked for")
+
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", fail)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", fail)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    assert main(["methods"]) == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in RESOLVED)
+    assert set(RESOLVED) | set(LOCATED) <= set(METHODS)
+
+
+def test_the_commands_help_names_the_folders(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["predict", "--help"])
+    assert "NAME:FOLDER (own weights of depth-anything-3," in " ".join(capsys.readouterr().out.split())
+
+
+def test_what_stereo_may_fetch_is_said_only_where_no_cache_has_it(
+    hub_cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    method = find_method(f"foundation-stereo:{stand_ins.stereo_clone(tmp_path / 'clone')}")
+    loaded(method)
+    told = capsys.readouterr().err
+    assert "DINOv2's code (https://github.com/facebookresearch/dinov2, whatever HF_HUB_OFFLINE says)" in told
+    assert "and timm's edgenext_small (the Hub)\n" in told
+    (hub_cache / "models--timm--edgenext_small.usi_in1k").mkdir(parents=True)
+    loaded(method)
+    told = capsys.readouterr().err
+    assert "DINOv2's code" in told
+    assert "edgenext" not in told
+    (tmp_path / "torch" / "hub" / "facebookresearch_dinov2_main").mkdir(parents=True)
+    loaded(method)
+    assert "fetch" not in capsys.readouterr().err

@@ -1,0 +1,167 @@
+"""What is missing, wrong or not to be fetched for the paper's networks, by its words. With stand-ins."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.methods import find_method
+from rebar_depth_bench.methods.registry import LOCATED
+from tests.bench.methods import stand_in_models as stand_ins
+from tests.bench.methods.predictors import loaded
+from tests.bench.methods.stand_in_views import BUILDERS, asked, located, row
+
+
+@pytest.fixture(autouse=True)
+def site(tmp_path: Path) -> Iterator[Path]:
+    """Put the stand-ins of the packages on the path, and take them off again."""
+    with stand_ins.installed(tmp_path / "site") as folder:
+        yield folder
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "words"),
+    [
+        ("unidepth", "unidepth", "pip install 'unidepth @ git+https://github.com/lpiccinelli-eth/UniDepth'"),
+        ("depth-anything-3", "depth_anything_3", "pip install depth-anything-3"),
+        ("foundation-stereo", "cv2", "pip install 'rebar-depth-bench[methods]'"),
+        *((name, "torch", "pip install 'rebar-depth-bench[torch]'") for name in LOCATED),
+    ],
+)
+def test_a_missing_package_says_what_to_install(
+    name: str, module: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method = located(name, tmp_path)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MethodError, match=f"{name} needs {module} .*{re.escape(words)}"):
+        method.load()
+
+
+@pytest.mark.parametrize("name", LOCATED)
+def test_weights_of_another_network_are_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(
+        MethodError, match=r"weights fill 0.00% of the network, lacking 1 tensors, first gain|Missing"
+    ):
+        located(name, tmp_path, other=1.0).load()
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "words"),
+    [
+        ("metric3d", "hubconf.py", "no hubconf.py in it"),
+        ("metric3d", "metric_depth_vit_small_800k.pth", "expected that of https://huggingface.co/JUGGHM/Metric3D"),
+        (
+            "unidepth",
+            "model.safetensors",
+            "no model.safetensors in it, expected config.json and model.safetensors",
+        ),
+        ("depth-anything-3", "config.json", "no config.json in it"),
+        ("foundation-stereo", "core/foundation_stereo.py", "no clone of FoundationStereo with core/foundation_"),
+        ("foundation-stereo", "pretrained_models/23-51-11/cfg.yaml", "no cfg.yaml in"),
+    ],
+)
+def test_a_folder_without_what_is_needed_is_refused(name: str, spoil: str, words: str, tmp_path: Path) -> None:
+    folder = BUILDERS[name](tmp_path / "theirs")
+    (folder / spoil).unlink()
+    with pytest.raises(MethodError, match=re.escape(words)):
+        find_method(f"{name}:{folder}")
+    with pytest.raises(MethodError, match=r"no such folder|no clone of FoundationStereo"):
+        find_method(f"{name}:{tmp_path / 'nowhere'}")
+
+
+@pytest.mark.parametrize("name", LOCATED)
+def test_a_damaged_checkpoint_is_said_in_words(name: str, tmp_path: Path) -> None:
+    folder = BUILDERS[name](tmp_path / "theirs")
+    [weights] = [*folder.rglob("*.pth"), *folder.rglob("*.safetensors")]
+    weights.write_bytes(b"no checkpoint")
+    with pytest.raises(MethodError, match=r"cannot be (loaded|read)"):
+        loaded(f"{name}:{folder}")
+
+
+@pytest.mark.parametrize("config", ['{"model_name": "da3-large"}', "{}", "[]", "{"])
+def test_another_model_of_da3s_family_is_refused(config: str, tmp_path: Path) -> None:
+    folder = stand_ins.da3_weights(tmp_path / "theirs")
+    (folder / "config.json").write_text(config)
+    with pytest.raises(MethodError, match=r"expected 'da3metric-large': only its output|cannot be read as a JSON"):
+        find_method(f"depth-anything-3:{folder}")
+
+
+def test_code_that_wants_a_gpu_says_so(tmp_path: Path) -> None:
+    if importlib.import_module("torch").cuda.is_available():
+        pytest.skip("there is a GPU")
+    folder = stand_ins.metric3d_clone(tmp_path / "theirs")
+    code = (folder / "hubconf.py").read_text()
+    (folder / "hubconf.py").write_text(code.replace("print(", 'torch.linspace(0, 1, 2, device="cuda"); print('))
+    run = loaded(f"metric3d:{folder}")
+    with pytest.raises(MethodError, match=r"metric3d: .* asks for a CUDA GPU, and torch sees none here"):
+        run(asked("metric3d", row()))
+
+
+@pytest.mark.parametrize(
+    ("name", "code"), [("metric3d", "hubconf.py"), ("foundation-stereo", "core/foundation_stereo.py")]
+)
+def test_what_its_code_imports_and_is_not_there_is_named(name: str, code: str, tmp_path: Path) -> None:
+    folder = BUILDERS[name](tmp_path / "theirs")
+    text = (folder / code).read_text()
+    (folder / code).write_text(text.replace("import torch", "import torch, no_such_mmcv", 1))
+    with pytest.raises(MethodError, match=r"No module named 'no_such_mmcv'; install what its repository's req"):
+        loaded(f"{name}:{folder}")
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "old", "new", "words"),
+    [
+        ("metric3d", "theirs/hubconf.py", "self.gain * red", "red[..., ::2]", r"(616, 532), expected (616, 1064)"),
+        (
+            "unidepth",
+            "site/unidepth/models.py",
+            "* rgb[None, :1]",
+            "* rgb[None, :1, 1:]",
+            "(1, 1, 89, 160), expec",
+        ),
+        ("depth-anything-3", "site/depth_anything_3/api.py", "red[None]", "red", "(280, 504), expected 1 x h x w"),
+    ],
+)
+def test_an_answer_of_another_shape_is_refused(
+    name: str, code: str, old: str, new: str, words: str, tmp_path: Path
+) -> None:
+    method = located(name, tmp_path)
+    text = (tmp_path / code).read_text()
+    assert old in text
+    (tmp_path / code).write_text(text.replace(old, new))
+    with pytest.raises(MethodError, match=re.escape(f"depth of shape {words}")):
+        method.load()(asked(name, row()))
+
+
+def test_another_package_called_core_is_not_taken_for_it(tmp_path: Path, site: Path) -> None:
+    (site / "core").mkdir()
+    (site / "core" / "foundation_stereo.py").write_text("FoundationStereo = None\n")
+    importlib.import_module("core.foundation_stereo")
+    with pytest.raises(MethodError, match=r"core is imported from .* already, expected it from"):
+        located("foundation-stereo", tmp_path).load()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("unidepth", "not on this machine, and HF_HUB_OFFLINE is set: .* name their folder: unidepth:FOLDER"),
+        ("depth-anything-3", "depth-anything/DA3METRIC-LARGE: .* HF_HUB_OFFLINE .*: depth-anything-3:FOLDER"),
+        ("metric3d", "metric3d: its code, which is then run, not on this machine, and HF_HUB_OFFLINE is set"),
+        (
+            "foundation-stereo",
+            "Google Drive .*: git clone https://github.com/NVlabs/FoundationStereo, put the folder",
+        ),
+    ],
+)
+def test_without_a_folder_nothing_is_fetched_offline(
+    name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    with pytest.raises(MethodError, match=words):
+        loaded(name)

@@ -1,0 +1,339 @@
+"""Methods from anywhere, run into an archive: found, refused in words, interrupted, taken up again."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import zipfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rebar_depth_bench import score
+from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.methods import (
+    METHODS,
+    ConfigViews,
+    MethodInfo,
+    MultiViewMethod,
+    Prepared,
+    all_methods,
+    find_method,
+)
+from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.progress import Progress
+
+OWN = """
+import time
+import numpy as np
+from rebar_depth_bench.methods import Method, MethodInfo
+
+def load():
+    def run(row):
+        assert set(row) == {"view_id", "left_rgb", "left_K"}
+        time.sleep(SECONDS)
+        with open(LOG, "a") as log:
+            print(row["view_id"], file=log)
+        return np.full(row["left_rgb"].shape[:2], row["left_K"][0, 0] / 200, np.float32)
+    return run
+
+METHOD = Method(MethodInfo("own", "a test", ("left_rgb", "left_K"), True, "here", "MIT"), load)
+NOTHING = "no method"
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    """A user's file with a method that notes the views it is asked for."""
+    return write_own(tmp_path, 0.0)
+
+
+def write_own(folder: Path, seconds: float) -> Path:
+    path = folder / "own.py"
+    path.write_text(OWN.replace("SECONDS", str(seconds)).replace("LOG", repr(str(folder / "log"))))
+    return path
+
+
+def runtime_of(archive: Path) -> dict[str, dict[str, float]]:
+    with zipfile.ZipFile(archive) as source:
+        found: dict[str, dict[str, float]] = json.loads(source.read("submission.json"))["runtime"]
+    return found
+
+
+def test_a_users_file_is_a_method(own: Path, tiny_root: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "own.zip"
+    command = ["predict", f"{own}:METHOD", "--data", str(tiny_root), "--config", "lattice", "--out", str(archive)]
+    assert main(command) == 0
+    result = score(archive, tiny_root)
+    assert result.method == "own"
+    assert result.tables["lattice"].ranked
+    seconds = runtime_of(archive)["seconds"]
+    assert list(seconds) == (tmp_path / "log").read_text().split()
+    assert all(0 <= value < 60 for value in seconds.values())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["log", "own.py", "own.zip"]
+
+
+def test_an_interrupted_prediction_goes_on_with_the_missing_views(tiny_root: Path, tmp_path: Path) -> None:
+    own, archive = write_own(tmp_path, 0.5), tmp_path / "own.zip"
+    command = [sys.executable, "-m", "rebar_depth_bench", "predict", f"{own}:METHOD", "--config", "lattice"]
+    command += ["--data", str(tiny_root), "--out", str(archive)]
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert running.stderr is not None
+    while "3 of 9" not in running.stderr.readline():
+        pass
+    running.send_signal(signal.SIGINT)
+    _, complaint = running.communicate(timeout=60)
+    assert running.returncode == 1
+    assert "interrupted" in complaint
+    assert "Traceback" not in complaint
+    assert not archive.exists()
+    before = (tmp_path / "log").read_text().split()
+    assert subprocess.run(command, check=False, capture_output=True).returncode == 0
+    after = (tmp_path / "log").read_text().split()
+    assert len(set(after)) == 9
+    assert len(after) - 9 <= 1, "only the view that was interrupted is predicted again"
+    assert after[: len(before)] == before
+    assert len(runtime_of(archive)["seconds"]) == 9
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_views_of_another_run_are_not_taken_for_this_ones(own: Path, tiny_root: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "out.zip"
+    left_over = tmp_path / ".out.zip.views"
+    (left_over / "lattice-orbit").mkdir(parents=True)
+    (left_over / "key.json").write_text("{}")
+    view_id = score_views(tiny_root)[0]
+    np.savez(left_over / f"{view_id}.npz", depth_m=np.full((90, 160), 99.0), seconds=0.0)
+    predict(find_method(f"{own}:METHOD"), tiny_root, archive, configs=["lattice-orbit"])
+    assert view_id in (tmp_path / "log").read_text()
+
+
+def score_views(root: Path) -> list[str]:
+    manifest = json.loads((root / "manifest.json").read_text())
+    return [view["view_id"] for view in manifest["configs"]["lattice-orbit"]["views"]]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        (
+            "magic",
+            "no method 'magic', expected one of sgbm, sgbm-filled, ",
+        ),
+        ("nowhere.py:METHOD", "nowhere.py: no such file"),
+        ("OWN:NOTHING", "is str, expected a rebar_depth_bench.methods.Method"),
+        ("OWN:ABSENT", "own.py: has no ABSENT, expected the name of a method in it"),
+        ("BROKEN:METHOD", "cannot be imported: ZeroDivisionError: division by zero"),
+    ],
+)
+def test_what_is_no_method_is_said_in_words(name: str, words: str, own: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.py"
+    broken.write_text("1 / 0")
+    with pytest.raises(MethodError, match=re.escape(words)):
+        find_method(name.replace("OWN", str(own)).replace("BROKEN", str(broken)))
+
+
+@pytest.mark.parametrize("returned", ["np.ones((3, 4))", "np.ones((90, 160), int)", "None"])
+def test_a_wrong_answer_is_refused_at_once(returned: str, own: Path, tiny_root: Path, tmp_path: Path) -> None:
+    text = own.read_text()
+    own.write_text(re.sub(r"return np\.full.*", f"return {returned}", text))
+    with pytest.raises(MethodError, match=r"own: lattice.* returned .*, expected float metres of"):
+        predict(find_method(f"{own}:METHOD"), tiny_root, tmp_path / "x.zip", configs=["lattice-orbit"])
+    assert len((tmp_path / "log").read_text().split()) == 1
+    assert not (tmp_path / "x.zip").exists()
+
+
+def test_an_installed_package_offers_its_methods(
+    own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site = tmp_path / "site"
+    info = site / "stranger-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
+    lines = [
+        "[rebar_depth_bench.methods]",
+        "theirs = own_copy:METHOD",
+        "bad = own_copy:NOTHING",
+        "gone = nowhere:X",
+    ]
+    (info / "entry_points.txt").write_text("\n".join(lines))
+    (site / "own_copy.py").write_text(own.read_text())
+    monkeypatch.syspath_prepend(str(site))
+    assert find_method("theirs").info.licence == "MIT"
+    found = all_methods()
+    assert list(found)[: len(METHODS)] == list(METHODS)
+    assert isinstance(found["bad"], MethodError)
+    assert "cannot be imported: ModuleNotFoundError" in str(found["gone"])
+    assert main(["methods"]) == 0
+    listed = capsys.readouterr().out
+    assert "theirs" in listed
+    assert "cannot be" in listed
+
+
+def test_controls_that_know_the_answer_score_as_they_should(tiny_root: Path, tmp_path: Path) -> None:
+    tables = {}
+    for name in ("truth", "noisy-truth"):
+        predict(find_method(name), tiny_root, tmp_path / f"{name}.zip", configs=["lattice"])
+        tables[name] = score(tmp_path / f"{name}.zip", tiny_root).tables["lattice"]
+    assert tables["truth"].native is not None
+    assert tables["truth"].native.abs_rel == 0
+    noisy = tables["noisy-truth"]
+    assert noisy.native is not None
+    assert noisy.scaled is not None
+    assert noisy.scale_median == pytest.approx(0.8, rel=2e-3)
+    assert noisy.native.abs_rel == pytest.approx(0.25, rel=0.01)
+    assert noisy.scaled.abs_rel == pytest.approx(0.01 * (2 / np.pi) ** 0.5, rel=0.05)  # of a Gaussian
+
+
+def whole_config(log: list[str], *, unfit: str = "") -> MultiViewMethod:
+    """Answers with the number of views that its config has; notes what it was asked for."""
+
+    def check(views: ConfigViews) -> None:
+        log.append(f"check {views.config}")
+        if views.config == unfit:
+            raise MethodError(f"{views.config}: does not fit")
+
+    def prepare(views: ConfigViews, work: Path, progress: Progress) -> Prepared:
+        log.append(f"prepare {views.config} {(work / 'kept').exists()}")
+        (work / "kept").touch()
+        progress("preparing", 1, 1)
+        counted = sum(row["left_K"].shape == (3, 3) for row in views.rows("left_K"))
+        assert counted == len(views.view_ids)
+
+        def run(row: Mapping[str, Any]) -> np.ndarray:
+            assert set(row) == {"view_id"}
+            log.append(row["view_id"])
+            return np.full(views.grid, counted, np.float32)
+
+        return Prepared(run, {"counted": counted})
+
+    return MultiViewMethod(MethodInfo("whole", "a test", (), False, "here", "MIT"), prepare, check)
+
+
+def test_a_method_of_all_views_is_prepared_once_a_config(tiny_root: Path, tmp_path: Path) -> None:
+    log: list[str] = []
+    archive = tmp_path / "whole.zip"
+    prepared = predict(whole_config(log), tiny_root, archive)
+    assert log[:3] == ["check lattice", "check lattice-orbit", "prepare lattice False"]
+    assert log.count("prepare lattice False") == log.count("prepare lattice-orbit False") == 1
+    assert len(log) == 4 + 9 + 2
+    assert {name: found.notes for name, found in prepared.items()} == {
+        "lattice": {"counted": 9},
+        "lattice-orbit": {"counted": 2},
+    }
+    with zipfile.ZipFile(archive) as source:
+        told = json.loads(source.read("submission.json"))
+    assert told["notes"] == {"lattice": {"counted": 9}, "lattice-orbit": {"counted": 2}}
+    assert set(told["runtime"]["preparing"]) == {"lattice", "lattice-orbit"}
+    assert score(archive, tiny_root).tables["lattice"].ranked
+
+
+def test_what_it_keeps_is_there_again_and_finished_configs_are_left_alone(tiny_root: Path, tmp_path: Path) -> None:
+    def stop(what: str, done: int, _: int) -> None:
+        if what == "whole on lattice-orbit" and done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        predict(whole_config([]), tiny_root, tmp_path / "whole.zip", progress=stop)
+    log: list[str] = []
+    prepared = predict(whole_config(log), tiny_root, tmp_path / "whole.zip")
+    assert log[2:] == ["prepare lattice-orbit True", score_views(tiny_root)[1]]
+    assert set(prepared) == {"lattice", "lattice-orbit"}
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.zip"]
+
+
+def test_a_config_that_does_not_fit_stops_the_run_before_it_begins(tiny_root: Path, tmp_path: Path) -> None:
+    log: list[str] = []
+    with pytest.raises(MethodError, match="lattice-orbit: does not fit"):
+        predict(whole_config(log, unfit="lattice-orbit"), tiny_root, tmp_path / "whole.zip")
+    assert log == ["check lattice", "check lattice-orbit"]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_users_file_that_was_changed_is_another_method(own: Path) -> None:
+    before = find_method(f"{own}:METHOD").info
+    assert find_method(f"{own}:METHOD").info == before
+    own.write_text(own.read_text() + "# changed\n")
+    after = find_method(f"{own}:METHOD").info
+    assert after.name == before.name
+    assert after.source != before.source
+
+
+def test_a_dataset_rendered_otherwise_is_predicted_anew(own: Path, tiny_root: Path, tmp_path: Path) -> None:
+    """The ground truth of another light or sample count is the same; the pictures are not."""
+
+    def stop(_: str, done: int, __: int) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    def run(root: Path, progress: Progress) -> None:
+        predict(
+            find_method(f"{own}:METHOD"), root, tmp_path / "out.zip", configs=["lattice-orbit"], progress=progress
+        )
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tiny_root, stop)
+    other = tmp_path / "other"
+    other.mkdir()
+    for path in tiny_root.iterdir():
+        (other / path.name).symlink_to(path)
+    manifest = json.loads((tiny_root / "manifest.json").read_text())
+    manifest["configs"]["lattice-orbit"]["key"] = "another"
+    (other / "manifest.json").unlink()
+    (other / "manifest.json").write_text(json.dumps(manifest))
+    run(other, lambda *_: None)
+    first, second = score_views(tiny_root)
+    assert (tmp_path / "log").read_text().split() == [first, first, second]
+
+
+WRONG = {
+    "load returned NoneType, expected a function of a row": "def load():\n    pass",
+    "load: raised FileNotFoundError: weights.pth": "def load():\n    raise FileNotFoundError('weights.pth')",
+    "lattice-orbit/0025: the predictor, given view_id, left_rgb: raised KeyError: 'left_depth'": (
+        "def load():\n    return lambda row: row['left_depth']"
+    ),
+}
+
+
+@pytest.mark.parametrize(("words", "code"), WRONG.items(), ids=["no predictor", "load", "predictor"])
+def test_what_a_users_code_raises_is_told_with_its_place(
+    words: str, code: str, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "wrong.py"
+    info = "MethodInfo('wrong', 'a test', ('left_rgb',), False, 'here', 'MIT')"
+    path.write_text(f"from rebar_depth_bench.methods import *\n{code}\nMETHOD = Method({info}, load)\n")
+    command = ["predict", f"{path}:METHOD", "--data", str(tiny_root), "--out", str(tmp_path / "out.zip")]
+    assert main([*command, "--config", "lattice-orbit"]) == 2
+    complaint = capsys.readouterr().err
+    assert f"error: wrong: {words}" in complaint
+    assert "Traceback" not in complaint
+    assert "raised" not in words or f"({path}:" in complaint
+
+
+def test_notes_that_are_no_json_are_refused_at_once(tiny_root: Path, tmp_path: Path) -> None:
+    log: list[str] = []
+    method = whole_config(log)
+    spoiled = replace(method, prepare=lambda *given: replace(method.prepare(*given), notes={"bad": float("nan")}))
+    with pytest.raises(MethodError, match="whole: lattice: the note 'bad' is no plain JSON value"):
+        predict(spoiled, tiny_root, tmp_path / "whole.zip")
+    assert log[-1].startswith("prepare")
+
+
+def test_a_check_that_fails_by_accident_is_told(tiny_root: Path, tmp_path: Path) -> None:
+    method = replace(whole_config([]), check=lambda _: print(1 // 0))
+    with pytest.raises(MethodError, match="whole: lattice: check: raised ZeroDivisionError"):
+        predict(method, tiny_root, tmp_path / "whole.zip")
+    assert not list(tmp_path.iterdir())
+
+
+def test_columns_without_a_comma_are_refused() -> None:
+    with pytest.raises(TypeError, match="columns is the text 'left_rgb', expected a tuple of names"):
+        MethodInfo("mine", "a test", "left_rgb", False, "here", "MIT")  # type: ignore[arg-type]

@@ -1,0 +1,134 @@
+"""The page's script, operated in a real browser where the machine has one."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rebar_depth_bench.reporting.html.assets import inline_script
+from rebar_depth_bench.reporting.html.page import render_report
+from tests.bench.reporting.results import overflowed, result, scored, unpredicted
+from tests.bench.reporting.test_report import panels
+
+_BROWSER = next((found for name in ("chromium", "google-chrome") if (found := shutil.which(name))), None)
+
+needs_browser = pytest.mark.skipif(_BROWSER is None, reason="no chromium on this machine")
+
+_TABLE = """
+<table class="sortable"><thead>
+<tr><th scope="col" rowspan="2">Name</th><th scope="colgroup" colspan="2">errors</th>
+<th scope="col" rowspan="2">Last</th></tr>
+<tr><th scope="col">One</th><th scope="col">Two</th></tr></thead>
+<tbody>
+<tr><th>v10</th><td data-value="0.5">0.5</td><td data-value="2">2</td><td>b</td></tr>
+<tr><th>v9</th><td>none</td><td data-value="10">10</td><td>a</td></tr>
+<tr><th>v1</th><td data-value="1e-05">1.0e-05</td><td data-value="-3">-3</td><td>–</td></tr>
+<tr><th>v2</th><td data-value="0.5">0.5</td><td data-value="1">1</td><td>c</td></tr>
+</tbody></table>
+"""
+
+
+def _operated(page: str, operations: str, folder: Path) -> Any:
+    """Return what ``operations`` (a function body of JavaScript) returns after ``page`` has loaded."""
+    assert _BROWSER is not None
+    ask = f"<script>document.title = JSON.stringify((() => {{ {operations} }})());</script>"
+    file = folder / "page.html"
+    file.write_text(f"{page}{ask}", encoding="utf-8")
+    profile = f"--user-data-dir={folder / 'profile'}"
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", profile]
+    done = subprocess.run(
+        [_BROWSER, *options, "--dump-dom", file.as_uri()], capture_output=True, text=True, timeout=120, check=True
+    )
+    title = re.search(r"<title>(.*?)</title>", done.stdout, re.DOTALL)
+    assert title, done.stderr
+    return json.loads(html.unescape(title[1]))
+
+
+@needs_browser
+def test_tables_sort_numbers_as_numbers_and_dashes_last(tmp_path: Path) -> None:
+    script = files("rebar_depth_bench.reporting.html").joinpath("sortable.js").read_text(encoding="utf-8")
+    page = f"<title>t</title>{_TABLE}<script>{script}</script>"
+    seen = _operated(
+        page,
+        """
+        const names = () => [...document.querySelectorAll("tbody th")].map((one) => one.textContent).join(" ");
+        const states = () => [...document.querySelectorAll("th[aria-sort]")].map((one) => one.ariaSort).join(" ");
+        const press = (index) => { document.querySelectorAll("th button")[index].click(); return names(); };
+        return { Name: [press(0), press(0), press(0)], Last: [press(1), states(), press(1)],
+          One: [press(2), press(2), states(), press(2)], Two: [press(3)] };
+        """,
+        tmp_path,
+    )
+    assert seen["Name"] == ["v1 v2 v9 v10", "v10 v9 v2 v1", "v10 v9 v1 v2"], "third press: as it was"
+    assert seen["Last"] == ["v9 v10 v2 v1", "none ascending none none", "v2 v10 v9 v1"], "under a row span"
+    assert seen["One"] == ["v1 v10 v2 v9", "v10 v2 v1 v9", "none none descending none", "v10 v9 v1 v2"]
+    assert seen["Two"] == ["v1 v2 v10 v9"]
+
+
+@needs_browser
+def test_views_are_shown_one_at_a_time_by_button_key_thumbnail_and_config(tmp_path: Path) -> None:
+    views = [scored("lattice/0000", abs_rel=0.1), scored("lattice/0001", abs_rel=0.9), unpredicted("pile/0000")]
+    page = render_report(result(*views), [panels(view.view_id, view) for view in views])
+    page = re.sub(r"<meta http-equiv=[^>]*>", "", page)  # its policy would stop this test's own script
+    seen = _operated(
+        page.replace("</body>\n</html>\n", ""),
+        """
+        const find = (what) => document.querySelector(what);
+        const shown = () => [...document.querySelectorAll("article")].filter((one) => one.offsetHeight)
+          .map((one) => one.querySelector("h3").textContent + ", " + find("output").textContent).join(" | ");
+        const press = (key) =>
+          find(".controls").dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+        const choose = (config) => {
+          find("select").value = config; find("select").dispatchEvent(new Event("change"));
+        };
+        const [back, on] = document.querySelectorAll("[data-step]");
+        const seen = [[shown(), back.disabled]];
+        on.click(); seen.push(shown());
+        press("ArrowRight"); press("ArrowRight"); seen.push([shown(), on.disabled]);
+        press("ArrowLeft"); seen.push(shown());
+        document.querySelectorAll(".thumbs button")[0].click(); seen.push(shown());
+        choose("pile"); seen.push([shown(), back.disabled, on.disabled]);
+        seen.push(document.querySelectorAll(".thumbs button:not([hidden])").length);
+        choose(""); seen.push(shown());
+        return seen;
+        """,
+        tmp_path,
+    )
+    worst, best, none = "lattice/0001, 1 of 3", "lattice/0000, 2 of 3", "pile/0000, 3 of 3"
+    assert seen == [
+        [worst, True],
+        best,
+        [none, True],
+        *(best, worst, ["pile/0000, 1 of 1", True, True], 1, worst),
+    ]
+
+
+@needs_browser
+def test_the_policy_lets_the_pages_script_run_and_no_other(tmp_path: Path) -> None:
+    assert _BROWSER is not None
+    page = render_report(result(scored("lattice/0000"), overflowed("pier/0000")), [panels()])
+    file = tmp_path / "page.html"
+    file.write_text(
+        page.replace("</body>", "<script>document.title = 'stranger'</script></body>"), encoding="utf-8"
+    )
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
+    command = [_BROWSER, *options, "--dump-dom", file.as_uri()]
+    dom = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+    assert 'class="browser browsing"' in dom
+    assert "<title>stranger" not in dom
+
+
+def test_scripts_are_joined_in_order_and_the_policy_changes_with_them() -> None:
+    both, one = inline_script("sortable.js", "browser.js"), inline_script("sortable.js")
+    assert both.text.startswith(one.text)
+    assert both.policy != one.policy
+    assert "</script" not in both.text.lower()
+    assert "<!--" not in both.text

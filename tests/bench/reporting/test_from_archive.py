@@ -1,0 +1,37 @@
+"""The report of a real archive on a really rendered dataset."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rebar_depth_bench import score
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.reporting import write_report
+from rebar_depth_bench.scoring.result import badness
+
+pytestmark = pytest.mark.render
+
+
+def test_as_many_views_as_asked_for_are_embedded_the_worst_first(
+    tiny_root: Path, tiny_truth: dict[str, np.ndarray], archive_of: Callable[..., Path], tmp_path: Path
+) -> None:
+    factors = 1.1 + 0.05 * np.random.default_rng(3).permutation(len(tiny_truth))
+    archive = archive_of(
+        {view: depth_m * f for (view, depth_m), f in zip(tiny_truth.items(), factors, strict=True)}
+    )
+    result = score(archive, tiny_root)
+    worst_first = [view.view_id for view in sorted(result.views, key=badness, reverse=True)]
+    page = tmp_path / "page.html"
+    write_report(result, archive, tiny_root, page, views_shown=3)
+    text = page.read_text(encoding="utf-8")
+    assert re.findall(r"<h3>(lattice/\d+)</h3>", text) == [*worst_first[:2], worst_first[-1]]
+    assert f"3 of {len(tiny_truth)} views of <b>lattice</b>" in text
+    write_report(result, archive, tiny_root, page, views_shown=0)
+    assert "<article" not in page.read_text(encoding="utf-8")
+    with pytest.raises(InputError, match="views to show: -1"):
+        write_report(result, archive, tiny_root, page, views_shown=-1)

@@ -1,0 +1,78 @@
+"""Several submissions side by side, in the terminal and through the command."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.reporting.comparison_tables import print_paper_table
+from rebar_depth_bench.reporting.published import load_published, published_rows
+from tests.bench.reporting.results import HOSTILE, result, scored, unpredicted
+
+
+def printed(*results: object, published: bool = True) -> str:
+    console = Console(width=80, record=True, file=io.StringIO())
+    print_paper_table(results, console, published=published)  # type: ignore[arg-type]
+    return console.export_text()
+
+
+def test_best_first_and_what_is_not_ranked_last() -> None:
+    text = printed(
+        result(scored("lattice/0000", 0.75), method="far"),
+        result(unpredicted("lattice/0000"), method="silent"),
+        result(scored("lattice/0000", 0.25), method="near"),
+    )
+    assert text.index("near") < text.index("far") < text.index("silent ‡")
+
+
+def test_the_papers_rows_stand_with_their_scene_and_their_mark() -> None:
+    text = printed(result(scored("pier/0000"), scored("mine/0000")))
+    for row in published_rows("pier"):
+        assert f"paper: {row.method}" in text
+        assert row.rmse_cm in text
+    assert "paper: COLMAP+ArUco †" in text
+    assert text.count("paper: Depth Pro") == 1
+    mark = load_published().parts["synthetic"].mark
+    assert mark in " ".join(text.split())
+    assert "paper" not in printed(result(scored("pier/0000")), published=False)
+
+
+def test_a_hostile_name_is_shown_harmless_and_the_table_keeps_to_80_columns() -> None:
+    text = printed(result(scored("lattice/0000"), method=HOSTILE))
+    assert "\x1b[31m" not in text
+    assert "=<script" in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_the_command_writes_latex_and_csv_of_all_archives(
+    tiny_truth: dict[str, np.ndarray],
+    tiny_root: Path,
+    archive_of: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    archives = [
+        str(archive_of({view: factor * depth for view, depth in tiny_truth.items()}, f"{factor}.zip"))
+        for factor in (1.0, 1.5)
+    ]
+    latex, table = tmp_path / "table.tex", tmp_path / "table.csv"
+    command = ["table", *archives, "--data", str(tiny_root), "--latex", str(latex), "--csv", str(table)]
+    assert main(command) == 0
+    rows = list(csv.DictReader(io.StringIO(table.read_text())))
+    assert [float(row["native_abs_rel"]) for row in rows] == pytest.approx([0, 0.5], abs=1e-6)
+    assert [json.loads(row["ranked"]) for row in rows] == [True, True]
+    assert r"\begin{tabular}" in latex.read_text()
+    assert "AbsRel_s" in capsys.readouterr().out
+
+
+def test_a_missing_archive_is_said_in_words(tiny_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["table", "nowhere.zip", "--data", str(tiny_root)]) == 2
+    assert "does not exist" in capsys.readouterr().err

@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from rebar_depth_bench.reporting import formatting
+from rebar_depth_bench.reporting.tables import print_table, result_csv
+from rebar_depth_bench.scoring.result import Result, tabulate
+from tests.bench.reporting.results import HOSTILE, overflowed, result, scored, unpredicted
+
+
+def _printed(shown: Result, width: int, *, terminal: bool = False) -> str:
+    out = io.StringIO()
+    print_table(shown, Console(file=out, width=width, force_terminal=terminal))
+    return out.getvalue()
+
+
+def _row_numbers(printed: str, config: str) -> list[str]:
+    rows = [line.split() for line in printed.splitlines() if line.split()[:1] == [config]]
+    return [cell for row in rows for cell in row[1:]]
+
+
+@pytest.fixture
+def two_configs() -> Result:
+    return result(
+        scored("lattice/0000"),
+        scored("lattice/0001"),
+        scored("lattice-zed-raw/0000", coverage=0.94996),
+        unpredicted("lattice-zed-raw/0001"),
+    )
+
+
+NUMBERS = {
+    "0.7500",
+    "20.09",
+    "18.71",
+    "0.123",
+    "0.0613",
+    "1.52",
+    "1.17",
+    "0.988",
+    "0.625",
+    "1.2",
+    "4.6",
+    "7.9",
+    "13.6",
+    "100.0",
+    "2/2",
+    "yes",
+}
+
+
+@pytest.mark.parametrize("width", [40, 80, 100, 140, 200])
+def test_every_number_is_printed_whole_at_any_width(two_configs: Result, width: int) -> None:
+    assert set(_row_numbers(_printed(two_configs, width), "lattice")) == NUMBERS
+
+
+@pytest.mark.parametrize(("width", "tables"), [(80, 3), (100, 2), (160, 1)])
+def test_the_table_folds_where_the_console_is_narrow(two_configs: Result, width: int, tables: int) -> None:
+    printed = _printed(two_configs, width)
+    assert max(map(len, printed.splitlines())) <= width
+    assert sum(line.startswith("config") for line in printed.splitlines()) == tables
+
+
+@pytest.mark.parametrize("width", [80, 160])
+def test_alignment_protocol_method_and_dataset_are_stated(two_configs: Result, width: int) -> None:
+    printed = _printed(two_configs, width)
+    for stated in (
+        "native (no alignment)",
+        "scaled (oracle median scale per view, s = median(z)/median(p))",
+        "my model, protocol rebar-1",
+        "1.2.3 (sha256:fedcba987654)",
+        "cm",
+    ):
+        assert stated in printed
+
+
+def test_why_a_row_is_not_ranked_is_said_in_words(two_configs: Result) -> None:
+    printed = _printed(two_configs, 160)
+    assert (
+        "lattice-zed-raw: not ranked: 1 of 2 views without any prediction; coverage 47.4 % is below 95 %."
+        in printed
+    )
+    assert "lattice: not ranked" not in printed
+    assert {"no", "1/2"} <= set(_row_numbers(printed, "lattice-zed-raw"))
+
+
+def test_overflow_reads_as_a_dash_with_a_footnote_and_unranks() -> None:
+    printed = _printed(result(overflowed("pier/0000")), 160)
+    assert "pier: not ranked: a number overflowed." in printed
+    assert _row_numbers(printed, "pier")[3:6] == ["1.0e+200", "–", "1.0e+202"]
+    assert formatting.DASH_NOTE in printed
+
+
+def test_a_config_without_any_prediction_is_all_dashes() -> None:
+    printed = _printed(result(unpredicted("pier/0000")), 160)
+    assert _row_numbers(printed, "pier") == ["0/1", "0.0", "no", *["–"] * 9, *["0.0"] * 4]
+
+
+def test_no_footnote_without_a_dash() -> None:
+    assert formatting.DASH not in _printed(result(scored("lattice/0000")), 160)
+
+
+def test_piped_output_has_no_colour_and_a_hostile_method_controls_nothing() -> None:
+    shown = result(scored("lattice/0000"), method=HOSTILE)
+    piped = _printed(shown, 100)
+    assert "\x1b" not in piped
+    assert "\u202e" not in piped
+    assert "[red]\N{REPLACEMENT CHARACTER}[31m" in piped, "markup is text"
+    assert "\x1b[31m" not in _printed(shown, 100, terminal=True)
+
+
+def test_coverage_is_rounded_down_so_that_a_miss_never_reads_as_a_pass() -> None:
+    assert formatting.coverage_percent(0.94999) == "94.9"
+    assert formatting.coverage_percent(0.99999) == "99.9"
+    assert formatting.coverage_percent(0.283) == "28.3"
+    assert formatting.coverage_percent(1.0) == "100.0"
+
+
+def test_numbers_that_fixed_decimals_would_hide_are_scientific() -> None:
+    assert formatting.number(0.00004, 4) == "4.0e-05"
+    assert formatting.number(0.00005, 4) == "0.0001"
+    assert formatting.number(0.0, 4) == "0.0000"
+    assert formatting.number(2e6, 2) == "2.0e+06"
+    assert formatting.number(float("nan"), 2) == formatting.DASH
+
+
+def test_no_views_at_all_is_a_reason() -> None:
+    assert formatting.unranked_reasons(tabulate([])) == ["no views"]
+
+
+def test_csv_has_the_numbers_of_the_json(two_configs: Result) -> None:
+    rows = list(csv.DictReader(io.StringIO(result_csv(two_configs))))
+    written = json.loads(two_configs.to_json())
+    assert [row["config"] for row in rows] == ["lattice", "lattice-zed-raw"]
+    for row in rows:
+        table = written["tables"][row["config"]]
+        assert (int(row["views"]), int(row["views_scored"])) == (table["views"], table["views_scored"])
+        assert float(row["coverage"]) == table["coverage"]
+        assert row["ranked"] == str(table["ranked"]).lower()
+        assert float(row["scale_median"]) == table["scale_median"]
+        for alignment in ("native", "scaled"):
+            for name, value in table[alignment].items():
+                assert float(row[f"{alignment}_{name}"]) == value
+        for tolerance, share in table["within_mm"].items():
+            assert float(row[f"within_{tolerance}mm"]) == share
+        assert row["dataset_digest"] == written["dataset"]["digest"]
+        assert row["dataset_version"] == "1.2.3"
+        assert row["submission_sha256"] == written["submission"]["sha256"]
+        assert row["software_version"] == "0.1.0"
+        assert (row["protocol"], row["method"]) == ("rebar-1", "my model")
+
+
+def test_csv_nulls_are_empty_and_lines_end_in_newlines() -> None:
+    content = result_csv(result(unpredicted("pier/0000"), method="a\rb\nc"))
+    assert "\r\n" not in content
+    assert content.endswith("\n")
+    row = next(csv.DictReader(io.StringIO(content, newline="")))
+    assert row["native_abs_rel"] == row["scaled_delta1"] == row["scale_median"] == ""
+    assert row["method"] == "a\N{REPLACEMENT CHARACTER}b\N{REPLACEMENT CHARACTER}c"
+
+
+@pytest.mark.parametrize("method", [HOSTILE, "+1", "-1", "@x"])
+def test_csv_never_hands_a_formula_to_a_spreadsheet(method: str) -> None:
+    row = next(csv.DictReader(io.StringIO(result_csv(result(scored("lattice/0000"), method=method)))))
+    assert row["method"] == "'" + formatting.printable(method)

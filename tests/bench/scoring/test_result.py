@@ -1,0 +1,109 @@
+"""Tables from views: means, medians, what ranks, and the JSON's bytes."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rebar_depth_bench.scoring.metrics import DepthMetrics
+from rebar_depth_bench.scoring.protocol import WITHIN_MM
+from rebar_depth_bench.scoring.result import Result, ViewScore, tabulate
+
+
+def view(number: int, value: float | None, coverage: float = 1.0, scale: float = 1.0) -> ViewScore:
+    metrics = None if value is None else DepthMetrics(value, value, value, 0.5)
+    return ViewScore(
+        view_id=f"lattice/{number:04d}",
+        scored_px=10,
+        coverage=coverage,
+        scale=None if value is None else scale,
+        native=metrics,
+        scaled=metrics,
+        within_mm=dict.fromkeys(WITHIN_MM, 0.25),
+    )
+
+
+def result_of(*views: ViewScore) -> Result:
+    return Result("m", "00", "sha256:11", "1", "2", {"lattice": tabulate(views)}, views)
+
+
+def test_table_is_the_mean_over_views_and_the_median_scale() -> None:
+    table = tabulate([view(0, 1.0, scale=0.5), view(1, 2.0, scale=0.7), view(2, 6.0, scale=4.0)])
+    assert table.native is not None
+    assert table.native.abs_rel == 3.0
+    assert table.scale_median == 0.7
+    assert (table.views, table.views_scored, table.ranked) == (3, 3, True)
+
+
+def test_even_number_of_scales_takes_the_middle_two() -> None:
+    assert tabulate([view(0, 1.0, scale=1.0), view(1, 1.0, scale=2.0)]).scale_median == 1.5
+
+
+@pytest.mark.parametrize(("coverage", "ranked"), [(0.95, True), (math.nextafter(0.95, 0), False)])
+def test_coverage_decides_rank_at_its_bound(coverage: float, ranked: bool) -> None:
+    assert tabulate([view(0, 1.0, coverage), view(1, 1.0, coverage)]).ranked is ranked
+
+
+def test_a_view_without_prediction_is_left_out_of_means_and_costs_the_rank() -> None:
+    views = [view(n, 1.0) for n in range(99)] + [view(99, None, coverage=0.0)]
+    table = tabulate(views)
+    assert table.native is not None
+    assert (table.native.abs_rel, table.views_scored, table.views, table.ranked) == (1.0, 99, 100, False)
+    assert table.coverage == pytest.approx(0.99)
+
+
+def test_an_overflowed_view_does_not_vanish_from_the_mean() -> None:
+    table = tabulate([view(0, 1.0), view(1, math.inf)])
+    assert table.ranked is False
+    written = result_of(view(0, 1.0), view(1, math.inf)).to_dict()["tables"]["lattice"]
+    assert written["native"]["abs_rel"] is None
+    assert written["native"]["delta1"] == 0.5
+
+
+def test_no_view_at_all_is_all_null_and_unranked() -> None:
+    table = result_of().to_dict()["tables"]["lattice"]
+    assert table["views"] == 0
+    assert table["ranked"] is False
+    assert table["native"]["abs_rel"] is None
+    assert table["scale_median"] is None
+
+
+def test_json_has_the_contracts_keys_and_units() -> None:
+    content = json.loads(result_of(view(0, 0.25)).to_json())
+    assert list(content) == ["protocol", "dataset", "submission", "software", "tables", "views"]
+    assert content["protocol"] == "rebar-1"
+    assert content["dataset"] == {"digest": "sha256:11", "version": "1"}
+    assert content["submission"] == {"method": "m", "sha256": "00"}
+    table = content["tables"]["lattice"]
+    assert list(table) == [
+        "views",
+        "views_scored",
+        "coverage",
+        "ranked",
+        "native",
+        "scaled",
+        "scale_median",
+        "within_mm",
+        "ci95",
+    ]
+    assert table["native"] == {"abs_rel": 0.25, "rmse_cm": 0.25, "mae_cm": 0.25, "delta1": 0.5}
+    assert list(table["within_mm"]) == ["3", "5", "10", "20"]
+    assert list(content["views"][0]) == [
+        "view_id",
+        "scored_px",
+        "coverage",
+        "scale",
+        "native",
+        "scaled",
+        "within_mm",
+    ]
+
+
+@given(st.lists(st.floats(0, 1e6), min_size=1, max_size=20))
+def test_means_do_not_depend_on_the_order_of_views(values: list[float]) -> None:
+    views = [view(n, value) for n, value in enumerate(values)]
+    assert tabulate(views).native == tabulate(views[::-1]).native

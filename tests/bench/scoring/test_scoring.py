@@ -1,0 +1,191 @@
+"""Scores of real archives on a really rendered dataset: what must be exact, and what must never help."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rebar_depth_bench import DatasetError, SubmissionError, score
+from rebar_depth_bench.data.ground_truth import CACHE_FOLDER, ViewTruth
+from rebar_depth_bench.scoring.protocol import interior
+from rebar_depth_bench.scoring.result import Table, tabulate
+from rebar_depth_bench.scoring.score import score_view
+
+Depths = dict[str, np.ndarray]
+Archive = Callable[..., Path]
+
+
+def lattice(archive: Path, root: Path) -> Table:
+    return score(archive, root).tables["lattice"]
+
+
+def test_ground_truth_is_exactly_perfect(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+    table = lattice(archive_of(tiny_truth), tiny_root)
+    assert table.native is not None
+    for metrics in (table.native, table.scaled):
+        assert metrics is not None
+        assert (metrics.abs_rel, metrics.rmse_cm, metrics.mae_cm, metrics.delta1) == (0.0, 0.0, 0.0, 1.0)
+    assert table.scale_median == 1.0
+    assert table.coverage == 1.0
+    assert table.ranked
+    assert set(table.within_mm.values()) == {1.0}
+
+
+def test_twice_the_depth_is_all_scale(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+    table = lattice(archive_of({view: 2 * depth for view, depth in tiny_truth.items()}), tiny_root)
+    assert table.native is not None
+    assert table.scaled is not None
+    assert table.native.abs_rel == 1.0
+    assert table.native.delta1 == 0.0
+    assert table.scale_median == 0.5
+    assert (table.scaled.abs_rel, table.scaled.rmse_cm, table.scaled.delta1) == (0.0, 0.0, 1.0)
+
+
+def test_all_negative_predictions_have_null_metrics_and_no_rank(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive
+) -> None:
+    archive = archive_of({view: -depth - 1 for view, depth in tiny_truth.items()})
+    content = json.loads(score(archive, tiny_root).to_json())
+    table = content["tables"]["lattice"]
+    assert table["coverage"] == 0.0
+    assert table["views_scored"] == 0
+    assert table["ranked"] is False
+    assert set(table["native"].values()) == {None}
+    assert table["scale_median"] is None
+    assert set(table["within_mm"].values()) == {0.0}
+    assert content["views"][0]["native"]["abs_rel"] is None
+
+
+def test_an_independent_evaluation_agrees(
+    tiny_truth: Depths, tiny_masks: Depths, tiny_root: Path, archive_of: Archive
+) -> None:
+    rng = np.random.default_rng(5)
+    predictions = {
+        view: (depth * rng.uniform(0.7, 1.6) + rng.normal(0, 0.01, depth.shape)).astype(np.float32)
+        for view, depth in tiny_truth.items()
+    }
+    table = lattice(archive_of(predictions), tiny_root)
+    rows = []
+    for view, prediction in predictions.items():
+        scored = interior(tiny_masks[view]) & (tiny_truth[view] > 0)
+        z = tiny_truth[view][scored].astype(float)
+        p = prediction[scored].astype(float)
+        s = np.median(z) / np.median(p)
+        rows.append(
+            [
+                np.mean(np.abs(p - z) / z),
+                100 * np.sqrt(np.mean((p - z) ** 2)),
+                100 * np.mean(np.abs(p - z)),
+                np.mean(np.maximum(p / z, z / p) < 1.25),
+                np.mean(np.abs(s * p - z) / z),
+                np.mean(np.abs(p - z) <= 0.01),
+                s,
+            ]
+        )
+    means = np.mean(rows, axis=0)
+    assert table.native is not None
+    assert table.scaled is not None
+    found = [table.native.abs_rel, table.native.rmse_cm, table.native.mae_cm, table.native.delta1]
+    assert [*found, table.scaled.abs_rel, table.within_mm[10]] == pytest.approx(means[:6].tolist(), rel=1e-12)
+    assert table.scale_median == pytest.approx(np.median([row[6] for row in rows]), rel=1e-12)
+
+
+def test_same_bytes_for_any_number_of_workers_and_on_the_command_line(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
+) -> None:
+    archive = archive_of({view: 1.1 * depth for view, depth in tiny_truth.items()})
+    one, four = (score(archive, tiny_root, workers=workers).to_json() for workers in (1, 4))
+    assert one == four
+    target = tmp_path / "result.json"
+    command = [
+        sys.executable,
+        "-m",
+        "rebar_depth_bench",
+        "score",
+        str(archive),
+        "--data",
+        str(tiny_root),
+        "--json",
+        str(target),
+    ]
+    subprocess.run(command, check=True, capture_output=True)
+    assert target.read_bytes() == one
+
+
+def test_one_bad_entry_refuses_the_whole_archive(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
+) -> None:
+    good = archive_of(tiny_truth)
+    bad = tmp_path / "bad.zip"
+    with zipfile.ZipFile(good) as source, zipfile.ZipFile(bad, "w") as target:
+        for name in source.namelist():
+            content = source.read(name)
+            broken = name.endswith(("0.npy", "5.npy"))
+            target.writestr(name, content[:-7] if broken else content)
+    with pytest.raises(SubmissionError) as caught:
+        score(bad, tiny_root)
+    broken_views = [view for view in tiny_truth if view[-1] in "05"]
+    assert len(caught.value.problems) == len(broken_views) > 0
+    assert all(any(view in problem for problem in caught.value.problems) for view in broken_views)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0, 1.0), blank=st.sampled_from([0, -1, np.nan, np.inf]))
+def test_blanking_pixels_never_improves_what_ranks(seed: int, share: float, blank: float) -> None:
+    """Removing predictions, even the worst ones on purpose, lowers ``within_mm`` or costs the rank."""
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(0.2, 0.5, 400).astype(np.float32)
+    p = (z * rng.uniform(0.5, 2.0) + rng.normal(0, 0.02, 400)).astype(np.float32)
+    truth = ViewTruth("lattice/0000", np.arange(400, dtype=np.uint32), z, float(np.median(z)))
+    whole = score_view(truth, p.reshape(20, 20))
+    blanked = p.copy()
+    worst_first = np.argsort(-np.abs(p - z))
+    blanked[worst_first[: int(share * 400)]] = blank
+    less = score_view(truth, blanked.reshape(20, 20))
+    assert all(less.within_mm[t] <= whole.within_mm[t] for t in whole.within_mm)
+    assert less.coverage <= whole.coverage
+    if less.coverage < 0.95:
+        assert not tabulate([less]).ranked
+
+
+def test_leaving_views_out_is_refused(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+    fewer = dict(list(tiny_truth.items())[1:])
+    with pytest.raises(SubmissionError, match="lattice"):
+        score(archive_of(fewer), tiny_root)
+
+
+def test_a_config_may_be_left_out_whole(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+    assert list(score(archive_of(tiny_truth), tiny_root).tables) == ["lattice"]
+
+
+def test_a_damaged_ground_truth_is_named(
+    tiny_root: Path, tiny_truth: Depths, archive_of: Archive, tmp_path: Path
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(tiny_root, copy, ignore=shutil.ignore_patterns(CACHE_FOLDER))
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["configs"]["lattice"]["views"][3]["left"] = "0" * 64
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    view_id = manifest["configs"]["lattice"]["views"][3]["view_id"]
+    with pytest.raises(DatasetError, match=f"view {view_id}: ground truth has digest"):
+        score(archive_of(tiny_truth), copy)
+    assert not list(copy.glob(f"{CACHE_FOLDER}/*lattice-*"))
+
+
+def test_a_damaged_cache_is_made_anew(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+    archive = archive_of(tiny_truth)
+    before = score(archive, tiny_root).to_json()
+    for name in ("views.json", "index"):
+        cached = next(tiny_root.glob(f"{CACHE_FOLDER}/rebar-1-lattice-*/{name}"))
+        cached.write_bytes(cached.read_bytes()[:20])
+        assert score(archive, tiny_root).to_json() == before

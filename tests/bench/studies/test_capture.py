@@ -1,0 +1,204 @@
+"""Real captures and folders of depth maps: what is read, and every way in which they can be wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from rebar_depth_bench import SubmissionWriter
+from rebar_depth_bench.errors import CalibrationError, InputError, SubmissionError
+from rebar_depth_bench.studies.depth_source import open_depths
+from rebar_depth_bench.studies.pseudo_reference.capture import is_capture, open_capture
+from rebar_depth_bench.submission import EntryError
+from tests.bench.studies.captures import CONF, write_capture
+from tests.bench.submission.zips import exr, npz, png
+
+DEPTH = np.linspace(0.5, 2.0, 12).reshape(3, 4).astype(np.float32)
+VIEWS = {"walk/a": (3, 4), "walk/b": (3, 4)}
+
+
+def test_a_capture_states_its_views_and_camera(tmp_path: Path) -> None:
+    root = write_capture(tmp_path / "zed-1", views=2)
+    assert is_capture(root)
+    assert not is_capture(tmp_path)
+    capture = open_capture(root)
+    assert capture.expected_views() == {"zed-1/000000": (36, 64), "zed-1/000001": (36, 64)}
+    words = capture.camera_words()
+    assert "fx 35.09, fy 35.09" in words  # 701.88 * 64 / 1280, 701.70 * 36 / 720
+    assert "baseline 119.98 mm" in words
+    assert "must be on the very grid of left/" in words
+    assert "lens distortion" in words
+
+
+def test_a_capture_takes_toml_and_jpeg(tmp_path: Path) -> None:
+    root = write_capture(tmp_path / "c", views=1)
+    (root / "calibration.conf").unlink()
+    (root / "calibration.toml").write_text(
+        "[left]\nfx = 50\nfy = 50\ncx = 31.5\ncy = 17.5\ndistortion = [0, 0, 0, 0]\n"
+        "[right]\nfx = 50\nfy = 50\ncx = 31.5\ncy = 17.5\ndistortion = [0, 0, 0, 0]\n"
+        "[stereo]\nrotation = [0, 0, 0]\nbaseline_m = 0.1\n"
+    )
+    for eye in ("left", "right"):
+        (root / eye / "000000.png").rename(root / eye / "000000.tmp")
+        Image.open(root / eye / "000000.tmp").save(root / eye / "000000.JPG", "JPEG")
+    words = open_capture(root).camera_words()
+    assert "baseline 100.00 mm" in words
+    assert "lens distortion" not in words
+
+
+def unpaired(root: Path) -> None:
+    (root / "right" / "000001.png").unlink()
+
+
+def other_size(root: Path) -> None:
+    Image.new("L", (32, 18)).save(root / "right" / "000001.png")
+
+
+def no_picture(root: Path) -> None:
+    (root / "left" / "000001.png").write_bytes(b"none")
+
+
+def bad_name(root: Path) -> None:
+    for eye in ("left", "right"):
+        (root / eye / "000001.png").rename(root / eye / "view one.png")
+
+
+def twice(root: Path) -> None:
+    Image.new("L", (64, 36)).save(root / "left" / "000001.jpg")
+
+
+def no_right(root: Path) -> None:
+    (root / "right").rename(root / "Right")
+
+
+def empty(root: Path) -> None:
+    for file in (*(root / "left").iterdir(), *(root / "right").iterdir()):
+        file.unlink()
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (unpaired, r"left/000001.png: has no right/000001"),
+        (other_size, r"right/000001.png: is 32 x 18, expected 64 x 36"),
+        (no_picture, r"left/000001.png: is no readable picture"),
+        (bad_name, r"left/view one.png: expected a name of letters"),
+        (twice, r"left/000001.png: the name stands twice"),
+        (no_right, r"right/: no such folder"),
+        (empty, r"left/ holds no picture"),
+    ],
+)
+def test_a_bad_capture_is_refused_with_its_layout(
+    damage: Callable[[Path], None], words: str, tmp_path: Path
+) -> None:
+    root = write_capture(tmp_path / "c", views=2)
+    damage(root)
+    with pytest.raises(InputError, match=words) as caught:
+        open_capture(root)
+    assert "expected a capture: left/<name>.png|jpg" in str(caught.value)
+
+
+def test_a_folder_whose_name_no_id_may_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the folder is called 'my capture', expected letters"):
+        open_capture(write_capture(tmp_path / "my capture", views=1))
+
+
+def test_calibrations_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    square = write_capture(tmp_path / "square", views=1, size=(64, 64))
+    with pytest.raises(
+        InputError, match=r"fx is 0\.563 times fy, expected 1: the calibration belongs to pictures"
+    ):
+        open_capture(square)
+    without = write_capture(tmp_path / "without", views=1)
+    (without / "calibration.conf").unlink()
+    with pytest.raises(InputError, match=r"0 calibration files, expected one of calibration\.conf or"):
+        open_capture(without)
+    broken = write_capture(tmp_path / "broken", views=1)
+    (broken / "calibration.conf").write_text(CONF.replace("fx=701.88", "fx=none"))
+    with pytest.raises(CalibrationError, match="fx"):
+        open_capture(broken)
+
+
+def test_folders_hold_every_format_by_name_or_by_whole_id(tmp_path: Path) -> None:
+    units = np.round(DEPTH.astype(np.float64) * 1000)
+    (tmp_path / "submission.json").write_text('{"method": "mine", "depth_scale": 0.001}')
+    (tmp_path / "walk").mkdir()
+    files: dict[str, Callable[[Path], object]] = {
+        "a.npy": lambda path: np.save(path, DEPTH),
+        "a.npz": lambda path: path.write_bytes(npz(depth=DEPTH)),
+        "walk/a.exr": lambda path: exr(path, {"Z": DEPTH}),
+        "a.png": lambda path: path.write_bytes(png(units)),
+    }
+    for name, write in files.items():
+        path = tmp_path / name
+        write(path)
+        with open_depths(tmp_path, VIEWS) as source:
+            assert (source.method, source.view_ids) == ("mine", ("walk/a",))
+            expected = units * 0.001 if name == "a.png" else DEPTH
+            assert np.array_equal(source.read("walk/a"), expected), name
+        path.unlink()
+
+
+def test_a_folder_and_an_archive_are_read_alike(tmp_path: Path) -> None:
+    archive, folder = tmp_path / "a.zip", tmp_path / "method-x"
+    folder.mkdir()
+    with SubmissionWriter(archive, method="method-y") as writer:
+        for view_id in VIEWS:
+            writer.add(view_id, DEPTH)
+            np.save(folder / f"{view_id.partition('/')[2]}.npy", DEPTH)
+    with open_depths(archive, VIEWS) as one, open_depths(folder, VIEWS) as other:
+        assert (one.method, other.method) == ("method-y", "method-x")
+        assert one.view_ids == other.view_ids == tuple(VIEWS)
+        assert np.array_equal(one.read("walk/b"), other.read("walk/b"))
+        assert one.sha256() != other.sha256()
+        before = other.sha256()
+    np.save(folder / "b.npy", 2 * DEPTH)
+    with open_depths(folder, VIEWS) as changed:
+        assert changed.sha256() != before
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({}, "no depth file of any view was found, expected <view_id>"),
+        ({"c.npy": b""}, "no depth file of any view was found"),
+        ({"a.npy": b"", "a.npz": b""}, r"walk/a: 2 files were found \(a.npy, a.npz\), expected one"),
+        ({"a.png": b""}, r"no depth_scale, expected metres per PNG unit, since 1 files are PNG \(first a.png\)"),
+        ({"a.npy": b"", "submission.json": b"{"}, "submission.json: the text is not valid JSON"),
+        ({"a.npy": b"", "submission.json": b'{"method": 1}'}, "submission.json: method is a number"),
+    ],
+)
+def test_a_bad_folder_is_refused_at_once(files: dict[str, bytes], words: str, tmp_path: Path) -> None:
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(SubmissionError, match=words):
+        open_depths(tmp_path, VIEWS)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.npy", b"\x93NUMPY\x01\x00", "a.npy: the .npy header is cut off"),
+        ("a.npz", b"PK\x03\x04", "a.npz: inside the .npz, the zip has no end record"),
+        ("a.exr", b"none", "a.exr: the bytes start with"),
+        ("a.png", png(np.ones((3, 4)), bits=8), "a.png: the PNG is 8-bit greyscale, expected 16-bit"),
+        ("a.png", png(np.ones((4, 3))), r"a.png: the image is 4 x 3, expected 3 x 4 \(H x W\)"),
+        ("a.png", bytes(10_000_000), r"a.png: it has more than 262171 bytes, expected a map of 3 x 4 \(H x W\)"),
+    ],
+)
+def test_a_damaged_file_is_refused_when_it_is_read(name: str, content: bytes, words: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(content)
+    with open_depths(tmp_path, VIEWS, png_scale=0.001) as source, pytest.raises(EntryError, match=words):
+        source.read("walk/a")
+
+
+def test_a_file_that_is_gone_by_then_is_refused_in_words(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", DEPTH)
+    with open_depths(tmp_path, VIEWS) as source:
+        (tmp_path / "a.npy").unlink()
+        with pytest.raises(EntryError, match=r"a\.npy: it cannot be read: No such file"):
+            source.read("walk/a")

@@ -1,0 +1,212 @@
+from __future__ import annotations
+
+import json
+import os
+import struct
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.submission import SubmissionWriter, check_archive, open_submission
+from tests.bench.submission.zips import DEPTH, EXPECTED, SHAPE, Array
+
+
+def write(path: Path, **options: object) -> None:
+    with SubmissionWriter(path, "my model", **options) as writer:  # type: ignore[arg-type]
+        writer.add("lattice/0000", DEPTH)
+        writer.add("lattice/0001", DEPTH[::-1].astype(np.float16))
+
+
+def interrupt(path: Path) -> None:
+    with SubmissionWriter(path, "other") as writer:
+        writer.add("lattice/0000", DEPTH)
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_what_is_written_reads_back(tmp_path: Path, compress: bool) -> None:
+    path = tmp_path / "s.zip"
+    write(
+        path,
+        compress=compress,
+        description="d",
+        url="https://x.org/a",
+        uses_intrinsics=True,
+        runtime={"gpu": "none"},
+    )
+    assert check_archive(path, EXPECTED) == []
+    with open_submission(path, EXPECTED) as reader:
+        assert reader.view_ids == ("lattice/0000", "lattice/0001")
+        np.testing.assert_array_equal(reader.read("lattice/0000"), DEPTH)
+        half = reader.read("lattice/0001")
+        assert half.dtype == np.float16
+        np.testing.assert_array_equal(half, DEPTH[::-1].astype(np.float16))
+        meta = reader.meta
+    assert meta is not None
+    assert (meta.method, meta.description, meta.url) == ("my model", "d", "https://x.org/a")
+    assert (meta.uses_intrinsics, meta.runtime, meta.depth_scale) == (True, {"gpu": "none"}, None)
+
+
+def test_other_zip_readers_and_numpy_agree(tmp_path: Path) -> None:
+    write(tmp_path / "s.zip")
+    with zipfile.ZipFile(tmp_path / "s.zip") as archive:
+        assert archive.testzip() is None
+        assert [info.external_attr >> 16 for info in archive.infolist()] == [0o100644] * 3
+        with archive.open("lattice/0000.npy") as entry:
+            np.testing.assert_array_equal(np.load(entry), DEPTH)
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_the_same_predictions_give_the_same_bytes(
+    tmp_path: Path, compress: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path / "a.zip", compress=compress)
+    monkeypatch.setattr(time, "time", lambda: 2e9)
+    previous = os.umask(0o077)
+    try:
+        write(tmp_path / "b.zip", compress=compress)
+    finally:
+        os.umask(previous)
+    assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
+
+
+def test_stored_values_are_aligned_in_the_file(tmp_path: Path) -> None:
+    write(tmp_path / "s.zip")
+    content = (tmp_path / "s.zip").read_bytes()
+    assert content.index(DEPTH.tobytes()) % 64 == 0
+
+
+def test_an_exception_leaves_the_earlier_archive_and_no_other_file(tmp_path: Path) -> None:
+    path = tmp_path / "s.zip"
+    write(path)
+    before = path.read_bytes()
+    with pytest.raises(KeyboardInterrupt):
+        interrupt(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_nothing_stands_under_the_name_before_the_end(tmp_path: Path) -> None:
+    path = tmp_path / "s.zip"
+    with SubmissionWriter(path, "m") as writer:
+        writer.add("lattice/0000", DEPTH)
+        assert not path.exists()
+    assert path.exists()
+
+
+def test_seconds_go_into_runtime(tmp_path: Path) -> None:
+    with SubmissionWriter(tmp_path / "s.zip", "m", runtime={"gpu": "x"}) as writer:
+        writer.add("lattice/0000", DEPTH, seconds=0.25)
+    with zipfile.ZipFile(tmp_path / "s.zip") as archive:
+        runtime = json.loads(archive.read("submission.json"))["runtime"]
+    assert runtime == {"gpu": "x", "seconds": {"lattice/0000": 0.25}}
+
+
+def test_values_without_prediction_and_other_precisions_are_kept(tmp_path: Path) -> None:
+    odd = np.array([[np.nan, np.inf, -np.inf, 0.0], [-1.0, 1e300, 1e-300, 2.0], [1, 2, 3, 4]])
+    with SubmissionWriter(tmp_path / "s.zip", "m") as writer:
+        writer.add("lattice/0000", odd)
+        writer.add("lattice/0001", np.asfortranarray(DEPTH.astype(">f4")))
+    with open_submission(tmp_path / "s.zip", EXPECTED) as reader:
+        with np.errstate(over="ignore", under="ignore"):
+            np.testing.assert_array_equal(reader.read("lattice/0000"), odd.astype(np.float32))
+        np.testing.assert_array_equal(reader.read("lattice/0001"), DEPTH)
+
+
+class Tensor:
+    def __array__(self, dtype: object = None, copy: object = None) -> Array:
+        return DEPTH
+
+
+class GpuTensor:
+    def __array__(self, dtype: object = None, copy: object = None) -> Array:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+
+def test_anything_with_an_array_interface_is_taken(tmp_path: Path) -> None:
+    with SubmissionWriter(tmp_path / "s.zip", "m") as writer:
+        writer.add("lattice/0000", Tensor())
+        writer.add("lattice/0001", DEPTH.tolist())
+    assert check_archive(tmp_path / "s.zip", EXPECTED) == []
+
+
+@pytest.mark.parametrize(
+    ("view_id", "depth", "words"),
+    [
+        ("lattice/0000", DEPTH, "lattice/0000: the view was added twice, expected once"),
+        ("0001", DEPTH, "view_id is 0001, expected '<config>/<number>'"),
+        ("../x", DEPTH, r"view_id is ../x, expected"),
+        ("lattice/0001\n", DEPTH, r"view_id is 'lattice/0001\\n', expected"),
+        (7, DEPTH, "view_id is 7, expected"),
+        ("lattice/0001", DEPTH[None], r"lattice/0001: depth has shape \(1, 3, 4\), expected \(H, W\)"),
+        ("lattice/0001", np.zeros((0, 4)), r"shape \(0, 4\), expected \(H, W\)"),
+        ("lattice/0001", np.ones(SHAPE, np.uint16), "dtype uint16, expected floats in metres"),
+        ("lattice/0001", np.ones(SHAPE, bool), "dtype bool, expected floats"),
+        ("lattice/0001", np.ones(SHAPE, complex), "dtype complex128, expected floats"),
+        ("lattice/0001", np.zeros(SHAPE).view(np.ma.MaskedArray), "masked array, expected NaN"),
+        ("lattice/0001", GpuTensor(), "cannot become a numpy array .*cuda:0"),
+        ("lattice/0001", [[1.0], [1.0, 2.0]], "cannot become a numpy array"),
+    ],
+)
+def test_add_refuses_in_words(tmp_path: Path, view_id: str, depth: object, words: str) -> None:
+    with SubmissionWriter(tmp_path / "s.zip", "m") as writer:
+        writer.add("lattice/0000", DEPTH)
+        with pytest.raises(InputError, match=words):
+            writer.add(view_id, depth)
+        writer.add("lattice/0001", DEPTH)
+    assert check_archive(tmp_path / "s.zip", EXPECTED) == []
+
+
+def test_add_needs_an_open_writer_and_a_sane_time(tmp_path: Path) -> None:
+    writer = SubmissionWriter(tmp_path / "s.zip", "m")
+    with pytest.raises(InputError, match="not open, expected add"):
+        writer.add("lattice/0000", DEPTH)
+    with writer, pytest.raises(InputError, match="seconds is nan, expected"):
+        writer.add("lattice/0000", DEPTH, seconds=float("nan"))
+    with pytest.raises(InputError, match="not open"):
+        writer.add("lattice/0000", DEPTH)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"method": " "}, "method is ' ', expected a printable name"),
+        ({"method": "m" * 201}, "method has 201 characters"),
+        ({"method": "m", "url": "ftp://x"}, "url is ftp://x, expected an address"),
+        ({"method": "m", "uses_intrinsics": "yes"}, "uses_intrinsics is text, expected true or false"),
+        ({"method": "m", "runtime": {"s": float("nan")}}, "the metadata is not JSON"),
+        ({"method": "m", "runtime": {"s": object()}}, "the metadata is not JSON"),
+    ],
+)
+def test_metadata_is_refused_before_anything_is_written(
+    tmp_path: Path, options: dict[str, object], words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        SubmissionWriter(tmp_path / "s.zip", **options)  # type: ignore[arg-type]
+
+
+def test_targets_that_cannot_be_written(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"), SubmissionWriter(tmp_path / "a" / "s.zip", "m"):
+        pass
+    with pytest.raises(InputError, match="is a directory"), SubmissionWriter(tmp_path, "m"):
+        pass
+
+
+def test_an_archive_past_4_gb_has_zip64_offsets_and_reads_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A low limit stands in for the 4 GB: the same fields are written, in kilobytes.
+    monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 1000)
+    path = tmp_path / "s.zip"
+    views = {f"lattice/{index:04d}": (16, 16) for index in range(4)}
+    with SubmissionWriter(path, "m") as writer:
+        for view_id in views:
+            writer.add(view_id, np.ones((16, 16)))
+    content = path.read_bytes()
+    assert b"PK\x06\x06" in content
+    assert struct.pack("<L", 0xFFFFFFFF) in content
+    assert check_archive(path, views) == []

@@ -1,0 +1,192 @@
+"""The seven configs of the contract, users' own scenes and variants: built, audited, published."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import datasets
+import numpy as np
+import pytest
+from PIL import Image
+
+import rebar_depth_bench as rdb
+from dataset_builder.audit import audit
+from dataset_builder.build.bars_table import read_bars
+from dataset_builder.build.contact_sheet import STRIP_PANEL_PX, TILE_PX
+from dataset_builder.config.catalog import CONFIGS, BuildRequest
+from dataset_builder.config.specs import RigSpec, RingSpec
+from dataset_builder.config.trajectories import offsets_m
+from dataset_builder.scene.assemblies import check_fits, make_assembly
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.geometry.cameras import ideal_K
+from rebar_depth_bench.scoring.score import score
+from tests.conftest import TINY, run_build
+
+VIEWS = {"lattice": 504, "lattice-orbit": 100, "lattice-zed": 504, "lattice-zed-raw": 504, "lattice-12": 504}
+VIEWS |= {"pile": 504, "pier": 504}
+GRID = ("--width", "240", "--height", "135", "--samples", "1")
+
+
+@pytest.fixture(scope="module")
+def full_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All configs, one view each, by the one command that a maintainer gives."""
+    root = tmp_path_factory.mktemp("full") / "dataset"
+    finished = run_build("--out", root, "--views", "1", *GRID)
+    assert finished.returncode == 0, finished.stderr
+    assert f"built: {', '.join(VIEWS)}" in finished.stdout
+    return root
+
+
+@pytest.fixture(scope="module")
+def manifest(full_root: Path) -> dict[str, Any]:
+    loaded: dict[str, Any] = json.loads((full_root / "manifest.json").read_text())
+    return loaded
+
+
+def test_the_registry_is_the_contracts() -> None:
+    assert {name: len(offsets_m(make().protocol)) for name, make in CONFIGS.items()} == VIEWS
+    distances = {
+        name: [float(np.linalg.norm(offset)) for offset in offsets_m(CONFIGS[name]().protocol)] for name in VIEWS
+    }
+    assert {
+        name: (round(min(far), 6), round(max(far), 6)) for name, far in distances.items() if len(far) == 504
+    } == {
+        **dict.fromkeys(("lattice", "lattice-zed", "lattice-zed-raw", "lattice-12"), (0.22, 0.43)),
+        "pile": (0.50, 0.90),
+        "pier": (8.0, 17.0),
+    }
+
+
+@pytest.mark.render
+def test_plain_datasets_reads_every_config(full_root: Path) -> None:
+    for name in VIEWS:
+        [row] = datasets.load_dataset(str(full_root), name, split="test")
+        assert row["view_id"] == f"{name}/{VIEWS[name] // 2:04d}"
+        assert row["left_rgb"].size == (240, 135)
+
+
+@pytest.mark.render
+def test_every_config_has_its_scene_and_optics(full_root: Path) -> None:
+    bars = read_bars(full_root / "bars.parquet")
+    assert {scene: len(found) for scene, found in bars.items()} == {
+        "lattice": 75,
+        "lattice-12": 75,
+        "pile": 6,
+        "pier": 231,
+    }
+    rows = {name: rdb.load(full_root, name)[0] for name in VIEWS}
+    for name, row in rows.items():
+        assert row["left_mask"].any(), name
+        on_grid = np.array_equal(row["left_K"], ideal_K(240, 135))
+        assert on_grid == ("zed" not in name)
+        assert row["left_distortion"].any() == (name == "lattice-zed-raw")
+    raw, rectified = rows["lattice-zed-raw"], rows["lattice-zed"]
+    assert raw["baseline_m"] == rectified["baseline_m"] == pytest.approx(0.119978, abs=1e-9)
+    assert (rows["pier"]["left_depth"] == 0).any()  # the sky is no surface
+    assert 5 < np.median(rows["pier"]["left_depth"][rows["pier"]["left_mask"]]) < 20
+
+
+@pytest.mark.render
+def test_the_audit_passes_on_all_of_them(full_root: Path) -> None:
+    report = audit(full_root, depth_views=1)
+    assert [f"{check.name}: {check.problems}" for check in report.failures] == []
+    assert sum("depth against Cycles" in check.name for check in report.checks) == len(VIEWS)
+
+
+@pytest.mark.render
+def test_the_truth_scores_perfectly_on_every_config(full_root: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "truth.zip"
+    with rdb.SubmissionWriter(archive, method="truth") as writer:
+        for name in VIEWS:
+            for row in rdb.load(full_root, name, columns=["view_id", "left_depth"]):
+                writer.add(row["view_id"], row["left_depth"])
+    tables = score(archive, full_root).tables
+    assert set(tables) == set(VIEWS)
+    scored = [table for table in tables.values() if table.views_scored]
+    assert len(scored) >= len(VIEWS) - 1  # tiny, the pier may keep no interior pixel
+    assert all(table.native is not None and table.native.abs_rel == 0.0 for table in scored)
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    with Image.open(path) as picture:
+        return picture.size
+
+
+@pytest.mark.render
+def test_pictures_show_every_view_and_every_scene(full_root: Path, manifest: dict[str, Any]) -> None:
+    sizes = {path.name: picture_size(path) for path in (full_root / "pictures").iterdir()}
+    assert sizes.pop("scenes.webp") == (3 * STRIP_PANEL_PX[0], STRIP_PANEL_PX[1])
+    assert sizes == {f"{name}.webp": (TILE_PX[0], 2 * TILE_PX[1]) for name in VIEWS}
+    card = (full_root / "README.md").read_text()
+    assert all(entry["sheet"] in card for entry in manifest["configs"].values())
+
+
+@pytest.mark.render
+def test_a_users_scene_and_a_variant_stand_beside_the_standard_configs(tmp_path: Path) -> None:
+    root = tmp_path / "dataset"
+    assert run_build("--out", root, "--config", "lattice", "--views", "1", *TINY).returncode == 0
+    standard = (root / "manifest.json").read_text()
+    for arguments in (
+        ("--scene", "examples/beam.toml"),
+        ("--config", "lattice", "--variant", "wet", "formwork"),
+    ):
+        finished = run_build("--out", root, *arguments, "--views", "1", *TINY)
+        assert finished.returncode == 0, finished.stderr
+    entries = json.loads((root / "manifest.json").read_text())["configs"]
+    assert list(entries) == ["lattice", "beam", "lattice-wet-formwork"]
+    assert entries["lattice"] == json.loads(standard)["configs"]["lattice"]
+    assert entries["lattice-wet-formwork"]["scene"]["appearance"]["variants"] == ["wet", "formwork"]
+    assert rdb.load(root, "beam")[0]["left_mask"].any()
+    plain, other = (rdb.load(root, name)[0] for name in ("lattice", "lattice-wet-formwork"))
+    assert np.array_equal(plain["left_cam_from_world"], other["left_cam_from_world"])
+    assert not np.array_equal(plain["left_rgb"], other["left_rgb"])
+    assert audit(root, depth_views=0).failures == ()
+
+
+@pytest.mark.parametrize(
+    ("request_", "words"),
+    [
+        (BuildRequest(variants=("rust",)), "no appearance variant 'rust', expected one of dusk"),
+        (BuildRequest(variants=("wet", "rusted")), "wet, rusted all set the steel, expected one of them"),
+        (
+            BuildRequest(configs=(), scenes=(CONFIGS["pile"](), CONFIGS["pile"]())),
+            "more than one config would be named pile",
+        ),
+        (BuildRequest(configs=("pier", "latice")), "no config 'latice', expected one of lattice"),
+    ],
+)
+def test_what_does_not_exist_is_refused_in_words(request_: BuildRequest, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        request_.config_specs()
+
+
+def test_a_mesh_takes_the_place_of_rods_alone(tmp_path: Path) -> None:
+    (tmp_path / "a.stl").write_bytes(b"")
+    refused = run_build("--out", tmp_path / "dataset", "--config", "pile", "--mesh", tmp_path / "a.stl")
+    assert refused.returncode == 2
+    assert "--mesh takes the place of the lattice's rods, but pile is no lattice" in refused.stderr
+
+
+def test_the_order_of_variants_makes_no_other_look() -> None:
+    one, other = (
+        BuildRequest(variants=names).config_specs() for names in (("wet", "formwork"), ("formwork", "wet"))
+    )
+    assert one == other
+    assert one[0].name == "lattice-wet-formwork"
+
+
+def test_the_screen_of_the_shadows_never_hangs_among_the_cameras() -> None:
+    [spec] = BuildRequest(configs=("lattice",), variants=("shadows",)).config_specs()
+    check_fits(make_assembly(spec.scene.assembly), spec)
+    far = replace(spec, protocol=RingSpec(radius_m=0.6, elevation_deg=30.0, azimuths=4))
+    with pytest.raises(InputError, match=r"would hang 0\.5"):
+        check_fits(make_assembly(far.scene.assembly), far)
+
+
+def test_size_and_samples_reach_every_rig() -> None:
+    for spec in BuildRequest(width=320, height=180, samples=3).config_specs():
+        assert (spec.rig.width, spec.rig.height, spec.colour.samples) == (320, 180, 3)
+        assert (spec.rig.calibration is None) == (spec.rig.baseline_m == RigSpec.baseline_m)

@@ -1,0 +1,126 @@
+"""Scanners as the bench runs them: offered, described, run over a rendered folder, scored."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+import tomllib
+import zipfile
+from dataclasses import replace
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dataset_builder.lidar import LIDAR_MOBILE, LIDAR_SURVEY, MOBILE, SURVEY, lidar_method
+from rebar_depth_bench import load, score
+from rebar_depth_bench.methods import MultiViewMethod
+from rebar_depth_bench.methods.runner import predict
+
+GROUP = "rebar_depth_bench.methods"
+NEAR_SPEC = replace(
+    SURVEY,
+    azimuth_step_rad=8 * SURVEY.azimuth_step_rad,
+    elevation_step_rad=8 * SURVEY.elevation_step_rad,
+    min_range_m=0.1,
+)
+NEAR = lidar_method("near", NEAR_SPEC, "one that measures close by, coarse as the tiny pictures are")
+
+
+def predictions(archive: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(archive) as source:
+        return {name: source.read(name) for name in source.namelist() if name != "submission.json"}
+
+
+def test_the_package_offers_both_by_the_door_that_anyone_uses() -> None:
+    pyproject = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    offered = pyproject["project"]["entry-points"][GROUP]
+    for method in (LIDAR_SURVEY, LIDAR_MOBILE):
+        assert EntryPoint(method.info.name, offered[method.info.name], GROUP).load() is method
+
+
+@pytest.mark.parametrize(("method", "nearest"), [(LIDAR_SURVEY, "0.6 m"), (LIDAR_MOBILE, "0.8 m")])
+def test_what_people_read_says_that_it_is_a_simulation(method: MultiViewMethod, nearest: str) -> None:
+    summary = method.info.summary
+    assert "reads the scene's mesh: a simulation, no measurement of pictures" in summary
+    assert "60 mm above the left camera, pose known exactly" in summary
+    assert f"no answer at ranges below {nearest}" in summary
+    assert method.info.uses_intrinsics
+
+
+@pytest.mark.parametrize("spec", [SURVEY, MOBILE])
+def test_notes_are_plain_json_and_hold_every_figure(spec: object) -> None:
+    notes = spec.notes()  # type: ignore[attr-defined]
+    assert json.loads(json.dumps(notes)) == notes
+    assert set(notes) == set(spec.__dataclass_fields__)  # type: ignore[attr-defined]
+
+
+def test_without_embreex_it_can_be_listed_and_says_what_to_install() -> None:
+    code = """
+import sys
+sys.modules["embreex"] = None
+from dataset_builder.lidar import LIDAR_SURVEY
+from rebar_depth_bench.errors import MethodError
+assert not {"bpy", "trimesh", "torch", "cv2"} & set(sys.modules)
+try:
+    LIDAR_SURVEY.check(None)
+except MethodError as error:
+    print(error)
+"""
+    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert finished.stdout.strip() == (
+        "lidar-survey needs embreex to cast rays: pip install 'rebar-depth-bench[build]'"
+    )
+
+
+def test_it_runs_over_a_rendered_folder_and_scores(tiny_root: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "near.zip"
+    notes = predict(NEAR, tiny_root, archive, configs=["lattice-orbit"])["lattice-orbit"].notes
+    assert notes["scanner"]["min_range_m"] == 0.1
+    with zipfile.ZipFile(archive) as source:
+        submission = json.loads(source.read("submission.json"))
+    assert submission["notes"]["lattice-orbit"] == notes
+    table = score(archive, tiny_root).tables["lattice-orbit"]
+    assert table.coverage is not None
+    assert table.coverage > 0.7
+    assert table.native is not None
+    assert table.native.abs_rel < 0.2
+    assert table.scale_median == pytest.approx(1.0, abs=0.02)
+    again = tmp_path / "again.zip"
+    predict(NEAR, tiny_root, again, configs=["lattice-orbit"])
+    assert predictions(again) == predictions(archive)
+
+
+def test_the_lattice_is_nearer_than_a_spinning_scanner_measures(tiny_root: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "mobile.zip"
+    coarse = lidar_method("coarse", replace(MOBILE, rays_per_beam=2), "fewer rays, for the test")
+    predict(coarse, tiny_root, archive, configs=["lattice-orbit"])
+    table = score(archive, tiny_root).tables["lattice-orbit"]
+    assert table.coverage == 0
+    assert table.native is None
+    assert not table.ranked
+
+
+def test_exact_beams_agree_with_the_ground_truth(tiny_root: Path, tmp_path: Path) -> None:
+    """Thin beams without noise from the camera's own place: what is left is the size of a cell."""
+    thin = replace(
+        SURVEY,
+        divergence_rad=0.0,
+        exit_diameter_m=0.0,
+        rays_per_beam=1,
+        noise_m=0.0,
+        min_range_m=0.1,
+        position_left_m=(0.0, 0.0, 0.0),
+    )
+    archive = tmp_path / "thin.zip"
+    predict(lidar_method("thin", thin, "thin beams"), tiny_root, archive, configs=["lattice-orbit"])
+    answers = predictions(archive)
+    for row in load(tiny_root, "lattice-orbit", columns=["view_id", "left_depth"]):
+        found = np.load(io.BytesIO(answers[f"{row['view_id']}.npy"]))
+        surface = row["left_depth"] > 0
+        error = np.abs(found - row["left_depth"])[surface] / row["left_depth"][surface]
+        assert np.isfinite(error).mean() > 0.99
+        assert np.nanmedian(error) < 1e-3

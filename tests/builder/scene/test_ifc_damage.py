@@ -1,0 +1,145 @@
+"""Damaged, absurd and hostile IFC models end in one sentence: no traceback, no hang, no bar in a wrong place."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dataset_builder.config.scene_file import scene_config
+from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
+from dataset_builder.scene.assemblies.ifc import tessellation
+from dataset_builder.scene.assemblies.ifc.bars import _swept, ifc_bars
+from dataset_builder.scene.model import Assembly
+from rebar_depth_bench.errors import InputError, MeshError
+from tests.builder.scene.ifc_writer import Ifc, extruded
+
+COLUMN = Path("examples/column.ifc")
+
+
+def refused(content: str | bytes, words: str) -> None:
+    with pytest.raises(MeshError, match=f"^a.ifc: .*{words}"):
+        ifc_bars(content.encode() if isinstance(content, str) else content, "a.ifc")
+
+
+def test_bars_without_a_readable_shape_are_named() -> None:
+    ifc = Ifc()
+    bar = ifc.rooted("IfcReinforcingBar")
+    refused(
+        ifc.file.to_string(), f"{bar.GlobalId.replace('$', '[$]')} .* no shape that can be read: .*tessellated"
+    )
+
+
+def test_a_shape_that_never_ends_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    ifc = Ifc()
+    for _ in range(2):
+        ifc.bar(extruded(ifc))
+    slow = "import time; time.sleep(60)"
+    code = f"import signal, runpy; signal.alarm(1); {slow}"
+    monkeypatch.setattr(tessellation, "COMMAND", (sys.executable, "-c", code))
+    refused(ifc.file.to_string(), "IfcReinforcingBar .* tessellated: took over 60 s")
+    monkeypatch.setattr(tessellation, "COMMAND", (sys.executable, "-c", "import os; os.abort()"))
+    refused(ifc.file.to_string(), "IfcReinforcingBar .* tessellated: brought the geometry kernel down")
+
+
+def test_maps_in_a_circle_and_maps_without_end() -> None:
+    ifc = Ifc()
+    origin, here = (
+        ifc.axes((0, 0, 0)),
+        ifc.new("IfcCartesianTransformationOperator3D", LocalOrigin=ifc.point((0, 0, 0))),
+    )
+    item = ifc.mapped(here, origin, ifc.disc(ifc.polyline((0, 0, 0), (500, 0, 0))))
+    for _ in range(40):  # each map holds the one before twice: 2^40 bars
+        item = ifc.mapped(here, origin, item, item)
+    with pytest.raises(ValueError, match="more than 10000 items"):
+        _swept(ifc.bar(item), 0.001, 1.0)
+    placement = ifc.at((0, 0, 0))
+    placement.PlacementRelTo = placement
+    with pytest.raises(ValueError, match="goes round in a circle"):
+        _swept(ifc.bar(ifc.disc(ifc.polyline((0, 0, 0), (500, 0, 0))), at=placement), 0.001, 1.0)
+
+
+def changed(old: str, new: str) -> str:
+    text = COLUMN.read_text()
+    assert old in text
+    return text.replace(old, new, 1)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "does not begin with ISO-10303-21"),
+        ("solid cage", "does not begin with ISO-10303-21"),
+        (COLUMN.read_text()[:5000], "does not end with END-ISO-10303-21.*truncated"),
+        (changed("'IFC4'", "'IFC9'"), "not an IFC file that can be read"),
+        (changed("IFCLOCALPLACEMENT(", "IFCLOCALPLAZEMENT("), "1 of its instances cannot be read, first #11"),
+        (changed("#31=", "#9031="), "1 instances are referred to and not there, first #31"),
+        (changed("#31=", "#30="), "#30 is defined twice"),
+        (COLUMN.read_text().replace("IFCREINFORCINGBAR", "IFCBEAM"), "holds no IfcReinforcingBar"),
+        (changed(".LENGTHUNIT.,.MILLI.,.METRE.", ".AREAUNIT.,.MILLI.,.SQUARE_METRE."), "no length unit"),
+    ],
+)  # fmt: skip
+def test_damaged_files_are_told_in_words(content: str, words: str) -> None:
+    refused(content, words)
+
+
+def test_absurd_files_are_told_in_words(tmp_path: Path) -> None:
+    for old, new, words in [
+        (".MILLI.", ".KILO.", "IfcReinforcingBar .* diameter is 8000 m, expected .* is the unit right"),
+        ("(-46.,-46.,0.1)", "(-46.,-46.,1.E9)", "bar 1, .* reaches 1e.06 m from the world's origin"),
+        ("(-46.,-46.,0.1)", "(-46.,0.,0.1)", "bar"),
+    ]:
+        (tmp_path / "a.ifc").write_text(changed(old, new))
+        if words == "bar":
+            assert len(load_cage(cage_file_spec(tmp_path / "a.ifc")).bars) == 13
+            continue
+        with pytest.raises(MeshError, match=words):
+            load_cage(cage_file_spec(tmp_path / "a.ifc"))
+
+
+def test_random_damage_never_ends_in_a_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Whatever a few changed characters make of it: bars, or a MeshError. The kernel is left out: it is slow."""
+    monkeypatch.setattr(tessellation, "COMMAND", ("false",))
+    text = COLUMN.read_text()
+    rng = random.Random(7)
+    kinds = {"bars": 0, "refused": 0}
+    for _ in range(60):
+        characters = list(text)
+        for _ in range(rng.randint(1, 3)):
+            place = rng.randrange(300, len(characters))
+            characters[place] = rng.choice("0123456789#$*().,;'AE- \x00\xff")
+        (tmp_path / "a.ifc").write_text("".join(characters))
+        try:
+            assembly: Assembly = load_cage(cage_file_spec(tmp_path / "a.ifc"))
+            kinds["bars"] += 1
+            assert all(np.isfinite(part.mesh.vertices_m).all() for part in assembly.parts)
+        except MeshError as error:
+            assert str(error).startswith(f"{tmp_path}/a.ifc: ")  # noqa: PT017
+            kinds["refused"] += 1
+    assert min(kinds.values()) > 3
+
+
+def test_a_missing_package_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ifcopenshell", None)
+    with pytest.raises(InputError, match=r"pip install 'rebar-depth-bench\[ifc\]'"):
+        scene_config(COLUMN)
+
+
+@pytest.mark.render
+def test_blender_and_ifcopenshell_live_in_one_process() -> None:
+    code = """
+import bpy
+from dataset_builder.assemblies.cage_file import cage_file_spec, load_cage
+from dataset_builder.assemblies.ifc_model import open_model, world_meshes
+from pathlib import Path
+assert len(load_cage(cage_file_spec("examples/column.ifc")).bars) == 13
+model = open_model(Path("examples/column.ifc").read_bytes(), "a")
+assert len(next(iter(world_meshes(model, [33])))[0]) > 100
+bpy.ops.wm.read_factory_settings(use_empty=True)
+"""
+    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr

@@ -1,0 +1,116 @@
+"""The lattice: 75 rods on a grid, all clear of each other, in a cube that stands on the board."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from numpy import ndarray
+
+from dataset_builder.config.specs import LatticeSpec
+from dataset_builder.scene.assemblies.lattice import CLEAR_GAP_M, LIFT_M, lattice_assembly
+from dataset_builder.scene.model import Assembly, Bar
+from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
+
+SPEC = LatticeSpec()
+
+
+@pytest.fixture(scope="module")
+def lattice() -> Assembly:
+    return lattice_assembly(SPEC)
+
+
+def run_of(bar: Bar) -> int:
+    """Return the axis that the bar runs along: 0 x, 1 y, 2 z."""
+    start, end = np.array(bar.axis_m)
+    return int(np.argmax(np.abs(end - start)))
+
+
+def gap_m(a: Bar, b: Bar) -> float:
+    """Return the clear distance of two axis-parallel straight bars that pass each other, ribs included."""
+    across = [k for k in range(3) if k not in (run_of(a), run_of(b))]
+    apart_m = np.linalg.norm([a.axis_m[0][k] - b.axis_m[0][k] for k in across])
+    return float(apart_m) - outer_radius_m(a.diameter_m) - outer_radius_m(b.diameter_m)
+
+
+def test_numbering_and_roles(lattice: Assembly) -> None:
+    assert [bar.bar_id for bar in lattice.bars] == list(range(1, 76))
+    assert [part.bar_id for part in lattice.parts] == list(range(1, 76))
+    assert [bar.role for bar in lattice.bars] == ["x-rod"] * 25 + ["y-rod"] * 25 + ["z-rod"] * 25
+    assert [run_of(bar) for bar in lattice.bars] == [0] * 25 + [1] * 25 + [2] * 25
+    first, second, sixth = (np.array(lattice.bars[k].axis_m[0]) for k in (0, 1, 5))
+    np.testing.assert_allclose(second - first, [0.0, 0.0, 0.02], atol=1e-12)
+    np.testing.assert_allclose(sixth - first, [0.0, 0.02, 0.0], atol=1e-12)
+
+
+def test_the_steel_fills_its_cube(lattice: Assembly) -> None:
+    vertices_m = np.concatenate([part.mesh.vertices_m for part in lattice.parts])
+    np.testing.assert_allclose(vertices_m.min(axis=0), [-0.05, -0.05, LIFT_M], atol=1e-12)
+    np.testing.assert_allclose(vertices_m.max(axis=0), [0.05, 0.05, 0.1 + LIFT_M], atol=1e-12)
+
+
+def test_no_two_rods_touch_and_the_closest_nearly_do(lattice: Assembly) -> None:
+    gaps = [gap_m(a, b) for a, b in combinations(lattice.bars, 2)]
+    assert min(gaps) == pytest.approx(CLEAR_GAP_M, abs=1e-9)
+    assert CLEAR_GAP_M >= 1e-4
+
+
+def test_each_part_is_its_bar(lattice: Assembly) -> None:
+    for bar, part in zip(lattice.bars, lattice.parts, strict=True):
+        axis = np.array(bar.axis_m)
+        run = run_of(bar)
+        off_axis = np.delete(part.mesh.vertices_m - axis[0], run, axis=1)
+        reach_m = np.linalg.norm(off_axis, axis=1).max()
+        assert reach_m == pytest.approx(outer_radius_m(bar.diameter_m), rel=1e-6)
+        along = part.mesh.vertices_m[:, run]
+        np.testing.assert_allclose([along.min(), along.max()], axis[:, run], atol=1e-12)
+        assert axis[1, run] - axis[0, run] == pytest.approx(SPEC.extent_m, abs=1e-12)
+
+
+def test_grid_neighbours_differ_in_diameter(lattice: Assembly) -> None:
+    for family in range(3):
+        diameters = np.array([bar.diameter_m for bar in lattice.bars[family * 25 : family * 25 + 25]])
+        grid = diameters.reshape(5, 5)
+        assert (grid[1:] != grid[:-1]).all()
+        assert (grid[:, 1:] != grid[:, :-1]).all()
+        assert set(diameters) == set(SPEC.diameters_m)
+
+
+def test_rods_of_one_kind_share_their_shape(lattice: Assembly) -> None:
+    shapes: dict[float, ndarray] = {}
+    for bar, part in zip(lattice.bars, lattice.parts, strict=True):
+        run = run_of(bar)
+        middle = np.array(bar.axis_m).mean(axis=0)
+        local = np.roll(part.mesh.vertices_m - middle, -run, axis=1)
+        known = shapes.setdefault(bar.diameter_m, local)
+        np.testing.assert_allclose(local, known, atol=1e-15)
+
+
+def test_windings_survive_the_turns(lattice: Assembly) -> None:
+    for part in lattice.parts[::25]:
+        a, b, c = np.moveaxis(part.mesh.vertices_m[part.mesh.faces], 1, 0)
+        middle = part.mesh.vertices_m.mean(axis=0)
+        volume = np.einsum("ij,ij->i", a - middle, np.cross(b - middle, c - middle)).sum() / 6
+        assert volume > 0
+
+
+def test_other_cubes_work() -> None:
+    bigger = lattice_assembly(LatticeSpec(extent_m=0.12, pitch_m=0.03, diameters_m=(0.008, 0.006)))
+    assert len(bigger.bars) == 48
+    assert min(gap_m(a, b) for a, b in combinations(bigger.bars, 2)) == pytest.approx(CLEAR_GAP_M, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"pitch_m": 0.015}, "whole number"),
+        ({"pitch_m": 0.0125}, "too small"),
+        ({"diameters_m": (0.010, 0.004)}, "too small"),
+        ({"extent_m": -0.1}, "positive"),
+    ],
+)
+def test_impossible_lattices_say_why(change: dict[str, float], reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        lattice_assembly(replace(SPEC, **change))  # type: ignore[arg-type]

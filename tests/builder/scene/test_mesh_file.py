@@ -1,0 +1,309 @@
+"""Users' mesh files as assemblies: which part is which bar, in whose frame and unit, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dataset_builder.config.specs import LatticeSpec
+from dataset_builder.scene.assemblies.lattice import lattice_assembly
+from dataset_builder.scene.assemblies.mesh_file import load_assembly, mesh_file_spec
+from dataset_builder.scene.mesh_ply import write_mesh_ply
+from dataset_builder.scene.model import Assembly
+from rebar_depth_bench.errors import MeshError
+
+ALONG_X = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+def rod(diameter_m: float, y_m: float = 0.0) -> trimesh.Trimesh:
+    """A closed rod of 0.5 m along x."""
+    body = trimesh.creation.cylinder(diameter_m / 2, 0.5, sections=64, transform=ALONG_X)
+    body.apply_translation([0.25, y_m, 0.1])
+    return body
+
+
+RODS = tuple(rod(diameter_m, y_m) for diameter_m, y_m in ((0.016, 0.0), (0.010, 0.1), (0.020, 0.2)))
+
+
+def joined(bodies: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    arrays = trimesh.util.append_faces([body.vertices for body in bodies], [body.faces for body in bodies])
+    return trimesh.Trimesh(*arrays, process=False)
+
+
+def scene(bodies: Sequence[trimesh.Trimesh], names: Sequence[str]) -> trimesh.Scene:
+    found = trimesh.Scene()
+    for body, name in zip(bodies, names, strict=True):
+        found.add_geometry(body, node_name=name, geom_name=name)
+    return found
+
+
+def obj(bodies: Sequence[trimesh.Trimesh], names: Sequence[str], per_metre: float = 1.0) -> bytes:
+    lines, start = ["mtllib missing.mtl"], 1
+    for body, name in zip(bodies, names, strict=True):
+        lines += [f"o {name}", *(f"v {x!r} {y!r} {z!r}" for x, y, z in (body.vertices * per_metre).tolist())]
+        lines += ["vn 0 0 1", "usemtl steel", *(f"f {a}//1 {b}//1 {c}//1" for a, b, c in body.faces + start)]
+        start += len(body.vertices)
+    return "\n".join(lines).encode()
+
+
+def loaded(folder: Path, name: str, content: bytes | str, unit: str | float = "m") -> Assembly:
+    (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+    return load_assembly(mesh_file_spec(folder / name, unit))
+
+
+def diameters_mm(assembly: Assembly) -> list[int]:
+    return [round(bar.diameter_m * 1000) for bar in assembly.bars]
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj", ".glb"])
+def test_a_lattice_comes_back_through_every_format(tmp_path: Path, suffix: str) -> None:
+    lattice = lattice_assembly(replace(LatticeSpec(), extent_m=0.040))
+    meshes = [part.mesh for part in lattice.parts]
+    bodies = [trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False) for mesh in meshes]
+    names = [f"rod {number}" for number in range(1, 13)]  # "rod 10" comes after "rod 9"
+    whole, path = joined(bodies), tmp_path / f"a{suffix}"
+    if suffix == ".ply":
+        bar_id = np.repeat(range(1, 13), [len(body.faces) for body in bodies])
+        write_mesh_ply(path, whole.vertices, whole.faces, bar_id)
+    elif suffix == ".glb":
+        (y_up := scene(bodies, names)).apply_transform(
+            trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
+        )
+        y_up.export(path)
+    else:
+        path.write_bytes(obj(bodies, names) if suffix == ".obj" else trimesh.exchange.stl.export_stl(whole))
+
+    back = load_assembly(mesh_file_spec(path, "m"))
+
+    assert [bar.bar_id for bar in back.bars] == [part.bar_id for part in back.parts] == list(range(1, 13))
+    for bar, bar_in in zip(back.bars, lattice.bars, strict=True):
+        np.testing.assert_allclose(bar.axis_m, bar_in.axis_m, rtol=0, atol=1e-4)
+        assert bar.role == "imported"
+        assert bar.diameter_m == pytest.approx(bar_in.diameter_m, rel=0.05)
+    for part, mesh in zip(back.parts, meshes, strict=True):
+        assert (part.name, part.material) == (f"bar-{part.bar_id:03d}", "steel")
+        assert (part.mesh.vertices_m.dtype, part.mesh.faces.dtype) == (np.float64, np.int32)
+        corners = part.mesh.vertices_m[part.mesh.faces]
+        np.testing.assert_allclose(corners, mesh.vertices_m[mesh.faces], rtol=0, atol=2e-8)
+        if suffix == ".ply":
+            np.testing.assert_array_equal(part.mesh.vertices_m, mesh.vertices_m)
+            np.testing.assert_array_equal(part.mesh.faces, mesh.faces)
+
+
+def test_own_ply_keeps_ids_and_winding_and_leaves_the_board_out(tmp_path: Path) -> None:
+    inside_out = RODS[1].copy()
+    inside_out.invert()
+    bodies = (RODS[0], trimesh.creation.box((2, 2, 0.01)), inside_out)
+    whole = joined(bodies)
+    bar_id = np.repeat([40_000, 0, 7], [len(body.faces) for body in bodies])
+    write_mesh_ply(tmp_path / "a.ply", whole.vertices, whole.faces, bar_id)
+    parts = load_assembly(mesh_file_spec(tmp_path / "a.ply", "m")).parts
+    assert [(part.bar_id, part.name) for part in parts] == [(7, "bar-007"), (40_000, "bar-40000")]
+    np.testing.assert_array_equal(parts[0].mesh.faces, inside_out.faces)
+    np.testing.assert_array_equal(parts[1].mesh.vertices_m, RODS[0].vertices)
+    in_feet = load_assembly(mesh_file_spec(tmp_path / "a.ply", "ft")).parts[1].mesh.vertices_m
+    np.testing.assert_array_equal(in_feet, RODS[0].vertices * 0.3048)
+    write_mesh_ply(tmp_path / "a.ply", whole.vertices, whole.faces, bar_id * 0)
+    with pytest.raises(MeshError, match="every face has bar_id 0"):
+        load_assembly(mesh_file_spec(tmp_path / "a.ply", "m"))
+    with pytest.raises(MeshError, match=f"^{tmp_path}/b.ply: truncated or damaged"):
+        loaded(tmp_path, "b.ply", (tmp_path / "a.ply").read_bytes()[:-1])
+
+
+def test_one_soup_is_split_by_first_faces(tmp_path: Path) -> None:
+    """Faces of two rods alternate, and their vertices come the other way round."""
+    first, second = RODS[2], RODS[1]
+    faces = np.stack([first.faces + len(second.vertices), second.faces], axis=1).reshape(-1, 3)
+    soup = trimesh.Trimesh(np.concatenate([second.vertices, first.vertices]), faces, process=False)
+    solids = "".join(trimesh.exchange.stl.export_stl_ascii(body) + "\n" for body in (first, second))
+    for name, content in {
+        "a.stl": trimesh.exchange.stl.export_stl(soup),
+        "text.stl": solids.replace("\n", "\r\n"),
+        "a.ply": trimesh.exchange.ply.export_ply(soup),
+        "text.PLY": trimesh.exchange.ply.export_ply(soup, encoding="ascii"),
+    }.items():
+        assembly = loaded(tmp_path, name, content)
+        assert diameters_mm(assembly) == [20, 10]
+        assert [len(part.mesh.vertices_m) for part in assembly.parts] == [130, 130]
+
+
+def test_objects_are_numbered_by_name_whatever_their_order(tmp_path: Path) -> None:
+    names = ("bar10", "bar9", "bar1")
+    files = {"a.obj": obj(RODS, names), "a.glb": scene(RODS, names).export(file_type="glb")}
+    for name, content in files.items():
+        assert diameters_mm(loaded(tmp_path, name, content)) == [20, 10, 16]
+
+
+def test_an_object_of_two_pieces_is_one_bar(tmp_path: Path) -> None:
+    lines = obj((joined(RODS[:2]), RODS[2]), "ab").split(b"\n")
+    content = b"\n".join([*lines[:400], b"usemtl paint", b"g group", *lines[400:]])
+    assert [len(part.mesh.faces) for part in loaded(tmp_path, "a.obj", content).parts] == [512, 256]
+    tree = json.loads(GLTF)
+    tree["meshes"][0]["primitives"] += tree["meshes"].pop(1)["primitives"]
+    tree["nodes"][1]["mesh"] = 1
+    tree["nodes"].pop(2)
+    tree["scenes"] = [{"nodes": [1, 0]}]
+    parts = loaded(tmp_path, "a.gltf", json.dumps(tree)).parts
+    assert [len(part.mesh.faces) for part in parts] == [512, 256]
+
+
+def test_gltf_is_turned_z_up_and_its_transforms_apply(tmp_path: Path) -> None:
+    plate = trimesh.Trimesh([[0, 0, 0], [2, 0, 0], [0, 2, 0.1]], [[0, 1, 2]], process=False)
+    found = trimesh.Scene()
+    turned = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 0, 1]) @ np.diag([1, 10, 100, 1])
+    turned[:3, 3] = 1, 2, 3
+    found.add_geometry(plate, node_name="a", transform=turned)
+    found.add_geometry(plate, node_name="b")
+    first, second = (
+        part.mesh.vertices_m for part in loaded(tmp_path, "a.glb", found.export(file_type="glb")).parts
+    )
+    np.testing.assert_allclose(first, [[1.0, -3, 2], [1.0, -3, 4], [-19.0, -13, 2]], atol=1e-5)
+    np.testing.assert_allclose(second, [[0.0, 0, 0], [2.0, 0, 0], [0, -0.1, 2]], atol=1e-7)
+
+
+def test_polygons_are_triangulated_and_closed_parts_turned_outward(tmp_path: Path) -> None:
+    square = "v 0 0 0\nv .1 0 0\nv .1 .1 0\nv 0 .1 0\nf 1 2 \\\n3 4\n"
+    mesh = loaded(tmp_path, "a.obj", square).parts[0].mesh
+    assert trimesh.Trimesh(mesh.vertices_m, mesh.faces).area == pytest.approx(0.01)
+    inside_out = RODS[0].copy()
+    inside_out.invert()
+    for part in loaded(tmp_path, "b.obj", obj((inside_out, RODS[1]), "ab")).parts:
+        assert trimesh.Trimesh(part.mesh.vertices_m, part.mesh.faces).is_volume
+
+
+@pytest.mark.parametrize(
+    ("unit", "per_metre"),
+    [("m", 1), ("cm", 100), ("mm", 1000), ("in", 1 / 0.0254), ("ft", 1 / 0.3048), (0.5, 2)],
+)
+def test_units(tmp_path: Path, unit: str | float, per_metre: float) -> None:
+    assembly = loaded(tmp_path, "a.obj", obj(RODS, "abc", per_metre), unit)
+    assert diameters_mm(assembly) == [16, 10, 20]
+    np.testing.assert_allclose(assembly.parts[1].mesh.vertices_m, RODS[1].vertices, atol=1e-12)
+
+
+def test_estimates_of_an_open_tube_and_a_wedge(tmp_path: Path) -> None:
+    """Far from the origin; one end of the tube is open, and one side there is tessellated finely.
+
+    The wedge's section is a 3-4-5 triangle: the middle of its surface lies beside that of its volume.
+    """
+    tube = rod(0.016)
+    tube.update_faces(tube.face_normals[:, 0] < 0.5)
+    for _ in range(3):
+        x, y, _ = tube.triangles_center.T
+        tube = tube.subdivide(np.flatnonzero((x > 0.26) & (y > 0)))
+    ends = [[x, y, z] for x in (0.0, 1.0) for y, z in ((0.0, 0.0), (0.03, 0.0), (0.0, 0.04))]
+    faces = [[0, 2, 1], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]]
+    wedge = trimesh.Trimesh(ends, faces)
+    for body in (tube, wedge):
+        body.apply_translation([300, -200, 500])
+    bars = loaded(tmp_path, "a.obj", obj((tube, wedge), "ab")).bars
+    np.testing.assert_allclose(bars[0].axis_m, [[300.0, -200, 500.1], [300.5, -200, 500.1]], rtol=0, atol=2e-6)
+    middle = [-200 + 0.01, 500 + 0.04 / 3]
+    np.testing.assert_allclose(bars[1].axis_m, [[300, *middle], [301, *middle]], rtol=0, atol=2e-5)
+    assert bars[0].diameter_m == pytest.approx(0.016, rel=0.005)
+    assert bars[1].diameter_m == pytest.approx((4 * 0.0006 / np.pi) ** 0.5, rel=1e-3)
+
+
+def test_what_the_spec_refuses(tmp_path: Path) -> None:
+    path = tmp_path / "a.stl"
+    with pytest.raises(MeshError, match="cannot be read: No such file"):
+        mesh_file_spec(path, "m")
+    path.write_bytes(trimesh.exchange.stl.export_stl(RODS[0]))
+    with pytest.raises(MeshError, match="unknown unit 'km', expected one of m, cm, mm, in, ft"):
+        mesh_file_spec(path, "km")
+    for unit_m in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(MeshError, match="expected a positive length"):
+            mesh_file_spec(path, unit_m)
+    with pytest.raises(MeshError, match=r"kind '.step' are not read, expected .glb, .gltf, .obj, .ply, .stl"):
+        mesh_file_spec(tmp_path / "a.step", "m")
+    for unit_m in (1000, 1e-6, 1e200):
+        with pytest.raises(MeshError, match="is the unit right"):
+            load_assembly(mesh_file_spec(path, unit_m))
+    spec = mesh_file_spec(path, "m")
+    path.write_bytes(trimesh.exchange.stl.export_stl(RODS[1]))
+    with pytest.raises(MeshError, match=f"changed since it was chosen: sha256 .* {spec.sha256} expected"):
+        load_assembly(spec)
+
+
+def test_too_many_bars(tmp_path: Path) -> None:
+    corners = np.arange(65_536)[:, None, None] * [1e-4, 0, 0] + [[0, 0, 0], [5e-5, 0, 0], [0, 0.1, 0]]
+    soup = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * 65_536).reshape(-1, 3), process=False)
+    with pytest.raises(MeshError, match="65536 separate parts found, expected at most 65535 bars"):
+        loaded(tmp_path, "a.stl", trimesh.exchange.stl.export_stl(soup))
+
+
+GLB = scene(RODS, "abc").export(file_type="glb")
+GLTF = trimesh.exchange.gltf.export_gltf(scene(RODS, "abc"), embed_buffers=True)["model.gltf"].decode()
+STL = trimesh.exchange.stl.export_stl_ascii(RODS[0])
+PLY = trimesh.exchange.ply.export_ply(RODS[0], encoding="ascii").decode()
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+UNREADABLE = "not a mesh file of its kind that can be read"
+HOSTILE: dict[str, tuple[str, bytes | str, str]] = {
+    "empty obj": (".obj", "", "no triangle found"),
+    "points only": (".obj", TRIANGLE, "no triangle found"),
+    "corner beyond": (".obj", TRIANGLE + "f 1 2 9", UNREADABLE),
+    "relative corner": (".obj", TRIANGLE + "f -3 -2 -1", "negative"),
+    "no number": (".obj", TRIANGLE + "f 1 2 x", UNREADABLE),
+    "nan": (".obj", TRIANGLE + "v nan 0 0\nf 1 2 4", "a vertex is .nan, 0.0, 0.0., expected finite"),
+    "no area": (".obj", TRIANGLE + "f 1 2 2", "bar 1 .1 triangles. is no surface: every triangle has zero area"),
+    "empty stl": (".stl", "", "no triangle found"),
+    "cut binary stl": (".stl", trimesh.exchange.stl.export_stl(RODS[0])[:-1], "no triangle found"),
+    "cut text stl": (".stl", STL[:-80], "no triangle found"),
+    "garbled text stl": (".stl", STL.replace("vertex 0", "vertex O", 1), UNREADABLE),
+    "inf in a second solid": (".stl", STL + "\n" + STL.replace("vertex 0.0", "vertex inf", 1), "finite"),
+    "empty ply": (".ply", "", UNREADABLE),
+    "half a ply header": (".ply", PLY[:60], UNREADABLE),
+    "ply without y": (".ply", PLY.replace("float y", "float w"), UNREADABLE),
+    "ply corner beyond": (".ply", PLY.replace("\n3 ", "\n3 999", 1), "triangles name vertices 0 to 999"),
+    "foreign bar_id": (".ply", PLY.replace("end_h", "property int bar_id\nend_h"), "it has bar_id, but not"),
+    "empty glb": (".glb", "", UNREADABLE),
+    "cut glb": (".glb", GLB[:-4], UNREADABLE),
+    "glb with a wild accessor": (".glb", GLB.replace(b'"count":130', b'"count":999', 1), UNREADABLE),
+    "deep gltf": (".gltf", "[" * 100_000, UNREADABLE),
+    "no gltf": (".gltf", "{}", "no triangle found"),
+    "gltf 1": (".gltf", '{"asset": {"version": "1.0"}}', UNREADABLE),
+    "sparse gltf": (".gltf", GLTF.replace('"count"', '"sparse":{},"count"', 1), "sparse, instanced"),
+    "outside buffer": (".gltf", GLTF.replace('"data:', '"b.bin","x":"', 1), "'b.bin' would be looked for"),
+}
+
+
+@pytest.mark.parametrize(("suffix", "content", "words"), HOSTILE.values(), ids=HOSTILE)
+def test_hostile_files(tmp_path: Path, suffix: str, content: bytes | str, words: str) -> None:
+    (tmp_path / "b.bin").write_bytes(b"beside")
+    with pytest.raises(MeshError, match=words) as caught:
+        loaded(tmp_path, "a" + suffix, content)
+    assert str(caught.value).startswith(f"{tmp_path / 'a'}{suffix}: ")
+    assert "\n" not in str(caught.value)
+
+
+SAMPLES = {"a.obj": obj(RODS[:1], "a"), "a.glb": GLB, "a.gltf": GLTF.encode(), "b.stl": STL.encode()}
+SAMPLES |= {"a.stl": trimesh.exchange.stl.export_stl(RODS[0]), "b.ply": PLY.encode()}
+SAMPLES |= {"a.ply": trimesh.exchange.ply.export_ply(RODS[0])}
+
+
+@settings(max_examples=150)
+@given(name=st.sampled_from(sorted(SAMPLES)), data=st.data())
+def test_any_damage_is_answered_in_words(
+    tmp_path_factory: pytest.TempPathFactory, name: str, data: st.DataObject
+) -> None:
+    content = bytearray(SAMPLES[name])
+    # Half of the damage falls on the first 400 bytes, where the headers are.
+    places = st.integers(0, len(content) - 1) | st.integers(0, 399)
+    for place, value in data.draw(st.lists(st.tuples(places, st.integers(0, 255)), min_size=1, max_size=4)):
+        content[place] = value
+    folder = tmp_path_factory.mktemp("damaged")
+    try:
+        assembly = loaded(folder, name, bytes(content[: data.draw(places | st.none())]))
+    except MeshError as error:
+        assert str(error).startswith(str(folder / name))  # noqa: PT017
+        return
+    assert all(np.isfinite(part.mesh.vertices_m).all() for part in assembly.parts)
+    assert all(bar.diameter_m > 0 for bar in assembly.bars)

@@ -1,0 +1,256 @@
+"""The pile: six true stirrups in a heap that rests, and that no bar of runs through another or the board."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jaxtyping import Float64
+from numpy import ndarray
+
+from dataset_builder.config.specs import PileSpec
+from dataset_builder.scene.assemblies import make_assembly
+from dataset_builder.scene.assemblies import pile as pile_module
+from dataset_builder.scene.assemblies.pile import (
+    RIBS,
+    SELF_GAP_M,
+    STATES,
+    hook_extension_m,
+    pile_assembly,
+    settled_poses,
+    stirrup_centreline_m,
+)
+from dataset_builder.scene.model import Assembly
+from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
+from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
+
+SPEC = PileSpec()
+RADIUS_M = outer_radius_m(SPEC.diameter_m, RIBS)
+STORED = json.loads((STATES / "pile-0.json").read_text())
+
+Line = Float64[ndarray, "n 3"]
+
+
+@pytest.fixture(scope="module")
+def pile() -> Assembly:
+    return pile_assembly(SPEC)
+
+
+@pytest.fixture(scope="module")
+def lines_m(pile: Assembly) -> list[Line]:
+    return [np.array(bar.axis_m) for bar in pile.bars]
+
+
+def segment_distances_m(a: Line, b: Line) -> Float64[ndarray, "n k"]:
+    """Return the exact distance of every segment of one line from every segment of another.
+
+    Two segments are closest inside both (their common perpendicular) or at an end of one of them.
+    """
+    a0, a1, b0, b1 = a[:-1, None], a[1:, None], b[None, :-1], b[None, 1:]
+    u, v, w = a1 - a0, b1 - b0, a0 - b0
+    uu, uv, vv, uw, vw = ((x * y).sum(-1) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
+    area = uu * vv - uv * uv
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s, t = (uv * vw - vv * uw) / area, (uu * vw - uv * uw) / area
+        inside = np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
+    crossing = (area > 1e-12 * uu * vv) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+    ends = [point_distances_m(a0, b0, b1), point_distances_m(a1, b0, b1)]
+    ends += [point_distances_m(b0, a0, a1), point_distances_m(b1, a0, a1)]
+    return np.asarray(np.where(crossing, inside, np.min(ends, axis=0)))
+
+
+def point_distances_m(point: ndarray, start: ndarray, end: ndarray) -> Float64[ndarray, "n k"]:
+    leg = end - start
+    share = np.clip(((point - start) * leg).sum(-1) / (leg * leg).sum(-1), 0, 1)
+    return np.asarray(np.linalg.norm(point - start - share[..., None] * leg, axis=-1))
+
+
+def directions(line: Line) -> Line:
+    steps = np.diff(line, axis=0)
+    return np.asarray(steps / np.linalg.norm(steps, axis=1, keepdims=True))
+
+
+def test_six_stirrups_in_order(pile: Assembly) -> None:
+    assert [bar.bar_id for bar in pile.bars] == [part.bar_id for part in pile.parts] == [1, 2, 3, 4, 5, 6]
+    assert {(bar.role, bar.diameter_m) for bar in pile.bars} == {("stirrup", 0.010)}
+    assert {part.material for part in pile.parts} == {"steel"}
+    again = make_assembly(SPEC)
+    assert again.bars == pile.bars
+    assert all(
+        one.mesh.vertices_m.tobytes() == other.mesh.vertices_m.tobytes()
+        for one, other in zip(pile.parts, again.parts, strict=True)
+    )
+
+
+def test_every_stirrup_is_a_closed_solid_round_its_line(pile: Assembly, lines_m: list[Line]) -> None:
+    for part, line_m in zip(pile.parts, lines_m, strict=True):
+        solid = trimesh.Trimesh(part.mesh.vertices_m, part.mesh.faces, process=False)
+        assert solid.is_watertight
+        assert solid.is_winding_consistent
+        assert len(part.mesh.faces) < 60_000
+        length_m = np.linalg.norm(np.diff(line_m, axis=0), axis=1).sum()
+        assert solid.volume == pytest.approx(np.pi / 4 * SPEC.diameter_m**2 * length_m, rel=0.01)
+        some = part.mesh.vertices_m[::97, None]
+        off_axis_m = point_distances_m(some, line_m[None, :-1], line_m[None, 1:]).min(axis=1)
+        assert off_axis_m.max() < RADIUS_M + 1e-9
+
+
+def test_no_bar_runs_through_another_or_the_board(lines_m: list[Line], pile: Assembly) -> None:
+    gaps_m = [segment_distances_m(a, b).min() - 2 * RADIUS_M for a, b in combinations(lines_m, 2)]
+    assert min(gaps_m) > -1e-4
+    assert min(gaps_m) < 1e-4, "a heap whose bars do not lie on each other"
+    lowest_m = min(line[:, 2].min() for line in lines_m) - RADIUS_M
+    assert -1e-4 < lowest_m < 1e-4
+    assert min(part.mesh.vertices_m[:, 2].min() for part in pile.parts) >= lowest_m
+
+
+def test_the_heap_is_no_neat_stack_and_leaves_markers_free(lines_m: list[Line], pile: Assembly) -> None:
+    vertices_m = np.concatenate([part.mesh.vertices_m for part in pile.parts])
+    assert np.abs(vertices_m[:, :2]).max() <= 0.17
+    assert vertices_m[:, 2].max() > 0.03
+    planes = [np.linalg.svd(line - line.mean(axis=0))[2][2] for line in lines_m]
+    assert np.rad2deg(np.arccos(min(abs(plane[2]) for plane in planes))) > 8.0
+    covered = [
+        ((vertices_m[:, :2] > corners[:, :2].min(axis=0)) & (vertices_m[:, :2] < corners[:, :2].max(axis=0)))
+        .all(axis=1)
+        .any()
+        for corners in marker_corners_m(BoardSpec()).values()
+    ]
+    assert len(covered) - sum(covered) >= 4
+
+
+def developed_length_m(size_m: tuple[float, float], diameter_m: float) -> float:
+    """Return a bar's length by the bending schedule's sum: sides less corners, three quarter bends, two hooks."""
+    radius_m = 2.5 * diameter_m  # half of the mandrel of 4 d, and half the bar
+    sides_m = 2 * (size_m[0] - diameter_m) + 2 * (size_m[1] - diameter_m) - 8 * radius_m
+    turned_deg = 3 * 90 + 2 * 135
+    flat_m = sides_m + np.deg2rad(turned_deg) * radius_m + 2 * max(6 * diameter_m, 0.075)
+    turn_m = sides_m + 2 * np.pi * radius_m
+    outer_m = 2 * outer_radius_m(diameter_m, RIBS) + SELF_GAP_M
+    return float(flat_m * np.hypot(1.0, outer_m / turn_m))
+
+
+def resampled_m(line: Line) -> Line:
+    """Return points every 5 mm or so along a line."""
+    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    at_m = np.linspace(0.0, along_m[-1], int(along_m[-1] / 0.005))
+    return np.stack([np.interp(at_m, along_m, column) for column in line.T], axis=1)
+
+
+@settings(max_examples=30)
+@given(
+    st.sampled_from([0.006, 0.008, 0.010, 0.012]),
+    st.floats(0.2, 0.6),
+    st.floats(0.2, 0.6),
+)
+def test_any_stirrup_has_its_size_length_and_hooks(diameter_m: float, length_m: float, width_m: float) -> None:
+    size_m = (length_m, width_m)
+    outer_m = outer_radius_m(diameter_m, RIBS)
+    line = stirrup_centreline_m(size_m, diameter_m, outer_m)
+    np.testing.assert_allclose(np.ptp(line[:, :2], axis=0) + diameter_m, size_m, atol=1e-12)
+    legs_m = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    assert legs_m.sum() == pytest.approx(developed_length_m(size_m, diameter_m), rel=4e-4)
+    np.testing.assert_allclose(np.average((line[:-1] + line[1:]) / 2, axis=0, weights=legs_m), 0.0, atol=1e-12)
+
+    flat = directions(line * [1.0, 1.0, 0.0])
+    heading_deg = np.rad2deg(np.unwrap(np.arctan2(flat[:, 1], flat[:, 0])))
+    straight_deg = heading_deg[legs_m > 0.9 * hook_extension_m(diameter_m)]
+    # Tip, hook, three corners, hook, tip: all to the left.
+    np.testing.assert_allclose(np.diff(straight_deg), [135, 90, 90, 90, 135], atol=1e-6)
+    assert [legs_m[0], legs_m[-1]] == pytest.approx([max(6 * diameter_m, 0.075)] * 2, rel=1e-3)
+    middle = (line.min(axis=0) + line.max(axis=0)) / 2
+    for tip in (line[0], line[-1]):
+        assert (np.abs(tip - middle)[:2] < np.array(size_m) / 2 - diameter_m).all(), "a hook ends outside the core"
+
+
+@pytest.mark.parametrize(("size_m", "diameter_m"), [(SPEC.size_m, SPEC.diameter_m), ((0.5, 0.4), 0.006)])
+def test_no_stirrup_runs_through_itself(size_m: tuple[float, float], diameter_m: float) -> None:
+    outer_m = outer_radius_m(diameter_m, RIBS)
+    line = stirrup_centreline_m(size_m, diameter_m, outer_m)
+    fine = resampled_m(line)
+    number = np.arange(len(fine) - 1)
+    apart = np.abs(number[:, None] - number) > 16  # 80 mm along the bar, more than a bend
+    own_gap_m = segment_distances_m(fine, fine)[apart].min() - 2 * outer_m
+    assert 0.5 * SELF_GAP_M < own_gap_m < 1.5 * SELF_GAP_M
+
+
+def test_bends_stay_close_to_their_arcs() -> None:
+    line = stirrup_centreline_m(SPEC.size_m, SPEC.diameter_m, RADIUS_M)
+    corner = (line.min(axis=0) + line.max(axis=0)) / 2 + [0.135 - 0.025, 0.095 - 0.025, 0.0]
+    bend = line[(line[:, 0] >= corner[0] - 1e-9) & (line[:, 1] >= corner[1] - 1e-9)]
+    assert len(bend) > 10
+    from_centre_m = np.linalg.norm((bend - corner)[:, :2], axis=1)
+    np.testing.assert_allclose(from_centre_m, 0.025, atol=1e-12)
+    chord_middles = (bend[:-1] + bend[1:]) / 2
+    assert (0.025 - np.linalg.norm((chord_middles - corner)[:, :2], axis=1)).max() < 5e-5
+
+
+@pytest.mark.parametrize(
+    ("size_m", "diameter_m"),
+    [((0.12, 0.10), 0.010), ((0.03, 0.20), 0.010), ((0.28, 0.20), 0.0), ((float("nan"), 0.2), 0.010)],
+)
+def test_stirrups_that_cannot_be_are_refused(size_m: tuple[float, float], diameter_m: float) -> None:
+    with pytest.raises(MeshError, match="no stirrup can be made"):
+        pile_assembly(replace(SPEC, size_m=size_m, diameter_m=diameter_m))
+
+
+@pytest.mark.parametrize("name", ["pile-99", "", "../settled/pile-0", "pile-0.json", "*"])
+def test_unknown_states_are_named(name: str) -> None:
+    with pytest.raises(MeshError, match=r"no settled state .* expected one of pile-0"):
+        pile_assembly(replace(SPEC, state=name))
+
+
+@pytest.mark.parametrize("change", [{"stirrups": 5}, {"size_m": (0.30, 0.20)}, {"diameter_m": 0.008}])
+def test_poses_of_other_stirrups_are_refused(change: dict[str, object]) -> None:
+    with pytest.raises(MeshError, match=f"other stirrups.*{next(iter(change))}"):
+        pile_assembly(replace(SPEC, **change))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (lambda text: text[: len(text) // 2], "JSON"),
+        (lambda text: text.replace("quaternion_wxyz", "turn"), "quaternion_wxyz"),
+        (lambda _: "[]", "TypeError"),
+        (lambda text: with_pose(text, quaternion_wxyz=[1.0, 0.1, 0.0, 0.0]), "norm 1"),
+        (lambda text: with_pose(text, quaternion_wxyz=[float("nan"), 0.0, 0.0, 0.0]), "norm 1"),
+        (lambda text: with_pose(text, quaternion_wxyz=[1.0, 0.0, 0.0]), "four numbers"),
+        (lambda text: with_pose(text, position_m=[0.0, float("inf"), 0.0]), "finite"),
+        (lambda text: with_pose(text, position_m=[0.0, 0.0]), "unpack"),
+        (lambda text: without_last(text), "5 poses"),
+    ],
+)
+def test_spoilt_states_say_what_is_wrong(
+    spoil: object, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert callable(spoil)
+    (tmp_path / "pile-0.json").write_text(spoil((STATES / "pile-0.json").read_text()))
+    monkeypatch.setattr(pile_module, "STATES", tmp_path)
+    with pytest.raises(MeshError, match=rf"'pile-0'.*{reason}"):
+        settled_poses(SPEC)
+
+
+def with_pose(text: str, **values: object) -> str:
+    content = json.loads(text)
+    content["stirrups"][2] |= values
+    return json.dumps(content)
+
+
+def without_last(text: str) -> str:
+    content = json.loads(text)
+    content["stirrups"].pop()
+    return json.dumps(content)
+
+
+def test_a_state_never_changes_under_its_name() -> None:
+    digest = hashlib.sha256((STATES / "pile-0.json").read_bytes()).hexdigest()
+    assert digest == "e55162bfe0a5931671a22bbdb5d9640775eb7caeec72cc007b0984c9dcd86932"

@@ -1,0 +1,74 @@
+"""The ray caster against geometry whose depth is known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dataset_builder.scene.model import WorldMesh
+from dataset_builder.scene.raycast import RayCaster
+from rebar_depth_bench.geometry.cameras import camera_centre, ideal_K, look_at, pixel_rays, transform
+
+WIDTH, HEIGHT = 160, 90
+
+
+def slab(z: float, half: float, bar_id: int) -> WorldMesh:
+    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return WorldMesh(corners, faces, np.full(2, bar_id, np.uint16))
+
+
+def joined(*meshes: WorldMesh) -> WorldMesh:
+    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+    return WorldMesh(
+        np.concatenate([mesh.vertices_m for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]).astype(np.int32),
+        np.concatenate([mesh.face_bar_id for mesh in meshes]),
+    )
+
+
+@pytest.mark.parametrize("scale", [1.0, 40.0])
+def test_depth_of_a_tilted_plane_is_exact(scale: float) -> None:
+    eye = scale * np.array([0.21, -0.13, 0.31])
+    pose = look_at(eye, scale * np.array([0.01, 0.02, 0.0]))
+    rays = pixel_rays(ideal_K(WIDTH, HEIGHT), WIDTH, HEIGHT)
+    truth = RayCaster(slab(0.0, scale * 100, 7)).cast(rays, pose)
+    directions = rays @ pose[:3, :3]  # world directions with unit planar depth
+    expected = np.where(directions[..., 2] < 0, -eye[2] / directions[..., 2], 0.0)
+    hit = truth.depth_m > 0
+    assert hit.mean() > 0.9
+    assert truth.depth_m[hit] == pytest.approx(expected[hit].astype(np.float32), rel=1.2e-7)
+
+
+def test_nearest_surface_wins_and_the_rest_is_nothing() -> None:
+    mesh = joined(slab(0.0, 0.2, 0), slab(0.1, 0.05, 9))
+    pose = look_at(np.array([0.0, -0.001, 0.5]), np.array([0.0, 0.0, 0.0]))
+    truth = RayCaster(mesh).cast(pixel_rays(ideal_K(WIDTH, HEIGHT), WIDTH, HEIGHT), pose)
+    centre = (HEIGHT // 2, WIDTH // 2)
+    assert truth.bars[centre] == 9
+    assert truth.depth_m[centre] == pytest.approx(0.4, abs=1e-3)
+    assert truth.bars[centre[0], 50] == 0
+    assert truth.depth_m[centre[0], 50] == pytest.approx(0.5, abs=1e-3)
+    assert truth.depth_m[0, 0] == 0.0
+    assert np.array_equal(truth.mask, truth.bars > 0)
+
+
+def test_unprojected_depth_lies_on_the_surface() -> None:
+    rng = np.random.default_rng(3)
+    corners = rng.normal(0, 0.2, (60, 3, 3)) + np.array([0, 0, 0.2])
+    mesh = WorldMesh(
+        corners.reshape(-1, 3),
+        np.arange(180, dtype=np.int32).reshape(-1, 3),
+        np.arange(1, 61, dtype=np.uint16),
+    )
+    pose = look_at(np.array([0.9, 0.4, 0.5]), np.array([0.0, 0.0, 0.2]))
+    rays = pixel_rays(ideal_K(WIDTH, HEIGHT), WIDTH, HEIGHT)
+    truth = RayCaster(mesh).cast(rays, pose)
+    assert truth.mask.sum() > 500
+    points = transform(np.linalg.inv(pose), (rays * truth.depth_m[..., None])[truth.mask])
+    triangles = corners[truth.bars[truth.mask] - 1]
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    off_plane_m = np.abs(np.einsum("ij,ij->i", points - triangles[:, 0], normals))
+    assert off_plane_m.max() < 1e-7  # what float32 storage of about 1 m leaves
+    assert np.linalg.norm(camera_centre(pose)) > 1

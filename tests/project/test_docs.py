@@ -1,0 +1,101 @@
+"""The README's commands parse, its Python runs, its tables and links are true."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from argparse import ArgumentParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dataset_builder.cli import argument_parser as build_parser
+from dataset_builder.config.catalog import CONFIGS, SWEEPS
+from dataset_builder.scene.variants import VARIANTS
+from leaderboard.cli import argument_parser as board_parser
+from leaderboard.settings import Settings
+from rebar_depth_bench.cli.main import argument_parser as bench_parser
+from rebar_depth_bench.methods import find_method, own_methods
+from tests.bench.methods.predictors import loaded
+
+PAGES = [
+    Path("README.md"),
+    Path("CONTRIBUTING.md"),
+    Path("ARCHITECTURE.md"),
+    Path("cards/BENCHMARK.md"),
+    Path("deploy/README.md"),
+]
+PARSERS: dict[str, ArgumentParser] = {
+    "rebar-build": build_parser(),
+    "rebar-bench": bench_parser(),
+    "rebar-leaderboard": board_parser(),
+}
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(), flags=re.DOTALL)
+
+
+def commands() -> list[str]:
+    lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
+    inline = re.findall(r"`(rebar-(?:build|bench|leaderboard) [^`\n]*)`", Path("README.md").read_text())
+    return [line for line in [*lines, *inline] if line.startswith(tuple(PARSERS))]
+
+
+@pytest.mark.parametrize("command", commands())
+def test_every_command_shown_is_one_that_parses(command: str) -> None:
+    program, *arguments = shlex.split(command, comments=True)
+    assert PARSERS[program].parse_args(arguments)
+
+
+def test_the_python_shown_runs(tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = blocks(Path("README.md"), "python")
+    monkeypatch.chdir(tmp_path)
+    shown = first.replace('"demo-output/dataset"', repr(str(tiny_root)))
+    assert shown != first
+    names: dict[str, object] = {"my_model": lambda rgb, K: np.full(rgb.shape[:2], K[0, 0] / 200)}
+    exec(shown + second, names)
+    assert (tmp_path / "submission.zip").is_file()
+    batch = next(iter(names["loader"]))  # type: ignore[call-overload]
+    assert {"rgb", "depth", "mask", "K", "poses", "view_id", "right_rgb", "baseline_m"} <= set(batch)
+
+
+def test_the_template_of_a_method_is_one(tmp_path: Path) -> None:
+    [template] = blocks(Path("README.md"), "py")
+    path = tmp_path / "my_model.py"
+    path.write_text(f"load_my_model = lambda: lambda rgb, K: rgb[..., 0] * K[0, 0]\n{template}")
+    method = find_method(f"{path}:METHOD")
+    row = {"left_rgb": np.full((2, 3, 3), 2.0), "left_K": 5 * np.eye(3)}
+    assert loaded(method)(row).tolist() == [[10.0] * 3] * 2
+    assert set(method.info.columns) == set(row)
+
+
+def test_every_setting_of_the_leaderboard_is_shown_with_its_default() -> None:
+    page = Path("deploy/README.md").read_text()
+    for name, field in Settings.model_fields.items():
+        default = "" if field.is_required() or field.default == "" else f"`{field.default}`"
+        assert f"| `{name}` | {default} | {field.description} |" in page
+
+
+def test_tables_name_every_config_variant_and_method() -> None:
+    readme = Path("README.md").read_text()
+    assert set(re.findall(r"^\| `([\w-]+)` \|", readme, flags=re.MULTILINE)) == {
+        *CONFIGS,
+        *SWEEPS,
+        *own_methods(),
+        *VARIANTS,
+    }
+    assert all(f"| `{variant.name}` | {variant.words} |" in readme for variant in VARIANTS.values())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=str)
+def test_links_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\(([^)#]+)\)", page.read_text())
+    assert all((page.parent / link).exists() for link in links if "://" not in link)
+
+
+def test_make_targets_shown_exist() -> None:
+    targets = set(re.findall(r"^([a-z-]+):.*##", Path("Makefile").read_text(), flags=re.MULTILINE))
+    shown = {name for page in PAGES for name in re.findall(r"\bmake ([a-z-]+)\b(?:`|\s+#)", page.read_text())}
+    assert {"demo", "test"} <= shown <= targets
