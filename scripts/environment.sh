@@ -17,19 +17,18 @@ version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 "$python" -c 'import ensurepip, venv' 2>/dev/null ||
     fail "$python lacks venv; install it (Debian: apt-get install python3.11-venv)"
 
-# The stamp names what was installed from which descriptions; anything else installs anew.
-stamp="$venv/.installed-$extra"
+# The file holds a digest of the requirements that were installed; other requirements install anew.
+installed="$venv/.installed-$extra"
 wanted=$(cat pyproject.toml constraints.txt | "$python" -c 'import hashlib, sys; print(hashlib.sha256(sys.stdin.buffer.read()).hexdigest())')
-if [ ! -x "$venv/bin/python" ] || [ "$(cat "$stamp" 2>/dev/null)" != "$wanted" ]; then
+if [ ! -x "$venv/bin/python" ] || [ "$(cat "$installed" 2>/dev/null)" != "$wanted" ]; then
     echo "installing the environment into $venv (a few minutes the first time)" >&2
     "$venv/bin/python" -m pip --version >/dev/null 2>&1 || "$python" -m venv --clear "$venv"
     "$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
         --constraint constraints.txt --editable ".[$extra]"
-    echo "$wanted" >"$stamp"
+    echo "$wanted" >"$installed"
 fi
 
-if ! complaint=$("$venv/bin/python" -c 'import bpy' 2>&1); then
-    library=$(printf '%s\n' "$complaint" | sed -n 's/.*ImportError: \([^ :]*\.so[^ :]*\): cannot open shared object.*/\1/p')
-    [ -n "$library" ] && fail "Blender needs the system library $library; on Debian: apt-get install libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libice6 libgl1"
-    fail "Blender's Python module does not import: $(printf '%s\n' "$complaint" | tail -n 1)"
+# A library that is missing although the list of system packages has been checked.
+if [ "$extra" = build ] && ! complaint=$("$venv/bin/python" -c 'import bpy' 2>&1); then
+    fail "Blender's Python module does not import: $(printf '%s\n' "$complaint" | tail -n 1); on Debian: apt-get install $(awk '$1 == "blender" { printf "%s ", $3 }' scripts/system-packages.txt)"
 fi
