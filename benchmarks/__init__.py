@@ -1,1 +1,1 @@
-"""Speed and memory, measured and not asserted: ratios within one run, medians, the machine noted."""
+"""Benchmarks of speed and memory: medians and ratios within one run, printed with a description of the machine."""

@@ -1,4 +1,4 @@
-"""Where the seconds of a build go in each scene, what a second worker brings, and what the full set would take.
+"""Benchmark of dataset builds: time per stage and scene, speed-up by a second worker, estimate for all configs.
 
 python -m benchmarks.build [VIEWS] [CONFIG ...]
 """
@@ -13,22 +13,22 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.timing import machine, print_markdown
-from dataset_builder.build.build import build
-from dataset_builder.build.shards import VIEWS_PER_SHARD
+from benchmarks.timing import machine_description, print_markdown
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
-from dataset_builder.config.trajectories import offsets_m
+from dataset_builder.config.trajectories import camera_offsets_m
+from dataset_builder.pipeline.build import build
+from dataset_builder.pipeline.shards import VIEWS_PER_SHARD
 
 SCENES = ("lattice", "pile", "pier")
 STAGES = ("colour", "truth", "encode", "scene", "write")
 CORES = os.cpu_count() or 1
 SCALING = BuildRequest(("lattice",), views=2 * VIEWS_PER_SHARD, width=320, height=180)
-"""Two units of work, one a worker; small, since one thread is slow."""
+"""Two work units, one per worker; small views, since each worker has only one thread."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One build: its wall-clock seconds, and its workers' seconds by stage."""
+    """Timing of one build: wall-clock seconds, and seconds of all workers by stage."""
 
     views: int
     workers: int
@@ -37,13 +37,13 @@ class Run:
 
     @property
     def waiting_s(self) -> float:
-        """Seconds in which a worker's time was spent on no stage: starting, packing, publishing, idling."""
+        """Worker seconds outside all stages: process start, packing, publishing and idle time."""
         return self.wall_s * self.workers - sum(self.seconds.values())
 
 
 def main(views: str = "8", *configs: str) -> None:
     count = int(views)
-    print(f"{count} stereo views at 1280 x 720 of each; {machine()}\n")
+    print(f"{count} stereo views at 1280 x 720 of each; {machine_description()}\n")
     runs = {config: _run(BuildRequest((config,), count), 1, CORES) for config in configs or SCENES}
     headings = [
         "scene",
@@ -55,12 +55,12 @@ def main(views: str = "8", *configs: str) -> None:
     print_markdown(headings, [_row(config, run) for config, run in runs.items()])
     peak_gb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
     print(f"\npeak memory of a render process: {peak_gb:.2f} GB")
-    one, two = (_run(SCALING, workers, threads=1) for workers in (1, 2))
+    one_worker, two_workers = (_run(SCALING, workers, threads=1) for workers in (1, 2))
     print(
         f"{SCALING.views} views of {SCALING.width} x {SCALING.height}: "
-        f"2 single-threaded workers are {one.wall_s / two.wall_s:.2f} times as fast as 1"
+        f"2 single-threaded workers are {one_worker.wall_s / two_workers.wall_s:.2f} times as fast as 1"
     )
-    print(f"\n{_full_set(runs)}")
+    print(f"\n{_full_set_estimate(runs)}")
 
 
 def _run(request: BuildRequest, workers: int, threads: int) -> Run:
@@ -80,15 +80,17 @@ def _by_stage(run: Run) -> list[float]:
     return [*(run.seconds[stage] for stage in STAGES), run.waiting_s]
 
 
-def _full_set(runs: dict[str, Run]) -> str:
-    """Return the estimate for all configs: each takes as long a view as its scene's benchmarked config."""
-    known = {CONFIGS[config]().scene.assembly.kind: run.wall_s / run.views for config, run in runs.items()}
+def _full_set_estimate(runs: dict[str, Run]) -> str:
+    """Return the time estimate for all configs, assuming the measured seconds per view of each scene."""
+    seconds_per_view = {
+        CONFIGS[config]().scene.assembly.kind: run.wall_s / run.views for config, run in runs.items()
+    }
     specs = [make() for make in CONFIGS.values()]
-    missing = sorted({spec.scene.assembly.kind for spec in specs} - set(known))
+    missing = sorted({spec.scene.assembly.kind for spec in specs} - set(seconds_per_view))
     if missing:
         return f"no estimate for the full set: {', '.join(missing)} not measured"
-    views = {spec.name: len(offsets_m(spec.protocol)) for spec in specs}
-    hours = sum(views[spec.name] * known[spec.scene.assembly.kind] for spec in specs) / 3600
+    views = {spec.name: len(camera_offsets_m(spec.protocol)) for spec in specs}
+    hours = sum(views[spec.name] * seconds_per_view[spec.scene.assembly.kind] for spec in specs) / 3600
     return f"the full set, {len(specs)} configs of {sum(views.values())} views: {hours:.0f} hours on this machine"
 
 

@@ -1,6 +1,6 @@
-"""Which codec for depth and colour: size and time on rendered views.
+"""Benchmark of depth and colour codecs: size and time on rendered views.
 
-python -m benchmarks.codecs ROOT     (pip install imagecodecs pcodec for the rows that need them)
+python -m benchmarks.codecs ROOT     (the rows of imagecodecs and pcodec need: pip install imagecodecs pcodec)
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import OpenEXR
 from PIL import Image
 
 import rebar_depth_bench as rdb
-from benchmarks.timing import machine, median_seconds, print_markdown
+from benchmarks.timing import machine_description, median_seconds, print_markdown
 
 Codec = tuple[Callable[[Any], Any], Callable[[Any], Any]]
 REPEATS = 5
@@ -46,7 +46,7 @@ def pillow(kind: str, **options: Any) -> Codec:
 
 
 def depth_codecs(shape: tuple[int, int]) -> Mapping[str, Codec]:
-    tags = {317: 3, 278: shape[0]}  # floating-point predictor, one strip
+    tags = {317: 3, 278: shape[0]}  # TIFF tags: floating-point predictor, all rows in one strip
     codecs = {
         "EXR ZIP": exr(OpenEXR.ZIP_COMPRESSION),
         "EXR ZSTD": exr(OpenEXR.ZSTD_COMPRESSION),
@@ -108,7 +108,7 @@ def measure(name: str, codec: Codec, images: list[Any]) -> list[object]:
 def main(root: str) -> None:
     rows = list(rdb.load(root, "lattice", columns=["left_rgb", "left_depth"]))
     shape = rows[0]["left_depth"].shape
-    print(f"{len(rows)} rendered views, medians of {REPEATS}, ms and MB per image; {machine()}\n")
+    print(f"{len(rows)} rendered views, medians of {REPEATS}, ms and MB per image; {machine_description()}\n")
     for title, column, codecs in (
         ("depth", "left_depth", depth_codecs(shape)),
         ("colour", "left_rgb", colour_codecs()),

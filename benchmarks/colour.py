@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.timing import machine, print_markdown
+from benchmarks.timing import machine_description, print_markdown
 from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
 from dataset_builder.blender.render import configure_colour, render_colour
 from dataset_builder.blender.scene import build_scene
@@ -28,11 +28,13 @@ from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
 
 REFERENCE = ColourSpec(samples=256, prefilter="ACCURATE")
-"""Denoised: the noise left in 256 raw samples would hide what is better than it."""
-RIVAL = ColourSpec(samples=16, prefilter="ACCURATE")
-"""What BlenderProc renders with by default, at 16 samples."""
+"""Reference setting; denoised, since the noise of 256 raw samples would exceed the error of good candidates."""
+
+BLENDERPROC_DEFAULT = ColourSpec(samples=16, prefilter="ACCURATE")
+"""Default denoiser settings of BlenderProc, at 16 samples."""
+
 CANDIDATES = (
-    RIVAL,
+    BLENDERPROC_DEFAULT,
     ColourSpec(samples=16, denoise=False),
     ColourSpec(samples=8),
     ColourSpec(samples=8, prefilter="ACCURATE"),
@@ -51,47 +53,48 @@ def main(config: str = "lattice", views: str = "1") -> None:
     assembly = make_assembly(spec.scene.assembly)
     build_scene(assembly, spec.scene)
     caster = RayCaster(evaluated_world_mesh())
-    every = poses(spec.protocol, aim_point_m(assembly), rig)
-    chosen = [every[index] for index in subset(len(every), int(views))]
-    masks = [caster.cast(pixel_rays(K, rig.width, rig.height), pose).mask for pose in chosen]
+    all_poses = poses(spec.protocol, aim_point_m(assembly), rig)
+    selected = [all_poses[index] for index in subset(len(all_poses), int(views))]
+    masks = [caster.cast(pixel_rays(K, rig.width, rig.height), pose).mask for pose in selected]
 
-    say = _only_own_words()
+    write_line = _redirect_blender_output()
 
-    def rendered(colour: ColourSpec, seed: int) -> tuple[list[np.ndarray], float]:
+    def render_views(colour: ColourSpec, seed: int) -> tuple[list[np.ndarray], float]:
         configure_colour(colour, os.cpu_count() or 1)
         pictures, seconds = [], []
         with tempfile.TemporaryDirectory() as scratch:
-            for pose in chosen:
+            for pose in selected:
                 start = time.perf_counter()
                 pictures.append(render_colour(rig_cameras(rig, pose)["left"], seed, Path(scratch)))
                 seconds.append(time.perf_counter() - start)
         return pictures, float(np.median(seconds))
 
-    say(f"{config}, {len(chosen)} left views at {rig.width} x {rig.height}; {machine()}\n")
-    rendered(replace(RIVAL, samples=1), seed=0)  # the scene's first render also loads it
-    results = {colour: rendered(colour, seed=1) for colour in CANDIDATES}
-    reference, reference_s = rendered(REFERENCE, seed=2)
-    rival_s = results[RIVAL][1]
+    write_line(f"{config}, {len(selected)} left views at {rig.width} x {rig.height}; {machine_description()}\n")
+    # The first render of a scene also loads it into the renderer and is therefore not timed.
+    render_views(replace(BLENDERPROC_DEFAULT, samples=1), seed=0)
+    results = {colour: render_views(colour, seed=1) for colour in CANDIDATES}
+    reference, reference_s = render_views(REFERENCE, seed=2)
+    baseline_s = results[BLENDERPROC_DEFAULT][1]
     table = [
         (
             _name(colour),
             f"{seconds:.1f}",
-            f"{seconds / rival_s:.2f}",
+            f"{seconds / baseline_s:.2f}",
             f"{_psnr_db(pictures, reference, masks):.1f}",
         )
         for colour, (pictures, seconds) in results.items()
     ]
-    table.append((_name(REFERENCE), f"{reference_s:.1f}", f"{reference_s / rival_s:.2f}", "reference"))
+    table.append((_name(REFERENCE), f"{reference_s:.1f}", f"{reference_s / baseline_s:.2f}", "reference"))
     headings = ["setting", "s a picture", "times 16 + ACCURATE", "PSNR on steel, dB"]
-    print_markdown(headings, table, say)
+    print_markdown(headings, table, write_line)
 
 
-def _only_own_words() -> Callable[[str], None]:
-    """Send Blender's prints to nowhere and return what prints for us."""
-    own = os.fdopen(os.dup(1), "w", buffering=1)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    return lambda words: print(words, file=own)
+def _redirect_blender_output() -> Callable[[str], None]:
+    """Redirect standard output, to which Blender writes, to the null device; return a working print function."""
+    terminal = os.fdopen(os.dup(1), "w", buffering=1)
+    null_device = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null_device, 1)
+    return lambda text: print(text, file=terminal)
 
 
 def _name(colour: ColourSpec) -> str:
@@ -99,9 +102,9 @@ def _name(colour: ColourSpec) -> str:
 
 
 def _psnr_db(pictures: list[np.ndarray], reference: list[np.ndarray], masks: list[np.ndarray]) -> float:
-    """Return the peak signal-to-noise ratio over the steel pixels of all pictures, 8-bit values."""
-    off = [a[mask].astype(float) - b[mask] for a, b, mask in zip(pictures, reference, masks, strict=True)]
-    return float(20 * np.log10(PSNR_PEAK / np.sqrt(np.mean(np.concatenate(off) ** 2))))
+    """Return the peak signal-to-noise ratio in dB over the steel pixels of all 8-bit images."""
+    differences = [a[mask].astype(float) - b[mask] for a, b, mask in zip(pictures, reference, masks, strict=True)]
+    return float(20 * np.log10(PSNR_PEAK / np.sqrt(np.mean(np.concatenate(differences) ** 2))))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A load of HTTP/1.1 requests, light enough to leave the server the bottleneck: bare asyncio streams."""
+"""HTTP/1.1 load generator on plain asyncio streams, with low overhead so that the server is the bottleneck."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-PIECE = 1 << 16
-_LIMIT = 1 << 22
+WRITE_CHUNK_BYTES = 1 << 16
+_STREAM_LIMIT_BYTES = 1 << 22
 
 
 @dataclass(frozen=True)
-class Answer:
-    """A response: its status, its headers with small names, its body."""
+class Response:
+    """HTTP response: status, headers with lower-case names, and body."""
 
     status: int
     headers: Mapping[str, str]
@@ -26,10 +26,11 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What is sent: readers that ask for ``targets``, each (route, path), and uploaders with a token each.
+class LoadPlan:
+    """Definition of a load: readers that request random ``targets`` (route, path), and one uploader per token.
 
-    ``pause_s`` and ``upload_pause_s`` pass between a reader's or an uploader's answer and its next request.
+    ``pause_s`` and ``upload_pause_s`` are the seconds between the response to a reader or an uploader and its next
+    request. ``conditional`` readers send ``If-None-Match`` with the last entity tag of the path.
     """
 
     host: str
@@ -45,8 +46,8 @@ class Plan:
 
 
 @dataclass
-class Tally:
-    """What came of a load: seconds by route, what went wrong, and the share of a core the client itself took."""
+class LoadResult:
+    """Measurements of a load: response times by route, errors, and the client's CPU use in cores."""
 
     read_s: dict[str, list[float]] = field(default_factory=dict)
     upload_s: list[float] = field(default_factory=list)
@@ -57,70 +58,72 @@ class Tally:
 
     @property
     def all_read_s(self) -> list[float]:
-        """Seconds of all reads."""
-        return [seconds for one in self.read_s.values() for seconds in one]
+        """Response times of all reads, in seconds."""
+        return [seconds for route_seconds in self.read_s.values() for seconds in route_seconds]
 
 
-def run_load(plan: Plan, seed: int) -> Tally:
-    """Send what is planned and return what came of it."""
-    tally = Tally({route: [] for route, _ in plan.targets})
+def run_load(plan: LoadPlan, seed: int) -> LoadResult:
+    """Send the requests of a plan and return the measurements."""
+    result = LoadResult({route: [] for route, _ in plan.targets})
     start, start_cpu_s = time.perf_counter(), _cpu_s()
-    asyncio.run(_send_all(plan, tally, seed))
-    tally.wall_s = time.perf_counter() - start
-    tally.client_cores = (_cpu_s() - start_cpu_s) / tally.wall_s
-    return tally
+    asyncio.run(_send_all(plan, result, seed))
+    result.wall_s = time.perf_counter() - start
+    result.client_cores = (_cpu_s() - start_cpu_s) / result.wall_s
+    return result
 
 
-async def _send_all(plan: Plan, tally: Tally, seed: int) -> None:
+async def _send_all(plan: LoadPlan, result: LoadResult, seed: int) -> None:
     end = time.perf_counter() + plan.seconds
-    readers = [_read(plan, tally, random.Random(seed + place), end) for place in range(plan.readers)]
-    uploaders = [_upload(plan, tally, token, end) for token in plan.tokens]
+    readers = [_run_reader(plan, result, random.Random(seed + index), end) for index in range(plan.readers)]
+    uploaders = [_run_uploader(plan, result, token, end) for token in plan.tokens]
     await asyncio.gather(*readers, *uploaders)
 
 
-async def _read(plan: Plan, tally: Tally, rng: random.Random, end: float) -> None:
-    """Be one reader: a connection that is kept, a request after the other, targets by chance."""
-    tags: dict[str, str] = {}
+async def _run_reader(plan: LoadPlan, result: LoadResult, rng: random.Random, end: float) -> None:
+    """Request random targets one after the other on one persistent connection until ``end``."""
+    etags: dict[str, str] = {}
     async with _Connection(plan.host, plan.port) as connection:
         while time.perf_counter() < end:
             route, path = rng.choice(plan.targets)
-            tag = f"If-None-Match: {tags[path]}\r\n" if path in tags else ""
+            if_none_match = f"If-None-Match: {etags[path]}\r\n" if path in etags else ""
             start = time.perf_counter()
             try:
-                answer = await connection.ask(f"GET {path} HTTP/1.1\r\nHost: {plan.host}\r\n{tag}\r\n".encode())
+                response = await connection.send_request(
+                    f"GET {path} HTTP/1.1\r\nHost: {plan.host}\r\n{if_none_match}\r\n".encode()
+                )
             except (OSError, EOFError, ValueError) as error:
-                tally.errors.append(f"GET {route}: {error!r}")
+                result.errors.append(f"GET {route}: {error!r}")
                 return
-            tally.read_s[route].append(time.perf_counter() - start)
-            tally.unchanged += answer.status == 304
-            if answer.status not in (200, 304):
-                tally.errors.append(f"GET {route}: {answer.status} {answer.body[:200]!r}")
-            if plan.conditional and "etag" in answer.headers:
-                tags[path] = answer.headers["etag"]
+            result.read_s[route].append(time.perf_counter() - start)
+            result.unchanged += response.status == 304
+            if response.status not in (200, 304):
+                result.errors.append(f"GET {route}: {response.status} {response.body[:200]!r}")
+            if plan.conditional and "etag" in response.headers:
+                etags[path] = response.headers["etag"]
             if plan.pause_s:
                 await asyncio.sleep(plan.pause_s * (0.5 + rng.random()))
 
 
-async def _upload(plan: Plan, tally: Tally, token: str, end: float) -> None:
-    """Be one uploader: the archive again and again, each time on a connection of its own, as clients do."""
+async def _run_uploader(plan: LoadPlan, result: LoadResult, token: str, end: float) -> None:
+    """Upload the archive repeatedly until ``end``, each time on a new connection as real clients do."""
     assert plan.archive is not None
     content = plan.archive.read_bytes()
     while time.perf_counter() < end:
         start = time.perf_counter()
         try:
             async with _Connection(plan.host, plan.port) as connection:
-                answer = await connection.ask(*_form(plan.host, token, content))
+                response = await connection.send_request(*_multipart_request(plan.host, token, content))
         except (OSError, EOFError, ValueError) as error:
-            tally.errors.append(f"POST: {error!r}")
+            result.errors.append(f"POST: {error!r}")
         else:
-            tally.upload_s.append(time.perf_counter() - start)
-            if answer.status != 202 or json.loads(answer.body)["status"] != "queued":
-                tally.errors.append(f"POST: {answer.status} {answer.body[:200]!r}")
+            result.upload_s.append(time.perf_counter() - start)
+            if response.status != 202 or json.loads(response.body)["status"] != "queued":
+                result.errors.append(f"POST: {response.status} {response.body[:200]!r}")
         await asyncio.sleep(plan.upload_pause_s)
 
 
-def _form(host: str, token: str, content: bytes) -> tuple[bytes, ...]:
-    """Return an upload's request: its head, the form's parts."""
+def _multipart_request(host: str, token: str, content: bytes) -> tuple[bytes, ...]:
+    """Return the parts of a multipart upload request: head, form prefix, archive content and form suffix."""
     boundary = secrets.token_hex(16)
     before = (
         f'--{boundary}\r\nContent-Disposition: form-data; name="archive"; filename="a.zip"\r\n'
@@ -136,31 +139,33 @@ def _form(host: str, token: str, content: bytes) -> tuple[bytes, ...]:
 
 
 class _Connection:
-    """A connection that is kept between requests."""
+    """Persistent HTTP/1.1 connection."""
 
     def __init__(self, host: str, port: int) -> None:
         self._host, self._port = host, port
 
     async def __aenter__(self) -> _Connection:
-        self._reader, self._writer = await asyncio.open_connection(self._host, self._port, limit=_LIMIT)
+        self._reader, self._writer = await asyncio.open_connection(
+            self._host, self._port, limit=_STREAM_LIMIT_BYTES
+        )
         return self
 
     async def __aexit__(self, *_: object) -> None:
         self._writer.close()
 
-    async def ask(self, *parts: bytes) -> Answer:
-        """Send a request and return its answer. Raises ``EOFError`` or ``OSError`` where the connection is cut."""
+    async def send_request(self, *parts: bytes) -> Response:
+        """Send a request and return its response. Raises ``EOFError`` or ``OSError`` on a closed connection."""
         for part in parts:
             view = memoryview(part)
-            for start in range(0, len(view), PIECE):
-                self._writer.write(view[start : start + PIECE])
+            for start in range(0, len(view), WRITE_CHUNK_BYTES):
+                self._writer.write(view[start : start + WRITE_CHUNK_BYTES])
                 await self._writer.drain()
         head = (await self._reader.readuntil(b"\r\n\r\n")).decode("latin-1").split("\r\n")
         headers = {name.lower(): value.strip() for name, _, value in (line.partition(":") for line in head[1:])}
         status = int(head[0].split()[1])
         if status in (204, 304):
-            return Answer(status, headers, b"")
-        return Answer(status, headers, await self._reader.readexactly(int(headers["content-length"])))
+            return Response(status, headers, b"")
+        return Response(status, headers, await self._reader.readexactly(int(headers["content-length"])))
 
 
 def _cpu_s() -> float:

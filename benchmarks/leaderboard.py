@@ -1,11 +1,11 @@
-"""How fast the leaderboard answers 50 readers, alone and while archives come in and are scored.
+"""Benchmark of the leaderboard under load by 50 readers, with and without concurrent uploads and scoring.
 
 python -m benchmarks.leaderboard [--data ROOT --archive ZIP] [--db URL] [--rows N] [--json FILE]
 
-The real server runs in a process of its own, the client in this one. Without ``--data`` the dataset is a small one
-made of arithmetic, and so is the archive. ``--db`` names an empty database, which is filled and left so; without
-it the server keeps SQLite. Every reader asks again once it has its answer, so that reads alone keep the server
-busy: figures say what it can do at most, latencies what 50 readers at once wait.
+The real server runs in a separate process, the client in this one. Without ``--data`` a small synthetic dataset
+and archive are used. ``--db`` names an empty database, which is filled and not cleared afterwards; without it the
+server uses SQLite. By default every reader sends its next request immediately after a response, so that reads
+alone saturate the server: the rates are its maximum throughput, the latencies those of 50 concurrent readers.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from pathlib import Path
 
 import rebar_depth_bench as rdb
 from benchmarks import filled_board
-from benchmarks.filled_board import Served, fill, new_tokens, running_server
-from benchmarks.http_load import Plan, Tally, run_load
-from benchmarks.synthetic_dataset import write_archive, write_dataset
-from benchmarks.timing import machine, print_markdown
+from benchmarks.filled_board import ServerProcess, add_scored_submissions, new_tokens, running_server
+from benchmarks.http_load import LoadPlan, LoadResult, run_load
+from benchmarks.timing import machine_description, print_markdown
 from leaderboard.db.engine import Database
 from leaderboard.db.submissions import SCORED
 from leaderboard.settings import read_settings
 from rebar_depth_bench.data.manifest import open_folder
+from tests.synthetic_dataset import write_archive, write_dataset
 
 CONFIGS, VIEWS = ("lattice", "pile"), 24
 SEED = 7
@@ -40,7 +40,7 @@ WARM_UP_S = 3.0
 
 @dataclass(frozen=True)
 class Latency:
-    """Reads of a route: how many a second, and what share of them took how many milliseconds at most."""
+    """Reads of a route: rate per second, and percentiles and maximum of the latency in milliseconds."""
 
     per_s: float
     p50_ms: float
@@ -49,8 +49,12 @@ class Latency:
 
 
 @dataclass(frozen=True)
-class Window:
-    """A stretch of load: reads by route, uploads accepted and submissions scored a minute, what was in its way."""
+class LoadWindow:
+    """Measurements of one load window.
+
+    ``reads`` are by route. ``unchanged`` is the share of responses with status 304. ``client_cores`` and
+    ``server_cores`` are the CPU use of the client and the server process in cores.
+    """
 
     reads: Mapping[str, Latency]
     accepted_per_min: float
@@ -65,27 +69,30 @@ class Window:
 def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     with tempfile.TemporaryDirectory() as scratch:
-        data, archive = _material(options, Path(scratch))
+        data, archive = _dataset_and_archive(options, Path(scratch))
         state = Path(scratch) / "state"
         state.mkdir()
-        settings = read_settings(None, {"data": str(data), "state": state, "db": options.db})
+        settings = read_settings(None, {"data": str(data), "state_dir": state, "db": options.db})
         with closing(Database(settings.database_url)) as database:
             database.migrate()
-            if filled_board.count(database):
+            if filled_board.count_submissions(database):
                 print("the database holds submissions, expected an empty one", file=sys.stderr)
                 return 2
-            ids = fill(database, rdb.score(archive, data).to_json(), options.rows, SEED)
-            print(f"{options.rows} rows on {'PostgreSQL' if options.db else 'SQLite'}; {machine()}\n", flush=True)
-            with running_server(data, state, options.db, options.scorers) as served:
+            ids = add_scored_submissions(database, rdb.score(archive, data).to_json(), options.rows, SEED)
+            print(
+                f"{options.rows} rows on {'PostgreSQL' if options.db else 'SQLite'}; {machine_description()}\n",
+                flush=True,
+            )
+            with running_server(data, state, options.db, options.workers) as served:
                 config = open_folder(data).configs[0]
                 plan = replace(_plan(options, served, config, ids), archive=archive)
                 before_mb = served.megabytes()
                 windows = _measure(plan, served, database, ids, options)
                 memory_mb = (before_mb, served.megabytes())
-    _print(windows, memory_mb)
+    _print_report(windows, memory_mb)
     if options.json:
-        options.json.write_text(json.dumps(_document(windows, memory_mb), indent=1) + "\n")
-    return 1 if any(one.errors for found in windows.values() for one in found) else 0
+        options.json.write_text(json.dumps(_to_json_object(windows, memory_mb), indent=1) + "\n")
+    return 1 if any(window.errors for same_kind in windows.values() for window in same_kind) else 0
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -98,7 +105,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--rows", type=int, default=200, help="scored rows on the board")
     parser.add_argument("--readers", type=int, default=50)
     parser.add_argument("--uploaders", type=int, default=8)
-    parser.add_argument("--scorers", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--pause", type=float, default=0.0, help="seconds a reader waits between requests")
     parser.add_argument("--upload-pause", type=float, default=5.0, help="seconds an uploader waits")
     parser.add_argument("--conditional", action="store_true", help="readers keep what they have, as browsers do")
@@ -108,8 +115,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _material(options: argparse.Namespace, scratch: Path) -> tuple[Path, Path]:
-    """Return the dataset and the archive that are given, or made here."""
+def _dataset_and_archive(options: argparse.Namespace, scratch: Path) -> tuple[Path, Path]:
+    """Return the dataset and archive paths from the options, or those of synthetic ones written to ``scratch``."""
     if (options.data is None) != (options.archive is None):
         _parser().error("--data and --archive go together")
     if options.data is not None:
@@ -120,14 +127,14 @@ def _material(options: argparse.Namespace, scratch: Path) -> tuple[Path, Path]:
     return data, archive
 
 
-def _plan(options: argparse.Namespace, served: Served, config: str, ids: Sequence[str]) -> Plan:
+def _plan(options: argparse.Namespace, served: ServerProcess, config: str, ids: Sequence[str]) -> LoadPlan:
     targets = (
         ("/", "/"),
         ("/?config=", f"/?config={config}"),
         ("/api/v1/leaderboard", f"/api/v1/leaderboard?config={config}"),
-        *(("/submissions/ID", f"/submissions/{one}") for one in ids[:1]),
+        *(("/submissions/ID", f"/submissions/{submission_id}") for submission_id in ids[:1]),
     )
-    return Plan(
+    return LoadPlan(
         host=served.host,
         port=served.port,
         targets=targets,
@@ -140,82 +147,86 @@ def _plan(options: argparse.Namespace, served: Served, config: str, ids: Sequenc
 
 
 def _measure(
-    plan: Plan, served: Served, database: Database, ids: Sequence[str], options: argparse.Namespace
-) -> dict[str, list[Window]]:
+    plan: LoadPlan, served: ServerProcess, database: Database, ids: Sequence[str], options: argparse.Namespace
+) -> dict[str, list[LoadWindow]]:
     tokens = new_tokens(database, options.uploaders)
-    windows: dict[str, list[Window]] = {ALONE: [], BUSY: []}
+    windows: dict[str, list[LoadWindow]] = {ALONE: [], BUSY: []}
     run_load(replace(plan, seconds=WARM_UP_S), SEED)
     for turn in range(options.repeats):
         for name, with_tokens in ((ALONE, ()), (BUSY, tokens)):
-            scored, cpu_s = filled_board.count(database, SCORED), served.cpu_s()
-            tally = run_load(replace(plan, tokens=with_tokens), SEED + 1000 * turn)
-            scored, cpu_s = filled_board.count(database, SCORED) - scored, served.cpu_s() - cpu_s
-            filled_board.empty_queue(database)
-            filled_board.drop_newer(database, ids)
-            windows[name].append(_window(tally, scored, cpu_s))
+            scored, cpu_s = filled_board.count_submissions(database, SCORED), served.cpu_s()
+            result = run_load(replace(plan, tokens=with_tokens), SEED + 1000 * turn)
+            scored, cpu_s = filled_board.count_submissions(database, SCORED) - scored, served.cpu_s() - cpu_s
+            filled_board.clear_queue(database)
+            filled_board.remove_scored_except(database, ids)
+            windows[name].append(_window(result, scored, cpu_s))
     return windows
 
 
-def _window(tally: Tally, scored: int, server_cpu_s: float) -> Window:
-    by_route = {ALL: tally.all_read_s, **tally.read_s}
-    return Window(
-        reads={route: _latency(found, tally.wall_s) for route, found in by_route.items()},
-        accepted_per_min=60 * len(tally.upload_s) / tally.wall_s,
-        scored_per_min=60 * scored / tally.wall_s,
-        upload_p50_ms=1e3 * statistics.median(tally.upload_s) if tally.upload_s else 0.0,
-        unchanged=tally.unchanged / max(1, len(tally.all_read_s)),
-        client_cores=tally.client_cores,
-        server_cores=server_cpu_s / tally.wall_s,
-        errors=tuple(tally.errors),
+def _window(result: LoadResult, scored: int, server_cpu_s: float) -> LoadWindow:
+    by_route = {ALL: result.all_read_s, **result.read_s}
+    return LoadWindow(
+        reads={route: _latency(route_seconds, result.wall_s) for route, route_seconds in by_route.items()},
+        accepted_per_min=60 * len(result.upload_s) / result.wall_s,
+        scored_per_min=60 * scored / result.wall_s,
+        upload_p50_ms=1e3 * statistics.median(result.upload_s) if result.upload_s else 0.0,
+        unchanged=result.unchanged / max(1, len(result.all_read_s)),
+        client_cores=result.client_cores,
+        server_cores=server_cpu_s / result.wall_s,
+        errors=tuple(result.errors),
     )
 
 
 def _latency(seconds: Sequence[float], wall_s: float) -> Latency:
-    """Return the figures of a route's reads; percentiles are of the nearest rank."""
+    """Return the latency statistics of a route's reads, with nearest-rank percentiles."""
     ordered = sorted(seconds) or [0.0]
     p50, p99 = (ordered[min(len(ordered) - 1, int(share * len(ordered)))] for share in (0.5, 0.99))
     return Latency(len(seconds) / wall_s, 1e3 * p50, 1e3 * p99, 1e3 * ordered[-1])
 
 
-def _print(windows: Mapping[str, Sequence[Window]], memory_mb: tuple[float, float]) -> None:
+def _print_report(windows: Mapping[str, Sequence[LoadWindow]], memory_mb: tuple[float, float]) -> None:
     repeats = len(windows[ALONE])
     print(f"Medians of {repeats} windows:\n")
     routes = windows[ALONE][0].reads
-    rows = [(f"`{route}`", name, *_cells(found, route)) for route in routes for name, found in windows.items()]
+    rows = [
+        (f"`{route}`", name, *_cells(same_kind, route)) for route in routes for name, same_kind in windows.items()
+    ]
     print_markdown(["route", "", "a second", "p50 ms", "p99 ms", "max ms"], rows)
     busy = windows[BUSY]
     ratios = [
         with_uploads.reads[ALL].p99_ms / alone.reads[ALL].p99_ms
         for alone, with_uploads in zip(windows[ALONE], busy, strict=True)
     ]
-    errors = [error for found in windows.values() for one in found for error in one.errors]
+    errors = [error for same_kind in windows.values() for w in same_kind for error in w.errors]
     print(f"\np99 with uploads and scoring over p99 without: {statistics.median(ratios):.2f}")
     print(
-        f"uploads accepted a minute: {_of(busy, lambda one: one.accepted_per_min):.0f}, "
-        f"median {_of(busy, lambda one: one.upload_p50_ms):.0f} ms each; "
-        f"scored a minute: {_of(busy, lambda one: one.scored_per_min):.0f}"
+        f"uploads accepted a minute: {_median_of(busy, lambda w: w.accepted_per_min):.0f}, "
+        f"median {_median_of(busy, lambda w: w.upload_p50_ms):.0f} ms each; "
+        f"scored a minute: {_median_of(busy, lambda w: w.scored_per_min):.0f}"
     )
-    print(f"answers 304: {_of(busy, lambda one: one.unchanged):.0%}; errors: {len(errors)} {errors[:3] or ''}")
-    cpu_ms = _of(windows[ALONE], lambda one: 1e3 * one.server_cores / one.reads[ALL].per_s)
+    print(f"answers 304: {_median_of(busy, lambda w: w.unchanged):.0%}; errors: {len(errors)} {errors[:3] or ''}")
+    cpu_ms = _median_of(windows[ALONE], lambda w: 1e3 * w.server_cores / w.reads[ALL].per_s)
     print(f"processor time of the server for a read: {cpu_ms:.2f} ms")
-    client = max(one.client_cores for found in windows.values() for one in found)
+    client = max(w.client_cores for same_kind in windows.values() for w in same_kind)
     print(f"the client took {client:.0%} of a core at most")
     print(f"memory of the server's process: {memory_mb[0]:.0f} MB before, {memory_mb[1]:.0f} MB after")
 
 
-def _cells(windows: Sequence[Window], route: str) -> list[str]:
-    figures = [astuple(one.reads[route]) for one in windows]
+def _cells(windows: Sequence[LoadWindow], route: str) -> list[str]:
+    figures = [astuple(window.reads[route]) for window in windows]
     return [f"{statistics.median(column):.0f}" for column in zip(*figures, strict=True)]
 
 
-def _of(windows: Sequence[Window], figure: Callable[[Window], float]) -> float:
+def _median_of(windows: Sequence[LoadWindow], figure: Callable[[LoadWindow], float]) -> float:
     return statistics.median(map(figure, windows))
 
 
-def _document(windows: Mapping[str, Sequence[Window]], memory_mb: tuple[float, float]) -> dict[str, object]:
+def _to_json_object(
+    windows: Mapping[str, Sequence[LoadWindow]], memory_mb: tuple[float, float]
+) -> dict[str, object]:
     return {
-        "machine": machine(),
-        "windows": {name: [asdict(one) for one in found] for name, found in windows.items()},
+        "machine": machine_description(),
+        "windows": {name: [asdict(window) for window in same_kind] for name, same_kind in windows.items()},
         "server_mb": {"before": memory_mb[0], "after": memory_mb[1]},
     }
 

@@ -1,4 +1,4 @@
-"""What loading costs over the bare decoders, on the same bytes.
+"""Benchmark of dataset loading: overhead of ``load`` and ``torch_loader`` over the decoders on the same bytes.
 
 python -m benchmarks.loader ROOT [CONFIG]
 """
@@ -11,7 +11,7 @@ from typing import Any
 import datasets
 
 import rebar_depth_bench as rdb
-from benchmarks.timing import machine, median_seconds, print_markdown
+from benchmarks.timing import machine_description, median_seconds, print_markdown
 from rebar_depth_bench.data.dataset import decode_row, features
 
 REPEATS = 7
@@ -24,7 +24,7 @@ def main(root: str, config: str = "lattice") -> None:
     loader = rdb.torch_loader(loaded, batch_size=1)
     left = ("view_id", "left_rgb", "left_depth", "left_mask", "left_K", "left_cam_from_world")
     raw_left = [{name: row[name] for name in left} for row in raw]
-    print(f"{len(raw)} views, medians of {REPEATS}, one process; {machine()}\n")
+    print(f"{len(raw)} views, medians of {REPEATS}, one process; {machine_description()}\n")
     timings = {
         "all columns: bare decoders": median_seconds(lambda: [decode_row(row) for row in raw], REPEATS),
         "all columns: rdb.load": median_seconds(lambda: list(loaded), REPEATS),

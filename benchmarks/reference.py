@@ -1,8 +1,9 @@
-"""Reference results: every method that runs on a plain CPU with nothing fetched, on a subset of every scene.
+"""Reference results of every method that runs on a CPU without downloads, on a subset of every scene.
 
-``python -m benchmarks.reference OUT`` renders the subset into OUT/dataset, runs the methods into OUT/NAME.zip,
-scores them and writes ``cards/reference.json``, from which the benchmark card's table is made. It takes hours;
-stopped and run again, it goes on with the archives that are missing or older than the dataset.
+``python -m benchmarks.reference OUT`` renders the subset into OUT/dataset, writes the predictions of each method
+to OUT/NAME.zip, scores them and writes ``cards/reference.json``, the source of the reference tables in the
+benchmark card. It takes hours. After an interruption, the same command computes only the archives that are missing
+or older than the dataset.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from cards.benchmark import RESULTS
+from cards.benchmark import REFERENCE_RESULTS
 from dataset_builder.cli import main as rebar_build
 from rebar_depth_bench import score
 from rebar_depth_bench.atomic_io import write_text
@@ -27,7 +28,7 @@ from rebar_depth_bench.submission.metadata import METADATA_NAME
 
 @dataclass(frozen=True)
 class Subset:
-    """What is rendered of each config: so many of its views, spread evenly, so large, with so many samples."""
+    """Rendered subset of each config: number of evenly spread views, image size in pixels, samples per pixel."""
 
     views: int = 72
     width: int = 640
@@ -37,28 +38,33 @@ class Subset:
 
 SUBSET = Subset()
 WITH_BOARD = ("lattice", "pile")
-ALL = (*WITH_BOARD, "pier")
+ALL_SCENES = (*WITH_BOARD, "pier")
 
 RUNS: Mapping[str, tuple[str, ...]] = {
-    "sgbm": ALL,
-    "sgbm-filled": ALL,
+    "sgbm": ALL_SCENES,
+    "sgbm-filled": ALL_SCENES,
     "sweep-aruco": WITH_BOARD,
     "sweep-anchored": ("pier",),
     "lidar-mobile": ("pier",),
-    "constant": ALL,
+    "constant": ALL_SCENES,
     "board-plane": WITH_BOARD,
-    "noisy-truth": ALL,
-    "truth": ALL,
+    "noisy-truth": ALL_SCENES,
+    "truth": ALL_SCENES,
 }
-"""Which method runs on which configs. The pier has no board: only there the truth anchors. The others are nearer
-than the scanner's least range. ``lidar-survey`` is left out: it takes about 25 s of a core for each view."""
+"""Configs on which each method runs.
+
+The methods that need the marker board do not run on the pier, which has none; ``sweep-anchored``, which takes its
+scale from ground truth, runs only there. The scanner methods run only on the pier, since the other scenes are
+closer than the scanner's minimum range. ``lidar-survey`` is omitted because it takes about 25 core-seconds per
+view.
+"""
 
 
 def main(out: Path) -> int:
-    """Make what is missing and write the results; return the exit status."""
+    """Compute missing archives and write the results; return the exit status."""
     root = out / "dataset"
     size = ("--width", SUBSET.width, "--height", SUBSET.height, "--samples", SUBSET.samples)
-    build = ("--out", root, "--config", *ALL, "--views", SUBSET.views, *size)
+    build = ("--out", root, "--config", *ALL_SCENES, "--views", SUBSET.views, *size)
     if status := rebar_build(list(map(str, build))):
         return status
     for method, configs in RUNS.items():
@@ -67,8 +73,8 @@ def main(out: Path) -> int:
         if _is_stale(archive, root) and (status := rebar_bench(list(map(str, predict)))):
             return status
     results = {method: _result(out / f"{method}.zip", root) for method in RUNS}
-    found = {"command": "python -m benchmarks.reference OUT", "subset": asdict(SUBSET), "results": results}
-    write_text(RESULTS, json.dumps(found, indent=1, allow_nan=False) + "\n")
+    document = {"command": "python -m benchmarks.reference OUT", "subset": asdict(SUBSET), "results": results}
+    write_text(REFERENCE_RESULTS, json.dumps(document, indent=1, allow_nan=False) + "\n")
     return 0
 
 
@@ -77,23 +83,23 @@ def _is_stale(archive: Path, root: Path) -> bool:
 
 
 def _result(archive: Path, root: Path) -> dict[str, Any]:
-    """Return a result's JSON without its views, and the archive's own account of time and cameras."""
+    """Return the result of an archive as a JSON object without views, with the archive's notes and run times."""
     result = {key: value for key, value in score(archive, root).to_dict().items() if key != "views"}
     with zipfile.ZipFile(archive) as source:
-        told = json.loads(source.read(METADATA_NAME))
-    seconds = told["runtime"]["seconds"]
+        metadata = json.loads(source.read(METADATA_NAME))
+    seconds = metadata["runtime"]["seconds"]
     return {
         **result,
-        "notes": told.get("notes"),
+        "notes": metadata.get("notes"),
         "seconds": {
             "a_view": {config: _median(seconds, config) for config in result["tables"]},
-            "preparing": told["runtime"].get("preparing"),
+            "preparing": metadata["runtime"].get("preparing"),
         },
     }
 
 
 def _median(seconds: Mapping[str, float], config: str) -> float:
-    return round(statistics.median(spent for view, spent in seconds.items() if config_of(view) == config), 3)
+    return round(statistics.median(duration for view, duration in seconds.items() if config_of(view) == config), 3)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
-"""How fast stored float32 .npy views are scored once the ground truth is cached.
+"""Benchmark of scoring stored float32 .npy views with cached ground truth.
 
 python -m benchmarks.scoring ROOT [CONFIG]
 
-The plain evaluators are the usual full-frame code of public ones, with NumPy and with torch on one thread: decode
-everything, index with a mask, average. A folder of fewer than 504 views is scored several times over: the last
-table is what 504 views take from the page cache. The archive's SHA-256 has a thread of its own and is not counted.
+The plain NumPy and torch evaluators, each on one thread, are typical of public evaluation code: decode the whole
+view, index it with a mask, average. The last figure is the time of 504 views in the page cache; the views of a
+smaller folder are scored repeatedly. The archive's SHA-256, which ``score`` computes in a separate thread, is not
+included.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ import numpy as np
 import torch
 
 import rebar_depth_bench as rdb
-from benchmarks.timing import machine, median_seconds, print_markdown
-from rebar_depth_bench.data.ground_truth import config_truth
+from benchmarks.timing import machine_description, median_seconds, print_markdown
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.extended.evaluate import FAMILIES, SCALED, Family
-from rebar_depth_bench.extended.ground_truth import SteelConfig, steel_config
+from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, SCALED, MeasureFamily
+from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, load_steel_truth
 from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.scoring.ground_truth import config_truth
 from rebar_depth_bench.scoring.protocol import interior
 from rebar_depth_bench.scoring.score import score_view
 from rebar_depth_bench.submission import SubmissionReader, open_submission
@@ -83,27 +84,29 @@ def _torch_numbers(p: torch.Tensor, z: torch.Tensor) -> list[float]:
 
 
 def extended_rows(root: str, config: str, submission: SubmissionReader) -> list[tuple[str, str]]:
-    """Return the milliseconds of each family a view, native and scaled together, and their sum."""
-    steel = steel_config(open_folder(root), config)
+    """Return the milliseconds per view of each measure family, native and scaled together, and their sum."""
+    steel = load_steel_truth(open_folder(root), config)
     views = []
-    for place in range(len(steel)):
-        truth = steel.view(place)
+    for index in range(len(steel)):
+        truth = steel.view(index)
         views.append((truth, submission.read(truth.view_id).ravel()[truth.index].astype(np.float64)))
     seconds = {"gathering a view's truth": median_seconds(lambda: [*map(steel.view, range(len(steel)))], REPEATS)}
-    for family in FAMILIES.values():
+    for family in MEASURE_FAMILIES.values():
         seconds[family.title] = median_seconds(partial(_evaluate_all, family, steel, views), REPEATS // 3)
     seconds["all"] = sum(seconds.values())
     return [(name, f"{1e3 * value / len(views):.1f}") for name, value in seconds.items()]
 
 
-def _evaluate_all(family: Family, steel: SteelConfig, views: list[tuple[SteelTruth, np.ndarray]]) -> None:
+def _evaluate_all(
+    family: MeasureFamily, steel: ConfigSteelTruth, views: list[tuple[SteelTruth, np.ndarray]]
+) -> None:
     for truth, p_m in views:
         predictions = [p_m / 1.1 if alignment == SCALED else p_m for alignment in family.alignments]
         list(family.evaluate(predictions, truth, steel))
 
 
 def peak_megabytes(archive: Path, root: str) -> float:
-    """Return the peak memory of a ``rebar-bench score`` process."""
+    """Return the peak memory of a ``rebar-bench score`` process in MB."""
     command = [sys.executable, "-m", "rebar_depth_bench", "score", str(archive), "--data", root]
     subprocess.run(command, check=True, capture_output=True)
     return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
@@ -115,27 +118,27 @@ def main(root: str, config: str = "lattice") -> None:
     rows = list(rdb.load(root, config, columns=["view_id", "left_depth", "left_mask"]))
     truths = {row["view_id"]: (row["left_depth"], row["left_mask"]) for row in rows}
     scored = config_truth(folder, config)
-    pixels = sum(len(one.index) for one in scored) / len(scored)
-    print(f"{len(rows)} views, {pixels:.0f} scored pixels each; {machine()}\n")
+    pixels = sum(len(truth.index) for truth in scored) / len(scored)
+    print(f"{len(rows)} views, {pixels:.0f} scored pixels each; {machine_description()}\n")
     with tempfile.TemporaryDirectory() as scratch:
         archive = Path(scratch) / "submission.zip"
         with rdb.SubmissionWriter(archive, method="benchmark") as writer:
             for view_id, (truth_m, _) in truths.items():
                 writer.add(view_id, 1.1 * truth_m + np.float32(0.01))
         with open_submission(archive, folder.expected_views()) as submission:
-            timed: dict[str, Callable[[], object]] = {
-                "read and checksum alone": lambda: [submission.read(one.view_id) for one in scored],
-                "rebar-bench": lambda: [score_view(one, submission.read(one.view_id)) for one in scored],
+            runs: dict[str, Callable[[], object]] = {
+                "read and checksum alone": lambda: [submission.read(truth.view_id) for truth in scored],
+                "rebar-bench": lambda: [score_view(truth, submission.read(truth.view_id)) for truth in scored],
                 "plain NumPy": lambda: plain_scores(archive, truths, numpy_metrics),
                 "plain torch": lambda: plain_scores(archive, truths, torch_metrics),
             }
-            seconds = {name: median_seconds(run, REPEATS) for name, run in timed.items()}
+            seconds = {name: median_seconds(run, REPEATS) for name, run in runs.items()}
             cores = os.cpu_count() or 1
             with ThreadPoolExecutor(cores) as pool:
                 whole_s = median_seconds(
                     lambda: [
                         *pool.map(
-                            lambda place: score_view(scored[place], submission.read(scored.view_ids[place])),
+                            lambda index: score_view(scored[index], submission.read(scored.view_ids[index])),
                             islice(cycle(range(len(scored))), FULL_CONFIG),
                         )
                     ],

@@ -1,9 +1,9 @@
-"""Whether structure from motion recovers the true cameras, and the board their scale, from the rendered pictures.
+"""Accuracy of structure from motion on the rendered images: camera poses, and scale from the marker board.
 
 python -m benchmarks.sfm ROOT [CONFIG]
 
-COLMAP (pycolmap) gets the left pictures and the one true K, which it keeps, as in the methods ``colmap-*`` and
-``sweep-*``. Where there is a board, its markers give scale and frame.
+COLMAP (pycolmap) receives the left images and their true K, which stays fixed, as in the methods ``colmap-*`` and
+``sweep-*``. In scenes with a marker board, its markers define scale and frame.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from pathlib import Path
 
 import pycolmap
 
-from benchmarks.timing import machine, print_markdown
+from benchmarks.timing import machine_description, print_markdown
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods import ConfigViews
-from rebar_depth_bench.methods.multiview.images import write_pictures
-from rebar_depth_bench.methods.multiview.metric_scale import board_fit
-from rebar_depth_bench.methods.multiview.pipeline import pictured_structure
-from rebar_depth_bench.methods.multiview.pose_errors import placed_report, scaled_report, true_similarity
+from rebar_depth_bench.methods.multiview.images import write_left_images
+from rebar_depth_bench.methods.multiview.metric_scale import fit_board
+from rebar_depth_bench.methods.multiview.pipeline import reconstruct_images
+from rebar_depth_bench.methods.multiview.pose_errors import aligned_report, board_frame_report, similarity_to_world
 
 
 def main(root: str, config: str = "lattice-orbit") -> None:
-    print(f"{config} of {root}; pycolmap {pycolmap.__version__}; {machine()}\n")
+    print(f"{config} of {root}; pycolmap {pycolmap.__version__}; {machine_description()}\n")
     views = ConfigViews(open_folder(root), config)
     with tempfile.TemporaryDirectory() as scratch:
-        pictures = write_pictures(views, Path(scratch) / "images")
+        pictures = write_left_images(views, Path(scratch) / "images")
         start = time.perf_counter()
-        structure = pictured_structure(views, pictures, Path(scratch))
+        structure = reconstruct_images(views, pictures, Path(scratch))
         seconds = time.perf_counter() - start
     rows = [
         ("registered", f"{len(structure.cam_from_sfm)} of {len(pictures.names)}"),
@@ -38,23 +38,23 @@ def main(root: str, config: str = "lattice-orbit") -> None:
         ("mean reprojection error", f"{structure.reprojection_px:.3f} px"),
         ("features, matches, mapping", f"{seconds:.1f} s"),
     ]
-    true = true_similarity(structure.cam_from_sfm, pictures.cam_from_world)
-    found = scaled_report(structure.cam_from_sfm, pictures.cam_from_world, true.scale)
-    rows += _told(found, "after the best similarity")
+    similarity = similarity_to_world(structure.cam_from_sfm, pictures.cam_from_world)
+    report = aligned_report(structure.cam_from_sfm, pictures.cam_from_world, similarity.scale)
+    rows += _error_rows(report, "after the best similarity")
     if views.board is not None:
-        fit = board_fit(pictures.markers, structure.cam_from_sfm, pictures.grid.K, views.board)
-        found = placed_report(structure.cam_from_sfm, pictures.cam_from_world, fit.metric)
+        fit = fit_board(pictures.markers, structure.cam_from_sfm, pictures.grid.K, views.board)
+        report = board_frame_report(structure.cam_from_sfm, pictures.cam_from_world, fit.metric)
         rows += [
             ("markers", f"{len(fit.markers)} of {views.board.markers}, {1000 * fit.rms_m:.3f} mm rms"),
-            ("scale from the board", f"{found['scale_error_percent']:+.4f} % off"),
-            *_told(found, "in the board's frame"),
+            ("scale from the board", f"{report['scale_error_percent']:+.4f} % off"),
+            *_error_rows(report, "in the board's frame"),
         ]
     print_markdown(["", ""], rows)
 
 
-def _told(found: dict[str, dict[str, float]], frame: str) -> list[tuple[str, str]]:
+def _error_rows(report: dict[str, dict[str, float]], frame: str) -> list[tuple[str, str]]:
     return [
-        (f"{label}, {frame}", f"{found[key]['median']:.3f} {unit} median, {found[key]['largest']:.3f} largest")
+        (f"{label}, {frame}", f"{report[key]['median']:.3f} {unit} median, {report[key]['largest']:.3f} largest")
         for label, key, unit in (
             ("centre error", "centre_error_mm", "mm"),
             ("rotation error", "rotation_error_deg", "deg"),

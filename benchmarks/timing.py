@@ -1,4 +1,4 @@
-"""What the benchmarks share: medians, the machine's description, tables."""
+"""Helpers of the benchmarks: median timing, machine description, Markdown tables."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def median_seconds(work: Callable[[], object], repeats: int) -> float:
-    """Return the median wall-clock time of ``repeats`` calls, after one that is not counted."""
+    """Return the median wall-clock seconds of ``repeats`` calls, after one warm-up call."""
     work()
     times = []
     for _ in range(repeats):
@@ -21,8 +21,8 @@ def median_seconds(work: Callable[[], object], repeats: int) -> float:
     return statistics.median(times)
 
 
-def machine() -> str:
-    """Return one line about the processor, the cores and the load when asked."""
+def machine_description() -> str:
+    """Return one line with the processor model, the number of cores and the current load average."""
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     load = os.getloadavg()[0]
@@ -30,10 +30,10 @@ def machine() -> str:
 
 
 def print_markdown(
-    headings: Sequence[str], rows: Sequence[Sequence[object]], say: Callable[[str], object] = print
+    headings: Sequence[str], rows: Sequence[Sequence[object]], write_line: Callable[[str], object] = print
 ) -> None:
-    """Print a Markdown table."""
-    say(f"| {' | '.join(headings)} |")
-    say(f"|{'---|' * len(headings)}")
+    """Write a Markdown table line by line with ``write_line``."""
+    write_line(f"| {' | '.join(headings)} |")
+    write_line(f"|{'---|' * len(headings)}")
     for row in rows:
-        say(f"| {' | '.join(str(cell) for cell in row)} |")
+        write_line(f"| {' | '.join(str(cell) for cell in row)} |")

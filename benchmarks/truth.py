@@ -1,9 +1,9 @@
-"""What exact depth itself scores in the extended measures: how near to perfect they can come.
+"""Extended measures of the ground-truth depth itself: the best values that a prediction can reach.
 
 python -m benchmarks.truth ROOT [CONFIG ...]
 
-Bars have ribs and flat ends, the fit takes a few dozen points of each: a fitted axis is off by hundredths of a
-millimetre where depth is exact.
+Bars have ribs and flat ends, and the axis fit uses a few dozen points of each bar. Even with exact depth, fitted
+axes therefore deviate by hundredths of a millimetre.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import rebar_depth_bench as rdb
 from benchmarks.timing import print_markdown
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.evaluate import NATIVE, ONCE, measures_by_alignment, view_samples
-from rebar_depth_bench.extended.ground_truth import steel_config
+from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.result import ExtendedView, tabulate_extended
 
 COLUMNS = ["view_id", "left_depth"]
-PERFECT = ("boundary_f1", "cloud_f_1mm", "layer_confusion", "full_mask_abs_rel", "shifted_rmse_cm")
-BARS = ("bars_found", "pass_gb50204_cover_slab")
-SAMPLES = (
+SCORES = ("boundary_f1", "cloud_f_1mm", "layer_confusion", "full_mask_abs_rel", "shifted_rmse_cm")
+BAR_SCORES = ("bars_found", "pass_gb50204_cover_slab")
+ERROR_SAMPLES = (
     "axis_offset_judged_mm",
     "spacing_judged_mm",
     "layer_judged_mm",
@@ -34,23 +34,23 @@ SAMPLES = (
 def main(root: str, *configs: str) -> None:
     folder = open_folder(root)
     measures = measures_by_alignment()
-    perfect, bars = [], []
+    score_rows, error_rows = [], []
     for config in configs or folder.configs:
-        steel = steel_config(folder, config)
+        steel = load_steel_truth(folder, config)
         depth_m = {row["view_id"]: row["left_depth"] for row in rdb.load(root, config, columns=COLUMNS)}
-        truths = [steel.view(place) for place in range(len(steel))]
+        truths = [steel.view(index) for index in range(len(steel))]
         views = [
             ExtendedView(truth.view_id, view_samples(depth_m[truth.view_id], truth, steel, 1.0))
             for truth in truths
         ]
         table = tabulate_extended(views, range(len(views)), measures)
         numbers = {**table.numbers[ONCE], **table.numbers[NATIVE]}
-        perfect.append((config, len(views), *(f"{numbers[one].value:g}" for one in (*PERFECT, *BARS))))
-        pooled = [np.concatenate([view.samples[NATIVE][one] for view in views]) for one in SAMPLES]
-        bars.append((config, *map(_spread, pooled)))
-    print_markdown(["config", "views", *PERFECT, *BARS], perfect)
+        score_rows.append((config, len(views), *(f"{numbers[name].value:g}" for name in (*SCORES, *BAR_SCORES))))
+        pooled = [np.concatenate([view.samples[NATIVE][name] for view in views]) for name in ERROR_SAMPLES]
+        error_rows.append((config, *map(_spread, pooled)))
+    print_markdown(["config", "views", *SCORES, *BAR_SCORES], score_rows)
     print("\nmm, over all bars or pairs judged: median / 95th percentile / largest (how many)\n")
-    print_markdown(["config", *SAMPLES], bars)
+    print_markdown(["config", *ERROR_SAMPLES], error_rows)
 
 
 def _spread(values: np.ndarray) -> str:

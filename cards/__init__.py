@@ -1,4 +1,4 @@
-"""The cards that people read: one travels with every dataset folder, one describes the benchmark."""
+"""Generators of the Markdown cards: the dataset card of each dataset folder, and the benchmark card."""
 
 from cards.benchmark import benchmark_card
 from cards.dataset import dataset_card

@@ -1,4 +1,4 @@
-"""``python -m cards`` prints the benchmark card."""
+"""Command ``python -m cards``: prints the benchmark card."""
 
 from cards import benchmark_card
 

@@ -1,6 +1,6 @@
-"""The benchmark card: what is measured, by which rules, with which limits. Its numbers come from the code.
+"""Benchmark card: metrics, protocol, limits, methods and reference results.
 
-The benchmark card's tables of reference results, from the stored JSON.
+The constants of the card are taken from the code, the tables of reference results from ``cards/reference.json``.
 """
 
 from __future__ import annotations
@@ -12,35 +12,36 @@ from pathlib import Path
 from typing import Any
 
 from cards.templates import render
-from rebar_depth_bench.extended.evaluate import FAMILIES, ONCE, Family
+from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, ONCE, MeasureFamily
 from rebar_depth_bench.extended.inspection.tolerances import PROFILES
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, own_methods
-from rebar_depth_bench.scoring.bootstrap import DRAWS, MIN_VIEWS, RING_VIEWS
+from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_VIEWS, RESAMPLES
 from rebar_depth_bench.scoring.protocol import DELTA1_RATIO, MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
 
-RESULTS = Path(__file__).parent / "reference.json"
+REFERENCE_RESULTS = Path(__file__).parent / "reference.json"
+"""JSON file of the reference results, written by ``python -m benchmarks.reference``."""
 
 
 def reference_context() -> dict[str, Any]:
-    """Return what the card's template shows: the command, the subset, and each config's rows in words."""
-    stored = json.loads(RESULTS.read_text())
+    """Return the template variables of the reference results: command, subset, and formatted rows by config."""
+    document = json.loads(REFERENCE_RESULTS.read_text())
     tables: dict[str, list[dict[str, str]]] = {}
-    for method, result in stored["results"].items():
+    for method, result in document["results"].items():
         for config, table in result["tables"].items():
             tables.setdefault(config, []).append(_reference_row(method, result, config, table))
-    return {"command": stored["command"], "subset": stored["subset"], "reference": tables}
+    return {"command": document["command"], "subset": document["subset"], "reference": tables}
 
 
 def _reference_row(
     method: str, result: Mapping[str, Any], config: str, table: Mapping[str, Any]
 ) -> dict[str, str]:
     native, scaled = table["native"] or {}, table["scaled"] or {}
-    low_high = (table.get("ci95") or {}).get("native", {}).get("abs_rel")
-    interval = "" if low_high is None else f" ({_number(low_high[0], 3)}-{_number(low_high[1], 3)})"
+    bounds = (table.get("ci95") or {}).get("native", {}).get("abs_rel")
+    interval = "" if bounds is None else f" ({_number(bounds[0], 3)}-{_number(bounds[1], 3)})"
     return {
         "method": method,
-        "mark": " †" if own_methods()[method].info.reads_truth else "",
+        "mark": " †" if own_methods()[method].info.uses_ground_truth else "",
         "coverage": _percent(table["coverage"]),
         "ranked": "yes" if table["ranked"] else "no",
         "abs_rel": _number(native.get("abs_rel"), 4) + interval,
@@ -53,10 +54,10 @@ def _reference_row(
 
 
 def _seconds(result: Mapping[str, Any], config: str, views: int) -> str:
-    """Return the seconds a view takes, with its share of what was prepared for all of them."""
-    spent = result["seconds"]
-    preparing = (spent["preparing"] or {}).get(config, 0.0)
-    return "-" if preparing is None else f"{spent['a_view'][config] + preparing / views:.2g}"
+    """Return the formatted seconds per view, including an equal share of the preparation; "-" if unknown."""
+    seconds = result["seconds"]
+    preparing = (seconds["preparing"] or {}).get(config, 0.0)
+    return "-" if preparing is None else f"{seconds['a_view'][config] + preparing / views:.2g}"
 
 
 def _number(value: float | None, digits: int, unit: str = "") -> str:
@@ -67,8 +68,8 @@ def _percent(share: float | None) -> str:
     return "-" if share is None else f"{100 * share:.1f} %"
 
 
-_STEP = re.compile(r"(?<=_)\d[\d.]*(?:-[\d.]+)?(?=(?:mm|pct|m|px)$)")
-"""The tolerance, threshold or bin that a measure's name ends with."""
+_PARAMETER = re.compile(r"(?<=_)\d[\d.]*(?:-[\d.]+)?(?=(?:mm|pct|m|px)$)")
+"""Pattern of the tolerance, threshold or bin at the end of a measure's name, without its unit."""
 
 
 def benchmark_card() -> str:
@@ -81,38 +82,42 @@ def benchmark_card() -> str:
         within_mm=WITHIN_MM,
         methods=[_method_row(method) for method in own_methods().values()],
         **reference_context(),
-        draws=DRAWS,
-        ring_views=RING_VIEWS,
+        draws=RESAMPLES,
+        ring_views=BLOCK_VIEWS,
         min_views=MIN_VIEWS,
         extended_protocol=EXTENDED_PROTOCOL,
-        families=[_family_rows(family) for family in FAMILIES.values()],
+        families=[_family_rows(family) for family in MEASURE_FAMILIES.values()],
         profiles=PROFILES,
     )
 
 
 def _method_row(method: AnyMethod) -> dict[str, str]:
     info = method.info
-    name = f"`{info.name}`{' †' if info.reads_truth else ''}"
-    what = f"{info.summary} ({info.unexercised})" if info.unexercised else info.summary
+    name = f"`{info.name}`{' †' if info.uses_ground_truth else ''}"
+    what = f"{info.summary} ({info.untested_note})" if info.untested_note else info.summary
     needs = "all views of a config" if isinstance(method, MultiViewMethod) else ", ".join(info.columns)
     return {"name": name, "what": what, "needs": needs, "licence": info.licence}
 
 
-def _family_rows(family: Family) -> dict[str, Any]:
-    taken = "once" if family.alignments == (ONCE,) else "native and scaled"
-    alike: dict[str, list[Measure]] = {}
+def _family_rows(family: MeasureFamily) -> dict[str, Any]:
+    alignment = "once" if family.alignments == (ONCE,) else "native and scaled"
+    measures_by_name: dict[str, list[Measure]] = {}
     for measure in family.measures:
-        alike.setdefault(_STEP.sub("N", measure.name), []).append(measure)
-    return {"title": family.title, "taken": taken, "rows": [_row(name, same) for name, same in alike.items()]}
+        measures_by_name.setdefault(_PARAMETER.sub("N", measure.name), []).append(measure)
+    return {
+        "title": family.title,
+        "taken": alignment,
+        "rows": [_measure_row(name, variants) for name, variants in measures_by_name.items()],
+    }
 
 
-def _row(name: str, measures: Sequence[Measure]) -> dict[str, str]:
-    """Return one row for measures that differ by a tolerance or a bin alone, which it calls N."""
+def _measure_row(name: str, measures: Sequence[Measure]) -> dict[str, str]:
+    """Return one row for measures that differ only in the tolerance or bin of their name, written as N."""
     first, definition = measures[0], measures[0].definition
-    step = _STEP.search(first.name)
-    if step is not None:
-        steps = ", ".join(found[0] for one in measures if (found := _STEP.search(one.name)))
-        definition = f"{definition.replace(f' {step[0]} ', ' N ', 1)}; N = {steps}"
+    parameter = _PARAMETER.search(first.name)
+    if parameter is not None:
+        values = ", ".join(match[0] for measure in measures if (match := _PARAMETER.search(measure.name)))
+        definition = f"{definition.replace(f' {parameter[0]} ', ' N ', 1)}; N = {values}"
     return {
         "name": name,
         "unit": first.unit,

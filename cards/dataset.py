@@ -1,4 +1,4 @@
-"""The dataset card: YAML that ``datasets`` reads, and a description with tables made from the manifest."""
+"""Dataset card: YAML header for the ``datasets`` library, and a description with tables from the manifest."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from datasets.info import DatasetInfosDict
 from huggingface_hub import DatasetCardData
 
 from cards.templates import render
-from rebar_depth_bench.data.dataset import COLUMN_MEANINGS, column_kind, features
+from rebar_depth_bench.data.dataset import COLUMN_DESCRIPTIONS, column_kind, features
 
 SPLIT = "test"
-_OPTICS = {
+_OPTICS_TEXTS = {
     "ideal": "",
     "raw": "factory-calibrated lenses, on the distorted grid as the sensor sees it",
     "rectified": "factory-calibrated lenses, on the grid that OpenCV's stereoRectify makes of the pair; "
     "depth along the rectified axis",
 }
-_SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
+_SIZE_CATEGORIES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 
 
 def dataset_card(manifest: Mapping[str, Any]) -> str:
-    """Return the folder's ``README.md``: ``datasets.load_dataset(ROOT, config)`` works from its YAML alone.
+    """Return the text of the dataset folder's ``README.md``.
 
-    Each config's shards are named by a pattern that carries their digest, so that a rebuilt config is another
-    config to the cache of ``datasets`` and never served stale.
+    Its YAML header is sufficient for ``datasets.load_dataset(ROOT, config)``. The file pattern of each config
+    contains the digest of its shards, so that the cache of ``datasets`` never serves an older build of a config.
     """
     return render(
         "dataset_card.md.j2",
-        yaml=_metadata(manifest).to_yaml(),
+        yaml=_card_metadata(manifest).to_yaml(),
         manifest=manifest,
         configs=[_config_row(name, entry) for name, entry in manifest["configs"].items()],
         columns=column_rows(),
@@ -39,11 +39,13 @@ def dataset_card(manifest: Mapping[str, Any]) -> str:
 
 
 def column_rows() -> list[dict[str, str]]:
-    """Return the columns of a row, each eye's pair together, with the type and the meaning of each."""
+    """Return the names, type and description of the dataset columns; left and right columns share one row."""
     rows: dict[str, dict[str, str]] = {}
     for name, feature in features().items():
         kind = column_kind(name)
-        row = rows.setdefault(kind, {"names": "", "type": _type_name(feature), "meaning": COLUMN_MEANINGS[kind]})
+        row = rows.setdefault(
+            kind, {"names": "", "type": _type_name(feature), "meaning": COLUMN_DESCRIPTIONS[kind]}
+        )
         row["names"] += f"{', ' if row['names'] else ''}`{name}`"
     return list(rows.values())
 
@@ -56,7 +58,7 @@ def _type_name(feature: Any) -> str:
     return "image" if kind == "Image" else str(feature.dtype)
 
 
-def _metadata(manifest: Mapping[str, Any]) -> DatasetCardData:
+def _card_metadata(manifest: Mapping[str, Any]) -> DatasetCardData:
     configs: Mapping[str, Mapping[str, Any]] = manifest["configs"]
     views = sum(len(entry["views"]) for entry in configs.values())
     card = DatasetCardData(
@@ -64,9 +66,9 @@ def _metadata(manifest: Mapping[str, Any]) -> DatasetCardData:
         pretty_name="Industrial rebar metric depth",
         task_categories=["depth-estimation"],
         tags=["depth", "stereo", "construction", "rebar", "synthetic"],
-        size_categories=[next((name for limit, name in _SIZES if views < limit), "100K<n<1M")],
+        size_categories=[next((name for limit, name in _SIZE_CATEGORIES if views < limit), "100K<n<1M")],
     )
-    infos = {name: _info(name, entry, manifest["version"]) for name, entry in configs.items()}
+    infos = {name: _dataset_info(name, entry, manifest["version"]) for name, entry in configs.items()}
     DatasetInfosDict(infos).to_dataset_card_data(card)
     card["configs"] = [
         {"config_name": name, "data_files": [{"split": SPLIT, "path": _shard_pattern(entry["shards"])}]}
@@ -75,7 +77,7 @@ def _metadata(manifest: Mapping[str, Any]) -> DatasetCardData:
     return card
 
 
-def _info(name: str, entry: Mapping[str, Any], version: str) -> DatasetInfo:
+def _dataset_info(name: str, entry: Mapping[str, Any], version: str) -> DatasetInfo:
     size = entry["bytes"]
     split = SplitInfo(SPLIT, num_examples=len(entry["views"]), num_bytes=size)
     return DatasetInfo(
@@ -89,16 +91,16 @@ def _info(name: str, entry: Mapping[str, Any], version: str) -> DatasetInfo:
 
 
 def _shard_pattern(shards: Iterable[str]) -> str:
-    """Return the glob of a config's shards, ``<config>/test-*-<digest>.parquet``."""
-    first = next(iter(shards))
-    return f"{first.partition('/')[0]}/{SPLIT}-*-{first.rpartition('-')[2]}"
+    """Return the glob pattern of a config's shards, ``<config>/test-*-<digest>.parquet``."""
+    shard = next(iter(shards))
+    return f"{shard.partition('/')[0]}/{SPLIT}-*-{shard.rpartition('-')[2]}"
 
 
 def _config_row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
     rig, views = entry["rig"], entry["views"]
     steel = np.array([view["steel_px"] for view in views], float)
     scored = np.array([view["scored_px"] for view in views], float)
-    seen = steel > 0
+    with_steel = steel > 0
     return {
         "name": name,
         "views": f"{len(views)} of {entry['protocol_views']}",
@@ -107,11 +109,11 @@ def _config_row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
         "grid": f"{rig['width']} x {rig['height']}",
         "distance": _distance(entry["protocol"]),
         "steel": f"{100 * np.mean(steel) / (rig['width'] * rig['height']):.1f} %",
-        "kept": f"{100 * np.mean(scored[seen] / steel[seen]):.0f} %" if seen.any() else "none",
+        "kept": f"{100 * np.mean(scored[with_steel] / steel[with_steel]):.0f} %" if with_steel.any() else "none",
         "out_of_protocol": int(np.count_nonzero(scored == 0)),
         "sheet": entry["sheet"],
         "variants": entry["scene"]["appearance"]["variants"],
-        "optics": _OPTICS[rig["grid"]],
+        "optics": _OPTICS_TEXTS[rig["grid"]],
         "megabytes": f"{entry['bytes'] / 1e6:.1f}",
     }
 

@@ -1,4 +1,4 @@
-"""Metric depth on steel reinforcement: load the dataset, write a submission, score it."""
+"""Benchmark of metric depth on steel reinforcement: load the dataset, write a submission, score it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
     "torch_loader",
 ]
 
-_HOMES = {
+_MODULE_BY_NAME = {
     "load": "data.dataset",
     "score": "scoring.score",
     "torch_loader": "data.torch_loader",
@@ -40,12 +40,15 @@ _HOMES = {
 
 
 def __dir__() -> list[str]:
-    """List the public names, also those not imported yet."""
+    """Return the public names, including those not imported yet."""
     return sorted(__all__)
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first asked for: what it stands on takes seconds."""
+    """Import a public name on first access, because its dependencies take seconds to import.
+
+    Raises ``AttributeError`` for a name that is not in ``__all__``.
+    """
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES.get(name, 'errors')}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULE_BY_NAME.get(name, 'errors')}"), name)

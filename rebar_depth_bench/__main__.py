@@ -1,4 +1,4 @@
-"""``python -m rebar_depth_bench`` is ``rebar-bench``."""
+"""Entry point of ``python -m rebar_depth_bench``, the same as ``rebar-bench``."""
 
 from rebar_depth_bench.cli.main import main
 

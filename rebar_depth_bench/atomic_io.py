@@ -1,7 +1,8 @@
-"""Whole files or none: write beside the target, flush to disk, rename."""
+"""Atomic file writes (temporary file in the target's folder, fsync, rename) and file locks."""
 
 from __future__ import annotations
 
+import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
@@ -10,13 +11,16 @@ from pathlib import Path
 
 from rebar_depth_bench.errors import InputError
 
+TEMPORARY_PATTERN = ".*.tmp"
+"""Names of temporary files that killed processes leave."""
+
 
 @contextmanager
-def replacing(target: Path) -> Iterator[Path]:
-    """Yield a temporary path in the target's folder; on a clean exit it is flushed and becomes ``target``.
+def atomic_replace(target: Path) -> Iterator[Path]:
+    """Yield a temporary path in the target's folder; on a clean exit, flush it and rename it to ``target``.
 
-    On an exception the temporary file is removed and an earlier ``target`` stays as it was. Raises ``InputError``
-    where no file of that name can be written.
+    Missing parent folders are created. On an exception the temporary file is removed and an existing ``target`` is
+    left unchanged. Raises ``InputError`` if ``target`` is a folder or its folder cannot be written.
     """
     if target.is_dir():
         raise InputError(f"{target}: is a folder, expected the name of a file to write")
@@ -30,16 +34,16 @@ def replacing(target: Path) -> Iterator[Path]:
     try:
         yield temporary
         temporary.chmod(0o644)
-        sync(temporary)
+        fsync_path(temporary)
         temporary.replace(target)
-        sync(target.parent)
+        fsync_path(target.parent)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
 
 
-def sync(path: Path) -> None:
-    """Flush a file's or a folder's content to the disk."""
+def fsync_path(path: Path) -> None:
+    """Flush the content of a file or folder to disk (fsync)."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -47,12 +51,27 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
+@contextmanager
+def exclusive_lock(path: Path, *, wait: bool = False, mode: int = 0o666) -> Iterator[None]:
+    """Hold an exclusive lock on a folder, or on a file that is created with ``mode`` if it does not exist.
+
+    The kernel releases the lock however the process ends. Raises ``BlockingIOError`` if another process holds it,
+    unless ``wait`` is set.
+    """
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT, mode)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def write_bytes(target: Path, content: bytes) -> None:
-    """Write ``content`` to ``target``, whole or not at all."""
-    with replacing(target) as temporary:
+    """Write ``content`` to ``target`` atomically."""
+    with atomic_replace(target) as temporary:
         temporary.write_bytes(content)
 
 
 def write_text(target: Path, content: str) -> None:
-    """Write ``content`` as UTF-8 to ``target``, whole or not at all."""
+    """Write ``content`` to ``target`` atomically, as UTF-8."""
     write_bytes(target, content.encode())

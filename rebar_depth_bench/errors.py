@@ -1,9 +1,8 @@
-"""The one tree of errors; every message says what is wrong, what was found, what was expected, and where.
+"""Exception hierarchy of the project, and helpers that format problems for error messages.
 
-``InputError`` is the user's to mend (exit status 2); any other ``RebarDepthError`` is ours or the
-machine's (exit status 1).
-
-How a refusal is worded: one sentence with the entry, what was found and what was expected.
+Every message is one sentence that names the file or entry, the value found and the value expected. An
+``InputError`` is caused by the user's input (exit status 2); any other ``RebarDepthError`` is caused by this
+software or by the machine (exit status 1).
 """
 
 from __future__ import annotations
@@ -14,27 +13,27 @@ MAX_PROBLEMS_SHOWN = 20
 
 
 class RebarDepthError(Exception):
-    """Root of every error this project raises on purpose."""
+    """Base class of all errors that the project raises deliberately."""
 
 
 class InputError(RebarDepthError):
-    """What the user handed in is at fault: a folder, an archive, an argument."""
+    """Invalid user input: a folder, an archive or an argument."""
 
 
 class DatasetError(InputError):
-    """A dataset folder is missing, incomplete or contradicts its own manifest."""
+    """Dataset folder that is missing, incomplete or inconsistent with its manifest."""
 
 
 class MeshError(InputError):
-    """A mesh file cannot serve as an assembly of bars."""
+    """Mesh file that cannot be used as an assembly of bars."""
 
 
 class MethodError(InputError):
-    """A method is unknown, or lacks what it needs (package, weights, a right image)."""
+    """Unknown method, or method whose requirements (package, weights, right image) are not met."""
 
 
 class SubmissionError(InputError):
-    """An archive is refused: ``problems`` holds every reason, one sentence each."""
+    """Rejected submission archive; ``problems`` lists every reason, one sentence each."""
 
     def __init__(self, archive: str, problems: Sequence[str]) -> None:
         self.archive = archive
@@ -43,7 +42,7 @@ class SubmissionError(InputError):
 
 
 class CalibrationError(InputError):
-    """A calibration file is refused: ``problems`` holds every reason, one sentence each."""
+    """Rejected calibration file; ``problems`` lists every reason, one sentence each."""
 
     def __init__(self, path: str, problems: Sequence[str]) -> None:
         self.path = path
@@ -52,40 +51,55 @@ class CalibrationError(InputError):
 
 
 class BuildError(RebarDepthError):
-    """A build could not finish for a reason that is not the user's input."""
+    """Build failure that is not caused by the user's input."""
 
 
 class RenderProcessError(BuildError):
-    """A render process died or answered nonsense, twice."""
+    """Render process that died or returned an invalid response twice."""
 
 
 def problem_summary(problems: Sequence[str]) -> str:
-    """Return ``N problems`` and up to ``MAX_PROBLEMS_SHOWN`` of them, one a line, then how many are left."""
+    """Return the number of problems, the first ``MAX_PROBLEMS_SHOWN`` one per line, and the number omitted."""
     noun = "problem" if len(problems) == 1 else "problems"
     lines = [f"{len(problems)} {noun}", *(f"  - {problem}" for problem in problems[:MAX_PROBLEMS_SHOWN])]
-    left_over = len(problems) - MAX_PROBLEMS_SHOWN
-    if left_over > 0:
-        lines.append(f"  ... and {left_over} more")
+    omitted = len(problems) - MAX_PROBLEMS_SHOWN
+    if omitted > 0:
+        lines.append(f"  ... and {omitted} more")
     return "\n".join(lines)
 
 
-_SHOWN_CHARACTERS = 120
+_MAX_TEXT_CHARACTERS = 120
 
 
 class EntryError(InputError):
-    """One entry of an archive is refused; ``problem`` is the sentence that says why."""
+    """Rejected entry of an archive; ``problem`` is the reason, one sentence."""
 
     def __init__(self, problem: str) -> None:
         self.problem = problem
         super().__init__(problem)
 
 
-def show(text: str) -> str:
-    """Return ``text`` fit for a one-line message: control characters escaped, long text cut."""
-    shown = text if text and text.isprintable() else ascii(text)
-    return shown if len(shown) <= _SHOWN_CHARACTERS else shown[:_SHOWN_CHARACTERS] + "..."
+def escape_text(text: str) -> str:
+    """Return ``text`` for a one-line message: escaped if not printable, truncated to 120 characters."""
+    escaped = text if text and text.isprintable() else ascii(text)
+    return escaped if len(escaped) <= _MAX_TEXT_CHARACTERS else escaped[:_MAX_TEXT_CHARACTERS] + "..."
 
 
-def show_shape(shape: tuple[int, int]) -> str:
-    """Return ``H x W``."""
+def printable(text: str, limit: int = 200) -> str:
+    """Return a name from a submission, truncated to ``limit`` characters.
+
+    Control characters and characters that change the text direction become U+FFFD.
+    """
+    clean = "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text[: limit + 1])
+    return clean if len(clean) <= limit else clean[: limit - 1] + "…"
+
+
+def exception_summary(error: Exception) -> str:
+    """Return the type of an exception and the first line of its message."""
+    first_line = (str(error).strip().splitlines() or [""])[0]
+    return f"{type(error).__name__}: {first_line}"
+
+
+def format_shape(shape: tuple[int, int]) -> str:
+    """Return a (height, width) shape formatted as ``H x W``."""
     return f"{shape[0]} x {shape[1]}"

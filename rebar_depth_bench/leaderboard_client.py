@@ -1,4 +1,4 @@
-"""Talks to a leaderboard: uploads an archive, waits until it is scored, fetches the result."""
+"""HTTP client of a leaderboard: upload an archive, wait until it is scored, fetch the result."""
 
 from __future__ import annotations
 
@@ -11,26 +11,28 @@ from typing import Any, Self
 from rebar_depth_bench.errors import InputError, RebarDepthError, SubmissionError
 from rebar_depth_bench.progress import Progress, silent
 
-POLL_S = 2.0
-NOT_THERE = "no such submission"
-MOST_AWAY = 30
-"""So often in a row is a service that does not answer asked again."""
-ANSWER_S = 3600.0
-"""The answer to an upload waits for the archive's check."""
+POLL_INTERVAL_S = 2.0
+"""Time between two status requests, seconds."""
+NO_SUBMISSION_DETAIL = "no such submission"
+"""``detail`` of the service's 404 response for an unknown submission id."""
+MAX_FAILED_POLLS = 30
+"""Number of consecutive failed status requests that ``LeaderboardClient.wait`` tolerates."""
+UPLOAD_TIMEOUT_S = 3600.0
+"""Read timeout, seconds; the service responds to an upload only after it has checked the archive."""
 
 
 class ServiceError(RebarDepthError):
-    """The leaderboard cannot be reached, or answers what it should not."""
+    """Leaderboard that cannot be reached or returns an unexpected response."""
 
 
-class Leaderboard:
-    """A leaderboard at ``url``, and the token to submit with. A context manager."""
+class LeaderboardClient:
+    """Client for the leaderboard at ``url`` that authenticates with ``token``; a context manager."""
 
     def __init__(self, url: str, token: str) -> None:
-        """Raise ``InputError`` where the client's package is missing."""
+        """Open an HTTP client; raise ``InputError`` if ``httpx2`` is not installed."""
         self._http = _httpx()
         self._url = url.rstrip("/")
-        timeout = self._http.Timeout(30.0, read=ANSWER_S)
+        timeout = self._http.Timeout(30.0, read=UPLOAD_TIMEOUT_S)
         self._client = self._http.Client(headers={"Authorization": f"Bearer {token}"}, timeout=timeout)
 
     def __enter__(self) -> Self:
@@ -42,57 +44,65 @@ class Leaderboard:
         self._client.close()
 
     def submit(self, archive: Path, progress: Progress = silent) -> dict[str, Any]:
-        """Upload an archive and return the accepted submission: ``id``, ``status``, ``url``.
+        """Upload an archive and return the accepted submission, a dict with ``id``, ``status`` and ``url``.
 
-        Raises ``SubmissionError`` with every problem of the archive, ``InputError`` for a token, a quota or a
-        size, ``ServiceError`` where the service cannot be reached.
+        Raises ``SubmissionError`` with every problem of a rejected archive, ``InputError`` for an invalid token,
+        an exhausted quota, an archive that is too large or a file that cannot be read, and ``ServiceError`` if
+        the service cannot be reached.
         """
         self._check_token()
         try:
             total = archive.stat().st_size
             with archive.open("rb") as stream:
-                watched = _Watched(stream.read, lambda done: progress("uploading", done, total))
-                answer = self._call("POST", "", files={"archive": (archive.name, watched, "application/zip")})
+                upload = _ProgressReader(stream.read, lambda done: progress("uploading", done, total))
+                response = self._call("POST", "", files={"archive": (archive.name, upload, "application/zip")})
         except OSError as error:
             raise InputError(f"{archive}: cannot be read: {error.strerror or error}") from None
-        if answer.status_code == 422:
-            content = _content(answer)
+        if response.status_code == 422:
+            content = _json_object(response)
             raise SubmissionError(str(archive), content.get("problems", [content.get("detail", "refused")]))
-        return self._accepted(answer, 202)
+        return self._submission_from(response, 202)
 
     def _check_token(self) -> None:
-        """Ask for what is not there: a token or an address that is wrong is told before gigabytes are sent."""
-        answer = self._call("GET", "/none")
-        if answer.status_code != 404 or _content(answer).get("detail") != NOT_THERE:
-            self._accepted(answer, 404)
+        """Verify URL and token before uploading, by requesting a submission that does not exist."""
+        response = self._call("GET", "/none")
+        if response.status_code != 404 or _json_object(response).get("detail") != NO_SUBMISSION_DETAIL:
+            self._submission_from(response, 404)
 
     def wait(self, submission_id: str, progress: Progress = silent) -> dict[str, Any]:
-        """Return the submission once it is scored or failed. A service that is away for a while is asked again."""
-        away = 0
+        """Poll until the submission is scored or failed, and return it.
+
+        Raises ``ServiceError`` after more than ``MAX_FAILED_POLLS`` consecutive failed requests, and
+        ``InputError`` if the service rejects the token or the id.
+        """
+        failed_polls = 0
         while True:
             try:
-                answer = self._call("GET", f"/{submission_id}")
-                if answer.status_code == 429:
-                    raise ServiceError(f"{self._url}: {_content(answer).get('detail', 'too many requests')}")
-                found = self._accepted(answer, 200)
-                away = 0
+                response = self._call("GET", f"/{submission_id}")
+                if response.status_code == 429:
+                    raise ServiceError(f"{self._url}: {_json_object(response).get('detail', 'too many requests')}")
+                submission = self._submission_from(response, 200)
+                failed_polls = 0
             except ServiceError:
-                away += 1
-                if away > MOST_AWAY:
+                failed_polls += 1
+                if failed_polls > MAX_FAILED_POLLS:
                     raise
-                found = {"status": "no answer, asking again"}
-            if found["status"] in ("scored", "failed"):
-                progress(found["status"], 1, 1)
-                return found
-            progress(found["status"], 0, 1)
-            time.sleep(POLL_S)
+                submission = {"status": "no answer, asking again"}
+            if submission["status"] in ("scored", "failed"):
+                progress(submission["status"], 1, 1)
+                return submission
+            progress(submission["status"], 0, 1)
+            time.sleep(POLL_INTERVAL_S)
 
     def result(self, submission_id: str) -> bytes:
-        """Return the result's JSON, byte for byte as ``rebar-bench score --json`` writes it."""
-        answer = self._call("GET", f"/{submission_id}/result.json")
-        if answer.status_code != 200:
-            raise ServiceError(f"{self._url}: answered {answer.status_code} for the result, expected 200")
-        content: bytes = answer.content
+        """Return the result JSON, byte-identical to the output of ``rebar-bench score --json``.
+
+        Raises ``ServiceError`` if the response status is not 200.
+        """
+        response = self._call("GET", f"/{submission_id}/result.json")
+        if response.status_code != 200:
+            raise ServiceError(f"{self._url}: answered {response.status_code} for the result, expected 200")
+        content: bytes = response.content
         return content
 
     def _call(self, method: str, path: str, **content: Any) -> Any:
@@ -103,33 +113,36 @@ class Leaderboard:
         except self._http.HTTPError as error:
             raise ServiceError(f"{self._url}: no answer: {error or type(error).__name__}") from None
 
-    def _accepted(self, answer: Any, status: int) -> dict[str, Any]:
-        content = _content(answer)
-        if answer.status_code == status and "id" in content:
+    def _submission_from(self, response: Any, status: int) -> dict[str, Any]:
+        content = _json_object(response)
+        if response.status_code == status and "id" in content:
             return content
-        told = content.get("detail", f"answered {answer.status_code}, expected {status}")
-        kind = InputError if 400 <= answer.status_code < 500 else ServiceError
-        raise kind(f"{self._url}: {told}")
+        detail = content.get("detail", f"answered {response.status_code}, expected {status}")
+        error_type = InputError if 400 <= response.status_code < 500 else ServiceError
+        raise error_type(f"{self._url}: {detail}")
 
 
-class _Watched:
-    """A file that tells how much of it was read; ``fileno`` is not offered, so that it is read in pieces."""
+class _ProgressReader:
+    """File-like object that reports the number of bytes read so far.
 
-    def __init__(self, read: Callable[[int], bytes], tell: Callable[[int], None]) -> None:
-        self._read, self._tell_done, self._done = read, tell, 0
+    It has no ``fileno``, so that the HTTP client reads it in chunks.
+    """
+
+    def __init__(self, read: Callable[[int], bytes], on_read: Callable[[int], None]) -> None:
+        self._read, self._on_read, self._bytes_read = read, on_read, 0
 
     def read(self, size: int = -1) -> bytes:
-        """Read on."""
+        """Read up to ``size`` bytes and report the total."""
         data = self._read(size)
-        self._done += len(data)
-        self._tell_done(self._done)
+        self._bytes_read += len(data)
+        self._on_read(self._bytes_read)
         return data
 
 
-def _content(answer: Any) -> dict[str, Any]:
-    """Return an answer's JSON object; an empty one for what is none, such as a proxy's page."""
+def _json_object(response: Any) -> dict[str, Any]:
+    """Return the JSON object of a response, or an empty dict if the body is not one (such as a proxy's page)."""
     try:
-        content = answer.json()
+        content = response.json()
     except ValueError:
         return {}
     return content if isinstance(content, dict) else {}

@@ -1,4 +1,4 @@
-"""Work on many views by a few threads, with only a few views in memory."""
+"""Ordered parallel map over threads with bounded memory."""
 
 from __future__ import annotations
 
@@ -15,22 +15,23 @@ _Done = TypeVar("_Done")
 
 
 def ordered_map(work: Callable[[_Item], _Done], items: Iterable[_Item], workers: int | None) -> Iterator[_Done]:
-    """Yield ``work(item)`` in the order of ``items``, on ``workers`` threads (None: one a core).
+    """Yield ``work(item)`` in the order of ``items``, computed on ``workers`` threads (None: one per core).
 
-    No more than two items a thread are taken ahead of what was yielded, so that memory stays flat however many
-    there are. What ``items`` or ``work`` raises is raised here. Raises ``InputError`` for fewer than one thread.
+    At most two items per thread are taken ahead of the result being yielded, so memory use does not grow with the
+    number of items. Exceptions of ``items`` and ``work`` propagate. Raises ``InputError`` if ``workers`` is less
+    than 1.
     """
     if workers is not None and workers < 1:
         raise InputError(f"workers is {workers}, expected 1 or more")
     threads = workers or os.cpu_count() or 1
-    waiting: deque[Future[_Done]] = deque()
+    pending: deque[Future[_Done]] = deque()
     pool = ThreadPoolExecutor(threads)
     try:
         for item in items:
-            waiting.append(pool.submit(work, item))
-            if len(waiting) >= 2 * threads:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+            pending.append(pool.submit(work, item))
+            if len(pending) >= 2 * threads:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
     finally:
         pool.shutdown(cancel_futures=True)

@@ -1,12 +1,12 @@
-"""How long work tells how far it is."""
+"""Progress callback type and a no-op callback."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 Progress = Callable[[str, int, int], None]
-"""Told what the work is, how many of its steps are done and how many there are."""
+"""Callback with the arguments: name of the task, number of steps done, total number of steps."""
 
 
-def silent(what: str, done: int, total: int) -> None:
-    """Tell nobody."""
+def silent(task: str, done: int, total: int) -> None:
+    """Ignore progress; the default callback."""

@@ -1,4 +1,4 @@
-"""Reads TOML tables strictly: each key that is missing, unknown or wrong becomes one sentence."""
+"""Strict validation of TOML tables: one problem sentence for each missing, unknown or invalid key."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from typing import Any, Generic, TypeVar, overload
 
 T = TypeVar("T")
 D = TypeVar("D")
-_SHOWN_CHARACTERS = 60
-_LARGEST = 1e9
-"""No number of a scene or of a model's description comes near it, and its powers are finite."""
+_MAX_REPR_CHARACTERS = 60
+_MAX_MAGNITUDE = 1e9
+"""Largest accepted magnitude: far above any number of a scene or model file, with powers that stay finite."""
 
 
 @dataclass(frozen=True)
-class Kind(Generic[T]):
-    """What a value must be, in words, and what makes one of it; ``convert`` raises ``ValueError`` otherwise.
+class FieldType(Generic[T]):
+    """Type of a TOML value: a description of the expected value and a conversion function.
 
-    The error's words, where it has any, tell what was found in place of the value itself.
+    ``convert`` returns the converted value and raises ``ValueError`` for an invalid one. The message of the
+    ``ValueError``, if not empty, replaces the value in the reported problem.
     """
 
     expected: str
@@ -26,89 +27,97 @@ class Kind(Generic[T]):
 
 
 @dataclass(frozen=True)
-class Keys:
-    """One table; ``where`` goes before each key in a problem, and problems go to the shared list."""
+class TableReader:
+    """Reader of one table that appends every problem to the shared list ``problems``.
+
+    ``where`` is the prefix of each key in a problem.
+    """
 
     values: Mapping[str, Any]
     where: str
     problems: list[str]
 
     @overload
-    def required(self, key: str, kind: Kind[T]) -> T | None: ...
+    def required(self, key: str, field_type: FieldType[T]) -> T | None: ...
     @overload
-    def required(self, key: str, kind: Kind[T], fallback: D) -> T | D: ...
-    def required(self, key: str, kind: Kind[Any], fallback: Any = None) -> Any:
-        """Return the value of ``key``; ``fallback``, and a problem more, where it is missing or wrong."""
+    def required(self, key: str, field_type: FieldType[T], fallback: D) -> T | D: ...
+    def required(self, key: str, field_type: FieldType[Any], fallback: Any = None) -> Any:
+        """Return the value of ``key``; if it is missing or invalid, add a problem and return ``fallback``."""
         if key not in self.values:
-            self.problems.append(f"{self.where}{key} is missing, expected {kind.expected}")
-        return self.optional(key, kind, fallback)
+            self.problems.append(f"{self.where}{key} is missing, expected {field_type.expected}")
+        return self.optional(key, field_type, fallback)
 
     @overload
-    def optional(self, key: str, kind: Kind[T]) -> T | None: ...
+    def optional(self, key: str, field_type: FieldType[T]) -> T | None: ...
     @overload
-    def optional(self, key: str, kind: Kind[T], default: D) -> T | D: ...
-    def optional(self, key: str, kind: Kind[Any], default: Any = None) -> Any:
-        """Return the value of ``key``, or ``default`` where it is not given; a wrong one is a problem more."""
+    def optional(self, key: str, field_type: FieldType[T], default: D) -> T | D: ...
+    def optional(self, key: str, field_type: FieldType[Any], default: Any = None) -> Any:
+        """Return the value of ``key``, or ``default`` if it is missing; add a problem if it is invalid."""
         if key not in self.values:
             return default
         try:
-            return kind.convert(self.values[key])
+            return field_type.convert(self.values[key])
         except ValueError as error:
-            found = found_words(error, self.values[key])
-            self.problems.append(f"{self.where}{key}: {found}, expected {kind.expected}")
+            description = describe_value(error, self.values[key])
+            self.problems.append(f"{self.where}{key}: {description}, expected {field_type.expected}")
             return default
 
-    def only(self, known: Iterable[str]) -> None:
-        """Note every key that is not one of ``known`` as a problem."""
+    def reject_unknown(self, known: Iterable[str]) -> None:
+        """Add a problem for every key that is not one of ``known``."""
         names = tuple(known)
         for key in self.values:
             if key not in names:
-                near = get_close_matches(key, names, n=1)
-                hint = f"did you mean {near[0]}?" if near else f"expected only {', '.join(names)}"
-                self.problems.append(f"{self.where}{shown(key)} is not a known key, {hint}")
+                close_matches = get_close_matches(key, names, n=1)
+                hint = (
+                    f"did you mean {close_matches[0]}?" if close_matches else f"expected only {', '.join(names)}"
+                )
+                self.problems.append(f"{self.where}{short_repr(key)} is not a known key, {hint}")
 
 
-def found_words(error: ValueError, value: object) -> str:
-    """Return what a problem says was found: the error's own words, or the value."""
-    return str(error) or f"got {shown(value)}"
+def describe_value(error: ValueError, value: object) -> str:
+    """Return the part of a problem that describes the invalid value: the error's message, or else the value."""
+    return str(error) or f"got {short_repr(value)}"
 
 
-def shown(value: object) -> str:
-    """Return a value as a problem shows it: on one line and short."""
+def short_repr(value: object) -> str:
+    """Return ``repr(value)`` on one line, truncated to 60 characters."""
     try:
-        found = " ".join(repr(value).split())
-    except (ValueError, RecursionError):  # an integer of thousands of digits, lists in lists in lists
+        line = " ".join(repr(value).split())
+    except (ValueError, RecursionError):  # Huge integers and deep nesting have no repr.
         return f"a huge {type(value).__name__}"
-    return found if len(found) <= _SHOWN_CHARACTERS else f"{found[:_SHOWN_CHARACTERS]} ..."
+    return line if len(line) <= _MAX_REPR_CHARACTERS else f"{line[:_MAX_REPR_CHARACTERS]} ..."
 
 
 def finite(value: object) -> float:
-    """Return a number as float; raise ``ValueError`` for anything else: truth values, NaN, beyond 1e9."""
+    """Return a number as float.
+
+    Raises ``ValueError`` for anything else, including booleans, NaN and magnitudes above 1e9.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
         raise ValueError
-    if abs(value) > _LARGEST:
-        raise ValueError(f"got a number beyond {_LARGEST:g}")
+    if abs(value) > _MAX_MAGNITUDE:
+        raise ValueError(f"got a number beyond {_MAX_MAGNITUDE:g}")
     return float(value)
 
 
-def number(low: float, high: float) -> Kind[float]:
-    """Return the kind of finite numbers from ``low`` to ``high``, above 0 where ``low`` is 0."""
-    words = f"above 0, up to {high:g}" if low == 0 else f"from {low:g} to {high:g}"
+def number(low: float, high: float) -> FieldType[float]:
+    """Return the type of finite numbers from ``low`` to ``high``; 0 is excluded if ``low`` is 0."""
+    interval = f"above 0, up to {high:g}" if low == 0 else f"from {low:g} to {high:g}"
 
     def convert(value: object) -> float:
-        found = finite(value)
-        if not low <= found <= high or found == 0 == low:
+        result = finite(value)
+        if not low <= result <= high or result == 0 == low:
             raise ValueError
-        return found
+        return result
 
-    return Kind(f"a number {words}", convert)
-
-
-POSITIVE = Kind("a number above 0", number(0, _LARGEST).convert)
+    return FieldType(f"a number {interval}", convert)
 
 
-def three_numbers(low: float, high: float) -> Kind[tuple[float, float, float]]:
-    """Return the kind of lists of three numbers from ``low`` to ``high``: red, green, blue."""
+POSITIVE = FieldType("a number above 0", number(0, _MAX_MAGNITUDE).convert)
+
+
+def three_numbers(low: float, high: float) -> FieldType[tuple[float, float, float]]:
+    """Return the type of RGB lists: three numbers from ``low`` to ``high``, converted to a tuple."""
 
     def convert(value: object) -> tuple[float, float, float]:
         if not isinstance(value, list) or len(value) != 3:
@@ -118,41 +127,41 @@ def three_numbers(low: float, high: float) -> Kind[tuple[float, float, float]]:
             raise ValueError
         return red, green, blue
 
-    return Kind(f"three numbers from {low:g} to {high:g}: red, green, blue", convert)
+    return FieldType(f"three numbers from {low:g} to {high:g}: red, green, blue", convert)
 
 
-def whole_number(low: int, high: int) -> Kind[int]:
-    """Return the kind of integers from ``low`` to ``high``; truth values and 6.0 are none."""
+def whole_number(low: int, high: int) -> FieldType[int]:
+    """Return the type of integers from ``low`` to ``high``; booleans and floats such as 6.0 are rejected."""
 
     def convert(value: object) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             raise ValueError
         return value
 
-    return Kind(f"a whole number from {low} to {high}", convert)
+    return FieldType(f"a whole number from {low} to {high}", convert)
 
 
-def text_that(expected: str, accept: Callable[[str], bool]) -> Kind[str]:
-    """Return the kind of strings that ``accept`` takes."""
+def string_matching(expected: str, accept: Callable[[str], bool]) -> FieldType[str]:
+    """Return the type of strings for which ``accept`` returns true."""
 
     def convert(value: object) -> str:
         if not isinstance(value, str) or not accept(value):
             raise ValueError
         return value
 
-    return Kind(expected, convert)
+    return FieldType(expected, convert)
 
 
-def text(most: int, what: str = "text on one line") -> Kind[str]:
-    """Return the kind of printable strings, not blank, of up to ``most`` characters."""
-    return text_that(
-        f"{what}, 1 to {most} characters",
-        lambda value: bool(value.strip()) and value.isprintable() and len(value) <= most,
+def text(max_length: int, what: str = "text on one line") -> FieldType[str]:
+    """Return the type of printable, non-blank strings of at most ``max_length`` characters."""
+    return string_matching(
+        f"{what}, 1 to {max_length} characters",
+        lambda value: bool(value.strip()) and value.isprintable() and len(value) <= max_length,
     )
 
 
-def choice(choices: Mapping[T, str]) -> Kind[T]:
-    """Return the kind of values that are a key of ``choices``, which says how each is written."""
+def choice(choices: Mapping[T, str]) -> FieldType[T]:
+    """Return the type of values that equal a key of ``choices``, which maps each value to its TOML notation."""
     *others, last = choices.values()
 
     def convert(value: object) -> T:
@@ -161,15 +170,15 @@ def choice(choices: Mapping[T, str]) -> Kind[T]:
                 return candidate
         raise ValueError
 
-    return Kind(f"{', '.join(others)} or {last}", convert)
+    return FieldType(f"{', '.join(others)} or {last}", convert)
 
 
-def words(*names: str) -> Kind[str]:
-    """Return the kind of strings that are one of ``names``."""
+def one_of(*names: str) -> FieldType[str]:
+    """Return the type of strings that equal one of ``names``."""
     return choice({name: f'"{name}"' for name in names})
 
 
-FLAG: Kind[bool] = choice({True: "true", False: "false"})
+FLAG: FieldType[bool] = choice({True: "true", False: "false"})
 
 
 def _table(value: object) -> Mapping[str, Any]:
@@ -178,4 +187,4 @@ def _table(value: object) -> Mapping[str, Any]:
     return value
 
 
-TABLE: Kind[Mapping[str, Any]] = Kind("a table", _table)
+TABLE: FieldType[Mapping[str, Any]] = FieldType("a table", _table)

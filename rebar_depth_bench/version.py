@@ -1,4 +1,4 @@
-"""The version of this software, as installed or as in the source tree's metadata."""
+"""Software version, read from the metadata of the installed distribution."""
 
 from importlib.metadata import version
 
@@ -6,5 +6,5 @@ DISTRIBUTION = "rebar-depth-bench"
 
 
 def software_version() -> str:
-    """Return the installed distribution's version."""
+    """Return the version of the installed distribution."""
     return version(DISTRIBUTION)

@@ -1,1 +1,1 @@
-"""The commands of ``rebar-bench``, a module each: SUMMARY, ``add_arguments(parser)`` and ``run(options)``."""
+"""Commands of ``rebar-bench``, one module each, with SUMMARY, ``add_arguments(parser)`` and ``run(options)``."""

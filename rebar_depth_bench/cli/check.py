@@ -1,11 +1,10 @@
-"""``rebar-bench check``."""
+"""The ``rebar-bench check`` command."""
 
 from __future__ import annotations
 
 import argparse
 
-from rebar_depth_bench.cli.arguments import add_archive, add_data
-from rebar_depth_bench.cli.console import ProgressBars
+from rebar_depth_bench.console import ProgressBars, add_archive, add_data
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.submission import check_archive
@@ -20,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Check an archive; raise ``SubmissionError`` with every problem."""
+    """Check an archive; raise ``SubmissionError`` with all of its problems."""
     expected = open_folder(options.data).expected_views()
     with ProgressBars() as bars:
         problems = check_archive(options.archive, expected, bars.update)

@@ -1,4 +1,4 @@
-"""``rebar-bench compare``."""
+"""The ``rebar-bench compare`` command."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import json
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_text
-from rebar_depth_bench.cli.arguments import add_data, add_file, add_workers
-from rebar_depth_bench.cli.console import ProgressBars
+from rebar_depth_bench.console import ProgressBars, add_data, add_output_file, add_workers
 from rebar_depth_bench.reporting.comparison_tables import comparison_csv, print_comparison
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.score import score
@@ -22,13 +21,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("first", metavar="A", help="the archive that the others are compared with")
     parser.add_argument("others", metavar="B", nargs="+", help="one or more archives")
     add_data(parser)
-    add_file(parser, "--json", "write the differences as JSON")
-    add_file(parser, "--csv", "write the differences as CSV")
+    add_output_file(parser, "--json", "write the differences as JSON")
+    add_output_file(parser, "--csv", "write the differences as CSV")
     add_workers(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Score all archives, compare each with the first, write and print the differences."""
+    """Score all archives, compare each with the first, and write and print the differences."""
     with ProgressBars() as bars:
         first, *others = (
             score(archive, options.data, workers=options.workers, progress=bars.update)

@@ -1,9 +1,7 @@
-"""``rebar-bench demo``.
+"""The ``rebar-bench demo`` command: render, predict, score and report a few views.
 
-The whole chain on a handful of views: render, predict, score, report.
-
-Rendering is the builder's work, which stands on this package and not the other way round: the demo runs the
-``rebar-build`` command as a user would.
+``dataset_builder`` depends on this package and not vice versa, so the demo renders by running ``rebar-build`` in a
+subprocess.
 """
 
 from __future__ import annotations
@@ -17,18 +15,18 @@ from pathlib import Path
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_bytes
-from rebar_depth_bench.cli.console import EXIT_INPUT, ProgressBars
+from rebar_depth_bench.console import EXIT_INPUT, ProgressBars
 from rebar_depth_bench.errors import BuildError, InputError
 from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.runner import predict
-from rebar_depth_bench.reporting import write_report
+from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.score import score
 
 DEMO_FOLDER = "demo-output"
 DEMO_VIEWS = 6
 DEMO_SAMPLES = 8
-"""Half of what a build takes by default: the denoiser bears it, and the demo takes half the time."""
+"""Samples per pixel: half the default of a build, which halves the demo's run time; the denoiser compensates."""
 DEMO_CONFIG = "lattice"
 DEMO_METHODS = ("sgbm", "sgbm-filled", "constant")
 
@@ -36,16 +34,16 @@ DEMO_METHODS = ("sgbm", "sgbm-filled", "constant")
 def run_demo(out: Path, views: int) -> None:
     """Build ``views`` lattice views in ``out``, run three methods, score and report each.
 
-    Run again it goes on where it stopped. Raises ``InputError`` where the build extra is missing.
+    An interrupted demo is resumed. Raises ``InputError`` if the ``build`` extra is not installed.
     """
     data = out / "dataset"
-    _say(f"rendering {views} stereo views of the lattice at 1280 x 720 into {data}")
-    _build(data, views)
+    _print_step(f"rendering {views} stereo views of the lattice at 1280 x 720 into {data}")
+    _build_dataset(data, views)
     reports = []
     for name in DEMO_METHODS:
         method = METHODS[name]
         archive = out / f"{name}.zip"
-        _say(f"predicting with {name}: {method.info.summary}")
+        _print_step(f"predicting with {name}: {method.info.summary}")
         with ProgressBars() as bars:
             predict(method, data, archive, configs=[DEMO_CONFIG], progress=bars.update)
             result = score(archive, data, progress=bars.update)
@@ -58,7 +56,7 @@ def run_demo(out: Path, views: int) -> None:
         print(f"  {report.resolve()}")
 
 
-def _build(data: Path, views: int) -> None:
+def _build_dataset(data: Path, views: int) -> None:
     if find_spec("dataset_builder") is None or find_spec("bpy") is None:
         raise InputError("the demo renders with Blender: pip install 'rebar-depth-bench[build]'")
     command = ["-m", "dataset_builder", "--out", str(data), "--config", DEMO_CONFIG, "--views", str(views)]
@@ -70,7 +68,7 @@ def _build(data: Path, views: int) -> None:
         raise BuildError(f"rebar-build ended with exit status {finished.returncode}, expected 0")
 
 
-def _say(step: str) -> None:
+def _print_step(step: str) -> None:
     print(step, file=sys.stderr, flush=True)
 
 
@@ -88,5 +86,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the demo."""
+    """Run the demo with the command's options."""
     run_demo(options.out, options.views)

@@ -9,24 +9,23 @@ from typing import Protocol
 import datasets
 
 from rebar_depth_bench.cli import check, compare, demo, methods, predict, score, submit, table
-from rebar_depth_bench.cli.arguments import check_outputs
-from rebar_depth_bench.cli.console import run_command
+from rebar_depth_bench.console import check_outputs, replace_renamed_options, run_command
 from rebar_depth_bench.studies.registry import add_study_commands
 from rebar_depth_bench.version import software_version
 
 
 class Command(Protocol):
-    """What a command's module has: one line, its arguments, and how it runs."""
+    """Interface of a command module: one-line summary, arguments and entry point."""
 
     SUMMARY: str
 
     @property
     def add_arguments(self) -> Callable[[argparse.ArgumentParser], None]:
-        """Add the command's arguments to its parser."""
+        """Function that adds the command's arguments to its parser."""
 
     @property
     def run(self) -> Callable[[argparse.Namespace], None]:
-        """Run the command: results to standard output, progress to standard error."""
+        """Function that runs the command: results to standard output, progress to standard error."""
 
 
 COMMANDS: Mapping[str, Command] = {
@@ -40,12 +39,15 @@ COMMANDS: Mapping[str, Command] = {
     "demo": demo,
 }
 
+RENAMED_OPTIONS = {"--given-scale": "--baseline-scale", "--k": "--num-anchor-views"}
+"""Old option strings that are still accepted, and their new names."""
+
 _STUDY_SUMMARY = "the studies of the paper, on your own archives"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run ``rebar-bench``; return its exit status."""
-    options = argument_parser().parse_args(arguments)
+    """Run ``rebar-bench`` and return its exit code."""
+    options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
     datasets.disable_progress_bars()
     return run_command(lambda: _run(options), interrupted=getattr(options, "interrupted", "interrupted"))
 
@@ -56,7 +58,7 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def argument_parser() -> argparse.ArgumentParser:
-    """Return the command's argument parser."""
+    """Return the argument parser of ``rebar-bench``."""
     parser = argparse.ArgumentParser(
         prog="rebar-bench",
         description="Score metric depth on reinforcement against exact ground truth.",
@@ -64,8 +66,8 @@ def argument_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=software_version())
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, command in COMMANDS.items():
-        own = commands.add_parser(name, help=command.SUMMARY, description=command.SUMMARY)
-        command.add_arguments(own)
-        own.set_defaults(run=command.run)
+        subparser = commands.add_parser(name, help=command.SUMMARY, description=command.SUMMARY)
+        command.add_arguments(subparser)
+        subparser.set_defaults(run=command.run)
     add_study_commands(commands.add_parser("study", help=_STUDY_SUMMARY, description=_STUDY_SUMMARY))
     return parser

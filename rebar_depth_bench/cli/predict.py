@@ -1,4 +1,4 @@
-"""``rebar-bench predict``."""
+"""The ``rebar-bench predict`` command."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from rebar_depth_bench.cli.arguments import add_data
-from rebar_depth_bench.cli.console import ProgressBars
+from rebar_depth_bench.console import ProgressBars, add_data
 from rebar_depth_bench.methods import METHODS, find_method
-from rebar_depth_bench.methods.registry import LOCATED
+from rebar_depth_bench.methods.registry import FROM_FOLDER
 from rebar_depth_bench.methods.runner import predict
 
 SUMMARY = "run a method over a dataset into an archive"
@@ -20,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     names = (
         f"{', '.join(METHODS)}, an installed package's, or one from elsewhere: my_model.py:METHOD, my_model.toml "
         "(an ONNX model), hf:ORG/NAME (a checkpoint of transformers), NAME:FOLDER (own weights of "
-        f"{', '.join(LOCATED)})"
+        f"{', '.join(FROM_FOLDER)})"
     )
     parser.set_defaults(interrupted="interrupted; the same command goes on where it was")
     parser.add_argument("method", metavar="METHOD", help=names)
@@ -31,23 +30,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def in_words(value: object) -> str:
-    """Return a note's plain JSON value in one line for people."""
+def format_note(value: object) -> str:
+    """Return a note, a plain JSON value, formatted on one line."""
     if isinstance(value, dict):
-        return ", ".join(f"{key.replace('_', ' ')} {in_words(one)}" for key, one in value.items())
+        return ", ".join(f"{key.replace('_', ' ')} {format_note(item)}" for key, item in value.items())
     if isinstance(value, list | tuple):
-        return ", ".join(map(in_words, value))
+        return ", ".join(map(format_note, value))
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Predict and print where the archive is."""
+    """Predict into an archive; print the method's notes to standard error and the archive's path."""
     method = find_method(options.method)
     info = method.info
     print(f"{info.name}: {info.summary}; from {info.source}; licence {info.licence}", file=sys.stderr)
     with ProgressBars() as bars:
         prepared = predict(method, options.data, options.out, configs=options.config, progress=bars.update)
-    for config, found in prepared.items():
-        for key, value in found.notes.items():
-            print(f"{config}: {key.replace('_', ' ')}: {in_words(value)}", file=sys.stderr)
+    for config, preparation in prepared.items():
+        for key, value in preparation.notes.items():
+            print(f"{config}: {key.replace('_', ' ')}: {format_note(value)}", file=sys.stderr)
     print(options.out)

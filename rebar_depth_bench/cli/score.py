@@ -1,4 +1,4 @@
-"""``rebar-bench score``."""
+"""The ``rebar-bench score`` command."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import replace
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_bytes, write_text
-from rebar_depth_bench.cli.arguments import add_archive, add_data, add_file, add_workers
-from rebar_depth_bench.cli.console import ProgressBars
+from rebar_depth_bench.console import ProgressBars, add_archive, add_data, add_output_file, add_workers
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.evaluate import score_extended
-from rebar_depth_bench.reporting import VIEWS_SHOWN, write_report
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
+from rebar_depth_bench.reporting.html.page import write_report
+from rebar_depth_bench.reporting.html.view_browser import VIEWS_SHOWN
 from rebar_depth_bench.reporting.tables import print_table, result_csv
 from rebar_depth_bench.scoring.score import score
 
@@ -24,8 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     add_archive(parser)
     add_data(parser)
-    add_file(parser, "--json", "write the result as JSON")
-    add_file(parser, "--html", "write a self-contained report")
+    add_output_file(parser, "--json", "write the result as JSON")
+    add_output_file(parser, "--html", "write a self-contained report")
     parser.add_argument(
         "--html-views",
         type=int,
@@ -33,18 +33,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="views of each config in pictures (default: %(default)s)",
     )
-    add_file(parser, "--csv", "write the tables as CSV")
+    add_output_file(parser, "--csv", "write the tables as CSV")
     parser.add_argument(
         "--extended",
         action="store_true",
         help="also boundary, point clouds, layers, inspection bar by bar, other alignments",
     )
-    add_file(parser, "--extended-csv", "write these as CSV (implies --extended)")
+    add_output_file(parser, "--extended-csv", "write these as CSV (implies --extended)")
     add_workers(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Score, write what is asked for, print the tables."""
+    """Score an archive, write the requested files and print the tables."""
     if options.html_views < 0:
         raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
     with ProgressBars() as bars:

@@ -1,4 +1,4 @@
-"""``rebar-bench table``: several submissions in the layout of the paper's Table I."""
+"""The ``rebar-bench table`` command: several submissions in the layout of the paper's Table I."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import argparse
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_text
-from rebar_depth_bench.cli.arguments import add_data, add_file, add_workers
-from rebar_depth_bench.cli.console import ProgressBars
-from rebar_depth_bench.reporting.comparison_tables import print_paper_table, told_apart
+from rebar_depth_bench.console import ProgressBars, add_data, add_output_file, add_workers
+from rebar_depth_bench.reporting.comparison_tables import disambiguate_method_names, print_paper_table
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import results_csv
 from rebar_depth_bench.scoring.score import score
@@ -21,21 +20,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("archives", metavar="ARCHIVE", nargs="+", help="the submissions' zips, a row each")
     add_data(parser)
-    add_file(parser, "--latex", "write the table as LaTeX (booktabs)")
-    add_file(parser, "--csv", "write all tables as CSV")
+    add_output_file(parser, "--latex", "write the table as LaTeX (booktabs)")
+    add_output_file(parser, "--csv", "write all tables as CSV")
     parser.add_argument("--intervals", action="store_true", help="put the 95 %% intervals into the LaTeX table")
     parser.add_argument("--no-published", action="store_true", help="leave the paper's own rows out")
     add_workers(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Score all archives, write what is asked for, print the table."""
+    """Score all archives, write the requested files and print the table."""
     with ProgressBars() as bars:
         results = [
             score(archive, options.data, workers=options.workers, progress=bars.update)
             for archive in options.archives
         ]
-    results = told_apart(results)
+    results = disambiguate_method_names(results)
     published = not options.no_published
     if options.latex:
         write_text(options.latex, latex_table(results, published=published, intervals=options.intervals))

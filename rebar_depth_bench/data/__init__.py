@@ -1,1 +1,1 @@
-"""Dataset folders: manifest, rows, codecs, digests, bars, ground truth and its cache."""
+"""Dataset folders: manifest, rows, codecs, digests, bars, ground truth and its array cache."""

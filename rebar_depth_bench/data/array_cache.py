@@ -1,7 +1,8 @@
-"""Arrays of many views kept as a few flat files: written and read view by view.
+"""Disk cache of per-view arrays, written and read one view at a time.
 
-A cache is a folder: ``views.json`` with the views' ids, where each one's part starts, its checksum and a note,
-and a file of raw values per array. It appears under its name whole or not at all.
+A cache is a folder with one file of raw values per array, in which the values of all views are concatenated, and
+an index ``views.json`` with the views' ids, the offset of each view's values, their CRC-32 and metadata. The
+folder is created atomically.
 """
 
 from __future__ import annotations
@@ -19,28 +20,29 @@ import numpy as np
 from numpy import ndarray
 from zlib_ng import zlib_ng
 
-from rebar_depth_bench.atomic_io import sync
+from rebar_depth_bench.atomic_io import fsync_path
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.submission.zip_directory import FileSource
 
-_OUTLINE = "views.json"
+_INDEX_FILE = "views.json"
 _KEYS = ("view_ids", "starts", "checksums", "notes")
 
 
 @dataclass(frozen=True, eq=False)
 class ViewArrays:
-    """One view's part: arrays of one length by name, and a small JSON-able note."""
+    """Cached data of one view: named 1-D arrays of equal length, and small JSON-serialisable metadata."""
 
     view_id: str
     arrays: Mapping[str, ndarray]
-    note: Any
+    metadata: Any
 
 
 @dataclass(frozen=True, eq=False)
-class FlatCache:
-    """All views' parts, in order; each is read when it is asked for, so that memory holds only those in use.
+class ArrayCache:
+    """Open cache: the index of all views in order, and the files their values are read from on demand.
 
-    The files stay open: whoever deletes or replaces the folder takes nothing from those who read.
+    View ``i`` occupies the values ``starts[i]`` to ``starts[i + 1]`` of each file. Files stay open, so that a
+    reader is not affected by another process that deletes or replaces the folder.
     """
 
     path: Path
@@ -48,91 +50,91 @@ class FlatCache:
     view_ids: tuple[str, ...]
     starts: tuple[int, ...]
     checksums: tuple[int, ...]
-    notes: tuple[Any, ...]
+    metadata: tuple[Any, ...]
     sources: Mapping[str, FileSource]
 
     def __len__(self) -> int:
         return len(self.view_ids)
 
-    def view(self, place: int) -> ViewArrays:
-        """Return the view at ``place``, read-only; threads may ask at once.
+    def view(self, index: int) -> ViewArrays:
+        """Read the view at position ``index`` as read-only arrays; thread-safe.
 
-        Raises ``DatasetError`` if its values are not those that were written.
+        Raises ``DatasetError`` if the values do not match their checksum.
         """
-        start, end = self.starts[place], self.starts[place + 1]
+        start, end = self.starts[index], self.starts[index + 1]
         arrays: dict[str, ndarray] = {}
         for name, dtype in self.dtypes.items():
             size = np.dtype(dtype).itemsize
             arrays[name] = np.frombuffer(self.sources[name].read_at(start * size, (end - start) * size), dtype)
-        if _checksum(arrays.values()) != self.checksums[place]:
+        if _checksum(arrays.values()) != self.checksums[index]:
             raise DatasetError(
-                f"{self.path}: the cached values of {self.view_ids[place]} are damaged; delete this folder, it is "
+                f"{self.path}: the cached values of {self.view_ids[index]} are damaged; delete this folder, it is "
                 "filled again"
             )
-        return ViewArrays(self.view_ids[place], arrays, self.notes[place])
+        return ViewArrays(self.view_ids[index], arrays, self.metadata[index])
 
 
 def open_cache(
-    path: Path, dtypes: Mapping[str, type], fill: Callable[[], Iterator[ViewArrays]], *, outdated: str
-) -> FlatCache:
-    """Return the cache at ``path``; where there is none or a damaged one, write it from the views ``fill`` yields.
+    path: Path, dtypes: Mapping[str, type], fill: Callable[[], Iterator[ViewArrays]], *, stale_pattern: str
+) -> ArrayCache:
+    """Open the cache at ``path``; if it is missing or damaged, write it from the views that ``fill`` yields.
 
-    ``outdated`` is a pattern of names beside it that a new cache replaces. Filling holds one view in memory.
-    Raises ``DatasetError`` where it cannot be written.
+    ``stale_pattern`` is a glob pattern of folder names next to ``path``; matching folders are deleted when a new
+    cache is written. At most one view is held in memory. Raises ``DatasetError`` if the cache cannot be written.
     """
-    for last in (False, True):  # a second look, for another process may have put it there a moment ago
+    for is_retry in (False, True):  # Retry once: another process may have just created the cache.
         try:
             return _read(path, dtypes)
         except (OSError, ValueError, LookupError, TypeError):
-            if last:
-                shutil.rmtree(path, ignore_errors=True)  # not there, or damaged
+            if is_retry:
+                shutil.rmtree(path, ignore_errors=True)  # The folder is missing or damaged.
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=".filling-", dir=path.parent))
     except OSError as error:
-        raise _unwritable(path, error) from None
+        raise _write_error(path, error) from None
     try:
         _write(temporary, dtypes, fill())
-        for old in path.parent.glob(outdated):
-            if old != path:
-                shutil.rmtree(old, ignore_errors=True)
-        _put_in_place(temporary, path)
+        for stale in path.parent.glob(stale_pattern):
+            if stale != path:
+                shutil.rmtree(stale, ignore_errors=True)
+        _move_into_place(temporary, path)
         return _read(path, dtypes)
     except OSError as error:
-        raise _unwritable(path, error) from None
+        raise _write_error(path, error) from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _put_in_place(temporary: Path, path: Path) -> None:
+def _move_into_place(temporary: Path, path: Path) -> None:
     try:
         temporary.rename(path)
     except OSError:
-        if not path.is_dir():  # else another process was faster, with the same bytes
+        if not path.is_dir():  # Otherwise another process created the same cache first.
             raise
 
 
-def _unwritable(path: Path, error: OSError) -> DatasetError:
+def _write_error(path: Path, error: OSError) -> DatasetError:
     return DatasetError(f"{path}: the cache of ground truth cannot be written: {error.strerror or error}")
 
 
-def _read(path: Path, dtypes: Mapping[str, type]) -> FlatCache:
-    outline = json.loads((path / _OUTLINE).read_text())
-    view_ids, starts, checksums, notes = (tuple(outline[key]) for key in _KEYS)
-    if not len(starts) - 1 == len(view_ids) == len(checksums) == len(notes):
+def _read(path: Path, dtypes: Mapping[str, type]) -> ArrayCache:
+    index = json.loads((path / _INDEX_FILE).read_text())
+    view_ids, starts, checksums, metadata = (tuple(index[key]) for key in _KEYS)
+    if not len(starts) - 1 == len(view_ids) == len(checksums) == len(metadata):
         raise ValueError(f"{path}: the outline contradicts itself")
     sources = {name: FileSource(path / name) for name in dtypes}
     for name, dtype in dtypes.items():
-        found, expected = sources[name].size, starts[-1] * np.dtype(dtype).itemsize
-        if found != expected:
-            raise ValueError(f"{path / name}: {found} bytes, expected {expected}")
-    return FlatCache(path, dtypes, view_ids, starts, checksums, notes, sources)
+        size_bytes, expected_bytes = sources[name].size, starts[-1] * np.dtype(dtype).itemsize
+        if size_bytes != expected_bytes:
+            raise ValueError(f"{path / name}: {size_bytes} bytes, expected {expected_bytes}")
+    return ArrayCache(path, dtypes, view_ids, starts, checksums, metadata, sources)
 
 
-def _write(into: Path, dtypes: Mapping[str, type], views: Iterator[ViewArrays]) -> None:
-    view_ids, starts, checksums, notes = [], [0], [], []
+def _write(folder: Path, dtypes: Mapping[str, type], views: Iterator[ViewArrays]) -> None:
+    view_ids, starts, checksums, metadata = [], [0], [], []
     with ExitStack() as stack:
-        files = {name: stack.enter_context((into / name).open("wb")) for name in dtypes}
+        files = {name: stack.enter_context((folder / name).open("wb")) for name in dtypes}
         for view in views:
             arrays: list[ndarray] = [
                 np.ascontiguousarray(view.arrays[name], dtype) for name, dtype in dtypes.items()
@@ -142,11 +144,11 @@ def _write(into: Path, dtypes: Mapping[str, type], views: Iterator[ViewArrays]) 
             view_ids.append(view.view_id)
             starts.append(starts[-1] + len(arrays[0]))
             checksums.append(_checksum(arrays))
-            notes.append(view.note)
-    outline = dict(zip(_KEYS, (view_ids, starts, checksums, notes), strict=True))
-    (into / _OUTLINE).write_text(json.dumps(outline))
-    for path in (*into.iterdir(), into):
-        sync(path)
+            metadata.append(view.metadata)
+    index = dict(zip(_KEYS, (view_ids, starts, checksums, metadata), strict=True))
+    (folder / _INDEX_FILE).write_text(json.dumps(index))
+    for path in (*folder.iterdir(), folder):
+        fsync_path(path)
 
 
 def _checksum(arrays: Iterable[ndarray]) -> int:

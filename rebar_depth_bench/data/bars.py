@@ -1,4 +1,4 @@
-"""``bars.parquet``: the reinforcing bars of every scene of a dataset folder, as their axes and diameters."""
+"""Table ``bars.parquet``: axes and diameters of the reinforcing bars of every scene of a dataset folder."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.errors import DatasetError
 
-BARS = "bars.parquet"
+BARS_FILE = "bars.parquet"
 BARS_SCHEMA = pa.schema(
     [
         ("scene", pa.string()),
@@ -23,12 +24,15 @@ BARS_SCHEMA = pa.schema(
         ("axis", pa.list_(pa.list_(pa.float64(), 3))),
     ]
 )
-"""``axis`` is the centreline as a polyline, world frame, metres."""
+"""Schema of ``bars.parquet``; ``axis`` is the centreline as a polyline in the world frame, metres."""
 
 
 @dataclass(frozen=True)
 class Bar:
-    """One reinforcing bar: its id (1 and up), what it does, its nominal diameter and its centreline (world)."""
+    """Reinforcing bar: id (1 or more), role, nominal diameter in metres and centreline.
+
+    ``axis_m`` is the centreline as a polyline in the world frame, metres.
+    """
 
     bar_id: int
     role: str
@@ -37,9 +41,9 @@ class Bar:
 
 
 def read_bars(path: Path) -> dict[str, tuple[Bar, ...]]:
-    """Return the bars of every scene in a ``bars.parquet``, in the file's order.
+    """Read a ``bars.parquet`` and return the bars of each scene, keyed by scene name, in the order of the file.
 
-    Raises ``DatasetError`` in words where the file is missing, is no such table, or holds a bar that cannot be.
+    Raises ``DatasetError`` if the file is missing, is not such a table, or holds an invalid bar or a repeated id.
     """
     try:
         rows = pq.read_table(path, schema=BARS_SCHEMA).to_pylist()
@@ -47,7 +51,7 @@ def read_bars(path: Path) -> dict[str, tuple[Bar, ...]]:
         raise DatasetError(f"{path}: cannot be read as a table of bars: {error}") from error
     scenes: dict[str, dict[int, Bar]] = {}
     for row in rows:
-        bar = _checked_bar(path, row)
+        bar = _bar_from_row(path, row)
         bars = scenes.setdefault(row["scene"], {})
         if bar.bar_id in bars:
             raise DatasetError(f"{path}: scene {row['scene']!r} has bar {bar.bar_id} twice, expected each id once")
@@ -55,8 +59,25 @@ def read_bars(path: Path) -> dict[str, tuple[Bar, ...]]:
     return {scene: tuple(bars.values()) for scene, bars in scenes.items()}
 
 
-def _checked_bar(path: Path, row: Mapping[str, Any]) -> Bar:
-    """Return a row as a bar, or raise ``DatasetError`` that says what is wrong with it."""
+def write_bars(path: Path, scenes: Mapping[str, tuple[Bar, ...]]) -> None:
+    """Write the bars of all scenes, sorted by scene name; the bars of a scene keep their order."""
+    rows = [
+        {
+            "scene": scene,
+            "bar_id": bar.bar_id,
+            "role": bar.role,
+            "diameter_m": bar.diameter_m,
+            "axis": [list(point) for point in bar.axis_m],
+        }
+        for scene, bars in sorted(scenes.items())
+        for bar in bars
+    ]
+    with atomic_replace(path) as temporary:
+        pq.write_table(pa.Table.from_pylist(rows, schema=BARS_SCHEMA), temporary)
+
+
+def _bar_from_row(path: Path, row: Mapping[str, Any]) -> Bar:
+    """Convert a row to a ``Bar``; raise ``DatasetError`` if a value is missing or invalid."""
     where = f"{path}: bar {row['bar_id']} of scene {row['scene']!r}"
     empty = [name for name in BARS_SCHEMA.names if row[name] is None]
     if empty or any(point is None for point in row["axis"]):

@@ -1,8 +1,7 @@
-"""``load``: a config of a dataset folder through plain ``datasets``, its rows decoded to numpy.
+"""Dataset rows: columns and features, loading through ``datasets``, and decoding to NumPy.
 
-The columns of a dataset row and how ``datasets`` is told of them.
-
-All views of one config, as a method that needs more than one at once sees them.
+``load`` returns a config as a ``datasets`` object whose rows decode to NumPy arrays; ``ConfigViews`` gives access
+to all views of a config for methods that need more than one view at a time.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ def _matrix(rows: int, columns: int) -> List:
 
 
 def features(*, decode_images: bool = True) -> Features:
-    """Return the features of a row, in the order of the contract's table.
+    """Return the ``datasets`` features of a row, in column order.
 
-    ``decode_images=False`` leaves image columns as their encoded bytes.
+    With ``decode_images=False`` image columns are left as encoded bytes.
     """
     image = Image(decode=decode_images)
     columns: dict[str, object] = {"view_id": Value("string")}
@@ -47,7 +46,7 @@ def features(*, decode_images: bool = True) -> Features:
     return Features(columns)
 
 
-COLUMN_MEANINGS: dict[str, str] = {
+COLUMN_DESCRIPTIONS: dict[str, str] = {
     "view_id": "`<config>/<0000>`: the view's index in its full protocol, also when a subset is built",
     "rgb": "lossless 8-bit colour, H x W, WebP",
     "depth": "lossless float32 planar depth along the optical axis, metres, 0.0 where there is no surface; "
@@ -60,19 +59,20 @@ COLUMN_MEANINGS: dict[str, str] = {
     "cam_from_world": "4 x 4 rigid pose: `x_cam = cam_from_world @ x_world`; OpenCV axes, metres",
     "baseline_m": "metres between the two camera centres; along the left one's x axis except on a raw grid",
 }
-"""What a column holds, by its name or its kind (the name without the eye)."""
+"""Description of each column, by column kind (see ``column_kind``); shown in the dataset card."""
 
 
 def column_kind(name: str) -> str:
-    """Return a column's kind: its name without the eye it belongs to."""
+    """Return the kind of a column: its name without the prefix ``left_`` or ``right_``."""
     eye, _, kind = name.partition("_")
     return kind if eye in EYES else name
 
 
 SPLIT = "test"
+"""Split that is loaded."""
 
 
-def _image_bytes(decode: Callable[[bytes], Any]) -> Callable[[Mapping[str, Any]], Any]:
+def _image_cell_decoder(decode: Callable[[bytes], Any]) -> Callable[[Mapping[str, Any]], Any]:
     return lambda cell: decode(cell["bytes"])
 
 
@@ -81,16 +81,16 @@ def _float64(cell: object) -> Any:
 
 
 _DECODERS: Mapping[str, Callable[[Any], Any]] = {
-    "rgb": _image_bytes(codecs.decode_rgb),
+    "rgb": _image_cell_decoder(codecs.decode_rgb),
     "depth": codecs.decode_depth,
-    "mask": _image_bytes(codecs.decode_mask),
-    "bars": _image_bytes(codecs.decode_bars),
-    "preview": _image_bytes(codecs.decode_rgb),
+    "mask": _image_cell_decoder(codecs.decode_mask),
+    "bars": _image_cell_decoder(codecs.decode_bars),
+    "preview": _image_cell_decoder(codecs.decode_rgb),
     "K": _float64,
     "distortion": _float64,
     "cam_from_world": _float64,
 }
-"""How a cell of each kind of column is decoded; a column's kind is its name without the eye."""
+"""Decoder of a cell, by column kind; columns of other kinds are left unchanged."""
 
 
 @overload
@@ -110,10 +110,10 @@ def load(
 ) -> Dataset | IterableDataset:
     """Load a config of a dataset folder or Hub repository.
 
-    Rows are dicts with the contract's columns decoded: colour uint8 H x W x 3, depth float32 H x W (planar,
+    Rows are dicts of decoded columns: colour uint8 H x W x 3, depth float32 H x W (planar,
     metres, 0 where no surface), masks bool H x W, bar ids uint16 H x W, K float64 3 x 3 in pixels, distortion
-    float64 5, poses float64 4 x 4. ``columns`` keeps only the named ones, which saves decoding the others.
-    With ``streaming`` rows come one by one from an ``IterableDataset`` and nothing is copied to the cache.
+    float64 5, poses float64 4 x 4. ``columns`` selects columns; the others are not decoded. With ``streaming``
+    the result is an ``IterableDataset``, and nothing is copied to the cache of ``datasets``.
 
     Raises ``DatasetError`` for a folder, config or column that does not exist.
     """
@@ -126,22 +126,28 @@ def load(
 def load_undecoded(
     root: str | Path, config: str, *, streaming: bool, columns: Sequence[str] | None
 ) -> Dataset | IterableDataset:
-    """Load a config whose image and depth cells are still bytes, for ``decode_row``. Raises as ``load`` does."""
+    """Load a config with image and depth cells left as bytes, to be decoded by ``decode_row``.
+
+    Raises ``DatasetError`` as ``load`` does.
+    """
     open_folder(root).config(config)
-    kept = _checked_columns(columns)
+    selected_columns = _validated_columns(columns)
     try:
         loaded = datasets.load_dataset(str(root), config, split=SPLIT, streaming=streaming)
     except (DatasetsError, DatasetGenerationError, OSError, pa.ArrowException) as error:
         raise DatasetError(f"{root}: config {config} cannot be loaded: {error}") from error
-    selected = loaded.select_columns(list(kept))
-    for name in kept:
+    selected = loaded.select_columns(list(selected_columns))
+    for name in selected_columns:
         if isinstance(selected.features[name], Image):
-            selected = selected.cast_column(name, Image(decode=False))  # a change of reading, not of data
+            selected = selected.cast_column(name, Image(decode=False))  # This changes only the decoding.
     return selected
 
 
-def iterate(root: str | Path, config: str, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield a config's decoded rows one by one, nothing cached. Raises ``DatasetError`` for damaged shards."""
+def iterate_rows(root: str | Path, config: str, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield the decoded rows of a config by streaming, without a cache.
+
+    Raises ``DatasetError`` if the config cannot be loaded or a shard is damaged.
+    """
     rows = iter(load(root, config, streaming=True, columns=columns))
     while True:
         try:
@@ -154,24 +160,24 @@ def iterate(root: str | Path, config: str, columns: Sequence[str]) -> Iterator[d
 
 
 def decode_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Decode the cells of one row whose images are still bytes."""
+    """Decode the cells of a row of ``load_undecoded``."""
     return {name: _decoder(name)(cell) for name, cell in row.items()}
 
 
 def decode_batch(batch: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
-    """Decode a dict of columns, as ``datasets`` hands it to a transform."""
+    """Decode a dict of columns, the format that ``datasets`` passes to a transform."""
     return {name: [_decoder(name)(cell) for cell in cells] for name, cells in batch.items()}
 
 
 def _decoder(column: str) -> Callable[[Any], Any]:
-    return _DECODERS.get(column_kind(column), _as_it_is)
+    return _DECODERS.get(column_kind(column), _identity)
 
 
-def _as_it_is(cell: Any) -> Any:
+def _identity(cell: Any) -> Any:
     return cell
 
 
-def _checked_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
+def _validated_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
     known = tuple(features())
     if columns is None:
         return known
@@ -183,24 +189,24 @@ def _checked_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class ConfigViews:
-    """One config of a dataset folder."""
+    """Views, image size, board and mesh of one config of a dataset folder."""
 
     folder: DatasetFolder
     config: str
 
     @property
     def view_ids(self) -> tuple[str, ...]:
-        """The views' ids, in order."""
+        """Ids of the views, in order."""
         return tuple(view.view_id for view in self.folder.views(self.config))
 
     @property
     def grid(self) -> tuple[int, int]:
-        """(height, width) of the pictures, pixels."""
+        """Image size (height, width), pixels."""
         return self.folder.grid(self.config)
 
     @property
     def board(self) -> BoardSpec | None:
-        """The board under the assembly, None where there is none. Raises ``DatasetError`` for a damaged one."""
+        """ArUco board under the assembly, or None. Raises ``DatasetError`` if its description is invalid."""
         board = self.folder.config(self.config)["scene"].get("board")
         try:
             return None if board is None else BoardSpec(**board)
@@ -211,9 +217,9 @@ class ConfigViews:
 
     @property
     def mesh(self) -> Path:
-        """The PLY file of the scene's mesh, which is ground truth. Raises ``DatasetError`` if it is not there."""
+        """Path of the scene's PLY mesh, which is ground truth. Raises ``DatasetError`` if it is missing."""
         return self.folder.file(self.folder.config(self.config)["mesh"])
 
     def rows(self, *columns: str) -> Iterator[dict[str, Any]]:
-        """Yield ``view_id`` and the named columns of every view, decoded, one by one, in order."""
-        return iterate(self.folder.root, self.config, ("view_id", *columns))
+        """Yield the decoded ``view_id`` and named columns of each view, in order."""
+        return iterate_rows(self.folder.root, self.config, ("view_id", *columns))

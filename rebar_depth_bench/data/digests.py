@@ -1,4 +1,4 @@
-"""SHA-256 digests: of files, of decoded ground truth, of parameters."""
+"""SHA-256 digests of files, decoded ground truth and parameters."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _CHUNK_BYTES = 1 << 20
 
 
 def file_sha256(path: Path) -> str:
-    """Return the hex SHA-256 of a file, read in pieces."""
+    """Return the hex SHA-256 of a file, read in chunks of 1 MiB."""
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while chunk := stream.read(_CHUNK_BYTES):
@@ -25,9 +25,10 @@ def file_sha256(path: Path) -> str:
 
 
 def files_digest(paths: Iterable[Path]) -> str:
-    """Return the hex SHA-256 over the names and SHA-256s of files, in the order given.
+    """Return the hex SHA-256 over the names and SHA-256 digests of files, in the order of ``paths``.
 
-    Their folders are left out: the same files elsewhere have the same digest. Raises ``OSError`` where one lacks.
+    Folders do not enter the digest, so that copies elsewhere have the same one. Raises ``OSError`` if a file is
+    missing.
     """
     lines = [f"{path.name} {file_sha256(path)}\n" for path in paths]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
@@ -41,7 +42,10 @@ def eye_digest(
     distortion: Float64[ndarray, 5],
     cam_from_world: Float64[ndarray, "4 4"],
 ) -> str:
-    """Return the hex SHA-256 of one eye's ground truth, of its decoded values and not of their encoding."""
+    """Return the hex SHA-256 of the ground truth of one camera of a view.
+
+    It covers the image size and the decoded values, not their encoding.
+    """
     digest = hashlib.sha256(np.array(depth_m.shape, "<u4").tobytes())
     arrays = (
         (depth_m, "<f4"),
@@ -57,12 +61,12 @@ def eye_digest(
 
 
 def views_digest(views: Iterable[Mapping[str, Any]]) -> str:
-    """Return ``sha256:...`` over the views' ids and eye digests, in order of id: the ground-truth digest."""
+    """Return the ground-truth digest, ``sha256:...``, over the ids and eye digests of the views, sorted by id."""
     lines = sorted(f"{view['view_id']} {view['left']} {view['right']}\n" for view in views)
     return "sha256:" + hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def parameters_digest(parameters: object) -> str:
-    """Return the hex SHA-256 of a JSON-able value in canonical form."""
+    """Return the hex SHA-256 of the canonical JSON of ``parameters`` (sorted keys, no whitespace, no NaN)."""
     canonical = json.dumps(parameters, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(canonical.encode()).hexdigest()

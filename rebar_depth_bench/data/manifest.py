@@ -1,4 +1,4 @@
-"""A dataset folder as its manifest describes it: configs, views, digests. Local, or a Hub repository."""
+"""Manifest of a dataset folder or Hub repository: configs, views, digests and files."""
 
 from __future__ import annotations
 
@@ -14,14 +14,18 @@ from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError, LocalEntr
 
 from rebar_depth_bench.errors import DatasetError
 
-MANIFEST = "manifest.json"
-FORMAT = "rebar-depth-dataset-1"
+MANIFEST_FILE = "manifest.json"
+MANIFEST_FORMAT = "rebar-depth-dataset-1"
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 
 
 @dataclass(frozen=True)
 class ViewRecord:
-    """What the manifest says of one view: its id, its eyes' digests and how many pixels are steel and scored."""
+    """Manifest entry of one view.
+
+    ``left`` and ``right`` are the hex SHA-256 digests of the cameras' ground truth; ``steel_px`` and ``scored_px``
+    count steel and scored pixels.
+    """
 
     view_id: str
     left: str
@@ -36,34 +40,34 @@ _CONFIG_KEYS = {"scene", "rig", "views", "ground_truth_digest", "key", "shards",
 
 @dataclass(frozen=True)
 class DatasetFolder:
-    """A dataset's manifest, read and checked. ``root`` is a folder's path or a Hub repository id."""
+    """Dataset with a validated manifest; ``root`` is a folder path or a Hub repository id."""
 
     root: str
     manifest: Mapping[str, Any]
 
     @property
     def local(self) -> Path | None:
-        """The folder on this machine, None for a Hub repository."""
+        """Path of a local dataset folder, or None for a Hub repository."""
         path = Path(self.root)
         return path if path.is_dir() else None
 
     @property
     def digest(self) -> str:
-        """The ground-truth digest, ``sha256:...``."""
+        """Ground-truth digest, ``sha256:...``."""
         return str(self.manifest["ground_truth"]["digest"])
 
     @property
     def version(self) -> str:
-        """The dataset's version."""
+        """Version of the dataset."""
         return str(self.manifest["version"])
 
     @property
     def configs(self) -> tuple[str, ...]:
-        """The names of the configs in the folder."""
+        """Names of the configs."""
         return tuple(self.manifest["configs"])
 
     def config(self, name: str) -> Mapping[str, Any]:
-        """Return the manifest's entry of a config; raise ``DatasetError`` for an unknown one."""
+        """Return the manifest entry of a config; raise ``DatasetError`` if there is no such config."""
         try:
             entry: Mapping[str, Any] = self.manifest["configs"][name]
         except KeyError:
@@ -73,41 +77,47 @@ class DatasetFolder:
         return entry
 
     def views(self, config: str) -> list[ViewRecord]:
-        """Return the records of a config's views, in order."""
+        """Return the manifest entries of a config's views, in order."""
         return [ViewRecord(**view) for view in self.config(config)["views"]]
 
     def grid(self, config: str) -> tuple[int, int]:
-        """Return (height, width) of a config's images, pixels."""
+        """Return the image size (height, width) of a config, pixels."""
         rig = self.config(config)["rig"]
         return int(rig["height"]), int(rig["width"])
 
     def file(self, name: str) -> Path:
-        """Return a file of the folder on this machine, fetched first if it is a Hub repository's.
+        """Return the local path of a file of the dataset, downloaded first if the dataset is a Hub repository.
 
-        Raises ``DatasetError`` if it is not there.
+        Raises ``DatasetError`` if the file is missing or cannot be downloaded.
         """
-        return _file(self.root, name)
+        return _local_path(self.root, name)
 
     def expected_views(self) -> dict[str, tuple[int, int]]:
-        """Return every view id of the folder with its (height, width)."""
+        """Return the (height, width) of every view of every config, keyed by view id."""
         return {view.view_id: self.grid(config) for config in self.configs for view in self.views(config)}
 
 
 def open_folder(root: str | Path) -> DatasetFolder:
-    """Open a dataset folder or a Hub dataset repository; raise ``DatasetError`` in words if it is neither."""
+    """Open a dataset folder or Hub dataset repository.
+
+    Raises ``DatasetError`` if ``root`` is neither or its manifest is invalid.
+    """
     manifest = read_manifest(_manifest_path(str(root)))
     return DatasetFolder(str(root), manifest)
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """Read and check a manifest's outline."""
+    """Read a manifest and check its format, its keys and its view entries.
+
+    Raises ``DatasetError`` if it cannot be read or is invalid.
+    """
     try:
         manifest = json.loads(path.read_bytes())
     except (OSError, ValueError) as error:
         raise DatasetError(f"{path}: cannot be read as JSON: {error}") from None
-    found = manifest.get("format") if isinstance(manifest, dict) else type(manifest).__name__
-    if found != FORMAT:
-        raise DatasetError(f"{path}: format is {found!r}, expected {FORMAT!r}")
+    format_name = manifest.get("format") if isinstance(manifest, dict) else type(manifest).__name__
+    if format_name != MANIFEST_FORMAT:
+        raise DatasetError(f"{path}: format is {format_name!r}, expected {MANIFEST_FORMAT!r}")
     missing = [key for key in ("version", "ground_truth", "configs", "files") if key not in manifest]
     if missing:
         raise DatasetError(f"{path}: lacks {', '.join(missing)}")
@@ -131,10 +141,10 @@ def _manifest_path(root: str) -> Path:
     folder = Path(root)
     if not folder.is_dir() and (folder.exists() or not _HUB_ID.fullmatch(root)):
         raise DatasetError(f"{root}: no such folder, expected a dataset folder or a Hub repository id")
-    return _file(root, MANIFEST)
+    return _local_path(root, MANIFEST_FILE)
 
 
-def _file(root: str, name: str) -> Path:
+def _local_path(root: str, name: str) -> Path:
     if Path(root).is_dir():
         path = Path(root) / name
         if not path.is_file():

@@ -1,4 +1,4 @@
-"""Torch batches from a loaded config. The only module of the bench that needs torch."""
+"""PyTorch data loader for a loaded config; importing it requires torch."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ def torch_loader(
     shuffle: bool = False,
     stereo: bool = False,
 ) -> DataLoader[Batch]:
-    """Return a ``DataLoader`` over what ``load`` returned, streaming or not.
+    """Return a ``DataLoader`` over a dataset returned by ``load``, streaming or not.
 
-    A batch is a dict: ``rgb`` uint8 B x 3 x H x W, ``depth`` float32 B x 1 x H x W (planar, metres, 0 where no
-    surface), ``mask`` bool B x 1 x H x W, ``K`` float64 B x 3 x 3 (pixels), ``poses`` float64 B x 4 x 4
-    (``cam_from_world``), all of the left view, and ``view_id``, a list. With ``stereo`` also the right view's
-    under ``right_...`` and ``baseline_m`` float64 B.
+    A batch is a dict: ``rgb`` uint8 B x 3 x H x W, ``depth`` float32 B x 1 x H x W (planar, metres, 0 where there
+    is no surface), ``mask`` bool B x 1 x H x W, ``K`` float64 B x 3 x 3 (pixels), ``poses`` float64 B x 4 x 4
+    (``cam_from_world``), all of the left view, and ``view_id``, a list of str. With ``stereo`` the batch also has
+    the same keys of the right view, prefixed ``right_``, and ``baseline_m`` float64 B.
 
-    Columns that a batch does not need are not decoded; a streamed dataset has its columns decoded already, so
-    give ``load`` the ``columns`` it needs. ``shuffle`` needs a dataset that is not streamed.
-    Raises ``MethodError`` where torch is missing.
+    Columns that a batch does not need are not decoded, except in a streamed dataset, whose columns are already
+    decoded; pass ``columns`` to ``load`` to select them. ``shuffle`` requires a dataset that is not streamed.
+    Importing this module without torch raises ``MethodError``.
     """
     keys = {**_LEFT, **_RIGHT, "baseline_m": "baseline_m"} if stereo else _LEFT
     rows = ds.select_columns(["view_id", *keys.values()])
-    source = _Stream(rows) if isinstance(rows, IterableDataset) else rows
+    source = _StreamedRows(rows) if isinstance(rows, IterableDataset) else rows
     return DataLoader(
         source,
         batch_size=batch_size,
@@ -61,7 +61,7 @@ def torch_loader(
 
 
 class _Collate:
-    """Stacks decoded rows into tensors. A class, so that worker processes can pickle it."""
+    """Collate function that stacks decoded rows into tensors; a class, so that it can be pickled for workers."""
 
     def __init__(self, keys: Mapping[str, str]) -> None:
         self._keys = keys
@@ -76,7 +76,10 @@ class _Collate:
 
 
 def _tensor(key: str, stacked: np.ndarray[Any, Any]) -> torch.Tensor:
-    """Return a batch's tensor; colour keeps its channels last in memory, which costs no copy."""
+    """Convert a stacked array to a tensor, with a channel axis for depth and masks.
+
+    Colour is permuted to channels first as a view, without a copy (memory stays channels last).
+    """
     kind = key.removeprefix("right_")
     tensor = torch.from_numpy(stacked)
     if kind == "rgb":
@@ -84,8 +87,8 @@ def _tensor(key: str, stacked: np.ndarray[Any, Any]) -> torch.Tensor:
     return tensor[:, None] if kind in ("depth", "mask") else tensor
 
 
-class _Stream(TorchIterableDataset[Mapping[str, Any]]):
-    """A streamed dataset as torch knows them; ``datasets`` itself gives each worker shards of its own."""
+class _StreamedRows(TorchIterableDataset[Mapping[str, Any]]):
+    """Torch iterable over a streamed dataset; ``datasets`` assigns separate shards to each worker."""
 
     def __init__(self, rows: IterableDataset) -> None:
         self._rows = rows

@@ -1,1 +1,1 @@
-"""Measures beyond ``rebar-1``: alignments, thin structure, point clouds, and what inspection asks, bar by bar."""
+"""Extended measures: depth alignments, thin structure, point clouds and per-bar inspection; they never rank."""

@@ -1,7 +1,7 @@
-"""Scale against shape: other alignments beside the median scale, and what a correction on site could mend.
+"""Alignment measures: depth errors after alignments other than the median scale, and the spread of that scale.
 
-p is the prediction and z the truth on a view's n scored pixels with a prediction, in metres. The alignments are
-oracles: they know the truth. None of them ranks.
+p is the prediction and z the ground truth on a view's n scored pixels that have a prediction, in metres. Every
+alignment is an oracle: it is computed from the ground truth. None of these measures ranks.
 """
 
 from __future__ import annotations
@@ -12,54 +12,66 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, Samples
+from rebar_depth_bench.extended.measures import Measure, Samples, finite_sample
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.scoring.metrics import depth_metrics, is_prediction, median, median_scale
-
-_NUMBERS = (("abs_rel", "AbsRel", ""), ("rmse_cm", "RMSE", "cm"), ("mae_cm", "MAE", "cm"), ("delta1", "δ1", ""))
+from rebar_depth_bench.scoring.metrics import (
+    METRIC_NAMES,
+    METRIC_TITLES,
+    depth_metrics,
+    is_valid_prediction,
+    median,
+    median_scale,
+)
 
 
 def log_scale(p_m: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"]) -> float:
-    """Return the scale that is least squares in log depth: exp(mean(log z/p)), Eigen et al. 2014, eq. 1."""
+    """Return the least-squares scale in log depth: exp(mean(log z/p)) (Eigen et al. 2014, eq. 1)."""
     return float(np.exp(np.mean(np.log(z_m / p_m))))
 
 
 def scale_and_shift(p_m: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"]) -> tuple[float, float]:
-    """Return (a, b), b in metres, that minimise sum (a p + b - z)^2; a prediction without relief is only shifted.
+    """Return (a, b), b in metres, that minimise sum (a p + b - z)^2.
 
-    MiDaS (Ranftl et al. 2020, eq. 3) does the same to disparity; this is depth.
+    A constant prediction is only shifted (a = 1). MiDaS (Ranftl et al. 2020, eq. 3) applies the same fit to
+    disparity; this one applies it to depth.
     """
-    unit_m = float(np.max(p_m))  # predictions near float64's limits could not be squared
+    unit_m = float(np.max(p_m))  # normalised: squares of predictions near the limits of float64 would overflow
     q, z_mean_m = p_m / unit_m, float(np.mean(z_m))
-    from_mean = q - np.mean(q)
-    spread = float(from_mean @ from_mean)
-    flat = spread <= len(q) * 1e-24
-    a = 1.0 if flat else float(from_mean @ (z_m - z_mean_m)) / spread / unit_m
+    deviation = q - np.mean(q)
+    sum_of_squares = float(deviation @ deviation)
+    is_constant = sum_of_squares <= len(q) * 1e-24
+    a = 1.0 if is_constant else float(deviation @ (z_m - z_mean_m)) / sum_of_squares / unit_m
     return a, z_mean_m - a * unit_m * float(np.mean(q))
 
 
 def scale_invariant_log(p_m: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"]) -> float:
-    """Return the spread of d = log z/p over pixels: sqrt(mean d^2 - (mean d)^2), Eigen et al. 2014, eq. 2."""
+    """Return the standard deviation of d = log z/p over pixels: sqrt(mean d^2 - (mean d)^2).
+
+    Eigen et al. 2014, eq. 2.
+    """
     return float(np.std(np.log(z_m / p_m)))
 
 
 def alignment_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
-    """Return a view's alignments; ``p_m`` is native planar depth on ``truth.index``, metres, NaN for none.
+    """Return a view's alignment samples.
 
-    One value each, none where the view has no prediction or a number overflows: the median scale s; how much of
-    AbsRel it takes away (``scale_explains``); ``log_scaled_*`` after the least-squares scale in log depth;
-    ``shifted_*`` after least-squares scale and shift; ``silog``.
+    ``p_m`` is the native planar depth on ``truth.index`` in metres, NaN where there is no prediction. Each sample
+    has one value, or none where the view has no prediction or the number overflows: ``scale`` (the median scale
+    s) and its logarithm, ``scale_explains`` (the share of AbsRel that s removes), ``log_scaled_*`` (metrics after
+    the least-squares scale in log depth), ``shifted_*`` (metrics after least-squares scale and shift),
+    ``shift_cm`` and ``silog``.
     """
-    pixels = truth.interior & is_prediction(p_m)
+    pixels = truth.interior & is_valid_prediction(p_m)
     p, z = p_m[pixels], truth.depth_m[pixels].astype(np.float64)
     samples: dict[str, float] = {}
     if len(p):
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             samples = _scale_numbers(p, z) | _log_numbers(p, z) | _shift_numbers(p, z)
-    return {name: _known(samples.get(name)) for name in _SAMPLES}
+    return {name: finite_sample(samples.get(name)) for name in _SAMPLE_NAMES}
 
 
 def _scale_numbers(p: Float64[ndarray, " n"], z: Float64[ndarray, " n"]) -> dict[str, float]:
+    """Return s, log s and the share of AbsRel that s removes; the last only where AbsRel is above 0."""
     s = median_scale(p, median(z))
     native, scaled = depth_metrics(p, z).abs_rel, depth_metrics(p, z, s).abs_rel
     numbers = {"scale": s, "log_of_scale": math.log(s) if 0 < s < math.inf else math.nan}
@@ -69,31 +81,31 @@ def _scale_numbers(p: Float64[ndarray, " n"], z: Float64[ndarray, " n"]) -> dict
 
 
 def _log_numbers(p: Float64[ndarray, " n"], z: Float64[ndarray, " n"]) -> dict[str, float]:
+    """Return SILog and the metrics after the least-squares scale in log depth."""
     metrics = depth_metrics(p, z, log_scale(p, z))
-    numbers = {f"log_scaled_{name}": getattr(metrics, name) for name, *_ in _NUMBERS}
+    numbers = {f"log_scaled_{name}": getattr(metrics, name) for name in METRIC_NAMES}
     return {"silog": scale_invariant_log(p, z), **numbers}
 
 
 def _shift_numbers(p: Float64[ndarray, " n"], z: Float64[ndarray, " n"]) -> dict[str, float]:
+    """Return the shift b and the metrics after least-squares scale and shift."""
     a, b_m = scale_and_shift(p, z)
     metrics = depth_metrics(a * p + b_m, z)
-    return {"shift_cm": 100 * b_m} | {f"shifted_{name}": getattr(metrics, name) for name, *_ in _NUMBERS}
+    return {"shift_cm": 100 * b_m} | {f"shifted_{name}": getattr(metrics, name) for name in METRIC_NAMES}
 
 
-def _known(value: float | None) -> Float64[ndarray, " one"]:
-    return np.array([value] if value is not None and math.isfinite(value) else [], dtype=np.float64)
-
-
-_SAMPLES = (
+_SAMPLE_NAMES = (
     *("scale", "log_of_scale", "scale_explains", "silog", "shift_cm"),
-    *(f"{alignment}_{name}" for alignment in ("log_scaled", "shifted") for name, *_ in _NUMBERS),
+    *(f"{alignment}_{name}" for alignment in ("log_scaled", "shifted") for name in METRIC_NAMES),
 )
+"""Names of all samples of a view."""
 
 
-def _aligned_measures(prefix: str, title: str, how: str) -> list[Measure]:
-    names = [(f"{prefix}_{key}", head, unit) for key, head, unit in _NUMBERS]
+def _aligned_measures(prefix: str, title: str, alignment: str) -> list[Measure]:
+    """Return the measures of the metrics after one alignment."""
+    names = [(f"{prefix}_{key}", head, unit) for key, (head, unit) in METRIC_TITLES.items()]
     return [
-        Measure(name, name, "mean", f"{head}, {title}", unit, "", f"{head} after {how}, an oracle per view")
+        Measure(name, name, "mean", f"{head}, {title}", unit, "", f"{head} after {alignment}, an oracle per view")
         for name, head, unit in names
     ]
 
@@ -135,3 +147,4 @@ MEASURES: tuple[Measure, ...] = (
         "standard deviation of log p - log z over a view's pixels",
     ),
 )
+"""Alignment measures in table order."""

@@ -1,27 +1,28 @@
-"""Boundary F1 at the steel: are the occluding contours of bars predicted where they are, the right side in front?
+"""Boundary F1 at the steel: precision and recall of the occluding contours of bars.
 
-The variant, called "pooled at steel": pairs of horizontal and vertical neighbour pixels of which at least one is
-steel and both have true depth. A pair has a contour at threshold t where max/min of its two depths is > 1 + t
-(the boundary metric of Bochkovskii et al., "Depth Pro: Sharp Monocular Metric Depth in Less Than a Second",
-arXiv:2410.02073); a predicted contour is right where the same side is in front. Counts are pooled over directions,
-then per t
+The variant implemented here is "pooled at steel". It uses pairs of horizontal and vertical neighbour pixels of
+which at least one is steel and both have true depth. A pair has a contour at threshold t where max/min of its two
+depths is > 1 + t (the boundary metric of Bochkovskii et al., "Depth Pro: Sharp Monocular Metric Depth in Less Than
+a Second", arXiv:2410.02073). A predicted contour is correct where the ground truth has one with the same side in
+front. Counts are pooled over directions, then per t
 
-    precision = right / predicted,    recall = right / true,    F1 = 2 right / (predicted + true),
+    precision = correct / predicted,    recall = correct / true,    F1 = 2 correct / (predicted + true),
 
-and the plain mean over those t at which the view has a true contour. How it differs:
+and each is averaged, unweighted, over those t at which the view has a true contour. Differences from the
+published variants:
 
 - Depth Pro takes precision and recall for each of four directions (which side is in front), averages them over
   the directions, and weights ten t from 5 to 25 % by t, over the whole frame.
 - MoGe's evaluation (Wang et al., CVPR 2025; its radius 1) pools as here, over pairs of valid pixels, at those t
   with those weights.
-- Here t is 1, 2, 5, 10, 20 %, all of one weight: a 20 mm gap is 7 % at 0.3 m, while at 12 m bars one behind the
+- Here t is 1, 2, 5, 10, 20 %, all of equal weight: a 20 mm gap is 7 % at 0.3 m, while at 12 m bars one behind the
   other are 1-3 % apart.
-- Both of them let a hole remove false contours. Here a pair with a missing prediction counts as predicted and
-  wrong at every t. That is the only rule under which no hole can raise precision, recall or F1, for a hole does
-  not tell what it hides; ``boundary_missing`` says how many pairs it concerns.
+- In both of them a missing prediction can remove false contours. Here a pair with a missing prediction counts as
+  predicted and incorrect at every t. This is the only rule under which no missing prediction can raise precision,
+  recall or F1, because the depth that it replaces is unknown. ``boundary_missing`` is the share of such pairs.
 
-An edge of steel against nothing (sky: no true depth) is no pair. Ratios do not change with scale: a scaled
-prediction has the same numbers, so call this once, with the native one.
+An edge between steel and background without true depth (sky) forms no pair. Depth ratios are invariant to scale,
+so a scaled prediction has the same numbers: evaluate the native prediction once.
 """
 
 from __future__ import annotations
@@ -34,44 +35,46 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.scoring.metrics import is_prediction
+from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 THRESHOLDS_PERCENT = (1, 2, 5, 10, 20)
-"""A contour's relative depth step t, ascending."""
+"""Relative depth steps t of a contour, ascending, in percent."""
 
 
 @dataclass(frozen=True, eq=False)
 class ContourCounts:
-    """Contours among ``pairs`` neighbour pairs, one count for each threshold; ``right`` are true and predicted.
+    """Contour counts over ``pairs`` neighbour pixel pairs, one count per threshold.
 
-    ``predicted`` includes the ``missing`` pairs, those with a missing prediction.
+    ``true`` counts contours of the ground truth, ``predicted`` those of the prediction plus the ``missing`` pairs
+    (those with a missing prediction), ``correct`` those that are both true and predicted with the same side in
+    front.
     """
 
     pairs: int
     missing: int
     true: Int64[ndarray, " t"]
     predicted: Int64[ndarray, " t"]
-    right: Int64[ndarray, " t"]
+    correct: Int64[ndarray, " t"]
 
 
 def boundary_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
-    """Return a view's boundary scores; ``p_m`` is planar depth on ``truth.index``, metres, NaN for none.
+    """Return a view's boundary samples; ``p_m`` is planar depth on ``truth.index``, metres, NaN where missing.
 
-    One value each of ``boundary_f1``, ``boundary_precision``, ``boundary_recall`` (means over the t that have a
-    true contour), ``boundary_f1_<t>pct`` and ``boundary_missing`` (share of pairs with a missing prediction), all
-    0 to 1; none where the view has no true contour (no pair, for ``boundary_missing``).
+    Each of ``boundary_f1``, ``boundary_precision``, ``boundary_recall`` (means over the t that have a true
+    contour), ``boundary_f1_<t>pct`` and ``boundary_missing`` (share of pairs with a missing prediction) has one
+    value from 0 to 1. It is empty where the view has no true contour (for ``boundary_missing``: no pair).
     """
     first, second = neighbour_pairs(truth.index, truth.bar_id > 0, truth.height, truth.width)
     counts = contour_counts(p_m, truth.depth_m.astype(np.float64), first, second)
-    told = counts.true > 0
-    f1 = 2.0 * counts.right / np.maximum(counts.predicted + counts.true, 1)
-    precision = counts.right / np.maximum(counts.predicted, 1)  # nothing predicted: nothing right, 0
-    recall = counts.right / np.maximum(counts.true, 1)
+    has_contour = counts.true > 0
+    f1 = 2.0 * counts.correct / np.maximum(counts.predicted + counts.true, 1)
+    precision = counts.correct / np.maximum(counts.predicted, 1)  # 0 where nothing is predicted
+    recall = counts.correct / np.maximum(counts.true, 1)
     return {
-        "boundary_f1": _mean(f1[told]),
-        "boundary_precision": _mean(precision[told]),
-        "boundary_recall": _mean(recall[told]),
-        **{f"boundary_f1_{t}pct": f1[i : i + 1][told[i : i + 1]] for i, t in enumerate(THRESHOLDS_PERCENT)},
+        "boundary_f1": _mean(f1[has_contour]),
+        "boundary_precision": _mean(precision[has_contour]),
+        "boundary_recall": _mean(recall[has_contour]),
+        **{f"boundary_f1_{t}pct": f1[i : i + 1][has_contour[i : i + 1]] for i, t in enumerate(THRESHOLDS_PERCENT)},
         "boundary_missing": np.array([counts.missing / counts.pairs] if counts.pairs else [], np.float64),
     }
 
@@ -79,18 +82,20 @@ def boundary_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
 def neighbour_pairs(
     index: UInt32[ndarray, " n"], on_steel: Bool[ndarray, " n"], height: int, width: int
 ) -> tuple[Int64[ndarray, " m"], Int64[ndarray, " m"]]:
-    """Return the pairs of pixels side by side or one above the other, at least one of them steel.
+    """Return the pairs of horizontally or vertically adjacent pixels of which at least one is steel.
 
-    ``index`` are flat indices into the height x width grid, ascending; the pairs are positions in it, the left or
-    upper pixel first. The last pixel of a row and the first of the next are no pair.
+    ``index`` holds flat indices into the height x width grid, ascending. The pairs are positions in ``index``,
+    the left or upper pixel first. The last pixel of a row and the first of the next row are not adjacent.
     """
     left = np.flatnonzero((np.diff(index) == 1) & (index[:-1] % width != width - 1))
-    rank = np.zeros((height + 1) * width, np.int32)  # 1 + position in index; one empty row below the frame
-    rank[index] = np.arange(1, len(index) + 1, dtype=np.int32)
-    rank_below = rank[index + np.uint32(width)]
-    upper = np.flatnonzero(rank_below)
+    position = np.zeros(
+        (height + 1) * width, np.int32
+    )  # 1 + position in index, 0: not in it; one empty row below the frame
+    position[index] = np.arange(1, len(index) + 1, dtype=np.int32)
+    position_below = position[index + np.uint32(width)]
+    upper = np.flatnonzero(position_below)
     first = np.concatenate([left, upper])
-    second = np.concatenate([left + 1, rank_below[upper] - np.int64(1)])
+    second = np.concatenate([left + 1, position_below[upper] - np.int64(1)])
     at_steel = on_steel[first] | on_steel[second]
     return first[at_steel], second[at_steel]
 
@@ -101,35 +106,38 @@ def contour_counts(
     first: Int64[ndarray, " m"],
     second: Int64[ndarray, " m"],
 ) -> ContourCounts:
-    """Count true, predicted and right contours among pairs of positions in ``p_m`` and ``z_m`` (metres, z > 0)."""
-    valid = is_prediction(p_m)
-    known = valid[first] & valid[second]
-    missing = len(known) - int(np.count_nonzero(known))
-    z_step, z_second_nearer = _step(z_m[first], z_m[second])
-    p_known_m = np.where(valid, p_m, np.nan)
-    p_step, p_second_nearer = _step(p_known_m[first], p_known_m[second])
+    """Count contours among pairs of positions in ``p_m`` (prediction) and ``z_m`` (true, > 0), both metres."""
+    valid = is_valid_prediction(p_m)
+    both_valid = valid[first] & valid[second]
+    missing = len(both_valid) - int(np.count_nonzero(both_valid))
+    z_step, z_second_nearer = _depth_step(z_m[first], z_m[second])
+    p_valid_m = np.where(valid, p_m, np.nan)
+    p_step, p_second_nearer = _depth_step(p_valid_m[first], p_valid_m[second])
     lowest = 1.0 + THRESHOLDS_PERCENT[0] / 100
-    some = np.flatnonzero((z_step > lowest) | (p_step > lowest))  # most pairs lie on one surface
-    z_step, p_step = z_step[some], p_step[some]
-    same_side = z_second_nearer[some] == p_second_nearer[some]
-    true, predicted, right = [], [], []
+    candidates = np.flatnonzero(
+        (z_step > lowest) | (p_step > lowest)
+    )  # Most pairs lie on one surface: skip them early.
+    z_step, p_step = z_step[candidates], p_step[candidates]
+    same_side = z_second_nearer[candidates] == p_second_nearer[candidates]
+    true, predicted, correct = [], [], []
     for percent in THRESHOLDS_PERCENT:
         z_contour, p_contour = z_step > 1.0 + percent / 100, p_step > 1.0 + percent / 100
         true.append(np.count_nonzero(z_contour))
         predicted.append(np.count_nonzero(p_contour) + missing)
-        right.append(np.count_nonzero(z_contour & p_contour & same_side))
-    return ContourCounts(len(first), missing, np.array(true), np.array(predicted), np.array(right))
+        correct.append(np.count_nonzero(z_contour & p_contour & same_side))
+    return ContourCounts(len(first), missing, np.array(true), np.array(predicted), np.array(correct))
 
 
-def _step(
+def _depth_step(
     first_m: Float64[ndarray, " m"], second_m: Float64[ndarray, " m"]
 ) -> tuple[Float64[ndarray, " m"], Bool[ndarray, " m"]]:
-    """Return max/min of each pair, NaN (no contour) where one is missing, and whether the second is nearer."""
+    """Return max/min of each pair (NaN, so no contour, where one is missing) and whether the second is nearer."""
     with np.errstate(over="ignore", invalid="ignore"):
         return np.maximum(first_m, second_m) / np.minimum(first_m, second_m), second_m < first_m
 
 
 def _mean(values: Float64[ndarray, " n"]) -> Float64[ndarray, " one"]:
+    """Return a sample that holds the mean of ``values``, empty for no values."""
     return np.array([values.mean()] if len(values) else [], np.float64)
 
 
@@ -187,3 +195,4 @@ MEASURES: tuple[Measure, ...] = (
         "share of neighbour pixel pairs at the steel of which a prediction is missing",
     ),
 )
+"""Boundary measures in table order."""

@@ -1,8 +1,8 @@
-"""Confusion of layers: steel pixels predicted nearer to another layer than to their own.
+"""Depth layer confusion: steel pixels predicted closer to another layer than to their own.
 
-Another layer of a pixel is steel in sight beside it, in the image, that is nearer or farther by more than the
-bar's diameter. "Layer" is meant as the camera sees it, not as drawings name it: any steel so much nearer or
-farther. The measures are this project's own.
+Another layer of a pixel is visible steel near it in the image that is nearer or farther by more than the bar's
+diameter. "Layer" refers to depth as the camera sees it, not to the reinforcement layers of a drawing: any steel
+that much nearer or farther is one. These measures are defined by this project.
 """
 
 from __future__ import annotations
@@ -13,12 +13,16 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.scoring.metrics import is_prediction
+from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 DIRECTIONS = 16
+"""Number of evenly spaced image directions in which other layers are searched."""
+
 RADII_PX = (3, 6, 12, 24)
-"""Where a pixel looks for other layers, ascending, whatever the picture's size: what a network or a matching
-window mixes up lies pixels away, not millimetres."""
+"""Distances in pixels at which other layers are searched, ascending, the same for every image size.
+
+Networks and matching windows confuse surfaces that are pixels apart, whatever the distance in millimetres.
+"""
 
 
 def other_layers(
@@ -27,29 +31,31 @@ def other_layers(
     index: UInt32[ndarray, " n"],
     gap_m: Float32[ndarray, " n"],
 ) -> tuple[Float32[ndarray, " n"], Float32[ndarray, " n"]]:
-    """Return ``front_m`` and ``behind_m``: planar depth of the nearest other layers in sight beside steel pixels.
+    """Return ``front_m`` and ``behind_m``: planar depth of the closest other layers visible beside steel pixels.
 
     ``depth_m`` is true planar depth (metres, 0 where there is no surface), ``bars`` bar ids (0: no steel),
-    ``index`` flat indices of steel pixels, ``gap_m`` the diameter of each one's bar. Looking ``RADII_PX`` away in
-    ``DIRECTIONS``, steel farther than z + gap is behind (of several the nearest to z counts), steel nearer than
-    z - gap is in front; NaN where there is none.
+    ``index`` flat indices of steel pixels, ``gap_m`` the diameter of each pixel's bar. Neighbours are sampled at
+    ``RADII_PX`` in ``DIRECTIONS`` directions. Steel farther than z + gap is behind and steel nearer than z - gap
+    is in front; of several the one closest to z counts. NaN where there is no such steel.
 
-    The same bar may be another layer (the far side of a hoop) but only where something farther than both pixels
-    is in sight between them: no straight bar joins them then. So a bar that runs away from the camera is
-    not its own other layer, not even where another bar crosses in front of it.
+    The same bar can be another layer (the far side of a hoop), but only where something farther than both pixels
+    is visible between them, so that no straight bar connects them. A bar that runs away from the camera is
+    therefore not its own other layer, even where another bar crosses in front of it.
     """
     margin = RADII_PX[-1]
     width = depth_m.shape[1] + 2 * margin
     padded_m, padded_bars = np.pad(depth_m, margin).ravel(), np.pad(bars, margin).ravel()
     row, column = np.divmod(index.astype(np.int64), depth_m.shape[1])
-    home = (row + margin) * width + column + margin
-    z_m, own = padded_m[home], padded_bars[home]
+    centre = (row + margin) * width + column + margin
+    z_m, own = padded_m[centre], padded_bars[centre]
     front_m, behind_m = np.full(len(index), -np.inf, np.float32), np.full(len(index), np.inf, np.float32)
     for angle in np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS):
-        between_m = np.zeros(len(index), np.float32)  # the farthest yet seen that is not this bar
+        between_m = np.zeros(
+            len(index), np.float32
+        )  # the farthest surface so far in this direction that is not this bar
         for radius in RADII_PX:
-            there = home + round(radius * np.sin(angle)) * width + round(radius * np.cos(angle))
-            seen_m, seen_bars = padded_m[there], padded_bars[there]
+            neighbour = centre + round(radius * np.sin(angle)) * width + round(radius * np.cos(angle))
+            seen_m, seen_bars = padded_m[neighbour], padded_bars[neighbour]
             is_other = seen_bars != own
             is_layer = (seen_bars > 0) & (is_other | (between_m > np.maximum(z_m, seen_m)))
             np.fmin(behind_m, np.where(is_layer & (seen_m > z_m + gap_m), seen_m, np.inf), out=behind_m)
@@ -60,23 +66,24 @@ def other_layers(
 
 
 def layer_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
-    """Return a view's layer confusion; ``p_m`` is planar depth on ``truth.index``, metres, NaN for none.
+    """Return a view's layer samples; ``p_m`` is planar depth on ``truth.index``, metres, NaN where missing.
 
-    Over interior pixels, one value 0 to 1 each; none where the view has no pixel to take the share of:
+    Each sample has one value from 0 to 1 over interior pixels, or none where no pixel qualifies:
 
     - ``layer_swallowed``: of the pixels with a layer behind in sight, those with |p - behind| < |p - z|.
     - ``layer_pulled_forward``: of those with a layer in front in sight, those with |p - front| < |p - z|.
-    - ``layer_confusion``: of those with either, those that are one or the other.
-    - ``layers_in_sight``: the share of interior pixels with either; it depends on the truth alone.
+    - ``layer_confusion``: of those with either, those to which one of the two applies.
+    - ``layers_in_sight``: the share of interior pixels with either; it depends on the ground truth alone.
 
     A missing prediction counts as confused in each.
     """
     inside = truth.interior
     z_m, predicted_m = truth.depth_m[inside].astype(np.float64), p_m[inside]
     front_m, behind_m = truth.front_m[inside].astype(np.float64), truth.behind_m[inside].astype(np.float64)
-    missing = ~is_prediction(predicted_m)
+    missing = ~is_valid_prediction(predicted_m)
     has_front, has_behind = ~np.isnan(front_m), ~np.isnan(behind_m)
-    # Against the midpoint: the two distances of a prediction far beyond both round to the same.
+    # Comparing with the midpoint is exact: for a prediction far beyond both layers, the two distances would round
+    # to the same float.
     swallowed = has_behind & (missing | (predicted_m > (z_m + behind_m) / 2))
     pulled = has_front & (missing | (predicted_m < (z_m + front_m) / 2))
     in_sight = has_front | has_behind
@@ -89,11 +96,13 @@ def layer_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
 
 
 def _share(hit: Bool[ndarray, " n"], of: Bool[ndarray, " n"]) -> Float64[ndarray, " one"]:
+    """Return a sample that holds the share of ``of`` pixels that are ``hit``, empty for no such pixel."""
     total = np.count_nonzero(of)
     return np.array([np.count_nonzero(hit) / total] if total else [], np.float64)
 
 
 def _nan_if_infinite(values_m: Float32[ndarray, " n"]) -> Float32[ndarray, " n"]:
+    """Return the values with infinities replaced by NaN."""
     return np.where(np.isinf(values_m), np.float32(np.nan), values_m)
 
 
@@ -136,3 +145,4 @@ MEASURES: tuple[Measure, ...] = (
         "share of interior pixels within 24 px of steel more than a diameter nearer or farther, by the truth",
     ),
 )
+"""Layer measures in table order."""

@@ -1,18 +1,17 @@
-"""The numbers of ``rebar-1`` on the whole steel mask, rim included, beside those on the interior that it scores.
+"""Full-mask measures: the protocol's metrics on the whole steel mask beside those on its interior.
 
-``rebar-1`` leaves out a rim of one pixel (3 x 3 erosion), where a mixed pixel has no one depth. On a near lattice
-that keeps most of the mask, on a far pier a sixth of it: ``kept_share`` tells, and the pair of scores tells what
-the rim hides. Formulas: ``metrics.depth_metrics`` (Eigen et al. 2014).
+The protocol scores the interior only: it leaves out a rim of one pixel (3 x 3 erosion), where a mixed pixel has no
+single depth. The interior is most of the mask of a near lattice and a sixth of the mask of a distant pier;
+``kept_share`` is that fraction, and comparing the two sets of scores shows the effect of the rim. Formulas:
+``metrics.depth_metrics`` (Eigen et al. 2014).
 
-As in ``rebar-1`` the four errors are means over the pixels that have a prediction, so a hole can lower them. They
-are there to be compared with each other, region with region, and their measures have no better side. What may be
-compared between methods are the coverage and the shares within a tolerance, of ALL pixels of the region: a hole
-is a failure there.
+As in the protocol, the four errors are means over the pixels that have a prediction, so missing predictions can
+lower them. They serve to compare the two regions with each other, and their measures have no better direction.
+Coverage and the shares within a tolerance are taken over ALL pixels of the region, where a missing prediction is a
+failure; only these may be compared between methods.
 """
 
 from __future__ import annotations
-
-from dataclasses import fields
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -20,32 +19,31 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.scoring.metrics import DepthMetrics, aligned_metrics, is_prediction
+from rebar_depth_bench.scoring.metrics import METRIC_NAMES, METRIC_TITLES, is_valid_prediction, metrics_at_scales
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-
-_ERRORS = tuple(field.name for field in fields(DepthMetrics))
 
 
 def full_mask_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
-    """Return a view's scores on its whole mask; ``p_m`` is planar depth on ``truth.index``, metres, NaN for none.
+    """Return a view's samples by region; ``p_m`` is planar depth on ``truth.index``, metres, NaN where missing.
 
-    One value each of ``full_mask_<number>`` and ``interior_<number>`` for abs_rel, rmse_cm, mae_cm, delta1 (over
-    predicted pixels; none where there is no such pixel), and for coverage and within_<t>mm (shares of all
-    pixels, 0 to 1; none where the view has no such pixel); and ``kept_share`` = interior / mask pixels.
+    ``full_mask_<metric>`` and ``interior_<metric>`` have one value each for abs_rel, rmse_cm, mae_cm, delta1
+    (over predicted pixels; empty where there is no such pixel) and for coverage and within_<t>mm (shares of all
+    pixels, 0 to 1; empty where the view has no such pixel). ``kept_share`` is the number of interior pixels over
+    that of mask pixels.
     """
     mask = truth.bar_id > 0
     interior = truth.interior & mask
-    total, kept = np.count_nonzero(mask), np.count_nonzero(interior)
+    mask_count, interior_count = np.count_nonzero(mask), np.count_nonzero(interior)
     return {
         **_scores("full_mask", p_m, truth, mask),
         **_scores("interior", p_m, truth, interior),
-        "kept_share": np.array([kept / total] if total else [], np.float64),
+        "kept_share": np.array([interior_count / mask_count] if mask_count else [], np.float64),
     }
 
 
 def _scores(prefix: str, p_m: Float64[ndarray, " n"], truth: SteelTruth, pixels: Bool[ndarray, " n"]) -> Samples:
-    """Return the numbers over some of the view's pixels, their names prefixed."""
-    predicted = pixels & is_prediction(p_m)
+    """Return the metrics over the selected pixels as samples, their names prefixed."""
+    predicted = pixels & is_valid_prediction(p_m)
     p_valid_m, z_m = p_m[predicted], truth.depth_m[predicted].astype(np.float64)
     numbers: dict[str, float] = {}
     total = int(np.count_nonzero(pixels))
@@ -53,43 +51,48 @@ def _scores(prefix: str, p_m: Float64[ndarray, " n"], truth: SteelTruth, pixels:
         numbers["coverage"] = len(p_valid_m) / total
         numbers.update((f"within_{t}mm", 0.0) for t in WITHIN_MM)
     if len(p_valid_m):
-        [found], within = aligned_metrics(p_valid_m, z_m, (1.0,), WITHIN_MM)
-        numbers.update((name, getattr(found, name)) for name in _ERRORS)
+        [metrics], within = metrics_at_scales(p_valid_m, z_m, (1.0,), WITHIN_MM)
+        numbers.update((name, getattr(metrics, name)) for name in METRIC_NAMES)
         numbers.update((f"within_{t}mm", count / total) for t, count in within.items())
     return {
-        f"{prefix}_{name}": np.array([numbers[name]] if name in numbers else [], np.float64) for name in _NUMBERS
+        f"{prefix}_{name}": np.array([numbers[name]] if name in numbers else [], np.float64)
+        for name in _NUMBER_NAMES
     }
 
 
-_NUMBERS = (*_ERRORS, "coverage", *(f"within_{t}mm" for t in WITHIN_MM))
-_TITLES = {"abs_rel": ("AbsRel", ""), "rmse_cm": ("RMSE", "cm"), "mae_cm": ("MAE", "cm"), "delta1": ("δ1", "")}
+_NUMBER_NAMES = (*METRIC_NAMES, "coverage", *(f"within_{t}mm" for t in WITHIN_MM))
+"""Names of all numbers computed on each region."""
+
 _REGIONS = {
     "full_mask": ("whole mask", "steel pixels, rim included"),
     "interior": ("interior", "interior steel pixels"),
 }
+"""Short name and description of each region."""
 
 
-def _error_measure(region: str, number: str) -> Measure:
-    (short, pixels), (title, unit) = _REGIONS[region], _TITLES[number]
-    definition = f"{number} as rebar-1 defines it, over the predicted {pixels}; to set beside the other region's"
-    return Measure(f"{region}_{number}", f"{region}_{number}", "mean", f"{title}, {short}", unit, "", definition)
+def _error_measure(region: str, metric: str) -> Measure:
+    """Return the measure of one error metric on one region."""
+    (short, pixels), (title, unit) = _REGIONS[region], METRIC_TITLES[metric]
+    definition = f"{metric} as rebar-1 defines it, over the predicted {pixels}; to set beside the other region's"
+    return Measure(f"{region}_{metric}", f"{region}_{metric}", "mean", f"{title}, {short}", unit, "", definition)
 
 
-def _share_measure(region: str, number: str) -> Measure:
+def _share_measure(region: str, metric: str) -> Measure:
+    """Return the measure of the coverage or of a share within a tolerance on one region."""
     short, pixels = _REGIONS[region]
-    if number == "coverage":
+    if metric == "coverage":
         title, definition = f"Coverage, {short}", f"share of {pixels} with a prediction (finite and > 0)"
     else:
-        tolerance = number.removeprefix("within_").removesuffix("mm")
+        tolerance = metric.removeprefix("within_").removesuffix("mm")
         title = f"Within {tolerance} mm, {short}"
         definition = f"share of {pixels} with |p - z| <= {tolerance} mm; a missing prediction is not within"
-    return Measure(f"{region}_{number}", f"{region}_{number}", "mean", title, "%", "higher", definition)
+    return Measure(f"{region}_{metric}", f"{region}_{metric}", "mean", title, "%", "higher", definition)
 
 
 MEASURES: tuple[Measure, ...] = (
     *(
-        _error_measure(region, number) if number in _TITLES else _share_measure(region, number)
-        for number in _NUMBERS
+        _error_measure(region, number) if number in METRIC_TITLES else _share_measure(region, number)
+        for number in _NUMBER_NAMES
         for region in _REGIONS
     ),
     Measure(
@@ -102,3 +105,4 @@ MEASURES: tuple[Measure, ...] = (
         "interior pixels / steel pixels, by the truth",
     ),
 )
+"""Full-mask measures in table order."""

@@ -1,4 +1,4 @@
-"""Gathers the ground truth of extended measures from a config's rows, once, and keeps it beside the dataset."""
+"""Ground truth of the extended measures: computed once from a config's rows and cached beside the dataset."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.data.array_cache import FlatCache, ViewArrays, open_cache
-from rebar_depth_bench.data.bars import BARS, read_bars
+from rebar_depth_bench.data.array_cache import ArrayCache, ViewArrays, open_cache
+from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.ground_truth import cache_names, cache_path, checked_rows
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.extended.depth_layers import other_layers
-from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_runs, cage_truth
+from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_segments, cage_truth
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.ground_truth import cache_name_pattern, cache_path, verified_rows
 
 _DTYPES: Mapping[str, type] = {
     "index": np.uint32,
@@ -32,15 +32,19 @@ _DTYPES: Mapping[str, type] = {
     "front_m": np.float32,
     "behind_m": np.float32,
 }
+"""Arrays of ``SteelTruth`` that are cached, with their types."""
+
 
 Rays = Float64[ndarray, "hw 2"]
+"""x/z and y/z of each pixel's ray, row by row."""
 
 
 @dataclass(frozen=True, eq=False)
-class SteelConfig:
-    """All views of a config that ``rebar-1`` scores, with the cage they show.
+class ConfigSteelTruth:
+    """Steel ground truth of all views of a config that have scored pixels.
 
-    ``diameter_m`` is looked up by bar id, NaN for none. Views of one lens share their rays.
+    ``cage`` holds the bar segments of the scene, ``diameter_m`` the nominal diameter by bar id (NaN for ids
+    without a bar). ``rays`` holds the rays of each distinct lens (K and distortion), which views share.
     """
 
     height: int
@@ -48,32 +52,33 @@ class SteelConfig:
     cage: CageTruth
     diameter_m: Float64[ndarray, " ids"]
     rays: Mapping[str, Rays]
-    cache: FlatCache
+    cache: ArrayCache
 
     def __len__(self) -> int:
+        """Return the number of views."""
         return len(self.cache)
 
-    def view(self, place: int) -> SteelTruth:
-        """Return the view at ``place`` in the order of the protocol."""
-        view = self.cache.view(place)
-        arrays, note = view.arrays, view.note
+    def view(self, position: int) -> SteelTruth:
+        """Return the view at ``position`` in protocol order."""
+        view = self.cache.view(position)
+        arrays, metadata = view.arrays, view.metadata
         return SteelTruth(
             view_id=view.view_id,
             height=self.height,
             width=self.width,
-            K=np.array(note["K"]),
-            cam_from_world=np.array(note["cam_from_world"]),
-            rays=self.rays[_lens(note)][arrays["index"]],
+            K=np.array(metadata["K"]),
+            cam_from_world=np.array(metadata["cam_from_world"]),
+            rays=self.rays[_lens_key(metadata)][arrays["index"]],
             **arrays,
         )
 
 
-def steel_config(folder: DatasetFolder, config: str, progress: Progress = silent) -> SteelConfig:
-    """Return a config's truth for extended measures, from its cache or else from the dataset.
+def load_steel_truth(folder: DatasetFolder, config: str, progress: Progress = silent) -> ConfigSteelTruth:
+    """Return a config's ground truth for extended measures, from the cache or else computed from the dataset.
 
-    Raises ``DatasetError`` where the bars are missing or a view is not the one the manifest stands for.
+    Raises ``DatasetError`` if the bars of the scene are missing or a view contradicts the manifest.
     """
-    bars_path = folder.file(BARS)
+    bars_path = folder.file(BARS_FILE)
     scene = folder.config(config)["scene"]["name"]
     bars = read_bars(bars_path).get(scene)
     if bars is None:
@@ -85,37 +90,43 @@ def steel_config(folder: DatasetFolder, config: str, progress: Progress = silent
         cache_path(folder, config, EXTENDED_PROTOCOL, file_sha256(bars_path)),
         _DTYPES,
         lambda: _view_arrays(folder, config, cage, diameter_m, progress),
-        outdated=cache_names(config, EXTENDED_PROTOCOL),
+        stale_pattern=cache_name_pattern(config, EXTENDED_PROTOCOL),
     )
     height, width = folder.grid(config)
-    lenses = {_lens(note): note for note in cache.notes}
-    rays = {lens: _rays(note, height, width) for lens, note in lenses.items()}
-    return SteelConfig(height, width, cage, diameter_m, rays, cache)
+    lenses = {_lens_key(metadata): metadata for metadata in cache.metadata}
+    rays = {lens: _rays(metadata, height, width) for lens, metadata in lenses.items()}
+    return ConfigSteelTruth(height, width, cage, diameter_m, rays, cache)
 
 
 def _view_arrays(
     folder: DatasetFolder, config: str, cage: CageTruth, diameter_m: Float64[ndarray, " ids"], progress: Progress
 ) -> Iterator[ViewArrays]:
+    """Yield the cached arrays of every view with scored pixels, with K, distortion and pose as metadata."""
     rays: dict[str, Rays] = {}
-    for row, scored in checked_rows(folder, config, progress, "bars in the views"):
+    for row, scored in verified_rows(folder, config, progress, "bars in the views"):
         if not len(scored):
             continue
-        note = {
+        metadata = {
             "K": row["left_K"].tolist(),
             "distortion": row["left_distortion"].tolist(),
             "cam_from_world": row["left_cam_from_world"].tolist(),
         }
-        if _lens(note) not in rays:
-            rays[_lens(note)] = _rays(note, *row["left_depth"].shape)
-        arrays = _steel_arrays(row, scored, rays[_lens(note)], cage, diameter_m)
-        yield ViewArrays(row["view_id"], arrays, note)
+        if _lens_key(metadata) not in rays:
+            rays[_lens_key(metadata)] = _rays(metadata, *row["left_depth"].shape)
+        arrays = _steel_arrays(row, scored, rays[_lens_key(metadata)], cage, diameter_m)
+        yield ViewArrays(row["view_id"], arrays, metadata)
 
 
 def _steel_arrays(
     row: Mapping[str, Any], scored: ndarray, rays: Rays, cage: CageTruth, diameter_m: Float64[ndarray, " ids"]
 ) -> dict[str, ndarray]:
+    """Return the arrays of ``SteelTruth`` for one row, by field name.
+
+    ``scored`` holds the flat indices of the scored pixels. Segments and other layers are determined for these
+    only.
+    """
     depth_m, bars = row["left_depth"], row["left_bars"]
-    index = np.flatnonzero(widened(row["left_mask"]) & (depth_m > 0))
+    index = np.flatnonzero(dilate_mask(row["left_mask"]) & (depth_m > 0))
     interior = np.zeros(depth_m.size, dtype=bool)
     interior[scored] = True
     interior = interior[index]
@@ -131,15 +142,15 @@ def _steel_arrays(
     own, z_m = arrays["bar_id"][interior], arrays["depth_m"][interior]
     camera_m = np.column_stack([z_m[:, None] * rays[scored], z_m])
     rotation, translation = row["left_cam_from_world"][:3, :3], row["left_cam_from_world"][:3, 3]
-    arrays["run"][interior] = assign_runs((camera_m - translation) @ rotation, own, cage)
+    arrays["run"][interior] = assign_segments((camera_m - translation) @ rotation, own, cage)
     gap_m = diameter_m[own].astype(np.float32)
     front_m, behind_m = other_layers(depth_m, bars, scored, gap_m)
     arrays["front_m"][interior], arrays["behind_m"][interior] = front_m, behind_m
     return arrays
 
 
-def widened(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Return a mask grown by one pixel in all eight directions."""
+def dilate_mask(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Return a mask dilated by one pixel in all eight directions (3 x 3)."""
     rows = mask.copy()
     rows[1:] |= mask[:-1]
     rows[:-1] |= mask[1:]
@@ -149,10 +160,12 @@ def widened(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     return grown
 
 
-def _lens(note: Mapping[str, Any]) -> str:
-    return repr((note["K"], note["distortion"]))
+def _lens_key(metadata: Mapping[str, Any]) -> str:
+    """Return a key that is equal for views with the same K and distortion."""
+    return repr((metadata["K"], metadata["distortion"]))
 
 
-def _rays(note: Mapping[str, Any], height: int, width: int) -> Rays:
-    rays = pixel_rays(np.array(note["K"]), width, height, np.array(note["distortion"]))
+def _rays(metadata: Mapping[str, Any], height: int, width: int) -> Rays:
+    """Return x/z and y/z of every pixel's ray, row by row, lens distortion undone."""
+    rays = pixel_rays(np.array(metadata["K"]), width, height, np.array(metadata["distortion"]))
     return np.ascontiguousarray(rays[..., :2].reshape(-1, 2))

@@ -1,10 +1,11 @@
-"""How extended measures are named: a view yields samples, a measure is a statistic of them.
+"""Extended measure definitions: a view yields samples, and a measure is a statistic of the pooled samples.
 
-Fewer pixels, evenly, where a measure does not need all of them.
+Also samples of single values, and pixel subsampling for measures that do not need every pixel.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -14,19 +15,20 @@ from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 EXTENDED_PROTOCOL = "rebar-extended-1"
-"""Names the definitions of all extended measures; changing one changes this name."""
+"""Version of the definitions of all extended measures; any change of a definition changes it."""
 
 Samples = Mapping[str, Float64[ndarray, " n"]]
-"""What one view yields: float64 values by name, none where the view has nothing to say. No NaN."""
+"""Samples of one view: float64 values by name, without NaN; empty where the measure does not apply."""
 
 Statistic = Literal["mean", "median", "std", "p95"]
+"""Statistics of pooled samples."""
 
 
 def percentile(values: Float64[ndarray, " n"], percent: int) -> float:
-    """Return the smallest of one or more values with at least that share of them at or below it.
+    """Return the smallest value with at least ``percent`` % of the values at or below it; needs one value or more.
 
-    Of a median where the share is met exactly, the mean of it and the next, as ``Resampling.percentile`` takes it.
-    Infinite values are the largest.
+    For the median (50), if the share is met exactly, it is the mean of that value and the next, as in
+    ``Resampling.percentile``. Infinite values are the largest.
     """
     ordered = np.sort(values)
     lower = float(ordered[-(-len(ordered) * percent // 100) - 1])
@@ -47,12 +49,12 @@ STATISTICS: Mapping[Statistic, Callable[[Float64[ndarray, " n"]], float]] = {
 
 @dataclass(frozen=True)
 class Measure:
-    """A number of a table: ``statistic`` of the samples called ``sample``, pooled over a config's views.
+    """Definition of one table entry: ``statistic`` of the samples named ``sample``, pooled over a config's views.
 
-    ``better`` is "lower" or "higher" only where a missing pixel fails, or a bar that is not found does; else "".
-    ``unit`` is "mm", "cm", "%" (samples are shares 0 to 1 and shown times 100), "m" or "". ``definition`` is one
-    sentence with the formula. ``convert``, where given, makes the number from the statistic: it falls as the
-    statistic grows, and is None where a statistic says no more than that something was missed.
+    ``better`` is "lower" or "higher" only if missing pixels, or bars that were not found, count as failures;
+    otherwise "". ``unit`` is "mm", "cm", "%" (samples are shares from 0 to 1, shown times 100), "m" or "".
+    ``definition`` is one sentence with the formula. ``convert``, if set, maps the statistic to the measure's
+    value. It must be decreasing, and returns None where the statistic only reflects that something was missed.
     """
 
     name: str
@@ -65,11 +67,16 @@ class Measure:
     convert: Callable[[float], float | None] | None = None
 
     def number(self, statistic: float) -> float | None:
-        """Return the measure's number from the statistic of its samples; None where that tells none."""
+        """Return the measure's value from the statistic of its samples; None where it is undefined."""
         return statistic if self.convert is None else self.convert(statistic)
 
 
-def thinned(position: Int64[ndarray, " n"], most: int) -> Int64[ndarray, " m"]:
-    """Return at most ``most`` of the positions, evenly strided: of n, the m at floor(i n / m)."""
-    count = min(len(position), most)
+def finite_sample(value: float | None) -> Float64[ndarray, " one"]:
+    """Return a sample of one value, empty if the value is None or not finite."""
+    return np.array([value] if value is not None and math.isfinite(value) else [], dtype=np.float64)
+
+
+def subsample(position: Int64[ndarray, " n"], max_count: int) -> Int64[ndarray, " m"]:
+    """Return at most ``max_count`` of the positions, evenly strided: of n, the m at floor(i n / m)."""
+    count = min(len(position), max_count)
     return np.asarray(position[np.arange(count) * len(position) // max(count, 1)])

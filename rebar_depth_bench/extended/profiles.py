@@ -1,4 +1,4 @@
-"""Scale and error against distance and against how wide a bar is in the picture."""
+"""Error profiles: scale and AbsRel binned by true distance and by the apparent width of the bar."""
 
 from __future__ import annotations
 
@@ -9,31 +9,35 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, Samples, thinned
+from rebar_depth_bench.extended.measures import Measure, Samples, finite_sample, subsample
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.scoring.metrics import is_prediction, median
+from rebar_depth_bench.scoring.metrics import is_valid_prediction, median
 
 DISTANCE_EDGES_M = (0.2, 0.25, 0.3, 0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0)
+"""Bin edges of true distance (planar depth), metres."""
+
 WIDTH_EDGES_PX = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0)
+"""Bin edges of apparent bar width, pixels."""
+
 
 MAX_PIXELS = 16_000
-"""A view's interior is thinned to this many: bins need no more."""
+"""Interior pixels per view after subsampling; the bins do not need more."""
 
 MIN_PIXELS = 50
-"""A view has a value in a bin from this many predicted pixels on."""
+"""Minimum number of predicted pixels for a view to have a value in a bin."""
 
 
 def profile_samples(
     p_m: Float64[ndarray, " n"], truth: SteelTruth, diameter_m: Float64[ndarray, " ids"]
 ) -> Samples:
-    """Return a view's s and AbsRel in each bin of true distance and of bar width in which it has enough pixels.
+    """Return a view's median scale and AbsRel in each bin of true distance and of bar width with enough pixels.
 
-    ``p_m`` is planar depth on ``truth.index``, metres, NaN for none; ``diameter_m`` is looked up by bar id.
-    Interior pixels with a prediction count; a bin holds its lower edge. s of a bin is median(z / p) over its
-    pixels. A bar's width is fx d / z, pixels.
+    ``p_m`` is planar depth on ``truth.index``, metres, NaN where missing; ``diameter_m`` is indexed by bar id.
+    Only interior pixels with a prediction count. A bin includes its lower edge. The scale s of a bin is median(z
+    / p) over its pixels. The width of a bar is fx d / z, pixels.
     """
-    kept = thinned(np.flatnonzero(truth.interior), MAX_PIXELS)
-    pixels = kept[is_prediction(p_m[kept])]
+    sampled = subsample(np.flatnonzero(truth.interior), MAX_PIXELS)
+    pixels = sampled[is_valid_prediction(p_m[sampled])]
     z, p = truth.depth_m[pixels].astype(np.float64), p_m[pixels]
     with np.errstate(over="ignore"):
         ratio, error = z / p, np.abs(p - z) / z
@@ -47,27 +51,25 @@ def profile_samples(
                 continue
             inside = (values >= low) & (values < high)
             enough = np.count_nonzero(inside) >= MIN_PIXELS
-            samples[f"scale_at_{name}"] = _known([median(ratio[inside])] if enough else [])
-            samples[f"abs_rel_at_{name}"] = _known([float(np.mean(error[inside]))] if enough else [])
+            samples[f"scale_at_{name}"] = finite_sample(median(ratio[inside]) if enough else None)
+            samples[f"abs_rel_at_{name}"] = finite_sample(float(np.mean(error[inside])) if enough else None)
     return samples
 
 
-def _known(values: list[float]) -> Float64[ndarray, " one"]:
-    return np.array([value for value in values if np.isfinite(value)], dtype=np.float64)
-
-
 def bin_names(axis: str, edges: tuple[float, ...]) -> list[str]:
-    """Return what each bin between ``edges`` is called: ``scale_at_`` and ``abs_rel_at_`` go before it."""
+    """Return the name of each bin between ``edges``, the suffix of ``scale_at_`` and ``abs_rel_at_``."""
     return [f"{low:g}-{high:g}{axis}" for low, high in pairwise(edges)]
 
 
 AXES = {"m": DISTANCE_EDGES_M, "px": WIDTH_EDGES_PX}
-"""The edges of the bins of true distance and of bar width, by unit."""
+"""Bin edges of true distance and of bar width, by unit."""
 
 _WHERE = {"m": "at", "px": "on bars of"}
+"""Preposition of each axis in titles and definitions."""
 
 
 def _measures() -> Iterator[Measure]:
+    """Yield the scale and AbsRel measures of every bin."""
     for axis, edges in AXES.items():
         for name in bin_names(axis, edges):
             where = f"{_WHERE[axis]} {name.removesuffix(axis)} {axis}"
@@ -79,3 +81,4 @@ def _measures() -> Iterator[Measure]:
 
 
 MEASURES: tuple[Measure, ...] = tuple(_measures())
+"""Profile measures in table order."""

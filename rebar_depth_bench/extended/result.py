@@ -1,4 +1,4 @@
-"""What the extended measures say: per view, per config with intervals, and as a part of the result's JSON."""
+"""Extended results: measures per view, tables per config with confidence intervals, and their JSON form."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample
-from rebar_depth_bench.scoring.rounding import INTERVAL_DIGITS, rounded
+from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """A number of a table, its 95 % block bootstrap interval, and how many samples it stands on; None of none.
+class MeasureEstimate:
+    """Value of a measure, its 95 % block bootstrap interval, and the number of pooled samples.
 
-    A value that is None although there are samples is one that ``Measure.convert`` does not tell.
+    ``value`` and ``interval`` are None without samples. ``value`` is also None where ``Measure.convert`` returns
+    None for the statistic.
     """
 
     value: float | None
@@ -30,7 +31,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class ExtendedView:
-    """One view's samples by alignment and name, as tables are made of them."""
+    """Samples of one view by alignment and sample name, the input of the tables."""
 
     view_id: str
     samples: Mapping[str, Samples]
@@ -38,7 +39,7 @@ class ExtendedView:
 
 @dataclass(frozen=True)
 class ViewNumbers:
-    """One view's numbers by alignment and measure: what is kept of a view once its config has a table."""
+    """Measures of one view by alignment and name, kept after the table of its config is computed."""
 
     view_id: str
     numbers: Mapping[str, Mapping[str, float | None]]
@@ -46,15 +47,15 @@ class ViewNumbers:
 
 @dataclass(frozen=True)
 class ExtendedTable:
-    """One config's numbers by alignment and measure."""
+    """Estimates of one config by alignment and measure name."""
 
     views: int
-    numbers: Mapping[str, Mapping[str, Estimate]]
+    numbers: Mapping[str, Mapping[str, MeasureEstimate]]
 
 
 @dataclass(frozen=True, eq=False)
 class ExtendedResult:
-    """Everything the extended measures say of an archive; ``measures`` holds those of each alignment, in order."""
+    """Extended measures of a submission; ``measures`` holds the definitions of each alignment, in order."""
 
     measures: Mapping[str, Sequence[Measure]]
     tables: Mapping[str, ExtendedTable]
@@ -70,16 +71,16 @@ class ExtendedResult:
 
 
 def view_numbers(view: ExtendedView, measures: Mapping[str, Sequence[Measure]]) -> ViewNumbers:
-    """Return the measures of one view by itself, None where it has no sample."""
+    """Return all measures of a single view, None where it has no sample."""
     numbers = {
-        alignment: {one.name: view_value(view, alignment, one) for one in of_alignment}
-        for alignment, of_alignment in measures.items()
+        alignment: {measure.name: view_value(view, alignment, measure) for measure in alignment_measures}
+        for alignment, alignment_measures in measures.items()
     }
     return ViewNumbers(view.view_id, numbers)
 
 
 def view_value(view: ExtendedView, alignment: str, measure: Measure) -> float | None:
-    """Return a measure of one view by itself, None where it has no sample."""
+    """Return one measure of a single view, None where it has no sample."""
     samples = view.samples[alignment][measure.sample]
     return measure.number(STATISTICS[measure.statistic](samples)) if len(samples) else None
 
@@ -87,31 +88,38 @@ def view_value(view: ExtendedView, alignment: str, measure: Measure) -> float | 
 def tabulate_extended(
     views: Sequence[ExtendedView], indices: Sequence[int], measures: Mapping[str, Sequence[Measure]]
 ) -> ExtendedTable:
-    """Return a config's table; ``indices`` are the views' in the full protocol, ascending."""
+    """Return a config's table.
+
+    ``indices`` are the positions of the views in the full protocol, ascending.
+    """
     resampling = resample(indices)
     numbers = {
-        alignment: _estimates(of_alignment, [view.samples[alignment] for view in views], resampling)
-        for alignment, of_alignment in measures.items()
+        alignment: _estimates(alignment_measures, [view.samples[alignment] for view in views], resampling)
+        for alignment, alignment_measures in measures.items()
     }
     return ExtendedTable(len(views), numbers)
 
 
 def _estimates(
     measures: Sequence[Measure], by_view: Sequence[Samples], resampling: Resampling
-) -> dict[str, Estimate]:
-    """Return each measure's estimate by name; measures of the same statistic of the same samples share it."""
-    statistics: dict[tuple[str, Statistic], Estimate] = {}
-    for one in measures:
-        key = (one.sample, one.statistic)
+) -> dict[str, MeasureEstimate]:
+    """Return each measure's estimate by name; measures of the same samples and statistic share it."""
+    statistics: dict[tuple[str, Statistic], MeasureEstimate] = {}
+    for measure in measures:
+        key = (measure.sample, measure.statistic)
         if key not in statistics:
-            statistics[key] = estimate(one, [samples[one.sample] for samples in by_view], resampling)
-    return {one.name: converted(one, statistics[one.sample, one.statistic]) for one in measures}
+            statistics[key] = estimate(measure, [samples[measure.sample] for samples in by_view], resampling)
+    return {
+        measure.name: convert_estimate(measure, statistics[measure.sample, measure.statistic])
+        for measure in measures
+    }
 
 
-def converted(measure: Measure, statistic: Estimate) -> Estimate:
-    """Return a measure's estimate from that of its statistic: value and interval's ends through ``convert``.
+def convert_estimate(measure: Measure, statistic: MeasureEstimate) -> MeasureEstimate:
+    """Return a measure's estimate from that of its statistic, with ``convert`` applied to value and interval.
 
-    The ends change places, as ``convert`` falls. An end that tells no number is 0; an infinite one leaves none.
+    ``convert`` is decreasing, so the interval's ends are swapped. An end for which ``convert`` returns None
+    becomes 0; if the upper end is infinite there is no interval.
     """
     if measure.convert is None or statistic.value is None:
         return statistic
@@ -120,47 +128,56 @@ def converted(measure: Measure, statistic: Estimate) -> Estimate:
     if value is not None and statistic.interval is not None:
         low, high = (measure.convert(end) or 0.0 for end in reversed(statistic.interval))
         ends = (low, high) if math.isfinite(high) else None
-    return Estimate(value, ends, statistic.samples)
+    return MeasureEstimate(value, ends, statistic.samples)
 
 
-def estimate(measure: Measure, by_view: Sequence[Float64[ndarray, " m"]], resampling: Resampling) -> Estimate:
-    """Return a measure's statistic of the samples of all views, pooled, with its interval."""
+def estimate(
+    measure: Measure, by_view: Sequence[Float64[ndarray, " m"]], resampling: Resampling
+) -> MeasureEstimate:
+    """Return a measure's statistic of the samples of all views, pooled, with its bootstrap interval."""
     samples = np.concatenate([np.empty(0), *by_view])
     if not len(samples):
-        return Estimate(None, None, 0)
-    view = np.repeat(np.arange(len(by_view)), [len(one) for one in by_view])
+        return MeasureEstimate(None, None, 0)
+    view = np.repeat(np.arange(len(by_view)), [len(view_samples) for view_samples in by_view])
     draws = _draws(measure, samples, view, resampling)
-    return Estimate(STATISTICS[measure.statistic](samples), interval(draws), len(samples))
+    return MeasureEstimate(STATISTICS[measure.statistic](samples), interval(draws), len(samples))
 
 
 def _draws(
     measure: Measure, samples: Float64[ndarray, " m"], view: Int64[ndarray, " m"], resampling: Resampling
 ) -> Float64[ndarray, " draws"]:
+    """Return the statistic in each bootstrap resample."""
     if measure.statistic == "mean":
         return resampling.pooled_means(samples, view)
     if measure.statistic == "std":
-        from_mean = samples - samples.mean()
-        means, squares = (resampling.pooled_means(from_mean**power, view) for power in (1, 2))
+        deviation = samples - samples.mean()
+        means, squares = (resampling.pooled_means(deviation**power, view) for power in (1, 2))
         return np.asarray(np.sqrt(np.maximum(squares - means**2, 0.0)))
     return resampling.percentile(samples, view, {"median": 50, "p95": 95}[measure.statistic])
 
 
 def _view_dict(view: ViewNumbers) -> dict[str, Any]:
+    """Return the JSON object of a view's numbers, rounded."""
     numbers = {
-        alignment: {name: rounded(value) for name, value in of_alignment.items()}
-        for alignment, of_alignment in view.numbers.items()
+        alignment: {name: rounded(value) for name, value in alignment_numbers.items()}
+        for alignment, alignment_numbers in view.numbers.items()
     }
     return {"view_id": view.view_id, **numbers}
 
 
 def _table_dict(table: ExtendedTable) -> dict[str, Any]:
+    """Return the JSON object of a config's table."""
     numbers = {
-        alignment: {name: _estimate_dict(one) for name, one in of_alignment.items()}
-        for alignment, of_alignment in table.numbers.items()
+        alignment: {name: _estimate_dict(entry) for name, entry in alignment_estimates.items()}
+        for alignment, alignment_estimates in table.numbers.items()
     }
     return {"views": table.views, **numbers}
 
 
-def _estimate_dict(one: Estimate) -> dict[str, Any]:
-    ends = None if one.interval is None else [rounded(end, INTERVAL_DIGITS) for end in one.interval]
-    return {"value": rounded(one.value), "ci95": ends, "samples": one.samples}
+def _estimate_dict(entry: MeasureEstimate) -> dict[str, Any]:
+    """Return the JSON object of an estimate, rounded."""
+    return {
+        "value": rounded(entry.value),
+        "ci95": rounded_interval(entry.interval),
+        "samples": entry.samples,
+    }

@@ -1,4 +1,4 @@
-"""The ground truth that extended measures need of one view: the steel, a band round it, and its camera."""
+"""Per-view ground truth of the extended measures: steel pixels, a one-pixel band around them, and the camera."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy import ndarray
 
 @dataclass(frozen=True, eq=False)
 class SteelTruth:
-    """One view's pixels on steel and within one pixel (3 x 3) of it, wherever true depth is > 0.
+    """Ground truth of one view at the pixels on steel or within one pixel (3 x 3) of it that have true depth > 0.
 
-    ``index`` holds flat indices into the height x width grid, ascending; the other arrays go with it.
-    ``bar_id`` is 0 beside the steel; ``interior`` marks the pixels that ``rebar-1`` scores.
-    ``rays`` are x/z and y/z of each pixel's ray in the camera's frame (lens distortion undone), so that
-    ``x_cam = depth_m * (rays[:, 0], rays[:, 1], 1)``.
-    ``run`` is the bar's straight run that the true point lies nearest to (an index into ``CageTruth.runs``),
-    -1 where it is on none; ``front_m`` and ``behind_m`` are the depths of the nearest other layer in front of
-    and behind the pixel, NaN where none is in sight: see ``layers``.
+    ``index`` holds flat indices into the height x width grid, ascending; the other arrays are parallel to it.
+    ``depth_m`` is planar depth, metres. ``bar_id`` is 0 beside the steel; ``interior`` marks the scored pixels of
+    the protocol. ``rays`` are x/z and y/z of each pixel's ray in the camera frame (lens distortion undone), so
+    that ``x_cam = depth_m * (rays[:, 0], rays[:, 1], 1)``. ``run`` is the straight bar segment whose axis is
+    nearest to the true point (an index into ``CageTruth.segments``), -1 where the point is on no segment.
+    ``front_m`` and ``behind_m`` are the depths of the closest other layer in front of and behind the pixel, NaN
+    where none is visible: see ``depth_layers.other_layers``.
     """
 
     view_id: str

@@ -1,6 +1,7 @@
-"""The A3 sheet under an assembly: its markers' size, dictionary and places. World frame, metres.
+"""ArUco board: an A3 sheet under an assembly, with its marker size, dictionary and layout.
 
-Sheet coordinates are world x and y (origin in the middle, the sheet seen from above with x to the right and y up).
+The sheet lies in the plane z = 0 of the world frame, centred on the origin, long side along x; seen from above, x
+points right and y up. Lengths are metres.
 """
 
 from __future__ import annotations
@@ -12,15 +13,18 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 MARKER_MODULES = 6
-"""Modules across a marker of a 4 x 4 dictionary, its black frame included."""
+"""Modules across a marker of a 4 x 4 dictionary, including its black border."""
 
 MARGIN_MODULES = 1.5
-"""White between a marker and the sheet's edge: the quiet zone, and half a module for the printed line."""
+"""White margin between a marker and the sheet's edge, modules: 1 of quiet zone and 0.5 for the printed line."""
 
 
 @dataclass(frozen=True)
 class BoardSpec:
-    """An A3 sheet, long side along world x, centred on the origin, with ArUco markers round the assembly."""
+    """A3 sheet with ArUco markers around the assembly; long side along world x, centred on the origin.
+
+    ``markers`` is the number of markers, 6 or 12; ``dictionary`` is the name of an OpenCV ArUco dictionary.
+    """
 
     width_m: float = 0.420
     height_m: float = 0.297
@@ -30,12 +34,12 @@ class BoardSpec:
 
 
 def marker_corners_m(spec: BoardSpec) -> dict[int, Float64[ndarray, "4 3"]]:
-    """Return each marker's world corners, metres, in OpenCV's order as printed.
+    """Return the corners of each marker in the world frame, metres, keyed by marker id.
 
-    The order is top left, top right, bottom right, bottom left, for a reader who faces +y. Ids count
-    from 0 along the sheet's rows, from the top left marker on.
+    Corners are in OpenCV's order: top left, top right, bottom right, bottom left, as seen from above with +y up.
+    Ids count from 0 row by row, starting at the top left marker.
 
-    Raises ``ValueError`` for a board that is neither of 6 nor of 12 markers, or whose markers stand too close.
+    Raises ``ValueError`` if the board has neither 6 nor 12 markers or the markers are too close to each other.
     """
     half = spec.marker_side_m / 2
     square = np.array([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]])
@@ -46,18 +50,18 @@ def marker_corners_m(spec: BoardSpec) -> dict[int, Float64[ndarray, "4 3"]]:
 
 
 def _marker_centres_m(spec: BoardSpec) -> list[tuple[float, float]]:
-    """Return the markers' middles, row by row from the top, as far from the assembly as the sheet allows.
+    """Return the marker centres, row by row from the top, as far from the assembly as the sheet allows.
 
-    Six stand in two columns at the short sides, beyond the assembly's shadow; twelve also fill the long
-    sides. Whole millimetres keep marker edges on the pixel edges of a texture.
+    Six markers form two columns at the short sides, outside the assembly's shadow; twelve also fill the long
+    sides. Centres are rounded to whole millimetres, which keeps marker edges on the pixel edges of a texture.
     """
     inset_m = spec.marker_side_m * (0.5 + MARGIN_MODULES / MARKER_MODULES)
-    x_m = _whole_millimetres(spec.width_m / 2 - inset_m)
-    y_m = _whole_millimetres(spec.height_m / 2 - inset_m)
+    x_m = _floor_to_millimetre(spec.width_m / 2 - inset_m)
+    y_m = _floor_to_millimetre(spec.height_m / 2 - inset_m)
     if spec.markers == 6:
         edge_row = [-x_m, x_m]
     elif spec.markers == 12:
-        inner_m = _whole_millimetres(x_m / 2)
+        inner_m = _floor_to_millimetre(x_m / 2)
         edge_row = [-x_m, -inner_m, 0.0, inner_m, x_m]
     else:
         raise ValueError(f"a board has 6 or 12 markers, not {spec.markers}")
@@ -69,15 +73,15 @@ def _marker_centres_m(spec: BoardSpec) -> list[tuple[float, float]]:
 
 def _check_quiet_zones(centres: list[tuple[float, float]], spec: BoardSpec) -> None:
     points = np.array(centres)
-    apart = np.abs(points[:, None] - points[None]).max(axis=-1)
-    nearest_m = apart[~np.eye(len(points), dtype=bool)].min()
-    needed_m = spec.marker_side_m * (1 + 1 / MARKER_MODULES)
-    if nearest_m < needed_m:
+    distance = np.abs(points[:, None] - points[None]).max(axis=-1)
+    smallest_m = distance[~np.eye(len(points), dtype=bool)].min()
+    min_distance_m = spec.marker_side_m * (1 + 1 / MARKER_MODULES)
+    if smallest_m < min_distance_m:
         raise ValueError(
             f"{spec.markers} markers of {spec.marker_side_m} m leave each other no quiet zone on a sheet of"
-            f" {spec.width_m} x {spec.height_m} m: {nearest_m:.4f} m apart, {needed_m:.4f} m needed"
+            f" {spec.width_m} x {spec.height_m} m: {smallest_m:.4f} m apart, {min_distance_m:.4f} m needed"
         )
 
 
-def _whole_millimetres(length_m: float) -> float:
+def _floor_to_millimetre(length_m: float) -> float:
     return float(np.floor(length_m * 1000 + 1e-9) / 1000)

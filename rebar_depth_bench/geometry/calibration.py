@@ -1,7 +1,4 @@
-"""Factory calibration of a stereo camera: two lenses with distortion and the rigid motion between them.
-
-Read from a Stereolabs ``.conf`` file or from TOML; scaled to another grid of the same sensor.
-"""
+"""Stereo calibration files: Stereolabs ``.conf`` or TOML, scaled to the requested image size."""
 
 from __future__ import annotations
 
@@ -10,33 +7,30 @@ from pathlib import Path
 
 from rebar_depth_bench.errors import CalibrationError
 from rebar_depth_bench.geometry.calibration_formats import parse_conf, parse_toml
-from rebar_depth_bench.geometry.stereo_calibration import (
-    StereoCalibration,
-    check_invertible,
-    scaled,
-)
+from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration, check_invertible, scale_calibration
 
 MAX_FILE_BYTES = 1_000_000
-"""A calibration has a few kilobytes; what is larger is something else."""
+"""Size limit of a calibration file, bytes; real ones have a few kilobytes."""
 
 Parser = Callable[[str, int, int, list[str]], StereoCalibration | None]
 PARSERS: Mapping[str, Parser] = {".conf": parse_conf, ".toml": parse_toml}
 
 
 def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibration:
-    """Read a stereo calibration for a ``width`` x ``height`` grid, from ``.conf`` or ``.toml``.
+    """Read a stereo calibration from a ``.conf`` or ``.toml`` file, for images of ``width`` x ``height`` pixels.
 
     ``.conf`` is Stereolabs' INI file: sections ``LEFT_CAM_2K``, ``_FHD``, ``_HD``, ``_VGA`` (and ``RIGHT_CAM_``)
     with fx fy cx cy k1 k2 and, if given, p1 p2 k3; ``STEREO`` with Baseline, TY, TZ (millimetres; 0 where TY or
-    TZ is missing) and RX, CV, RZ (radians), each with the section's suffix or without. Read are the asked grid's
-    own sections, or else those nearest in shape and then in width, ``scaled`` as if both saw the same sensor area.
-    The motion is ``x_right = R x_left + T`` with R = Rodrigues(RX, CV, RZ) and T = -(Baseline, TY, TZ): the whole
-    vector is negated, which keeps it on the line that the vendor's rectification uses.
+    TZ is missing) and RX, CV, RZ (radians), each with or without the section's suffix. If the file has no sections
+    for the requested size, those nearest in aspect ratio and then in width are read and passed to
+    ``scale_calibration``, which assumes that both sizes cover the same sensor area. The motion is
+    ``x_right = R x_left + T`` with R = Rodrigues(RX, CV, RZ) and T = -(Baseline, TY, TZ): the whole vector is
+    negated, which keeps it on the line that the vendor's rectification uses.
 
-    TOML, where ``K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` may stand for the four numbers, ``rotation`` may be
-    3 x 3, and ``baseline_m = 0.12`` may stand for ``translation_m = [-0.12, 0, 0]``::
+    In TOML, ``K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` may replace the four numbers, ``rotation`` may be a
+    3 x 3 matrix, and ``baseline_m = 0.12`` may replace ``translation_m = [-0.12, 0, 0]``::
 
-        width = 1280    # the grid the lenses belong to; the asked one where it is missing
+        width = 1280    # image size of the calibration; default: the requested size
         height = 720
 
         [left]
@@ -54,22 +48,22 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
         rotation = [-9.17e-4, 6.24e-3, 7.70e-4]    # Rodrigues vector, radians
         translation_m = [-0.119978, 0.0, 0.0]
 
-    Raises ``CalibrationError`` with every problem found, each naming section and key, what stands there and what
-    was expected; also for a lens model that cannot be inverted all over the picture.
+    Raises ``CalibrationError`` with every problem, each naming section, key, value and expected value; also if a
+    distortion model cannot be inverted over the whole image.
     """
     path = Path(path)
     if path.suffix.lower() not in PARSERS:
         raise CalibrationError(str(path), [f"its name ends on {path.suffix!r}, expected {' or '.join(PARSERS)}"])
     problems: list[str] = []
-    read = PARSERS[path.suffix.lower()](_text(path), width, height, problems)
-    if read is not None and not problems:
-        _check_rig(read, problems)
-    if read is None or problems:
+    calibration = PARSERS[path.suffix.lower()](_read_text(path), width, height, problems)
+    if calibration is not None and not problems:
+        _check_rig(calibration, problems)
+    if calibration is None or problems:
         raise CalibrationError(str(path), problems)
-    return scaled(read, width, height)
+    return scale_calibration(calibration, width, height)
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     try:
         with path.open("rb") as file:
             content = file.read(MAX_FILE_BYTES + 1)

@@ -1,9 +1,8 @@
-"""The rectified pair of a calibrated stereo camera, as OpenCV computes it. Scoring never comes here.
+"""Stereo rectification with OpenCV, and transfer of depth from the rectified to the raw left image.
 
-A pair on the raw grid for methods that want it rectified, and their depth brought back to the raw left grid.
-
-Nothing is invented on the way back: each raw pixel takes the one rectified pixel its ray falls on, and depth
-along the rectified axis becomes depth along the raw one by that ray.
+Methods that need a rectified pair use it on raw (distorted) images; scoring does not. Depth is transferred without
+interpolation: each raw pixel takes the value of the rectified pixel nearest to its ray, and depth along the
+rectified optical axis is converted to depth along the raw optical axis with that ray.
 """
 
 from __future__ import annotations
@@ -29,10 +28,10 @@ from rebar_depth_bench.geometry.stereo_calibration import (
 
 @dataclass(frozen=True, eq=False)
 class Rectification:
-    """Two parallel pinholes that stand where the eyes stand.
+    """Rectified stereo pair: two parallel pinhole cameras at the centres of the original cameras.
 
-    ``K`` (pixels) is both eyes'; ``R_left`` and ``R_right`` turn an eye's own axes into the rectified ones,
-    ``x_rectified = R x_eye``; the right eye then stands ``baseline_m`` along the rectified x axis.
+    ``K`` (pixels) applies to both; ``R_left`` and ``R_right`` rotate camera axes into rectified axes,
+    ``x_rectified = R x_cam``. The right camera is ``baseline_m`` along the rectified x axis.
     """
 
     K: Float64[ndarray, "3 3"]
@@ -42,10 +41,10 @@ class Rectification:
 
 
 def rectify(calibration: StereoCalibration) -> Rectification:
-    """Return the rectification on the calibration's own grid.
+    """Return the rectification for the image size of the calibration.
 
-    ``cv2.stereoRectify`` with zero disparity at infinity and ``alpha=0``, which leaves no pixel outside the raw
-    pictures: what Stereolabs' open capture code calls. (Bouguet's method: each eye turns by half.)
+    Calls ``cv2.stereoRectify`` with zero disparity at infinity and ``alpha=0``, which leaves no pixel outside the
+    raw images, as Stereolabs' open capture code does. (Bouguet's method: each camera is rotated by half.)
     """
     motion = right_from_left(calibration)
     return rectify_pair(
@@ -66,7 +65,10 @@ def rectify_pair(
     height: int,
     baseline_m: float,
 ) -> Rectification:
-    """Return the rectification of two eyes (left, right) given as a dataset row gives them, metres and pixels."""
+    """Return the rectification of a pair of cameras (left, right), as ``rectify`` does.
+
+    ``K`` and ``distortion`` are those of a dataset row; lengths are metres.
+    """
     R_left, R_right, P_left, *_ = cv2.stereoRectify(
         K[0],
         distortion[0],
@@ -82,15 +84,17 @@ def rectify_pair(
 
 
 PARALLEL_TOLERANCE = 1e-9
+"""Largest deviation of an entry of ``right_from_left`` from that of a rectified pair."""
 
 
 @dataclass(frozen=True, eq=False)
 class RectifiedPair:
-    """A rectified pair, and the way back to the raw left grid.
+    """Rectified image pair, with the mapping back to the raw left image.
 
-    Both pictures have the pinhole ``K`` (pixels) and lie on one canvas, wide enough for every raw pixel of both
-    eyes. ``seen_by_right`` tells which pixels of the canvas the raw right picture shows. ``pixel`` is the canvas
-    pixel (column, row) that each raw left pixel's ray falls on, ``depth_ratio`` raw depth over rectified depth.
+    Both images have the pinhole matrix ``K`` (pixels) and the same canvas, large enough for every raw pixel of
+    both cameras. ``seen_by_right`` marks the canvas pixels that the raw right image covers. ``pixel`` is the
+    canvas pixel (column, row) nearest to the ray of each raw left pixel, ``depth_ratio`` the raw depth divided by
+    the rectified depth.
     """
 
     left_rgb: UInt8[ndarray, "hc wc 3"]
@@ -103,17 +107,17 @@ class RectifiedPair:
 
 
 def is_rectified(row: Mapping[str, Any]) -> bool:
-    """Tell whether a row's eyes are parallel pinholes, the right one on the left one's x axis."""
+    """Return whether a row's cameras are undistorted, parallel, and offset along the left one's x axis."""
     parallel = np.eye(4)
     parallel[0, 3] = -row["baseline_m"]
-    straight = not (row["left_distortion"].any() or row["right_distortion"].any())
-    return straight and bool(np.abs(_right_from_left(row) - parallel).max() <= PARALLEL_TOLERANCE)
+    is_undistorted = not (row["left_distortion"].any() or row["right_distortion"].any())
+    return is_undistorted and bool(np.abs(_right_from_left(row) - parallel).max() <= PARALLEL_TOLERANCE)
 
 
 def rectified_pair(row: Mapping[str, Any]) -> RectifiedPair:
-    """Rectify a dataset row's pair with its own K, distortion and poses (``rectification.rectify_pair``).
+    """Rectify the image pair of a dataset row with its K, distortion and poses (``rectify_pair``).
 
-    Raises ``ValueError`` in words for a lens model that cannot be inverted.
+    Raises ``ValueError`` if a distortion model cannot be inverted.
     """
     height, width, _ = row["left_rgb"].shape
     Ks, distortions = (row["left_K"], row["right_K"]), (row["left_distortion"], row["right_distortion"])
@@ -122,14 +126,14 @@ def rectified_pair(row: Mapping[str, Any]) -> RectifiedPair:
         pixel_rays(K, width, height, distortion) @ rotation.T
         for K, distortion, rotation in zip(Ks, distortions, _rotations(rectified), strict=True)
     ]
-    K, size = canvas(rectified.K, [project(rectified.K, eye) for eye in rays])
+    K, size = enclosing_canvas(rectified.K, [project(rectified.K, eye) for eye in rays])
     left, right = (
         cv2.initUndistortRectifyMap(*eye, K, size, cv2.CV_32FC1)
         for eye in zip(Ks, distortions, _rotations(rectified), strict=True)
     )
     return RectifiedPair(
-        left_rgb=resampled(row["left_rgb"], left),
-        right_rgb=resampled(row["right_rgb"], right),
+        left_rgb=resample(row["left_rgb"], left),
+        right_rgb=resample(row["right_rgb"], right),
         K=K,
         baseline_m=rectified.baseline_m,
         seen_by_right=(np.abs(right[0] - (width - 1) / 2) <= width / 2)
@@ -140,13 +144,13 @@ def rectified_pair(row: Mapping[str, Any]) -> RectifiedPair:
 
 
 def raw_depth_m(pair: RectifiedPair, rectified_depth_m: Float32[ndarray, "hc wc"]) -> Float32[ndarray, "h w"]:
-    """Return the raw left grid's planar depth from the rectified left picture's; NaN stays NaN."""
+    """Convert planar depth of the rectified left image to that of the raw left image; NaN is preserved."""
     column, row = np.moveaxis(pair.pixel, -1, 0)
     return np.asarray(rectified_depth_m[row, column] * pair.depth_ratio, dtype=np.float32)
 
 
 def matched_in_right(pair: RectifiedPair, disparity_px: Float32[ndarray, "hc wc"]) -> Bool[ndarray, "hc wc"]:
-    """Tell which pixels of the rectified left picture have their match inside the raw right picture."""
+    """Return a mask of the rectified left pixels whose match lies inside the raw right image."""
     rows, columns = np.indices(disparity_px.shape)
     match = np.rint(columns - np.nan_to_num(disparity_px)).astype(np.int64)
     on_canvas = (match >= 0) & (match < disparity_px.shape[1])
@@ -161,19 +165,19 @@ def _rotations(rectified: Rectification) -> tuple[Float64[ndarray, "3 3"], Float
     return rectified.R_left, rectified.R_right
 
 
-def canvas(
-    K: Float64[ndarray, "3 3"], places_px: list[Float64[ndarray, "h w 2"]]
+def enclosing_canvas(
+    K: Float64[ndarray, "3 3"], points_px: list[Float64[ndarray, "h w 2"]]
 ) -> tuple[Float64[ndarray, "3 3"], tuple[int, int]]:
-    """Return K moved by whole pixels, and the width and height, so that all places lie on the canvas."""
-    low = np.floor(np.min([eye.min(axis=(0, 1)) for eye in places_px], axis=0)).astype(int)
-    high = np.ceil(np.max([eye.max(axis=(0, 1)) for eye in places_px], axis=0)).astype(int)
-    moved = K.copy()
-    moved[:2, 2] -= low
+    """Return K shifted by whole pixels and the (width, height) of the smallest canvas that holds all points."""
+    low = np.floor(np.min([eye.min(axis=(0, 1)) for eye in points_px], axis=0)).astype(int)
+    high = np.ceil(np.max([eye.max(axis=(0, 1)) for eye in points_px], axis=0)).astype(int)
+    shifted_K = K.copy()
+    shifted_K[:2, 2] -= low
     width, height = (high - low + 1).tolist()
-    return moved, (width, height)
+    return shifted_K, (width, height)
 
 
-def resampled(rgb: UInt8[ndarray, "h w 3"], maps: Any) -> UInt8[ndarray, "hc wc 3"]:
-    """Return a picture on another grid, bicubic, by OpenCV's two maps."""
+def resample(rgb: UInt8[ndarray, "h w 3"], maps: Any) -> UInt8[ndarray, "hc wc 3"]:
+    """Resample an image with OpenCV's two coordinate maps; bicubic, border pixels replicated."""
     map_x, map_y = maps
     return np.asarray(cv2.remap(rgb, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))

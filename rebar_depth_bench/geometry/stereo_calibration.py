@@ -1,4 +1,4 @@
-"""Two calibrated lenses and the rigid motion between them, as plain values; scaled to another grid."""
+"""Stereo calibration: intrinsics and distortion of two cameras, and the rigid motion between them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rebar_depth_bench.geometry.cameras import rigid, rotation_matrix, undistort
 
 @dataclass(frozen=True)
 class Lens:
-    """One eye's pinhole and its distortion, pixels; ``distortion`` is k1 k2 p1 p2 k3 (OpenCV's order)."""
+    """Intrinsics of one camera: pinhole parameters, pixels, and distortion k1 k2 p1 p2 k3 (OpenCV's order)."""
 
     fx: float
     fy: float
@@ -24,10 +24,10 @@ class Lens:
 
 @dataclass(frozen=True)
 class StereoCalibration:
-    """A calibrated pair: ``x_right = R(rotation_rad) @ x_left + translation_m`` in OpenCV axes.
+    """Calibrated stereo pair, with ``x_right = R(rotation_rad) @ x_left + translation_m`` in OpenCV axes.
 
-    ``rotation_rad`` is a Rodrigues vector; ``translation_m`` is about (-baseline, 0, 0). The lenses are those
-    of the ``width`` x ``height`` grid.
+    ``rotation_rad`` is a Rodrigues vector; ``translation_m`` is about (-baseline, 0, 0). The intrinsics apply to
+    images of ``width`` x ``height`` pixels.
     """
 
     width: int
@@ -39,12 +39,12 @@ class StereoCalibration:
 
 
 def lens_K(lens: Lens) -> Float64[ndarray, "3 3"]:
-    """Return a lens's pinhole matrix, pixels."""
+    """Return the pinhole matrix of a camera, pixels."""
     return np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
 
 
 def lens_distortion(lens: Lens) -> Float64[ndarray, 5]:
-    """Return k1 k2 p1 p2 k3."""
+    """Return the distortion coefficients k1 k2 p1 p2 k3."""
     return np.array(lens.distortion, dtype=np.float64)
 
 
@@ -54,33 +54,38 @@ def right_from_left(calibration: StereoCalibration) -> Float64[ndarray, "4 4"]:
 
 
 def calibrated_baseline_m(calibration: StereoCalibration) -> float:
-    """Return the metres between the two camera centres."""
+    """Return the distance between the camera centres, metres."""
     return float(np.linalg.norm(calibration.translation_m))
 
 
-def scaled(calibration: StereoCalibration, width: int, height: int) -> StereoCalibration:
-    """Return the calibration of another grid that covers the very same sensor area.
+def scale_calibration(calibration: StereoCalibration, width: int, height: int) -> StereoCalibration:
+    """Return the calibration for another image size that covers the same sensor area.
 
-    Pixel centres stand at integers, so a side that shrinks from W to W' has cx' = (cx + 0.5) W'/W - 0.5. The
-    distortion belongs to the plane z = 1 and stays.
+    Pixel centres are at integers, so scaling a side from W to W' gives cx' = (cx + 0.5) W'/W - 0.5. The distortion
+    coefficients refer to the plane z = 1 and do not change.
     """
-    by_x, by_y = width / calibration.width, height / calibration.height
-    if (by_x, by_y) == (1.0, 1.0):
+    scale_x, scale_y = width / calibration.width, height / calibration.height
+    if (scale_x, scale_y) == (1.0, 1.0):
         return calibration
 
-    def lens(eye: Lens) -> Lens:
-        cx, cy = (eye.cx + 0.5) * by_x - 0.5, (eye.cy + 0.5) * by_y - 0.5
-        return replace(eye, fx=eye.fx * by_x, fy=eye.fy * by_y, cx=cx, cy=cy)
+    def scale_lens(lens: Lens) -> Lens:
+        cx, cy = (lens.cx + 0.5) * scale_x - 0.5, (lens.cy + 0.5) * scale_y - 0.5
+        return replace(lens, fx=lens.fx * scale_x, fy=lens.fy * scale_y, cx=cx, cy=cy)
 
     return replace(
-        calibration, width=width, height=height, left=lens(calibration.left), right=lens(calibration.right)
+        calibration,
+        width=width,
+        height=height,
+        left=scale_lens(calibration.left),
+        right=scale_lens(calibration.right),
     )
 
 
 def check_invertible(lens: Lens, width: int, height: int) -> None:
-    """Raise ``ValueError`` in words where no ray reaches some pixel on the rim of a grid.
+    """Check that the distortion can be inverted at all pixels on the rim of a ``width`` x ``height`` image.
 
-    The rim lies farthest out, and the model folds at a radius: an invertible rim means an invertible picture.
+    The rim is farthest from the principal point and the model folds at a radius, so that an invertible rim implies
+    an invertible image. Raises ``ValueError`` if it cannot be inverted.
     """
     u, v = np.arange(-0.5, width), np.arange(-0.5, height)
     rim = np.concatenate(

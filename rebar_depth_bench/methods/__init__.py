@@ -1,4 +1,4 @@
-"""Methods by name: those that come with the bench, and anyone's."""
+"""Public interface of depth methods: descriptions, loaders and lookup by name."""
 
 from rebar_depth_bench.data.dataset import ConfigViews
 from rebar_depth_bench.methods.base import AnyMethod, Method, MethodInfo, MultiViewMethod, Predictor, Prepared

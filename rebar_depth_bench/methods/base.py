@@ -1,4 +1,4 @@
-"""What a method is: a description, the columns it needs, and a way to load its predictor."""
+"""Method types: a description, the dataset columns that a method reads, and its loader."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from rebar_depth_bench.data.dataset import ConfigViews
 from rebar_depth_bench.progress import Progress
 
 Predictor = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]
-"""From a decoded row to the left view's planar depth, metres, on the left grid; NaN where it has no answer."""
+"""Function from a decoded row to planar depth of the left view, metres, on the left grid; NaN: no prediction."""
 
 
 @dataclass(frozen=True)
 class MethodInfo:
-    """What people should know of a method before they run it or read its numbers.
+    """Description of a method, shown in listings and written into submissions.
 
-    ``reads_truth``: it is told some of what it is asked, so its numbers stand for no instrument. ``unexercised``
-    says what of it never ran where it was written: weights or hardware that were not there.
+    ``columns`` are the dataset columns that the predictor reads. ``uses_ground_truth`` is True if the method reads
+    ground truth, so that its numbers do not describe an instrument. ``untested_note`` states which part was never
+    run by the authors because weights or hardware were not available; empty if everything was tested.
     """
 
     name: str
@@ -31,17 +32,17 @@ class MethodInfo:
     uses_intrinsics: bool
     source: str
     licence: str
-    reads_truth: bool = False
-    unexercised: str = ""
+    uses_ground_truth: bool = False
+    untested_note: str = ""
 
     def __post_init__(self) -> None:
-        if isinstance(self.columns, str):  # a forgotten comma
+        if isinstance(self.columns, str):  # Catches a one-element tuple written without its comma.
             raise TypeError(f"columns is the text {self.columns!r}, expected a tuple of names")
 
 
 @dataclass(frozen=True)
 class Method:
-    """A method and how to load it. ``load`` raises ``MethodError`` where a package or weights are missing."""
+    """Single-view method; ``load()`` returns the predictor or raises ``MethodError`` if parts are missing."""
 
     info: MethodInfo
     load: Callable[[], Predictor]
@@ -49,7 +50,7 @@ class Method:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A predictor made from all views of a config, and what was found on the way, as plain JSON values."""
+    """Predictor made from all views of a config, and notes on the preparation as plain JSON values."""
 
     predict: Predictor
     notes: Mapping[str, Any] = field(default_factory=dict)
@@ -57,14 +58,14 @@ class Prepared:
 
 @dataclass(frozen=True)
 class MultiViewMethod:
-    """A method that sees all views of a config before it answers for any of them.
+    """Method that reads all views of a config before it predicts any of them.
 
-    ``check(views)`` raises ``MethodError`` for a config that cannot serve it (one without a board, say) or where
-    a package is missing; it is asked of every config before work begins. ``prepare(views, work, progress)`` makes
-    the predictor from all views: ``views.rows("left_rgb", "left_K")`` yields them decoded, ``view_ids``, ``grid``,
-    ``board`` and ``mesh`` are there too; ``progress("what", done, total)`` tells how far it is. What it leaves in
-    the folder ``work`` is there again when an interrupted run goes on. The predictor's rows hold ``view_id`` and
-    ``info.columns``.
+    ``check(views)`` raises ``MethodError`` if the config is unsuitable (for example without a board) or a package
+    is missing; it is called for every config before any work begins. ``prepare(views, work, progress)`` makes the
+    predictor from all views: ``views.rows("left_rgb", "left_K")`` yields decoded rows, and ``views`` also has
+    ``view_ids``, ``grid``, ``board`` and ``mesh``; ``progress("what", done, total)`` reports progress. Files in
+    the folder ``work`` persist until an interrupted run is resumed. The rows passed to the predictor hold
+    ``view_id`` and ``info.columns``.
     """
 
     info: MethodInfo

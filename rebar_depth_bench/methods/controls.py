@@ -1,11 +1,10 @@
-"""The control that knows nothing: the same depth everywhere. Whatever scaling it corrects is scale, not shape.
+"""Control methods, which serve as reference points for the scores of real methods.
 
-Controls that know the answer: exact depth, and exact depth spoiled by a known factor and noise.
-
-For teaching and for tests: what a perfect submission scores, and what scale and noise of known size do to each
-number. They read the ground truth and so are no methods.
-
-The control that knows the board and nothing else: the plane it lies in, from its markers.
+- ``constant``: the same depth at every pixel. Whatever scaling improves in its scores is scale, not shape.
+- ``truth`` and ``noisy-truth``: exact depth, and exact depth with a known factor and known noise. They show what a
+  perfect submission scores and how scale and noise of known size affect each metric; they are meant for teaching
+  and tests. They read the ground truth, so their scores describe no real method.
+- ``board-plane``: the plane of the ArUco board, estimated from its markers, and nothing else.
 """
 
 from __future__ import annotations
@@ -28,11 +27,11 @@ from rebar_depth_bench.progress import Progress
 CONSTANT_DEPTH_M = 1.0
 
 
-def _load() -> Predictor:
-    return _predict
+def _load_constant() -> Predictor:
+    return _predict_constant
 
 
-def _predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+def _predict_constant(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
     return np.full(row["left_rgb"].shape[:2], CONSTANT_DEPTH_M, np.float32)
 
 
@@ -45,26 +44,28 @@ CONSTANT = Method(
         source="this project",
         licence="Apache-2.0",
     ),
-    _load,
+    _load_constant,
 )
 
 
-FACTOR = 1.25
-NOISE = 0.01
+NOISY_TRUTH_FACTOR = 1.25
+NOISY_TRUTH_STD = 0.01
 
 
-def spoiled(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
-    """Return ``FACTOR`` times the truth, times 1 + Gaussian noise of standard deviation ``NOISE`` at each pixel.
+def noisy_depth_m(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+    """Return ground truth depth, metres, times ``NOISY_TRUTH_FACTOR`` and multiplicative Gaussian noise.
 
-    The noise depends on the view's id alone. No answer where there is no surface.
+    Each pixel is multiplied by 1 + noise of standard deviation ``NOISY_TRUTH_STD``. The noise depends only on the
+    view id. Pixels without a surface remain 0 (no prediction).
     """
     seed = int.from_bytes(hashlib.sha256(row["view_id"].encode()).digest()[:8], "little")
     depth_m = row["left_depth"].astype(np.float64)
-    noise = np.random.default_rng(seed).normal(0.0, NOISE, depth_m.shape)
-    return np.asarray(FACTOR * depth_m * (1 + noise), np.float32)
+    noise = np.random.default_rng(seed).normal(0.0, NOISY_TRUTH_STD, depth_m.shape)
+    return np.asarray(NOISY_TRUTH_FACTOR * depth_m * (1 + noise), np.float32)
 
 
-def _control(name: str, summary: str) -> MethodInfo:
+def _ground_truth_info(name: str, summary: str) -> MethodInfo:
+    """Return the description of a control that reads the ground truth."""
     return MethodInfo(
         name=name,
         summary=f"control that reads the ground truth: {summary}",
@@ -72,22 +73,25 @@ def _control(name: str, summary: str) -> MethodInfo:
         uses_intrinsics=False,
         source="this project",
         licence="Apache-2.0",
-        reads_truth=True,
+        uses_ground_truth=True,
     )
 
 
-TRUTH = Method(_control("truth", "exact depth"), lambda: lambda row: np.asarray(row["left_depth"]))
+TRUTH = Method(_ground_truth_info("truth", "exact depth"), lambda: lambda row: np.asarray(row["left_depth"]))
 NOISY_TRUTH = Method(
-    _control("noisy-truth", f"{FACTOR:g} times exact depth, with {NOISE:.0%} of noise"), lambda: spoiled
+    _ground_truth_info(
+        "noisy-truth", f"{NOISY_TRUTH_FACTOR:g} times exact depth, with {NOISY_TRUTH_STD:.0%} of noise"
+    ),
+    lambda: noisy_depth_m,
 )
 
 
 def plane_depth_m(
     cam_from_board: Float64[ndarray, "4 4"], rays_cam: Float64[ndarray, "h w 3"]
 ) -> Float32[ndarray, "h w"]:
-    """Return the planar depth, metres, at which rays (z = 1) meet the board's plane z = 0; NaN where they do not.
+    """Return the planar depth, metres, at which rays (z = 1) meet the board plane z = 0; NaN if they miss it.
 
-    With n the board's normal and t its origin in the camera frame: depth = n . t / n . ray.
+    With n the normal of the board and t its origin in the camera frame: depth = n . t / n . ray.
     """
     normal, origin_m = cam_from_board[:3, 2], cam_from_board[:3, 3]
     with np.errstate(divide="ignore", over="ignore"):
@@ -95,7 +99,8 @@ def plane_depth_m(
     return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(np.nan))
 
 
-def _check(views: ConfigViews) -> None:
+def _check_board_plane(views: ConfigViews) -> None:
+    """Raise ``MethodError`` if OpenCV is missing or the config's scene has no board."""
     try:
         import cv2  # noqa: F401
     except ImportError as error:
@@ -108,7 +113,7 @@ def _check(views: ConfigViews) -> None:
         )
 
 
-def _prepare(views: ConfigViews, work: Path, progress: Progress) -> Prepared:
+def _prepare_board_plane(views: ConfigViews, work: Path, progress: Progress) -> Prepared:
     del work, progress
     from rebar_depth_bench.geometry.aruco_detection import board_pose, detected_corners_px
 
@@ -135,6 +140,6 @@ BOARD_PLANE = MultiViewMethod(
         source="this project, OpenCV's ArUco detector",
         licence="Apache-2.0",
     ),
-    _prepare,
-    _check,
+    _prepare_board_plane,
+    _check_board_plane,
 )

@@ -1,8 +1,12 @@
-"""Where methods come from: the bench, an installed package's entry point, a checkpoint, or a file of the user's.
+"""Registry of methods: built-in methods, entry points of installed packages, checkpoints and users' files.
 
-A package offers its methods as entry points of the group ``rebar_depth_bench.methods``; a Python file is named
-with the method in it, ``my_model.py:METHOD``; a TOML file describes an ONNX model; ``hf:`` names a checkpoint of
-``transformers``, ``NAME:FOLDER`` a folder with the weights of one of the paper's other networks (``LOCATED``).
+Names are resolved as follows:
+
+- ``hf:ORG/NAME`` or ``hf:FOLDER``: a checkpoint of ``transformers``;
+- ``NAME:FOLDER``: a network of the paper with its weights, or code and weights, in a folder (``FROM_FOLDER``);
+- ``my_model.py:METHOD``: a method defined in a Python file;
+- ``my_model.toml``: an ONNX model described by a TOML file;
+- any other name: a built-in method, or an entry point of the group ``rebar_depth_bench.methods``.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import AnyMethod, Method, MultiViewMethod
 from rebar_depth_bench.methods.controls import BOARD_PLANE, CONSTANT, NOISY_TRUTH, TRUTH
-from rebar_depth_bench.methods.huggingface.model import DEPTH_PRO, PREFIX, depth_pro_method, hf_method
+from rebar_depth_bench.methods.huggingface.model import DEPTH_PRO, HF_PREFIX, depth_pro_method, hf_method
 from rebar_depth_bench.methods.monocular.depth_anything_3 import DEPTH_ANYTHING_3, DEPTH_ANYTHING_3_MODEL
 from rebar_depth_bench.methods.monocular.hub import folder_method, hub_method
 from rebar_depth_bench.methods.monocular.metric3d import METRIC3D, cached_metric3d_method, metric3d_method
@@ -30,9 +34,9 @@ from rebar_depth_bench.methods.onnx.model import onnx_method
 from rebar_depth_bench.methods.stereo.foundation_stereo import FOUNDATION_STEREO, foundation_stereo_method
 from rebar_depth_bench.methods.stereo.sgbm import SGBM, SGBM_FILLED
 
-GROUP = "rebar_depth_bench.methods"
+ENTRY_POINT_GROUP = "rebar_depth_bench.methods"
 DISTRIBUTION = "rebar-depth-bench"
-_DIGITS = 16
+_DIGEST_CHARACTERS = 16
 
 METHODS: Mapping[str, AnyMethod] = {
     method.info.name: method
@@ -43,118 +47,135 @@ METHODS: Mapping[str, AnyMethod] = {
         *(CONSTANT, BOARD_PLANE, NOISY_TRUTH, TRUTH),
     )
 }
-"""Those that come with the bench."""
+"""Built-in methods by name."""
 
-LOCATED: Mapping[str, Callable[[Path], Method]] = {
+FROM_FOLDER: Mapping[str, Callable[[Path], Method]] = {
     "depth-anything-3": partial(folder_method, DEPTH_ANYTHING_3_MODEL),
     "foundation-stereo": foundation_stereo_method,
     "metric3d": metric3d_method,
     "unidepth": partial(folder_method, UNIDEPTH_MODEL),
 }
-"""Those that take their weights, or code and weights, from a folder: ``NAME:FOLDER``."""
+"""Constructors of methods whose weights, or code and weights, are in a folder: ``NAME:FOLDER``."""
 
-RESOLVED: Mapping[str, Callable[[], Method]] = {
+FROM_HUB: Mapping[str, Callable[[], Method]] = {
     "depth-anything-3": partial(hub_method, DEPTH_ANYTHING_3_MODEL),
     "depth-pro": depth_pro_method,
     "metric3d": cached_metric3d_method,
     "unidepth": partial(hub_method, UNIDEPTH_MODEL),
 }
-"""Those whose weights are looked up when they are asked for by their bare name: the commit or digest of what is
-run goes into their summary. Listing them looks nothing up."""
+"""Constructors of methods whose weights are looked up when the bare name is requested.
+
+The commit or digest of the weights (and code) becomes part of the summary. Listing methods looks nothing up.
+"""
 
 
 def find_method(name: str) -> AnyMethod:
-    """Return a method by its name, from a file by ``path.py:NAME`` or ``path.toml``, from a folder by
-    ``NAME:FOLDER`` (``LOCATED``), or by ``hf:ORG/NAME``.
+    """Return the method of a name; the module docstring lists the accepted forms.
 
-    What says which weights these are may be fetched here, where no cache has it (``RESOLVED``, ``hf:``).
+    For ``FROM_HUB`` and ``hf:`` names, the files that identify the weights are downloaded if they are not cached.
 
-    Raises ``MethodError`` for an unknown one, and where a file or package cannot be imported or holds none.
+    Raises ``MethodError`` if the name is unknown, or if a file or package cannot be imported or holds no method.
     """
-    if name.startswith(PREFIX):
-        return hf_method(name.removeprefix(PREFIX))
-    known_as, _, place = name.partition(":")
-    if place and known_as in LOCATED:
-        return LOCATED[known_as](Path(place).expanduser())
+    if name.startswith(HF_PREFIX):
+        return hf_method(name.removeprefix(HF_PREFIX))
+    method_name, _, folder = name.partition(":")
+    if folder and method_name in FROM_FOLDER:
+        return FROM_FOLDER[method_name](Path(folder).expanduser())
     path, colon, attribute = name.rpartition(":")
     if colon and path.endswith(".py"):
-        module = _module(Path(path))
+        module = _import_file(Path(path))
         if not hasattr(module, attribute):
             raise MethodError(f"{path}: has no {attribute}, expected the name of a method in it")
-        return _of_file(Path(path), _checked(name, getattr(module, attribute)))
+        return _with_file_digest(Path(path), _require_method(name, getattr(module, attribute)))
     if name.endswith(".toml"):
         return onnx_method(Path(name))
-    if name in RESOLVED:
-        return RESOLVED[name]()
+    if name in FROM_HUB:
+        return FROM_HUB[name]()
     if name in METHODS:
         return METHODS[name]
-    offered = _offered()
-    if name in offered:
-        return _loaded(offered[name])
-    known = ", ".join((*METHODS, *offered))
+    entries = _entry_point_methods()
+    if name in entries:
+        return _load_entry_point(entries[name])
+    known = ", ".join((*METHODS, *entries))
     raise MethodError(
         f"no method {name!r}, expected one of {known}, or a file's like my_model.py:METHOD or "
-        f"my_model.toml, or hf:ORG/NAME, or a folder for one of {', '.join(LOCATED)}: NAME:FOLDER"
+        f"my_model.toml, or hf:ORG/NAME, or a folder for one of {', '.join(FROM_FOLDER)}: NAME:FOLDER"
     )
 
 
 def all_methods() -> dict[str, AnyMethod | MethodError]:
-    """Return every method by name; of a package whose method cannot be loaded, why."""
-    found: dict[str, AnyMethod | MethodError] = dict(METHODS)
-    for name, entry in _offered().items():
+    """Return all built-in and entry-point methods by name; for entry points that cannot be loaded, the error."""
+    methods: dict[str, AnyMethod | MethodError] = dict(METHODS)
+    for name, entry in _entry_point_methods().items():
         try:
-            found[name] = _loaded(entry)
+            methods[name] = _load_entry_point(entry)
         except MethodError as error:
-            found[name] = error
-    return found
+            methods[name] = error
+    return methods
 
 
 def own_methods() -> dict[str, AnyMethod]:
-    """Return the methods of this distribution by name: the bench's, and those its other packages offer."""
-    offered = {name: entry for name, entry in _offered().items() if entry.dist and entry.dist.name == DISTRIBUTION}
-    return {**METHODS, **{name: _loaded(entry) for name, entry in offered.items()}}
+    """Return the methods of this distribution by name: built-in ones and its own entry points."""
+    entries = {
+        name: entry
+        for name, entry in _entry_point_methods().items()
+        if entry.dist and entry.dist.name == DISTRIBUTION
+    }
+    return {**METHODS, **{name: _load_entry_point(entry) for name, entry in entries.items()}}
 
 
-def _offered() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in METHODS}
+def _entry_point_methods() -> dict[str, EntryPoint]:
+    """Return entry points by name; built-in names take precedence."""
+    return {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP) if entry.name not in METHODS}
 
 
-def _loaded(entry: EntryPoint) -> AnyMethod:
+def _load_entry_point(entry: EntryPoint) -> AnyMethod:
+    """Return the method of an entry point. Raises ``MethodError`` if it cannot be imported or is no method."""
     try:
         value = entry.load()
-    except Exception as error:  # whatever a stranger's module raises when it is imported
-        raise MethodError(f"{entry.name}: {entry.value} cannot be imported: {_words(error)}") from error
-    return _checked(entry.name, value)
+    except Exception as error:  # Importing third-party modules may raise anything.
+        raise MethodError(f"{entry.name}: {entry.value} cannot be imported: {_error_text(error)}") from error
+    return _require_method(entry.name, value)
 
 
-def _of_file(path: Path, method: AnyMethod) -> AnyMethod:
-    """Name the file's digest in the source: a run that goes on does not mix what two versions answered."""
-    source = f"{method.info.source} ({path.name} sha256:{file_sha256(path)[:_DIGITS]})"
+def _with_file_digest(path: Path, method: AnyMethod) -> AnyMethod:
+    """Return the method with the file's digest appended to ``info.source``.
+
+    A resumed run therefore never mixes predictions of two versions of the file.
+    """
+    source = f"{method.info.source} ({path.name} sha256:{file_sha256(path)[:_DIGEST_CHARACTERS]})"
     return replace(method, info=replace(method.info, source=source))
 
 
-def _module(path: Path) -> ModuleType:
+def _import_file(path: Path) -> ModuleType:
+    """Import a Python file as a module. Raises ``MethodError`` if it is missing or cannot be imported."""
     if not path.is_file():
         raise MethodError(f"{path}: no such file, expected a Python file that holds a method")
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:
         raise MethodError(f"{path}: is no Python file")
     module = importlib.util.module_from_spec(spec)
-    sys.path.insert(0, str(path.resolve().parent))  # its neighbours may be imported, as from a script
+    sys.path.insert(0, str(path.resolve().parent))  # Allows imports of files beside it, as for a script.
+    writes_bytecode, sys.dont_write_bytecode = (
+        sys.dont_write_bytecode,
+        True,
+    )  # No __pycache__ beside the user's files.
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        raise MethodError(f"{path}: cannot be imported: {_words(error)}") from error
+        raise MethodError(f"{path}: cannot be imported: {_error_text(error)}") from error
     finally:
         sys.path.pop(0)
+        sys.dont_write_bytecode = writes_bytecode
     return module
 
 
-def _checked(name: str, value: object) -> AnyMethod:
+def _require_method(name: str, value: object) -> AnyMethod:
+    """Return ``value`` if it is a method, else raise ``MethodError``."""
     if not isinstance(value, Method | MultiViewMethod):
         raise MethodError(f"{name}: is {type(value).__name__}, expected a rebar_depth_bench.methods.Method")
     return value
 
 
-def _words(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"

@@ -1,8 +1,8 @@
-"""Colours for depth and for signed error: two maps of 255 colours, as data, the same bytes on every machine.
+"""Colour maps of depth and signed error with 255 colours each, identical on every machine.
 
-Both were laid out in OKLab (Ottosson 2020) with equal steps between their 17 anchors. Between anchors the
-colours are interpolated in whole numbers: previews are part of the dataset's digest, so no rounding may
-depend on a processor.
+The 17 anchors of each map were chosen in OKLab (Ottosson 2020) with equal steps. Between anchors the colours are
+interpolated in integer arithmetic, because previews are part of the dataset's digest and must not depend on the
+rounding of a processor.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, UInt8
 from numpy import ndarray
 
 COLOURS = 255
-"""Colours in a map: with one more for "nothing here" they fill an 8-bit palette."""
+"""Number of colours in a map; with one more for missing values they fill an 8-bit palette."""
 
 _DEPTH_ANCHORS = (
     "151c53 29206a 40227e 58218f 712795 8b2b94 a52f8e bd3585 d14079 "
@@ -24,30 +24,36 @@ _ERROR_ANCHORS = (
 )
 
 
-def _interpolated(anchors: str) -> UInt8[ndarray, "255 3"]:
-    """Return the map through evenly spaced ``rrggbb`` anchors, linear in sRGB, in integer arithmetic."""
+def _interpolate_anchors(anchors: str) -> UInt8[ndarray, "255 3"]:
+    """Return the map that interpolates evenly spaced ``rrggbb`` anchors linearly in sRGB, using integers."""
     points = np.array([list(bytes.fromhex(anchor)) for anchor in anchors.split()], dtype=np.int64)
     steps = COLOURS - 1
-    along = np.arange(COLOURS) * (len(points) - 1)
-    left = np.minimum(along // steps, len(points) - 2)
-    part = (along - left * steps)[:, None]
-    mixed = (points[left] * (steps - part) + points[left + 1] * part + steps // 2) // steps
-    colours: ndarray = mixed.astype(np.uint8)
+    positions = np.arange(COLOURS) * (len(points) - 1)
+    left = np.minimum(positions // steps, len(points) - 2)
+    weight = (positions - left * steps)[:, None]
+    interpolated = (points[left] * (steps - weight) + points[left + 1] * weight + steps // 2) // steps
+    colours: ndarray = interpolated.astype(np.uint8)
     colours.setflags(write=False)
     return colours
 
 
-DEPTH_COLOURS = _interpolated(_DEPTH_ANCHORS)
-"""Far (0, dark blue) to near (254, bright yellow): lightness rises all the way, so it reads in grey too."""
+DEPTH_COLOURS = _interpolate_anchors(_DEPTH_ANCHORS)
+"""Depth map from far (0, dark blue) to near (254, bright yellow).
 
-ERROR_COLOURS = _interpolated(_ERROR_ANCHORS)
-"""Too near (0, blue) over none (127, near white) to too far (254, red-brown): both arms equally dark."""
+Lightness increases monotonically, so that the map remains readable in greyscale.
+"""
+
+ERROR_COLOURS = _interpolate_anchors(_ERROR_ANCHORS)
+"""Signed-error map from too near (0, blue) through zero (127, near white) to too far (254, red-brown).
+
+Both ends are equally dark.
+"""
 
 
 def robust_range(values: Float[ndarray, " n"], share: float = 0.02) -> tuple[float, float]:
-    """Return the order statistics that leave out ``share`` of ``values`` at either end (no interpolation).
+    """Return the order statistics that exclude ``share`` of ``values`` at either end, without interpolation.
 
-    ``values`` holds at least one number and none that is not finite.
+    ``values`` must not be empty, and all values must be finite.
     """
     low = int(share * (values.size - 1))
     high = values.size - 1 - low
@@ -55,29 +61,29 @@ def robust_range(values: Float[ndarray, " n"], share: float = 0.02) -> tuple[flo
     return float(ordered[low]), float(ordered[high])
 
 
-def positions(values: Float[ndarray, "*shape"], first: float, last: float) -> UInt8[ndarray, "*shape"]:
-    """Return where ``values`` fall in a map of 255 colours that runs from ``first`` (0) to ``last`` (254).
+def colour_indices(values: Float[ndarray, "*shape"], first: float, last: float) -> UInt8[ndarray, "*shape"]:
+    """Return the indices of ``values`` in a map of 255 colours that runs from ``first`` (0) to ``last`` (254).
 
-    Values beyond either end take the end's colour, and so do infinities; NaN takes colour 0. ``first`` may
-    be larger than ``last``. Where both are equal, everything takes the middle colour.
+    Values beyond either end, including infinities, get the index of that end; NaN gets index 0. ``first`` may be
+    larger than ``last``. If both are equal, all values get the middle index.
     """
     steps = COLOURS - 1
     if first == last:
         return np.full(values.shape, steps // 2, dtype=np.uint8)
     with np.errstate(invalid="ignore", over="ignore"):
-        along = (values.astype(np.float64) - first) * steps / (last - first)
-    found: ndarray = np.rint(np.clip(np.nan_to_num(along, nan=0.0), 0, steps)).astype(np.uint8)
-    return found
+        positions = (values.astype(np.float64) - first) * steps / (last - first)
+    indices: ndarray = np.rint(np.clip(np.nan_to_num(positions, nan=0.0), 0, steps)).astype(np.uint8)
+    return indices
 
 
 def depth_preview(
     depth_m: Float32[ndarray, "h w"],
 ) -> tuple[UInt8[ndarray, "h w"], bytes]:
-    """Return a depth image as palette indices and the palette, 768 bytes of RGB, for an 8-bit palette PNG.
+    """Return a depth image as palette indices and the palette (768 bytes of RGB) of an 8-bit palette PNG.
 
-    ``depth_m`` is metres, 0 (or anything that is not a positive number) where there is no surface: index 0,
-    black. Colours 1 to 255 run from far (dark) to near (bright and warm), evenly in inverse depth so that
-    near steel keeps its contrast before a distant ground, between the 2nd and the 98th percentile.
+    ``depth_m`` is in metres. Pixels that are not finite or <= 0 have no surface and get index 0, black. Colours 1
+    to 255 run from far (dark) to near (bright and warm) between the 2nd and the 98th percentile. They are evenly
+    spaced in inverse depth, so that near steel keeps its contrast in front of distant ground.
     """
     palette = bytes(3) + DEPTH_COLOURS.tobytes()
     indices = np.zeros(depth_m.shape, dtype=np.uint8)
@@ -85,5 +91,5 @@ def depth_preview(
     if surface.any():
         inverse = 1.0 / depth_m[surface].astype(np.float64)
         far, near = robust_range(inverse)
-        indices[surface] = positions(inverse, far, near) + np.uint8(1)
+        indices[surface] = colour_indices(inverse, far, near) + np.uint8(1)
     return indices, palette

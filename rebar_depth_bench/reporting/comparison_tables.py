@@ -1,12 +1,11 @@
-"""A comparison as a table in the terminal and as CSV.
+"""Comparison tables of several results.
 
-Several results side by side in the terminal, in the layout of the paper's Table I.
+A paired comparison of two submissions is printed in the terminal or written as CSV; any number of results is
+printed side by side in the layout of the paper's Table I.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,50 +15,49 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.published import load_published, paper_scene, published_rows
-from rebar_depth_bench.reporting.tables import csv_cell
-from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS, RING_VIEWS
+from rebar_depth_bench.reporting.tables import csv_text
+from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_VIEWS
 from rebar_depth_bench.scoring.comparison import Comparison, Difference
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
-from rebar_depth_bench.scoring.result import SCALE, Result, Table
+from rebar_depth_bench.scoring.result import SCALE_MEDIAN, Result, Table
 from rebar_depth_bench.version import software_version
-
-_METRIC_KEYS = ("abs_rel", "rmse_cm", "mae_cm", "delta1")
-_METRIC_DECIMALS = (4, 2, 2, 3)
 
 
 def _titles() -> dict[str, tuple[str, int, float]]:
-    """Return each number's title, decimals and factor from value to what is shown."""
+    """Return title, number of decimals and display factor by name of the number."""
     titles = {"coverage": ("coverage, % ↑", 1, 100.0)}
     for alignment in ("native", "scaled"):
-        for key, (name, unit, better), decimals in zip(
-            _METRIC_KEYS, formatting.METRIC_HEADS, _METRIC_DECIMALS, strict=True
+        for (key, decimals), (name, unit, better) in zip(
+            formatting.METRIC_DECIMALS.items(), formatting.METRIC_HEADS, strict=True
         ):
             title = f"{alignment} {name}{f', {unit}' if unit else ''} {better}"
             titles[f"{alignment}.{key}"] = (title, decimals, 1.0)
-    titles[SCALE] = ("scale s, median", 3, 1.0)
+    titles[SCALE_MEDIAN] = ("scale s, median", 3, 1.0)
     return titles | {f"within_mm.{t}": (f"within {t} mm, % ↑", 1, 100.0) for t in WITHIN_MM}
 
 
-TITLES: Mapping[str, tuple[str, int, float]] = _titles()
+NUMBER_TITLES: Mapping[str, tuple[str, int, float]] = _titles()
+"""Title, number of decimals and factor from value to display, by name of the number."""
 
 
 def print_comparison(comparison: Comparison, console: Console) -> None:
-    """Print a table per config: both submissions, the paired difference, its interval and what it says."""
-    first, other = (formatting.printable(one.method) for one in comparison.stamp.archives)
+    """Print a table per config: both submissions, their paired difference, its interval and the verdict."""
+    first, other = (printable(archive.method) for archive in comparison.provenance.archives)
     console.print(Text(f"B: {other}, against A: {first}", style="bold"))
-    console.print(Text(_stamps(comparison), style="dim"))
+    console.print(Text(_provenance(comparison), style="dim"))
     for config, rows in comparison.configs.items():
         console.print()
-        console.print(Text(f"{formatting.printable(config)}, {_views_note(rows)}", style="italic"))
+        console.print(Text(f"{printable(config)}, {_views_note(rows)}", style="italic"))
         console.print(_comparison_table(rows))
     console.print()
     console.print(
         Text(
             "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
-            f"({RING_VIEWS} steps of the protocol); none with fewer than {MIN_VIEWS} views. B is called better or "
-            "worse where the interval leaves out zero. Of many comparisons one in twenty does so by chance. "
+            f"({BLOCK_VIEWS} steps of the protocol); none with fewer than {MIN_VIEWS} views. B is called better "
+            "or worse where the interval leaves out zero. Of many comparisons one in twenty does so by chance. "
             "Errors of a submission that is not ranked (coverage below 95 %, or a view without prediction) are "
             "not judged."
         )
@@ -67,12 +65,10 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
 
 
 def comparison_csv(comparisons: list[Comparison]) -> str:
-    r"""Return comparisons as tidy CSV: a row per pair, config and number, with the stamps; ``\n`` ends."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    stamps = ("protocol", "dataset_digest", "software_version", "first_sha256", "other_sha256")
-    numbers = ("views", "first", "other", "difference", "low", "high", "verdict")
-    writer.writerow(["first_method", "other_method", "config", "number", *numbers, *stamps])
+    r"""Return comparisons as tidy CSV: one row per pair, config and number, with provenance, ``\n`` line ends."""
+    provenance_heads = ("protocol", "dataset_digest", "software_version", "first_sha256", "other_sha256")
+    number_heads = ("views", "first", "other", "difference", "low", "high", "verdict")
+    lines = [["first_method", "other_method", "config", "number", *number_heads, *provenance_heads]]
     for comparison in comparisons:
         content = comparison.to_dict()
         first, other = content["submissions"]
@@ -82,26 +78,26 @@ def comparison_csv(comparisons: list[Comparison]) -> str:
                 cells += [row[key] for key in ("views", "first", "other", "difference")]
                 cells += [*(row["ci95"] or (None, None)), row["verdict"]]
                 cells += [content["protocol"], content["dataset"]["digest"], content["software"]["version"]]
-                writer.writerow([csv_cell(cell) for cell in (*cells, first["sha256"], other["sha256"])])
-    return out.getvalue()
+                lines.append([*cells, first["sha256"], other["sha256"]])
+    return csv_text(lines)
 
 
-def _stamps(comparison: Comparison) -> str:
+def _provenance(comparison: Comparison) -> str:
     content = comparison.to_dict()
     dataset = content["dataset"]
     archives = (
-        f"{letter} {formatting.short_digest(one['sha256'])}"
-        for letter, one in zip("AB", content["submissions"], strict=True)
+        f"{letter} {formatting.short_digest(submission['sha256'])}"
+        for letter, submission in zip("AB", content["submissions"], strict=True)
     )
     return (
-        f"protocol {content['protocol']}, dataset {formatting.printable(dataset['version'])} "
+        f"protocol {content['protocol']}, dataset {printable(dataset['version'])} "
         f"({formatting.short_digest(dataset['digest'])}), archives {', '.join(archives)}, "
         f"software {content['software']['version']}"
     )
 
 
 def _views_note(rows: Sequence[Difference]) -> str:
-    counts = sorted({one.views for one in rows})
+    counts = sorted({row.views for row in rows})
     if len(counts) == 1:
         return f"{counts[0]} views"
     return f"{counts[-1]} views; errors and scale on the {counts[0]} where both have a prediction"
@@ -113,18 +109,20 @@ def _comparison_table(rows: Sequence[Difference]) -> RichTable:
     for heading in ("A", "B", "B - A", "95 % interval"):
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("B is")
-    for one in rows:
-        table.add_row(*map(Text, _comparison_cells(one)))
+    for row in rows:
+        table.add_row(*map(Text, _comparison_cells(row)))
     return table
 
 
-def _comparison_cells(one: Difference) -> list[str]:
-    title, decimals, factor = TITLES[one.name]
-    first, other = (_number(value, decimals, factor) for value in (one.first, one.other))
-    change = _signed(one.difference, decimals, factor)
-    ends = one.interval
-    between = formatting.DASH if ends is None else " to ".join(_signed(end, decimals, factor) for end in ends)
-    return [title, first, other, change, between, one.verdict]
+def _comparison_cells(row: Difference) -> list[str]:
+    title, decimals, factor = NUMBER_TITLES[row.name]
+    first, other = (_number(value, decimals, factor) for value in (row.first, row.other))
+    change = _signed(row.difference, decimals, factor)
+    interval = row.interval
+    interval_text = (
+        formatting.DASH if interval is None else " to ".join(_signed(end, decimals, factor) for end in interval)
+    )
+    return [title, first, other, change, interval_text, row.verdict]
 
 
 def _number(value: float | None, decimals: int, factor: float) -> str:
@@ -139,8 +137,11 @@ def _signed(value: float | None, decimals: int, factor: float) -> str:
 _HEADS = ("RMSE, cm ↓", "AbsRel ↓", "AbsRel_s ↓", "s")
 
 
-def told_apart(results: Sequence[Result]) -> list[Result]:
-    """Return the results, those of one method's name with the first digits of their archive's digest behind it."""
+def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
+    """Return the results with unique method names.
+
+    A name that occurs more than once gets the first eight digits of its submission's SHA-256 appended.
+    """
     names = Counter(result.method for result in results)
     return [
         replace(result, method=f"{result.method} ({result.submission_sha256[:8]})")
@@ -151,13 +152,14 @@ def told_apart(results: Sequence[Result]) -> list[Result]:
 
 
 def print_paper_table(results: Sequence[Result], console: Console, *, published: bool) -> None:
-    """Print a table per config: a row per result, then the paper's rows of that scene, marked, in no contest.
+    """Print a table per config: one row per result, sorted by native AbsRel, with unranked rows last.
 
-    ``results`` are of one dataset, at least one. Best first by native AbsRel; rows that are not ranked come last.
+    ``results`` must not be empty and must belong to one dataset. With ``published``, the paper's rows of the same
+    scene follow; they are marked and not compared with the results.
     """
     first = results[0]
     digest = formatting.short_digest(first.dataset_digest)
-    version = formatting.printable(first.dataset_version)
+    version = printable(first.dataset_version)
     console.print(
         Text(f"protocol {PROTOCOL}, dataset {version} ({digest}), software {software_version()}", style="dim")
     )
@@ -166,10 +168,8 @@ def print_paper_table(results: Sequence[Result], console: Console, *, published:
         scene = paper_scene(config) if published else None
         views = rows[0][1].views
         console.print()
-        console.print(
-            Text(f"{formatting.printable(config)}, {views} {formatting.plural('view', views)}", style="italic")
-        )
-        console.print(_paper_table(sorted(rows, key=lambda row: _place(row[1])), scene))
+        console.print(Text(f"{printable(config)}, {formatting.counted(views, 'view')}", style="italic"))
+        console.print(_paper_table(sorted(rows, key=lambda row: _paper_table_sort_key(row[1])), scene))
     console.print()
     console.print(Text("RMSE, AbsRel: native (no alignment). AbsRel_s: scaled (oracle median scale per view)."))
     console.print(Text("s: median over views of median(z)/median(p). ‡: not ranked."))
@@ -180,27 +180,21 @@ def print_paper_table(results: Sequence[Result], console: Console, *, published:
 
 def _paper_table(rows: Sequence[tuple[str, Table]], scene: str | None) -> RichTable:
     grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    grid.add_column("", overflow="fold")  # names give way, numbers never
+    grid.add_column("", overflow="fold")  # Long names are wrapped; numbers are never truncated.
     for head in _HEADS:
         grid.add_column(head, justify="right", no_wrap=True)
     for method, table in rows:
         grid.add_row(
-            Text(formatting.printable(method, 40) + ("" if table.ranked else " ‡")),
-            *map(Text, _paper_cells(table)),
+            Text(printable(method, 40) + ("" if table.ranked else " ‡")),
+            *map(Text, formatting.paper_cells(table)),
         )
     if scene is not None:
         grid.add_section()
         for row in published_rows(scene):
             mark = " †" if row.median_anchored else ""
-            cells = (row.rmse_cm, row.abs_rel, row.abs_rel_scaled, row.scale)
-            grid.add_row(Text(f"paper: {row.method}{mark}"), *map(Text, cells), style="dim")
+            grid.add_row(Text(f"paper: {row.method}{mark}"), *map(Text, row.cells), style="dim")
     return grid
 
 
-def _paper_cells(table: Table) -> list[str]:
-    native, scaled = formatting.metric_cells(table.native), formatting.metric_cells(table.scaled)
-    return [native[1], native[0], scaled[0], formatting.scale_cell(table.scale_median)]
-
-
-def _place(table: Table) -> tuple[bool, float]:
+def _paper_table_sort_key(table: Table) -> tuple[bool, float]:
     return not table.ranked, float("inf") if table.native is None else table.native.abs_rel

@@ -1,4 +1,4 @@
-"""How numbers, names and verdicts are spelled: the same in the terminal's table and in the HTML report."""
+"""Text formatting of numbers, names and ranking reasons, shared by terminal tables and HTML reports."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import math
 from collections.abc import Iterable, Mapping
 from decimal import ROUND_DOWN, Decimal
 
-from rebar_depth_bench.scoring.metrics import DepthMetrics
+from rebar_depth_bench.scoring.metrics import METRIC_TITLES, DepthMetrics
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, WITHIN_MM
 from rebar_depth_bench.scoring.result import Table
 
 DASH = "–"
-"""Stands for an undefined number, null in the JSON."""
+"""Text of an undefined number, which is null in the JSON."""
 
 DASH_NOTE = f"{DASH}: undefined, because no pixel has a prediction or a number overflowed."
 
@@ -23,12 +23,18 @@ INTERVAL_NOTE = (
     "Small figures: 95 % interval, block bootstrap over views (other views of the same scene, not other scenes)."
 )
 
-METRIC_HEADS = (("AbsRel", "", "↓"), ("RMSE", "cm", "↓"), ("MAE", "cm", "↓"), ("δ1", "", "↑"))
-"""Name, unit and better direction of each number that ``metric_cells`` spells."""
+METRIC_DECIMALS: Mapping[str, int] = {"abs_rel": 4, "rmse_cm": 2, "mae_cm": 2, "delta1": 3}
+"""Number of decimals of each field of ``DepthMetrics``."""
+
+METRIC_HEADS = tuple((*titles, "↑" if name == "delta1" else "↓") for name, titles in METRIC_TITLES.items())
+"""Name, unit and better direction of each number that ``metric_cells`` formats."""
 
 
 def number(value: float | None, decimals: int) -> str:
-    """Return a number with fixed decimals, scientific where these would hide it, a dash if undefined."""
+    """Return a number with fixed decimals, in scientific notation if these would hide it, a dash if undefined.
+
+    Scientific notation is used below half a unit of the last decimal and from 1e6 on.
+    """
     if value is None or not math.isfinite(value):
         return DASH
     if value != 0 and not 0.5 * 10**-decimals <= abs(value) < 1e6:
@@ -37,74 +43,79 @@ def number(value: float | None, decimals: int) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Return a share in per cent, one decimal, rounded."""
+    """Return a share in per cent, rounded to one decimal."""
     return DASH if share is None else f"{share * 100:.1f}"
 
 
 def coverage_percent(share: float | None) -> str:
-    """Return a coverage in per cent, one decimal, rounded down: no gap reads as full, no miss as a pass."""
+    """Return a coverage in per cent with one decimal, rounded down.
+
+    Incomplete coverage is therefore never shown as 100 %, and coverage below the threshold never as reaching it.
+    """
     if share is None:
         return DASH
     return str((Decimal(repr(share)) * 100).quantize(Decimal("0.1"), rounding=ROUND_DOWN))
 
 
 def metric_cells(metrics: DepthMetrics | None) -> list[str]:
-    """Return AbsRel, RMSE in cm, MAE in cm, delta1."""
-    if metrics is None:
-        return [DASH] * len(METRIC_HEADS)
-    return [
-        number(metrics.abs_rel, 4),
-        number(metrics.rmse_cm, 2),
-        number(metrics.mae_cm, 2),
-        number(metrics.delta1, 3),
-    ]
+    """Return AbsRel, RMSE (cm), MAE (cm) and delta1 as text; dashes if ``metrics`` is None."""
+    return [number(getattr(metrics, name, None), decimals) for name, decimals in METRIC_DECIMALS.items()]
+
+
+def paper_cells(table: Table) -> list[str]:
+    """Return RMSE (cm) and AbsRel native, AbsRel scaled and the median s as text, as in the paper's Table I."""
+    native, scaled = metric_cells(table.native), metric_cells(table.scaled)
+    return [native[1], native[0], scaled[0], scale_cell(table.scale_median)]
 
 
 def scale_cell(scale: float | None) -> str:
-    """Return a scale factor s."""
+    """Return a scale factor s with three decimals."""
     return number(scale, 3)
 
 
 def within_cells(within_mm: Mapping[int, float | None] | Mapping[int, float]) -> list[str]:
-    """Return the shares within 3, 5, 10 and 20 mm, per cent."""
+    """Return the shares within each tolerance of ``WITHIN_MM``, per cent."""
     return [percent(within_mm[tolerance]) for tolerance in WITHIN_MM]
 
 
 def interval_cell(interval: tuple[float, float] | None, decimals: int, factor: float = 1.0) -> str:
-    """Return a 95 % interval times ``factor`` as low – high, empty where there is none."""
+    """Return a 95 % interval times ``factor`` as ``low – high``; empty if it is undefined."""
     if interval is None or not all(math.isfinite(end) for end in interval):
         return ""
     low, high = (number(end * factor, decimals) for end in interval)
     return f"{low} – {high}"
 
 
+def interval_text(interval: tuple[float, float] | None, decimals: int) -> str:
+    """Return an interval as ``low to high``; a dash if it is None."""
+    return DASH if interval is None else " to ".join(number(end, decimals) for end in interval)
+
+
 def coverage_interval_cell(interval: tuple[float, float] | None) -> str:
-    """Return the 95 % interval of a coverage in per cent, both ends rounded down as the coverage is."""
+    """Return the 95 % interval of a coverage in per cent, both ends rounded down like the coverage itself."""
     if interval is None or not all(math.isfinite(end) for end in interval):
         return ""
     return " – ".join(coverage_percent(end) for end in interval)
 
 
 def metric_interval_cells(intervals: Mapping[str, tuple[float, float] | None], alignment: str) -> list[str]:
-    """Return the intervals of what ``metric_cells`` spells, with as many decimals; ``native`` or ``scaled``."""
-    decimals = {"abs_rel": 4, "rmse_cm": 2, "mae_cm": 2, "delta1": 3}
-    return [interval_cell(intervals.get(f"{alignment}.{name}"), places) for name, places in decimals.items()]
+    """Return the intervals of the numbers of ``metric_cells``, with the same numbers of decimals.
 
-
-def printable(text: str, limit: int = 200) -> str:
-    """Return a name from an archive without control or direction-changing characters, cut to ``limit``."""
-    clean = "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text[: limit + 1])
-    return clean if len(clean) <= limit else clean[: limit - 1] + "…"
+    ``alignment`` is ``native`` or ``scaled``.
+    """
+    return [
+        interval_cell(intervals.get(f"{alignment}.{name}"), decimals) for name, decimals in METRIC_DECIMALS.items()
+    ]
 
 
 def short_digest(digest: str, digits: int = 12) -> str:
-    """Return ``sha256:`` and the first digits of a digest, enough to tell two datasets apart."""
+    """Return ``sha256:`` and the first digits of a digest, which suffice to distinguish two datasets."""
     algorithm, colon, value = digest.rpartition(":")
     return f"{algorithm}{colon}{value[:digits]}"
 
 
 def unranked_reasons(table: Table) -> list[str]:
-    """Return in words why a config's row is not ranked; empty where it is."""
+    """Return the reasons why a config's row is not ranked; empty for a ranked row."""
     if table.ranked:
         return []
     reasons = []
@@ -112,7 +123,7 @@ def unranked_reasons(table: Table) -> list[str]:
         reasons.append("no views")
     missing = table.views - table.views_scored
     if missing:
-        reasons.append(f"{missing} of {table.views} {plural('view', table.views)} without any prediction")
+        reasons.append(f"{missing} of {counted(table.views, 'view')} without any prediction")
     if table.coverage is not None and table.coverage < MIN_RANKED_COVERAGE:
         reasons.append(f"coverage {coverage_percent(table.coverage)} % is below {MIN_RANKED_COVERAGE * 100:.0f} %")
     if any(_overflowed(metrics) for metrics in (table.native, table.scaled)):
@@ -121,13 +132,18 @@ def unranked_reasons(table: Table) -> list[str]:
 
 
 def has_dash(rows: Iterable[Iterable[str]]) -> bool:
-    """Return whether any cell is undefined, so that the footnote is due."""
+    """Return whether any cell is undefined, so that ``DASH_NOTE`` must be shown."""
     return any(cell == DASH for row in rows for cell in row)
 
 
 def plural(noun: str, count: int) -> str:
-    """Return an English noun for that many of it."""
+    """Return the English noun in the singular or plural for ``count``."""
     return noun if count == 1 else f"{noun}s"
+
+
+def counted(count: int, noun: str) -> str:
+    """Return the count and the noun, such as ``1 view`` or ``3 views``."""
+    return f"{count} {plural(noun, count)}"
 
 
 def _overflowed(metrics: DepthMetrics | None) -> bool:

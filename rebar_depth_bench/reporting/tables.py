@@ -1,11 +1,11 @@
-"""A result as a table: in the terminal, as wide as it may be, and as tidy CSV."""
+"""Result tables in the terminal, adapted to its width, and as tidy CSV."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,9 @@ from rich.segment import Segments
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
+from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.result import Result, Table
 
@@ -25,8 +27,8 @@ _FORMULA_STARTS = ("=", "+", "-", "@")
 
 
 @dataclass(frozen=True)
-class _Group:
-    """Columns that stay together, under a title that states their alignment."""
+class _ColumnGroup:
+    """Columns that are printed together, under a title that states their alignment."""
 
     title: str
     heads: tuple[str, ...]
@@ -34,62 +36,59 @@ class _Group:
 
 
 def print_table(result: Result, console: Console) -> None:
-    """Print a row per config to ``console``: one table where it fits, else the same columns in two or three.
+    """Print one row per config to ``console``: one table if it fits, else the same columns in two or three tables.
 
-    No number is ever cut: a console narrower than the narrowest layout gets longer lines.
+    Numbers are never truncated: a console narrower than the narrowest layout gets longer lines.
     """
     _print_line(console, _headline(result), style="bold")
-    _print_line(console, _stamps(result), style="dim")
-    names = [formatting.printable(name) for name in result.tables]
+    _print_line(console, _provenance(result), style="dim")
+    names = [printable(name) for name in result.tables]
     for groups in _fitting_layout(names, list(result.tables.values()), console):
         console.print()
         for group in groups:
             if group.title:
                 _print_line(console, group.title, style="italic")
-        print_whole(console, _rich_table(names, groups))
+        print_unwrapped(console, _rich_table(names, groups))
     _print_notes(result, console)
 
 
 def result_csv(result: Result) -> str:
-    r"""Return the tables as CSV: a row per config, the JSON's numbers and stamps as columns, ``\n`` ends.
+    r"""Return the tables as CSV with one row per config and ``\n`` line ends.
 
-    Undefined numbers are empty. A text that a spreadsheet would run as a formula gets a leading apostrophe,
-    and control characters in it become U+FFFD.
+    Columns are the JSON's numbers and provenance. Undefined numbers are empty. Text that a spreadsheet would
+    execute as a formula gets a leading apostrophe, and control characters become U+FFFD.
     """
     return results_csv([result])
 
 
 def results_csv(results: Sequence[Result]) -> str:
-    """Return the tables of several results as one CSV, as ``result_csv`` spells them."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(_csv_header())
+    """Return the tables of several results as one CSV, in the format of ``result_csv``."""
+    rows = [_csv_header()]
     for result in results:
         content = result.to_dict()
-        rows = [_csv_row(content, name, table) for name, table in content["tables"].items()]
-        writer.writerows([csv_cell(value) for value in row] for row in rows)
-    return out.getvalue()
+        rows += [_csv_row(content, name, table) for name, table in content["tables"].items()]
+    return csv_text(rows)
 
 
 def _headline(result: Result) -> str:
-    return f"{formatting.printable(result.method)}, protocol {PROTOCOL}"
+    return f"{printable(result.method)}, protocol {PROTOCOL}"
 
 
-def _stamps(result: Result) -> str:
+def _provenance(result: Result) -> str:
     digest = formatting.short_digest(result.dataset_digest)
     return (
-        f"dataset {formatting.printable(result.dataset_version)} ({digest}), "
+        f"dataset {printable(result.dataset_version)} ({digest}), "
         f"archive {formatting.short_digest(result.submission_sha256)}, software {result.software_version}"
     )
 
 
 def _print_line(console: Console, line: str, style: str = "") -> None:
-    """Print text as it is: no markup, no highlighting of numbers, wrapped at words."""
+    """Print plain text, wrapped at words, without markup or highlighting of numbers."""
     console.print(Text(line, style=style))
 
 
-def print_whole(console: Console, table: RichTable) -> None:
-    """Print a table at its own width even where the console is narrower: rich would cut numbers."""
+def print_unwrapped(console: Console, table: RichTable) -> None:
+    """Print a table at its natural width even if the console is narrower, because rich would truncate numbers."""
     width = _width(table, console)
     options = console.options.update(width=width, max_width=width)
     console.print(Segments(list(console.render(table, options))), soft_wrap=True, end="")
@@ -103,52 +102,51 @@ def _print_notes(result: Result, console: Console) -> None:
     for name, table in result.tables.items():
         reasons = formatting.unranked_reasons(table)
         if reasons:
-            _print_line(
-                console, f"{formatting.printable(name)}: not ranked: {'; '.join(reasons)}.", style="yellow"
-            )
-    if formatting.has_dash(row for group in _groups(list(result.tables.values())) for row in group.rows):
+            _print_line(console, f"{printable(name)}: not ranked: {'; '.join(reasons)}.", style="yellow")
+    if formatting.has_dash(row for group in _column_groups(list(result.tables.values())) for row in group.rows):
         _print_line(console, formatting.DASH_NOTE)
 
 
-def _groups(tables: Sequence[Table]) -> tuple[_Group, _Group, _Group, _Group]:
-    """Return the columns of coverage and rank, native, scaled, and tolerances."""
+def _column_groups(tables: Sequence[Table]) -> tuple[_ColumnGroup, _ColumnGroup, _ColumnGroup, _ColumnGroup]:
+    """Return the column groups: coverage and rank, native, scaled, tolerances."""
     metric_heads = tuple(f"{name} {better}\n{unit}" for name, unit, better in formatting.METRIC_HEADS)
     return (
-        _Group(
+        _ColumnGroup(
             "",
             ("views\nscored\n/all", "cover-\nage ↑\n%", "ranked\n"),
             tuple(
                 (
-                    f"{one.views_scored}/{one.views}",
-                    formatting.coverage_percent(one.coverage),
-                    "yes" if one.ranked else "no",
+                    f"{table.views_scored}/{table.views}",
+                    formatting.coverage_percent(table.coverage),
+                    "yes" if table.ranked else "no",
                 )
-                for one in tables
+                for table in tables
             ),
         ),
-        _Group(
+        _ColumnGroup(
             formatting.NATIVE_TITLE,
             tuple(f"native\n{head}" for head in metric_heads),
-            tuple(tuple(formatting.metric_cells(one.native)) for one in tables),
+            tuple(tuple(formatting.metric_cells(table.native)) for table in tables),
         ),
-        _Group(
+        _ColumnGroup(
             formatting.SCALED_TITLE,
             (*(f"scaled\n{head}" for head in metric_heads), "scale\ns\n"),
             tuple(
-                (*formatting.metric_cells(one.scaled), formatting.scale_cell(one.scale_median)) for one in tables
+                (*formatting.metric_cells(table.scaled), formatting.scale_cell(table.scale_median))
+                for table in tables
             ),
         ),
-        _Group(
+        _ColumnGroup(
             formatting.WITHIN_TITLE,
-            tuple(f"within\n{t} mm\n% ↑" for t in WITHIN_MM),
-            tuple(tuple(formatting.within_cells(one.within_mm)) for one in tables),
+            tuple(f"within\n{tolerance_mm} mm\n% ↑" for tolerance_mm in WITHIN_MM),
+            tuple(tuple(formatting.within_cells(table.within_mm)) for table in tables),
         ),
     )
 
 
-def _fitting_layout(names: Sequence[str], tables: Sequence[Table], console: Console) -> list[list[_Group]]:
-    """Return the groups of each table to print: as few tables as the console's width allows."""
-    base, native, scaled, within = _groups(tables)
+def _fitting_layout(names: Sequence[str], tables: Sequence[Table], console: Console) -> list[list[_ColumnGroup]]:
+    """Return the column groups of each table to print, with as few tables as the console's width allows."""
+    base, native, scaled, within = _column_groups(tables)
     layouts = [
         [[base, native, scaled, within]],
         [[native, scaled], [base, within]],
@@ -160,7 +158,7 @@ def _fitting_layout(names: Sequence[str], tables: Sequence[Table], console: Cons
     return layouts[-1]
 
 
-def _rich_table(names: Sequence[str], groups: Sequence[_Group]) -> RichTable:
+def _rich_table(names: Sequence[str], groups: Sequence[_ColumnGroup]) -> RichTable:
     table = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
     heads = [head for group in groups for head in group.heads]
     lines = max(head.count("\n") for head in heads)
@@ -173,46 +171,45 @@ def _rich_table(names: Sequence[str], groups: Sequence[_Group]) -> RichTable:
 
 
 def _header(head: str, lines: int) -> Text:
-    """Return a heading of ``lines`` + 1 lines, its own at the bottom."""
+    """Return a heading padded at the top with empty lines to ``lines`` + 1 lines."""
     return Text("\n" * (lines - head.count("\n")) + head)
 
 
 def _width(table: RichTable, console: Console) -> int:
-    """Return the width at which nothing in ``table`` is folded or cut."""
+    """Return the width at which nothing in ``table`` is wrapped or truncated, characters."""
     return Measurement.get(console, console.options.update(max_width=_UNBOUNDED), table).maximum
 
 
 def _csv_header() -> list[str]:
     return [
-        *("protocol", "method", "config", *number_heads()),
+        *("protocol", "method", "config", *number_columns()),
         *("dataset_digest", "dataset_version", "submission_sha256", "software_version"),
     ]
 
 
 def _csv_row(content: dict[str, Any], name: str, table: dict[str, Any]) -> list[Any]:
-    """Return one config's cells in the header's order, from the objects of the result's JSON."""
+    """Return one config's cells in the order of the header, from the objects of the result's JSON."""
     return [
         *(content["protocol"], content["submission"]["method"], name),
-        *number_cells(table),
+        *number_values(table),
         *(content["dataset"]["digest"], content["dataset"]["version"]),
         *(content["submission"]["sha256"], content["software"]["version"]),
     ]
 
 
-def number_heads() -> list[str]:
-    """Return the CSV's heads of a config's numbers."""
-    metrics = ("abs_rel", "rmse_cm", "mae_cm", "delta1")
+def number_columns() -> list[str]:
+    """Return the CSV column names of a config's numbers."""
     return [
         *("views", "views_scored", "coverage", "ranked"),
-        *(f"native_{name}" for name in metrics),
-        *(f"scaled_{name}" for name in metrics),
+        *(f"native_{name}" for name in METRIC_NAMES),
+        *(f"scaled_{name}" for name in METRIC_NAMES),
         "scale_median",
         *(f"within_{t}mm" for t in WITHIN_MM),
     ]
 
 
-def number_cells(table: Mapping[str, Any]) -> list[Any]:
-    """Return a config's numbers, ``number_heads`` by ``number_heads``, from its table in the result's JSON."""
+def number_values(table: Mapping[str, Any]) -> list[Any]:
+    """Return a config's numbers in the order of ``number_columns``, from its table in the result's JSON."""
     return [
         *(table[key] for key in ("views", "views_scored", "coverage", "ranked")),
         *table["native"].values(),
@@ -222,11 +219,18 @@ def number_cells(table: Mapping[str, Any]) -> list[Any]:
     ]
 
 
+def csv_text(rows: Iterable[Iterable[str | float | bool | None]]) -> str:
+    r"""Return rows of values, the first of which is the header, as CSV with ``\n`` line ends."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([csv_cell(value) for value in row] for row in rows)
+    return out.getvalue()
+
+
 def csv_cell(value: str | float | bool | None) -> str:
-    """Return a value as a CSV cell: empty for None, no formula, no control characters."""
+    """Return a value as a CSV cell: empty for None, text without formulas and control characters."""
     if value is None:
         return ""
     if isinstance(value, str):
-        clean = formatting.printable(value, limit=_UNBOUNDED)
+        clean = printable(value, limit=_UNBOUNDED)
         return f"'{clean}" if clean.startswith(_FORMULA_STARTS) else clean
     return json.dumps(value)

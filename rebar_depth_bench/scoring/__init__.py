@@ -1,1 +1,1 @@
-"""Scoring: protocol, metrics, bootstrap intervals, results and comparisons."""
+"""Scoring of submissions: protocol, metrics, bootstrap intervals, results and comparisons."""

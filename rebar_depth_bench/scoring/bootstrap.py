@@ -1,11 +1,11 @@
-"""95 % intervals of a config's numbers: a bootstrap that resamples blocks of neighbouring views.
+"""Block bootstrap of table metrics: 95 % percentile intervals over resampled views.
 
-Views next to each other see nearly the same steel, so their errors are alike; drawing single views would make
-the intervals too narrow. Blocks of consecutive views keep that likeness: the circular block bootstrap of Politis
-and Romano ("A circular block-resampling procedure for stationary data", 1992), percentile intervals.
+Neighbouring views show nearly the same steel, so their errors are correlated, and resampling single views would
+give intervals that are too narrow. Resampling blocks of consecutive views preserves the correlation: circular
+block bootstrap of Politis and Romano ("A circular block-resampling procedure for stationary data", 1992).
 
-The intervals say how far a number would move with other views of the same scenes from the same protocol. They say
-nothing about other cages, lights or cameras.
+The intervals describe the variation with other views of the same scenes from the same camera protocol. They do not
+describe the variation with other cages, lights or cameras.
 """
 
 from __future__ import annotations
@@ -17,31 +17,39 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-DRAWS = 2000
-LEVEL = 0.95
-RING_VIEWS = 12
-"""Block length in steps of the full protocol: a dome's ring of azimuths."""
+RESAMPLES = 2000
+"""Number of bootstrap resamples (draws)."""
+
+CONFIDENCE_LEVEL = 0.95
+"""Confidence level of the intervals."""
+
+BLOCK_VIEWS = 12
+"""Block length in steps of the full camera protocol: one ring of azimuths of the dome."""
 
 MIN_VIEWS = 5
-"""With fewer views there is no interval: a handful of values says too little of their own spread."""
+"""Smallest number of views for which an interval is computed; fewer values do not determine their spread."""
 
 _MIN_BLOCKS = 4
 _SEED = 0
-_NUMBERS_AT_ONCE = 4_000_000
+_CHUNK_ELEMENTS = 4_000_000
 
 Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Resampling:
-    """How often each of n views, in protocol order, is in each of ``DRAWS`` resamples of n views."""
+    """Bootstrap resamples of n views in protocol order.
+
+    ``counts[i, j]`` is the number of times that view j occurs in resample i; there are ``RESAMPLES`` resamples.
+    """
 
     counts: Float64[ndarray, "draws n"]
 
     def means(self, values: Float64[ndarray, "n k"]) -> Float64[ndarray, "draws k"]:
-        """Return the mean of each column in each resample; NaN marks a view without a value.
+        """Return the mean of each column in each resample; NaN in ``values`` marks a view without a value.
 
-        NaN where a resample has no value, and in a column with too few values (``MIN_VIEWS``) or an infinity.
+        The result is NaN where a resample has no value, and in columns with fewer than ``MIN_VIEWS`` values or
+        with an infinite value.
         """
         present = ~np.isnan(values)
         sums = self.counts @ np.where(np.isfinite(values), values, 0.0)
@@ -53,9 +61,10 @@ class Resampling:
     def pooled_means(
         self, samples: Float64[ndarray, " m"], view: Int64[ndarray, " m"]
     ) -> Float64[ndarray, " draws"]:
-        """Return in each resample the mean of samples pooled over views; ``view`` says whose each sample is.
+        """Return the mean of samples pooled over views in each resample; ``view`` is each sample's view index.
 
-        NaN where a resample has no sample, and everywhere with too few views (``MIN_VIEWS``) or an infinity.
+        The result is NaN where a resample has no sample, and everywhere if fewer than ``MIN_VIEWS`` views have
+        samples or a sample is not finite.
         """
         if len(np.unique(view)) < MIN_VIEWS or not np.isfinite(samples).all():
             return np.full(len(self.counts), np.nan)
@@ -66,70 +75,83 @@ class Resampling:
             means = sums[:, 0] / sums[:, 1]
         return np.asarray(means)
 
+    def medians(self, values: Float64[ndarray, " n"]) -> Float64[ndarray, " draws"]:
+        """Return the median over views in each resample; NaN in ``values`` marks a view without a value.
+
+        The result is NaN in the cases of ``percentile``.
+        """
+        present = np.flatnonzero(~np.isnan(values))
+        return self.percentile(values[present], present, 50)
+
     def percentile(
         self, samples: Float64[ndarray, " m"], view: Int64[ndarray, " m"], percent: float
     ) -> Float64[ndarray, " draws"]:
-        """Return in each resample a percentile of samples pooled over views; ``view`` says whose each sample is.
+        """Return a percentile of samples pooled over views in each resample; ``view`` is each sample's view index.
 
-        That is the smallest sample with at least that share of samples at or below it; of a median where the share
-        is met exactly, the mean of it and the next.
-        NaN where a resample has no sample, and everywhere with too few views (``MIN_VIEWS``) or an infinity.
+        The percentile is the smallest sample with at least ``percent`` of the samples at or below it. For the
+        median (``percent`` = 50), if exactly half of the samples are at or below it, the mean of this sample and
+        the next one is returned.
+
+        The result is NaN where a resample has no sample, and everywhere if fewer than ``MIN_VIEWS`` views have
+        samples or a sample is not finite.
         """
         if len(np.unique(view)) < MIN_VIEWS or not np.isfinite(samples).all():
             return np.full(len(self.counts), np.nan)
         order = np.argsort(samples, kind="stable")
-        ordered, owner = samples[order], view[order]
-        step = max(1, _NUMBERS_AT_ONCE // len(samples))
-        parts = [
-            _weighted_percentile(ordered, self.counts[start : start + step, owner], percent)
-            for start in range(0, len(self.counts), step)
+        ordered, ordered_view = samples[order], view[order]
+        chunk_draws = max(1, _CHUNK_ELEMENTS // len(samples))
+        chunks = [
+            _weighted_percentile(ordered, self.counts[start : start + chunk_draws, ordered_view], percent)
+            for start in range(0, len(self.counts), chunk_draws)
         ]
-        return np.concatenate(parts)
+        return np.concatenate(chunks)
 
 
 def interval(estimates: Float64[ndarray, " draws"]) -> Interval | None:
-    """Return the percentile interval of a number's estimates over resamples, None of none; NaN does not count."""
-    known = estimates[np.isfinite(estimates)]
-    if not len(known):
+    """Return the percentile interval of the finite estimates over resamples, or None if no estimate is finite."""
+    finite = estimates[np.isfinite(estimates)]
+    if not len(finite):
         return None
-    low, high = np.percentile(known, [50 * (1 - LEVEL), 50 * (1 + LEVEL)])
+    low, high = np.percentile(finite, [50 * (1 - CONFIDENCE_LEVEL), 50 * (1 + CONFIDENCE_LEVEL)])
     return float(low), float(high)
 
 
 def resample(indices: Sequence[int]) -> Resampling:
-    """Return the resamples of views, given their indices in the full protocol, ascending.
+    """Return the resamples of views, given their ascending indices in the full camera protocol.
 
-    The same indices give the same resamples, on any machine: raw PCG64 numbers do not change between versions.
+    The same indices give the same resamples on every machine, since the raw PCG64 stream does not change between
+    NumPy versions.
     """
     n = len(indices)
     length = block_length(indices)
     blocks = -(-n // length)
-    starts = (np.random.PCG64(_SEED).random_raw(DRAWS * blocks) % max(n, 1)).astype(np.int64)
-    views = (starts.reshape(DRAWS, blocks, 1) + np.arange(length)).reshape(DRAWS, -1)[:, :n] % max(n, 1)
-    flat = views + n * np.arange(DRAWS)[:, None]
-    counts = np.bincount(flat.ravel(), minlength=DRAWS * n).reshape(DRAWS, n)
+    starts = (np.random.PCG64(_SEED).random_raw(RESAMPLES * blocks) % max(n, 1)).astype(np.int64)
+    views = (starts.reshape(RESAMPLES, blocks, 1) + np.arange(length)).reshape(RESAMPLES, -1)[:, :n] % max(n, 1)
+    flat = views + n * np.arange(RESAMPLES)[:, None]
+    counts = np.bincount(flat.ravel(), minlength=RESAMPLES * n).reshape(RESAMPLES, n)
     return Resampling(counts.astype(np.float64))
 
 
 def block_length(indices: Sequence[int]) -> int:
-    """Return how many views make a block: as many as lie on ``RING_VIEWS`` steps of the full protocol, at least 1.
+    """Return the number of views per block: those on ``BLOCK_VIEWS`` steps of the full camera protocol, at least
+    1.
 
-    A sparse subset, whose views are farther apart than that, is drawn view by view.
+    The views of a sparse subset, which are farther apart than that, are resampled one by one.
     """
     n = len(indices)
     if n < 2:
         return 1
     stride = max(1.0, (indices[-1] - indices[0]) / (n - 1))
-    return max(1, min(round(RING_VIEWS / stride), n // _MIN_BLOCKS))
+    return max(1, min(round(BLOCK_VIEWS / stride), n // _MIN_BLOCKS))
 
 
 def _weighted_percentile(
     ordered: Float64[ndarray, " m"], weights: Float64[ndarray, "draws m"], percent: float
 ) -> Float64[ndarray, " draws"]:
-    below = np.cumsum(weights, axis=1)
-    wanted = below[:, -1] * percent / 100
-    lower = ordered[np.minimum((below < wanted[:, None]).sum(axis=1), len(ordered) - 1)]
+    cumulative = np.cumsum(weights, axis=1)
+    threshold = cumulative[:, -1] * percent / 100
+    lower = ordered[np.minimum((cumulative < threshold[:, None]).sum(axis=1), len(ordered) - 1)]
     if percent != 50:
-        return np.where(below[:, -1] > 0, lower, np.nan)
-    upper = ordered[np.minimum((below <= wanted[:, None]).sum(axis=1), len(ordered) - 1)]
-    return np.where(below[:, -1] > 0, (lower + upper) / 2, np.nan)
+        return np.where(cumulative[:, -1] > 0, lower, np.nan)
+    upper = ordered[np.minimum((cumulative <= threshold[:, None]).sum(axis=1), len(ordered) - 1)]
+    return np.where(cumulative[:, -1] > 0, (lower + upper) / 2, np.nan)

@@ -1,7 +1,7 @@
-"""Two submissions on the same views: the paired difference of every number, and whether it stands out.
+"""Paired comparison of two submissions: the difference of every metric on the same views and its significance.
 
-Both see the same views, so the views' difficulty cancels in the difference of each: its interval is far narrower
-than the two intervals by themselves, and only it says whether one submission is better here.
+The difficulty of each view cancels in the paired difference. The interval of the difference is therefore much
+narrower than the intervals of the two submissions, and only it shows whether one submission is better.
 """
 
 from __future__ import annotations
@@ -15,31 +15,35 @@ import numpy as np
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.bootstrap import Interval, interval, resample
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.provenance import ArchiveStamp, Stamp
+from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
 from rebar_depth_bench.scoring.result import (
-    SCALE,
-    VIEW_NUMBERS,
+    SCALE_MEDIAN,
+    VIEW_METRICS,
     Result,
     ViewScore,
-    estimate_draws,
+    bootstrap_estimates,
     protocol_indices,
 )
-from rebar_depth_bench.scoring.rounding import INTERVAL_DIGITS, rounded
+from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
 from rebar_depth_bench.submission import config_of
 
 Verdict = Literal["better", "worse", "equal", "undecided", "not ranked", ""]
 
-_OF_ALL_VIEWS = ("coverage", "within_mm.")
-_HIGHER_IS_BETTER = ("coverage", "native.delta1", "scaled.delta1", "within_mm.")
+_ALL_VIEWS_PREFIXES = ("coverage", "within_mm.")
+"""Name prefixes of the metrics that every view has, also a view without predictions."""
+
+_HIGHER_IS_BETTER_PREFIXES = ("coverage", "native.delta1", "scaled.delta1", "within_mm.")
+"""Name prefixes of the metrics whose larger value is better."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One number of both submissions on the same views, and ``other - first`` with its 95 % interval.
+    """Metric of two submissions on the same views, and the difference ``other - first`` with its 95 % interval.
 
-    ``verdict`` says how the other does: "equal" where all views agree, "undecided" where the interval holds zero
-    or there is none, "not ranked" for errors where either submission is not ranked, for an error over the pixels
-    one chose to predict is no merit; "" for the scale factor, where neither direction is better.
+    ``verdict`` rates the other submission: "better" or "worse" if the interval excludes zero; "equal" if the
+    interval is [0, 0]; "undecided" if the interval contains zero or is None; "not ranked" for error metrics if
+    either submission is not ranked, since errors over a freely chosen subset of the pixels are not comparable; ""
+    for the scale factor, where neither direction is better.
     """
 
     name: str
@@ -53,23 +57,25 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Every number's difference by config, for the configs that both archives hold."""
+    """Differences of all metrics for each config that both archives contain."""
 
-    stamp: Stamp
+    provenance: Provenance
     configs: Mapping[str, Sequence[Difference]]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the comparison as a JSON object."""
+        """Return the comparison as a JSON-compatible object."""
         return {
-            **self.stamp.to_dict(),
-            "configs": {name: [_difference_dict(one) for one in rows] for name, rows in self.configs.items()},
+            **self.provenance.to_dict(),
+            "configs": {
+                name: [_difference_dict(difference) for difference in rows] for name, rows in self.configs.items()
+            },
         }
 
 
 def compare(first: Result, other: Result) -> Comparison:
-    """Return how ``other`` differs from ``first``.
+    """Return the differences of ``other`` from ``first``.
 
-    Raises ``InputError`` if they were scored against different ground truth or share no config.
+    Raises ``InputError`` if they were scored against different ground truth or have no config in common.
     """
     if first.dataset_digest != other.dataset_digest:
         raise InputError(
@@ -82,71 +88,81 @@ def compare(first: Result, other: Result) -> Comparison:
             f"{first.method} has {', '.join(first.tables)} and {other.method} has {', '.join(other.tables)}: "
             "expected a config that is in both"
         )
-    archives = [ArchiveStamp(one.method, one.submission_sha256) for one in (first, other)]
+    archives = [ArchiveIdentity(result.method, result.submission_sha256) for result in (first, other)]
     return Comparison(
-        stamp=Stamp(PROTOCOL, first.dataset_digest, first.dataset_version, archives),
-        configs={config: _of_config(first, other, config) for config in shared},
+        provenance=Provenance(PROTOCOL, first.dataset_digest, first.dataset_version, archives),
+        configs={config: _config_differences(first, other, config) for config in shared},
     )
 
 
-def _of_config(first: Result, other: Result, config: str) -> list[Difference]:
-    found = _differences(_views(first, config), _views(other, config))
+def _config_differences(first: Result, other: Result, config: str) -> list[Difference]:
+    differences = _differences(_views_by_id(first, config), _views_by_id(other, config))
     if first.tables[config].ranked and other.tables[config].ranked:
-        return found
+        return differences
     return [
-        one if one.name == SCALE or one.name.startswith(_OF_ALL_VIEWS) else replace(one, verdict="not ranked")
-        for one in found
+        difference
+        if difference.name == SCALE_MEDIAN or difference.name.startswith(_ALL_VIEWS_PREFIXES)
+        else replace(difference, verdict="not ranked")
+        for difference in differences
     ]
 
 
-def _views(result: Result, config: str) -> dict[str, ViewScore]:
+def _views_by_id(result: Result, config: str) -> dict[str, ViewScore]:
     return {view.view_id: view for view in result.views if config_of(view.view_id) == config}
 
 
 def _differences(first: Mapping[str, ViewScore], other: Mapping[str, ViewScore]) -> list[Difference]:
-    """Return a difference per number. Error metrics go over the views where both submissions have a value."""
-    both = [view_id for view_id in first if first[view_id].native and other[view_id].native]
-    of_all, of_both = (_on_views([first[v] for v in ids], [other[v] for v in ids]) for ids in (list(first), both))
-    return [of_all[name] if name.startswith(_OF_ALL_VIEWS) else of_both[name] for name in VIEW_NUMBERS]
+    """Return one difference per metric; error metrics use only the views where both submissions have a value."""
+    predicted_by_both = [view_id for view_id in first if first[view_id].native and other[view_id].native]
+    on_all_views, on_predicted_by_both = (
+        _differences_on_views([first[v] for v in ids], [other[v] for v in ids])
+        for ids in (list(first), predicted_by_both)
+    )
+    return [
+        on_all_views[name] if name.startswith(_ALL_VIEWS_PREFIXES) else on_predicted_by_both[name]
+        for name in VIEW_METRICS
+    ]
 
 
-def _on_views(first: Sequence[ViewScore], other: Sequence[ViewScore]) -> dict[str, Difference]:
-    """Return the differences on these views of both, by name; the same resamples serve both sides."""
+def _differences_on_views(first: Sequence[ViewScore], other: Sequence[ViewScore]) -> dict[str, Difference]:
+    """Return the differences on the given views by metric name, with the same resamples for both submissions."""
     resampling = resample(protocol_indices([view.view_id for view in first]))
-    draws = estimate_draws(other, resampling) - estimate_draws(first, resampling)
-    found = {}
-    for k, name in enumerate(VIEW_NUMBERS):
-        a, b = (_estimate(name, views) for views in (first, other))
-        ends = interval(draws[:, k])
-        change = None if a is None or b is None else b - a
-        found[name] = Difference(name, len(first), a, b, change, ends, _verdict(name, ends))
-    return found
+    draws = bootstrap_estimates(other, resampling) - bootstrap_estimates(first, resampling)
+    differences = {}
+    for k, name in enumerate(VIEW_METRICS):
+        first_value, other_value = (_table_value(name, views) for views in (first, other))
+        bounds = interval(draws[:, k])
+        change = None if first_value is None or other_value is None else other_value - first_value
+        differences[name] = Difference(
+            name, len(first), first_value, other_value, change, bounds, _verdict(name, bounds)
+        )
+    return differences
 
 
-def _estimate(name: str, views: Sequence[ViewScore]) -> float | None:
-    values = [value for view in views if (value := VIEW_NUMBERS[name](view)) is not None]
+def _table_value(name: str, views: Sequence[ViewScore]) -> float | None:
+    values = [value for view in views if (value := VIEW_METRICS[name](view)) is not None]
     if not values or not np.isfinite(values).all():
         return None
-    return float(np.median(values) if name == SCALE else np.mean(values))
+    return float(np.median(values) if name == SCALE_MEDIAN else np.mean(values))
 
 
-def _verdict(name: str, ends: Interval | None) -> Verdict:
-    if name == SCALE:
+def _verdict(name: str, bounds: Interval | None) -> Verdict:
+    if name == SCALE_MEDIAN:
         return ""
-    if ends == (0.0, 0.0):
+    if bounds == (0.0, 0.0):
         return "equal"
-    if ends is None or ends[0] <= 0.0 <= ends[1]:
+    if bounds is None or bounds[0] <= 0.0 <= bounds[1]:
         return "undecided"
-    return "better" if (ends[0] > 0) == name.startswith(_HIGHER_IS_BETTER) else "worse"
+    return "better" if (bounds[0] > 0) == name.startswith(_HIGHER_IS_BETTER_PREFIXES) else "worse"
 
 
-def _difference_dict(one: Difference) -> dict[str, Any]:
+def _difference_dict(difference: Difference) -> dict[str, Any]:
     return {
-        "name": one.name,
-        "views": one.views,
-        "first": rounded(one.first),
-        "other": rounded(one.other),
-        "difference": rounded(one.difference),
-        "ci95": None if one.interval is None else [rounded(end, INTERVAL_DIGITS) for end in one.interval],
-        "verdict": one.verdict,
+        "name": difference.name,
+        "views": difference.views,
+        "first": rounded(difference.first),
+        "other": rounded(difference.other),
+        "difference": rounded(difference.difference),
+        "ci95": rounded_interval(difference.interval),
+        "verdict": difference.verdict,
     }

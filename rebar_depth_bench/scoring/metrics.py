@@ -1,14 +1,15 @@
-"""The numbers of protocol ``rebar-1``: pure functions on the scored pixels of one view, in float64 metres.
+"""Depth metrics of protocol ``rebar-1``: pure functions on the scored pixels of one view, in float64 metres.
 
-``z_m`` is ground truth, ``p_m`` the prediction on the same pixels, both of length n >= 1, finite and > 0.
+``z_m`` is the ground-truth depth and ``p_m`` the predicted depth on the same pixels, both of length n >= 1, finite
+and > 0.
 Definitions: Eigen et al., "Depth Map Prediction from a Single Image using a Multi-Scale Deep Network",
-NeurIPS 2014, section 4; the median scale follows Zhou et al., CVPR 2017, applied to each view by itself.
+NeurIPS 2014, section 4; the median scale follows Zhou et al., CVPR 2017, applied to each view separately.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,13 +18,13 @@ from numpy import ndarray
 
 from rebar_depth_bench.scoring.protocol import DELTA1_RATIO
 
-_CHUNK = 8192
-_SAMPLE = 4096
+_CHUNK_PX = 8192
+_SAMPLE_SIZE = 4096
 
 
 @dataclass(frozen=True)
 class DepthMetrics:
-    """Errors of one view, or their means over views.
+    """Depth errors of one view, or their means over views.
 
     ``abs_rel`` = mean(|p - z| / z); ``rmse_cm`` = 100 sqrt(mean((p - z)^2)); ``mae_cm`` = 100 mean(|p - z|);
     ``delta1`` = share of pixels with max(p/z, z/p) < 1.25.
@@ -35,67 +36,79 @@ class DepthMetrics:
     delta1: float
 
 
+METRIC_TITLES: Mapping[str, tuple[str, str]] = {
+    "abs_rel": ("AbsRel", ""),
+    "rmse_cm": ("RMSE", "cm"),
+    "mae_cm": ("MAE", "cm"),
+    "delta1": ("δ1", ""),
+}
+"""Title and unit of each field of ``DepthMetrics``."""
+
+METRIC_NAMES = tuple(METRIC_TITLES)
+"""Names of the fields of ``DepthMetrics``, in order."""
+
+
 def depth_metrics(p_m: Float[ndarray, " n"], z_m: Float[ndarray, " n"], scale: float = 1.0) -> DepthMetrics:
-    """Return the errors of ``scale`` times a prediction; too large to square gives ``inf``, no warning."""
-    [metrics], _ = aligned_metrics(p_m, z_m, (scale,))
+    """Return the errors of ``scale * p_m``; errors whose square overflows give ``inf`` without a warning."""
+    [metrics], _ = metrics_at_scales(p_m, z_m, (scale,))
     return metrics
 
 
-def aligned_metrics(
+def metrics_at_scales(
     p_m: Float[ndarray, " n"],
     z_m: Float[ndarray, " n"],
     scales: Sequence[float],
     tolerances_mm: Sequence[int] = (),
 ) -> tuple[list[DepthMetrics], dict[int, int]]:
-    """Return ``depth_metrics`` at each scale, and how many pixels of the first are within each tolerance.
+    """Return ``depth_metrics`` at each scale, and the number of pixels within each tolerance at the first scale.
 
-    One pass over the pixels for all of it, in parts that stay in the processor's cache: arrays of a whole view
-    would be mapped, cleared and given back for every operation, which takes longer than the arithmetic.
+    All sums are computed in one pass over chunks that fit into the processor's cache. Temporary arrays of a whole
+    view would be mapped, cleared and unmapped for every operation, which takes longer than the arithmetic.
     """
-    sums = [_Sums(dict.fromkeys(() if place else tolerances_mm, 0)) for place in range(len(scales))]
-    scaled, work = np.empty((2, _CHUNK))
+    sums = [_ErrorSums(dict.fromkeys(() if index else tolerances_mm, 0)) for index in range(len(scales))]
+    scaled, buffer = np.empty((2, _CHUNK_PX))
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-        for start in range(0, len(z_m), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            p, z = p_m[part].astype(np.float64), z_m[part].astype(np.float64)
-            for one, scale in zip(sums, scales, strict=True):
+        for start in range(0, len(z_m), _CHUNK_PX):
+            chunk = slice(start, start + _CHUNK_PX)
+            p, z = p_m[chunk].astype(np.float64), z_m[chunk].astype(np.float64)
+            for error_sums, scale in zip(sums, scales, strict=True):
                 at_scale = p if scale == 1.0 else np.multiply(p, scale, out=scaled[: len(p)])
-                one.add(at_scale, z, work[: len(p)])
-    return [one.metrics(len(z_m)) for one in sums], sums[0].within_mm
+                error_sums.add(at_scale, z, buffer[: len(p)])
+    return [error_sums.metrics(len(z_m)) for error_sums in sums], sums[0].within_mm
 
 
 def median_scale(p_m: Float[ndarray, " n"], z_median_m: float) -> float:
-    """Return the oracle scale s = median(z) / median(p); an even count takes the mean of the two middle values.
+    """Return the ground-truth scale s = median(z) / median(p), with medians as in ``median``.
 
-    ``z_median_m`` is the median of the truth on the very pixels of ``p_m``.
+    ``z_median_m`` is the median of the ground truth on the same pixels as ``p_m``.
     """
     with np.errstate(over="ignore", divide="ignore"):
         return float(np.float64(z_median_m) / median(p_m))
 
 
 def median(values: Float[ndarray, " n"]) -> float:
-    """Return the exact median of finite values in float64; an even count takes the mean of the two middle values.
+    """Return the exact median of finite values in float64; for an even count the mean of the two middle values.
 
-    A sample brackets the middle, so that only a twentieth of the values is partitioned: a third of
-    ``numpy.median``'s time on a view.
+    A sample of the values brackets the median, so that only a twentieth of the values is partitioned. On a view
+    this takes a third of the time of ``numpy.median``.
     """
     count = len(values)
     ranks = ((count - 1) // 2, count // 2)
-    inside, below = _middle_part(values, *ranks) if count >= 4 * _SAMPLE else (values, 0)
-    places = [rank - below for rank in ranks]
-    low, high = np.partition(inside, places)[places].astype(np.float64)
+    candidates, below = _values_around_median(values, *ranks) if count >= 4 * _SAMPLE_SIZE else (values, 0)
+    positions = [rank - below for rank in ranks]
+    low, high = np.partition(candidates, positions)[positions].astype(np.float64)
     return float(low if low == high else low + (high - low) / 2)
 
 
-def is_prediction(p_m: Float[ndarray, " n"]) -> Bool[ndarray, " n"]:
-    """Return which values are predictions: finite and > 0."""
+def is_valid_prediction(p_m: Float[ndarray, " n"]) -> Bool[ndarray, " n"]:
+    """Return a mask of the valid predictions: finite and > 0."""
     with np.errstate(invalid="ignore"):
         return np.asarray(np.isfinite(p_m) & (p_m > 0))
 
 
 @dataclass
-class _Sums:
-    """Sums over the pixels gone through so far, from which ``DepthMetrics`` follow."""
+class _ErrorSums:
+    """Running sums over pixels, from which ``DepthMetrics`` are computed."""
 
     within_mm: dict[int, int]
     absolute_m: float = 0.0
@@ -103,12 +116,14 @@ class _Sums:
     relative: float = 0.0
     inliers: int = 0
 
-    def add(self, p: Float64[ndarray, " m"], z: Float64[ndarray, " m"], work: Float64[ndarray, " m"]) -> None:
-        """Take in some pixels; what ``work`` holds is lost."""
-        # z has room for the factor in float64: products compare exactly where quotients would round.
-        self.inliers += np.count_nonzero(p < np.multiply(z, DELTA1_RATIO, out=work))
-        self.inliers -= np.count_nonzero(z >= np.multiply(p, DELTA1_RATIO, out=work))  # of those just counted
-        error_m = np.subtract(p, z, out=work)
+    def add(self, p: Float64[ndarray, " m"], z: Float64[ndarray, " m"], buffer: Float64[ndarray, " m"]) -> None:
+        """Add the pixels of one chunk to the sums; ``buffer`` is overwritten."""
+        # The ratios are compared as products: in float64 the product of a float32 depth and DELTA1_RATIO is exact,
+        # whereas a quotient would be rounded.
+        self.inliers += np.count_nonzero(p < np.multiply(z, DELTA1_RATIO, out=buffer))
+        # The pixels with z/p at or above the ratio all satisfy p < ratio * z and were counted in the line above.
+        self.inliers -= np.count_nonzero(z >= np.multiply(p, DELTA1_RATIO, out=buffer))
+        error_m = np.subtract(p, z, out=buffer)
         np.abs(error_m, out=error_m)
         for tolerance_mm in self.within_mm:
             self.within_mm[tolerance_mm] += int(np.count_nonzero(error_m <= tolerance_mm / 1000.0))
@@ -117,7 +132,7 @@ class _Sums:
         self.relative += float(np.add.reduce(np.divide(error_m, z, out=error_m)))
 
     def metrics(self, count: int) -> DepthMetrics:
-        """Return the means over ``count`` pixels."""
+        """Return the metrics over ``count`` pixels."""
         return DepthMetrics(
             abs_rel=self.relative / count,
             rmse_cm=100.0 * math.sqrt(self.square_m2 / count),
@@ -126,13 +141,14 @@ class _Sums:
         )
 
 
-def _middle_part(values: Float[ndarray, " n"], low_rank: int, high_rank: int) -> tuple[ndarray, int]:
-    """Return some of the values, among them those of both ranks, and how many values lie below all of them."""
-    sample = np.sort(values[:: len(values) // _SAMPLE])
-    middle, margin = len(sample) // 2, len(sample) // 42  # three standard deviations of a sample's median
+def _values_around_median(values: Float[ndarray, " n"], low_rank: int, high_rank: int) -> tuple[ndarray, int]:
+    """Return a subset of the values that contains both ranks, and the number of values below the subset."""
+    sample = np.sort(values[:: len(values) // _SAMPLE_SIZE])
+    # The margin is three standard deviations of the rank of the sample's median.
+    middle, margin = len(sample) // 2, len(sample) // 42
     low, high = sample[middle - margin], sample[middle + margin]
     below = int(np.count_nonzero(values < low))
-    inside = values[(values >= low) & (values <= high)]
-    if below <= low_rank and high_rank < below + len(inside):
-        return inside, below
-    return values, 0  # the sample misled
+    candidates = values[(values >= low) & (values <= high)]
+    if below <= low_rank and high_rank < below + len(candidates):
+        return candidates, below
+    return values, 0  # Fallback: the sample did not bracket the median.

@@ -1,4 +1,4 @@
-"""What a score says: per view, per config, and as the bytes of the contract's JSON."""
+"""Score results: per view, per config, and as JSON."""
 
 from __future__ import annotations
 
@@ -8,26 +8,29 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample
-from rebar_depth_bench.scoring.metrics import DepthMetrics
+from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
-from rebar_depth_bench.scoring.rounding import INTERVAL_DIGITS, rounded
+from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
 
-_METRICS = ("abs_rel", "rmse_cm", "mae_cm", "delta1")
-SCALE = "scale_median"
-_INDEX = re.compile("[0-9]{4}")
+if TYPE_CHECKING:
+    from rebar_depth_bench.extended.result import ExtendedResult
+
+SCALE_MEDIAN = "scale_median"
+"""Key of the median over views of the scale factor in ``VIEW_METRICS``."""
+
+_VIEW_INDEX = re.compile("[0-9]{4}")
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One view's numbers. ``scale``, ``native`` and ``scaled`` are None where no pixel has a prediction."""
+    """Metrics of one view; ``scale``, ``native`` and ``scaled`` are None without valid predictions."""
 
     view_id: str
     scored_px: int
@@ -38,28 +41,32 @@ class ViewScore:
     within_mm: Mapping[int, float]
 
 
-def _metric(alignment: str, name: str) -> Callable[[ViewScore], float | None]:
+def _metric_getter(alignment: str, name: str) -> Callable[[ViewScore], float | None]:
     return lambda view: getattr(getattr(view, alignment), name, None)
 
 
-def _within(tolerance_mm: int) -> Callable[[ViewScore], float | None]:
+def _within_getter(tolerance_mm: int) -> Callable[[ViewScore], float | None]:
     return lambda view: view.within_mm[tolerance_mm]
 
 
-VIEW_NUMBERS: Mapping[str, Callable[[ViewScore], float | None]] = {
+VIEW_METRICS: Mapping[str, Callable[[ViewScore], float | None]] = {
     "coverage": lambda view: view.coverage,
-    **{f"{alignment}.{name}": _metric(alignment, name) for alignment in ("native", "scaled") for name in _METRICS},
-    SCALE: lambda view: view.scale,
-    **{f"within_mm.{tolerance_mm}": _within(tolerance_mm) for tolerance_mm in WITHIN_MM},
+    **{
+        f"{alignment}.{name}": _metric_getter(alignment, name)
+        for alignment in ("native", "scaled")
+        for name in METRIC_NAMES
+    },
+    SCALE_MEDIAN: lambda view: view.scale,
+    **{f"within_mm.{tolerance_mm}": _within_getter(tolerance_mm) for tolerance_mm in WITHIN_MM},
 }
-"""What a view contributes to each number of a table; None where it has no value."""
+"""Functions that return a view's value of each table metric, by metric name; None where the view has no value."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """One config's numbers: means over its views, the median of their scales.
+    """Metrics of one config: means over its views, and the median of their scale factors.
 
-    ``intervals`` has the 95 % block bootstrap interval of each of ``VIEW_NUMBERS``, None where there is none.
+    ``intervals`` has the 95 % block bootstrap interval of each of ``VIEW_METRICS``, None where it is undefined.
     """
 
     views: int
@@ -75,7 +82,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Result:
-    """Everything a score says, and the stamps of what it was computed from."""
+    """Result of scoring one submission, with the digests and versions of its inputs."""
 
     method: str
     submission_sha256: str
@@ -87,7 +94,7 @@ class Result:
     extended: ExtendedResult | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the contract's JSON object; extended measures, where there are any, stand at its end."""
+        """Return the result as a JSON-compatible object; extended measures, if computed, are its last entry."""
         extended = {} if self.extended is None else {"extended": self.extended.to_dict()}
         return {
             "protocol": PROTOCOL,
@@ -100,74 +107,77 @@ class Result:
         }
 
     def to_json(self) -> bytes:
-        """Return the JSON's bytes: the same for the same archive and dataset, wherever computed."""
+        """Return the result as UTF-8 JSON; the same archive and dataset give the same bytes on every machine."""
         return (json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
 def tabulate(views: Sequence[ViewScore]) -> Table:
-    """Return a config's table from the scores of its views in the protocol.
+    """Return the table of a config from the scores of its scored views.
 
-    A number that is not finite (a prediction so large that its square overflows) is kept out of the table
-    and the row out of the ranking: it must not help by vanishing.
+    A config with an infinite metric (a prediction so large that its square overflows) is not ranked, and the
+    metric is written as null: an overflow must not improve the rank.
     """
-    with_value = [view for view in views if view.native is not None]
-    native = _mean_metrics([view.native for view in with_value if view.native])
-    scaled = _mean_metrics([view.scaled for view in with_value if view.scaled])
-    coverage = _mean([view.coverage for view in views])
-    complete = bool(views) and len(with_value) == len(views)
+    predicted = [view for view in views if view.native is not None]
+    native = _mean_metrics([view.native for view in predicted if view.native])
+    scaled = _mean_metrics([view.scaled for view in predicted if view.scaled])
+    coverage = mean([view.coverage for view in views])
+    complete = bool(views) and len(predicted) == len(views)
     finite = all(_is_finite(metrics) for metrics in (native, scaled))
     return Table(
         views=len(views),
-        views_scored=len(with_value),
+        views_scored=len(predicted),
         coverage=coverage,
         ranked=complete and finite and coverage is not None and coverage >= MIN_RANKED_COVERAGE,
         native=native,
         scaled=scaled,
-        scale_median=median([view.scale for view in with_value if view.scale is not None]) if with_value else None,
-        within_mm={t: _mean([view.within_mm[t] for view in views]) for t in WITHIN_MM},
-        intervals=view_intervals(views) if views else dict.fromkeys(VIEW_NUMBERS),
+        scale_median=median([view.scale for view in predicted if view.scale is not None]) if predicted else None,
+        within_mm={t: mean([view.within_mm[t] for view in views]) for t in WITHIN_MM},
+        intervals=view_intervals(views) if views else dict.fromkeys(VIEW_METRICS),
     )
 
 
 def view_intervals(views: Sequence[ViewScore]) -> dict[str, Interval | None]:
-    """Return the 95 % interval of every number of the table that these views make."""
-    estimates = estimate_draws(views, resample(protocol_indices([view.view_id for view in views])))
-    return {name: interval(estimates[:, k]) for k, name in enumerate(VIEW_NUMBERS)}
+    """Return the 95 % interval of every table metric of the given views."""
+    estimates = bootstrap_estimates(views, resample(protocol_indices([view.view_id for view in views])))
+    return {name: interval(estimates[:, k]) for k, name in enumerate(VIEW_METRICS)}
 
 
-def estimate_draws(views: Sequence[ViewScore], resampling: Resampling) -> Float64[ndarray, "draws k"]:
-    """Return the ``VIEW_NUMBERS`` of the table that each resample of the views makes; NaN where undefined."""
-    values = view_numbers(views)
+def bootstrap_estimates(views: Sequence[ViewScore], resampling: Resampling) -> Float64[ndarray, "draws k"]:
+    """Return the table's ``VIEW_METRICS`` in each resample of the views; NaN where undefined."""
+    values = view_metric_values(views)
     draws = resampling.means(values)
-    scale = list(VIEW_NUMBERS).index(SCALE)
-    present = np.flatnonzero(~np.isnan(values[:, scale]))
-    draws[:, scale] = resampling.percentile(values[present, scale], present, 50)
+    scale = list(VIEW_METRICS).index(SCALE_MEDIAN)
+    draws[:, scale] = resampling.medians(values[:, scale])
     return draws
 
 
-def view_numbers(views: Sequence[ViewScore]) -> Float64[ndarray, "n k"]:
-    """Return the ``VIEW_NUMBERS`` of each view, NaN where it has no value."""
-    rows = [[get(view) for get in VIEW_NUMBERS.values()] for view in views]
-    return np.array(rows, dtype=np.float64).reshape(len(views), len(VIEW_NUMBERS))
+def view_metric_values(views: Sequence[ViewScore]) -> Float64[ndarray, "n k"]:
+    """Return the ``VIEW_METRICS`` of each view, one row per view; NaN where it has no value."""
+    rows = [[get(view) for get in VIEW_METRICS.values()] for view in views]
+    return np.array(rows, dtype=np.float64).reshape(len(views), len(VIEW_METRICS))
 
 
 def protocol_indices(view_ids: Sequence[str]) -> list[int]:
-    """Return each view's index in its full protocol, the four digits its id ends with; else every view's place."""
-    tails = [view_id.rpartition("/")[2] for view_id in view_ids]
-    if all(_INDEX.fullmatch(tail) for tail in tails) and tails == sorted(tails):
-        return [int(tail) for tail in tails]
-    return list(range(len(tails)))
+    """Return each view's index in its full camera protocol: the four digits at the end of its view_id.
+
+    If the ids do not all end with four digits, or are not in ascending order, return the positions in the
+    sequence.
+    """
+    suffixes = [view_id.rpartition("/")[2] for view_id in view_ids]
+    if all(_VIEW_INDEX.fullmatch(suffix) for suffix in suffixes) and suffixes == sorted(suffixes):
+        return [int(suffix) for suffix in suffixes]
+    return list(range(len(suffixes)))
 
 
-def badness(view: ViewScore) -> float:
-    """Return what views are sorted by: native AbsRel; no prediction at all and overflows are the worst."""
+def sort_key_worst_first(view: ViewScore) -> float:
+    """Return the sort key of a view: native AbsRel, or ``inf`` without predictions or on overflow."""
     if view.native is None or not math.isfinite(view.native.abs_rel):
         return math.inf
     return view.native.abs_rel
 
 
-def _mean(values: Sequence[float]) -> float | None:
-    """Return the correctly rounded mean, None of nothing, inf where a value is not finite."""
+def mean(values: Sequence[float]) -> float | None:
+    """Return the correctly rounded mean; None for no values, ``inf`` for non-finite values or on overflow."""
     if not values:
         return None
     if not all(math.isfinite(value) for value in values):
@@ -179,10 +189,9 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _mean_metrics(metrics: Sequence[DepthMetrics]) -> DepthMetrics | None:
-    means = {name: _mean([getattr(one, name) for one in metrics]) for name in _METRICS}
-    if any(mean is None for mean in means.values()):
-        return None
-    return DepthMetrics(**{name: mean for name, mean in means.items() if mean is not None})
+    means = {name: mean([getattr(view_metrics, name) for view_metrics in metrics]) for name in METRIC_NAMES}
+    defined = {name: value for name, value in means.items() if value is not None}
+    return DepthMetrics(**defined) if defined else None
 
 
 def _is_finite(metrics: DepthMetrics | None) -> bool:
@@ -190,14 +199,7 @@ def _is_finite(metrics: DepthMetrics | None) -> bool:
 
 
 def _metrics_dict(metrics: DepthMetrics | None) -> dict[str, float | None]:
-    if metrics is None:
-        return dict.fromkeys(_METRICS)
-    return {
-        "abs_rel": rounded(metrics.abs_rel),
-        "rmse_cm": rounded(metrics.rmse_cm),
-        "mae_cm": rounded(metrics.mae_cm),
-        "delta1": rounded(metrics.delta1),
-    }
+    return {name: rounded(getattr(metrics, name, None)) for name in METRIC_NAMES}
 
 
 def _within_dict(within_mm: Mapping[int, float | None] | Mapping[int, float]) -> dict[str, float | None]:
@@ -219,12 +221,12 @@ def _table_dict(table: Table) -> dict[str, Any]:
 
 
 def _intervals_dict(intervals: Mapping[str, Interval | None]) -> dict[str, Any]:
-    """Return the intervals nested as the table's own numbers are."""
+    """Return the intervals nested like the metrics of the table."""
     nested: dict[str, Any] = {}
-    for name, ends in intervals.items():
+    for name, bounds in intervals.items():
         group, _, key = name.rpartition(".")
         target = nested.setdefault(group, {}) if group else nested
-        target[key] = None if ends is None else [rounded(end, INTERVAL_DIGITS) for end in ends]
+        target[key] = rounded_interval(bounds)
     return nested
 
 

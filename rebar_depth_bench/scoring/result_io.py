@@ -1,4 +1,4 @@
-"""A result read back from the bytes of its JSON."""
+"""Parser of result JSON."""
 
 from __future__ import annotations
 
@@ -10,71 +10,71 @@ from typing import Any
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.result import VIEW_NUMBERS, Result, Table, ViewScore
+from rebar_depth_bench.scoring.result import VIEW_METRICS, Result, Table, ViewScore
 
 
 def read_result(data: bytes, where: str) -> Result:
-    """Return a result with its tables and views, without extended measures; ``where`` names it in the error.
+    """Return the result in ``data`` without extended measures; ``where`` names the source in error messages.
 
-    Raises ``InputError`` for what is no result of this protocol.
+    Raises ``InputError`` if ``data`` is not a result of the current protocol.
     """
     try:
-        found = json.loads(data)
-        if found["protocol"] != PROTOCOL:
-            raise InputError(f"{where}: the protocol is {found['protocol']!r}, expected {PROTOCOL!r}")
+        document = json.loads(data)
+        if document["protocol"] != PROTOCOL:
+            raise InputError(f"{where}: the protocol is {document['protocol']!r}, expected {PROTOCOL!r}")
         return Result(
-            method=found["submission"]["method"],
-            submission_sha256=found["submission"]["sha256"],
-            dataset_digest=found["dataset"]["digest"],
-            dataset_version=found["dataset"]["version"],
-            software_version=found["software"]["version"],
-            tables={config: read_table(table) for config, table in found["tables"].items()},
-            views=[_view(view) for view in found["views"]],
+            method=document["submission"]["method"],
+            submission_sha256=document["submission"]["sha256"],
+            dataset_digest=document["dataset"]["digest"],
+            dataset_version=document["dataset"]["version"],
+            software_version=document["software"]["version"],
+            tables={config: read_table(table) for config, table in document["tables"].items()},
+            views=[_read_view(view) for view in document["views"]],
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{where}: is no result of rebar-bench: {type(error).__name__}: {error}") from None
 
 
-def read_table(found: Mapping[str, Any]) -> Table:
-    """Return a config's table from its object in the JSON."""
+def read_table(table: Mapping[str, Any]) -> Table:
+    """Return the table of a config from its JSON object."""
     return Table(
-        views=found["views"],
-        views_scored=found["views_scored"],
-        coverage=found["coverage"],
-        ranked=found["ranked"],
-        native=_metrics(found["native"], found["views_scored"] > 0),
-        scaled=_metrics(found["scaled"], found["views_scored"] > 0),
-        scale_median=found["scale_median"],
-        within_mm=_within(found["within_mm"]),
-        intervals={name: _ends(found.get("ci95", {}), name) for name in VIEW_NUMBERS},
+        views=table["views"],
+        views_scored=table["views_scored"],
+        coverage=table["coverage"],
+        ranked=table["ranked"],
+        native=_read_metrics(table["native"], table["views_scored"] > 0),
+        scaled=_read_metrics(table["scaled"], table["views_scored"] > 0),
+        scale_median=table["scale_median"],
+        within_mm=_read_within_mm(table["within_mm"]),
+        intervals={name: _read_interval(table.get("ci95", {}), name) for name in VIEW_METRICS},
     )
 
 
-def _view(found: Mapping[str, Any]) -> ViewScore:
-    predicted = found["coverage"] > 0
+def _read_view(view: Mapping[str, Any]) -> ViewScore:
+    predicted = view["coverage"] > 0
     return ViewScore(
-        view_id=found["view_id"],
-        scored_px=found["scored_px"],
-        coverage=found["coverage"],
-        scale=found["scale"],
-        native=_metrics(found["native"], predicted),
-        scaled=_metrics(found["scaled"], predicted),
-        within_mm=_within(found["within_mm"]),
+        view_id=view["view_id"],
+        scored_px=view["scored_px"],
+        coverage=view["coverage"],
+        scale=view["scale"],
+        native=_read_metrics(view["native"], predicted),
+        scaled=_read_metrics(view["scaled"], predicted),
+        within_mm=_read_within_mm(view["within_mm"]),
     )
 
 
-def _metrics(found: Mapping[str, float | None], predicted: bool) -> DepthMetrics | None:
-    """Return metrics; where there is a prediction, a number that is null has overflowed."""
+def _read_metrics(values: Mapping[str, float | None], predicted: bool) -> DepthMetrics | None:
+    """Return the metrics, or None without predictions; with predictions, null denotes an overflow (``inf``)."""
     if not predicted:
         return None
-    return DepthMetrics(**{name: math.inf if value is None else value for name, value in found.items()})
+    return DepthMetrics(**{name: math.inf if value is None else value for name, value in values.items()})
 
 
-def _within(found: Mapping[str, Any]) -> dict[int, Any]:
-    return {int(tolerance_mm): share for tolerance_mm, share in found.items()}
+def _read_within_mm(within_mm: Mapping[str, Any]) -> dict[int, Any]:
+    return {int(tolerance_mm): share for tolerance_mm, share in within_mm.items()}
 
 
-def _ends(nested: Mapping[str, Any], name: str) -> tuple[float, float] | None:
+def _read_interval(nested: Mapping[str, Any], name: str) -> tuple[float, float] | None:
     group, _, key = name.rpartition(".")
-    ends = (nested.get(group, {}) if group else nested).get(key)
-    return None if ends is None or None in ends else (ends[0], ends[1])
+    bounds = (nested.get(group, {}) if group else nested).get(key)
+    return None if bounds is None or None in bounds else (bounds[0], bounds[1])

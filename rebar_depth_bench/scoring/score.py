@@ -1,4 +1,4 @@
-"""``score``: an archive against a dataset folder, by protocol ``rebar-1``."""
+"""Scoring of a submission archive against a dataset folder by protocol ``rebar-1``."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from rebar_depth_bench.data.ground_truth import ConfigTruth, ViewTruth, config_truth
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.parallel import ordered_map
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.scoring.metrics import aligned_metrics, is_prediction, median, median_scale
+from rebar_depth_bench.scoring.ground_truth import ConfigTruth, ViewTruth, config_truth
+from rebar_depth_bench.scoring.metrics import is_valid_prediction, median, median_scale, metrics_at_scales
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Result, ViewScore, tabulate
 from rebar_depth_bench.submission import EntryError, SubmissionReader, config_of, open_submission
@@ -33,11 +33,11 @@ def score(
 ) -> Result:
     """Score an archive against a dataset folder or Hub repository.
 
-    Views are scored on ``workers`` threads (default: one a core) straight from the archive; memory holds a few
-    views at a time. The result does not depend on the number of workers.
+    Views are read directly from the archive and scored on ``workers`` threads (default: one per core); only a few
+    views are in memory at a time. The result does not depend on the number of workers.
 
-    Raises ``SubmissionError`` with every problem if any part of the archive is at fault, ``DatasetError`` if the
-    folder is.
+    Raises ``SubmissionError`` with all problems if any part of the archive is invalid, and ``DatasetError`` if the
+    dataset folder is invalid.
     """
     folder = open_folder(root)
     with (
@@ -60,9 +60,9 @@ def score(
 
 
 def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewScore:
-    """Return the numbers of one view's prediction (planar depth, metres) on the view's scored pixels."""
+    """Return the metrics of one view's prediction (planar depth, metres) on the view's scored pixels."""
     p_m, z_m, z_median_m = prediction_m.ravel().take(truth.index.astype(np.intp)), truth.depth_m, truth.median_m
-    valid = is_prediction(p_m)
+    valid = is_valid_prediction(p_m)
     if not valid.all():
         p_m, z_m = p_m[valid], z_m[valid]
         z_median_m = median(z_m) if len(z_m) else 0.0
@@ -71,7 +71,7 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
     if not len(p_m):
         return ViewScore(truth.view_id, scored_px, coverage, None, None, None, dict.fromkeys(WITHIN_MM, 0.0))
     scale = median_scale(p_m, z_median_m)
-    (native, scaled), within = aligned_metrics(p_m, z_m, (1.0, scale), WITHIN_MM)
+    (native, scaled), within = metrics_at_scales(p_m, z_m, (1.0, scale), WITHIN_MM)
     return ViewScore(
         view_id=truth.view_id,
         scored_px=scored_px,
@@ -86,7 +86,7 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
 def _score_all(
     submission: SubmissionReader, folder: DatasetFolder, workers: int | None, progress: Progress
 ) -> dict[str, list[ViewScore]]:
-    """Score every view of the archive, or raise with all that is wrong with it and score nothing."""
+    """Return the scores of every view of the archive by config. Raises ``SubmissionError`` with all problems."""
     present = {config_of(view_id) for view_id in submission.view_ids}
     unread = set(submission.view_ids)
     problems: list[str] = []
@@ -94,28 +94,28 @@ def _score_all(
     for config in folder.configs:
         if config in present:
             truths = config_truth(folder, config, progress)
-            outcomes = ordered_map(partial(_outcome, submission, truths), range(len(truths)), workers)
-            scored = list(_watched(outcomes, f"scoring {config}", len(truths), progress))
+            outcomes = ordered_map(partial(_score_or_problem, submission, truths), range(len(truths)), workers)
+            scored = list(_report_progress(outcomes, f"scoring {config}", len(truths), progress))
             scores[config] = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
             problems += [outcome for outcome in scored if isinstance(outcome, str)]
             unread.difference_update(truths.view_ids)
-    problems += _problems_out_of_protocol(submission, unread)
+    problems += _unscored_view_problems(submission, unread)
     if problems:
         raise SubmissionError(str(submission.path), problems)
     return scores
 
 
-def _outcome(submission: SubmissionReader, truths: ConfigTruth, place: int) -> ViewScore | str:
-    """Return a view's score, or the sentence that says what is wrong with its entry."""
-    truth = truths[place]
+def _score_or_problem(submission: SubmissionReader, truths: ConfigTruth, index: int) -> ViewScore | str:
+    """Return a view's score, or the problem of its entry."""
+    truth = truths[index]
     try:
         return score_view(truth, submission.read(truth.view_id))
     except EntryError as error:
         return error.problem
 
 
-def _problems_out_of_protocol(submission: SubmissionReader, view_ids: Iterable[str]) -> list[str]:
-    """Read the entries that no score looks at: a bad one is refused there too."""
+def _unscored_view_problems(submission: SubmissionReader, view_ids: Iterable[str]) -> list[str]:
+    """Return the problems of the entries of views without scored pixels, which are decoded but not scored."""
     problems = []
     for view_id in sorted(view_ids):
         try:
@@ -125,9 +125,9 @@ def _problems_out_of_protocol(submission: SubmissionReader, view_ids: Iterable[s
     return problems
 
 
-def _watched(
-    outcomes: Iterable[ViewScore | str], what: str, total: int, progress: Progress
+def _report_progress(
+    outcomes: Iterable[ViewScore | str], label: str, total: int, progress: Progress
 ) -> Iterator[ViewScore | str]:
     for done, outcome in enumerate(outcomes, start=1):
-        progress(what, done, total)
+        progress(label, done, total)
         yield outcome

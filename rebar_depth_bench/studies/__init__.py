@@ -1,5 +1,6 @@
-"""The studies of the paper, each a command: ``rebar-bench study NAME``.
+"""Studies of the paper, each available as the command ``rebar-bench study NAME``.
 
-A study module has ``SUMMARY`` (one line), ``add_arguments(parser)`` and ``run(options)``; its pure part returns a
-frozen result that knows its stamp.
+Each study is a package. Its ``command`` module has ``SUMMARY`` (one line), ``add_arguments(parser)`` and
+``run(options)``; a function without I/O on the command line computes a frozen result that carries its provenance
+(``scoring.provenance.Provenance``).
 """

@@ -1,4 +1,4 @@
-"""The studies by name, and their place under ``rebar-bench study``."""
+"""Registry of the studies by name, and their subcommands of ``rebar-bench study``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rebar_depth_bench.studies.scale_anchor import command as anchor
 
 
 class Study(Protocol):
-    """What a study's module has: one line, its arguments, and how it runs."""
+    """Interface of a study's command module: a one-line summary, its arguments and its entry point."""
 
     SUMMARY: str
 
@@ -23,7 +23,10 @@ class Study(Protocol):
 
     @property
     def run(self) -> Callable[[argparse.Namespace], None]:
-        """Run the study: results to standard output, progress to standard error; raises ``RebarDepthError``."""
+        """Run the study: results go to standard output, progress to standard error.
+
+        Raises ``RebarDepthError``.
+        """
 
 
 STUDIES: Mapping[str, Study] = {
@@ -35,7 +38,10 @@ STUDIES: Mapping[str, Study] = {
 
 
 def add_study_commands(parser: argparse.ArgumentParser) -> None:
-    """Add a command for each study to the parser of ``rebar-bench study``; each sets ``run`` to its own."""
+    """Add a subcommand for each study to the parser of ``rebar-bench study``.
+
+    Each subcommand sets the default ``run`` to the entry point of its study.
+    """
     commands = parser.add_subparsers(required=True, metavar="NAME")
     for name, study in STUDIES.items():
         command = commands.add_parser(name, help=study.SUMMARY, description=study.SUMMARY)

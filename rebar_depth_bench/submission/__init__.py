@@ -1,4 +1,4 @@
-"""Submission archives: writing them, checking them, and reading predictions out of them."""
+"""Submission archives: writing, validation and reading of predictions."""
 
 from rebar_depth_bench.errors import EntryError
 from rebar_depth_bench.submission.entries import ExpectedViews, config_of

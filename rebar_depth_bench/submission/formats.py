@@ -1,4 +1,4 @@
-"""The formats of a view's entry, by suffix: how large one may be, and how it becomes depth."""
+"""Registry of the entry formats: size bound and decoder for each file suffix."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ from rebar_depth_bench.submission.numpy_formats import Depth, decode_npy, decode
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """``decode(name, data, (H, W), depth_scale)``, which raises ``EntryError``, and the bound on its data."""
+    """Decoder and size bound of one entry format.
+
+    ``decode(name, data, (H, W), depth_scale)`` returns the depth in metres and raises ``EntryError``;
+    ``max_bytes((H, W))`` is the largest acceptable length of ``data`` in bytes.
+    """
 
     decode: Callable[[str, memoryview, tuple[int, int], float], Depth]
     max_bytes: Callable[[tuple[int, int]], int]

@@ -1,6 +1,8 @@
-"""``.exr`` entries: the header is parsed here, so that the library only meets a file worth decoding.
+"""Decoders of ``.exr`` and ``.png`` entries.
 
-``.png`` entries: container and inflated size are checked here, Pillow undoes the row filters.
+The OpenEXR header is parsed and checked in this module, so that the OpenEXR library receives only files with one
+flat channel of the expected size. For PNG, the chunks and the inflated size are checked in this module, and Pillow
+only undoes the row filters.
 """
 
 from __future__ import annotations
@@ -15,29 +17,31 @@ import numpy as np
 import OpenEXR
 from PIL import Image
 
-from rebar_depth_bench.errors import EntryError, show, show_shape
+from rebar_depth_bench.errors import EntryError, escape_text, format_shape
 from rebar_depth_bench.submission.numpy_formats import Depth
 
-_MAGIC = b"\x76\x2f\x31\x01"
+_EXR_MAGIC = b"\x76\x2f\x31\x01"
 _TILED, _LONG_NAMES, _DEEP, _MULTI_PART = 0x200, 0x400, 0x800, 0x1000
-_HEADER_LIMIT = 256 * 1024
-_LONGEST_NAME = 255
+_MAX_HEADER_BYTES = 256 * 1024
+_MAX_NAME_BYTES = 255
 _PIXEL_TYPES = {0: "UINT", 1: "HALF", 2: "FLOAT"}
-_TILE_LIMIT = 1024
+_MAX_TILE_PX = 1024
 
 
 def max_exr_bytes(shape: tuple[int, int]) -> int:
-    """Return the size of the largest acceptable ``.exr`` of that (H, W), in bytes.
+    """Return the largest acceptable size of an ``.exr`` file of shape (H, W), in bytes.
 
-    Uncompressed FLOAT values, eight bytes of offset and eight of leader per scan line, and a header.
+    The bound allows uncompressed FLOAT values, an eight-byte offset and an eight-byte block header per scan line,
+    and the file header.
     """
-    return shape[0] * shape[1] * 4 + shape[0] * 16 + _HEADER_LIMIT
+    return shape[0] * shape[1] * 4 + shape[0] * 16 + _MAX_HEADER_BYTES
 
 
 def decode_exr(name: str, data: memoryview, shape: tuple[int, int], depth_scale: float = 1.0) -> Depth:
-    """Return the file's only channel, float16 (HALF) or float32 (FLOAT) of (H, W), in metres.
+    """Return the single channel of an OpenEXR file in metres: (H, W), float16 (HALF) or float32 (FLOAT).
 
-    ``depth_scale`` does not apply. Raises ``EntryError``.
+    ``depth_scale`` is ignored. Raises ``EntryError`` if the file is damaged, has another size or pixel type, or is
+    not one flat image with one channel.
     """
     del depth_scale
     _check_exr_header(name, data, shape)
@@ -45,209 +49,229 @@ def decode_exr(name: str, data: memoryview, shape: tuple[int, int], depth_scale:
         image = OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0)
         (channel,) = image.channels().values()
         pixels: Depth = channel.pixels
-    except Exception as error:  # The library raises several unrelated types for damaged files.
-        raise EntryError(f"{name}: the OpenEXR data is corrupt or truncated ({show(str(error))})") from error
+    except Exception as error:  # OpenEXR raises several unrelated exception types for damaged files.
+        raise EntryError(
+            f"{name}: the OpenEXR data is corrupt or truncated ({escape_text(str(error))})"
+        ) from error
     if pixels.shape != shape or pixels.dtype not in (np.float16, np.float32):
         raise EntryError(
-            f"{name}: the image decodes to {pixels.dtype} {pixels.shape}, expected {show_shape(shape)} floats"
+            f"{name}: the image decodes to {pixels.dtype} {pixels.shape}, expected {format_shape(shape)} floats"
         )
     return pixels
 
 
 def _check_exr_header(name: str, data: memoryview, shape: tuple[int, int]) -> None:
-    head = bytes(data[:_HEADER_LIMIT])
-    if len(head) < 8 or not head.startswith(_MAGIC):
+    head = bytes(data[:_MAX_HEADER_BYTES])
+    if len(head) < 8 or not head.startswith(_EXR_MAGIC):
         raise EntryError(f"{name}: the bytes start with {head[:8]!r}, expected an OpenEXR file")
     flags = int.from_bytes(head[4:8], "little")
     if flags & 0xFF != 2 or flags & ~(0xFF | _TILED | _LONG_NAMES | _DEEP | _MULTI_PART):
         raise EntryError(f"{name}: the OpenEXR version field is {flags:#x}, expected version 2")
     if flags & (_DEEP | _MULTI_PART):
-        kind = "deep" if flags & _DEEP else "multi-part"
-        raise EntryError(f"{name}: the OpenEXR file is {kind}, expected one flat image")
+        layout = "deep" if flags & _DEEP else "multi-part"
+        raise EntryError(f"{name}: the OpenEXR file is {layout}, expected one flat image")
     try:
-        attributes = _attributes(head)
-        channels = list(_channels(attributes["channels"]))
+        attributes = _parse_attributes(head)
+        channels = list(_parse_channels(attributes["channels"]))
         window = struct.unpack("<4i", attributes["dataWindow"])
         tiles = struct.unpack("<2IB", attributes["tiles"]) if flags & _TILED else None
     except (ValueError, KeyError, struct.error) as error:
-        raise EntryError(f"{name}: the OpenEXR header is damaged ({show(str(error))})") from error
+        raise EntryError(f"{name}: the OpenEXR header is damaged ({escape_text(str(error))})") from error
     _check_channel(name, channels)
-    found = (window[3] - window[1] + 1, window[2] - window[0] + 1)
-    if found != shape:
-        raise EntryError(f"{name}: the data window is {show_shape(found)}, expected {show_shape(shape)} (H x W)")
+    window_shape = (window[3] - window[1] + 1, window[2] - window[0] + 1)
+    if window_shape != shape:
+        raise EntryError(
+            f"{name}: the data window is {format_shape(window_shape)}, expected {format_shape(shape)} (H x W)"
+        )
     if tiles is not None:
         _check_tiles(name, tiles, shape)
 
 
 def _check_channel(name: str, channels: list[tuple[str, int, int, int]]) -> None:
     if len(channels) != 1:
-        names = ", ".join(show(channel[0]) for channel in channels[:4]) + (", ..." if len(channels) > 4 else "")
+        names = ", ".join(escape_text(channel[0]) for channel in channels[:4]) + (
+            ", ..." if len(channels) > 4 else ""
+        )
         raise EntryError(f"{name}: the OpenEXR file has {len(channels)} channels ({names}), expected one")
-    label, kind, x_step, y_step = channels[0]
-    if kind not in (1, 2):
-        found = _PIXEL_TYPES.get(kind, f"of type {kind}")
-        raise EntryError(f"{name}: the channel {show(label)} is {found}, expected HALF or FLOAT")
+    label, pixel_type, x_step, y_step = channels[0]
+    if pixel_type not in (1, 2):
+        type_name = _PIXEL_TYPES.get(pixel_type, f"of type {pixel_type}")
+        raise EntryError(f"{name}: the channel {escape_text(label)} is {type_name}, expected HALF or FLOAT")
     if (x_step, y_step) != (1, 1):
-        raise EntryError(f"{name}: the channel {show(label)} is subsampled {x_step} x {y_step}, expected 1 x 1")
+        raise EntryError(
+            f"{name}: the channel {escape_text(label)} is subsampled {x_step} x {y_step}, expected 1 x 1"
+        )
 
 
 def _check_tiles(name: str, tiles: tuple[int, int, int], shape: tuple[int, int]) -> None:
-    most = max(_TILE_LIMIT, *shape)
-    width, height, mode = tiles
-    if not (0 < width <= most and 0 < height <= most):
-        raise EntryError(f"{name}: the tiles are {height} x {width}, expected 1 to {most} each")
-    if mode & 0x0F:
+    max_size = max(_MAX_TILE_PX, *shape)
+    width, height, level_mode = tiles
+    if not (0 < width <= max_size and 0 < height <= max_size):
+        raise EntryError(f"{name}: the tiles are {height} x {width}, expected 1 to {max_size} each")
+    if level_mode & 0x0F:
         raise EntryError(f"{name}: the OpenEXR file has several resolution levels, expected one")
 
 
-def _attributes(head: bytes) -> Mapping[str, bytes]:
-    """Return the values of the header's attributes. Raises ``ValueError`` if it is not well formed."""
+def _parse_attributes(head: bytes) -> Mapping[str, bytes]:
+    """Return the raw values of the header attributes by name. Raises ``ValueError`` if the header is malformed."""
     attributes: dict[str, bytes] = {}
-    at = 8
+    offset = 8
     while True:
-        name, at = _text(head, at)
+        name, offset = _read_name(head, offset)
         if not name:
             return attributes
-        _, at = _text(head, at)
-        (length,) = struct.unpack_from("<i", head, at)
-        at += 4
-        if length < 0 or at + length > len(head):
+        _, offset = _read_name(head, offset)
+        (length,) = struct.unpack_from("<i", head, offset)
+        offset += 4
+        if length < 0 or offset + length > len(head):
             raise ValueError(f"attribute {name} declares {length} bytes")
         if name in attributes:
             raise ValueError(f"attribute {name} stands twice")
-        attributes[name] = head[at : at + length]
-        at += length
+        attributes[name] = head[offset : offset + length]
+        offset += length
 
 
-def _channels(value: bytes) -> Iterator[tuple[str, int, int, int]]:
-    """Yield name, pixel type, x and y sampling of every channel."""
-    at = 0
+def _parse_channels(value: bytes) -> Iterator[tuple[str, int, int, int]]:
+    """Yield (name, pixel type, x sampling, y sampling) of every channel in a ``channels`` attribute."""
+    offset = 0
     while True:
-        name, at = _text(value, at)
+        name, offset = _read_name(value, offset)
         if not name:
             return
-        kind, _, x_step, y_step = struct.unpack_from("<iI2i", value, at)
-        at += 16
-        yield name, kind, x_step, y_step
+        pixel_type, _, x_step, y_step = struct.unpack_from("<iI2i", value, offset)
+        offset += 16
+        yield name, pixel_type, x_step, y_step
 
 
-def _text(data: bytes, at: int) -> tuple[str, int]:
-    end = data.find(b"\0", at, at + _LONGEST_NAME + 1)
+def _read_name(data: bytes, start: int) -> tuple[str, int]:
+    """Return the NUL-terminated name at byte ``start`` and the offset after it. Raises ``ValueError``."""
+    end = data.find(b"\0", start, start + _MAX_NAME_BYTES + 1)
     if end < 0:
-        raise ValueError(f"no end of the name at byte {at}")
-    return data[at:end].decode("utf-8", "backslashreplace"), end + 1
+        raise ValueError(f"no end of the name at byte {start}")
+    return data[start:end].decode("utf-8", "backslashreplace"), end + 1
 
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_HEADER = struct.Struct(">2I5B")
-_SLACK_BYTES = 256 * 1024
-# First column and row, then their steps, of the seven Adam7 passes.
-_ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
-_COLOURS = {0: "greyscale", 2: "RGB", 3: "palette", 4: "greyscale with alpha", 6: "RGBA"}
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_IHDR = struct.Struct(">2I5B")
+_CONTAINER_BYTES = 256 * 1024
+# First column, first row, column step and row step of the seven Adam7 passes (PNG specification).
+_ADAM7_PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+_COLOUR_TYPES = {0: "greyscale", 2: "RGB", 3: "palette", 4: "greyscale with alpha", 6: "RGBA"}
 
 
 def max_png_bytes(shape: tuple[int, int]) -> int:
-    """Return the size of the largest acceptable 16-bit ``.png`` of that (H, W), in bytes."""
+    """Return the largest acceptable size of a 16-bit ``.png`` file of shape (H, W), in bytes."""
     rows = shape[0] * (shape[1] * 2 + 1)
-    return rows + rows // 64 + _SLACK_BYTES
+    return rows + rows // 64 + _CONTAINER_BYTES
 
 
 def decode_png(name: str, data: memoryview, shape: tuple[int, int], depth_scale: float = 1.0) -> Depth:
-    """Return the 16-bit values times ``depth_scale`` (metres per unit) as float64 of (H, W).
+    """Return the 16-bit values times ``depth_scale`` (metres per unit): depth in metres, (H, W), float64.
 
-    float64 keeps ``value * depth_scale`` to one rounding; the products of a float32 image would not
-    be those that a reader of the file computes. Raises ``EntryError``.
+    In float64 the product ``value * depth_scale`` is rounded once, so it equals what any other reader of the file
+    computes; float32 products would differ. Raises ``EntryError`` if the file is damaged or is not a 16-bit
+    greyscale image of the expected size.
     """
-    chunks = list(_chunks(name, data))
+    chunks = list(_read_chunks(name, data))
     header = _check_png_header(name, chunks, shape)
-    rows = _inflate_rows(name, chunks, _row_bytes(shape, interlaced=bool(header[-1])))
+    rows = _inflate_rows(name, chunks, _filtered_row_bytes(shape, interlaced=bool(header[-1])))
     try:
-        with Image.open(io.BytesIO(_plain_png(header, rows)), formats=["PNG"]) as image:
+        with Image.open(io.BytesIO(_minimal_png(header, rows)), formats=["PNG"]) as image:
             units = np.asarray(image)
-    except Exception as error:  # Pillow raises several unrelated types for damaged files.
-        raise EntryError(f"{name}: the PNG data is corrupt ({show(str(error))})") from error
+    except Exception as error:  # Pillow raises several unrelated exception types for damaged files.
+        raise EntryError(f"{name}: the PNG data is corrupt ({escape_text(str(error))})") from error
     if units.shape != shape or units.dtype.kind not in "ui":
         raise EntryError(
-            f"{name}: the PNG decodes to {units.dtype} of shape {units.shape}, expected {show_shape(shape)}"
+            f"{name}: the PNG decodes to {units.dtype} of shape {units.shape}, expected {format_shape(shape)}"
         )
-    with np.errstate(over="ignore"):  # An infinite depth is no prediction, as everywhere.
+    with np.errstate(over="ignore"):  # Overflow gives infinite depth, which counts as no prediction.
         return units.astype(np.float64) * depth_scale
 
 
-def _chunks(name: str, data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield type and content of every chunk up to IEND, each with a right checksum."""
-    if bytes(data[:8]) != _SIGNATURE:
+def _read_chunks(name: str, data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
+    """Yield type and content of every chunk up to IEND.
+
+    Raises ``EntryError`` for a truncated file, a wrong checksum or bytes after IEND.
+    """
+    if bytes(data[:8]) != _PNG_SIGNATURE:
         raise EntryError(f"{name}: the bytes start with {bytes(data[:8])!r}, expected a PNG file")
-    at, kind = 8, b""
+    offset, kind = 8, b""
     while kind != b"IEND":
-        length = int.from_bytes(data[at : at + 4], "big")
-        end = at + 12 + length
+        length = int.from_bytes(data[offset : offset + 4], "big")
+        end = offset + 12 + length
         if end > len(data):
             raise EntryError(
-                f"{name}: the PNG is truncated at {len(data)} bytes, expected {max(end, at + 12)} or more"
+                f"{name}: the PNG is truncated at {len(data)} bytes, expected {max(end, offset + 12)} or more"
             )
-        kind, content = bytes(data[at + 4 : at + 8]), data[at + 8 : end - 4]
-        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            raise EntryError(f"{name}: the PNG chunk at byte {at} is corrupt: its checksum is not the one stored")
+        kind, content = bytes(data[offset + 4 : offset + 8]), data[offset + 8 : end - 4]
+        if zlib.crc32(data[offset + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            raise EntryError(
+                f"{name}: the PNG chunk at byte {offset} is corrupt: its checksum is not the one stored"
+            )
         yield kind, content
-        at = end
-    if at != len(data):
-        raise EntryError(f"{name}: {len(data) - at} bytes follow the PNG's end, expected none")
+        offset = end
+    if offset != len(data):
+        raise EntryError(f"{name}: {len(data) - offset} bytes follow the PNG's end, expected none")
 
 
 def _check_png_header(
     name: str, chunks: list[tuple[bytes, memoryview]], shape: tuple[int, int]
 ) -> tuple[int, ...]:
     kind, content = chunks[0]
-    if kind != b"IHDR" or len(content) != _HEADER.size or sum(k == b"IHDR" for k, _ in chunks) != 1:
+    if (
+        kind != b"IHDR"
+        or len(content) != _IHDR.size
+        or sum(chunk_kind == b"IHDR" for chunk_kind, _ in chunks) != 1
+    ):
         raise EntryError(f"{name}: the PNG does not start with its one header chunk, expected IHDR")
-    header = _HEADER.unpack(content)
+    header = _IHDR.unpack(content)
     width, height, bits, colour, compression, filtering, interlace = header
     if (bits, colour) != (16, 0):
-        found = f"{bits}-bit {_COLOURS.get(colour, f'colour type {colour}')}"
-        raise EntryError(f"{name}: the PNG is {found}, expected 16-bit greyscale")
+        actual = f"{bits}-bit {_COLOUR_TYPES.get(colour, f'colour type {colour}')}"
+        raise EntryError(f"{name}: the PNG is {actual}, expected 16-bit greyscale")
     if (height, width) != shape:
-        raise EntryError(f"{name}: the image is {height} x {width}, expected {show_shape(shape)} (H x W)")
+        raise EntryError(f"{name}: the image is {height} x {width}, expected {format_shape(shape)} (H x W)")
     if compression or filtering or interlace > 1:
-        found = f"compression {compression}, filter {filtering}, interlace {interlace}"
-        raise EntryError(f"{name}: the PNG header says {found}, expected 0, 0 and 0 or 1")
+        actual = f"compression {compression}, filter {filtering}, interlace {interlace}"
+        raise EntryError(f"{name}: the PNG header says {actual}, expected 0, 0 and 0 or 1")
     return header
 
 
-def _row_bytes(shape: tuple[int, int], *, interlaced: bool) -> int:
-    """Return the bytes of all filtered rows: a filter byte and two bytes per pixel each."""
+def _filtered_row_bytes(shape: tuple[int, int], *, interlaced: bool) -> int:
+    """Return the total size of the filtered rows in bytes: one filter byte per row and two bytes per pixel."""
     if not interlaced:
         return shape[0] * (1 + 2 * shape[1])
     total = 0
-    for x, y, x_step, y_step in _ADAM7:
+    for x, y, x_step, y_step in _ADAM7_PASSES:
         columns, rows = len(range(x, shape[1], x_step)), len(range(y, shape[0], y_step))
         total += rows * (1 + 2 * columns) if columns else 0
     return total
 
 
 def _inflate_rows(name: str, chunks: list[tuple[bytes, memoryview]], expected: int) -> bytes:
-    at = [index for index, (kind, _) in enumerate(chunks) if kind == b"IDAT"]
-    if not at or any(after != before + 1 for before, after in pairwise(at)):
-        raise EntryError(f"{name}: the PNG has {len(at)} image chunks, expected one run of IDAT")
+    indices = [index for index, (kind, _) in enumerate(chunks) if kind == b"IDAT"]
+    if not indices or any(after != before + 1 for before, after in pairwise(indices)):
+        raise EntryError(f"{name}: the PNG has {len(indices)} image chunks, expected one run of IDAT")
     inflater = zlib.decompressobj()
     try:
-        rows = inflater.decompress(b"".join(chunks[index][1] for index in at), expected + 1)
+        rows = inflater.decompress(b"".join(chunks[index][1] for index in indices), expected + 1)
     except zlib.error as error:
         raise EntryError(f"{name}: the PNG image data is corrupt ({error})") from error
     if len(rows) != expected or not inflater.eof:
-        found = f"more than {expected}" if len(rows) > expected else f"{len(rows)}"
-        raise EntryError(f"{name}: the PNG image data inflates to {found} bytes, expected {expected}, whole")
+        actual = f"more than {expected}" if len(rows) > expected else f"{len(rows)}"
+        raise EntryError(f"{name}: the PNG image data inflates to {actual} bytes, expected {expected}, whole")
     return rows
 
 
-def _plain_png(header: tuple[int, ...], rows: bytes) -> bytes:
-    """Return a PNG of header and rows alone: no colour profile, text or animation reaches Pillow.
+def _minimal_png(header: tuple[int, ...], rows: bytes) -> bytes:
+    """Return a PNG file with only the given header and rows, so that Pillow parses no ancillary chunks.
 
-    Deflate level 0 stores the rows, so that they are not compressed and inflated a second time.
+    Colour profiles, text and animation are left out. Deflate level 0 stores the rows uncompressed, which avoids
+    compressing and inflating them a second time.
     """
-    parts = ((b"IHDR", _HEADER.pack(*header)), (b"IDAT", zlib.compress(rows, 0)), (b"IEND", b""))
+    parts = ((b"IHDR", _IHDR.pack(*header)), (b"IDAT", zlib.compress(rows, 0)), (b"IEND", b""))
     chunks = (
         len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big")
         for kind, body in parts
     )
-    return _SIGNATURE + b"".join(chunks)
+    return _PNG_SIGNATURE + b"".join(chunks)

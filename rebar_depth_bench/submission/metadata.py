@@ -1,4 +1,4 @@
-"""``submission.json``: who made the predictions, and how their PNG values become metres."""
+"""Parsing and validation of ``submission.json``, the metadata of a submission."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 from urllib.parse import urlsplit
 
-from rebar_depth_bench.errors import show
+from rebar_depth_bench.errors import escape_text
 
 METADATA_NAME = "submission.json"
 MAX_METADATA_BYTES = 4 * 1024 * 1024
 MAX_METHOD_CHARACTERS = 200
 _MAX_URL_CHARACTERS = 2000
-_KINDS = {
+_JSON_TYPE_NAMES = {
     dict: "an object",
     list: "a list",
     str: "text",
@@ -26,7 +26,7 @@ _KINDS = {
 
 
 class MetadataError(Exception):
-    """``submission.json`` is refused; ``problems`` are sentences without the entry's name."""
+    """Error for an invalid ``submission.json``; ``problems`` are sentences without the entry's name."""
 
     def __init__(self, problems: list[str]) -> None:
         self.problems = tuple(problems)
@@ -35,9 +35,10 @@ class MetadataError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class SubmissionMeta:
-    """What ``submission.json`` declares; ``depth_scale`` is metres per unit of a PNG value.
+    """Values declared in ``submission.json``; None where a key is absent.
 
-    ``runtime`` is what the method's author reports, as it stands in the file; nothing is computed from it.
+    ``depth_scale`` is in metres per unit of a PNG value. ``runtime`` is the author's own report, kept unchanged;
+    nothing is computed from it.
     """
 
     method: str
@@ -51,10 +52,10 @@ class SubmissionMeta:
 def parse_metadata(data: bytes) -> SubmissionMeta:
     """Parse and validate the bytes of ``submission.json``; unknown keys are ignored.
 
-    Raises ``MetadataError`` with everything that is wrong.
+    Raises ``MetadataError`` with all problems.
     """
     values = _load_object(data)
-    found = [
+    problems = [
         *method_problems(values.get("method")),
         *description_problems(values.get("description")),
         *url_problems(values.get("url")),
@@ -62,8 +63,8 @@ def parse_metadata(data: bytes) -> SubmissionMeta:
         *_scale_problems(values.get("depth_scale")),
         *_runtime_problems(values.get("runtime")),
     ]
-    if found:
-        raise MetadataError(found)
+    if problems:
+        raise MetadataError(problems)
     scale = values.get("depth_scale")
     return SubmissionMeta(
         method=values["method"],
@@ -79,8 +80,8 @@ def _load_object(data: bytes) -> dict[str, Any]:
     if len(data) > MAX_METADATA_BYTES:
         raise MetadataError([f"the size is {len(data)} bytes, expected at most {MAX_METADATA_BYTES}"])
     try:
-        values = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)
-        # A number like 1e999 or half a surrogate pair parses, and then breaks whoever writes it out again.
+        values = json.loads(data.decode("utf-8"), parse_constant=_reject_constant)
+        # json.loads accepts numbers like 1e999 and lone surrogates, which cannot be written as JSON again.
         json.dumps(values, allow_nan=False, ensure_ascii=False).encode("utf-8")
     except UnicodeDecodeError as error:
         raise MetadataError([f"byte {error.start} is not UTF-8, expected UTF-8 text"]) from error
@@ -88,57 +89,61 @@ def _load_object(data: bytes) -> dict[str, Any]:
         raise MetadataError(["the JSON is nested too deep, expected a flat object"]) from error
     except ValueError as error:
         raise MetadataError(
-            [f"the text is not valid JSON ({show(str(error))}), expected a JSON object"]
+            [f"the text is not valid JSON ({escape_text(str(error))}), expected a JSON object"]
         ) from error
     if not isinstance(values, dict):
-        raise MetadataError([f'the JSON is {_kind(values)}, expected an object like {{"method": "name"}}'])
+        raise MetadataError(
+            [f'the JSON is {_json_type_name(values)}, expected an object like {{"method": "name"}}']
+        )
     return values
 
 
-def _refuse_constant(text: str) -> NoReturn:
+def _reject_constant(text: str) -> NoReturn:
     raise ValueError(f"{text} is not JSON")
 
 
 def method_problems(method: object) -> list[str]:
-    """Return what is wrong with a method's name: a printable one of at most 200 characters is expected."""
+    """Return the problems of a method name: it must be printable text of 1 to 200 characters."""
     expected = f"expected a printable name of 1 to {MAX_METHOD_CHARACTERS} characters"
     if method is None:
         return [f"method is missing, {expected}"]
     if not isinstance(method, str):
-        return [f"method is {_kind(method)}, {expected}"]
+        return [f"method is {_json_type_name(method)}, {expected}"]
     if not method.strip() or not method.isprintable():
-        return [f"method is {show(ascii(method))}, {expected}"]
+        return [f"method is {escape_text(ascii(method))}, {expected}"]
     if len(method) > MAX_METHOD_CHARACTERS:
         return [f"method has {len(method)} characters, {expected}"]
     return []
 
 
 def description_problems(description: object) -> list[str]:
-    """Return what is wrong with a description: any text will do, but for NUL, which PostgreSQL does not keep."""
-    found = type_problems("description", description, str)
+    """Return the problems of a description: any text without NUL, which PostgreSQL cannot store."""
+    problems = type_problems("description", description, str)
     has_nul = isinstance(description, str) and "\0" in description
-    return [*found, *(["description has a NUL character, expected text without one"] if has_nul else [])]
+    return [*problems, *(["description has a NUL character, expected text without one"] if has_nul else [])]
 
 
 def url_problems(url: object) -> list[str]:
-    """Return what is wrong with an address; none at all is fine."""
-    found = type_problems("url", url, str)
-    if found or not isinstance(url, str):
-        return found
+    """Return the problems of an optional HTTP or HTTPS address; None has no problems."""
+    problems = type_problems("url", url, str)
+    if problems or not isinstance(url, str):
+        return problems
     try:
         parts = urlsplit(url)
-        sound = parts.scheme in ("http", "https") and bool(parts.hostname)
+        valid = parts.scheme in ("http", "https") and bool(parts.hostname)
     except ValueError:
-        sound = False
-    sound = sound and url.isprintable() and " " not in url and len(url) <= _MAX_URL_CHARACTERS
-    return [] if sound else [f"url is {show(url)}, expected an address that starts with http:// or https://"]
+        valid = False
+    valid = valid and url.isprintable() and " " not in url and len(url) <= _MAX_URL_CHARACTERS
+    return (
+        [] if valid else [f"url is {escape_text(url)}, expected an address that starts with http:// or https://"]
+    )
 
 
-def type_problems(key: str, value: object, kind: type) -> list[str]:
-    """Return the problem of an optional value that is not of its kind."""
-    if value is None or isinstance(value, kind):
+def type_problems(key: str, value: object, expected_type: type) -> list[str]:
+    """Return the problem of an optional value that is not an instance of ``expected_type``."""
+    if value is None or isinstance(value, expected_type):
         return []
-    return [f"{key} is {_kind(value)}, expected {_KINDS[kind]}"]
+    return [f"{key} is {_json_type_name(value)}, expected {_JSON_TYPE_NAMES[expected_type]}"]
 
 
 def _scale_problems(scale: object) -> list[str]:
@@ -146,19 +151,19 @@ def _scale_problems(scale: object) -> list[str]:
         return []
     expected = "expected a finite number of metres per unit above 0"
     if isinstance(scale, bool) or not isinstance(scale, int | float):
-        return [f"depth_scale is {_kind(scale)}, {expected}"]
+        return [f"depth_scale is {_json_type_name(scale)}, {expected}"]
     try:
-        sound = math.isfinite(float(scale)) and float(scale) > 0
+        valid = math.isfinite(float(scale)) and float(scale) > 0
     except OverflowError:
-        sound = False
-    return [] if sound else [f"depth_scale is {show(str(scale))}, {expected}"]
+        valid = False
+    return [] if valid else [f"depth_scale is {escape_text(str(scale))}, {expected}"]
 
 
 def _runtime_problems(runtime: object) -> list[str]:
     if runtime is None or (isinstance(runtime, dict | str | int | float) and not isinstance(runtime, bool)):
         return []
-    return [f"runtime is {_kind(runtime)}, expected an object, text or a number"]
+    return [f"runtime is {_json_type_name(runtime)}, expected an object, text or a number"]
 
 
-def _kind(value: object) -> str:
-    return _KINDS.get(type(value), "null")
+def _json_type_name(value: object) -> str:
+    return _JSON_TYPE_NAMES.get(type(value), "null")

@@ -1,9 +1,9 @@
-"""``.npy`` entries: the header is parsed here, by pattern, before a single value is touched.
+"""Decoders of ``.npy`` and ``.npz`` entries.
 
-numpy's own reader allocates what the header claims, evaluates it as Python and warns about old ones;
-none of that belongs near bytes from outside.
-
-``.npz`` entries: a zip inside the zip, held to the same rules as the outer one.
+The ``.npy`` header is parsed with regular expressions before any value is read. NumPy's reader is not used on
+untrusted data: it allocates the size that the header declares, evaluates the header as a Python literal and emits
+warnings for old format versions. An ``.npz`` entry is a zip inside the archive and is checked by the same rules as
+the archive itself.
 """
 
 from __future__ import annotations
@@ -15,20 +15,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rebar_depth_bench.errors import EntryError, show, show_shape
+from rebar_depth_bench.errors import EntryError, escape_text, format_shape
 from rebar_depth_bench.submission.zip_directory import DirectoryError, MemorySource, read_directory
 from rebar_depth_bench.submission.zip_entries import check_entries, read_data
 
-HEADER_LIMIT = 4096
+MAX_HEADER_BYTES = 4096
+"""Largest accepted ``.npy`` header, magic string included, in bytes."""
+
 Depth = NDArray[np.floating[Any]]
-"""Metres along the optical axis, (H, W), float16, float32 or float64 in native byte order."""
+"""Planar depth along the optical axis in metres: (H, W), float16, float32 or float64 in native byte order."""
 
 _MAGIC = b"\x93NUMPY"
 _LENGTH_BYTES = {1: 2, 2: 4, 3: 4}
 _DESCR = re.compile(r"'descr'\s*:\s*(?:'([^']*)'|\[[^]]*\])")
-_FORTRAN = re.compile(r"'fortran_order'\s*:\s*(True|False)")
+_FORTRAN_ORDER = re.compile(r"'fortran_order'\s*:\s*(True|False)")
 _SHAPE = re.compile(r"'shape'\s*:\s*\(([0-9L,\s]*)\)")
-_FLOATS = re.compile(r"[<>=|]?f[248]")
+_FLOAT_DESCR = re.compile(r"[<>=|]?f[248]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,24 +41,25 @@ class _Header:
 
 
 def max_npy_bytes(shape: tuple[int, int]) -> int:
-    """Return the size of the largest acceptable ``.npy`` of that (H, W): float64 and a long header."""
-    return shape[0] * shape[1] * 8 + HEADER_LIMIT
+    """Return the largest acceptable size of an ``.npy`` file of shape (H, W) in bytes (float64 values)."""
+    return shape[0] * shape[1] * 8 + MAX_HEADER_BYTES
 
 
 def decode_npy(name: str, data: memoryview, shape: tuple[int, int], depth_scale: float = 1.0) -> Depth:
-    """Return the float16, float32 or float64 array of (H, W) that ``data`` holds, in native byte order.
+    """Return the depth array in ``data``, in metres: (H, W), float16, float32 or float64 in native byte order.
 
     The array is a read-only view on ``data``, or a copy if its bytes had to be swapped or aligned.
-    ``depth_scale`` does not apply: the values are metres. Raises ``EntryError``.
+    ``depth_scale`` is ignored, since the values are metres. Raises ``EntryError`` if the data is damaged or has
+    another shape or dtype.
     """
     del depth_scale
     header = _parse_header(name, data, shape)
-    found = len(data) - header.data_offset
-    expected = shape[0] * shape[1] * header.dtype.itemsize
-    if found != expected:
+    actual_bytes = len(data) - header.data_offset
+    expected_bytes = shape[0] * shape[1] * header.dtype.itemsize
+    if actual_bytes != expected_bytes:
         raise EntryError(
-            f"{name}: {found} bytes of values follow the header, "
-            f"expected {expected} for {show_shape(shape)} {header.dtype.name}"
+            f"{name}: {actual_bytes} bytes of values follow the header, "
+            f"expected {expected_bytes} for {format_shape(shape)} {header.dtype.name}"
         )
     values = np.frombuffer(data, header.dtype, offset=header.data_offset)
     array = values.reshape(shape[::-1]).T if header.fortran_order else values.reshape(shape)
@@ -64,22 +67,22 @@ def decode_npy(name: str, data: memoryview, shape: tuple[int, int], depth_scale:
 
 
 def _parse_header(name: str, data: memoryview, shape: tuple[int, int]) -> _Header:
-    text, data_offset = _header_text(name, bytes(data[: HEADER_LIMIT + 1]))
-    descr, fortran, dims = (pattern.findall(text) for pattern in (_DESCR, _FORTRAN, _SHAPE))
-    rest = _SHAPE.sub("", _FORTRAN.sub("", _DESCR.sub("", text)))
-    if not len(descr) == len(fortran) == len(dims) == 1 or re.sub(r"[\s,]", "", rest) != "{}":
+    text, data_offset = _header_text(name, bytes(data[: MAX_HEADER_BYTES + 1]))
+    descr, fortran, shapes = (pattern.findall(text) for pattern in (_DESCR, _FORTRAN_ORDER, _SHAPE))
+    remainder = _SHAPE.sub("", _FORTRAN_ORDER.sub("", _DESCR.sub("", text)))
+    if not len(descr) == len(fortran) == len(shapes) == 1 or re.sub(r"[\s,]", "", remainder) != "{}":
         raise EntryError(
-            f"{name}: the .npy header is {show(text.strip())}, expected descr, fortran_order and shape"
+            f"{name}: the .npy header is {escape_text(text.strip())}, expected descr, fortran_order and shape"
         )
     if _is_object(descr[0]):
         raise EntryError(f"{name}: the array holds pickled Python objects (dtype object), expected float16/32/64")
-    if not _FLOATS.fullmatch(descr[0]):
-        found = show(descr[0]) if descr[0] else "structured"
-        raise EntryError(f"{name}: the dtype is {found}, expected float16, float32 or float64")
-    found_shape = [show(size) for size in dims[0].replace("L", "").replace(",", " ").split()]
-    if found_shape != [str(size) for size in shape]:
-        found = " x ".join(found_shape) if found_shape else "a single value"
-        raise EntryError(f"{name}: the shape is {found}, expected {show_shape(shape)} (H x W)")
+    if not _FLOAT_DESCR.fullmatch(descr[0]):
+        actual = escape_text(descr[0]) if descr[0] else "structured"
+        raise EntryError(f"{name}: the dtype is {actual}, expected float16, float32 or float64")
+    actual_shape = [escape_text(size) for size in shapes[0].replace("L", "").replace(",", " ").split()]
+    if actual_shape != [str(size) for size in shape]:
+        actual = " x ".join(actual_shape) if actual_shape else "a single value"
+        raise EntryError(f"{name}: the shape is {actual}, expected {format_shape(shape)} (H x W)")
     return _Header(np.dtype(descr[0].replace("|", "=")), fortran[0] == "True", data_offset)
 
 
@@ -88,42 +91,42 @@ def _is_object(descr: str) -> bool:
 
 
 def _header_text(name: str, head: bytes) -> tuple[str, int]:
-    """Return the header's text and the byte where the values start."""
+    """Return the header's text and the byte offset of the values."""
     version = head[6] if head.startswith(_MAGIC) and len(head) >= 8 else 0
     if version not in _LENGTH_BYTES:
         pickled = head[:1] == b"\x80"
-        found = "a Python pickle" if pickled else f"bytes that start with {head[:8]!r}"
-        raise EntryError(f"{name}: {found} was found, expected a .npy array of version 1, 2 or 3")
+        actual = "a Python pickle" if pickled else f"bytes that start with {head[:8]!r}"
+        raise EntryError(f"{name}: {actual} was found, expected a .npy array of version 1, 2 or 3")
     start = 8 + _LENGTH_BYTES[version]
     length = int.from_bytes(head[8:start], "little")
-    if start + length > HEADER_LIMIT:
+    if start + length > MAX_HEADER_BYTES:
         raise EntryError(
-            f"{name}: the .npy header declares {length} bytes, expected at most {HEADER_LIMIT - start}"
+            f"{name}: the .npy header declares {length} bytes, expected at most {MAX_HEADER_BYTES - start}"
         )
     if start + length > len(head):
         raise EntryError(f"{name}: the .npy header is cut off at {len(head)} bytes, expected {start + length}")
     return head[start : start + length].decode("utf-8", "backslashreplace"), start + length
 
 
-# More than the one array that is expected, so that a wrong file can still be described.
-_MAX_MEMBERS = 256
-_CONTAINER_BYTES = 64 * 1024
+# More than the one expected array, so that the error message can list the members of a wrong file.
+_MAX_NPZ_MEMBERS = 256
+_MAX_NPZ_OVERHEAD_BYTES = 64 * 1024
 
 
 def max_npz_bytes(shape: tuple[int, int]) -> int:
-    """Return the size of the largest acceptable ``.npz`` of that (H, W), in bytes."""
+    """Return the largest acceptable size of an ``.npz`` file of shape (H, W), in bytes."""
     values = max_npy_bytes(shape)
-    return values + values // 1024 + _CONTAINER_BYTES
+    return values + values // 1024 + _MAX_NPZ_OVERHEAD_BYTES
 
 
 def decode_npz(name: str, data: memoryview, shape: tuple[int, int], depth_scale: float = 1.0) -> Depth:
-    """Return the one array of (H, W) inside, as ``decode_npy`` does. Raises ``EntryError``."""
+    """Return the only array of an ``.npz`` file, as ``decode_npy`` does. Raises ``EntryError``."""
     source = MemorySource(data)
     try:
-        directory = read_directory(source, _MAX_MEMBERS)
+        directory = read_directory(source, _MAX_NPZ_MEMBERS)
     except DirectoryError as error:
         raise EntryError(f"{name}: inside the .npz, {error}") from error
-    members = [show(entry.name) for entry in directory.entries]
+    members = [escape_text(entry.name) for entry in directory.entries]
     if len(members) != 1:
         listed = f" ({', '.join(members[:4])}{', ...' if len(members) > 4 else ''})" if members else ""
         raise EntryError(f"{name}: the .npz holds {len(members)} arrays{listed}, expected exactly one")

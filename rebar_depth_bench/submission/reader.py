@@ -1,4 +1,4 @@
-"""A submission archive, checked against the views of a dataset and read one view at a time."""
+"""Submission reader: validation against the views of a dataset, and decoding of one view at a time."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from typing import Self
 
 from rebar_depth_bench.errors import EntryError
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.submission.entries import ExpectedViews, lay_out, size_limit
+from rebar_depth_bench.submission.entries import ExpectedViews, match_entries, max_entry_bytes
 from rebar_depth_bench.submission.formats import FORMATS, Depth
 from rebar_depth_bench.submission.metadata import METADATA_NAME, MetadataError, SubmissionMeta, parse_metadata
 from rebar_depth_bench.submission.zip_directory import ByteSource, DirectoryError, FileSource, read_directory
-from rebar_depth_bench.submission.zip_entries import CheckedEntry, check_entries, has_bad_name, read_data
+from rebar_depth_bench.submission.zip_entries import CheckedEntry, check_entries, has_unsafe_name, read_data
 
 
 @dataclass(frozen=True, slots=True)
 class _Inspection:
-    """What can be known without decoding a view; ``views`` are those whose entries are sound so far."""
+    """Result of the structural checks, which decode no view; ``views`` has the entries without problems."""
 
     problems: tuple[str, ...]
     views: Mapping[str, CheckedEntry] = field(default_factory=dict)
@@ -29,9 +29,9 @@ class _Inspection:
 
 
 class SubmissionReader:
-    """An open archive. Made by ``open_submission``; a context manager.
+    """Open submission archive, created by ``open_submission``; a context manager that closes the file.
 
-    ``read`` may be called from many threads at once. The file must not be written to while it is open.
+    ``read`` is thread-safe. The file must not be written to while it is open.
     """
 
     def __init__(self, path: str | os.PathLike[str], expected: ExpectedViews) -> None:
@@ -55,24 +55,25 @@ class SubmissionReader:
 
     @property
     def structure_problems(self) -> tuple[str, ...]:
-        """Everything wrong with the archive that shows without decoding a view, in a fixed order."""
+        """Problems that are detected without decoding a view, in a fixed order."""
         return self._inspection.problems
 
     @property
     def meta(self) -> SubmissionMeta | None:
-        """What ``submission.json`` declares; None if it is missing or refused."""
+        """Metadata from ``submission.json``; None if it is missing or invalid."""
         return self._inspection.meta
 
     @property
     def view_ids(self) -> tuple[str, ...]:
-        """The views whose entries have no structural problem, sorted."""
+        """Sorted ids of the views whose entries have no structural problem."""
         return tuple(sorted(self._inspection.views))
 
     def read(self, view_id: str) -> Depth:
-        """Return the predicted depth of a view: metres, (H, W), float16, float32 or float64.
+        """Return the predicted planar depth of a view in metres: (H, W), float16, float32 or float64.
 
-        A stored ``.npy`` comes as a read-only view on the file where its alignment allows; everything
-        else is a new array. Raises ``EntryError``.
+        A stored ``.npy`` entry is returned as a read-only view on the mapped file where its alignment allows; all
+        other entries are returned as new arrays. Raises ``EntryError`` if the entry is missing or invalid, and
+        ``ValueError`` if the reader is closed.
         """
         scale = self.meta.depth_scale if self.meta else None
         if scale is None and self._suffix(view_id) == ".png":
@@ -80,7 +81,7 @@ class SubmissionReader:
         return self._decode(view_id, scale or 1.0)
 
     def problems(self, progress: Progress = silent) -> Iterator[str]:
-        """Yield every problem: those of the structure, then those of decoding each view in sorted order."""
+        """Yield all problems: structural ones first, then decoding errors of each view in sorted order."""
         yield from self.structure_problems
         scale = self.meta.depth_scale if self.meta else None
         for done, view_id in enumerate(self.view_ids, start=1):
@@ -91,13 +92,13 @@ class SubmissionReader:
                 yield error.problem
 
     def sha256(self) -> str:
-        """Return the hex SHA-256 of the very file that is read."""
+        """Return the hex SHA-256 of the open file. Raises ``ValueError`` if the reader is closed."""
         if self._source is None:
             raise ValueError(f"{self.path}: the submission is closed")
         return self._source.sha256()
 
     def close(self) -> None:
-        """Close the file; arrays already read stay valid."""
+        """Close the file; arrays that were already returned stay valid."""
         if self._source is not None:
             self._source.close()
             self._source = None
@@ -127,13 +128,13 @@ class SubmissionReader:
 def open_submission(path: str | os.PathLike[str], expected: ExpectedViews) -> SubmissionReader:
     """Open an archive and check its structure; ``expected`` has every view of the dataset folder.
 
-    Raises nothing for a bad archive: the reader's ``structure_problems`` say what is wrong with it.
+    An invalid archive raises no error: its problems are in ``structure_problems`` of the reader.
     """
     return SubmissionReader(path, expected)
 
 
 def check_archive(path: str | os.PathLike[str], expected: ExpectedViews, progress: Progress = silent) -> list[str]:
-    """Return every problem of an archive, each entry decoded; an empty list means it can be scored."""
+    """Return all problems of an archive, including decoding errors of each entry; empty if it can be scored."""
     with open_submission(path, expected) as reader:
         return list(reader.problems(progress))
 
@@ -152,20 +153,25 @@ def _file_problem(path: Path) -> str | None:
 
 
 def _inspect(source: ByteSource, expected: ExpectedViews) -> _Inspection:
-    # Junk of macOS doubles the count; beyond some room for a list of strangers nothing useful is left to say.
+    # Archives made by macOS have twice the number of entries. The remaining margin lets unknown entries be listed
+    # by name; with more of them a list would be of no use.
     directory = read_directory(source, max_entries=4 * len(expected) + 1024)
-    checked = check_entries(source, directory, lambda name: size_limit(name, expected))
-    well_named = [item for item in checked if not has_bad_name(item.entry)]
-    layout = lay_out([item.entry.name for item in well_named], expected)
-    meta, meta_problems = _read_meta(source, well_named[layout.metadata] if layout.metadata is not None else None)
-    sound = {view: well_named[index] for view, index in layout.views.items() if not well_named[index].problems}
+    checked = check_entries(source, directory, lambda name: max_entry_bytes(name, expected))
+    well_named = [item for item in checked if not has_unsafe_name(item.entry)]
+    matched = match_entries([item.entry.name for item in well_named], expected)
+    meta, meta_problems = _read_meta(
+        source, well_named[matched.metadata] if matched.metadata is not None else None
+    )
+    valid_views = {
+        view: well_named[index] for view, index in matched.views.items() if not well_named[index].problems
+    }
     problems = (
         *(problem for item in checked for problem in item.problems),
-        *layout.problems,
+        *matched.problems,
         *meta_problems,
-        *_scale_problems(meta, sound),
+        *_scale_problems(meta, valid_views),
     )
-    return _Inspection(problems, sound, meta)
+    return _Inspection(problems, valid_views, meta)
 
 
 def _read_meta(source: ByteSource, checked: CheckedEntry | None) -> tuple[SubmissionMeta | None, list[str]]:

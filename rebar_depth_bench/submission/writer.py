@@ -1,4 +1,4 @@
-"""Writing a submission archive: whole or not at all, and the same bytes for the same predictions."""
+"""Submission writer: atomic and deterministic creation of submission archives."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from typing import BinaryIO, Self
 
 import numpy as np
 
-from rebar_depth_bench.atomic_io import replacing
-from rebar_depth_bench.errors import InputError, show
+from rebar_depth_bench.atomic_io import atomic_replace
+from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.submission.metadata import (
     METADATA_NAME,
     description_problems,
@@ -28,21 +28,22 @@ from rebar_depth_bench.submission.numpy_formats import Depth
 
 _VIEW_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}/[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _EPOCH = (1980, 1, 1, 0, 0, 0)
-_MODE = 0o100644
-# An extra field that zip readers skip; it moves the values to a multiple of 64 bytes, so that they can be
-# used where they lie in a mapping of the file.
-_ALIGNMENT = 64
-_PADDING_FIELD = 0xD935
-_LOCAL_HEADER = 30
+_UNIX_MODE = 0o100644
+# Zip readers skip this extra field. It aligns the array values to 64 bytes in the file, so that they can be used
+# in place in a memory mapping.
+_ALIGNMENT_BYTES = 64
+_PADDING_FIELD_ID = 0xD935
+_LOCAL_HEADER_BYTES = 30
 
 
 class SubmissionWriter:
-    """Context manager that writes ``path``: one ``.npy`` per view, and ``submission.json``.
+    """Context manager that writes an archive to ``path``: one ``.npy`` entry per view, and ``submission.json``.
 
-    The archive appears under its name on a clean exit only; after an exception in the block whatever
-    stood there before is untouched. Entries are stored, which reads fastest; ``compress=True`` deflates
-    them (about 100 times slower to write, 10 times slower to read, a fifth smaller), and the bytes then
-    also depend on the zlib in use. ``notes`` is what the method has to say of itself; no score depends on it.
+    The archive appears at ``path`` only on a clean exit; after an exception in the block an existing file at
+    ``path`` is unchanged. The same predictions give the same bytes. Entries are stored uncompressed, which is
+    fastest to read; ``compress=True`` deflates them (about 100 times slower to write, 10 times slower to read, a
+    fifth smaller), and the bytes then also depend on the zlib library in use. ``notes`` is free-form information
+    about the method; no score depends on it.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class SubmissionWriter:
         notes: Mapping[str, object] | None = None,
         compress: bool = False,
     ) -> None:
-        """Raise ``InputError`` for metadata that a reader would refuse."""
+        """Check the metadata. Raises ``InputError`` if a reader would reject it."""
         self.path = Path(path)
         self._compression = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
         self._metadata: dict[str, object] = {
@@ -76,19 +77,21 @@ class SubmissionWriter:
         self._zip: zipfile.ZipFile | None = None
 
     def add(self, view_id: str, depth: object, seconds: float | None = None) -> None:
-        """Store the left view's planar depth in metres, (H, W), anything ``numpy.asarray`` takes.
+        """Store the planar depth of a left view in metres: (H, W), any object that ``numpy.asarray`` accepts.
 
-        float16 is kept, every other float becomes float32 (values past its range become infinite).
-        Values that are not finite or <= 0 mean no prediction. ``seconds`` is the time the method took;
-        it goes into ``runtime`` and makes the archive's bytes vary with it.
+        float16 is kept, every other float type is converted to float32 (values out of its range become infinite).
+        Values that are not finite or <= 0 mean no prediction. ``seconds`` is the method's computing time for the
+        view; it is stored in ``runtime``, so that the bytes of the archive depend on it.
 
-        Raises ``InputError`` for a view_id that is malformed or already there, an array that is not
-        two-dimensional or not of floats, or a time that is not a finite number >= 0.
+        Raises ``InputError`` if the writer is not open, ``view_id`` is malformed or was added before, ``depth`` is
+        not a two-dimensional array of floats, or ``seconds`` is not a finite number >= 0.
         """
         if self._zip is None:
             raise InputError(f"{self.path}: the writer is not open, expected add() inside its 'with' block")
         if not isinstance(view_id, str) or not _VIEW_ID.fullmatch(view_id):
-            raise InputError(f"view_id is {show(str(view_id))}, expected '<config>/<number>' like 'lattice/0000'")
+            raise InputError(
+                f"view_id is {escape_text(str(view_id))}, expected '<config>/<number>' like 'lattice/0000'"
+            )
         if view_id in self._view_ids:
             raise InputError(f"{view_id}: the view was added twice, expected once")
         if seconds is not None and not (isinstance(seconds, int | float) and 0 <= seconds < math.inf):
@@ -105,7 +108,7 @@ class SubmissionWriter:
         if self.path.is_dir():
             raise InputError(f"{self.path}: the path is a directory, expected a file name for the archive")
         with ExitStack() as stack:
-            part = stack.enter_context(replacing(self.path))
+            part = stack.enter_context(atomic_replace(self.path))
             self._file = stack.enter_context(part.open("wb"))
             self._zip = zipfile.ZipFile(self._file, "w", allowZip64=True)
             self._open = stack.pop_all()
@@ -123,7 +126,8 @@ class SubmissionWriter:
                 self._write_entry(archive, METADATA_NAME, b"", memoryview(self._metadata_bytes()))
                 archive.close()
             finally:
-                archive.fp = None  # closing it again would write a directory into a discarded file
+                # Without this, ZipFile would write a directory into the discarded file when it is closed again.
+                archive.fp = None
 
     def _metadata_bytes(self) -> bytes:
         values = {key: value for key, value in self._metadata.items() if value is not None}
@@ -136,23 +140,23 @@ class SubmissionWriter:
         assert self._file is not None
         info = zipfile.ZipInfo(name, _EPOCH)
         info.create_system = 3
-        info.external_attr = _MODE << 16
+        info.external_attr = _UNIX_MODE << 16
         info.compress_type = self._compression
         info.file_size = len(header) + len(body)
         if self._compression == zipfile.ZIP_STORED:
-            info.extra = _padding(self._file.tell() + _LOCAL_HEADER + len(name) + len(header))
+            info.extra = _padding_field(self._file.tell() + _LOCAL_HEADER_BYTES + len(name) + len(header))
         with archive.open(info, "w") as entry:
             entry.write(header)
             entry.write(body)
 
 
 def _as_depth(view_id: str, depth: object) -> Depth:
-    if isinstance(depth, np.ma.MaskedArray):  # Its mask would be dropped without a word.
+    if isinstance(depth, np.ma.MaskedArray):  # numpy.asarray would silently drop the mask.
         raise InputError(f"{view_id}: depth is a masked array, expected NaN where there is no prediction")
     try:
         array = np.asarray(depth)
-    except Exception as error:  # Whatever the object's own conversion raises, e.g. a tensor on a GPU.
-        raise InputError(f"{view_id}: depth cannot become a numpy array ({show(str(error))})") from error
+    except Exception as error:  # The object's own conversion may raise anything, e.g. for a tensor on a GPU.
+        raise InputError(f"{view_id}: depth cannot become a numpy array ({escape_text(str(error))})") from error
     if array.dtype.kind != "f":
         raise InputError(f"{view_id}: depth has dtype {array.dtype}, expected floats in metres")
     if array.ndim != 2 or 0 in array.shape:
@@ -163,19 +167,19 @@ def _as_depth(view_id: str, depth: object) -> Depth:
 
 def _npy_header(values: Depth) -> bytes:
     text = f"{{'descr': '{values.dtype.str}', 'fortran_order': False, 'shape': {values.shape}, }}"
-    # The format asks for a newline at the end, and for values that start at a multiple of 64.
+    # The .npy format requires a final newline and values that start at a multiple of 64 bytes.
     text += " " * (-(len(text) + 11) % 64) + "\n"
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode("ascii")
 
 
-def _padding(values_at: int) -> bytes:
-    """Return a zip extra field that moves byte ``values_at`` to a multiple of the alignment."""
-    length = -(values_at + 4) % _ALIGNMENT
-    return _PADDING_FIELD.to_bytes(2, "little") + length.to_bytes(2, "little") + bytes(length)
+def _padding_field(values_offset: int) -> bytes:
+    """Return a zip extra field that moves byte ``values_offset`` of the file to a multiple of the alignment."""
+    length = -(values_offset + 4) % _ALIGNMENT_BYTES
+    return _PADDING_FIELD_ID.to_bytes(2, "little") + length.to_bytes(2, "little") + bytes(length)
 
 
 def _check_metadata(values: Mapping[str, object]) -> None:
-    found = [
+    problems = [
         *method_problems(values["method"]),
         *description_problems(values["description"]),
         *url_problems(values["url"]),
@@ -184,6 +188,6 @@ def _check_metadata(values: Mapping[str, object]) -> None:
     try:
         json.dumps(values, allow_nan=False, ensure_ascii=False).encode("utf-8")
     except (TypeError, ValueError) as error:
-        found.append(f"the metadata is not JSON ({error}), expected text, finite numbers, lists and objects")
-    if found:
-        raise InputError("; ".join(found))
+        problems.append(f"the metadata is not JSON ({error}), expected text, finite numbers, lists and objects")
+    if problems:
+        raise InputError("; ".join(problems))

@@ -1,9 +1,10 @@
-"""Random access to the bytes of an archive: a file on disk, or bytes in memory (an ``.npz`` inside it).
+"""Zip byte sources and a bounded parser of the zip central directory.
 
-The central directory of a zip, parsed within bounds that are set before anything is read.
+A byte source is a file on disk or bytes in memory (an ``.npz`` entry of an archive). The limits on the size of the
+central directory are checked before it is read.
 
-``zipfile`` is not used for reading: it allocates whatever the directory claims, cuts names at NUL and
-accepts archives whose parts overlap. One parser decides here what every later check sees.
+``zipfile`` is not used for reading: it allocates the sizes that the directory declares, cuts names at NUL and
+accepts archives whose entries overlap. All later checks use the records of this parser.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-# Below this a read call is cheaper than a mapping and its page faults.
-_SMALLEST_MAPPING = 64 * 1024
+# For smaller reads, pread is cheaper than a mapping and its page faults.
+_MIN_MAPPED_BYTES = 64 * 1024
 
 
 class ByteSource(Protocol):
-    """Bytes that can be read anywhere, by several threads at once."""
+    """Interface of thread-safe random access to a sequence of bytes."""
 
     @property
     def size(self) -> int:
@@ -32,15 +33,15 @@ class ByteSource(Protocol):
         """Return exactly ``length`` bytes, or raise ``EOFError`` if the source holds fewer."""
 
 
-_PIECE_BYTES = 1 << 20
+_HASH_CHUNK_BYTES = 1 << 20
 
 
 class FileSource:
-    """A regular file, read through ``pread`` and short-lived read-only mappings.
+    """Byte source of a regular file, read through ``pread`` and short-lived read-only mappings.
 
-    Every large read maps its own range and the mapping dies with the last view on it, so the resident
-    memory stays that of the views in use however many gigabytes are read. The file must not be shortened
-    while a view is alive (the system would end the process).
+    Every large read maps its own range, and the mapping is released with the last view on it, so the resident
+    memory is that of the views in use, independent of the file size. The file must not be truncated while a view
+    exists (the operating system would terminate the process with SIGBUS).
     """
 
     def __init__(self, path: Path) -> None:
@@ -52,31 +53,31 @@ class FileSource:
         """Return exactly ``length`` bytes, or raise ``EOFError`` if the source holds fewer."""
         if offset < 0 or length < 0 or offset + length > os.fstat(self._fd).st_size:
             raise EOFError(f"{length} bytes at {offset} lie past the end of the file")
-        if length < _SMALLEST_MAPPING:
-            return _exactly(memoryview(os.pread(self._fd, length, offset)), length)
+        if length < _MIN_MAPPED_BYTES:
+            return _check_length(memoryview(os.pread(self._fd, length, offset)), length)
         lead = offset % mmap.ALLOCATIONGRANULARITY
-        # Populated at once: a fault for every page would take as long as reading what they hold.
+        # MAP_POPULATE loads all pages at once: one page fault per page would take as long as reading the pages.
         flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)
         mapped = mmap.mmap(self._fd, lead + length, flags, mmap.PROT_READ, offset=offset - lead)
         return memoryview(mapped)[lead:]
 
     def sha256(self) -> str:
-        """Return the hex SHA-256 of the whole file, read in pieces."""
+        """Return the hex SHA-256 of the whole file, read in chunks."""
         digest = hashlib.sha256()
         offset = 0
-        while piece := os.pread(self._fd, _PIECE_BYTES, offset):
-            digest.update(piece)
-            offset += len(piece)
+        while chunk := os.pread(self._fd, _HASH_CHUNK_BYTES, offset):
+            digest.update(chunk)
+            offset += len(chunk)
         return digest.hexdigest()
 
     def close(self) -> None:
-        """Close the file; views already handed out stay valid. Closing twice is harmless."""
+        """Close the file; views that were already returned stay valid. A second call has no effect."""
         self._close()
         self._fd = -1
 
 
 class MemorySource:
-    """Bytes in memory."""
+    """Byte source of data in memory."""
 
     def __init__(self, data: memoryview) -> None:
         self._data = data
@@ -86,33 +87,33 @@ class MemorySource:
         """Return exactly ``length`` bytes, or raise ``EOFError`` if the source holds fewer."""
         if offset < 0 or length < 0:
             raise EOFError(f"{length} bytes at {offset} lie outside the data")
-        return _exactly(self._data[offset : offset + length], length)
+        return _check_length(self._data[offset : offset + length], length)
 
 
-def _exactly(data: memoryview, length: int) -> memoryview:
+def _check_length(data: memoryview, length: int) -> memoryview:
     if len(data) != length:
         raise EOFError(f"{len(data)} bytes found, expected {length}")
     return data
 
 
-_END = struct.Struct("<4s4H2LH")
-_END64_LOCATOR = struct.Struct("<4sLQL")
-_END64 = struct.Struct("<4sQ2H2L4Q")
-_RECORD = struct.Struct("<4s4B4H3L5H2L")
-_LONGEST_COMMENT = 0xFFFF
+_END_RECORD = struct.Struct("<4s4H2LH")
+_ZIP64_END_LOCATOR = struct.Struct("<4sLQL")
+_ZIP64_END_RECORD = struct.Struct("<4sQ2H2L4Q")
+_DIRECTORY_RECORD = struct.Struct("<4s4B4H3L5H2L")
+_MAX_COMMENT_BYTES = 0xFFFF
 _FULL16 = 0xFFFF
 _FULL32 = 0xFFFFFFFF
 _UTF8_NAME = 0x800
-_BYTES_PER_RECORD = 512
+_MAX_BYTES_PER_RECORD = 512
 
 
 class DirectoryError(Exception):
-    """The file is no zip, or its directory cannot be trusted; the message is one problem sentence."""
+    """Error for a file that is not a zip or has an invalid directory; the message is one sentence."""
 
 
 @dataclass(frozen=True, slots=True)
 class ZipEntry:
-    """One record of the central directory; sizes and offsets in bytes."""
+    """Record of the central directory; sizes and offsets are in bytes."""
 
     name: str
     raw_name: bytes
@@ -128,15 +129,15 @@ class ZipEntry:
 
 @dataclass(frozen=True, slots=True)
 class Directory:
-    """All records in the order of the directory, and the byte where it starts."""
+    """Records of the central directory in its order; ``offset`` is the byte where the directory starts."""
 
     entries: tuple[ZipEntry, ...]
     offset: int
 
 
 @dataclass(frozen=True, slots=True)
-class _End:
-    """What the end record says, zip64 already resolved; ``position`` is where the directory must end."""
+class _EndRecord:
+    """End record of a zip with zip64 values resolved; ``position`` is the byte where the directory must end."""
 
     position: int
     count: int
@@ -145,15 +146,15 @@ class _End:
 
 
 def read_directory(source: ByteSource, max_entries: int) -> Directory:
-    """Parse the central directory, at most ``max_entries`` records.
+    """Parse the central directory, which may have at most ``max_entries`` records.
 
-    Raises ``DirectoryError`` for anything that is not one plain, whole, single-disk zip.
+    Raises ``DirectoryError`` if the source is not one complete single-disk zip without leading or trailing bytes.
     """
-    end = _find_end(source)
-    if end.count > max_entries or end.size > max_entries * _BYTES_PER_RECORD:
+    end = _find_end_record(source)
+    if end.count > max_entries or end.size > max_entries * _MAX_BYTES_PER_RECORD:
         raise DirectoryError(
             f"the zip directory declares {end.count} entries in {end.size} bytes, "
-            f"expected at most {max_entries} entries in {max_entries * _BYTES_PER_RECORD} bytes"
+            f"expected at most {max_entries} entries in {max_entries * _MAX_BYTES_PER_RECORD} bytes"
         )
     if end.offset + end.size != end.position:
         raise DirectoryError(
@@ -165,107 +166,113 @@ def read_directory(source: ByteSource, max_entries: int) -> Directory:
     return Directory(_parse_records(data, end.count), end.offset)
 
 
-def _find_end(source: ByteSource) -> _End:
-    length = min(source.size, _END.size + _LONGEST_COMMENT)
+def _find_end_record(source: ByteSource) -> _EndRecord:
+    length = min(source.size, _END_RECORD.size + _MAX_COMMENT_BYTES)
     tail = bytes(source.read_at(source.size - length, length))
-    at = tail.rfind(b"PK\x05\x06")
-    while at >= 0:
-        fits = at + _END.size <= len(tail)
-        if fits and at + _END.size + int.from_bytes(tail[at + 20 : at + 22], "little") == len(tail):
-            return _resolve_end(source, source.size - length + at, tail[at : at + _END.size])
-        at = tail.rfind(b"PK\x05\x06", 0, at + 3)
+    offset = tail.rfind(b"PK\x05\x06")
+    while offset >= 0:
+        fits = offset + _END_RECORD.size <= len(tail)
+        if fits and offset + _END_RECORD.size + int.from_bytes(tail[offset + 20 : offset + 22], "little") == len(
+            tail
+        ):
+            return _parse_end_record(
+                source, source.size - length + offset, tail[offset : offset + _END_RECORD.size]
+            )
+        offset = tail.rfind(b"PK\x05\x06", 0, offset + 3)
     if bytes(source.read_at(0, min(4, source.size))) == b"PK\x03\x04":
         raise DirectoryError("the zip has no end record, expected one at the end: the file is truncated")
     raise DirectoryError("the file is not a zip: no zip end record was found, expected a zip archive")
 
 
-def _resolve_end(source: ByteSource, position: int, record: bytes) -> _End:
-    found: tuple[int, ...] = _END.unpack(record)[1:7]
+def _parse_end_record(source: ByteSource, position: int, record: bytes) -> _EndRecord:
+    fields: tuple[int, ...] = _END_RECORD.unpack(record)[1:7]
     full = (_FULL16, _FULL16, _FULL16, _FULL16, _FULL32, _FULL32)
-    wide = _find_end64(source, position)
-    if wide is not None:
-        position, fields = wide
-        if any(a not in (b, limit) for a, b, limit in zip(found, fields, full, strict=True)):
-            raise DirectoryError(f"the zip end record says {found}, expected the zip64 end record's {fields}")
-        found = fields
-    disk, start_disk, here, count, size, offset = found
+    zip64 = _find_zip64_end_record(source, position)
+    if zip64 is not None:
+        position, expected = zip64
+        if any(a not in (b, limit) for a, b, limit in zip(fields, expected, full, strict=True)):
+            raise DirectoryError(f"the zip end record says {fields}, expected the zip64 end record's {expected}")
+        fields = expected
+    disk, start_disk, here, count, size, offset = fields
     if disk or start_disk or here != count:
         raise DirectoryError(
             f"the zip is part of a multi-disk set (disk {disk}, {here} of {count} entries), "
             "expected one whole file"
         )
-    return _End(position, count, size, offset)
+    return _EndRecord(position, count, size, offset)
 
 
-def _find_end64(source: ByteSource, position: int) -> tuple[int, tuple[int, ...]] | None:
-    locator_at = position - _END64_LOCATOR.size
-    if locator_at < 0:
+def _find_zip64_end_record(source: ByteSource, position: int) -> tuple[int, tuple[int, ...]] | None:
+    locator_offset = position - _ZIP64_END_LOCATOR.size
+    if locator_offset < 0:
         return None
-    magic, disk, at, disks = _END64_LOCATOR.unpack(source.read_at(locator_at, _END64_LOCATOR.size))
+    magic, disk, record_offset, disks = _ZIP64_END_LOCATOR.unpack(
+        source.read_at(locator_offset, _ZIP64_END_LOCATOR.size)
+    )
     if magic != b"PK\x06\x07":
         return None
     if disk or disks > 1:
         raise DirectoryError(f"the zip is part of a multi-disk set of {disks}, expected one whole file")
-    if at + _END64.size > locator_at:
+    if record_offset + _ZIP64_END_RECORD.size > locator_offset:
         raise DirectoryError(
-            f"the zip64 end record is declared at byte {at}, expected it before byte {locator_at}"
+            f"the zip64 end record is declared at byte {record_offset}, expected it before byte {locator_offset}"
         )
-    magic, length, _, _, *fields = _END64.unpack(source.read_at(at, _END64.size))
-    if magic != b"PK\x06\x06" or at + 12 + length != locator_at:
-        raise DirectoryError(f"no whole zip64 end record was found at byte {at}, expected one")
-    return at, tuple(fields)
+    magic, length, _, _, *fields = _ZIP64_END_RECORD.unpack(source.read_at(record_offset, _ZIP64_END_RECORD.size))
+    if magic != b"PK\x06\x06" or record_offset + 12 + length != locator_offset:
+        raise DirectoryError(f"no whole zip64 end record was found at byte {record_offset}, expected one")
+    return record_offset, tuple(fields)
 
 
 def _parse_records(data: bytes, count: int) -> tuple[ZipEntry, ...]:
     entries: list[ZipEntry] = []
-    at = 0
-    while at < len(data) and len(entries) < count:
-        entry, at = _parse_record(data, at, len(entries))
+    offset = 0
+    while offset < len(data) and len(entries) < count:
+        entry, offset = _parse_record(data, offset, len(entries))
         entries.append(entry)
-    if len(entries) != count or at != len(data):
+    if len(entries) != count or offset != len(data):
         raise DirectoryError(
-            f"the zip directory holds {len(entries)} entries in {at} bytes, "
+            f"the zip directory holds {len(entries)} entries in {offset} bytes, "
             f"expected the declared {count} in {len(data)} bytes"
         )
     return tuple(entries)
 
 
-def _parse_record(data: bytes, at: int, index: int) -> tuple[ZipEntry, int]:
-    if at + _RECORD.size > len(data) or data[at : at + 4] != b"PK\x01\x02":
-        raise DirectoryError(f"no zip directory record was found for entry {index}, expected one at +{at}")
-    fields = _RECORD.unpack_from(data, at)
+def _parse_record(data: bytes, start: int, index: int) -> tuple[ZipEntry, int]:
+    if start + _DIRECTORY_RECORD.size > len(data) or data[start : start + 4] != b"PK\x01\x02":
+        raise DirectoryError(f"no zip directory record was found for entry {index}, expected one at +{start}")
+    fields = _DIRECTORY_RECORD.unpack_from(data, start)
     flags, method = fields[5], fields[6]
     crc, compressed, size, name_length, extra_length, comment_length, disk = fields[9:16]
     attributes, offset = fields[17], fields[18]
-    name_end = at + _RECORD.size + name_length
+    name_end = start + _DIRECTORY_RECORD.size + name_length
     extra_end = name_end + extra_length
     if extra_end + comment_length > len(data):
         raise DirectoryError(f"the zip directory record of entry {index} runs past the directory's end")
-    raw_name = data[at + _RECORD.size : name_end]
+    raw_name = data[start + _DIRECTORY_RECORD.size : name_end]
     name = raw_name.decode("utf-8" if flags & _UTF8_NAME else "cp437", errors="backslashreplace")
-    size, compressed, offset = _widen((size, compressed, offset), data[name_end:extra_end], index)
+    size, compressed, offset = _apply_zip64_sizes((size, compressed, offset), data[name_end:extra_end], index)
     entry = ZipEntry(name, raw_name, flags, method, crc, compressed, size, offset, attributes >> 16, disk)
     return entry, extra_end + comment_length
 
 
-def _widen(values: tuple[int, int, int], extra: bytes, index: int) -> tuple[int, int, int]:
-    """Replace every value that is full by its 64-bit one from the zip64 extra field."""
+def _apply_zip64_sizes(values: tuple[int, int, int], extra: bytes, index: int) -> tuple[int, int, int]:
+    """Replace each saturated 32-bit value by its 64-bit value from the zip64 extra field."""
     if _FULL32 not in values:
         return values
-    wide = _zip64_field(extra)
+    zip64_values = _zip64_field(extra)
     needed = sum(value == _FULL32 for value in values)
-    if len(wide) < 8 * needed:
+    if len(zip64_values) < 8 * needed:
         raise DirectoryError(f"the zip directory record of entry {index} lacks its zip64 sizes, expected {needed}")
-    numbers = iter(struct.unpack_from(f"<{needed}Q", wide))
-    size, compressed, offset = (next(numbers) if value == _FULL32 else value for value in values)
+    replacements = iter(struct.unpack_from(f"<{needed}Q", zip64_values))
+    size, compressed, offset = (next(replacements) if value == _FULL32 else value for value in values)
     return size, compressed, offset
 
 
 def _zip64_field(extra: bytes) -> bytes:
-    at = 0
-    while at + 4 <= len(extra):
-        kind, length = struct.unpack_from("<2H", extra, at)
+    offset = 0
+    while offset + 4 <= len(extra):
+        kind, length = struct.unpack_from("<2H", extra, offset)
         if kind == 1:
-            return extra[at + 4 : at + 4 + length]
-        at += 4 + length
+            return extra[offset + 4 : offset + 4 + length]
+        offset += 4 + length
     return b""

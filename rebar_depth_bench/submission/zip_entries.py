@@ -1,6 +1,7 @@
-"""Structural checks of a zip's entries, made before the data of any entry is read.
+"""Zip entry validation and reading.
 
-The data of one checked entry: bounded inflation, exact length, verified checksum.
+All entries are checked structurally before the data of any entry is read. Reading a checked entry bounds the
+inflated size and verifies the length and the checksum.
 """
 
 from __future__ import annotations
@@ -14,17 +15,17 @@ from dataclasses import dataclass
 
 from zlib_ng import zlib_ng
 
-from rebar_depth_bench.errors import EntryError, show
+from rebar_depth_bench.errors import EntryError, escape_text
 from rebar_depth_bench.submission.zip_directory import ByteSource, Directory, ZipEntry
 
 STORED = 0
 DEFLATED = 8
-_LOCAL = struct.Struct("<4s5H3L2H")
+_LOCAL_HEADER = struct.Struct("<4s5H3L2H")
 _ENCRYPTED = 0x0001 | 0x0040 | 0x2000
-_SIZES_FOLLOW = 0x0008
-_PATCH = 0x0020
+_HAS_DATA_DESCRIPTOR = 0x0008
+_PATCH_DATA = 0x0020
 _FULL32 = 0xFFFFFFFF
-_KINDS = {
+_FILE_TYPES = {
     stat.S_IFLNK: "a symbolic link",
     stat.S_IFDIR: "a directory",
     stat.S_IFCHR: "a character device",
@@ -34,12 +35,12 @@ _KINDS = {
 }
 
 SizeLimit = Callable[[str], int | None]
-"""The largest uncompressed size in bytes that an entry of this name needs; None if its size is no matter."""
+"""Function from an entry name to its largest acceptable uncompressed size in bytes; None for no limit."""
 
 
 @dataclass(frozen=True, slots=True)
 class CheckedEntry:
-    """An entry with everything wrong about it, and the byte where its data starts (0 if unknown)."""
+    """Entry with its problems; ``data_offset`` is the byte where its data starts (0 if unknown)."""
 
     entry: ZipEntry
     data_offset: int
@@ -47,29 +48,29 @@ class CheckedEntry:
 
     @property
     def span(self) -> tuple[int, int]:
-        """The bytes that the entry takes in the file, from its local header to the end of its data."""
+        """Byte range (start, end) of the entry in the file, from its local header to the end of its data."""
         return self.entry.header_offset, self.data_offset + self.entry.compressed_size
 
 
-def has_bad_name(entry: ZipEntry) -> bool:
-    """Tell whether the name escapes the archive or has control characters."""
+def has_unsafe_name(entry: ZipEntry) -> bool:
+    """Return whether the name escapes the archive or has control characters."""
     return bool(_name_problems(entry))
 
 
 def check_entries(source: ByteSource, directory: Directory, limit: SizeLimit) -> tuple[CheckedEntry, ...]:
-    """Check every entry of the directory, in its order."""
+    """Return every entry of the directory, in its order, with its structural problems."""
     checked = tuple(_check_entry(source, entry, directory.offset, limit) for entry in directory.entries)
-    overlaps = _overlaps(checked)
+    overlaps = _overlap_problems(checked)
     return tuple(
-        CheckedEntry(item.entry, item.data_offset, item.problems + overlaps.get(index, ()))
-        for index, item in enumerate(checked)
+        CheckedEntry(check.entry, check.data_offset, check.problems + overlaps.get(index, ()))
+        for index, check in enumerate(checked)
     )
 
 
 def _check_entry(source: ByteSource, entry: ZipEntry, directory_offset: int, limit: SizeLimit) -> CheckedEntry:
-    data_offset, local_problems = _check_local(source, entry, directory_offset)
-    found = [*_name_problems(entry), *_kind_problems(entry), *_size_problems(entry, limit), *local_problems]
-    return CheckedEntry(entry, data_offset, tuple(f"{show(entry.name)}: {problem}" for problem in found))
+    data_offset, local_problems = _check_local_header(source, entry, directory_offset)
+    problems = [*_name_problems(entry), *_type_problems(entry), *_size_problems(entry, limit), *local_problems]
+    return CheckedEntry(entry, data_offset, tuple(f"{escape_text(entry.name)}: {problem}" for problem in problems))
 
 
 def _name_problems(entry: ZipEntry) -> list[str]:
@@ -82,102 +83,108 @@ def _name_problems(entry: ZipEntry) -> list[str]:
     )
 
 
-def _kind_problems(entry: ZipEntry) -> list[str]:
-    found = []
+def _type_problems(entry: ZipEntry) -> list[str]:
+    problems = []
     kind = stat.S_IFMT(entry.unix_mode)
     if kind not in (0, stat.S_IFREG) and not (kind == stat.S_IFDIR and entry.name.endswith("/")):
-        found.append(f"the entry is {_KINDS.get(kind, f'of file type {kind:#o}')}, expected a regular file")
+        problems.append(
+            f"the entry is {_FILE_TYPES.get(kind, f'of file type {kind:#o}')}, expected a regular file"
+        )
     if entry.flags & _ENCRYPTED:
-        found.append("the entry is encrypted, expected plain data")
-    if entry.flags & _PATCH:
-        found.append("the entry is patch data, expected plain data")
+        problems.append("the entry is encrypted, expected plain data")
+    if entry.flags & _PATCH_DATA:
+        problems.append("the entry is patch data, expected plain data")
     if entry.method not in (STORED, DEFLATED):
-        found.append(
+        problems.append(
             f"the compression method is {entry.method}, expected {STORED} (stored) or {DEFLATED} (deflated)"
         )
     if entry.disk:
-        found.append(f"the entry is on disk {entry.disk} of a multi-disk set, expected one whole file")
-    return found
+        problems.append(f"the entry is on disk {entry.disk} of a multi-disk set, expected one whole file")
+    return problems
 
 
 def _size_problems(entry: ZipEntry, limit: SizeLimit) -> list[str]:
-    found = []
+    problems = []
     allowed = 0 if entry.name.endswith("/") else limit(entry.name)
     if allowed is not None and entry.size > allowed:
-        found.append(f"the declared size is {entry.size} bytes, expected at most {allowed}")
+        problems.append(f"the declared size is {entry.size} bytes, expected at most {allowed}")
     if entry.method == STORED and entry.compressed_size != entry.size:
-        found.append(f"{entry.compressed_size} bytes are stored, expected the declared {entry.size}")
-    # Deflate grows data by 5 bytes per block of 16 KiB at worst; more only wastes the reader's time.
-    most = entry.size + entry.size // 1024 + 1024
-    if entry.method == DEFLATED and entry.compressed_size > most:
-        found.append(f"{entry.compressed_size} bytes are deflated for {entry.size}, expected at most {most}")
-    return found
+        problems.append(f"{entry.compressed_size} bytes are stored, expected the declared {entry.size}")
+    # Deflate enlarges incompressible data by at most 5 bytes per block of 16 KiB.
+    max_compressed = entry.size + entry.size // 1024 + 1024
+    if entry.method == DEFLATED and entry.compressed_size > max_compressed:
+        problems.append(
+            f"{entry.compressed_size} bytes are deflated for {entry.size}, expected at most {max_compressed}"
+        )
+    return problems
 
 
-def _check_local(source: ByteSource, entry: ZipEntry, directory_offset: int) -> tuple[int, list[str]]:
-    """Compare the entry with its local header; return where its data starts, and what is wrong."""
+def _check_local_header(source: ByteSource, entry: ZipEntry, directory_offset: int) -> tuple[int, list[str]]:
+    """Compare the entry with its local header; return its data's byte offset (0 if unknown) and the problems."""
     start = entry.header_offset
-    if start + _LOCAL.size > directory_offset:
+    if start + _LOCAL_HEADER.size > directory_offset:
         return 0, [f"the data is declared at byte {start}, expected it before the directory at {directory_offset}"]
-    magic, _, flags, method, _, _, crc, compressed, size, name_length, extra_length = _LOCAL.unpack(
-        source.read_at(start, _LOCAL.size)
+    magic, _, flags, method, _, _, crc, compressed, size, name_length, extra_length = _LOCAL_HEADER.unpack(
+        source.read_at(start, _LOCAL_HEADER.size)
     )
     if magic != b"PK\x03\x04":
         return 0, [f"no local header was found at byte {start}, expected one"]
-    data_offset = start + _LOCAL.size + name_length + extra_length
+    data_offset = start + _LOCAL_HEADER.size + name_length + extra_length
     end = data_offset + entry.compressed_size
     if end > directory_offset:
         return 0, [f"the data ends at byte {end}, expected it before the directory at {directory_offset}"]
-    raw_name = bytes(source.read_at(start + _LOCAL.size, name_length))
-    pairs: list[tuple[str, object, object]] = [
+    raw_name = bytes(source.read_at(start + _LOCAL_HEADER.size, name_length))
+    comparisons: list[tuple[str, object, object]] = [
         ("name", raw_name, entry.raw_name),
         ("compression method", method, entry.method),
         ("encryption", bool(flags & _ENCRYPTED), bool(entry.flags & _ENCRYPTED)),
     ]
-    # Sizes that follow the data, or stand in a zip64 field, are not in the header to be compared.
-    if not (flags | entry.flags) & _SIZES_FOLLOW:
-        pairs.append(("checksum", crc, entry.crc))
-        pairs += [("size", size, entry.size)] if size != _FULL32 else []
-        pairs += [("compressed size", compressed, entry.compressed_size)] if compressed != _FULL32 else []
+    # The local header lacks sizes that follow the data in a data descriptor or are in a zip64 extra field.
+    if not (flags | entry.flags) & _HAS_DATA_DESCRIPTOR:
+        comparisons.append(("checksum", crc, entry.crc))
+        comparisons += [("size", size, entry.size)] if size != _FULL32 else []
+        comparisons += [("compressed size", compressed, entry.compressed_size)] if compressed != _FULL32 else []
     return data_offset, [
-        f"the {what} in the local header is {show(str(local))}, expected the directory's {show(str(central))}"
-        for what, local, central in pairs
+        f"the {field} in the local header is {escape_text(str(local))}, "
+        f"expected the directory's {escape_text(str(central))}"
+        for field, local, central in comparisons
         if local != central
     ]
 
 
-def _overlaps(checked: Sequence[CheckedEntry]) -> dict[int, tuple[str, ...]]:
-    """Return the problem of every entry whose bytes are also another entry's."""
-    located = [index for index, item in enumerate(checked) if item.data_offset]
+def _overlap_problems(checked: Sequence[CheckedEntry]) -> dict[int, tuple[str, ...]]:
+    """Return, by entry index, the problem of every entry whose byte range overlaps that of another entry."""
+    located = [index for index, check in enumerate(checked) if check.data_offset]
     located.sort(key=lambda index: (checked[index].span, index))
-    found: dict[int, tuple[str, ...]] = {}
+    problems: dict[int, tuple[str, ...]] = {}
     widest = -1
     for index in located:
         start, end = checked[index].span
         if widest >= 0 and start < checked[widest].span[1]:
-            name, other = show(checked[index].entry.name), show(checked[widest].entry.name)
+            name, other = escape_text(checked[index].entry.name), escape_text(checked[widest].entry.name)
             problem = f"{name}: the data from byte {start} overlaps that of {other}, expected separate data"
-            found[index] = (problem,)
+            problems[index] = (problem,)
         if widest < 0 or end > checked[widest].span[1]:
             widest = index
-    return found
+    return problems
 
 
 def read_data(source: ByteSource, checked: CheckedEntry) -> memoryview:
-    """Return the entry's uncompressed bytes; a stored entry is a view on the source, not a copy.
+    """Return the entry's uncompressed bytes; for a stored entry a view on the source, not a copy.
 
-    Call it only for entries without problems: their declared size is what bounds the memory. Raises
-    ``EntryError`` for corrupt data.
+    Call it only for entries without problems, since their checked declared size bounds the memory use. Raises
+    ``EntryError`` if the data is corrupt or the file was truncated.
     """
     entry = checked.entry
-    name = show(entry.name)
+    name = escape_text(entry.name)
     try:
         data = source.read_at(checked.data_offset, entry.compressed_size)
     except EOFError as error:
         raise EntryError(f"{name}: the archive was shortened while it was read: {error}") from error
     if entry.method == DEFLATED:
         data = _inflate(name, data, entry.size)
-    crc = zlib_ng.crc32(data)  # six times as fast as zlib's: the rest of a view's read takes less
+    # zlib-ng's CRC-32 is six times as fast as zlib's, whose time exceeds the rest of reading a view.
+    crc = zlib_ng.crc32(data)
     if crc != entry.crc:
         raise EntryError(f"{name}: the data is corrupt: its checksum is {crc:08x}, expected {entry.crc:08x}")
     return data
@@ -186,7 +193,7 @@ def read_data(source: ByteSource, checked: CheckedEntry) -> memoryview:
 def _inflate(name: str, data: memoryview, size: int) -> memoryview:
     inflater = zlib.decompressobj(-zlib.MAX_WBITS)
     try:
-        # One byte more than declared is enough to tell a longer stream from a right one.
+        # One byte more than declared suffices to detect a stream that is too long.
         inflated = inflater.decompress(data, size + 1)
     except zlib.error as error:
         raise EntryError(f"{name}: the deflated data is corrupt ({error}), expected {size} bytes") from error

@@ -1,1 +1,1 @@
-"""Inspection measures: cylinders fitted to bars, spacings, tolerances."""
+"""Inspection measures: cylinders fitted to bars, bar spacing, and tolerances of standards."""

@@ -1,99 +1,114 @@
-"""The numbers that a table of inspection shows, and what each of them says in words.
+"""Inspection measures: names, units and definitions of the table entries.
 
-Capabilities: each tolerance of the profiles over the p95 of the error that it bounds.
+The capability measures divide each tolerance of the profiles by the p95 of the error that it bounds.
 """
 
 from __future__ import annotations
 
 from functools import partial
 
-from rebar_depth_bench.extended.inspection.segments import MAX_REACH_M
+from rebar_depth_bench.extended.inspection.segments import MAX_MATCH_RADIUS_M
 from rebar_depth_bench.extended.inspection.tolerances import (
-    CAPABILITIES,
+    CAPABILITY_INPUTS,
     PROFILES,
     Tolerance,
-    capability,
     pass_sample,
+    process_capability,
 )
-from rebar_depth_bench.extended.inspection.visible_segments import AROUND, MIN_PIXELS, MIN_VISIBLE, WIDE_PX
+from rebar_depth_bench.extended.inspection.visible_segments import (
+    FLANK_RADII_AND_SHARE,
+    MIN_DIAMETER_FIT_WIDTH_PX,
+    MIN_PIXELS,
+    MIN_VISIBLE_DIAMETERS,
+)
 from rebar_depth_bench.extended.measures import Measure
 
-MIN_PREDICTED = 0.5
-"""A run is found only if at least this share of the pixels it is judged on has a prediction."""
+MIN_PREDICTED_SHARE = 0.5
+"""Minimum share of a segment's sampled pixels that must have a prediction for it to be found."""
 
 MISS_MM = 100.0
-"""What a bar or pair that was not found counts as in ``..._judged_mm``: more than any found one can be off."""
+"""Error assigned to a bar or pair that was not found in ``..._judged_mm``, and the cap of all errors there.
 
-SIDE_BY_SIDE = 2.0
-"""A pair is judged where the visible parts of both pass each other for this many of the larger diameter."""
+The position and spacing errors of bars and pairs that were found are smaller.
+"""
 
-_JUDGED = (
-    f"Judged are straight runs of bars with {MIN_PIXELS} interior pixels or more over {MIN_VISIBLE:g} diameters "
-    "or more of their length, by the ground truth alone."
+MIN_VISIBLE_OVERLAP_DIAMETERS = 2.0
+"""Minimum overlap of the visible parts of a judged pair along the axis, in larger diameters."""
+
+_JUDGED_NOTE = (
+    f"Judged are straight runs of bars with {MIN_PIXELS} interior pixels or more over "
+    f"{MIN_VISIBLE_DIAMETERS:g} diameters or more of their length, by the ground truth alone."
 )
-_MISSED = f"What was not found counts as {MISS_MM:g} mm."
+_MISSED_NOTE = f"What was not found counts as {MISS_MM:g} mm."
 
 _SEPARATION = (
     "separation of fitted axes minus that of the true ones, along the true one, in the middle of what is seen of "
     "both; neighbouring parallel runs"
 )
-_BESIDE = f"seen side by side for {SIDE_BY_SIDE:g} diameters or more"
+_OVERLAP_NOTE = f"seen side by side for {MIN_VISIBLE_OVERLAP_DIAMETERS:g} diameters or more"
 
-_WHAT: dict[str, str] = {
-    "spacing": f"{_SEPARATION} whose separation is less than 45 degrees from the image plane, {_BESIDE}",
-    "layer": f"{_SEPARATION} whose separation is 45 degrees or less from the optical axis, {_BESIDE}",
+_DEFINITIONS: dict[str, str] = {
+    "spacing": f"{_SEPARATION} whose separation is less than 45 degrees from the image plane, {_OVERLAP_NOTE}",
+    "layer": f"{_SEPARATION} whose separation is 45 degrees or less from the optical axis, {_OVERLAP_NOTE}",
     "cover": "fitted axis minus true axis along the optical axis, in the middle of what is seen of the run; more "
     "is further from the camera",
     "diameter": "diameter of a cylinder fitted with a free radius, minus the nominal one; runs that are "
-    f"{WIDE_PX:g} pixels wide or more and seen on both sides (a tenth of the pixels beyond {AROUND[0]:g} radii)",
+    f"{MIN_DIAMETER_FIT_WIDTH_PX:g} pixels wide or more and seen on both sides (a tenth of the pixels "
+    f"beyond {FLANK_RADII_AND_SHARE[0]:g} radii)",
 }
+"""Definition of each kind of error."""
+
 _TITLES: dict[str, str] = {
     "spacing": "bar spacing",
     "layer": "layer distance",
     "cover": "cover (place in depth)",
     "diameter": "diameter",
 }
+"""Title of each kind of error."""
 
 
 def _error_measures(kind: str) -> tuple[Measure, ...]:
-    """Return bias, spread and size of one kind of error; only what counts all judged can be better or worse."""
-    title, what = _TITLES[kind], _WHAT[kind]
-    found, judged = f"{kind}_error_mm", f"{kind}_judged_mm"
+    """Return bias, spread, median and p95 of one kind of error.
+
+    Only the last two cover everything judged, so only they have a better direction.
+    """
+    title, definition = _TITLES[kind], _DEFINITIONS[kind]
+    found_sample, judged_sample = f"{kind}_error_mm", f"{kind}_judged_mm"
     return (
         Measure(
-            f"{kind}_bias_mm", found, "mean", f"{title}: bias", "mm", "",
-            f"Mean over what was found: {what}.",
+            f"{kind}_bias_mm", found_sample, "mean", f"{title}: bias", "mm", "",
+            f"Mean over what was found: {definition}.",
         ),
         Measure(
-            f"{kind}_std_mm", found, "std", f"{title}: spread", "mm", "",
-            f"Standard deviation over what was found: {what}.",
+            f"{kind}_std_mm", found_sample, "std", f"{title}: spread", "mm", "",
+            f"Standard deviation over what was found: {definition}.",
         ),
         Measure(
-            f"{kind}_median_mm", judged, "median", f"{title}: median error", "mm", "lower",
-            f"Median of the absolute value: {what}. {_MISSED}",
+            f"{kind}_median_mm", judged_sample, "median", f"{title}: median error", "mm", "lower",
+            f"Median of the absolute value: {definition}. {_MISSED_NOTE}",
         ),
         Measure(
-            f"{kind}_p95_mm", judged, "p95", f"{title}: p95 error", "mm", "lower",
-            f"95th percentile of the absolute value: {what}. {_MISSED}",
+            f"{kind}_p95_mm", judged_sample, "p95", f"{title}: p95 error", "mm", "lower",
+            f"95th percentile of the absolute value: {definition}. {_MISSED_NOTE}",
         ),
     )  # fmt: skip
 
 
-_PLACE_MEASURES: tuple[Measure, ...] = (
+_POSITION_MEASURES: tuple[Measure, ...] = (
     Measure(
         "bars_found", "bar_found", "mean", "bars found", "%", "higher",
-        f"Share of judged runs with predictions on {MIN_PREDICTED:.0%} or more of their pixels whose fitted "
+        f"Share of judged runs with predictions on {MIN_PREDICTED_SHARE:.0%} or more of their pixels whose fitted "
         "cylinder converged, its axis everywhere along what is seen nearer to the true one than half way to the "
-        f"nearest parallel run, and within {1000 * MAX_REACH_M:g} mm. {_JUDGED}",
+        f"nearest parallel run, and within {1000 * MAX_MATCH_RADIUS_M:g} mm. {_JUDGED_NOTE}",
     ),
     Measure(
         "axis_offset_median_mm", "axis_offset_judged_mm", "median", "axis offset: median", "mm", "lower",
-        f"Median distance of the fitted axis from the middle of what is seen of the true one. {_MISSED}",
+        f"Median distance of the fitted axis from the middle of what is seen of the true one. {_MISSED_NOTE}",
     ),
     Measure(
         "axis_offset_p95_mm", "axis_offset_judged_mm", "p95", "axis offset: p95", "mm", "lower",
         "95th percentile of the distance of the fitted axis from the middle of what is seen of the true one. "
-        + _MISSED,
+        + _MISSED_NOTE,
     ),
     Measure(
         "axis_offset_found_mm", "axis_offset_mm", "mean", "axis offset of found bars: mean", "mm", "",
@@ -104,15 +119,17 @@ _PLACE_MEASURES: tuple[Measure, ...] = (
         "Mean angle between fitted and true axis, over runs that were found.",
     ),
 )  # fmt: skip
+"""Detection rate, axis offset and axis tilt."""
 
 
 def _pass_measures() -> tuple[Measure, ...]:
+    """Return the pass rate of each tolerance."""
     return tuple(
         Measure(
             pass_sample(tolerance), pass_sample(tolerance), "mean",
             f"{profile.title}, {tolerance.title}: within {tolerance.limit_mm:g} mm", "%", "higher",
             f"Share of all judged with an error of at most {tolerance.limit_mm:g} mm either way; what was not "
-            f"found fails. Error: {_WHAT[tolerance.kind]}. Tolerance: {profile.source}.",
+            f"found fails. Error: {_DEFINITIONS[tolerance.kind]}. Tolerance: {profile.source}.",
         )
         for profile in PROFILES
         for tolerance in profile.tolerances
@@ -120,35 +137,38 @@ def _pass_measures() -> tuple[Measure, ...]:
 
 
 INSPECTION_MEASURES: tuple[Measure, ...] = (
-    *_PLACE_MEASURES,
-    *(measure for kind in _WHAT for measure in _error_measures(kind)),
+    *_POSITION_MEASURES,
+    *(measure for kind in _DEFINITIONS for measure in _error_measures(kind)),
     *_pass_measures(),
 )
-"""Every number of inspection, in a table's order."""
+"""All inspection measures except the capabilities, in table order."""
 
 
 def capability_name(tolerance: Tolerance) -> str:
-    """Return the name of the measure that says how a tolerance compares with the p95 of its error."""
+    """Return the name of the measure that divides a tolerance by the p95 of its error."""
     return f"capability_{tolerance.key}"
 
 
-def told_capability(limit_mm: float, p95_mm: float) -> float | None:
-    """Return ``capability``, None where the p95 is ``MISS_MM``: it is then of what was not found.
+def defined_capability(limit_mm: float, p95_mm: float) -> float | None:
+    """Return ``process_capability``; None where the p95 is ``MISS_MM`` or more, the value of a miss.
 
-    Raises ``ValueError`` as ``capability`` does.
+    Raises ``ValueError`` as ``process_capability`` does.
     """
-    return None if p95_mm >= MISS_MM else capability(limit_mm, p95_mm)
+    return None if p95_mm >= MISS_MM else process_capability(limit_mm, p95_mm)
 
 
-def _measures() -> tuple[Measure, ...]:
+def _capability_measures() -> tuple[Measure, ...]:
+    """Return the capability measures of all tolerances."""
     p95 = {measure.name: measure for measure in INSPECTION_MEASURES}
     profile_of = {tolerance.key: profile for profile in PROFILES for tolerance in profile.tolerances}
     return tuple(
-        _measure(f"{profile_of[one.key].title}, {one.title}", one, p95[name]) for one, name in CAPABILITIES
+        _capability_measure(f"{profile_of[tolerance.key].title}, {tolerance.title}", tolerance, p95[p95_name])
+        for tolerance, p95_name in CAPABILITY_INPUTS
     )
 
 
-def _measure(title: str, tolerance: Tolerance, p95: Measure) -> Measure:
+def _capability_measure(title: str, tolerance: Tolerance, p95: Measure) -> Measure:
+    """Return the measure that divides ``tolerance`` by the statistic of the measure ``p95``."""
     return Measure(
         name=capability_name(tolerance),
         sample=p95.sample,
@@ -158,9 +178,9 @@ def _measure(title: str, tolerance: Tolerance, p95: Measure) -> Measure:
         better="higher",
         definition=f"Capability: {tolerance.limit_mm:g} mm / {p95.name}; 1 or more where 95 % of all judged stay "
         f"within the tolerance, not told where that p95 is {MISS_MM:g} mm, of what was not found.",
-        convert=partial(told_capability, tolerance.limit_mm),
+        convert=partial(defined_capability, tolerance.limit_mm),
     )
 
 
-MEASURES: tuple[Measure, ...] = _measures()
-"""A capability for each tolerance, in the order of ``PROFILES``."""
+CAPABILITY_MEASURES: tuple[Measure, ...] = _capability_measures()
+"""Capability of each tolerance, in the order of ``PROFILES``."""

@@ -1,4 +1,4 @@
-"""Tolerances of reinforcement inspection, as named profiles, and how a method's error compares with them."""
+"""Tolerance profiles of reinforcement standards, and the process capability index of a measured error."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 ErrorKind = Literal["spacing", "layer", "cover"]
-"""Which error a tolerance is held against: see ``inspection``."""
+"""Kind of error that a tolerance bounds; ``inspection.measures`` defines each kind."""
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """One line of a profile: an error of this ``kind`` passes if its absolute value is at most ``limit_mm``."""
+    """One tolerance of a profile: errors of this ``kind`` pass if their absolute value is at most ``limit_mm``."""
 
     key: str
     kind: ErrorKind
@@ -22,7 +22,7 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class ToleranceProfile:
-    """The tolerances of one standard, and where the figures are from, in words to show beside them."""
+    """Tolerances of one standard; ``source`` is the citation shown beside them."""
 
     name: str
     title: str
@@ -68,29 +68,30 @@ EN_13670_CLASS_2 = ToleranceProfile(
 )
 
 PROFILES: tuple[ToleranceProfile, ...] = (GB_50204, EN_13670_CLASS_1, EN_13670_CLASS_2)
+"""All tolerance profiles, in report order."""
 
 
 def pass_sample(tolerance: Tolerance) -> str:
-    """Return the name of the 0/1 sample, and of its measure, that says what passes a tolerance."""
+    """Return the name of a tolerance's 0/1 sample and of the pass-rate measure over it."""
     return f"pass_{tolerance.key}"
 
 
 def p95_measure(kind: ErrorKind) -> str:
-    """Return the name of the measure whose p95 a tolerance of this kind is compared with."""
+    """Return the name of the measure whose p95 is compared with tolerances of this kind."""
     return f"{kind}_p95_mm"
 
 
-CAPABILITIES: tuple[tuple[Tolerance, str], ...] = tuple(
+CAPABILITY_INPUTS: tuple[tuple[Tolerance, str], ...] = tuple(
     (tolerance, p95_measure(tolerance.kind)) for profile in PROFILES for tolerance in profile.tolerances
 )
-"""Each tolerance with the measure that ``capability`` divides it by."""
+"""Each tolerance with the name of the measure that ``process_capability`` divides it by."""
 
 
-def capability(tolerance_mm: float, p95_mm: float) -> float:
-    """Return tolerance / p95 of the absolute error: 1 or more where 95 % of what is measured stays within it.
+def process_capability(tolerance_mm: float, p95_mm: float) -> float:
+    """Return the capability index tolerance / p95 of the absolute error, akin to the process capability Cp.
 
-    inf for a p95 of 0. Raises ``ValueError`` for a tolerance that is not positive and finite, or a p95 that is
-    negative or NaN.
+    It is 1 or more if 95 % of the errors are within the tolerance, and inf for a p95 of 0. Raises ``ValueError``
+    for a tolerance that is not positive and finite, or a p95 that is negative or NaN.
     """
     if not 0 < tolerance_mm < math.inf:
         raise ValueError(f"tolerance_mm is {tolerance_mm}, expected a positive length")

@@ -1,6 +1,6 @@
-"""Which straight runs a view shows well enough to be judged, and the pixels they are judged on.
+"""Visible bar segments of a view: those judged by inspection, and the pixels that they are judged on.
 
-Decided by the ground truth alone. Frame: the camera's (OpenCV axes), metres.
+Determined from the ground truth alone. Frame: the camera's (OpenCV axes), metres.
 """
 
 from __future__ import annotations
@@ -15,37 +15,43 @@ from rebar_depth_bench.extended.inspection.segments import CageTruth
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 
 MIN_PIXELS = 30
-"""A run with fewer interior pixels on it is not judged."""
+"""Minimum number of interior pixels of a judged segment."""
 
-MIN_VISIBLE = 3.0
-"""A run must show this many diameters of its length from its first interior pixel to its last."""
+MIN_VISIBLE_DIAMETERS = 3.0
+"""Minimum length along the axis from a judged segment's first interior pixel to its last, in diameters."""
 
 MAX_SAMPLES = 64
-"""A run is judged on at most this many of its interior pixels, spread evenly."""
+"""Maximum number of interior pixels that a segment is judged on, evenly spread."""
 
-WIDE_PX = 8.0
-"""A bar at least this many pixels wide (f d / z) has its diameter measured."""
+MIN_DIAMETER_FIT_WIDTH_PX = 8.0
+"""Minimum apparent width (f d / z) in pixels of a bar whose diameter is measured."""
 
-AROUND = (0.4, 0.1)
-"""And it must be seen on both sides: beyond 0.4 radii to either side of its middle lies a tenth of its pixels."""
+FLANK_RADII_AND_SHARE = (0.4, 0.1)
+"""Further condition for a diameter measurement: the bar is visible on both sides.
+
+At least this share (second value) of the sampled pixels lies beyond this many radii (first value) of the axis on
+either side.
+"""
 
 _GOLDEN = (np.sqrt(5.0) - 1) / 2
+"""Golden ratio minus 1."""
 
 
 @dataclass(frozen=True, eq=False)
-class SeenRuns:
-    """The runs of a view that are judged, r of them, each on up to k pixels.
+class VisibleSegments:
+    """The r judged segments of a view, each sampled at up to k pixels.
 
-    ``run`` are indices into ``CageTruth.runs``. ``middle_m`` is the axis point in the middle of the visible part,
-    ``half_m`` half that part's length. ``frame`` holds three unit vectors: across the line of sight, away from the
-    camera, along the axis. ``pixels`` are positions in the arrays of ``SteelTruth``, ``used`` tells which of the k
-    places hold one, ``rays`` are their rays in ``frame``, per metre of planar depth: see ``local_points_m``.
-    ``truth_m`` are the true points. ``wide`` tells where the diameter can be measured.
+    ``segment`` holds indices into ``CageTruth.segments``. ``middle_m`` is the axis point in the middle of the
+    visible part, ``half_m`` half the length of that part. ``frame`` holds three unit vectors: across the line of
+    sight, away from the camera, along the axis. ``pixels`` are positions in the arrays of ``SteelTruth``,
+    ``used`` marks which of the k places hold one, ``rays`` are the pixels' rays in ``frame`` per metre of planar
+    depth: see ``local_points_m``. ``truth_m`` are the true points in ``frame``, from ``middle_m``.
+    ``can_fit_diameter`` marks the segments whose diameter can be measured.
     """
 
-    run: Int64[ndarray, " r"]
+    segment: Int64[ndarray, " r"]
     diameter_m: Float64[ndarray, " r"]
-    reach_m: Float64[ndarray, " r"]
+    match_radius_m: Float64[ndarray, " r"]
     middle_m: Float64[ndarray, "r 3"]
     half_m: Float64[ndarray, " r"]
     frame: Float64[ndarray, "r 3 3"]
@@ -53,7 +59,7 @@ class SeenRuns:
     used: Bool[ndarray, "r k"]
     rays: Float64[ndarray, "r k 3"]
     truth_m: Float64[ndarray, "r k 3"]
-    wide: Bool[ndarray, " r"]
+    can_fit_diameter: Bool[ndarray, " r"]
 
     def local_points_m(self, depth_m: Float64[ndarray, "r k"]) -> Float64[ndarray, "r k 3"]:
         """Return the points at planar ``depth_m`` on the rays of ``pixels``, in ``frame`` from ``middle_m``."""
@@ -61,12 +67,16 @@ class SeenRuns:
         return np.asarray(depth_m[..., None] * self.rays - middle_m[:, None])
 
 
-def seen_runs(truth: SteelTruth, cage: CageTruth) -> SeenRuns:
-    """Return the runs with ``MIN_PIXELS`` interior pixels over ``MIN_VISIBLE`` diameters, and their samples."""
-    run, pixels, used = _sampled_pixels(truth)
+def visible_segments(truth: SteelTruth, cage: CageTruth) -> VisibleSegments:
+    """Return the judged segments of a view and their sampled pixels.
+
+    Judged are segments with at least ``MIN_PIXELS`` interior pixels that extend over at least
+    ``MIN_VISIBLE_DIAMETERS``.
+    """
+    segment, pixels, used = _sampled_pixels(truth)
     rotation, shift_m = truth.cam_from_world[:3, :3], truth.cam_from_world[:3, 3]
-    start_m = cage.start_m[run] @ rotation.T + shift_m
-    axis_m = (cage.end_m[run] - cage.start_m[run]) @ rotation.T
+    start_m = cage.start_m[segment] @ rotation.T + shift_m
+    axis_m = (cage.end_m[segment] - cage.start_m[segment]) @ rotation.T
     direction = axis_m / np.linalg.norm(axis_m, axis=1, keepdims=True)
     rays = np.concatenate([truth.rays.take(pixels, axis=0), np.ones((*pixels.shape, 1))], axis=-1)
     depth_m = truth.depth_m.take(pixels).astype(np.float64)
@@ -77,56 +87,59 @@ def seen_runs(truth: SteelTruth, cage: CageTruth) -> SeenRuns:
     frame = _frames(middle_m, direction)
     local_rays = rays @ frame.transpose(0, 2, 1)
     truth_m = depth_m[..., None] * local_rays - np.einsum("rij,rj->ri", frame, middle_m)[:, None]
-    diameter_m = cage.diameter_m[run]
-    wide = _is_wide(truth_m[..., 0], used, diameter_m, float(truth.K[0, 0]), middle_m[:, 2])
-    kept = high_m - low_m >= MIN_VISIBLE * diameter_m
-    every = (run, diameter_m, cage.reach_m[run], middle_m, (high_m - low_m) / 2, frame)
-    return SeenRuns(*(values[kept] for values in (*every, pixels, used, local_rays, truth_m, wide)))
+    diameter_m = cage.diameter_m[segment]
+    can_fit_diameter = _can_fit_diameter(truth_m[..., 0], used, diameter_m, float(truth.K[0, 0]), middle_m[:, 2])
+    long_enough = high_m - low_m >= MIN_VISIBLE_DIAMETERS * diameter_m
+    arrays = (segment, diameter_m, cage.match_radius_m[segment], middle_m, (high_m - low_m) / 2, frame)
+    return VisibleSegments(
+        *(values[long_enough] for values in (*arrays, pixels, used, local_rays, truth_m, can_fit_diameter))
+    )
 
 
 def _sampled_pixels(
     truth: SteelTruth,
 ) -> tuple[Int64[ndarray, " r"], Int64[ndarray, "r k"], Bool[ndarray, "r k"]]:
-    """Return the runs with enough interior pixels, and up to ``MAX_SAMPLES`` of each run's, evenly spread.
+    """Return the segments with enough interior pixels, and up to ``MAX_SAMPLES`` pixels of each, evenly spread.
 
-    Even strides would fall into step with the width of a bar and look at one column of it only; multiples of the
-    golden ratio fall into step with nothing.
+    Regular strides can coincide with the width of a bar and sample a single column of it. Multiples of the golden
+    ratio avoid such resonance.
     """
-    judged = np.flatnonzero(truth.interior & (truth.run >= 0))
-    runs = truth.run.take(judged)
-    by_run = judged.take(np.argsort(runs, kind="stable"))
-    counts = np.bincount(runs)
-    run = np.flatnonzero(counts >= MIN_PIXELS)
-    first = (np.cumsum(counts) - counts)[run]
-    total = counts[run][:, None]
-    place = np.arange(MAX_SAMPLES)
-    spread = np.floor(total * ((place + 0.5) * _GOLDEN % 1.0)).astype(np.int64)
-    used = place < total
-    chosen = np.where(total > MAX_SAMPLES, spread, np.where(used, place, 0))
-    return run, by_run.take(first[:, None] + chosen), used
+    candidates = np.flatnonzero(truth.interior & (truth.run >= 0))
+    segments = truth.run.take(candidates)
+    by_segment = candidates.take(np.argsort(segments, kind="stable"))
+    counts = np.bincount(segments)
+    segment = np.flatnonzero(counts >= MIN_PIXELS)
+    first = (np.cumsum(counts) - counts)[segment]
+    total = counts[segment][:, None]
+    slot = np.arange(MAX_SAMPLES)
+    spread = np.floor(total * ((slot + 0.5) * _GOLDEN % 1.0)).astype(np.int64)
+    used = slot < total
+    chosen = np.where(total > MAX_SAMPLES, spread, np.where(used, slot, 0))
+    return segment, by_segment.take(first[:, None] + chosen), used
 
 
 def _frames(middle_m: Float64[ndarray, "r 3"], direction: Float64[ndarray, "r 3"]) -> Float64[ndarray, "r 3 3"]:
-    """Return unit vectors across the line of sight, away from the camera, along the axis: a right angle each."""
+    """Return orthogonal unit vectors across the line of sight, away from the camera and along the axis."""
     away = middle_m - np.einsum("ri,ri->r", middle_m, direction)[:, None] * direction
     away_norm = np.linalg.norm(away, axis=1)
-    # An axis that points at the camera has no side that looks at it: any will do.
+    # For an axis that points at the camera every perpendicular direction is equivalent.
     any_side = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=1)])
     away = np.where((away_norm > 1e-9)[:, None], away, any_side)
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     return np.stack([np.cross(away, direction), away, direction], axis=1)
 
 
-def _is_wide(
+def _can_fit_diameter(
     across_m: Float64[ndarray, "r k"],
     used: Bool[ndarray, "r k"],
     diameter_m: Float64[ndarray, " r"],
     focal_px: float,
     depth_m: Float64[ndarray, " r"],
 ) -> Bool[ndarray, " r"]:
-    radii, share = AROUND
+    """Return which segments are wide enough in the image and visible on both sides of the axis."""
+    radii, share = FLANK_RADII_AND_SHARE
     beyond_m = (radii * diameter_m / 2)[:, None]
     left = (used & (across_m < -beyond_m)).sum(axis=1)
     right = (used & (across_m > beyond_m)).sum(axis=1)
-    seen_round = np.minimum(left, right) >= share * used.sum(axis=1)
-    return np.asarray((focal_px * diameter_m >= WIDE_PX * depth_m) & seen_round)
+    both_sides_visible = np.minimum(left, right) >= share * used.sum(axis=1)
+    return np.asarray((focal_px * diameter_m >= MIN_DIAMETER_FIT_WIDTH_PX * depth_m) & both_sides_visible)

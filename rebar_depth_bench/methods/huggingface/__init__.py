@@ -1,1 +1,1 @@
-"""Depth checkpoints that run through ``transformers``."""
+"""Monocular depth checkpoints that run through ``transformers``."""

@@ -1,4 +1,7 @@
-"""Checkpoints of ``transformers``: a local folder, or a model of the Hub that is never fetched silently."""
+"""Checkpoints of ``transformers`` in a local folder or on the Hugging Face Hub.
+
+Downloads from the Hub are always announced on standard error.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +15,27 @@ from typing import Any
 
 from rebar_depth_bench.data.digests import files_digest
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.monocular.hub import HUB_ACCESS, announce, local_copy, snapshot, unavailable
+from rebar_depth_bench.methods.monocular.hub import (
+    HUB_ACCESS,
+    announce_download,
+    download_error,
+    local_copy_hint,
+    snapshot,
+)
 
 CONFIG, PREPROCESSOR = "config.json", "preprocessor_config.json"
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _WEIGHTS = ("*.safetensors", "*.bin")
-"""The first kind that is there is taken: the other is the same weights once more."""
+"""File patterns of weights in order of preference; a checkpoint with both kinds holds the same weights twice."""
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A folder with ``config.json``; ``repository`` is the Hub's name where it is the Hub's cached snapshot."""
+    """Folder with ``config.json``, and its parsed content.
+
+    ``repository`` is the name on the Hub if the folder is a cached snapshot, else None. ``version`` is the digest
+    of a local folder or the commit of a snapshot.
+    """
 
     name: str
     folder: Path
@@ -32,57 +45,62 @@ class Checkpoint:
 
 
 def find_checkpoint(name_or_path: str) -> Checkpoint:
-    """Find a folder, or on the Hub ``ORG/NAME``, of which at most ``config.json`` is fetched here.
+    """Return the checkpoint in a local folder, or ``ORG/NAME`` on the Hub.
 
-    A folder's version is the digest of its weights, the Hub's is the commit.
+    At most ``config.json`` is downloaded here. The version of a local folder is the digest of its weights, that of
+    a Hub checkpoint its commit.
 
-    Raises ``MethodError`` where there is neither, or it holds no readable ``config.json``.
+    Raises ``MethodError`` if neither exists, or it has no readable ``config.json``.
     """
     folder = Path(name_or_path).expanduser()
     if name_or_path and folder.is_dir():
-        config = _json(folder / CONFIG)
+        config = _read_json_object(folder / CONFIG)
         return Checkpoint(folder.resolve().name, folder, None, _weights_digest(folder), config)
     if not _REPOSITORY.fullmatch(name_or_path):
         raise MethodError(
             f"{name_or_path}: no such folder, and no name of a model on the Hub, expected a folder with {CONFIG} "
             "or ORG/NAME"
         )
-    folder = snapshot(name_or_path, CONFIG, _instead(name_or_path))
-    return Checkpoint(name_or_path, folder, name_or_path, f"commit {folder.name}", _json(folder / CONFIG))
+    folder = snapshot(name_or_path, CONFIG, _local_copy_hint(name_or_path))
+    return Checkpoint(
+        name_or_path, folder, name_or_path, f"commit {folder.name}", _read_json_object(folder / CONFIG)
+    )
 
 
-def complete(checkpoint: Checkpoint) -> None:
-    """Fetch the weights if they are the Hub's and not in its cache; says so on standard error first.
+def ensure_weights(checkpoint: Checkpoint) -> None:
+    """Download weights and settings of a Hub checkpoint if they are not cached, after a notice on standard error.
 
-    Raises ``MethodError`` where they are not to be had, or where no pre-processing is with them.
+    Raises ``MethodError`` if the download fails or the checkpoint has no weights.
     """
     if checkpoint.repository and not (
-        _weights(checkpoint.folder) and (checkpoint.folder / PREPROCESSOR).is_file()
+        _weight_files(checkpoint.folder) and (checkpoint.folder / PREPROCESSOR).is_file()
     ):
-        _fetch(checkpoint.repository, checkpoint.folder.name)
-    if not _weights(checkpoint.folder):
+        _fetch_weights(checkpoint.repository, checkpoint.folder.name)
+    if not _weight_files(checkpoint.folder):
         raise MethodError(f"{checkpoint.name}: no weights, expected {' or '.join(_WEIGHTS)} beside {CONFIG}")
 
 
-def preprocessor(checkpoint: Checkpoint) -> dict[str, Any]:
-    """Return ``preprocessor_config.json``. Raises ``MethodError`` where it is missing or unreadable.
+def read_preprocessor_config(checkpoint: Checkpoint) -> dict[str, Any]:
+    """Return ``preprocessor_config.json``. Raises ``MethodError`` if it is missing or unreadable.
 
-    Nothing of it is guessed: at another size than the weights were trained for a network is silently worse.
+    There are no default values: at an input size other than that of training, a network silently performs worse.
     """
-    return _json(checkpoint.folder / PREPROCESSOR)
+    return _read_json_object(checkpoint.folder / PREPROCESSOR)
 
 
-def _weights(folder: Path) -> list[Path]:
-    return next((found for pattern in _WEIGHTS if (found := sorted(folder.glob(pattern)))), [])
+def _weight_files(folder: Path) -> list[Path]:
+    """Return the weight files of the first pattern that matches; empty if there are none."""
+    return next((paths for pattern in _WEIGHTS if (paths := sorted(folder.glob(pattern)))), [])
 
 
 def _weights_digest(folder: Path) -> str:
-    """Return the digest of the config, the pre-processing and the weights: what the answer depends on."""
-    files = [folder / CONFIG, folder / PREPROCESSOR, *_weights(folder)]
+    """Return the digest of config, pre-processing settings and weights, which determine the predictions."""
+    files = [folder / CONFIG, folder / PREPROCESSOR, *_weight_files(folder)]
     return f"sha256:{files_digest(path for path in files if path.is_file())}"
 
 
-def _json(path: Path) -> dict[str, Any]:
+def _read_json_object(path: Path) -> dict[str, Any]:
+    """Return the content of a JSON file. Raises ``MethodError`` if it is missing, unreadable or not an object."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -96,21 +114,26 @@ def _json(path: Path) -> dict[str, Any]:
     return value
 
 
-def _fetch(repository: str, commit: str) -> None:
-    """Fetch a commit's weights and settings into the Hub's cache, one kind of weights only."""
+def _fetch_weights(repository: str, commit: str) -> None:
+    """Download weights (of one kind only) and settings of a commit into the Hub cache."""
     from huggingface_hub import HfApi, constants, snapshot_download
 
-    announce(repository, "the weights", constants.ENDPOINT, _instead(repository))
+    announce_download(repository, "the weights", constants.ENDPOINT, _local_copy_hint(repository))
     try:
         files = HfApi().model_info(repository, revision=commit, files_metadata=True).siblings or []
         sizes = {file.rfilename: file.size or 0 for file in files if "/" not in file.rfilename}
-        weights = next((kind for kind in _WEIGHTS if any(Path(name).match(kind) for name in sizes)), _WEIGHTS[0])
-        wanted = [name for name in sizes if Path(name).match(weights) or name.endswith(".json")]
-        print(f"{repository}: {sum(sizes[name] for name in wanted) / 1e6:.1f} MB", file=sys.stderr, flush=True)
-        snapshot_download(repository, revision=commit, allow_patterns=wanted)
-    except Exception as error:  # the Hub's client raises its own, httpx's and the system's
-        raise unavailable(repository, constants.ENDPOINT, error, _instead(repository), HUB_ACCESS) from None
+        weight_pattern = next(
+            (pattern for pattern in _WEIGHTS if any(Path(name).match(pattern) for name in sizes)), _WEIGHTS[0]
+        )
+        file_names = [name for name in sizes if Path(name).match(weight_pattern) or name.endswith(".json")]
+        print(f"{repository}: {sum(sizes[name] for name in file_names) / 1e6:.1f} MB", file=sys.stderr, flush=True)
+        snapshot_download(repository, revision=commit, allow_patterns=file_names)
+    except Exception as error:  # huggingface_hub raises its own, httpx and OS errors.
+        raise download_error(
+            repository, constants.ENDPOINT, error, _local_copy_hint(repository), HUB_ACCESS
+        ) from None
 
 
-def _instead(repository: str) -> str:
-    return local_copy("hf", repository)
+def _local_copy_hint(repository: str) -> str:
+    """Return the hint for error messages on how to use a local copy."""
+    return local_copy_hint("hf", repository)

@@ -1,7 +1,8 @@
-"""Monocular depth models of ``transformers``, by the name of a checkpoint: ``hf:ORG/NAME`` or ``hf:FOLDER``.
+"""Monocular depth models of ``transformers``, named by their checkpoint: ``hf:ORG/NAME`` or ``hf:FOLDER``.
 
-Depth comes back on the left grid by the interpolation of each model's own post-processing: bilinear for Depth Pro,
-bicubic for the others. Between a bar and what is behind it that invents depths, as these models do for every user.
+Depth is brought to the left grid with the interpolation of each model's own post-processing: bilinear for Depth
+Pro, bicubic for the others. Between a bar and its background, interpolation produces depths that lie on neither
+surface, as these models do for every user.
 """
 
 from __future__ import annotations
@@ -15,32 +16,38 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.errors import MethodError, exception_summary
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.huggingface.checkpoints import Checkpoint, complete, find_checkpoint, preprocessor
-from rebar_depth_bench.methods.huggingface.families import Output, depth_m, family_of
+from rebar_depth_bench.methods.huggingface.checkpoints import (
+    Checkpoint,
+    ensure_weights,
+    find_checkpoint,
+    read_preprocessor_config,
+)
+from rebar_depth_bench.methods.huggingface.families import OutputKind, family_of, network_output_to_depth_m
 
-PREFIX = "hf:"
+HF_PREFIX = "hf:"
 DEPTH_PRO_CHECKPOINT = "apple/DepthPro-hf"
-_PRE_PROCESSED_HERE = ("depth_pro",)
+_WITHOUT_LIBRARY_PROCESSOR = ("depth_pro",)
 
 
 def hf_method(name_or_path: str) -> Method:
-    """Return the method that runs a checkpoint: ``ORG/NAME`` on the Hub, or a folder of ``save_pretrained``.
+    """Return the method of a checkpoint: ``ORG/NAME`` on the Hub, or a folder written by ``save_pretrained``.
 
-    Its ``config.json`` is read (and, from the Hub, fetched) at once, for it says whether the output is metres or
-    up to scale; weights are fetched by ``load``. What is fetched is said on standard error first.
+    ``config.json`` is read (and downloaded from the Hub if necessary) immediately because it determines whether
+    the output is metric or relative; weights are downloaded by ``load``. Downloads are announced on standard
+    error.
 
-    Raises ``MethodError`` for what is no checkpoint, or of a model that cannot be run here.
+    Raises ``MethodError`` if there is no such checkpoint or its model type is not supported.
     """
     checkpoint = find_checkpoint(name_or_path)
     family = family_of(checkpoint.config, checkpoint.name)
     output = family.output(checkpoint.config)
     info = MethodInfo(
-        name=f"{PREFIX}{checkpoint.name}",
+        name=f"{HF_PREFIX}{checkpoint.name}",
         summary=f"{family.name} from one picture: {output.value}; weights {checkpoint.version}",
         columns=_columns(output),
-        uses_intrinsics=output is Output.CANONICAL,
+        uses_intrinsics=output is OutputKind.CANONICAL,
         source=f"transformers, {checkpoint.name}",
         licence="that of the checkpoint",
     )
@@ -48,41 +55,44 @@ def hf_method(name_or_path: str) -> Method:
 
 
 def load_predictor(checkpoint: Checkpoint) -> Predictor:
-    """Load a checkpoint's network, on the GPU if torch sees one.
+    """Return the predictor of a checkpoint, on the GPU if torch finds one.
 
-    Raises ``MethodError`` where torch, ``transformers`` or weights are missing, or do not fill the network.
+    Raises ``MethodError`` if torch, ``transformers`` or weights are missing, or if the weights are incomplete.
     """
     family = family_of(checkpoint.config, checkpoint.name)
-    torch, transformers = _packages()
-    complete(checkpoint)
-    from rebar_depth_bench.methods.huggingface.families import PREPARATIONS
+    torch, transformers = _import_packages()
+    ensure_weights(checkpoint)
+    from rebar_depth_bench.methods.huggingface.families import PROCESSING_FACTORIES
 
-    kind = checkpoint.config["model_type"]
-    settings = preprocessor(checkpoint)
-    processor = None if kind in _PRE_PROCESSED_HERE else _processor(transformers, checkpoint)
+    model_type = checkpoint.config["model_type"]
+    settings = read_preprocessor_config(checkpoint)
+    processor = None if model_type in _WITHOUT_LIBRARY_PROCESSOR else _load_processor(transformers, checkpoint)
     try:
-        prepare = PREPARATIONS[kind](settings, processor)
+        processing = PROCESSING_FACTORIES[model_type](settings, processor)
     except KeyError as error:
         raise MethodError(f"{checkpoint.name}: preprocessor_config.json has no {error}") from None
-    model = _network(transformers, checkpoint).to("cuda" if torch.cuda.is_available() else "cpu")
+    model = _load_network(transformers, checkpoint).to("cuda" if torch.cuda.is_available() else "cpu")
     output = family.output(checkpoint.config)
 
-    def run(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+    def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         rgb = row["left_rgb"]
         with torch.inference_mode():
-            found = model(pixel_values=prepare.pixels(rgb).to(model.device)).predicted_depth[0]
-            values = prepare.on_left_grid(found.float().cpu(), rgb.shape[:2])
-        return depth_m(output, np.asarray(values.numpy()), row.get("left_K"))
+            raw_output = model(pixel_values=processing.to_network_input(rgb).to(model.device)).predicted_depth[0]
+            values = processing.to_left_grid(raw_output.float().cpu(), rgb.shape[:2])
+        return network_output_to_depth_m(output, np.asarray(values.numpy()), row.get("left_K"))
 
-    return run
-
-
-def _columns(output: Output) -> tuple[str, ...]:
-    return ("left_rgb", "left_K") if output is Output.CANONICAL else ("left_rgb",)
+    return predict
 
 
-def _packages() -> tuple[Any, Any]:
-    """Return torch and ``transformers``, untyped: they are imported nowhere else, and need not be installed."""
+def _columns(output: OutputKind) -> tuple[str, ...]:
+    return ("left_rgb", "left_K") if output is OutputKind.CANONICAL else ("left_rgb",)
+
+
+def _import_packages() -> tuple[Any, Any]:
+    """Return the modules torch and ``transformers``, which are optional dependencies.
+
+    Raises ``MethodError`` if one is not installed.
+    """
     try:
         return importlib.import_module("torch"), importlib.import_module("transformers")
     except ImportError as error:
@@ -91,57 +101,67 @@ def _packages() -> tuple[Any, Any]:
         ) from None
 
 
-def _processor(transformers: Any, checkpoint: Checkpoint) -> Any:
-    """Return the library's pre-processing, its Pillow kind: the same everywhere, with torchvision or without."""
-    return _loaded(
+def _load_processor(transformers: Any, checkpoint: Checkpoint) -> Any:
+    """Return the library's image processor with the Pillow backend.
+
+    This backend gives the same results with and without torchvision.
+    """
+    return _translate_load_errors(
         checkpoint,
         lambda: transformers.AutoImageProcessor.from_pretrained(checkpoint.folder, backend="pil"),
     )
 
 
-def _network(transformers: Any, checkpoint: Checkpoint) -> Any:
-    """Return the network, every weight filled: ``transformers`` itself leaves missing ones at random values."""
-    model, told = _loaded(
+def _load_network(transformers: Any, checkpoint: Checkpoint) -> Any:
+    """Return the network in evaluation mode.
+
+    Raises ``MethodError`` if weights are missing, which ``transformers`` itself would leave at random values.
+    """
+    model, loading_info = _translate_load_errors(
         checkpoint,
         lambda: transformers.AutoModelForDepthEstimation.from_pretrained(
             checkpoint.folder, dtype="float32", output_loading_info=True, local_files_only=True
         ),
     )
-    missing = sorted(told["missing_keys"])
+    missing = sorted(loading_info["missing_keys"])
     if missing:
         raise MethodError(
             f"{checkpoint.name}: the weights lack {len(missing)} of the network's tensors, first {missing[0]}, "
             "expected all of them"
         )
     if getattr(model, "use_fov_model", False):
-        model.use_fov_model = False  # it guesses the focal length, which is given
+        model.use_fov_model = False  # The field-of-view head estimates the focal length, which is known here.
     return model.eval()
 
 
-def _loaded(checkpoint: Checkpoint, load: Callable[[], Any]) -> Any:
+def _translate_load_errors(checkpoint: Checkpoint, load: Callable[[], Any]) -> Any:
+    """Return ``load()``. Raises ``MethodError`` for any exception."""
     try:
         return load()
-    except Exception as error:  # damaged files raise whatever reads them
-        first = (str(error).strip().splitlines() or [""])[0]
-        raise MethodError(f"{checkpoint.name}: cannot be loaded: {type(error).__name__}: {first}") from error
+    except Exception as error:  # Readers of damaged files raise various types.
+        raise MethodError(f"{checkpoint.name}: cannot be loaded: {exception_summary(error)}") from error
 
 
 DEPTH_PRO = Method(
     MethodInfo(
         name="depth-pro",
-        summary=f"Depth Pro from one picture: {Output.CANONICAL.value}, as in the paper; own weights: hf:FOLDER",
-        columns=_columns(Output.CANONICAL),
+        summary=f"Depth Pro from one picture: {OutputKind.CANONICAL.value}, as in the paper; "
+        "own weights: hf:FOLDER",
+        columns=_columns(OutputKind.CANONICAL),
         uses_intrinsics=True,
         source=f"transformers, {DEPTH_PRO_CHECKPOINT}",
         licence="Apple's own; it comes with the weights",
-        unexercised="never run with its real weights where this was written: they were not to be had",
+        untested_note="never run with its real weights where this was written: they were not to be had",
     ),
     lambda: load_predictor(find_checkpoint(DEPTH_PRO_CHECKPOINT)),
 )
-"""The paper's Depth Pro. Its weights come from the Hub, or its cache, when it is loaded."""
+"""Depth Pro as in the paper; loading takes the weights from the Hub or its cache."""
 
 
 def depth_pro_method() -> Method:
-    """Return the paper's Depth Pro with the commit of its weights in the summary; raises as ``hf_method`` does."""
-    found = hf_method(DEPTH_PRO_CHECKPOINT)
-    return replace(found, info=replace(DEPTH_PRO.info, summary=found.info.summary))
+    """Return Depth Pro as in the paper, with the commit of its weights in the summary.
+
+    Raises like ``hf_method``.
+    """
+    method = hf_method(DEPTH_PRO_CHECKPOINT)
+    return replace(method, info=replace(DEPTH_PRO.info, summary=method.info.summary))

@@ -1,1 +1,1 @@
-"""Monocular networks that run through their authors' own packages."""
+"""Monocular networks that run through their authors' own packages or code."""

@@ -1,11 +1,11 @@
-"""Depth Anything 3 Metric from one picture, with its authors' package; the focal length is given.
+"""Depth Anything 3 Metric from one image and its focal length, with its authors' package.
 
-The package resizes the picture (long side 504, both sides to multiples of 14); its answer is brought to the left
-grid bilinearly. Sky is left as the package fills it, from a random sample: torch's numbers are seeded for each
-view.
+The package resizes the image (long side 504, both sides multiples of 14); its output is brought to the left grid
+bilinearly. Sky is kept as the package fills it, from a random sample: torch is seeded for each view.
 
-Run here with the package's own code (0.1.1, a stand-in for torchvision) and a small network of random numbers,
-which a test repeats where the package is installed; never with its weights, which could not be fetched.
+Tested with the package's own code (0.1.1, with a stand-in for torchvision) and a small network with random
+weights; a test repeats this if the package is installed. It has never been run with the real weights, which could
+not be downloaded.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from numpy import ndarray
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import MethodInfo, Predictor
 from rebar_depth_bench.methods.monocular.conversions import da3_depth_m, da3_focal_px
-from rebar_depth_bench.methods.monocular.hub import CONFIG, WEIGHTS, HubModel, listed_method
+from rebar_depth_bench.methods.monocular.hub import CONFIG, WEIGHTS, HubModel, lazy_hub_method
 from rebar_depth_bench.methods.monocular.third_party import (
-    error_words,
-    filled,
-    package,
+    check_weights_loaded,
+    import_package,
+    import_torch,
     safetensors_names,
-    torch_for,
+    translate_errors,
 )
 
 NAME, REPOSITORY = "depth-anything-3", "depth-anything/DA3METRIC-LARGE"
 PRESET = "da3metric-large"
-"""Only this network's output becomes metres by the focal length: others are relative, or metres already."""
+"""The only model whose output is scaled to metres by the focal length; others are relative or already metric."""
 SEED = 1
 INSTALL = "pip install depth-anything-3"
 INFO = MethodInfo(
@@ -43,45 +43,52 @@ INFO = MethodInfo(
     uses_intrinsics=True,
     source=f"depth-anything-3, {REPOSITORY}",
     licence="Apache-2.0",
-    unexercised="tried with its real code and a small random network only: its weights were not to be had",
+    untested_note="tried with its real code and a small random network only: its weights were not to be had",
 )
 
 
 def load_predictor(folder: Path) -> Predictor:
-    """Load the network of a folder, on the GPU if torch sees one.
+    """Return the predictor of the network in a folder, on the GPU if torch finds one.
 
-    Raises ``MethodError`` where torch or the package is missing, or weights that fill the network.
+    Raises ``MethodError`` if torch or the package is missing, or if the weights are incomplete.
     """
-    torch = torch_for(NAME)
-    api = package("depth_anything_3.api", NAME, INSTALL)
-    with error_words(NAME, torch, f"{folder.name} cannot be loaded"):
+    torch = import_torch(NAME)
+    api = import_package("depth_anything_3.api", NAME, INSTALL)
+    with translate_errors(NAME, torch, f"{folder.name} cannot be loaded"):
         model = api.DepthAnything3.from_pretrained(str(folder), local_files_only=True)
-        model = filled(NAME, torch, model, safetensors_names(folder / WEIGHTS))
+        model = check_weights_loaded(NAME, torch, model, safetensors_names(folder / WEIGHTS))
 
-    def run(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+    def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         rgb, grid = row["left_rgb"], row["left_rgb"].shape[:2]
         with (
-            error_words(NAME, torch, "fails on a picture"),
+            translate_errors(NAME, torch, "fails on a picture"),
             torch.random.fork_rng(range(torch.cuda.device_count())),
         ):
             torch.manual_seed(SEED)
-            seen = np.asarray(model.inference([rgb]).depth, np.float32)
-        if seen.ndim != 3 or len(seen) != 1:
-            raise MethodError(f"{NAME}: the network returned depth of shape {seen.shape}, expected 1 x h x w")
-        values, values_grid = _on_left_grid(torch, seen[0], grid), (seen.shape[1], seen.shape[2])
-        return da3_depth_m(values, da3_focal_px(row["left_K"], grid, values_grid))
+            network_output = np.asarray(model.inference([rgb]).depth, np.float32)
+        if network_output.ndim != 3 or len(network_output) != 1:
+            raise MethodError(
+                f"{NAME}: the network returned depth of shape {network_output.shape}, expected 1 x h x w"
+            )
+        values, input_grid = (
+            _resize_to_left_grid(torch, network_output[0], grid),
+            (network_output.shape[1], network_output.shape[2]),
+        )
+        return da3_depth_m(values, da3_focal_px(row["left_K"], grid, input_grid))
 
-    return run
+    return predict
 
 
-def _on_left_grid(torch: Any, seen: Float32[ndarray, "h w"], grid: tuple[int, int]) -> Float32[ndarray, "H W"]:
+def _resize_to_left_grid(
+    torch: Any, values: Float32[ndarray, "h w"], grid: tuple[int, int]
+) -> Float32[ndarray, "H W"]:
     from rebar_depth_bench.methods.huggingface.families import resized
 
-    return np.asarray(resized(torch.from_numpy(seen), grid, "bilinear").numpy())
+    return np.asarray(resized(torch.from_numpy(values), grid, "bilinear").numpy())
 
 
 def check_preset(folder: Path) -> None:
-    """Raise ``MethodError`` where a folder's ``config.json`` is that of another model of the family."""
+    """Raise ``MethodError`` if ``config.json`` in a folder belongs to another model of the family."""
     try:
         preset = json.loads((folder / CONFIG).read_text(encoding="utf-8")).get("model_name")
     except (OSError, ValueError, AttributeError) as error:
@@ -94,5 +101,5 @@ def check_preset(folder: Path) -> None:
 
 
 DEPTH_ANYTHING_3_MODEL = HubModel(INFO, REPOSITORY, "depth_anything_3", INSTALL, load_predictor, check_preset)
-DEPTH_ANYTHING_3 = listed_method(DEPTH_ANYTHING_3_MODEL)
-"""The paper's Depth Anything 3 Metric. Its weights come from the Hub, or its cache, when it is loaded."""
+DEPTH_ANYTHING_3 = lazy_hub_method(DEPTH_ANYTHING_3_MODEL)
+"""Depth Anything 3 Metric as in the paper; loading takes the weights from the Hub or its cache."""

@@ -1,9 +1,9 @@
-"""Models of the Hub as local folders, never fetched silently; the folder's name is the commit.
+"""Hugging Face Hub downloads, and methods whose weights are on the Hub and whose code is in an author's package.
 
-Methods whose network comes from an author's package and whose weights from the Hub, or from a folder like it.
+Cached snapshots are local folders named after their commit; downloads are announced on standard error.
 
-By bare name the Hub's main branch is taken, as its cache knows it: no commit is pinned, for none was tried where
-this was written. The commit that is taken stands in the method's summary, and with it in a submission.
+A bare method name refers to the main branch of the repository, as the cache knows it. No commit is pinned because
+none was tested. The commit in use is part of the method's summary and thus of a submission.
 """
 
 from __future__ import annotations
@@ -14,20 +14,21 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.errors import MethodError, exception_summary
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.monocular.third_party import check_folder, with_weights
+from rebar_depth_bench.methods.monocular.third_party import check_folder, with_weights_digest
 
 HUB_ACCESS = "a connection, HF_TOKEN for a model that is not public"
+"""Requirements for downloads from the Hub, for error messages."""
 
 
-def snapshot(repository: str, file: str, instead: str) -> Path:
-    """Return the Hub's cached snapshot of a model's main branch, with at least ``file``; its name is the commit.
+def snapshot(repository: str, file: str, local_hint: str) -> Path:
+    """Return the cached snapshot of a model's main branch with at least ``file``; the folder name is the commit.
 
-    Only where the cache has none is ``file`` fetched, and said first. ``instead`` is what to name where the model
-    is in a folder of one's own (``local_copy``).
+    ``file`` is downloaded, after a notice, only if no snapshot is cached. ``local_hint`` is the advice in error
+    messages on how to use a local copy (``local_copy_hint``).
 
-    Raises ``MethodError`` where it is not to be had.
+    Raises ``MethodError`` if the download fails.
     """
     from huggingface_hub import constants, hf_hub_download
     from huggingface_hub.errors import LocalEntryNotFoundError
@@ -36,76 +37,75 @@ def snapshot(repository: str, file: str, instead: str) -> Path:
         return Path(hf_hub_download(repository, file, local_files_only=True)).parent
     except LocalEntryNotFoundError:
         pass
-    announce(repository, file, constants.ENDPOINT, instead)
+    announce_download(repository, file, constants.ENDPOINT, local_hint)
     try:
         return Path(hf_hub_download(repository, file)).parent
-    except Exception as error:  # the Hub's client raises its own, httpx's and the system's
-        raise unavailable(repository, constants.ENDPOINT, error, instead, HUB_ACCESS) from None
+    except Exception as error:  # huggingface_hub raises its own, httpx and OS errors.
+        raise download_error(repository, constants.ENDPOINT, error, local_hint, HUB_ACCESS) from None
 
 
-def complete_snapshot(repository: str, folder: Path, files: Sequence[str], instead: str) -> None:
-    """Fetch what a snapshot lacks of ``files``, at its own commit, whatever the main branch is by now.
+def complete_snapshot(repository: str, folder: Path, files: Sequence[str], local_hint: str) -> None:
+    """Download those of ``files`` that are missing in a snapshot, at its commit even if the main branch has moved.
 
-    Raises ``MethodError`` where they are not to be had.
+    Raises ``MethodError`` if the download fails.
     """
     from huggingface_hub import constants, snapshot_download
 
-    lacking = [name for name in files if not (folder / name).is_file()]
-    if not lacking:
+    missing = [name for name in files if not (folder / name).is_file()]
+    if not missing:
         return
-    announce(repository, " and ".join(lacking), constants.ENDPOINT, instead)
+    announce_download(repository, " and ".join(missing), constants.ENDPOINT, local_hint)
     try:
-        snapshot_download(repository, revision=folder.name, allow_patterns=lacking)
+        snapshot_download(repository, revision=folder.name, allow_patterns=missing)
     except Exception as error:
-        raise unavailable(repository, constants.ENDPOINT, error, instead, HUB_ACCESS) from None
-    for name in lacking:  # a file that the Hub does not list is passed over without a word
+        raise download_error(repository, constants.ENDPOINT, error, local_hint, HUB_ACCESS) from None
+    for name in missing:  # snapshot_download ignores files that the Hub does not list.
         if not (folder / name).is_file():
             raise MethodError(f"{repository}: no {name} at commit {folder.name}, expected {' and '.join(files)}")
 
 
-def local_copy(prefix: str, repository: str) -> str:
-    """Return how a copy of a model is made and named, for a method that takes ``PREFIX:FOLDER``."""
+def local_copy_hint(prefix: str, repository: str) -> str:
+    """Return the advice on how to make and name a local copy, for a method that takes ``PREFIX:FOLDER``."""
     return f"{prefix}:FOLDER (hf download {repository} --local-dir FOLDER)"
 
 
-def announce(name: str, what: str, where: str, instead: str) -> None:
-    """Say what is fetched from where. Raises ``MethodError`` where ``HF_HUB_OFFLINE`` forbids it."""
+def announce_download(name: str, what: str, url: str, local_hint: str) -> None:
+    """Print a download notice to standard error. Raises ``MethodError`` if ``HF_HUB_OFFLINE`` is set."""
     from huggingface_hub import constants
 
     if constants.HF_HUB_OFFLINE:
         raise MethodError(
             f"{name}: {what} not on this machine, and HF_HUB_OFFLINE is set: unset it, or fetch them elsewhere "
-            f"and name their folder: {instead}"
+            f"and name their folder: {local_hint}"
         )
-    print(f"{name}: fetching {what} from {where}", file=sys.stderr, flush=True)
+    print(f"{name}: fetching {what} from {url}", file=sys.stderr, flush=True)
 
 
-def unavailable(
-    name: str, where: str, error: Exception, instead: str, access: str = "a connection"
+def download_error(
+    name: str, url: str, error: Exception, local_hint: str, access: str = "a connection"
 ) -> MethodError:
-    """Return what to raise where something could not be fetched; ``access`` is what that takes."""
-    first = (str(error).strip().splitlines() or [""])[0]
+    """Return the error of a failed download; ``access`` describes the requirements."""
     return MethodError(
-        f"{name}: cannot be fetched from {where}: {type(error).__name__}: {first}; expected {access}, or a local "
-        f"copy: {instead}"
+        f"{name}: cannot be fetched from {url}: {exception_summary(error)}; expected {access}, or a local copy: "
+        f"{local_hint}"
     )
 
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
-FILES = (CONFIG, WEIGHTS)
-"""What ``PyTorchModelHubMixin`` reads, and what a folder has to hold."""
+REQUIRED_FILES = (CONFIG, WEIGHTS)
+"""Files that ``PyTorchModelHubMixin`` reads and that a folder must hold."""
 
 
-def any_config(_: Path) -> None:
-    """Take a folder with any ``config.json``."""
+def accept_any_config(_: Path) -> None:
+    """Accept a folder with any ``config.json``."""
 
 
 @dataclass(frozen=True)
 class HubModel:
-    """A network, and where on the Hub its weights lie.
+    """Network with weights on the Hub.
 
-    ``load(folder)`` makes its predictor of a folder with ``FILES``; ``check(folder)`` raises ``MethodError`` where
-    the folder's ``config.json`` is that of another network.
+    ``load(folder)`` returns the predictor of a folder with ``REQUIRED_FILES``; ``check(folder)`` raises
+    ``MethodError`` if ``config.json`` in the folder belongs to another network.
     """
 
     info: MethodInfo
@@ -113,46 +113,47 @@ class HubModel:
     package: str
     install: str
     load: Callable[[Path], Predictor]
-    check: Callable[[Path], None] = any_config
+    check: Callable[[Path], None] = accept_any_config
 
 
 def hub_method(model: HubModel) -> Method:
-    """Return the method of the Hub's weights, fetched when it is loaded; the commit is in its summary.
+    """Return the method with weights from the Hub, downloaded when it is loaded; the commit is in its summary.
 
-    Only ``config.json`` is fetched here, where the Hub's cache has none: the commit is not to be known without it.
+    Only ``config.json`` is downloaded here, if it is not cached, because it is needed to determine the commit.
 
-    Raises ``MethodError`` where it is not to be had.
+    Raises ``MethodError`` if the package is not installed or the download fails.
     """
-    _require(model)  # before anything is fetched for nothing
-    instead = local_copy(model.info.name, model.repository)
-    folder = snapshot(model.repository, CONFIG, instead)
+    _require_package(model)  # Checked first, so that nothing is downloaded in vain.
+    local_hint = local_copy_hint(model.info.name, model.repository)
+    folder = snapshot(model.repository, CONFIG, local_hint)
     model.check(folder)
 
     def load() -> Predictor:
-        complete_snapshot(model.repository, folder, FILES, instead)
+        complete_snapshot(model.repository, folder, REQUIRED_FILES, local_hint)
         return model.load(folder)
 
     return Method(replace(model.info, summary=f"{model.info.summary}; weights commit {folder.name}"), load)
 
 
-def _require(model: HubModel) -> None:
+def _require_package(model: HubModel) -> None:
+    """Raise ``MethodError`` if the network's package is not installed."""
     if find_spec(model.package) is None:
         raise MethodError(f"{model.info.name} needs {model.package}, which is not installed: {model.install}")
 
 
 def folder_method(model: HubModel, folder: Path) -> Method:
-    """Return the method of the weights in a folder, their digest in its summary.
+    """Return the method with weights from a folder; their digest is in its summary.
 
-    Raises ``MethodError`` for a folder without them, or with those of another network.
+    Raises ``MethodError`` if files are missing or belong to another network.
     """
-    check_folder(folder, model.info.name, FILES)
-    info = with_weights(model.info, folder.resolve().name, [folder / name for name in FILES])
+    check_folder(folder, model.info.name, REQUIRED_FILES)
+    info = with_weights_digest(model.info, folder.resolve().name, [folder / name for name in REQUIRED_FILES])
     model.check(folder)
     return Method(info, lambda: model.load(folder))
 
 
-def listed_method(model: HubModel) -> Method:
-    """Return the method as it is listed, for which nothing is looked up or fetched before it is loaded."""
+def lazy_hub_method(model: HubModel) -> Method:
+    """Return the method for listings; nothing is looked up or downloaded before it is loaded."""
     name, summary = model.info.name, model.info.summary
     info = replace(model.info, summary=f"{summary}; own weights: {name}:FOLDER")
     return Method(info, lambda: hub_method(model).load())

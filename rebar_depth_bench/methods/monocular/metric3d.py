@@ -1,10 +1,11 @@
-"""Metric3D v2 (``metric3d_vit_small``) from one picture, with its authors' code; the focal length is given.
+"""Metric3D v2 (``metric3d_vit_small``) from one image and its focal length, with its authors' code.
 
-The picture is resized with its ratio kept, in the middle of 616 x 1064 pixels of mean colour; the answer is cut
-out, brought to the left grid bilinearly and from the canonical camera to metres, as in ``hubconf.py``.
+The image is letterboxed: resized with its aspect ratio and centred in 616 x 1064 pixels of the mean colour. The
+margins of the output are cropped, the rest is brought to the left grid bilinearly and converted from the canonical
+camera to metres, as in ``hubconf.py``.
 
-Never run here with the real network: its weights could not be fetched. Its code imports mmcv or mmengine, and asks
-for a CUDA GPU in places; without one that is said in words.
+This method has never been run with the real network because its weights could not be downloaded. The code imports
+mmcv or mmengine and requires a CUDA GPU in places; without one, the error message states this.
 """
 
 from __future__ import annotations
@@ -22,129 +23,140 @@ from rebar_depth_bench.data.digests import files_digest
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.monocular.conversions import (
-    Fit,
-    fit_keeping_ratio,
+    Letterbox,
+    crop_margins,
+    fit_letterbox,
     metric3d_depth_m,
     padded,
-    without_margins,
 )
-from rebar_depth_bench.methods.monocular.hub import announce, unavailable
+from rebar_depth_bench.methods.monocular.hub import announce_download, download_error
 from rebar_depth_bench.methods.monocular.third_party import (
     check_folder,
-    device,
-    error_words,
-    filled,
-    torch_for,
-    with_weights,
+    check_weights_loaded,
+    import_torch,
+    torch_device,
+    translate_errors,
+    with_weights_digest,
 )
 
-NAME, ENTRY = "metric3d", "metric3d_vit_small"
-REPOSITORY, CACHED_AS = "yvanyin/metric3d:main", "yvanyin_metric3d_main"
-CHECKPOINT = "metric_depth_vit_small_800k.pth"
-WEIGHTS_URL = f"https://huggingface.co/JUGGHM/Metric3D/resolve/main/{CHECKPOINT}"
+NAME, HUB_ENTRY_POINT = "metric3d", "metric3d_vit_small"
+REPOSITORY, CACHE_FOLDER = "yvanyin/metric3d:main", "yvanyin_metric3d_main"
+CHECKPOINT_FILE = "metric_depth_vit_small_800k.pth"
+WEIGHTS_URL = f"https://huggingface.co/JUGGHM/Metric3D/resolve/main/{CHECKPOINT_FILE}"
 HUBCONF = "hubconf.py"
-TARGET = (616, 1064)
+INPUT_SIZE_PX = (616, 1064)
+"""Height and width of the network input, pixels."""
 MEAN_RGB, STD_RGB = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 MARGIN_RGB = (124, 116, 104)
-"""The mean in whole numbers, as OpenCV writes it into a picture."""
-INSTEAD = f"{NAME}:FOLDER, a clone of github.com/YvanYin/Metric3D with {CHECKPOINT} in it"
+"""Mean colour as integers, as OpenCV writes it into an image."""
+LOCAL_COPY_HINT = f"{NAME}:FOLDER, a clone of github.com/YvanYin/Metric3D with {CHECKPOINT_FILE} in it"
 INFO = MethodInfo(
     name=NAME,
     summary="Metric3D v2 (ViT-small) from one picture: depth in metres, the focal length given, as in the paper",
     columns=("left_rgb", "left_K"),
     uses_intrinsics=True,
-    source=f"github.com/YvanYin/Metric3D, {ENTRY}",
+    source=f"github.com/YvanYin/Metric3D, {HUB_ENTRY_POINT}",
     licence="BSD-2-Clause",
-    unexercised="never run with the real network where this was written: its code and weights were not to be had",
+    untested_note=(
+        "never run with the real network where this was written: its code and weights were not to be had"
+    ),
 )
 
 
 def metric3d_method(folder: Path) -> Method:
-    """Return Metric3D v2 of a clone of its repository, with the checkpoint in it or in its folder ``weight``.
+    """Return Metric3D v2 from a clone of its repository with the checkpoint in it or in its folder ``weight``.
 
-    Raises ``MethodError`` for a folder without them.
+    Raises ``MethodError`` if code or checkpoint is missing.
     """
     check_folder(folder, NAME, (HUBCONF,))
-    places = (folder / CHECKPOINT, folder / "weight" / CHECKPOINT)
-    checkpoint = next((place for place in places if place.is_file()), None)
+    candidates = (folder / CHECKPOINT_FILE, folder / "weight" / CHECKPOINT_FILE)
+    checkpoint = next((path for path in candidates if path.is_file()), None)
     if checkpoint is None:
         raise MethodError(
-            f"{NAME}:{folder}: no {CHECKPOINT} in it or in its weight/, expected that of {WEIGHTS_URL}"
+            f"{NAME}:{folder}: no {CHECKPOINT_FILE} in it or in its weight/, expected that of {WEIGHTS_URL}"
         )
     return Method(
-        with_weights(INFO, folder.resolve().name, [checkpoint]), lambda: load_predictor(folder, checkpoint)
+        with_weights_digest(INFO, folder.resolve().name, [checkpoint]), lambda: load_predictor(folder, checkpoint)
     )
 
 
 def load_predictor(folder: Path, checkpoint: Path) -> Predictor:
-    """Load the network of a folder with ``hubconf.py``, on the GPU if torch sees one.
+    """Return the predictor of the network in a folder with ``hubconf.py``, on the GPU if torch finds one.
 
-    Raises ``MethodError`` where torch, or what that code imports, is missing, or weights that fill the network.
+    Raises ``MethodError`` if torch or a module that its code imports is missing, or if the weights are incomplete.
     """
-    torch = torch_for(NAME)
-    with error_words(NAME, torch, f"{folder.name} cannot be loaded"):
-        model = torch.hub.load(str(folder), ENTRY, source="local", pretrain=False)
+    torch = import_torch(NAME)
+    with translate_errors(NAME, torch, f"{folder.name} cannot be loaded"):
+        model = torch.hub.load(str(folder), HUB_ENTRY_POINT, source="local", pretrain=False)
         weights = torch.load(checkpoint, map_location="cpu", weights_only=False)["model_state_dict"]
         model.load_state_dict(weights, strict=False)
-        model = filled(NAME, torch, model, weights)
+        model = check_weights_loaded(NAME, torch, model, weights)
 
-    def run(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+    def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         grid = row["left_rgb"].shape[:2]
-        fit = fit_keeping_ratio(grid, TARGET)
-        with error_words(NAME, torch, "fails on a picture"), torch.inference_mode():
-            found = model.inference({"input": network_input(row["left_rgb"], fit).to(device(torch))})[0]
-            seen = found.float().cpu().reshape(found.shape[-2:])
-        if tuple(seen.shape) != TARGET:
+        letterbox = fit_letterbox(grid, INPUT_SIZE_PX)
+        with translate_errors(NAME, torch, "fails on a picture"), torch.inference_mode():
+            raw_output = model.inference(
+                {"input": network_input(row["left_rgb"], letterbox).to(torch_device(torch))}
+            )[0]
+            padded_depth = raw_output.float().cpu().reshape(raw_output.shape[-2:])
+        if tuple(padded_depth.shape) != INPUT_SIZE_PX:
             raise MethodError(
-                f"{NAME}: the network returned depth of shape {tuple(seen.shape)}, expected {TARGET}"
+                f"{NAME}: the network returned depth of shape {tuple(padded_depth.shape)}, "
+                f"expected {INPUT_SIZE_PX}"
             )
-        canonical = _resized(torch, without_margins(seen, fit.margins)[None, None], grid)[0, 0]
-        return metric3d_depth_m(np.asarray(canonical.numpy()), row["left_K"], fit.scale)
+        canonical = _resize_bilinear(torch, crop_margins(padded_depth, letterbox.margins)[None, None], grid)[0, 0]
+        return metric3d_depth_m(np.asarray(canonical.numpy()), row["left_K"], letterbox.scale)
 
-    return run
+    return predict
 
 
-def network_input(rgb: UInt8[ndarray, "H W 3"], fit: Fit) -> Any:
-    """Return the picture as the network takes it: a tensor of 1 x 3 x 616 x 1064, normalised. Needs torch.
+def network_input(rgb: UInt8[ndarray, "H W 3"], letterbox: Letterbox) -> Any:
+    """Return the normalised network input, a tensor of shape 1 x 3 x 616 x 1064. Needs torch.
 
-    Source: ``hubconf.py`` of Metric3D, with torch's bilinear interpolation for OpenCV's, which is the same.
+    Source: ``hubconf.py`` of Metric3D, with torch's bilinear interpolation instead of OpenCV's, which is equal.
     """
-    torch = torch_for(NAME)
+    torch = import_torch(NAME)
     planes = torch.from_numpy(rgb.transpose(2, 0, 1).astype(np.float32))[None]
-    small = _resized(torch, planes, (fit.height_px, fit.width_px))[0].round().numpy().transpose(1, 2, 0)
-    picture = (padded(small, fit.margins, MARGIN_RGB) - MEAN_RGB) / STD_RGB
-    return torch.from_numpy(picture.astype(np.float32).transpose(2, 0, 1).copy())[None]
+    resized = (
+        _resize_bilinear(torch, planes, (letterbox.height_px, letterbox.width_px))[0]
+        .round()
+        .numpy()
+        .transpose(1, 2, 0)
+    )
+    normalised = (padded(resized, letterbox.margins, MARGIN_RGB) - MEAN_RGB) / STD_RGB
+    return torch.from_numpy(normalised.astype(np.float32).transpose(2, 0, 1).copy())[None]
 
 
-def _resized(torch: Any, planes: Any, grid: tuple[int, int]) -> Any:
+def _resize_bilinear(torch: Any, planes: Any, grid: tuple[int, int]) -> Any:
     return torch.nn.functional.interpolate(planes, size=grid, mode="bilinear", align_corners=False)
 
 
 def cached_metric3d_method() -> Method:
-    """Return Metric3D v2 of torch.hub's cache; what is not in it is fetched, and said first.
+    """Return Metric3D v2 from the cache of torch.hub; missing files are downloaded after a notice.
 
-    torch.hub takes the main branch and keeps no commit of it: the summary names its folder, and the digests of the
-    Python files in it and of the checkpoint. They are not to be known before both are there.
+    torch.hub takes the main branch and does not record its commit: the summary therefore names the cache folder
+    and the digests of its Python files and of the checkpoint. Both must be present to compute the digests.
 
-    Raises ``MethodError`` where torch is missing, or what is not to be had.
+    Raises ``MethodError`` if torch is missing or a download fails.
     """
-    torch = torch_for(NAME)
+    torch = import_torch(NAME)
     cache = Path(torch.hub.get_dir())
-    folder, checkpoint = cache / CACHED_AS, cache / "checkpoints" / CHECKPOINT
+    folder, checkpoint = cache / CACHE_FOLDER, cache / "checkpoints" / CHECKPOINT_FILE
     if not (folder / HUBCONF).is_file():
-        where = "https://github.com/YvanYin/Metric3D"
-        announce(NAME, "its code, which is then run,", where, INSTEAD)
-        with error_words(NAME, torch, f"its code of {where} cannot be fetched or run; {INSTEAD}"):
-            torch.hub.load(REPOSITORY, ENTRY, pretrain=False, trust_repo=True)
+        source = "https://github.com/YvanYin/Metric3D"
+        announce_download(NAME, "its code, which is then run,", source, LOCAL_COPY_HINT)
+        with translate_errors(NAME, torch, f"its code of {source} cannot be fetched or run; {LOCAL_COPY_HINT}"):
+            torch.hub.load(REPOSITORY, HUB_ENTRY_POINT, pretrain=False, trust_repo=True)
     if not checkpoint.is_file():
-        announce(NAME, "the weights", WEIGHTS_URL, INSTEAD)
+        announce_download(NAME, "the weights", WEIGHTS_URL, LOCAL_COPY_HINT)
         checkpoint.parent.mkdir(parents=True, exist_ok=True)
         try:
             torch.hub.download_url_to_file(WEIGHTS_URL, str(checkpoint), progress=False)
         except OSError as error:
-            raise unavailable(NAME, WEIGHTS_URL, error, INSTEAD) from None
+            raise download_error(NAME, WEIGHTS_URL, error, LOCAL_COPY_HINT) from None
     code = files_digest(sorted(folder.rglob("*.py")))
-    versions = f"code {CACHED_AS} sha256:{code}; weights sha256:{files_digest([checkpoint])}"
+    versions = f"code {CACHE_FOLDER} sha256:{code}; weights sha256:{files_digest([checkpoint])}"
     info = replace(INFO, summary=f"{INFO.summary}; {versions}")
     return Method(info, lambda: load_predictor(folder, checkpoint))
 
@@ -153,4 +165,4 @@ METRIC3D = Method(
     replace(INFO, summary=f"{INFO.summary}; own clone and weights: {NAME}:FOLDER"),
     lambda: cached_metric3d_method().load(),
 )
-"""The paper's Metric3D v2. torch.hub fetches its code, which is run, and its weights when it is loaded."""
+"""Metric3D v2 as in the paper; loading downloads its code, which is executed, and its weights with torch.hub."""

@@ -1,6 +1,6 @@
-"""Networks whose code comes from their authors: imported, loaded and run so that what goes wrong is said in words.
+"""Helpers for running third-party model code: import, weight checks and error translation.
 
-That code is run as it is; so is what a checkpoint of pickled Python may hold. Who names a folder trusts it.
+The code is executed unchanged, and so is any code in pickled checkpoints: users must trust the folders they name.
 """
 
 from __future__ import annotations
@@ -17,32 +17,33 @@ from rebar_depth_bench.data.digests import files_digest
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import MethodInfo
 
-MIN_FILLED = 0.99
-"""Of a network's numbers, the share that a checkpoint must fill: a token that is never used may lack."""
+MIN_LOADED_FRACTION = 0.99
+"""Smallest fraction of a network's parameters that a checkpoint must contain; an unused token may be missing."""
 
-LONGEST_WORDS = 300
+MAX_ERROR_CHARACTERS = 300
+"""Length to which messages of third-party exceptions are truncated."""
 
 
-def with_weights(info: MethodInfo, label: str, files: Sequence[Path]) -> MethodInfo:
-    """Return a method's description with its weights in it: ``label`` in the name, their digest in the summary.
+def with_weights_digest(info: MethodInfo, label: str, files: Sequence[Path]) -> MethodInfo:
+    """Return a method's description with ``label`` in the name and the digest of its weights in the summary.
 
-    So other weights are another method, and a stopped prediction is not continued with them.
+    Different weights are thus a different method, and an interrupted prediction is not resumed with them.
     """
     summary = f"{info.summary}; weights sha256:{files_digest(files)}"
     return replace(info, name=f"{info.name}:{label}", summary=summary)
 
 
-def check_folder(folder: Path, name: str, holds: Sequence[str]) -> None:
-    """Raise ``MethodError`` unless a folder holds these files."""
+def check_folder(folder: Path, name: str, required_files: Sequence[str]) -> None:
+    """Raise ``MethodError`` unless a folder contains these files."""
     if not folder.is_dir():
-        raise MethodError(f"{name}:{folder}: no such folder, expected one with {' and '.join(holds)}")
-    for file in holds:
+        raise MethodError(f"{name}:{folder}: no such folder, expected one with {' and '.join(required_files)}")
+    for file in required_files:
         if not (folder / file).is_file():
-            raise MethodError(f"{name}:{folder}: no {file} in it, expected {' and '.join(holds)}")
+            raise MethodError(f"{name}:{folder}: no {file} in it, expected {' and '.join(required_files)}")
 
 
-def package(module: str, method: str, install: str) -> Any:
-    """Return an imported module, untyped. Raises ``MethodError`` that says how to install what is missing."""
+def import_package(module: str, method: str, install: str) -> Any:
+    """Import and return a module. Raises ``MethodError`` with install instructions if it is missing."""
     try:
         with redirect_stdout(sys.stderr):
             return importlib.import_module(module)
@@ -50,34 +51,35 @@ def package(module: str, method: str, install: str) -> Any:
         raise MethodError(f"{method} needs {module.partition('.')[0]} ({error}): {install}") from None
 
 
-def torch_for(method: str) -> Any:
-    """Return torch, untyped. Raises ``MethodError`` where it is missing."""
-    return package("torch", method, "pip install 'rebar-depth-bench[torch]'")
+def import_torch(method: str) -> Any:
+    """Import and return torch. Raises ``MethodError`` if it is missing."""
+    return import_package("torch", method, "pip install 'rebar-depth-bench[torch]'")
 
 
 @contextmanager
-def error_words(method: str, torch: Any, doing: str) -> Iterator[None]:
-    """Run an author's code: what it prints goes to standard error, what it raises becomes a ``MethodError``.
+def translate_errors(method: str, torch: Any, doing: str) -> Iterator[None]:
+    """Run third-party code with its output sent to standard error and its exceptions converted to ``MethodError``.
 
-    Where torch sees no GPU and the code asks for CUDA, that is said.
+    ``doing`` describes the failed operation. The message states explicitly if the code requires CUDA and torch
+    finds no GPU.
     """
     try:
         with redirect_stdout(sys.stderr):
             yield
     except MethodError:
         raise
-    except Exception as error:  # whatever a stranger's code raises
-        words = " ".join(f"{type(error).__name__}: {error}".split())[:LONGEST_WORDS]
-        if not torch.cuda.is_available() and ("cuda" in words.lower() or "nvidia" in words.lower()):
-            words = f"its own code asks for a CUDA GPU, and torch sees none here ({words})"
+    except Exception as error:  # Third-party code may raise anything.
+        message = " ".join(f"{type(error).__name__}: {error}".split())[:MAX_ERROR_CHARACTERS]
+        if not torch.cuda.is_available() and ("cuda" in message.lower() or "nvidia" in message.lower()):
+            message = f"its own code asks for a CUDA GPU, and torch sees none here ({message})"
         if isinstance(error, ImportError):
-            words = f"{words}; install what its repository's requirements name"
-        raise MethodError(f"{method}: {doing}: {words}") from error
+            message = f"{message}; install what its repository's requirements name"
+        raise MethodError(f"{method}: {doing}: {message}") from error
 
 
 @contextmanager
-def importable(folder: Path) -> Iterator[None]:
-    """Let a folder's packages be imported first, as from a script in it."""
+def on_sys_path(folder: Path) -> Iterator[None]:
+    """Put a folder first on ``sys.path``, as for a script in it."""
     sys.path.insert(0, str(folder.resolve()))
     try:
         yield
@@ -85,33 +87,34 @@ def importable(folder: Path) -> Iterator[None]:
         sys.path.remove(str(folder.resolve()))
 
 
-def filled(method: str, torch: Any, network: Any, given: Iterable[str]) -> Any:
-    """Return a network in evaluation, on the GPU if torch sees one, whose weights ``given`` names.
+def check_weights_loaded(method: str, torch: Any, network: Any, loaded_names: Iterable[str]) -> Any:
+    """Return a network in evaluation mode, on the GPU if torch finds one, after checking its loaded weights.
 
-    Authors' code leaves what a checkpoint lacks at random numbers, and says nothing. Raises ``MethodError`` where
-    it fills less than ``MIN_FILLED`` of the network's numbers; what lacks otherwise is said on standard error.
+    ``loaded_names`` are the parameter names in the checkpoint. Authors' code silently leaves missing parameters at
+    random values. Raises ``MethodError`` if the checkpoint contains less than ``MIN_LOADED_FRACTION`` of the
+    parameters; other missing ones are listed on standard error.
     """
-    names = set(given)
-    wanted = {name: values.numel() for name, values in network.named_parameters()}
-    shared = {name: id(values) for name, values in network.named_parameters(remove_duplicate=False)}
-    there = {shared[name] for name in names if name in shared}
-    missing = [name for name in wanted if shared[name] not in there]
-    share = 1 - sum(wanted[name] for name in missing) / max(sum(wanted.values()), 1)
-    words = f"{method}: the weights fill {share:.2%} of the network, lacking {len(missing)} tensors"
-    if missing and share < MIN_FILLED:
-        raise MethodError(f"{words}, first {missing[0]}, expected those of this network")
+    names = set(loaded_names)
+    sizes = {name: values.numel() for name, values in network.named_parameters()}
+    parameter_ids = {name: id(values) for name, values in network.named_parameters(remove_duplicate=False)}
+    loaded_ids = {parameter_ids[name] for name in names if name in parameter_ids}
+    missing = [name for name in sizes if parameter_ids[name] not in loaded_ids]
+    fraction = 1 - sum(sizes[name] for name in missing) / max(sum(sizes.values()), 1)
+    message = f"{method}: the weights fill {fraction:.2%} of the network, lacking {len(missing)} tensors"
+    if missing and fraction < MIN_LOADED_FRACTION:
+        raise MethodError(f"{message}, first {missing[0]}, expected those of this network")
     if missing:
-        print(f"{words}: {', '.join(missing)}", file=sys.stderr, flush=True)
-    return network.to(device(torch)).eval()
+        print(f"{message}: {', '.join(missing)}", file=sys.stderr, flush=True)
+    return network.to(torch_device(torch)).eval()
 
 
-def device(torch: Any) -> str:
-    """Return the name of torch's device to run on."""
+def torch_device(torch: Any) -> str:
+    """Return the name of the torch device to use."""
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def safetensors_names(path: Path) -> list[str]:
-    """Return the names of a safetensors file's tensors. Raises ``MethodError`` for a damaged one."""
+    """Return the tensor names in a safetensors file. Raises ``MethodError`` if the file is damaged."""
     from safetensors import SafetensorError, safe_open
 
     try:

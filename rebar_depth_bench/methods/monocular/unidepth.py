@@ -1,10 +1,10 @@
-"""UniDepth v2 from one picture, with its authors' package; the camera is not given.
+"""UniDepth v2 from one image without intrinsics, with its authors' package.
 
-Its network finds a camera of its own, pads and resizes the picture and its answer itself; depth along the optical
-axis is its ``depth``, along the ray its ``radius``. It runs at its default resolution bounds.
+The network estimates the camera itself and pads and resizes image and output. Its ``depth`` is planar depth along
+the optical axis, its ``radius`` the distance along the ray. It runs at its default resolution bounds.
 
-Never run here with the real network: its weights could not be fetched and its package needs torchvision.
-Read off ``unidepth/models/unidepthv2/unidepthv2.py`` of its repository.
+This method has never been run with the real network: its weights could not be downloaded and its package needs
+torchvision. Written after ``unidepth/models/unidepthv2/unidepthv2.py`` of its repository.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from numpy import ndarray
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import MethodInfo, Predictor
 from rebar_depth_bench.methods.monocular.conversions import positive_or_nan
-from rebar_depth_bench.methods.monocular.hub import WEIGHTS, HubModel, listed_method
+from rebar_depth_bench.methods.monocular.hub import WEIGHTS, HubModel, lazy_hub_method
 from rebar_depth_bench.methods.monocular.third_party import (
-    error_words,
-    filled,
-    package,
+    check_weights_loaded,
+    import_package,
+    import_torch,
     safetensors_names,
-    torch_for,
+    translate_errors,
 )
 
 NAME, REPOSITORY = "unidepth", "lpiccinelli/unidepth-v2-vitl14"
@@ -38,26 +38,28 @@ INFO = MethodInfo(
     uses_intrinsics=False,
     source=f"github.com/lpiccinelli-eth/UniDepth, {REPOSITORY}",
     licence="CC BY-NC 4.0",
-    unexercised="never run with the real network where this was written: its code and weights were not to be had",
+    untested_note=(
+        "never run with the real network where this was written: its code and weights were not to be had"
+    ),
 )
 
 
 def load_predictor(folder: Path) -> Predictor:
-    """Load the network of a folder, on the GPU if torch sees one.
+    """Return the predictor of the network in a folder, on the GPU if torch finds one.
 
-    Raises ``MethodError`` where torch or the package is missing, or weights that fill the network.
+    Raises ``MethodError`` if torch or the package is missing, or if the weights are incomplete.
     """
-    torch = torch_for(NAME)
-    models = package("unidepth.models", NAME, INSTALL)
-    with error_words(NAME, torch, f"{folder.name} cannot be loaded"):
+    torch = import_torch(NAME)
+    models = import_package("unidepth.models", NAME, INSTALL)
+    with translate_errors(NAME, torch, f"{folder.name} cannot be loaded"):
         model = models.UniDepthV2.from_pretrained(str(folder), local_files_only=True)
-        model = filled(NAME, torch, model, safetensors_names(folder / WEIGHTS))
+        model = check_weights_loaded(NAME, torch, model, safetensors_names(folder / WEIGHTS))
 
-    def run(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+    def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         planes = torch.from_numpy(row["left_rgb"].transpose(2, 0, 1).copy())
-        with error_words(NAME, torch, "fails on a picture"), torch.inference_mode():
-            found = model.infer(planes)["depth"]
-            depth_m = np.asarray(found.float().cpu().numpy())
+        with translate_errors(NAME, torch, "fails on a picture"), torch.inference_mode():
+            raw_output = model.infer(planes)["depth"]
+            depth_m = np.asarray(raw_output.float().cpu().numpy())
         if depth_m.shape != (1, 1, *row["left_rgb"].shape[:2]):
             raise MethodError(
                 f"{NAME}: the network returned depth of shape {depth_m.shape}, expected 1 x 1 and the picture's "
@@ -65,9 +67,9 @@ def load_predictor(folder: Path) -> Predictor:
             )
         return positive_or_nan(depth_m[0, 0])
 
-    return run
+    return predict
 
 
 UNIDEPTH_MODEL = HubModel(INFO, REPOSITORY, "unidepth", INSTALL, load_predictor)
-UNIDEPTH = listed_method(UNIDEPTH_MODEL)
-"""The paper's UniDepth v2. Its weights come from the Hub, or its cache, when it is loaded."""
+UNIDEPTH = lazy_hub_method(UNIDEPTH_MODEL)
+"""UniDepth v2 as in the paper; loading takes the weights from the Hub or its cache."""

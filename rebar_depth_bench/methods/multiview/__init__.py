@@ -1,9 +1,8 @@
-"""Depth from all views of a config: structure from motion, a scale, and dense depth on its cameras.
+"""Multi-view methods: structure from motion on the left views, metric scale and dense depth.
 
-COLMAP as in the paper, and its stand-in on a CPU: cameras from the left views, a scale, dense depth.
-
-Four methods: dense depth by COLMAP's PatchMatch (CUDA) or by a plane sweep that is not COLMAP's; metres from the
-ArUco board, or from the median of ground truth, which is no metric result (the paper's dagger).
+There are four methods. Cameras are always estimated by COLMAP. Dense depth is computed by COLMAP's PatchMatch, as
+in the paper (needs CUDA), or by this project's plane sweep on the CPU, which is not part of COLMAP. Metric scale
+comes from the ArUco board, or from the median of ground truth, which is not a metric result (the paper's dagger).
 """
 
 from __future__ import annotations
@@ -16,18 +15,19 @@ from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.progress import Progress
 
-_DENSE = {
+_DENSE_SUMMARIES = {
     "colmap": "dense depth by COLMAP's PatchMatch, which needs CUDA",
     "sweep": "dense depth by a plane sweep on the CPU, which is not COLMAP's",
 }
-_METRES = {
+_SCALE_SUMMARIES = {
     "aruco": "metres from the ArUco board",
     "anchored": "median-anchored to ground truth, no metric result",
 }
-_UNEXERCISED = {"colmap": "PatchMatch never ran where this was written: there is no CUDA", "sweep": ""}
+_UNTESTED_NOTES = {"colmap": "PatchMatch never ran where this was written: there is no CUDA", "sweep": ""}
 
 
-def _run() -> ModuleType:
+def _import_pipeline() -> ModuleType:
+    """Return the ``pipeline`` module. Raises ``MethodError`` if pycolmap or OpenCV is not installed."""
     try:
         from rebar_depth_bench.methods.multiview import pipeline
     except ImportError as error:
@@ -37,22 +37,23 @@ def _run() -> ModuleType:
     return pipeline
 
 
-def _method(dense: str, anchoring: str) -> MultiViewMethod:
+def _method(dense: str, scale_source: str) -> MultiViewMethod:
     def prepare(views: ConfigViews, work: Path, progress: Progress) -> Prepared:
-        prepared: Prepared = _run().prepare(views, work, progress, dense, anchoring)
+        prepared: Prepared = _import_pipeline().prepare(views, work, progress, dense, scale_source)
         return prepared
 
     info = MethodInfo(
-        name=f"{dense}-{anchoring}",
-        summary=f"COLMAP's cameras from the left views, K known; {_DENSE[dense]}; {_METRES[anchoring]}",
+        name=f"{dense}-{scale_source}",
+        summary=f"COLMAP's cameras from the left views, K known; {_DENSE_SUMMARIES[dense]}; "
+        f"{_SCALE_SUMMARIES[scale_source]}",
         columns=(),
         uses_intrinsics=True,
         source="pycolmap" if dense == "colmap" else "pycolmap, and this project's plane sweep",
         licence="BSD-3-Clause" if dense == "colmap" else "BSD-3-Clause, Apache-2.0",
-        reads_truth=anchoring == "anchored",
-        unexercised=_UNEXERCISED[dense],
+        uses_ground_truth=scale_source == "anchored",
+        untested_note=_UNTESTED_NOTES[dense],
     )
-    return MultiViewMethod(info, prepare, lambda views: _run().check(views, dense, anchoring))
+    return MultiViewMethod(info, prepare, lambda views: _import_pipeline().check(views, dense, scale_source))
 
 
 COLMAP_ARUCO, COLMAP_ANCHORED = _method("colmap", "aruco"), _method("colmap", "anchored")

@@ -1,12 +1,12 @@
-"""The left views of a config as a multi-view method takes them: pictures on disk, one camera, the markers.
+"""Undistorted left images of a config on disk, their markers, and the selection of image pairs to match.
 
-A row's left picture as a pinhole camera would take it, and depth brought back to the row's own grid.
+All images are resampled to one pinhole camera; depth on its grid is transferred back to the grid of the left
+camera.
 
-Which pictures to match with which: those that, by the board's markers, are turned little against each other.
-
-A lattice looks nearly the same after a quarter or half a turn. On 24 views of it, 512 x 288, opposite views match
-with up to 74 inliers, where neighbours 15 degrees apart have 85 to 177: no count of inliers keeps them apart at
-every size, and COLMAP registers views on the wrong side. Markers carry names, which steel does not.
+Image pairs are matched only if their relative rotation, measured with the markers of the board, is small. A
+lattice looks nearly the same after a quarter or half turn. On 24 views of it (512 x 288), opposite views match
+with up to 74 inliers, while neighbours 15 degrees apart have 85 to 177: no threshold on inliers separates them at
+every image size, and COLMAP registers views on the wrong side. Unlike steel, markers have unique ids.
 """
 
 from __future__ import annotations
@@ -27,57 +27,62 @@ from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.aruco_detection import Corners, board_pose, detected_corners_px
 from rebar_depth_bench.geometry.cameras import pixel_rays, project
-from rebar_depth_bench.geometry.rectification import canvas, resampled
-from rebar_depth_bench.methods.multiview.pose_errors import rotation_deg
+from rebar_depth_bench.geometry.rectification import enclosing_canvas, resample
+from rebar_depth_bench.methods.multiview.pose_errors import rotation_angle_deg
 
 
 @dataclass(frozen=True, eq=False)
 class PinholeGrid:
-    """A pinhole canvas that holds every pixel of a camera's grid; without distortion, that grid itself.
+    """Pinhole image grid that contains every pixel of a camera; without distortion, the camera's own grid.
 
-    ``pixel`` is the canvas pixel (column, row) that each of the camera's pixels falls on, None where they are the
-    same. The optical axis is the camera's: planar depth stays what it is.
+    ``canvas_pixel`` is the pixel (column, row) of this grid for each pixel of the camera, None if both grids are
+    the same. The optical axis is that of the camera, so planar depth is unchanged.
     """
 
     K: Float64[ndarray, "3 3"]
     width: int
     height: int
-    pixel: Int64[ndarray, "h w 2"] | None
+    canvas_pixel: Int64[ndarray, "h w 2"] | None
 
     def depth_on_left_grid(self, depth: Float32[ndarray, "hc wc"]) -> Float32[ndarray, "h w"]:
-        """Return planar depth, in any unit, on the camera's grid: each pixel takes the pixel its ray falls on."""
-        if self.pixel is None:
+        """Return planar depth (any unit) on the camera's grid, sampled at the pixel that each ray falls on."""
+        if self.canvas_pixel is None:
             return depth
-        column, row = np.moveaxis(self.pixel, -1, 0)
+        column, row = np.moveaxis(self.canvas_pixel, -1, 0)
         return np.asarray(depth[row, column])
 
 
 def pinhole_grid(row: Mapping[str, Any], width: int, height: int) -> PinholeGrid:
-    """Return the canvas of a row's left camera (``left_K``, ``left_distortion``), whose grid is width x height."""
+    """Return the pinhole grid of a row's ``width`` x ``height`` left camera (``left_K``, ``left_distortion``)."""
     K, distortion = row["left_K"], row["left_distortion"]
     if not distortion.any():
         return PinholeGrid(K, width, height, None)
     rays = pixel_rays(K, width, height, distortion)
-    wide_K, (wide_width, wide_height) = canvas(K, [project(K, rays)])
+    wide_K, (wide_width, wide_height) = enclosing_canvas(K, [project(K, rays)])
     return PinholeGrid(wide_K, wide_width, wide_height, np.rint(project(wide_K, rays)).astype(np.int64))
 
 
-def pinhole_picture(row: Mapping[str, Any], grid: PinholeGrid) -> UInt8[ndarray, "hc wc 3"]:
-    """Return a row's left picture on its canvas, resampled (bicubic) where the lens distorts."""
-    if grid.pixel is None:
+def pinhole_image(row: Mapping[str, Any], grid: PinholeGrid) -> UInt8[ndarray, "hc wc 3"]:
+    """Return a row's left image on its pinhole grid, resampled (bicubic) if the lens has distortion."""
+    if grid.canvas_pixel is None:
         return np.asarray(row["left_rgb"])
     maps = cv2.initUndistortRectifyMap(
         row["left_K"], row["left_distortion"], np.eye(3), grid.K, (grid.width, grid.height), cv2.CV_32FC1
     )
-    return resampled(row["left_rgb"], maps)
+    return resample(row["left_rgb"], maps)
 
 
-COLUMNS = ("left_rgb", "left_K", "left_distortion", "left_cam_from_world")
+ROW_COLUMNS = ("left_rgb", "left_K", "left_distortion", "left_cam_from_world")
+"""Dataset columns that are read; the poses serve only for error reports."""
 
 
 @dataclass(frozen=True, eq=False)
-class LeftPictures:
-    """Pictures in ``folder``, by name; ``names`` gives each view's. The true poses serve the report alone."""
+class LeftImages:
+    """Undistorted images in ``folder``, with the pinhole grid that they share.
+
+    ``names`` maps view ids to image names; ``markers`` and ``cam_from_world`` are keyed by image name. The true
+    poses are used only for error reports.
+    """
 
     folder: Path
     names: Mapping[str, str]
@@ -86,46 +91,55 @@ class LeftPictures:
     cam_from_world: Mapping[str, Float64[ndarray, "4 4"]]
 
 
-def write_pictures(views: ConfigViews, folder: Path) -> LeftPictures:
-    """Write every left picture, undistorted where its lens distorts, and find the board's markers in it.
+def write_left_images(views: ConfigViews, folder: Path) -> LeftImages:
+    """Write all left images, undistorted if the lens has distortion, and detect the markers of the board.
 
-    Raises ``MethodError`` for views that are not all of one camera.
+    Raises ``MethodError`` if the views differ in K or distortion, if there are no views, or if an image cannot be
+    written.
     """
     folder.mkdir(exist_ok=True)
     height, width = views.grid
     grid: PinholeGrid | None = None
     camera: tuple[ndarray, ndarray] | None = None
     names, markers, poses = {}, {}, {}
-    for row in views.rows(*COLUMNS):
-        mine = (row["left_K"], row["left_distortion"])
+    for row in views.rows(*ROW_COLUMNS):
+        row_camera = (row["left_K"], row["left_distortion"])
         if grid is None or camera is None:
-            camera, grid = mine, pinhole_grid(row, width, height)
-        if not all(np.array_equal(a, b) for a, b in zip(camera, mine, strict=True)):
+            camera, grid = row_camera, pinhole_grid(row, width, height)
+        if not all(np.array_equal(a, b) for a, b in zip(camera, row_camera, strict=True)):
             raise MethodError(
                 f"{row['view_id']}: another K or distortion than the view before, expected one camera"
             )
         name = names[row["view_id"]] = row["view_id"].rpartition("/")[2] + ".png"
-        rgb = pinhole_picture(row, grid)
+        rgb = pinhole_image(row, grid)
         if not cv2.imwrite(str(folder / name), rgb[..., ::-1]):
             raise MethodError(f"{folder / name}: cannot be written")
         markers[name] = detected_corners_px(rgb, views.board.dictionary) if views.board else {}
         poses[name] = row["left_cam_from_world"]
     if grid is None:
         raise MethodError(f"{views.config}: no view, expected three or more")
-    return LeftPictures(folder, names, grid, markers, poses)
+    return LeftImages(folder, names, grid, markers, poses)
 
 
-MOST_TURNED_DEG = 60.0
+MAX_PAIR_ROTATION_DEG = 60.0
+"""Largest relative rotation of two images that are matched."""
 
 
-def plausible_pairs(
+def select_pairs(
     markers: Mapping[str, Corners], board: BoardSpec, K: Float64[ndarray, "3 3"]
 ) -> list[tuple[str, str]]:
-    """Return the pairs of pictures (pinhole, K in pixels) to match; a picture without markers goes with all."""
-    poses = {name: board_pose(found, board, K) for name, found in markers.items()}
-    kept = []
-    for one, other in combinations(sorted(markers), 2):
-        first, second = poses[one], poses[other]
-        if first is None or second is None or rotation_deg(second[:3, :3] @ first[:3, :3].T) <= MOST_TURNED_DEG:
-            kept.append((one, other))
-    return kept
+    """Return the pairs of image names to match; images without a board pose are matched with all others.
+
+    ``markers`` are detections in pinhole images with intrinsics ``K``, pixels.
+    """
+    poses = {name: board_pose(corners, board, K) for name, corners in markers.items()}
+    pairs = []
+    for name, other in combinations(sorted(markers), 2):
+        pose, other_pose = poses[name], poses[other]
+        if (
+            pose is None
+            or other_pose is None
+            or rotation_angle_deg(other_pose[:3, :3] @ pose[:3, :3].T) <= MAX_PAIR_ROTATION_DEG
+        ):
+            pairs.append((name, other))
+    return pairs

@@ -1,6 +1,6 @@
-"""Dense depth with COLMAP's PatchMatch stereo. It needs CUDA: ``pycolmap-cuda12`` in place of ``pycolmap``.
+"""COLMAP's PatchMatch stereo, which needs CUDA (``pycolmap-cuda12`` instead of ``pycolmap``).
 
-Never run where it was written, which has no CUDA; only the reader of its depth maps is tested.
+PatchMatch has never been run here because no CUDA device was available; only the reader of depth maps is tested.
 Source: J. L. Schoenberger et al., "Pixelwise View Selection for Unstructured Multi-View Stereo", ECCV 2016.
 """
 
@@ -21,7 +21,7 @@ _HEADER_BYTES = 24
 
 
 def require_cuda() -> None:
-    """Raise ``MethodError`` where COLMAP was built without CUDA."""
+    """Raise ``MethodError`` if COLMAP was built without CUDA."""
     if not pycolmap.has_cuda:
         raise MethodError(
             "COLMAP's PatchMatch stereo needs CUDA, which this pycolmap was built without: on a machine with an "
@@ -30,10 +30,10 @@ def require_cuda() -> None:
 
 
 def patch_match(images: Path, model: Path, work: Path) -> Path:
-    """Run PatchMatch with its geometric consistency on a sparse model; return the folder of its depth maps.
+    """Run PatchMatch with geometric consistency on a sparse model; return the folder of its depth maps.
 
-    What an interrupted run has done is kept: COLMAP passes over views whose maps are there, damaged ones too, so
-    these are removed first.
+    An interrupted run is resumed: COLMAP skips views whose depth maps exist, even if they are damaged, so damaged
+    maps are removed first.
     """
     dense = work / "dense"
     for path in (dense / "stereo" / "depth_maps").glob("*.bin"):
@@ -48,10 +48,10 @@ def patch_match(images: Path, model: Path, work: Path) -> Path:
 
 
 def read_depth_map(path: Path) -> Float32[ndarray, "h w"]:
-    """Return a depth map of COLMAP's ``.bin``, in the reconstruction's unit, NaN where it has none.
+    """Return the depth map in a ``.bin`` file of COLMAP, in the reconstruction's unit; NaN where there is none.
 
-    The format is the text ``WIDTH&HEIGHT&CHANNELS&`` and then float32, little-endian, row by row, plane by plane.
-    Raises ``MethodError`` for any other file.
+    The format is the text ``WIDTH&HEIGHT&CHANNELS&`` followed by little-endian float32 values, row by row, plane
+    by plane. Raises ``MethodError`` for any other file.
     """
     data = path.read_bytes()
     header = _HEADER.match(data[:_HEADER_BYTES])

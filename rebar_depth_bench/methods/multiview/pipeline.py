@@ -1,4 +1,4 @@
-"""All of it in order: pictures, structure, dense depth, metres; then a predictor that reads a view's depth."""
+"""Multi-view pipeline: undistorted images, sparse reconstruction, metric scale, dense depth and the predictor."""
 
 from __future__ import annotations
 
@@ -13,52 +13,53 @@ from numpy import ndarray
 
 from rebar_depth_bench.data.dataset import ConfigViews
 from rebar_depth_bench.methods.base import Prepared
-from rebar_depth_bench.methods.multiview.dense import DENSE
-from rebar_depth_bench.methods.multiview.images import LeftPictures, plausible_pairs, write_pictures
-from rebar_depth_bench.methods.multiview.metric_scale import ANCHORINGS
-from rebar_depth_bench.methods.multiview.sfm import Structure, find_structure
+from rebar_depth_bench.methods.multiview.dense import DENSE_METHODS
+from rebar_depth_bench.methods.multiview.images import LeftImages, select_pairs, write_left_images
+from rebar_depth_bench.methods.multiview.metric_scale import SCALE_SOURCES
+from rebar_depth_bench.methods.multiview.sfm import SparseReconstruction, reconstruct_sparse
 from rebar_depth_bench.progress import Progress, silent
 
 
-def pictured_structure(
-    views: ConfigViews, pictures: LeftPictures, work: Path, progress: Progress = silent
-) -> Structure:
-    """Return the reconstruction from a config's pictures; where there is a board its markers choose the pairs."""
-    K, board = pictures.grid.K, views.board
-    pairs = plausible_pairs(pictures.markers, board, K) if board else None
-    names = list(pictures.names.values())
-    return find_structure(pictures.folder, names, K, work, pairs=pairs, progress=progress)
+def reconstruct_images(
+    views: ConfigViews, left_images: LeftImages, work: Path, progress: Progress = silent
+) -> SparseReconstruction:
+    """Return the sparse reconstruction of a config; if there is a board, its markers select the pairs to match."""
+    K, board = left_images.grid.K, views.board
+    pairs = select_pairs(left_images.markers, board, K) if board else None
+    names = list(left_images.names.values())
+    return reconstruct_sparse(left_images.folder, names, K, work, pairs=pairs, progress=progress)
 
 
-def check(views: ConfigViews, dense: str, anchoring: str) -> None:
-    """Raise ``MethodError`` where the named parts cannot run here, or not on this config."""
-    DENSE[dense].check()
-    ANCHORINGS[anchoring].check(views)
+def check(views: ConfigViews, dense: str, scale_source: str) -> None:
+    """Raise ``MethodError`` if the named dense method cannot run or the scale source does not suit the config."""
+    DENSE_METHODS[dense].check()
+    SCALE_SOURCES[scale_source].check(views)
 
 
-def prepare(views: ConfigViews, work: Path, progress: Progress, dense: str, anchoring: str) -> Prepared:
-    """Reconstruct a config from its left views; notes tell cameras and scale beside the truth.
+def prepare(views: ConfigViews, work: Path, progress: Progress, dense: str, scale_source: str) -> Prepared:
+    """Reconstruct a config from its left views; notes compare cameras and scale with ground truth.
 
-    What is done stays in ``work`` and is not done again. A view that was not registered has no answer.
+    Intermediate results are stored in ``work`` and reused. Views that were not registered have no prediction.
     """
-    pictures = write_pictures(views, work / "images")
-    structure = pictured_structure(views, pictures, work, progress)
-    reader = cache(lambda: DENSE[dense].run(pictures, structure, work, progress))
-    scaled = ANCHORINGS[anchoring].scale(views, pictures, structure, reader)  # markers fail before hours of depth
-    read = reader()
+    left_images = write_left_images(views, work / "images")
+    reconstruction = reconstruct_images(views, left_images, work, progress)
+    reader = cache(lambda: DENSE_METHODS[dense].run(left_images, reconstruction, work, progress))
+    # The scale comes first: missing markers raise an error before hours of dense matching.
+    metric_scale = SCALE_SOURCES[scale_source].scale(views, left_images, reconstruction, reader)
+    read_depth = reader()
     notes = {
-        "views_registered": len(structure.cam_from_sfm),
-        "views": len(pictures.names),
-        "sparse_points": len(structure.points),
-        "reprojection_px": round(structure.reprojection_px, 4),
-        **scaled.notes,
+        "views_registered": len(reconstruction.cam_from_sfm),
+        "views": len(left_images.names),
+        "sparse_points": len(reconstruction.points),
+        "reprojection_px": round(reconstruction.reprojection_px, 4),
+        **metric_scale.notes,
     }
-    nothing = np.full(views.grid, np.nan, np.float32)
+    no_depth = np.full(views.grid, np.nan, np.float32)
 
     def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
-        name = pictures.names[row["view_id"]]
-        if name not in structure.cam_from_sfm:
-            return nothing
-        return np.asarray(pictures.grid.depth_on_left_grid(read(name)) * np.float32(scaled.scale_m))
+        name = left_images.names[row["view_id"]]
+        if name not in reconstruction.cam_from_sfm:
+            return no_depth
+        return np.asarray(left_images.grid.depth_on_left_grid(read_depth(name)) * np.float32(metric_scale.scale_m))
 
     return Prepared(predict, notes)

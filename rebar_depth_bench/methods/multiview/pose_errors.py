@@ -1,6 +1,6 @@
-"""Similarities between point sets, and angles of rotations: what lays a reconstruction on metres.
+"""Similarity transforms between point sets, and errors of reconstructed cameras and scale against ground truth.
 
-How far a reconstruction's cameras and scale are from the truth: told beside the depth, used for none of it.
+The errors are reported beside the depth and not used to compute it.
 """
 
 from __future__ import annotations
@@ -18,34 +18,34 @@ from rebar_depth_bench.geometry.cameras import camera_centre
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """``x -> scale * rotation @ x + translation``."""
+    """Similarity transform ``x -> scale * rotation @ x + translation``."""
 
     scale: float
     rotation: Float64[ndarray, "3 3"]
     translation: Float64[ndarray, " 3"]
 
-    def points(self, source: Float64[ndarray, "*n 3"]) -> Float64[ndarray, "*n 3"]:
-        """Apply it to points."""
+    def apply(self, source: Float64[ndarray, "*n 3"]) -> Float64[ndarray, "*n 3"]:
+        """Return the transformed points."""
         return np.asarray(self.scale * source @ self.rotation.T + self.translation)
 
 
-def similarity(source: Float64[ndarray, "n 3"], target: Float64[ndarray, "n 3"]) -> Similarity:
-    """Return the similarity with ``target ~ scale * rotation @ source + translation``, in least squares.
+def fit_similarity(source: Float64[ndarray, "n 3"], target: Float64[ndarray, "n 3"]) -> Similarity:
+    """Return the least-squares similarity with ``target ~ scale * rotation @ source + translation``.
 
-    For three or more points that are not on one line; those of a plane are fine: of the two rotations and mirrors
-    that fit them equally the rotation is taken.
+    Three or more points that are not collinear are required. For coplanar points a rotation and a reflection fit
+    equally well; the rotation is returned.
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
     """
-    source_middle, target_middle = source.mean(axis=0), target.mean(axis=0)
-    centred = source - source_middle
-    u, singular, vt = np.linalg.svd((target - target_middle).T @ centred)
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    source_centred = source - source_mean
+    u, singular_values, vt = np.linalg.svd((target - target_mean).T @ source_centred)
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = u @ np.diag(signs) @ vt
-    scale = float(singular @ signs / np.sum(centred**2))
-    return Similarity(scale, rotation, target_middle - scale * rotation @ source_middle)
+    scale = float(singular_values @ signs / np.sum(source_centred**2))
+    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
 
 
-def rotation_deg(rotation: Float64[ndarray, "3 3"]) -> float:
+def rotation_angle_deg(rotation: Float64[ndarray, "3 3"]) -> float:
     """Return the angle of a rotation, degrees."""
     skew = np.array(
         [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
@@ -54,49 +54,55 @@ def rotation_deg(rotation: Float64[ndarray, "3 3"]) -> float:
 
 
 Poses = Mapping[str, Float64[ndarray, "4 4"]]
+"""Camera poses (cam_from_...) by image name."""
 
 
-def true_similarity(cam_from_sfm: Poses, cam_from_world: Poses) -> Similarity:
-    """Return the similarity that lays the cameras' centres on the true ones, metres; three or more."""
-    return similarity(_centres(cam_from_sfm, cam_from_sfm), _centres(cam_from_world, cam_from_sfm))
+def similarity_to_world(cam_from_sfm: Poses, cam_from_world: Poses) -> Similarity:
+    """Return the similarity from estimated to true camera centres, metres; three or more cameras are required."""
+    return fit_similarity(_centres(cam_from_sfm, cam_from_sfm), _centres(cam_from_world, cam_from_sfm))
 
 
-def placed_report(cam_from_sfm: Poses, cam_from_world: Poses, metric: Similarity) -> dict[str, Any]:
-    """Return errors of scale, centres and rotations under the similarity that was found to the board's frame."""
+def board_frame_report(cam_from_sfm: Poses, cam_from_world: Poses, metric: Similarity) -> dict[str, Any]:
+    """Return errors of scale, camera centres and rotations under the estimated similarity to the board frame."""
     return {
-        **_scale_told(cam_from_sfm, cam_from_world, metric.scale),
+        **_scale_error(cam_from_sfm, cam_from_world, metric.scale),
         "cameras_compared": "in the board's frame",
         **_pose_errors(cam_from_sfm, cam_from_world, metric),
     }
 
 
-def scaled_report(cam_from_sfm: Poses, cam_from_world: Poses, scale_m: float) -> dict[str, Any]:
-    """Return errors of a scale found alone, and of the cameras under the best similarity to the true ones."""
+def aligned_report(cam_from_sfm: Poses, cam_from_world: Poses, scale_m: float) -> dict[str, Any]:
+    """Return the error of an estimated scale, and camera errors under the best similarity to the true cameras."""
     return {
-        **_scale_told(cam_from_sfm, cam_from_world, scale_m),
+        **_scale_error(cam_from_sfm, cam_from_world, scale_m),
         "cameras_compared": "after the best similarity",
-        **_pose_errors(cam_from_sfm, cam_from_world, true_similarity(cam_from_sfm, cam_from_world)),
+        **_pose_errors(cam_from_sfm, cam_from_world, similarity_to_world(cam_from_sfm, cam_from_world)),
     }
 
 
-def _scale_told(cam_from_sfm: Poses, cam_from_world: Poses, scale_m: float) -> dict[str, float]:
-    true_m = true_similarity(cam_from_sfm, cam_from_world).scale
+def _scale_error(cam_from_sfm: Poses, cam_from_world: Poses, scale_m: float) -> dict[str, float]:
+    true_m = similarity_to_world(cam_from_sfm, cam_from_world).scale
     return {"scale_m": scale_m, "scale_error_percent": round(100 * (scale_m / true_m - 1), 4)}
 
 
-def _pose_errors(cam_from_sfm: Poses, cam_from_world: Poses, placed: Similarity) -> dict[str, dict[str, float]]:
-    found_m = placed.points(_centres(cam_from_sfm, cam_from_sfm))
-    off_m = np.linalg.norm(found_m - _centres(cam_from_world, cam_from_sfm), axis=1)
-    turned_deg = [
-        rotation_deg(cam_from_world[name][:3, :3] @ placed.rotation @ pose[:3, :3].T)
+def _pose_errors(
+    cam_from_sfm: Poses, cam_from_world: Poses, world_from_sfm: Similarity
+) -> dict[str, dict[str, float]]:
+    centres_m = world_from_sfm.apply(_centres(cam_from_sfm, cam_from_sfm))
+    centre_errors_m = np.linalg.norm(centres_m - _centres(cam_from_world, cam_from_sfm), axis=1)
+    rotation_errors_deg = [
+        rotation_angle_deg(cam_from_world[name][:3, :3] @ world_from_sfm.rotation @ pose[:3, :3].T)
         for name, pose in cam_from_sfm.items()
     ]
-    return {"centre_error_mm": _spread(1000 * off_m), "rotation_error_deg": _spread(np.array(turned_deg))}
+    return {
+        "centre_error_mm": _median_and_largest(1000 * centre_errors_m),
+        "rotation_error_deg": _median_and_largest(np.array(rotation_errors_deg)),
+    }
 
 
 def _centres(poses: Poses, names: Poses) -> Float64[ndarray, "n 3"]:
     return np.array([camera_centre(poses[name]) for name in names])
 
 
-def _spread(errors: Float64[ndarray, " n"]) -> dict[str, float]:
+def _median_and_largest(errors: Float64[ndarray, " n"]) -> dict[str, float]:
     return {"median": round(float(np.median(errors)), 4), "largest": round(float(errors.max()), 4)}

@@ -1,1 +1,1 @@
-"""Depth models stored as ONNX files and described by a TOML file."""
+"""ONNX depth models described by a TOML file."""

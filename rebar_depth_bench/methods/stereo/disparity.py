@@ -1,4 +1,4 @@
-"""From a stereo pair to the left view's depth, whatever finds the disparities: rectified or raw, in metres."""
+"""Stereo depth from disparity, for rectified and raw image pairs and any matcher."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
 MIN_PARALLAX_PX = 1.0
+"""Smallest parallax, pixels, that is converted to depth."""
 STEREO_COLUMNS = (
     *("left_rgb", "right_rgb", "left_K", "right_K", "left_distortion", "right_distortion"),
     *("left_cam_from_world", "right_cam_from_world", "baseline_m"),
 )
-"""What a stereo method is given of a row."""
+"""Dataset columns that stereo methods read."""
 
 Matcher = Callable[[UInt8[ndarray, "h w 3"], UInt8[ndarray, "h w 3"]], Float32[ndarray, "h w"]]
-"""From the rectified left and right picture to the left view's disparity, pixels; <= 0 where it found none."""
+"""Function from rectified left and right RGB images to the left disparity, pixels; <= 0 where there is none."""
 
 
 def stereo_depth_m(row: Mapping[str, Any], match: Matcher) -> Float32[ndarray, "h w"]:
-    """Return the left grid's planar depth, metres, of a row with ``STEREO_COLUMNS``; NaN where there is none.
+    """Return planar depth on the left grid, metres, of a row with ``STEREO_COLUMNS``; NaN: no prediction.
 
-    A raw pair is rectified first, and its depth brought back to the raw grid (``raw_stereo``). Needs OpenCV.
+    A raw pair is rectified first, and its depth is transferred back to the raw grid (``geometry.rectification``).
+    Needs OpenCV.
     """
     from rebar_depth_bench.geometry import rectification
 
@@ -43,10 +45,10 @@ def disparity_to_depth_m(
     right_K: Float64[ndarray, "3 3"],
     baseline_m: float,
 ) -> Float32[ndarray, "h w"]:
-    """Return z = fx * B / (disparity - (cx_left - cx_right)); NaN where the parallax is below a pixel.
+    """Return z = fx * B / (disparity - (cx_left - cx_right)), metres; NaN if the parallax is below one pixel.
 
-    There a depth is worth nothing: half a pixel more or less halves or doubles it. A pixel whose match would lie
-    left of the right picture has no match: NaN as well.
+    Such depths are meaningless because an error of half a pixel halves or doubles them. Pixels whose match would
+    lie outside the right image on the left are NaN as well.
     """
     columns = np.arange(disparity_px.shape[1], dtype=np.float64)
     parallax_px = disparity_px - (left_K[0, 2] - right_K[0, 2])

@@ -1,12 +1,12 @@
 """FoundationStereo (``23-51-11``) on the rectified pair, with its authors' code; a raw pair is rectified first.
 
-Pictures go in as RGB of 0 to 255, their sides brought to multiples of 32 by repeating borders, 32 iterations, as
-in ``scripts/run_demo.py``. Where the match lies left of the right picture there is no answer, as in that script; a
-parallax below a pixel is none either.
+Input images are RGB with values 0 to 255, padded to multiples of 32 by repeating borders; 32 iterations are run,
+as in ``scripts/run_demo.py``. A pixel has no prediction if its match would lie beyond the left border of the right
+image, as in that script, or if its parallax is below one pixel.
 
-Never run here with the real network: its weights could not be fetched. When it is built, its code may fetch that
-of DINOv2 (GitHub, which knows nothing of ``HF_HUB_OFFLINE``) and timm's ``edgenext_small`` (the Hub): where their
-caches hold nothing of the kind, that is said first.
+This method has never been run with the real network because the weights could not be downloaded. When the network
+is built, its code may download DINOv2's code (from GitHub, regardless of ``HF_HUB_OFFLINE``) and timm's
+``edgenext_small`` (from the Hub); a notice is printed first if their caches are empty.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from numpy import ndarray
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.monocular.conversions import margins_to_multiple, padded, without_margins
+from rebar_depth_bench.methods.monocular.conversions import crop_margins, margins_to_multiple, padded
 from rebar_depth_bench.methods.monocular.third_party import (
-    device,
-    error_words,
-    filled,
-    importable,
-    package,
-    torch_for,
-    with_weights,
+    check_weights_loaded,
+    import_package,
+    import_torch,
+    on_sys_path,
+    torch_device,
+    translate_errors,
+    with_weights_digest,
 )
 from rebar_depth_bench.methods.stereo.disparity import STEREO_COLUMNS, stereo_depth_m
 
 NAME = "foundation-stereo"
-CODE, SETTINGS, CHECKPOINT = "core/foundation_stereo.py", "cfg.yaml", "model_best_bp2.pth"
-WEIGHTS = Path("pretrained_models", "23-51-11")
-STEP_PX, ITERATIONS = 32, 32
-HOW = (
+CODE_FILE, SETTINGS_FILE, CHECKPOINT_FILE = "core/foundation_stereo.py", "cfg.yaml", "model_best_bp2.pth"
+WEIGHTS_FOLDER = Path("pretrained_models", "23-51-11")
+SIDE_MULTIPLE_PX, ITERATIONS = 32, 32
+INSTALL_HINT = (
     "git clone https://github.com/NVlabs/FoundationStereo, put the folder 23-51-11 that its readme links (Google "
-    f"Drive) into FoundationStereo/{WEIGHTS.parent}, install its requirements, and name it: "
+    f"Drive) into FoundationStereo/{WEIGHTS_FOLDER.parent}, install its requirements, and name it: "
     f"{NAME}:FoundationStereo"
 )
 INFO = MethodInfo(
@@ -52,120 +52,142 @@ INFO = MethodInfo(
     uses_intrinsics=True,
     source="github.com/NVlabs/FoundationStereo, 23-51-11",
     licence="NVIDIA, research purposes only",
-    unexercised="never run with the real network where this was written: its code and weights were not to be had",
+    untested_note=(
+        "never run with the real network where this was written: its code and weights were not to be had"
+    ),
 )
 
 
 @dataclass(frozen=True)
 class Installation:
-    """A clone of the repository, and a folder with a checkpoint and its ``cfg.yaml``."""
+    """Folders of a FoundationStereo installation.
+
+    ``clone`` is a clone of the repository, ``weights`` a folder with a checkpoint and its ``cfg.yaml``.
+    """
 
     clone: Path
     weights: Path
 
 
 class _Settings(dict[str, Any]):
-    """A mapping whose keys are attributes too: all that the network asks of its settings."""
+    """Dictionary with attribute access, which is all that the network requires of its settings."""
 
     def __getattr__(self, name: str) -> Any:
         try:
             return self[name]
         except KeyError:
-            raise AttributeError(f"{SETTINGS} has no {name}") from None
+            raise AttributeError(f"{SETTINGS_FILE} has no {name}") from None
 
 
-def foundation_stereo_method(place: Path) -> Method:
-    """Return FoundationStereo of a clone of its repository, or with other weights of a folder below a clone.
+def foundation_stereo_method(folder: Path) -> Method:
+    """Return FoundationStereo from a clone of its repository, or with other weights in a folder inside a clone.
 
-    Raises ``MethodError`` where code, checkpoint or ``cfg.yaml`` is missing.
+    Raises ``MethodError`` if code, checkpoint or ``cfg.yaml`` is missing.
     """
-    found = _installation(place)
-    info = with_weights(INFO, found.weights.name, [found.weights / CHECKPOINT, found.weights / SETTINGS])
-    return Method(info, lambda: load_predictor(found))
+    installation = _find_installation(folder)
+    info = with_weights_digest(
+        INFO,
+        installation.weights.name,
+        [installation.weights / CHECKPOINT_FILE, installation.weights / SETTINGS_FILE],
+    )
+    return Method(info, lambda: load_predictor(installation))
 
 
-def load_predictor(found: Installation) -> Predictor:
-    """Load the network, on the GPU if torch sees one.
+def load_predictor(installation: Installation) -> Predictor:
+    """Return the predictor of an installation, on the GPU if torch finds one.
 
-    Raises ``MethodError`` where torch, OpenCV or what its code imports is missing, or weights that fill it.
+    Raises ``MethodError`` if torch, OpenCV or a module that its code imports is missing, or if the weights are
+    incomplete.
     """
-    torch = torch_for(NAME)
-    package("cv2", NAME, "pip install 'rebar-depth-bench[methods]'")
-    yaml = package("yaml", NAME, "pip install pyyaml")
-    if fetches := _may_fetch(torch):
-        print(f"{NAME}: its code may fetch {' and '.join(fetches)}", file=sys.stderr, flush=True)
-    with error_words(NAME, torch, f"{found.weights} cannot be loaded"), importable(found.clone):
-        settings = _Settings(yaml.safe_load((found.weights / SETTINGS).read_text(encoding="utf-8")))
+    torch = import_torch(NAME)
+    import_package("cv2", NAME, "pip install 'rebar-depth-bench[methods]'")
+    yaml = import_package("yaml", NAME, "pip install pyyaml")
+    if downloads := _possible_downloads(torch):
+        print(f"{NAME}: its code may fetch {' and '.join(downloads)}", file=sys.stderr, flush=True)
+    with (
+        translate_errors(NAME, torch, f"{installation.weights} cannot be loaded"),
+        on_sys_path(installation.clone),
+    ):
+        settings = _Settings(yaml.safe_load((installation.weights / SETTINGS_FILE).read_text(encoding="utf-8")))
         settings.setdefault("vit_size", "vitl")
         code = importlib.import_module("core.foundation_stereo")
-        _check_origin(code, found.clone)
-        checkpoint = torch.load(found.weights / CHECKPOINT, map_location="cpu", weights_only=False)["model"]
+        _check_module_origin(code, installation.clone)
+        checkpoint = torch.load(installation.weights / CHECKPOINT_FILE, map_location="cpu", weights_only=False)[
+            "model"
+        ]
         model = code.FoundationStereo(settings)
         model.load_state_dict(checkpoint)
-        model = filled(NAME, torch, model, checkpoint)
+        model = check_weights_loaded(NAME, torch, model, checkpoint)
 
     def match(left: UInt8[ndarray, "h w 3"], right: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
-        margins = margins_to_multiple((left.shape[0], left.shape[1]), STEP_PX)
+        margins = margins_to_multiple((left.shape[0], left.shape[1]), SIDE_MULTIPLE_PX)
         cuda = torch.cuda.is_available()
         with (
-            error_words(NAME, torch, "fails on a pair"),
+            translate_errors(NAME, torch, "fails on a pair"),
             torch.inference_mode(),
             torch.autocast("cuda", enabled=cuda),
         ):
-            pair = [_pixels(torch, padded(eye, margins)) for eye in (left, right)]
-            found_px = model.forward(*pair, iters=ITERATIONS, test_mode=True)
-            seen_px = found_px.float().cpu().numpy().reshape(pair[0].shape[-2:])
-        return np.asarray(without_margins(seen_px, margins), np.float32)
+            pair = [_to_tensor(torch, padded(image, margins)) for image in (left, right)]
+            disparity_px = model.forward(*pair, iters=ITERATIONS, test_mode=True)
+            padded_px = disparity_px.float().cpu().numpy().reshape(pair[0].shape[-2:])
+        return np.asarray(crop_margins(padded_px, margins), np.float32)
 
-    def run(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+    def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         return stereo_depth_m(row, match)
 
-    return run
+    return predict
 
 
-def _may_fetch(torch: Any) -> list[str]:
-    """Return what its code asks for when it is built and no cache has anything of, in words."""
+def _possible_downloads(torch: Any) -> list[str]:
+    """Return descriptions of the files that the network's code downloads because they are not cached."""
     from huggingface_hub import constants
 
-    found = []
+    downloads = []
     if not any(Path(torch.hub.get_dir()).glob("facebookresearch_dinov2_*")):
-        found.append(
+        downloads.append(
             "DINOv2's code (https://github.com/facebookresearch/dinov2, whatever HF_HUB_OFFLINE says), which is "
             "then run,"
         )
     if not any(Path(constants.HF_HUB_CACHE).glob("models--timm--edgenext_small*")):
-        found.append("timm's edgenext_small (the Hub)")
-    return found
+        downloads.append("timm's edgenext_small (the Hub)")
+    return downloads
 
 
-def _pixels(torch: Any, rgb: UInt8[ndarray, "h w 3"]) -> Any:
-    """Return 1 x 3 x h x w, 0 to 255."""
-    return torch.from_numpy(rgb.transpose(2, 0, 1).astype(np.float32))[None].to(device(torch))
+def _to_tensor(torch: Any, rgb: UInt8[ndarray, "h w 3"]) -> Any:
+    """Return an image as a 1 x 3 x h x w float32 tensor, values 0 to 255."""
+    return torch.from_numpy(rgb.transpose(2, 0, 1).astype(np.float32))[None].to(torch_device(torch))
 
 
-def _installation(place: Path) -> Installation:
-    weights = place if (place / CHECKPOINT).is_file() else place / WEIGHTS
-    start = place.resolve()
-    clone = next((folder for folder in (start, *start.parents) if (folder / CODE).is_file()), None)
-    if not place.is_dir() or clone is None:
-        raise MethodError(f"{NAME}:{place}: no clone of FoundationStereo with {CODE}, expected: {HOW}")
-    for name in (CHECKPOINT, SETTINGS):
+def _find_installation(folder: Path) -> Installation:
+    """Return the clone and weights folders for a folder given by the user.
+
+    Raises ``MethodError`` if code, checkpoint or settings are missing.
+    """
+    weights = folder if (folder / CHECKPOINT_FILE).is_file() else folder / WEIGHTS_FOLDER
+    start = folder.resolve()
+    clone = next((candidate for candidate in (start, *start.parents) if (candidate / CODE_FILE).is_file()), None)
+    if not folder.is_dir() or clone is None:
+        raise MethodError(
+            f"{NAME}:{folder}: no clone of FoundationStereo with {CODE_FILE}, expected: {INSTALL_HINT}"
+        )
+    for name in (CHECKPOINT_FILE, SETTINGS_FILE):
         if not (weights / name).is_file():
-            raise MethodError(f"{NAME}:{place}: no {name} in {weights}, expected: {HOW}")
+            raise MethodError(f"{NAME}:{folder}: no {name} in {weights}, expected: {INSTALL_HINT}")
     return Installation(clone, weights)
 
 
-def _check_origin(code: Any, clone: Path) -> None:
-    """Refuse another package that is called ``core`` as well."""
+def _check_module_origin(code: Any, clone: Path) -> None:
+    """Raise ``MethodError`` if ``core`` was imported from another package of the same name."""
     if not Path(code.__file__).resolve().is_relative_to(clone.resolve()):
         raise MethodError(f"{NAME}: core is imported from {code.__file__} already, expected it from {clone}")
 
 
-def _cannot_be_fetched() -> Predictor:
-    raise MethodError(f"{NAME}: its weights lie on Google Drive and cannot be fetched from here: {HOW}")
+def _raise_without_folder() -> Predictor:
+    """Raise ``MethodError`` with install instructions; the weights cannot be downloaded automatically."""
+    raise MethodError(f"{NAME}: its weights lie on Google Drive and cannot be fetched from here: {INSTALL_HINT}")
 
 
 FOUNDATION_STEREO = Method(
-    replace(INFO, summary=f"{INFO.summary}; a clone and weights of yours: {NAME}:FOLDER"), _cannot_be_fetched
+    replace(INFO, summary=f"{INFO.summary}; a clone and weights of yours: {NAME}:FOLDER"), _raise_without_folder
 )
-"""The paper's FoundationStereo, without a folder: says what to clone and download."""
+"""FoundationStereo as in the paper, without a folder; loading raises an error with install instructions."""

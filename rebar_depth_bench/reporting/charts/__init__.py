@@ -1,1 +1,1 @@
-"""SVG charts of reports."""
+"""Inline SVG charts of reports and study pages."""

@@ -1,22 +1,22 @@
-"""Inline SVG charts of error and scale against distance or against how wide a bar is in the picture."""
+"""Profile charts as inline SVG: error and scale by distance or by bar width in the image."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from rebar_depth_bench.extended.result import Estimate
+from rebar_depth_bench.extended.result import MeasureEstimate
 from rebar_depth_bench.reporting.charts.axes import (
     WIDTH,
     LogAxis,
     decade_axis,
-    label,
+    log_axis_with_one,
+    select_spaced,
     svg_figure,
     svg_text,
-    unit_axis,
+    tick_label,
 )
 from rebar_depth_bench.reporting.formatting import number, scale_cell
 
@@ -24,107 +24,116 @@ _LEFT, _RIGHT = 52.0, WIDTH - 14.0
 _ERROR_TOP, _ERROR_BOTTOM = 24.0, 164.0
 _SCALE_TOP, _SCALE_BOTTOM = 200.0, 270.0
 _HEIGHT = _SCALE_BOTTOM + 42
-_ASIDE = 6.0
-_LINE, _LABEL_GAP = 15.0, 7.0
-_DIGIT = 7.4
+_MARKER_OFFSET_PX = 6.0
+_LABEL_LINE_PX, _LABEL_GAP_PX = 15.0, 7.0
+_DIGIT_WIDTH_PX = 7.4
 
 
 @dataclass(frozen=True)
 class ProfileBin:
-    """What a config's views say between two edges: AbsRel under both alignments, and the native s."""
+    """Estimates of one bin between two edges: AbsRel native and scaled, and the native scale s."""
 
     low: float
     high: float
-    native: Estimate
-    scaled: Estimate
-    scale: Estimate
+    native: MeasureEstimate
+    scaled: MeasureEstimate
+    scale: MeasureEstimate
 
 
 def profile_chart(title: str, unit: str, bins: Sequence[ProfileBin]) -> Markup:
-    """Return AbsRel by bin, native (disc) and scaled (ring), above s by bin; nothing where no bin has a value.
+    """Return a chart with two panels by bin: AbsRel, native (disc) and scaled (ring), above the native scale s.
 
-    ``unit`` is what the edges are in. All axes are logarithmic; bars are 95 % intervals.
+    ``unit`` is the unit of the bin edges. All axes are logarithmic; vertical bars are 95 % intervals. The chart is
+    empty if no bin has a native AbsRel.
     """
-    known = [one for one in bins if one.native.value is not None]
-    if not known:
+    known_bins = [entry for entry in bins if entry.native.value is not None]
+    if not known_bins:
         return Markup()
-    x = LogAxis(known[0].low, known[-1].high, _LEFT, _RIGHT)
-    error = decade_axis(_reached(e for one in known for e in (one.native, one.scaled)), _ERROR_BOTTOM, _ERROR_TOP)
-    scale = unit_axis(_reached(one.scale for one in known), _SCALE_BOTTOM, _SCALE_TOP)
-    body = _edges(x, known) + _rows(error, error.ticks()) + _rows(scale, [1.0, *scale.ticks()])
+    x = LogAxis(known_bins[0].low, known_bins[-1].high, _LEFT, _RIGHT)
+    error = decade_axis(
+        _axis_values(estimate for entry in known_bins for estimate in (entry.native, entry.scaled)),
+        _ERROR_BOTTOM,
+        _ERROR_TOP,
+    )
+    scale = log_axis_with_one(_axis_values(entry.scale for entry in known_bins), _SCALE_BOTTOM, _SCALE_TOP)
+    body = (
+        _edge_grid(x, known_bins) + _value_grid(error, error.ticks()) + _value_grid(scale, [1.0, *scale.ticks()])
+    )
     body += f'<path class="one" d="M{_LEFT:g} {scale.at(1.0):.1f}H{_RIGHT:g}"/>'
-    body += _series([(_middle(x, one) + _ASIDE, one.scaled) for one in known], error, "scaled", "ring")
-    body += _series([(_middle(x, one) - _ASIDE, one.native) for one in known], error, "native", "fill")
-    body += _series([(_middle(x, one), one.scale) for one in known], scale, "native", "fill")
+    body += _series(
+        [(_bin_centre(x, entry) + _MARKER_OFFSET_PX, entry.scaled) for entry in known_bins],
+        error,
+        "scaled",
+        "ring",
+    )
+    body += _series(
+        [(_bin_centre(x, entry) - _MARKER_OFFSET_PX, entry.native) for entry in known_bins],
+        error,
+        "native",
+        "fill",
+    )
+    body += _series([(_bin_centre(x, entry), entry.scale) for entry in known_bins], scale, "native", "fill")
     body += svg_text(_LEFT, _ERROR_TOP - 10, "AbsRel") + svg_text(_LEFT, _SCALE_TOP - 10, "s, native")
     body += svg_text((_LEFT + _RIGHT) / 2, _HEIGHT - 4, f"{title}, {unit}", "middle")
-    return svg_figure(f"Against {title}", f"By {title}: {_spoken(known, unit)}.", _HEIGHT, body)
+    return svg_figure(f"Against {title}", f"By {title}: {_description(known_bins, unit)}.", _HEIGHT, body)
 
 
-def spaced(values: Iterable[float], axis: LogAxis, room: float) -> list[float]:
-    """Return the values that lie ``room`` pixels or more from each one kept before; the first one always stays."""
-    kept: list[float] = []
-    for value in values:
-        if all(abs(axis.at(value) - axis.at(other)) >= room for other in kept):
-            kept.append(value)
-    return kept
+def _axis_values(estimates: Iterable[MeasureEstimate]) -> list[float]:
+    values = [
+        value
+        for estimate in estimates
+        for value in (estimate.value, *(estimate.interval or ()))
+        if value is not None
+    ]
+    return [value * margin for value in values for margin in (0.95, 1.05)]
 
 
-def _reached(estimates: Iterable[Estimate]) -> list[float]:
-    found = [end for one in estimates for end in (one.value, *(one.interval or ())) if end is not None]
-    return [end * margin for end in found for margin in (0.95, 1.05)]
+def _bin_centre(x: LogAxis, profile_bin: ProfileBin) -> float:
+    return (x.at(profile_bin.low) + x.at(profile_bin.high)) / 2
 
 
-def _middle(x: LogAxis, one: ProfileBin) -> float:
-    return (x.at(one.low) + x.at(one.high)) / 2
-
-
-def _edges(x: LogAxis, bins: Sequence[ProfileBin]) -> str:
-    """Return a line at each edge of a bin through both parts, and as many edges' labels as have room."""
-    edges = sorted({edge for one in bins for edge in (one.low, one.high)})
+def _edge_grid(x: LogAxis, bins: Sequence[ProfileBin]) -> str:
+    """Return a line at each bin edge through both plots, and the labels of the edges that do not overlap."""
+    edges = sorted({edge for profile_bin in bins for edge in (profile_bin.low, profile_bin.high)})
     lines = "".join(
         f"M{x.at(edge):.1f} {top:g}V{bottom:g}"
         for edge in edges
         for top, bottom in ((_ERROR_TOP, _ERROR_BOTTOM), (_SCALE_TOP, _SCALE_BOTTOM))
     )
-    room = _DIGIT * max(len(label(edge)) for edge in edges)
+    label_width_px = _DIGIT_WIDTH_PX * max(len(tick_label(edge)) for edge in edges)
     labels = [
-        svg_text(round(x.at(edge), 1), _SCALE_BOTTOM + 17, label(edge), "middle")
-        for edge in spaced(edges, x, room)
+        svg_text(round(x.at(edge), 1), _SCALE_BOTTOM + 17, tick_label(edge), "middle")
+        for edge in select_spaced(edges, x, label_width_px)
     ]
     return f'<path class="axis" d="{lines}"/>{"".join(labels)}'
 
 
-def _rows(axis: LogAxis, ticks: Sequence[float]) -> str:
-    shown = spaced(ticks, axis, _LINE)
-    lines = "".join(f"M{_LEFT:g} {axis.at(tick):.1f}H{_RIGHT:g}" for tick in shown)
-    labels = [svg_text(_LEFT - _LABEL_GAP, round(axis.at(t) + 4.5, 1), label(t), "end") for t in shown]
+def _value_grid(axis: LogAxis, ticks: Sequence[float]) -> str:
+    labelled = select_spaced(ticks, axis, _LABEL_LINE_PX)
+    lines = "".join(f"M{_LEFT:g} {axis.at(tick):.1f}H{_RIGHT:g}" for tick in labelled)
+    labels = [svg_text(_LEFT - _LABEL_GAP_PX, round(axis.at(t) + 4.5, 1), tick_label(t), "end") for t in labelled]
     return f'<path class="axis" d="{lines}"/>{"".join(labels)}'
 
 
-def _series(points: Sequence[tuple[float, Estimate]], y: LogAxis, kind: str, mark: str) -> str:
-    """Return one alignment's marks, joined by a thin line, with their intervals behind them."""
-    places = [(x, y.at(one.value)) for x, one in points if one.value is not None]
-    joined = "L".join(f"{x:.1f} {at:.1f}" for x, at in places)
+def _series(points: Sequence[tuple[float, MeasureEstimate]], y: LogAxis, kind: str, mark: str) -> str:
+    """Return one alignment's markers, connected by a thin line, with their intervals behind them."""
+    points_px = [(x, y.at(estimate.value)) for x, estimate in points if estimate.value is not None]
+    path = "L".join(f"{x:.1f} {y_px:.1f}" for x, y_px in points_px)
     bars = "".join(
-        f"M{x:.1f} {y.at(one.interval[0]):.1f}V{y.at(one.interval[1]):.1f}"
-        for x, one in points
-        if one.interval is not None
+        f"M{x:.1f} {y.at(estimate.interval[0]):.1f}V{y.at(estimate.interval[1]):.1f}"
+        for x, estimate in points
+        if estimate.interval is not None
     )
     body = f'<path class="{kind} slim interval" d="{bars}"/>' if bars else ""
-    body += f'<path class="{kind} trend" d="M{joined}"/>' if len(places) > 1 else ""
+    body += f'<path class="{kind} trend" d="M{path}"/>' if len(points_px) > 1 else ""
     return body + "".join(
-        f'<circle class="{kind} {mark}" cx="{x:.1f}" cy="{at:.1f}" r="4.5"/>' for x, at in places
+        f'<circle class="{kind} {mark}" cx="{x:.1f}" cy="{y_px:.1f}" r="4.5"/>' for x, y_px in points_px
     )
 
 
-def _spoken(bins: Sequence[ProfileBin], unit: str) -> str:
+def _description(bins: Sequence[ProfileBin], unit: str) -> str:
     return "; ".join(
-        f"{one.low:g} to {one.high:g} {unit}: AbsRel native {number(_finite(one.native), 4)}, "
-        f"scaled {number(_finite(one.scaled), 4)}, s {scale_cell(_finite(one.scale))}"
-        for one in bins
+        f"{entry.low:g} to {entry.high:g} {unit}: AbsRel native {number(entry.native.value, 4)}, "
+        f"scaled {number(entry.scaled.value, 4)}, s {scale_cell(entry.scale.value)}"
+        for entry in bins
     )
-
-
-def _finite(one: Estimate) -> float | None:
-    return one.value if one.value is not None and math.isfinite(one.value) else None

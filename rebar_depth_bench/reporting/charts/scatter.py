@@ -1,4 +1,7 @@
-"""Native against oracle-scaled AbsRel, the paper's Figure 2: published points hollow, this archive's solid."""
+"""Scatter chart of native and oracle-scaled AbsRel, as in the paper's Figure 2.
+
+Published points are hollow, those of the submission are filled.
+"""
 
 from __future__ import annotations
 
@@ -7,70 +10,83 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from rebar_depth_bench.reporting.charts.axes import WIDTH, LogAxis, decade_axis, label, svg_figure, svg_text
-from rebar_depth_bench.reporting.formatting import number, printable
+from rebar_depth_bench.errors import printable
+from rebar_depth_bench.reporting.charts.axes import WIDTH, LogAxis, decade_axis, svg_figure, svg_text, tick_label
+from rebar_depth_bench.reporting.formatting import number
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52.0, WIDTH - 14.0, 14.0, 286.0
 _HALF_WIDTH, _HALF_HEIGHT = 8.0, 8.0
-_DIRECTIONS = ((1, 0), (-1, 0), (0, -1), (0, 1), (1, -1), (-1, 1), (1, 1), (-1, -1))
-_REACHES = (15.0, 24.0, 34.0)
-_MARGINS = (0.93, 1.07)
+_LABEL_DIRECTIONS = ((1, 0), (-1, 0), (0, -1), (0, 1), (1, -1), (-1, 1), (1, 1), (-1, -1))
+_LABEL_DISTANCES_PX = (15.0, 24.0, 34.0)
+_MARGIN_FACTORS = (0.93, 1.07)
 
-Ends = tuple[float, float] | None
+OptionalInterval = tuple[float, float] | None
 
 
 @dataclass(frozen=True)
 class ScatterPoint:
-    """One row's two AbsRel values, their intervals where known, and the ``mark`` that its row carries too."""
+    """Point of a table row: native and scaled AbsRel, their intervals or None, and the ``mark`` shown in both."""
 
     mark: str
     name: str
     native: float
     scaled: float
     published: bool
-    native_interval: Ends = None
-    scaled_interval: Ends = None
+    native_interval: OptionalInterval = None
+    scaled_interval: OptionalInterval = None
 
 
 def scatter_chart(title: str, points: Sequence[ScatterPoint]) -> Markup:
-    """Return the points on two logarithmic axes: native AbsRel to the right, scaled AbsRel upwards.
+    """Return the chart of the points on two logarithmic axes: native AbsRel along x, scaled AbsRel along y.
 
-    The dashed line is native = scaled: on it one scale per view changes nothing, far below it scale is all.
+    The dashed line is native = scaled. On it, one scale per view changes nothing; far below it, the error is
+    almost entirely one of scale.
     """
-    x_axis = decade_axis(_reached((p.native, p.native_interval) for p in points), _LEFT, _RIGHT)
-    y_axis = decade_axis(_reached((p.scaled, p.scaled_interval) for p in points), _BOTTOM, _TOP)
-    places = [(x_axis.at(p.native), y_axis.at(p.scaled)) for p in points]
-    marks = [_mark(point, *place, x_axis, y_axis) for point, place in zip(points, places, strict=True)]
+    x_axis = decade_axis(_axis_values((p.native, p.native_interval) for p in points), _LEFT, _RIGHT)
+    y_axis = decade_axis(_axis_values((p.scaled, p.scaled_interval) for p in points), _BOTTOM, _TOP)
+    points_px = [(x_axis.at(p.native), y_axis.at(p.scaled)) for p in points]
+    marks = [_mark(point, *place, x_axis, y_axis) for point, place in zip(points, points_px, strict=True)]
     labels = [
         svg_text(round(x, 1), round(y + 4.5, 1), point.mark, "middle" if point.published else "middle name")
-        for point, (x, y) in zip(points, label_places(places), strict=True)
+        for point, (x, y) in zip(points, place_labels(points_px), strict=True)
     ]
     body = _grid(x_axis, y_axis) + _diagonal(x_axis, y_axis) + "".join(marks) + "".join(labels)
-    spoken = "; ".join(
+    values_text = "; ".join(
         f"{p.mark}: {printable(p.name)}{', published' if p.published else ''}, "
         f"native {number(p.native, 4)}, scaled {number(p.scaled, 4)}"
         for p in points
     )
-    return svg_figure(title, f"AbsRel native and after the oracle scale. {spoken}.", _BOTTOM + 42, body)
+    return svg_figure(title, f"AbsRel native and after the oracle scale. {values_text}.", _BOTTOM + 42, body)
 
 
-def label_places(places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return a label's middle for each point, pixels: the nearest place where it meets no point and no label."""
-    placed: list[tuple[float, float]] = []
-    for x, y in places:
-        candidates = [(x + reach * dx, y + reach * dy) for reach in _REACHES for dx, dy in _DIRECTIONS]
+def place_labels(points_px: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the centre of each point's label, pixels.
+
+    This is the nearest candidate position with the fewest overlaps with points and labels already placed.
+    """
+    labels: list[tuple[float, float]] = []
+    for x, y in points_px:
+        candidates = [
+            (x + distance * dx, y + distance * dy)
+            for distance in _LABEL_DISTANCES_PX
+            for dx, dy in _LABEL_DIRECTIONS
+        ]
         inside = [(cx, cy) for cx, cy in candidates if _LEFT + 8 < cx < _RIGHT - 8 and _TOP < cy < _BOTTOM - 8]
-        placed.append(min(inside or candidates, key=lambda at: _met(at, [*places, *placed])))
-    return placed
+        labels.append(
+            min(inside or candidates, key=lambda candidate: _overlap_count(candidate, [*points_px, *labels]))
+        )
+    return labels
 
 
-def _met(at: tuple[float, float], others: Iterable[tuple[float, float]]) -> int:
-    return sum(abs(at[0] - x) < 2 * _HALF_WIDTH - 2 and abs(at[1] - y) < 2 * _HALF_HEIGHT - 2 for x, y in others)
+def _overlap_count(centre: tuple[float, float], others: Iterable[tuple[float, float]]) -> int:
+    return sum(
+        abs(centre[0] - x) < 2 * _HALF_WIDTH - 2 and abs(centre[1] - y) < 2 * _HALF_HEIGHT - 2 for x, y in others
+    )
 
 
-def _reached(values: Iterable[tuple[float, Ends]]) -> list[float]:
-    found = [number for value, ends in values for number in (value, *(ends or ()))]
-    return [number * margin for number in found for margin in _MARGINS]
+def _axis_values(values: Iterable[tuple[float, OptionalInterval]]) -> list[float]:
+    numbers = [number for value, ends in values for number in (value, *(ends or ()))]
+    return [number * margin for number in numbers for margin in _MARGIN_FACTORS]
 
 
 def _mark(point: ScatterPoint, x: float, y: float, x_axis: LogAxis, y_axis: LogAxis) -> str:
@@ -97,8 +113,8 @@ def _diagonal(x_axis: LogAxis, y_axis: LogAxis) -> str:
 def _grid(x_axis: LogAxis, y_axis: LogAxis) -> str:
     lines = "".join(f"M{x_axis.at(t):.1f} {_TOP:g}V{_BOTTOM:g}" for t in x_axis.ticks())
     lines += "".join(f"M{_LEFT:g} {y_axis.at(t):.1f}H{_RIGHT:g}" for t in y_axis.ticks())
-    labels = [svg_text(round(x_axis.at(t), 1), _BOTTOM + 17, label(t), "middle") for t in x_axis.ticks()]
-    labels += [svg_text(_LEFT - 7, round(y_axis.at(t) + 4.5, 1), label(t), "end") for t in y_axis.ticks()]
+    labels = [svg_text(round(x_axis.at(t), 1), _BOTTOM + 17, tick_label(t), "middle") for t in x_axis.ticks()]
+    labels += [svg_text(_LEFT - 7, round(y_axis.at(t) + 4.5, 1), tick_label(t), "end") for t in y_axis.ticks()]
     titles = svg_text((_LEFT + _RIGHT) / 2, _BOTTOM + 36, "native AbsRel", "middle")
     titles += (
         f'<g transform="rotate(-90 12 {_BOTTOM / 2:g})">{svg_text(12, _BOTTOM / 2, "scaled AbsRel", "middle")}</g>'

@@ -1,1 +1,1 @@
-"""HTML reports: pages, their sections, templates and scripts."""
+"""HTML reports and study pages: contexts, templates, scripts and style sheets."""

@@ -1,7 +1,4 @@
-"""The page's one inline script and the policy that lets this script run and nothing else.
-
-The templates of the pages: every value escaped, no undefined name passed over.
-"""
+"""Inline script with its Content-Security-Policy, and the Jinja environment of the pages."""
 
 from __future__ import annotations
 
@@ -16,17 +13,17 @@ from markupsafe import Markup
 
 @dataclass(frozen=True)
 class InlineScript:
-    """``text`` stands between the script's tags as it is; ``policy`` is the page's Content-Security-Policy."""
+    """Script of a page: ``text`` is its unescaped source, ``policy`` the page's Content-Security-Policy."""
 
     text: Markup
     policy: str
 
 
 def inline_script(*names: str) -> InlineScript:
-    """Return the scripts of this package of these ``names`` as one, and a policy that allows it by its digest.
+    """Return the concatenated scripts ``names`` of this package, and a policy that allows them by digest.
 
-    The policy follows W3C Content Security Policy Level 3, section 2.3.1 (hash source): no other script, no
-    request, images from the page itself.
+    The policy uses a hash source (W3C Content Security Policy Level 3, section 2.3.1). It forbids other scripts
+    and all requests; images must be data URIs.
     """
     folder = files("rebar_depth_bench.reporting.html")
     text = "\n" + "".join(folder.joinpath(name).read_text(encoding="utf-8") for name in names)
@@ -36,7 +33,10 @@ def inline_script(*names: str) -> InlineScript:
 
 
 def environment(*loaders: BaseLoader) -> Environment:
-    """Return the environment that pages are rendered in: templates of ``loaders``, then the report's."""
+    """Return the Jinja environment of pages, which looks templates up in ``loaders``, then in this package.
+
+    All values are escaped, and undefined names raise an error.
+    """
     return Environment(
         loader=ChoiceLoader([*loaders, PackageLoader("rebar_depth_bench.reporting", "html")]),
         autoescape=True,

@@ -1,7 +1,4 @@
-"""The extended measures' part of the page: charts, inspection, tolerances, and the other families folded away.
-
-Extended measures as rows of cells, and what each of them means in words.
-"""
+"""Extended measures section of the report: charts, inspection measures, tolerances and collapsed families."""
 
 from __future__ import annotations
 
@@ -13,30 +10,30 @@ from itertools import pairwise
 
 from markupsafe import Markup
 
-from rebar_depth_bench.extended.evaluate import FAMILIES, NATIVE, ONCE, SCALED, Family
+from rebar_depth_bench.errors import printable
+from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, NATIVE, ONCE, SCALED, MeasureFamily
 from rebar_depth_bench.extended.inspection.evaluate import MEASURES as INSPECTION_MEASURES
 from rebar_depth_bench.extended.inspection.measures import MISS_MM, capability_name
 from rebar_depth_bench.extended.inspection.tolerances import PROFILES, Tolerance, ToleranceProfile, pass_sample
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.point_cloud import TOLERANCES_MM
 from rebar_depth_bench.extended.profiles import AXES, bin_names
-from rebar_depth_bench.extended.result import Estimate, ExtendedResult, ExtendedTable
-from rebar_depth_bench.reporting import formatting
+from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting.charts.profile import ProfileBin, profile_chart
-from rebar_depth_bench.reporting.extended_tables import MISSED, NOT_TOLD, is_miss
+from rebar_depth_bench.reporting.extended_tables import MISSED, UNDEFINED, is_miss
 from rebar_depth_bench.reporting.formatting import DASH, number
 from rebar_depth_bench.reporting.html.rows import Cell
 
 _DECIMALS: Mapping[str, int] = {"mm": 2, "cm": 2, "m": 3, "%": 1, "": 4}
 _RATIO_DECIMALS = 2
 _ARROWS: Mapping[str, str] = {"lower": "↓", "higher": "↑", "": ""}
-_STEP = re.compile(r"\d[\d.]*(?:-[\d.]+)?(?= (?:mm|%|m|px)(?!\w))")
-"""The tolerance, threshold or bin in a measure's title: a number with a unit."""
+_TITLE_NUMBER = re.compile(r"\d[\d.]*(?:-[\d.]+)?(?= (?:mm|%|m|px)(?!\w))")
+"""Tolerance, threshold or bin in a measure's title: a number followed by a unit."""
 
 
 @dataclass(frozen=True)
 class MeasureRow:
-    """One measure: a cell per alignment, and how many samples they stand on."""
+    """Table row of one measure: a cell per alignment, and the numbers of samples."""
 
     name: str
     unit: str
@@ -46,43 +43,53 @@ class MeasureRow:
 
 
 @dataclass(frozen=True)
-class Meaning:
-    """What a number, or numbers that differ by a tolerance or a bin alone, say."""
+class MeasureDefinition:
+    """Definition of a measure, or of measures that differ only in a tolerance or bin."""
 
     name: str
     definition: str
 
 
 def measure_rows(table: ExtendedTable, measures: Iterable[Measure], alignments: Sequence[str]) -> list[MeasureRow]:
-    """Return a row for each measure that has a value under one of the ``alignments``, in the measures' order."""
+    """Return a row for each measure that has samples under any of the ``alignments``, in order."""
     rows = []
     for measure in measures:
-        found = [table.numbers[alignment][measure.name] for alignment in alignments]
-        if any(one.samples for one in found):
-            rows.append(_row(measure, found))
+        estimates = [table.numbers[alignment][measure.name] for alignment in alignments]
+        if any(estimate.samples for estimate in estimates):
+            rows.append(_measure_row(measure, estimates))
     return rows
 
 
-def estimate_cell(one: Estimate, measure: Measure) -> Cell:
-    """Return an estimate as its measure's unit spells it, with its interval."""
+def estimate_cell(estimate: MeasureEstimate, measure: Measure) -> Cell:
+    """Return the cell of an estimate with its interval, formatted in the measure's unit."""
     factor = 100.0 if measure.unit == "%" else 1.0
     decimals = _decimals(measure)
-    if one.value is None:
-        return Cell(NOT_TOLD if one.samples else DASH, None)
-    if not math.isfinite(one.value):
+    if estimate.value is None:
+        return Cell(UNDEFINED if estimate.samples else DASH, None)
+    if not math.isfinite(estimate.value):
         return Cell("∞" if measure.convert is not None else DASH, None)
-    if is_miss(one, measure):
-        told = one.interval is not None and one.interval[0] < one.interval[1]
-        return Cell(MISSED, one.value, _between(one.interval, factor, decimals) if told else "")
-    return Cell(_signed(one.value * factor, decimals), one.value, _between(one.interval, factor, decimals))
+    if is_miss(estimate, measure):
+        informative = estimate.interval is not None and estimate.interval[0] < estimate.interval[1]
+        return Cell(
+            MISSED, estimate.value, _interval_text(estimate.interval, factor, decimals) if informative else ""
+        )
+    return Cell(
+        _format_signed(estimate.value * factor, decimals),
+        estimate.value,
+        _interval_text(estimate.interval, factor, decimals),
+    )
 
 
-def meanings(measures: Iterable[Measure]) -> list[Meaning]:
-    """Return each measure's definition; measures that differ by a step alone share one, with N for the step."""
-    alike: dict[str, list[Measure]] = {}
+def measure_definitions(measures: Iterable[Measure]) -> list[MeasureDefinition]:
+    """Return the definitions of the measures.
+
+    Measures whose titles differ only in a tolerance or bin share one definition, in which N stands for that
+    number.
+    """
+    by_title: dict[str, list[Measure]] = {}
     for measure in measures:
-        alike.setdefault(_STEP.sub("N", measure.title, count=1), []).append(measure)
-    return [_meaning(title, same) for title, same in alike.items()]
+        by_title.setdefault(_TITLE_NUMBER.sub("N", measure.title, count=1), []).append(measure)
+    return [_measure_definition(title, group) for title, group in by_title.items()]
 
 
 def _decimals(measure: Measure) -> int:
@@ -91,34 +98,34 @@ def _decimals(measure: Measure) -> int:
     return _DECIMALS[measure.unit]
 
 
-def _meaning(title: str, same: Sequence[Measure]) -> Meaning:
-    first = same[0]
-    if len(same) == 1:
-        return Meaning(first.title, first.definition)
-    steps = [step[0] for one in same if (step := _STEP.search(one.title))]
-    definition = _STEP.sub(lambda step: "N" if step[0] == steps[0] else step[0], first.definition)
-    return Meaning(title, f"{definition}; N: {', '.join(steps)}")
+def _measure_definition(title: str, measures: Sequence[Measure]) -> MeasureDefinition:
+    first = measures[0]
+    if len(measures) == 1:
+        return MeasureDefinition(first.title, first.definition)
+    steps = [step[0] for measure in measures if (step := _TITLE_NUMBER.search(measure.title))]
+    definition = _TITLE_NUMBER.sub(lambda step: "N" if step[0] == steps[0] else step[0], first.definition)
+    return MeasureDefinition(title, f"{definition}; N: {', '.join(steps)}")
 
 
-def _row(measure: Measure, found: Sequence[Estimate]) -> MeasureRow:
-    samples = list(dict.fromkeys(str(one.samples) for one in found))
-    cells = [estimate_cell(one, measure) for one in found]
+def _measure_row(measure: Measure, estimates: Sequence[MeasureEstimate]) -> MeasureRow:
+    samples = list(dict.fromkeys(str(estimate.samples) for estimate in estimates))
+    cells = [estimate_cell(estimate, measure) for estimate in estimates]
     return MeasureRow(measure.title, measure.unit, _ARROWS[measure.better], cells, " / ".join(samples))
 
 
-def _between(ends: tuple[float, float] | None, factor: float, decimals: int) -> str:
+def _interval_text(ends: tuple[float, float] | None, factor: float, decimals: int) -> str:
     if ends is None or not all(map(math.isfinite, ends)):
         return ""
     joint = " to " if ends[0] < 0 else " – "
-    return joint.join(_signed(end * factor, decimals) for end in ends)
+    return joint.join(_format_signed(end * factor, decimals) for end in ends)
 
 
-def _signed(value: float, decimals: int) -> str:
+def _format_signed(value: float, decimals: int) -> str:
     return number(value, decimals).replace("-", "−")
 
 
-_ASIDES: Mapping[str, str] = {NATIVE: "no alignment", SCALED: "oracle median scale per view"}
-_ONCE_ASIDES: Mapping[str, str] = {
+_ALIGNMENT_NOTES: Mapping[str, str] = {NATIVE: "no alignment", SCALED: "oracle median scale per view"}
+_ONCE_NOTES: Mapping[str, str] = {
     "alignment": "own alignment, named in the row",
     "boundary": "no scale changes it",
 }
@@ -126,45 +133,46 @@ _AXIS_TITLES: Mapping[str, tuple[str, str]] = {
     "m": ("distance", "m"),
     "px": ("bar width in the picture", "pixels"),
 }
-_FOLDED = ("alignment", "full_mask", "boundary", "layers", "clouds")
+_FOLDED_FAMILIES = ("alignment", "full_mask", "boundary", "layers", "clouds")
 
-FIRST = (
+MAIN_INSPECTION_MEASURES = (
     "bars_found",
     "axis_offset_median_mm",
     "axis_offset_p95_mm",
     *(f"{kind}_{size}_mm" for kind in ("spacing", "layer", "diameter", "cover") for size in ("bias", "p95")),
 )
-"""What an inspector asks first."""
+"""Inspection measures that are shown openly; the others are collapsed."""
 
 _CLOUD_KINDS = ("accuracy", "completeness", "f")
 
 
 @dataclass(frozen=True)
-class Head:
-    """A column's alignment, and what that alignment is."""
+class AlignmentHead:
+    """Column heading: an alignment and a note that explains it."""
 
     alignment: str
     aside: str
 
 
 @dataclass(frozen=True)
-class MeasureTable:
-    """Measures of one family; ``kind`` is "grid" where rows are tolerances and columns are three shares.
+class ExtendedMeasureTable:
+    """Table of the measures of one family.
 
-    ``note`` says what a number stands for that is none; empty where there is no such number.
+    ``kind`` is "grid" for a table of tolerances (rows) by three shares (columns), else "rows". ``note`` explains a
+    placeholder in the cells; it is empty if there is none.
     """
 
     title: str
     kind: str
-    heads: list[Head]
+    heads: list[AlignmentHead]
     rows: list[MeasureRow]
-    meanings: list[Meaning]
+    measure_definitions: list[MeasureDefinition]
     note: str = ""
 
 
 @dataclass(frozen=True)
 class ToleranceRow:
-    """One line of a standard: pass rates, then capabilities, each native and scaled."""
+    """Table row of one tolerance of a standard: pass rates, then capabilities, each native and scaled."""
 
     standard: str
     name: str
@@ -174,24 +182,24 @@ class ToleranceRow:
 
 @dataclass(frozen=True)
 class ExtendedConfig:
-    """One config's extended measures, spelled; ``charts`` are captions and pictures."""
+    """Formatted extended measures of one config; ``charts`` are pairs of caption and SVG."""
 
     name: str
     views: int
     charts: list[tuple[str, Markup]]
-    first: MeasureTable
-    more: MeasureTable
+    main_inspection: ExtendedMeasureTable
+    other_inspection: ExtendedMeasureTable
     tolerances: list[ToleranceRow]
-    families: list[MeasureTable]
+    families: list[ExtendedMeasureTable]
 
-    def not_told(self) -> bool:
-        """Return whether a capability is of what was not found."""
-        return any(cell.text == NOT_TOLD for row in self.tolerances for cell in row.cells)
+    def has_undefined_capability(self) -> bool:
+        """Return whether any capability is undefined, because too many bars were not found."""
+        return any(cell.text == UNDEFINED for row in self.tolerances for cell in row.cells)
 
 
 @dataclass(frozen=True)
 class ExtendedSection:
-    """All configs, and where the tolerances come from."""
+    """Context of the section: its protocol, all configs, and the profiles that define the tolerances."""
 
     protocol: str
     configs: list[ExtendedConfig]
@@ -199,77 +207,86 @@ class ExtendedSection:
 
 
 def extended_section(extended: ExtendedResult) -> ExtendedSection:
-    """Return what ``part_extended.html.j2`` shows."""
-    configs = [_config(name, table) for name, table in extended.tables.items()]
+    """Return the context of ``part_extended.html.j2``."""
+    configs = [_extended_config(name, table) for name, table in extended.tables.items()]
     return ExtendedSection(EXTENDED_PROTOCOL, configs, PROFILES)
 
 
-def _config(name: str, table: ExtendedTable) -> ExtendedConfig:
-    inspection = FAMILIES["inspection"]
+def _extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
+    inspection = MEASURE_FAMILIES["inspection"]
     by_name = {measure.name: measure for measure in INSPECTION_MEASURES}
-    passes = {pass_sample(tolerance) for profile in PROFILES for tolerance in profile.tolerances}
-    rest = [one for one in INSPECTION_MEASURES if one.name not in passes and one.name not in FIRST]
-    folded = [_folded(table, key) for key in _FOLDED]
-    charts = [(_AXIS_TITLES[axis][0], _chart(table, axis)) for axis in AXES]
+    pass_rate_names = {pass_sample(tolerance) for profile in PROFILES for tolerance in profile.tolerances}
+    other = [
+        measure
+        for measure in INSPECTION_MEASURES
+        if measure.name not in pass_rate_names and measure.name not in MAIN_INSPECTION_MEASURES
+    ]
+    folded = [_folded_table(table, key) for key in _FOLDED_FAMILIES]
+    charts = [(_AXIS_TITLES[axis][0], _profile_chart(table, axis)) for axis in AXES]
     return ExtendedConfig(
-        name=formatting.printable(name),
+        name=printable(name),
         views=table.views,
         charts=[(title, chart) for title, chart in charts if chart],
-        first=_table(table, inspection.title, inspection, [by_name[one] for one in FIRST]),
-        more=_table(table, "Inspection: spread, median, found bars alone", inspection, rest),
-        tolerances=[_tolerance(table, *line) for line in _tolerance_lines()],
-        families=[one for one in [*folded, _profile(table)] if one.rows],
+        main_inspection=_measure_table(
+            table, inspection.title, inspection, [by_name[key] for key in MAIN_INSPECTION_MEASURES]
+        ),
+        other_inspection=_measure_table(table, "Inspection: spread, median, found bars alone", inspection, other),
+        tolerances=[_tolerance_row(table, *line) for line in _all_tolerances()],
+        families=[family for family in [*folded, _profile_table(table)] if family.rows],
     )
 
 
-def _tolerance_lines() -> list[tuple[ToleranceProfile, Tolerance]]:
+def _all_tolerances() -> list[tuple[ToleranceProfile, Tolerance]]:
     return [(profile, tolerance) for profile in PROFILES for tolerance in profile.tolerances]
 
 
-def _folded(table: ExtendedTable, key: str) -> MeasureTable:
-    family = FAMILIES[key]
+def _folded_table(table: ExtendedTable, key: str) -> ExtendedMeasureTable:
+    family = MEASURE_FAMILIES[key]
     if key == "clouds":
-        return _clouds(table, family)
-    return _table(table, family.title, family, family.measures, _ONCE_ASIDES.get(key, ""))
+        return _cloud_table(table, family)
+    return _measure_table(table, family.title, family, family.measures, _ONCE_NOTES.get(key, ""))
 
 
-def _table(
-    table: ExtendedTable, title: str, family: Family, measures: Iterable[Measure], once_aside: str = ""
-) -> MeasureTable:
+def _measure_table(
+    table: ExtendedTable, title: str, family: MeasureFamily, measures: Iterable[Measure], once_aside: str = ""
+) -> ExtendedMeasureTable:
     listed = list(measures)
-    heads = [Head(one, once_aside if one == ONCE else _ASIDES[one]) for one in family.alignments]
+    heads = [
+        AlignmentHead(alignment, once_aside if alignment == ONCE else _ALIGNMENT_NOTES[alignment])
+        for alignment in family.alignments
+    ]
     rows = measure_rows(table, listed, family.alignments)
-    return MeasureTable(title, "rows", heads, rows, meanings(listed), _miss_note(rows))
+    return ExtendedMeasureTable(title, "rows", heads, rows, measure_definitions(listed), _miss_note(rows))
 
 
 def _miss_note(rows: Iterable[MeasureRow]) -> str:
-    missed = any(cell.text == MISSED for row in rows for cell in row.cells)
-    return f"{MISSED}: {MISS_MM:g} mm, which stands for what was not found." if missed else ""
+    has_miss = any(cell.text == MISSED for row in rows for cell in row.cells)
+    return f"{MISSED}: {MISS_MM:g} mm, which stands for what was not found." if has_miss else ""
 
 
-def _profile(table: ExtendedTable) -> MeasureTable:
-    family = FAMILIES["profile"]
-    return _table(table, f"{family.title}: the numbers", family, family.measures)
+def _profile_table(table: ExtendedTable) -> ExtendedMeasureTable:
+    family = MEASURE_FAMILIES["profile"]
+    return _measure_table(table, f"{family.title}: the numbers", family, family.measures)
 
 
-def _clouds(table: ExtendedTable, family: Family) -> MeasureTable:
-    """Return a row per tolerance with accuracy, completeness and F-score, native and then scaled."""
+def _cloud_table(table: ExtendedTable, family: MeasureFamily) -> ExtendedMeasureTable:
+    """Return one row per tolerance with accuracy, completeness and F-score, first native, then scaled."""
     measures = {measure.name: measure for measure in family.measures}
     rows = []
     for tolerance_mm in TOLERANCES_MM:
         names = [f"cloud_{kind}_{tolerance_mm}mm" for kind in _CLOUD_KINDS]
-        found = [
+        estimates_and_measures = [
             (table.numbers[alignment][name], measures[name]) for alignment in family.alignments for name in names
         ]
-        if any(one.samples for one, _ in found):
-            cells = [estimate_cell(one, measure) for one, measure in found]
-            rows.append(MeasureRow(f"{tolerance_mm}", "mm", "", cells, str(found[0][0].samples)))
-    heads = [Head(one, _ASIDES[one]) for one in family.alignments]
-    return MeasureTable(family.title, "grid", heads, rows, meanings(family.measures))
+        if any(estimate.samples for estimate, _ in estimates_and_measures):
+            cells = [estimate_cell(estimate, measure) for estimate, measure in estimates_and_measures]
+            rows.append(MeasureRow(f"{tolerance_mm}", "mm", "", cells, str(estimates_and_measures[0][0].samples)))
+    heads = [AlignmentHead(alignment, _ALIGNMENT_NOTES[alignment]) for alignment in family.alignments]
+    return ExtendedMeasureTable(family.title, "grid", heads, rows, measure_definitions(family.measures))
 
 
-def _tolerance(table: ExtendedTable, profile: ToleranceProfile, tolerance: Tolerance) -> ToleranceRow:
-    measures = {measure.name: measure for measure in FAMILIES["inspection"].measures}
+def _tolerance_row(table: ExtendedTable, profile: ToleranceProfile, tolerance: Tolerance) -> ToleranceRow:
+    measures = {measure.name: measure for measure in MEASURE_FAMILIES["inspection"].measures}
     cells = [
         estimate_cell(table.numbers[alignment][name], measures[name])
         for name in (pass_sample(tolerance), capability_name(tolerance))
@@ -279,7 +296,7 @@ def _tolerance(table: ExtendedTable, profile: ToleranceProfile, tolerance: Toler
     return ToleranceRow(profile.title, tolerance.title, limit_mm, cells)
 
 
-def _chart(table: ExtendedTable, axis: str) -> Markup:
+def _profile_chart(table: ExtendedTable, axis: str) -> Markup:
     native, scaled = table.numbers[NATIVE], table.numbers[SCALED]
     edges = AXES[axis]
     bins = [

@@ -1,9 +1,9 @@
-"""A result as one self-contained HTML page: no requests, complete without its script, same input, same bytes.
+"""HTML report of a scored submission, as one self-contained page.
 
-The script sorts tables and shows views one at a time. Every text that comes from an archive or a dataset passes
-``printable`` and jinja's escaping. Sections are templates of their own, ``part_*.html.j2``.
-
-The report of a scored archive: picks the views to show and gathers their pictures.
+The page makes no requests, is complete without its script, and has the same bytes for the same input. The script
+sorts tables and shows views one at a time. All text from a submission or a dataset passes through ``printable``
+and Jinja's escaping. Each section has its own template, ``part_*.html.j2``. ``write_report`` also selects the
+views to show and loads their images.
 """
 
 from __future__ import annotations
@@ -19,46 +19,50 @@ from markupsafe import Markup
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.data.dataset import decode_row, load_undecoded
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import score_charts
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.assets import environment, inline_script
 from rebar_depth_bench.reporting.html.extended import extended_section
 from rebar_depth_bench.reporting.html.published import paper_scenes
-from rebar_depth_bench.reporting.html.rows import Row, table_row, view_row
+from rebar_depth_bench.reporting.html.rows import ScoreRow, table_row, view_row
 from rebar_depth_bench.reporting.html.view_browser import (
     VIEWS_SHOWN,
     ShownView,
-    counted,
+    shown_counts,
     shown_views,
     views_to_show,
 )
 from rebar_depth_bench.reporting.html.view_images import ViewPanels, colour_bar_uri
 from rebar_depth_bench.reporting.published import load_published
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
-from rebar_depth_bench.scoring.result import Result, ViewScore, badness
+from rebar_depth_bench.scoring.result import Result, ViewScore, sort_key_worst_first
 from rebar_depth_bench.submission import SubmissionReader, config_of, open_submission
 
 WORST_SHOWN = 10
-"""Views of a config that are listed at once; the others are folded away."""
+"""Number of views of a config that are listed openly; the full list is collapsed."""
 
 
 @dataclass(frozen=True)
-class ConfigViews:
-    """One config's views: chart, the worst ones, and all of them in protocol order where these are more."""
+class ConfigViewTables:
+    """View tables of one config: chart, rows of the worst views, and rows of all views in protocol order.
+
+    ``all`` is empty if the worst views are all views.
+    """
 
     name: str
     chart: Markup
-    worst: list[Row]
-    all: list[Row]
+    worst: list[ScoreRow]
+    all: list[ScoreRow]
     views: int
 
 
 def render_report(result: Result, panels: Iterable[ViewPanels], *, title: str | None = None) -> str:
-    """Return the report of ``result`` with the images of each of ``panels``, config by config, worst first.
+    """Return the HTML report of ``result`` with the images of ``panels``, by config, worst view first.
 
-    ``panels`` may come in any order and is gone through once: only the encoded images stay in memory.
-    ``title`` defaults to the method's name.
+    ``panels`` may be in any order and is iterated once; only the encoded images stay in memory. ``title`` defaults
+    to the method's name.
     """
     views = views_by_config(result)
     shown = shown_views(panels, list(result.tables))
@@ -67,9 +71,9 @@ def render_report(result: Result, panels: Iterable[ViewPanels], *, title: str | 
         environment()
         .get_template("report.html.j2")
         .render(
-            title=formatting.printable(title if title is not None else result.method),
-            method=formatting.printable(result.method),
-            stamps=_stamps(result),
+            title=printable(title if title is not None else result.method),
+            method=printable(result.method),
+            stamps=_provenance(result),
             protocol=PROTOCOL,
             script=script.text,
             policy=script.policy,
@@ -77,17 +81,17 @@ def render_report(result: Result, panels: Iterable[ViewPanels], *, title: str | 
             tolerances=WITHIN_MM,
             dash_note=formatting.DASH_NOTE,
             min_coverage=f"{MIN_RANKED_COVERAGE * 100:.0f}",
-            **results_part(result, views),
-            **paper_part(result),
-            **_extended(result),
-            **_browser(shown, views),
-            **_every_view(result, views),
+            **results_context(result, views),
+            **paper_context(result),
+            **_extended_context(result),
+            **_browser_context(shown, views),
+            **_views_context(result, views),
         )
     )
 
 
-def results_part(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
-    """Return what ``part_results.html.j2`` shows."""
+def results_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
+    """Return the context of ``part_results.html.j2``."""
     rows = [table_row(name, table) for name, table in result.tables.items()]
     return {
         "rows": rows,
@@ -98,8 +102,8 @@ def results_part(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> di
     }
 
 
-def paper_part(result: Result) -> dict[str, object]:
-    """Return what ``part_paper.html.j2`` shows."""
+def paper_context(result: Result) -> dict[str, object]:
+    """Return the context of ``part_paper.html.j2``."""
     published = load_published()
     return {
         "paper_scenes": paper_scenes(result),
@@ -108,49 +112,49 @@ def paper_part(result: Result) -> dict[str, object]:
     }
 
 
-def _extended(result: Result) -> dict[str, object]:
-    """Return what ``part_extended.html.j2`` shows, None where the archive was scored without."""
+def _extended_context(result: Result) -> dict[str, object]:
+    """Return the context of ``part_extended.html.j2``, None for a result without extended measures."""
     return {"extended": None if result.extended is None else extended_section(result.extended)}
 
 
-def _browser(shown: Sequence[ShownView], views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
-    """Return what ``part_browser.html.j2`` shows."""
+def _browser_context(shown: Sequence[ShownView], views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
+    """Return the context of ``part_browser.html.j2``."""
     return {
         "shown": shown,
-        "shown_counts": counted(shown, {name: len(scores) for name, scores in views.items()}),
+        "shown_counts": shown_counts(shown, {name: len(scores) for name, scores in views.items()}),
         "depth_bar": colour_bar_uri(DEPTH_COLOURS[::-1]),
         "error_bar": colour_bar_uri(ERROR_COLOURS),
     }
 
 
-def _every_view(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
-    """Return what ``part_views.html.j2`` shows."""
-    configs = [_config(name, views[name]) for name in result.tables]
-    return {"configs": configs, "dash_in_views": any(row.has_dash() for one in configs for row in one.worst)}
+def _views_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
+    """Return the context of ``part_views.html.j2``."""
+    configs = [_config_views(name, views[name]) for name in result.tables]
+    return {"configs": configs, "dash_in_views": any(row.has_dash() for config in configs for row in config.worst)}
 
 
-def _stamps(result: Result) -> list[tuple[str, str]]:
+def _provenance(result: Result) -> list[tuple[str, str]]:
     return [
         ("Protocol", PROTOCOL),
-        ("Dataset version", formatting.printable(result.dataset_version)),
-        ("Dataset digest", formatting.printable(result.dataset_digest)),
-        ("Archive sha256", formatting.printable(result.submission_sha256.removeprefix("sha256:"))),
-        ("Software", f"rebar-depth-bench {formatting.printable(result.software_version)}"),
+        ("Dataset version", printable(result.dataset_version)),
+        ("Dataset digest", printable(result.dataset_digest)),
+        ("Archive sha256", printable(result.submission_sha256.removeprefix("sha256:"))),
+        ("Software", f"rebar-depth-bench {printable(result.software_version)}"),
     ]
 
 
 def views_by_config(result: Result) -> Mapping[str, list[ViewScore]]:
-    """Return the views of each config, in protocol order."""
+    """Return the view scores by config, in protocol order."""
     views: dict[str, list[ViewScore]] = {name: [] for name in result.tables}
     for view in result.views:
         views.setdefault(config_of(view.view_id), []).append(view)
     return views
 
 
-def _config(name: str, views: Sequence[ViewScore]) -> ConfigViews:
-    worst = sorted(views, key=badness, reverse=True)[:WORST_SHOWN]
-    return ConfigViews(
-        name=formatting.printable(name),
+def _config_views(name: str, views: Sequence[ViewScore]) -> ConfigViewTables:
+    worst = sorted(views, key=sort_key_worst_first, reverse=True)[:WORST_SHOWN]
+    return ConfigViewTables(
+        name=printable(name),
         chart=score_charts.views_chart(name, views),
         worst=[view_row(view) for view in worst],
         all=[view_row(view) for view in views] if len(views) > WORST_SHOWN else [],
@@ -169,10 +173,10 @@ def write_report(
     *,
     views_shown: int = VIEWS_SHOWN,
 ) -> None:
-    """Write the HTML report of ``result``, which came from scoring ``archive`` on ``root``.
+    """Write the HTML report of ``result``, the scores of the submission ``archive`` on the dataset ``root``.
 
-    Of each config up to ``views_shown`` views are shown in pictures: the worst by native AbsRel, then evenly down
-    to the best. Raises ``InputError`` where ``views_shown`` is negative.
+    Up to ``views_shown`` views of each config are shown with images: the worst by native AbsRel, then evenly
+    spaced down to the best. Raises ``InputError`` if ``views_shown`` is negative.
     """
     chosen = {
         config: views_to_show([view for view in result.views if config_of(view.view_id) == config], views_shown)
@@ -180,14 +184,14 @@ def write_report(
     }
     folder = open_folder(root)
     with open_submission(archive, folder.expected_views()) as submission:
-        page = render_report(result, panels_of(chosen, root, submission))
+        page = render_report(result, iter_view_panels(chosen, root, submission))
     write_text(target, page)
 
 
-def panels_of(
+def iter_view_panels(
     chosen: Mapping[str, list[ViewScore]], root: str | Path, submission: SubmissionReader
 ) -> Iterator[ViewPanels]:
-    """Yield the arrays of the chosen views one view at a time; rows of other views are streamed past undecoded."""
+    """Yield the arrays of the chosen views (by config), one view at a time; other rows are not decoded."""
     for config, views in chosen.items():
         scores = {view.view_id: view for view in views}
         if scores:

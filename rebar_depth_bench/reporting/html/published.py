@@ -1,4 +1,4 @@
-"""A result beside the paper's published rows of the same scene: shown together, never ranked together."""
+"""Paper section of the report: a result beside the published rows of the same scene, not ranked with them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FIRST_LETTER = ord("A")
 
 @dataclass(frozen=True)
 class PaperRow:
-    """One line of a scene's table: RMSE cm, AbsRel, AbsRel_s, s; ``mark`` names its point in the chart."""
+    """Row of a scene's table: RMSE (cm), AbsRel, AbsRel_s, s; ``mark`` labels its point in the chart."""
 
     mark: str
     name: str
@@ -29,7 +29,7 @@ class PaperRow:
 
 @dataclass(frozen=True)
 class PaperScene:
-    """A scene of both: this archive's configs first, then the published rows, measured at ``distance``."""
+    """Scene of Table I: rows of the submission's configs, then the published rows, measured at ``distance``."""
 
     heading: str
     distance: str
@@ -38,25 +38,29 @@ class PaperScene:
 
 
 def paper_scenes(result: Result) -> list[PaperScene]:
-    """Return the scenes of Table I that the result has configs of, in the paper's order."""
-    own: dict[str, dict[str, Table]] = {}
+    """Return the scenes of Table I for which the result has configs, in the paper's order."""
+    tables_by_scene: dict[str, dict[str, Table]] = {}
     for config, table in result.tables.items():
-        own.setdefault(paper_scene(config) or "", {})[config] = table
+        tables_by_scene.setdefault(paper_scene(config) or "", {})[config] = table
     scenes = load_published().scenes
-    return [_paper_scene(name, scene, own[name]) for name, scene in scenes.items() if name in own]
+    return [
+        _paper_scene(name, scene, tables_by_scene[name])
+        for name, scene in scenes.items()
+        if name in tables_by_scene
+    ]
 
 
 def _paper_scene(name: str, scene: PublishedScene, tables: Mapping[str, Table]) -> PaperScene:
-    letters = [_letters(index) for index in range(len(tables))]
+    letters = [_letter_mark(index) for index in range(len(tables))]
     numbers = [str(index + 1) for index in range(len(scene.rows))]
-    rows = [_own_row(*both) for both in zip(letters, tables.items(), strict=True)]
-    rows += [published_row(*both) for both in zip(numbers, scene.rows, strict=True)]
+    rows = [_own_row(*arguments) for arguments in zip(letters, tables.items(), strict=True)]
+    rows += [published_row(*arguments) for arguments in zip(numbers, scene.rows, strict=True)]
     heading = scene.title if scene.title.lower() == name else f"{scene.title} ({name})"
-    chart = scatter_chart(f"{heading}: native and scaled AbsRel", _points(rows, tables))
+    chart = scatter_chart(f"{heading}: native and scaled AbsRel", _scatter_points(rows, tables))
     return PaperScene(heading, scene.distance, chart, rows)
 
 
-def _letters(index: int) -> str:
+def _letter_mark(index: int) -> str:
     return chr(_FIRST_LETTER + index) if index < 26 else f"A{index - 25}"
 
 
@@ -66,24 +70,26 @@ def _own_row(mark: str, config: tuple[str, Table]) -> PaperRow:
 
 
 def published_row(mark: str, row: PublishedRow) -> PaperRow:
-    """Return a published row as it is printed; ``mark`` names its point in a chart."""
-    texts = (row.rmse_cm, row.abs_rel, row.abs_rel_scaled, row.scale)
-    return PaperRow(mark, row.method, True, row.median_anchored, [Cell(text, float(text)) for text in texts])
+    """Return the table row of a published row, printed as published; ``mark`` labels its point in the chart."""
+    return PaperRow(mark, row.method, True, row.median_anchored, [Cell(text, float(text)) for text in row.cells])
 
 
-def _points(rows: Iterable[PaperRow], tables: Mapping[str, Table]) -> list[ScatterPoint]:
-    """Return the rows that have both values; the first rows are the tables', in their order."""
+def _scatter_points(rows: Iterable[PaperRow], tables: Mapping[str, Table]) -> list[ScatterPoint]:
+    """Return the points of the rows with both values; the first rows must be those of ``tables``, in order."""
     intervals = [table.intervals for table in tables.values()]
     points = []
     for index, row in enumerate(rows):
-        found = {} if row.published else intervals[index]
+        row_intervals = {} if row.published else intervals[index]
         native, scaled = row.cells[1].value, row.cells[2].value
         if native is not None and scaled is not None:
-            ends = finite_ends(found.get("native.abs_rel")), finite_ends(found.get("scaled.abs_rel"))
-            points.append(ScatterPoint(row.mark, row.name, native, scaled, row.published, *ends))
+            interval_pair = (
+                finite_interval(row_intervals.get("native.abs_rel")),
+                finite_interval(row_intervals.get("scaled.abs_rel")),
+            )
+            points.append(ScatterPoint(row.mark, row.name, native, scaled, row.published, *interval_pair))
     return points
 
 
-def finite_ends(interval: tuple[float, float] | None) -> tuple[float, float] | None:
-    """Return an interval that can be drawn, else None."""
+def finite_interval(interval: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Return the interval if both ends are finite, else None."""
     return interval if interval and all(map(math.isfinite, interval)) else None

@@ -1,4 +1,4 @@
-"""Configs and views as rows of cells: what the tables of the page show and what they sort by."""
+"""Table rows of configs and views: cells with their text and sort value."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.scoring.metrics import DepthMetrics
+from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Table, ViewScore
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A number as it is spelled, as it sorts (None: missing, always last), and its interval (empty: none)."""
+    """Table cell: formatted number, sort value (None if missing, sorted last), and interval text or ""."""
 
     text: str
     value: float | None
@@ -22,8 +23,8 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Row:
-    """One config or one view, spelled: the cells of both tables."""
+class ScoreRow:
+    """Formatted cells of one config or view, for the tables of errors and of coverage."""
 
     name: str
     views: Cell
@@ -45,49 +46,53 @@ class Row:
         return any(cell.interval for cell in [*self.native, *self.scaled, self.scale, self.coverage, *self.within])
 
 
-def table_row(name: str, table: Table) -> Row:
-    """Return a config's row; names come out printable, numbers with their intervals."""
-    found = table.intervals
-    within = [formatting.interval_cell(found.get(f"within_mm.{t}"), 1, 100.0) for t in WITHIN_MM]
-    return Row(
-        name=formatting.printable(name),
+def table_row(name: str, table: Table) -> ScoreRow:
+    """Return the row of a config, with a printable name and intervals."""
+    intervals = table.intervals
+    within_intervals = [formatting.interval_cell(intervals.get(f"within_mm.{t}"), 1, 100.0) for t in WITHIN_MM]
+    return ScoreRow(
+        name=printable(name),
         views=Cell(f"{table.views_scored}/{table.views}", table.views_scored),
         coverage=_cell(
             formatting.coverage_percent(table.coverage),
             table.coverage,
-            formatting.coverage_interval_cell(found.get("coverage")),
+            formatting.coverage_interval_cell(intervals.get("coverage")),
         ),
         ranked=table.ranked,
         reasons="; ".join(formatting.unranked_reasons(table)),
-        native=_metric_cells(table.native, formatting.metric_interval_cells(found, "native")),
-        scaled=_metric_cells(table.scaled, formatting.metric_interval_cells(found, "scaled")),
+        native=_metric_cells(table.native, formatting.metric_interval_cells(intervals, "native")),
+        scaled=_metric_cells(table.scaled, formatting.metric_interval_cells(intervals, "scaled")),
         scale=_cell(
             formatting.scale_cell(table.scale_median),
             table.scale_median,
-            formatting.interval_cell(found.get("scale_median"), 3),
+            formatting.interval_cell(intervals.get("scale_median"), 3),
         ),
-        within=_cells(formatting.within_cells(table.within_mm), [table.within_mm[t] for t in WITHIN_MM], within),
+        within=_cells(
+            formatting.within_cells(table.within_mm), [table.within_mm[t] for t in WITHIN_MM], within_intervals
+        ),
     )
 
 
-def view_row(view: ViewScore) -> Row:
-    """Return a view's row; its ``views`` cell holds the number of scored pixels."""
-    none = [""] * len(formatting.METRIC_HEADS)
-    return Row(
-        name=formatting.printable(view.view_id),
+def view_row(view: ViewScore) -> ScoreRow:
+    """Return the row of a view; its ``views`` cell holds the number of scored pixels."""
+    no_intervals = [""] * len(formatting.METRIC_HEADS)
+    return ScoreRow(
+        name=printable(view.view_id),
         views=Cell(f"{view.scored_px:,}".replace(",", "\N{NARROW NO-BREAK SPACE}"), view.scored_px),
         coverage=_cell(formatting.coverage_percent(view.coverage), view.coverage),
         ranked=True,
         reasons="",
-        native=_metric_cells(view.native, none),
-        scaled=_metric_cells(view.scaled, none),
+        native=_metric_cells(view.native, no_intervals),
+        scaled=_metric_cells(view.scaled, no_intervals),
         scale=_cell(formatting.scale_cell(view.scale), view.scale),
-        within=_cells(formatting.within_cells(view.within_mm), [view.within_mm[t] for t in WITHIN_MM], none),
+        within=_cells(
+            formatting.within_cells(view.within_mm), [view.within_mm[t] for t in WITHIN_MM], no_intervals
+        ),
     )
 
 
 def _metric_cells(metrics: DepthMetrics | None, intervals: Sequence[str]) -> list[Cell]:
-    values = [metrics.abs_rel, metrics.rmse_cm, metrics.mae_cm, metrics.delta1] if metrics else [None] * 4
+    values = [getattr(metrics, name, None) for name in METRIC_NAMES]
     return _cells(formatting.metric_cells(metrics), values, intervals)
 
 

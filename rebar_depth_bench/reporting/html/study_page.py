@@ -1,6 +1,7 @@
-"""A study as one self-contained HTML page: no scripts, no requests, the same bytes for the same input.
+"""HTML pages of studies: self-contained, without scripts or requests, same bytes for the same input.
 
-Every text passes jinja's escaping; what comes from an archive or a dataset passes ``wording.printable`` before.
+All text passes through Jinja's escaping; text from a submission or a dataset must pass through
+``errors.printable`` before.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from rebar_depth_bench.reporting.html.assets import environment
 
 @dataclass(frozen=True)
 class PageFigure:
-    """An SVG from ``study_charts``, its title and what to see in it."""
+    """Figure of a study page: an SVG from ``reporting.charts.lines``, its title and caption."""
 
     svg: Markup
     title: str
@@ -24,21 +25,26 @@ class PageFigure:
 
 @dataclass(frozen=True)
 class PageTable:
-    """A table: headings of (name, unit), and rows of as many cells; the first cell names its row."""
+    """Table of a study page: headings (name, unit), and rows with as many cells.
+
+    The first cell of a row is its name. Raises ``ValueError`` if a row has another number of cells.
+    """
 
     caption: str
     heads: Sequence[tuple[str, str]]
     rows: Sequence[Sequence[str]]
 
     def __post_init__(self) -> None:
-        wrong = [len(row) for row in self.rows if len(row) != len(self.heads)]
-        if wrong:
-            raise ValueError(f"table {self.caption!r}: a row has {wrong[0]} cells, expected {len(self.heads)}")
+        wrong_lengths = [len(row) for row in self.rows if len(row) != len(self.heads)]
+        if wrong_lengths:
+            raise ValueError(
+                f"table {self.caption!r}: a row has {wrong_lengths[0]} cells, expected {len(self.heads)}"
+            )
 
 
 @dataclass(frozen=True)
 class StudyPage:
-    """One study's page; ``title`` states the alignment, ``stamps`` are ``Stamp.lines()``."""
+    """Contents of a study's page; ``title`` states the alignment, ``stamps`` are (name, value) pairs."""
 
     study: str
     title: str
@@ -50,5 +56,5 @@ class StudyPage:
 
 
 def render_study(page: StudyPage) -> str:
-    """Return the page as HTML; it follows the reader's light or dark and needs no network."""
+    """Return the page as HTML; it follows the reader's light or dark mode and needs no network."""
     return environment().get_template("study.html.j2").render(page=page)

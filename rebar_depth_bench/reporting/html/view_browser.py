@@ -1,28 +1,30 @@
-"""The views that the page shows in pictures: which of them, in what order, and what stands beside each."""
+"""View browser of the report: selection, order and contents of the views shown with images."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.reporting.formatting import printable
-from rebar_depth_bench.reporting.html.rows import Row, view_row
+from rebar_depth_bench.errors import InputError, printable
+from rebar_depth_bench.reporting.html.rows import ScoreRow, view_row
 from rebar_depth_bench.reporting.html.view_images import ViewImages, ViewPanels, view_images
-from rebar_depth_bench.scoring.result import ViewScore, badness
+from rebar_depth_bench.scoring.result import ViewScore, sort_key_worst_first
 from rebar_depth_bench.submission import config_of
 
 VIEWS_SHOWN = 12
-"""Views of a config in a page: about 150 kB each at 1280 x 720."""
+"""Default number of views of a config shown with images, about 150 kB each at 1280 x 720."""
 
 
 @dataclass(frozen=True)
 class ShownView:
-    """One view in pictures: its numbers, images and what their colour bars say; ``label`` names its thumbnail."""
+    """View shown with images: its numbers, images and the texts of their colour bars.
+
+    ``label`` is the text of its thumbnail.
+    """
 
     config: str
     label: str
-    row: Row
+    row: ScoreRow
     images: ViewImages
     near: str
     far: str
@@ -34,7 +36,7 @@ class ShownView:
 
 @dataclass(frozen=True)
 class ShownCount:
-    """How many of a config's views are shown."""
+    """Number of a config's views that are shown, and of all its views."""
 
     config: str
     shown: int
@@ -42,19 +44,19 @@ class ShownCount:
 
     @property
     def partly(self) -> bool:
-        """Return whether some of the views are not shown."""
+        """Whether some of the views are not shown."""
         return self.shown < self.views
 
 
 def views_to_show(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
-    """Return ``count`` views, worst first: half of them the very worst, the rest evenly from there to the best.
+    """Return ``count`` views, worst first: half are the worst, the rest evenly spaced from there to the best.
 
-    All where there are no more than ``count``; a view without a value is worst. Raises ``InputError`` where
-    ``count`` is negative.
+    All views are returned if there are at most ``count``. A view without a value counts as worst. Raises
+    ``InputError`` if ``count`` is negative.
     """
     if count < 0:
         raise InputError(f"views to show: {count}, expected 0 or more of each config")
-    worst_first = sorted(views, key=badness, reverse=True)
+    worst_first = sorted(views, key=sort_key_worst_first, reverse=True)
     if len(worst_first) <= count:
         return worst_first
     worst = (count + 1) // 2
@@ -63,24 +65,30 @@ def views_to_show(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
 
 
 def shown_views(panels: Iterable[ViewPanels], configs: Sequence[str]) -> list[ShownView]:
-    """Return the encoded views: configs in the order of ``configs``, in each the worst view first."""
-    encoded = [(_order(view, configs), _shown(view)) for view in panels]
+    """Return the encoded views in the order of ``configs``, the worst view of each config first."""
+    encoded = [(_worst_first_key(view, configs), _shown_view(view)) for view in panels]
     return [view for _, view in sorted(encoded, key=lambda pair: pair[0])]
 
 
-def counted(shown: Sequence[ShownView], views: Mapping[str, int]) -> list[ShownCount]:
-    """Return how many views are shown of each config that has any, from all configs' numbers of ``views``."""
-    names = [view.config for view in shown]
-    counts = [ShownCount(printable(name), names.count(printable(name)), total) for name, total in views.items()]
+def shown_counts(shown: Sequence[ShownView], views: Mapping[str, int]) -> list[ShownCount]:
+    """Return the counts of every config with shown views; ``views`` holds the number of views by config."""
+    shown_configs = [view.config for view in shown]
+    counts = [
+        ShownCount(printable(name), shown_configs.count(printable(name)), total) for name, total in views.items()
+    ]
     return [count for count in counts if count.shown]
 
 
-def _order(view: ViewPanels, configs: Sequence[str]) -> tuple[int, float, str]:
+def _worst_first_key(view: ViewPanels, configs: Sequence[str]) -> tuple[int, float, str]:
     config = config_of(view.view_id)
-    return (configs.index(config) if config in configs else len(configs), -badness(view.score), view.view_id)
+    return (
+        configs.index(config) if config in configs else len(configs),
+        -sort_key_worst_first(view.score),
+        view.view_id,
+    )
 
 
-def _shown(view: ViewPanels) -> ShownView:
+def _shown_view(view: ViewPanels) -> ShownView:
     images = view_images(view)
     predicted = images.predicted_m
     row = view_row(view.score)

@@ -1,6 +1,6 @@
-"""The images of one view: colour, both depths on one scale, error as it stands and after scaling.
+"""Encoded images of one view: colour, true and predicted depth on one scale, native and scaled error.
 
-Pure functions from arrays to encoded images; colours come from ``rebar_depth_bench.reporting.colormap``.
+All functions are pure; colours come from ``rebar_depth_bench.reporting.colormap``.
 """
 
 from __future__ import annotations
@@ -15,30 +15,30 @@ from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS, positions, robust_range
+from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS, colour_indices, robust_range
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.scoring.result import ViewScore
 
 PANEL_WIDTH = 640
-"""Panels are reduced by a whole factor to about this many pixels."""
+"""Approximate width of a panel, pixels; images are reduced by an integer factor."""
 
-_NO_DEPTH = ((136, 136, 136), (112, 112, 112))
-_NO_PREDICTION = ((240, 200, 0), (16, 16, 16))
+_NO_DEPTH_STRIPES = ((136, 136, 136), (112, 112, 112))
+_NO_PREDICTION_STRIPES = ((240, 200, 0), (16, 16, 16))
 _HATCH_PX = 4
 _MAX_LIMIT_CM = 1e9
-_SLACK = 1e-6  # a float32 error of 30 cm is a little more than 30 cm
+_LIMIT_TOLERANCE = 1e-6  # An error of 30 cm in float32 is slightly more than 30 cm.
 _ROUND_STEPS = (1, 2, 3, 5, 7, 10)
 _BACKDROP_LEVELS = 16
-_BACKDROP_BRIGHTEST = 84
+_BACKDROP_MAX_LEVEL = 84
 
 
 @dataclass(frozen=True)
 class ViewPanels:
-    """What the report shows of one view; all arrays share H x W.
+    """Arrays and scores of one view to be rendered; all arrays share H x W.
 
-    ``rgb`` uint8 H x W x 3; ``truth_m`` float32 metres, 0 where there is no surface; ``prediction_m``
-    float metres, not finite or <= 0 where there is none; ``steel`` bool, rim included; ``score`` the
-    view's numbers.
+    ``rgb`` is uint8 H x W x 3; ``truth_m`` float32 metres, 0 without a surface; ``prediction_m`` float metres, not
+    finite or <= 0 without a prediction; ``steel`` bool, rim included; ``score`` holds the view's numbers. Raises
+    ``ValueError`` if the shapes differ.
     """
 
     view_id: str
@@ -50,18 +50,18 @@ class ViewPanels:
 
     def __post_init__(self) -> None:
         size = self.truth_m.shape
-        found = (self.rgb.shape[:2], self.prediction_m.shape, self.steel.shape)
-        if any(shape != size for shape in found):
-            raise ValueError(f"{self.view_id}: the images of a view must share H x W = {size}, found {found}")
+        shapes = (self.rgb.shape[:2], self.prediction_m.shape, self.steel.shape)
+        if any(shape != size for shape in shapes):
+            raise ValueError(f"{self.view_id}: the images of a view must share H x W = {size}, found {shapes}")
 
 
 @dataclass(frozen=True)
 class ViewImages:
-    """The encoded panels of one view as data URIs, and the ranges that their colour bars state.
+    """Encoded panels of one view as data URIs, and the ranges of their colour bars.
 
-    Depth colours run from ``near_m`` to ``far_m`` for truth and prediction alike; error colours from minus
-    to plus ``native_limit_cm`` or ``scaled_limit_cm`` (None where nothing can be shown).
-    ``predicted_m`` is the robust range of the prediction on scored pixels: it may lie off the colour bar.
+    Depth colours run from ``near_m`` to ``far_m`` for both ground truth and prediction, error colours from minus
+    to plus ``native_limit_cm`` or ``scaled_limit_cm`` (None if no scored pixel has an error). ``predicted_m`` is
+    the robust range of the prediction on scored pixels, which may lie outside the colour bar.
     """
 
     width: int
@@ -79,7 +79,7 @@ class ViewImages:
 
 
 def view_images(view: ViewPanels) -> ViewImages:
-    """Return a view's five panels, encoded, at about ``PANEL_WIDTH`` pixels wide."""
+    """Return the five encoded panels of a view, about ``PANEL_WIDTH`` pixels wide."""
     step = max(1, round(view.truth_m.shape[1] / PANEL_WIDTH))
     scored = scored_pixels(view.steel, view.truth_m)
     near_m, far_m = depth_range(view.truth_m, scored)
@@ -105,7 +105,7 @@ def view_images(view: ViewPanels) -> ViewImages:
 
 
 def error_webp(view: ViewPanels) -> bytes:
-    """Return a view's native error map alone, WebP, reduced as the other panels are."""
+    """Return a view's native error map as WebP, reduced like the other panels."""
     step = max(1, round(view.truth_m.shape[1] / PANEL_WIDTH))
     error_m = signed_error(view, 1.0)
     limit_cm = error_limit_cm(error_m, scored_pixels(view.steel, view.truth_m))
@@ -114,7 +114,11 @@ def error_webp(view: ViewPanels) -> bytes:
 
 
 def depth_range(truth_m: Float32[ndarray, "h w"], scored: ndarray) -> tuple[float, float]:
-    """Return (near, far), metres: robust range of true depth at flat indices ``scored``, a tenth wider."""
+    """Return (near, far), metres: the robust range of true depth at the flat indices ``scored``, widened.
+
+    The margin is a tenth of the range or 1 % of the near end at both ends, whichever is larger. Without scored
+    pixels the range is that of all surfaces, and 0 to 1 m without any surface.
+    """
     values = truth_m.ravel()[scored] if scored.size else truth_m[truth_m > 0]
     if not values.size:
         return 0.0, 1.0
@@ -124,37 +128,40 @@ def depth_range(truth_m: Float32[ndarray, "h w"], scored: ndarray) -> tuple[floa
 
 
 def predicted_range(prediction_m: Float[ndarray, "h w"], scored: ndarray) -> tuple[float, float] | None:
-    """Return the robust range, metres, of valid predictions at the flat indices ``scored``; None of none."""
+    """Return the robust range of valid predictions at the flat indices ``scored``, metres; None without any."""
     values = prediction_m.ravel()[scored].astype(np.float64)
     values = values[np.isfinite(values) & (values > 0)]
     return robust_range(values) if values.size else None
 
 
 def signed_error(view: ViewPanels, scale: float) -> Float64[ndarray, "h w"]:
-    """Return scale * prediction - truth, metres; NaN where either is missing or off the steel."""
+    """Return scale * prediction - truth, metres; NaN if either is missing, and outside the steel mask."""
     prediction = view.prediction_m.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
-        shown = view.steel & (view.truth_m > 0) & np.isfinite(prediction) & (prediction > 0)
+        valid = view.steel & (view.truth_m > 0) & np.isfinite(prediction) & (prediction > 0)
         error = scale * prediction - view.truth_m
-    return np.where(shown, error, np.nan)
+    return np.where(valid, error, np.nan)
 
 
 def error_limit_cm(error_m: Float64[ndarray, "h w"], scored: ndarray) -> float | None:
-    """Return the colour limit, cm: at least 95 % of the scored pixels' errors lie within; one round digit."""
+    """Return the colour limit of an error map, cm, rounded up to one digit.
+
+    It covers at least 95 % of the scored pixels' errors. The result is None if no scored pixel has an error.
+    """
     errors = np.abs(error_m.ravel()[scored])
     errors = errors[np.isfinite(errors)]
     if not errors.size:
         return None
-    reach_cm = 100 * float(np.sort(errors)[math.ceil(0.95 * errors.size) - 1])
-    return _rounded_up(min(max(reach_cm, 0.01), _MAX_LIMIT_CM))
+    percentile_cm = 100 * float(np.sort(errors)[math.ceil(0.95 * errors.size) - 1])
+    return _rounded_up(min(max(percentile_cm, 0.01), _MAX_LIMIT_CM))
 
 
 def depth_image(depth_m: Float[ndarray, "h w"], near_m: float, far_m: float) -> UInt8[ndarray, "h w 3"]:
-    """Return depth in colour, near bright and far dark, grey hatching where there is none."""
+    """Return depth in colours from near (bright) to far (dark), with grey hatching for pixels without depth."""
     with np.errstate(invalid="ignore"):
         present = np.isfinite(depth_m) & (depth_m > 0)
-    image = hatching(depth_m.shape, *_NO_DEPTH)
-    image[present] = DEPTH_COLOURS[positions(depth_m[present], far_m, near_m)]
+    image = hatching(depth_m.shape, *_NO_DEPTH_STRIPES)
+    image[present] = DEPTH_COLOURS[colour_indices(depth_m[present], far_m, near_m)]
     return image
 
 
@@ -164,20 +171,20 @@ def error_image(
     rgb: UInt8[ndarray, "h w 3"],
     limit_cm: float | None,
 ) -> UInt8[ndarray, "h w 3"]:
-    """Return signed error on steel in colour over the dimmed scene, hazard stripes where it is missing."""
+    """Return signed error on steel in colours over the dimmed scene, hazard stripes without prediction."""
     image = _backdrop(rgb)
     missing = steel & np.isnan(error_m)
-    image[missing] = hatching(steel.shape, *_NO_PREDICTION)[missing]
-    shown = steel & ~missing
+    image[missing] = hatching(steel.shape, *_NO_PREDICTION_STRIPES)[missing]
+    valid = steel & ~missing
     if limit_cm is not None:
-        image[shown] = ERROR_COLOURS[positions(error_m[shown], -limit_cm / 100, limit_cm / 100)]
+        image[valid] = ERROR_COLOURS[colour_indices(error_m[valid], -limit_cm / 100, limit_cm / 100)]
     return image
 
 
 def hatching(
     shape: tuple[int, ...], first: tuple[int, int, int], second: tuple[int, int, int]
 ) -> UInt8[ndarray, "h w 3"]:
-    """Return diagonal stripes of two colours."""
+    """Return an image of diagonal stripes of two colours."""
     rows, columns = np.indices(shape)
     stripe = (rows + columns) // _HATCH_PX % 2
     image: ndarray = np.array((first, second), dtype=np.uint8)[stripe]
@@ -185,25 +192,28 @@ def hatching(
 
 
 def reduced_colour(rgb: UInt8[ndarray, "h w 3"], step: int) -> UInt8[ndarray, "h w 3"]:
-    """Return a photograph averaged over blocks of ``step`` x ``step``; maps are sampled, never averaged."""
+    """Return a colour image averaged over blocks of ``step`` x ``step`` pixels.
+
+    Depth and error maps must be sampled instead of averaged.
+    """
     return np.asarray(Image.fromarray(rgb).reduce(step))
 
 
 def colour_bar_uri(colours: UInt8[ndarray, "n 3"]) -> str:
-    """Return a map of colours as a data URI of one row of pixels, first colour on the left."""
+    """Return a colour map as the data URI of a one-row PNG, first colour on the left."""
     return _data_uri(colours[None], kind="PNG")
 
 
 def _backdrop(rgb: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
-    """Return the scene in dark grey; few levels, because noise nobody looks at would double the file."""
+    """Return the scene in dark grey with few levels, because noise in the backdrop would double the file size."""
     grey = rgb.astype(np.int64) @ np.array([2, 5, 1]) // 8
-    dim = grey * _BACKDROP_LEVELS // 256 * _BACKDROP_BRIGHTEST // (_BACKDROP_LEVELS - 1)
+    dim = grey * _BACKDROP_LEVELS // 256 * _BACKDROP_MAX_LEVEL // (_BACKDROP_LEVELS - 1)
     return np.repeat(dim.astype(np.uint8)[..., None], 3, axis=2)
 
 
 def _rounded_up(value: float) -> float:
     power = 10.0 ** math.floor(math.log10(value))
-    return next(round(step * power, 6) for step in _ROUND_STEPS if step * power >= value * (1 - _SLACK))
+    return next(round(step * power, 6) for step in _ROUND_STEPS if step * power >= value * (1 - _LIMIT_TOLERANCE))
 
 
 def _data_uri(image: UInt8[ndarray, "h w 3"], *, kind: str = "WEBP", lossless: bool = True) -> str:

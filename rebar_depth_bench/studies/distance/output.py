@@ -1,4 +1,4 @@
-"""The study ``distance`` in words: its JSON, its CSV rows, its page."""
+"""JSON, CSV rows and page of the distance study."""
 
 from __future__ import annotations
 
@@ -6,119 +6,133 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.charts.lines import HEIGHT, LEFT, RIGHT, TOP, ChartWords, Series, chart, span_axis
+from rebar_depth_bench.reporting.charts.lines import HEIGHT, LEFT, RIGHT, TOP, ChartText, Series, chart, log_axis
 from rebar_depth_bench.reporting.html.study_page import PageFigure, PageTable, StudyPage
 from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS
-from rebar_depth_bench.studies.distance.study import ALL, Bin, DistanceStudy, Estimate, Slope, ViewPoint
+from rebar_depth_bench.studies.distance.study import (
+    ALL_CONFIGS,
+    DistanceBin,
+    DistancePoint,
+    DistanceStudy,
+    IntervalEstimate,
+    ScaleSlope,
+)
 
 
-def content(study: DistanceStudy) -> dict[str, Any]:
-    """Return the JSON object: the stamp, slopes, bins, and every view's distance, scale and errors."""
+def to_json(study: DistanceStudy) -> dict[str, Any]:
+    """Return the JSON object: provenance, slopes, bins, and the distance, scale and errors of every view."""
     return {
         "study": "distance",
-        **study.stamp.to_dict(),
+        **study.provenance.to_dict(),
         "bins_per_decade": study.bins_per_decade,
         "slopes": [asdict(slope) for slope in study.slopes],
-        "bins": [asdict(one) for one in study.bins],
-        "views": [_view(point) for point in study.points],
+        "bins": [asdict(bin_) for bin_ in study.bins],
+        "views": [_view_json(point) for point in study.points],
     }
 
 
-def rows(study: DistanceStudy) -> list[dict[str, Any]]:
-    """Return the CSV's rows: one per config and bin, with the stamps as columns."""
-    stamp = study.stamp
+def to_csv_rows(study: DistanceStudy) -> list[dict[str, Any]]:
+    """Return the rows of the CSV: one per config and bin, with the provenance in columns."""
+    provenance = study.provenance
     return [
         {
             "study": "distance",
-            "protocol": stamp.protocol,
-            "method": stamp.archives[0].method,
+            "protocol": provenance.protocol,
+            "method": provenance.archives[0].method,
             **{
-                name: getattr(one, name)
+                name: getattr(bin_, name)
                 for name in ("config", "low_m", "high_m", "distance_m", "views", "views_scored")
             },
-            **_estimate("scale_median", one.scale),
-            "scale_min": one.scale_range[0] if one.scale_range else None,
-            "scale_max": one.scale_range[1] if one.scale_range else None,
-            **_estimate("native_abs_rel", one.native_abs_rel),
-            **_estimate("scaled_abs_rel", one.scaled_abs_rel),
-            **stamp.csv_cells(),
+            **_estimate_cells("scale_median", bin_.scale),
+            "scale_min": bin_.scale_range[0] if bin_.scale_range else None,
+            "scale_max": bin_.scale_range[1] if bin_.scale_range else None,
+            **_estimate_cells("native_abs_rel", bin_.native_abs_rel),
+            **_estimate_cells("scaled_abs_rel", bin_.scaled_abs_rel),
+            **provenance.csv_cells(),
         }
-        for one in study.bins
+        for bin_ in study.bins
     ]
 
 
-def page(study: DistanceStudy) -> StudyPage:
-    """Return the page: s over distance, both errors over distance, slopes and bins."""
-    method = formatting.printable(study.stamp.archives[0].method)
+def to_page(study: DistanceStudy) -> StudyPage:
+    """Return the page: figures of s and of the errors over distance, tables of slopes and bins."""
+    method = printable(study.provenance.archives[0].method)
     return StudyPage(
         study="distance",
         title=f"{method} over distance: native, and scaled by an oracle median per view",
-        lead=" ".join([_slope_sentence(study.slopes[-1]), *_reversal(study.slopes[-1], study.bins)]),
-        stamps=study.stamp.lines(),
+        lead=" ".join([_slope_sentence(study.slopes[-1]), *_reversal_sentence(study.slopes[-1], study.bins)]),
+        stamps=study.provenance.lines(),
         figures=(_scale_figure(study), _error_figure(study)),
         tables=(_slope_table(study.slopes), _bin_table(study.bins)),
         notes=_notes(study),
     )
 
 
-def _slope_sentence(slope: Slope) -> str:
+def _slope_sentence(slope: ScaleSlope) -> str:
     value, interval = slope.slope.value, slope.slope.interval
-    name = "All configs together" if slope.config == ALL else formatting.printable(slope.config)
+    name = "All configs together" if slope.config == ALL_CONFIGS else printable(slope.config)
     if value is None:
         return f"{name}: no slope, for its views with a prediction are too few or all about as far."
     verb = "falls" if value < 0 else "grows"
     power = f"s {verb} as distance to the power {formatting.number(value, 3)}"
     if interval is None:
         return f"{name}: {power}, from too few views for an interval."
-    between = f"(95 % interval {_interval(interval, 3)})"
+    interval_text = f"(95 % interval {formatting.interval_text(interval, 3)})"
     if interval[0] <= 0 <= interval[1]:
-        return f"{name}: {power} {between}, so one scale may serve all distances."
-    return f"{name}: {power} {between}: twice the distance, {formatting.number(2**value, 3)} times the scale."
+        return f"{name}: {power} {interval_text}, so one scale may serve all distances."
+    return (
+        f"{name}: {power} {interval_text}: twice the distance, {formatting.number(2**value, 3)} times the scale."
+    )
 
 
-def _reversal(slope: Slope, bins: Sequence[Bin]) -> list[str]:
-    """Return a sentence where near bins surely need s on one side of 1 and far ones on the other."""
+def _reversal_sentence(slope: ScaleSlope, bins: Sequence[DistanceBin]) -> list[str]:
+    """Return a sentence if the correction reverses between the nearest and the farthest bin, else nothing.
+
+    The correction reverses if the median s of these two bins lies on different sides of 1 and the interval of the
+    slope excludes 0.
+    """
     interval = slope.slope.interval
     if interval is None or interval[0] <= 0 <= interval[1]:
         return []
-    known = sorted((one.distance_m, one.scale.value) for one in bins if one.scale.value is not None)
-    if not known or not min(s for _, s in known) < 1 < max(s for _, s in known):
+    scales = sorted((bin_.distance_m, bin_.scale.value) for bin_ in bins if bin_.scale.value is not None)
+    if not scales or not min(s for _, s in scales) < 1 < max(s for _, s in scales):
         return []
-    near, far = known[0], known[-1]
+    near, far = scales[0], scales[-1]
     if (near[1] < 1) == (far[1] < 1):
         return []
     return [
-        f"The correction reverses: the median s is {formatting.scale_cell(near[1])} at {_metres(near[0])} m and "
-        f"{formatting.scale_cell(far[1])} at {_metres(far[0])} m."
+        f"The correction reverses: the median s is {formatting.scale_cell(near[1])} "
+        f"at {_format_metres(near[0])} m and {formatting.scale_cell(far[1])} at {_format_metres(far[0])} m."
     ]
 
 
-def _by_config(bins: Sequence[Bin]) -> Mapping[str, list[Bin]]:
-    grouped: dict[str, list[Bin]] = {}
-    for one in bins:
-        grouped.setdefault(one.config, []).append(one)
+def _group_by_config(bins: Sequence[DistanceBin]) -> Mapping[str, list[DistanceBin]]:
+    grouped: dict[str, list[DistanceBin]] = {}
+    for bin_ in bins:
+        grouped.setdefault(bin_.config, []).append(bin_)
     return grouped
 
 
 def _scale_figure(study: DistanceStudy) -> PageFigure:
-    grouped = _by_config(study.bins)
-    clouds = {
+    grouped = _group_by_config(study.bins)
+    view_points = {
         config: [(p.distance_m, p.score.scale) for p in study.points if p.config == config and p.score.scale]
         for config in grouped
     }
     series = [
-        Series(config, colour, clouds[config], _line(bins, "scale"), _bars(bins, "scale"))
+        Series(config, colour, view_points[config], _bin_points(bins, "scale"), _error_bars(bins, "scale"))
         for colour, (config, bins) in enumerate(grouped.items())
     ]
-    far = [point.distance_m for point in study.points]
-    spoken = "; ".join(
-        f"{one.config} at {_metres(one.distance_m)} m: {formatting.scale_cell(one.scale.value)}"
-        for one in study.bins
+    distances_m = [point.distance_m for point in study.points]
+    description = "; ".join(
+        f"{bin_.config} at {_format_metres(bin_.distance_m)} m: {formatting.scale_cell(bin_.scale.value)}"
+        for bin_ in study.bins
     )
-    words = ChartWords("Scale s over distance", f"Median s of each bin. {spoken}", "distance, m", "s")
-    scales = [1.0, *(scale for cloud in clouds.values() for _, scale in cloud)]
-    svg = chart(series, span_axis(far, LEFT, RIGHT), span_axis(scales, HEIGHT, TOP), words, reference=1.0)
+    labels = ChartText("Scale s over distance", f"Median s of each bin. {description}", "distance, m", "s")
+    scales = [1.0, *(scale for points in view_points.values() for _, scale in points)]
+    svg = chart(series, log_axis(distances_m, LEFT, RIGHT), log_axis(scales, HEIGHT, TOP), labels, reference=1.0)
     caption = (
         "Dots: views; discs: medians of bins with 95 % intervals. The dashed line is s = 1, metric as it stands: "
         "below it the prediction is too far, above it too near. A level line is one scale for all distances."
@@ -127,25 +141,26 @@ def _scale_figure(study: DistanceStudy) -> PageFigure:
 
 
 def _error_figure(study: DistanceStudy) -> PageFigure:
-    grouped = _by_config(study.bins)
+    grouped = _group_by_config(study.bins)
     series = [
-        Series(config, colour, line=_line(bins, name), bars=_bars(bins, name), hollow=hollow)
+        Series(config, colour, line=_bin_points(bins, name), bars=_error_bars(bins, name), hollow=hollow)
         for colour, (config, bins) in enumerate(grouped.items())
         for name, hollow in (("native_abs_rel", False), ("scaled_abs_rel", True))
     ]
-    far = [one.distance_m for one in study.bins]
-    errors = [y for one in series for _, y in one.line] + [
-        end for one in series for bar in one.bars for end in bar[1:]
+    distances_m = [bin_.distance_m for bin_ in study.bins]
+    errors = [y for curve in series for _, y in curve.line] + [
+        end for curve in series for bar in curve.bars for end in bar[1:]
     ]
-    spoken = "; ".join(
-        f"{one.config} at {_metres(one.distance_m)} m: native {formatting.number(one.native_abs_rel.value, 4)}, "
-        f"scaled {formatting.number(one.scaled_abs_rel.value, 4)}"
-        for one in study.bins
+    description = "; ".join(
+        f"{bin_.config} at {_format_metres(bin_.distance_m)} m: "
+        f"native {formatting.number(bin_.native_abs_rel.value, 4)}, "
+        f"scaled {formatting.number(bin_.scaled_abs_rel.value, 4)}"
+        for bin_ in study.bins
     )
-    words = ChartWords(
-        "AbsRel over distance, native and scaled", f"Means of bins. {spoken}", "distance, m", "AbsRel"
+    labels = ChartText(
+        "AbsRel over distance, native and scaled", f"Means of bins. {description}", "distance, m", "AbsRel"
     )
-    svg = chart(series, span_axis(far, LEFT, RIGHT), span_axis(errors, HEIGHT, TOP), words)
+    svg = chart(series, log_axis(distances_m, LEFT, RIGHT), log_axis(errors, HEIGHT, TOP), labels)
     caption = (
         "Discs: native, no alignment; rings and dashed lines: scaled, an oracle s per view. Means of bins with "
         "95 % intervals."
@@ -153,17 +168,17 @@ def _error_figure(study: DistanceStudy) -> PageFigure:
     return PageFigure(svg, "AbsRel over distance, both in log.", caption)
 
 
-def _line(bins: Sequence[Bin], name: str) -> list[tuple[float, float]]:
-    found = [(one.distance_m, getattr(one, name).value) for one in bins]
-    return [(x, y) for x, y in found if y is not None]
+def _bin_points(bins: Sequence[DistanceBin], name: str) -> list[tuple[float, float]]:
+    values = [(bin_.distance_m, getattr(bin_, name).value) for bin_ in bins]
+    return [(x, y) for x, y in values if y is not None]
 
 
-def _bars(bins: Sequence[Bin], name: str) -> list[tuple[float, float, float]]:
-    found = [(one.distance_m, getattr(one, name).interval) for one in bins]
-    return [(x, *interval) for x, interval in found if interval is not None]
+def _error_bars(bins: Sequence[DistanceBin], name: str) -> list[tuple[float, float, float]]:
+    intervals = [(bin_.distance_m, getattr(bin_, name).interval) for bin_ in bins]
+    return [(x, *interval) for x, interval in intervals if interval is not None]
 
 
-def _slope_table(slopes: Sequence[Slope]) -> PageTable:
+def _slope_table(slopes: Sequence[ScaleSlope]) -> PageTable:
     return PageTable(
         caption="Slope of log s over log distance, least squares over views: 0 says that one scale serves all.",
         heads=(
@@ -176,19 +191,19 @@ def _slope_table(slopes: Sequence[Slope]) -> PageTable:
         ),
         rows=[
             (
-                formatting.printable(one.config),
-                str(one.views),
-                f"{_metres(one.nearest_m)} to {_metres(one.farthest_m)}",
-                formatting.number(one.slope.value, 3),
-                _interval(one.slope.interval, 3),
-                formatting.number(None if one.slope.value is None else 2**one.slope.value, 3),
+                printable(slope.config),
+                str(slope.views),
+                f"{_format_metres(slope.nearest_m)} to {_format_metres(slope.farthest_m)}",
+                formatting.number(slope.slope.value, 3),
+                formatting.interval_text(slope.slope.interval, 3),
+                formatting.number(None if slope.slope.value is None else 2**slope.slope.value, 3),
             )
-            for one in slopes
+            for slope in slopes
         ],
     )
 
 
-def _bin_table(bins: Sequence[Bin]) -> PageTable:
+def _bin_table(bins: Sequence[DistanceBin]) -> PageTable:
     return PageTable(
         caption="Bins of distance: native (no alignment) and scaled (oracle median scale per view), same pixels.",
         heads=(
@@ -205,18 +220,18 @@ def _bin_table(bins: Sequence[Bin]) -> PageTable:
         ),
         rows=[
             (
-                formatting.printable(one.config),
-                f"{_metres(one.low_m)} to {_metres(one.high_m)}",
-                f"{one.views_scored}/{one.views}",
-                formatting.scale_cell(one.scale.value),
-                _interval(one.scale.interval, 3),
-                _interval(one.scale_range, 3),
-                formatting.number(one.native_abs_rel.value, 4),
-                _interval(one.native_abs_rel.interval, 4),
-                formatting.number(one.scaled_abs_rel.value, 4),
-                _interval(one.scaled_abs_rel.interval, 4),
+                printable(bin_.config),
+                f"{_format_metres(bin_.low_m)} to {_format_metres(bin_.high_m)}",
+                f"{bin_.views_scored}/{bin_.views}",
+                formatting.scale_cell(bin_.scale.value),
+                formatting.interval_text(bin_.scale.interval, 3),
+                formatting.interval_text(bin_.scale_range, 3),
+                formatting.number(bin_.native_abs_rel.value, 4),
+                formatting.interval_text(bin_.native_abs_rel.interval, 4),
+                formatting.number(bin_.scaled_abs_rel.value, 4),
+                formatting.interval_text(bin_.scaled_abs_rel.interval, 4),
             )
-            for one in bins
+            for bin_ in bins
         ],
     )
 
@@ -235,7 +250,7 @@ def _notes(study: DistanceStudy) -> list[str]:
     return notes
 
 
-def _view(point: ViewPoint) -> dict[str, Any]:
+def _view_json(point: DistancePoint) -> dict[str, Any]:
     score = point.score
     return {
         "view_id": score.view_id,
@@ -246,16 +261,10 @@ def _view(point: ViewPoint) -> dict[str, Any]:
     }
 
 
-def _estimate(name: str, estimate: Estimate) -> dict[str, float | None]:
+def _estimate_cells(name: str, estimate: IntervalEstimate) -> dict[str, float | None]:
     low, high = estimate.interval or (None, None)
     return {name: estimate.value, f"{name}_low": low, f"{name}_high": high}
 
 
-def _interval(interval: tuple[float, float] | None, decimals: int) -> str:
-    if interval is None:
-        return formatting.DASH
-    return f"{formatting.number(interval[0], decimals)} to {formatting.number(interval[1], decimals)}"
-
-
-def _metres(value: float) -> str:
+def _format_metres(value: float) -> str:
     return formatting.number(value, 2)

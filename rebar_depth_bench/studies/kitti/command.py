@@ -1,9 +1,9 @@
-"""``rebar-bench study kitti``: predictions on KITTI's Eigen split, as a check against what is published.
+"""Command ``rebar-bench study kitti``: comparison of predictions on KITTI's Eigen split with published results.
 
-Predictions are one depth map an image at the ground truth's own size: a folder with
-``<drive>_<frame>_<side>.npy|npz|exr|png`` (16-bit PNG: metres times 256 unless ``submission.json`` says
-otherwise), or an archive in the submission format with the views ``kitti/<drive>_<frame>_<side>``. Other sizes are
-refused: to resize a depth map invents depth between a near and a far surface.
+Predictions are one depth map per image, at the size of its ground truth: either a folder with
+``<drive>_<frame>_<side>.npy|npz|exr|png`` (16-bit PNG in metres times 256, unless ``submission.json`` has another
+``depth_scale``), or an archive in the submission format with the views ``kitti/<drive>_<frame>_<side>``. Other
+sizes are rejected, because resizing a depth map creates false depth between a near and a far surface.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from typing import get_args
 
 import numpy as np
 
-from rebar_depth_bench.cli.console import ProgressBars
+from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.errors import InputError, SubmissionError
 from rebar_depth_bench.parallel import ordered_map
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.scoring.provenance import ArchiveStamp, Stamp
+from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
 from rebar_depth_bench.studies.common import add_output_arguments, write_outputs
 from rebar_depth_bench.studies.depth_source import DepthSource, open_depths
 from rebar_depth_bench.studies.kitti.ground_truth import (
     PNG_SCALE,
-    GroundTruth,
-    LidarDepth,
+    GroundTruthKind,
+    LidarDepthConvention,
     TruthFile,
     find_truth,
     read_truth,
 )
 from rebar_depth_bench.studies.kitti.metrics import CROPS, ImageScore, KittiImage, eigen_test_images, score_image
-from rebar_depth_bench.studies.kitti.output import csv_rows, study_page
+from rebar_depth_bench.studies.kitti.output import to_csv_rows, to_page
 from rebar_depth_bench.studies.kitti.result import KittiProtocol, KittiResult, tabulate_images
 from rebar_depth_bench.submission import EntryError
 from rebar_depth_bench.submission.formats import FORMATS
@@ -42,15 +42,19 @@ from rebar_depth_bench.submission.zip_directory import DirectoryError, FileSourc
 
 PROTOCOL = "rebar-kitti-eigen-1"
 SUMMARY = "check a method on KITTI's Eigen split against what is published"
-CAP_M = 80.0
+DEFAULT_CAP_M = 80.0
+"""Default depth cap, metres."""
 _SUFFIXES = ", ".join(FORMATS)
-_ANY_SHAPE = (1024, 4096)
-"""Bounds the size of an entry whose image has no ground truth: it is allowed and not read."""
+_MAX_SHAPE = (1024, 4096)
+"""Upper bound (H, W) for entries of images without ground truth, which are accepted but not read."""
 
 
 @dataclass(frozen=True)
-class _Outcome:
-    """One image: its score (None: no pixel counts), the digest of its ground truth, or what is wrong."""
+class _ImageOutcome:
+    """Outcome of one image: its score and the digest of its ground truth, or a problem with its prediction.
+
+    ``score`` is None if the image has no scored pixel or a problem.
+    """
 
     score: ImageScore | None = None
     digest: str = ""
@@ -69,32 +73,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ground-truth",
         required=True,
-        choices=get_args(GroundTruth),
+        choices=get_args(GroundTruthKind),
         help="one laser scan, or several (652 images)",
     )
     parser.add_argument("--crop", choices=tuple(CROPS), default="garg", help="default: %(default)s")
-    parser.add_argument("--cap", type=float, default=CAP_M, metavar="M", help="metres (default: %(default)s)")
+    parser.add_argument(
+        "--cap", type=float, default=DEFAULT_CAP_M, metavar="M", help="metres (default: %(default)s)"
+    )
     parser.add_argument(
         "--lidar-depth",
-        choices=get_args(LidarDepth),
+        choices=get_args(LidarDepthConvention),
         default="camera",
         help="a laser point's depth: z in the camera, or x in the scanner as in Monodepth (default: %(default)s)",
     )
-    parser.add_argument("--workers", type=int, metavar="N", help="threads (default: one a core)")
+    add_workers(parser)
     add_output_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the check and print its table."""
+    """Run the study, write the requested outputs and print the tables."""
     protocol = KittiProtocol(options.ground_truth, options.crop, options.cap, options.lidar_depth)
     with ProgressBars() as bars:
-        result = kitti_study(
+        result = run_kitti_study(
             options.predictions, options.kitti, protocol, workers=options.workers, progress=bars.update
         )
-    write_outputs(options, result.to_dict(), csv_rows(result), study_page(result))
+    write_outputs(options, result.to_dict(), to_csv_rows(result), to_page(result))
 
 
-def kitti_study(
+def run_kitti_study(
     predictions: str | Path,
     root: Path,
     protocol: KittiProtocol,
@@ -103,17 +109,19 @@ def kitti_study(
     workers: int | None = None,
     progress: Progress = silent,
 ) -> KittiResult:
-    """Score predictions on the Eigen split's images (or others) that have ground truth below ``root``.
+    """Score predictions on the images of the Eigen split that have ground truth below ``root``.
 
-    Raises ``DatasetError`` for KITTI's own files, ``SubmissionError`` for the predictions, each with every problem
-    that the predictions have, ``InputError`` for a cap or crop that is none.
+    ``images`` replaces the Eigen split by another list of images.
+
+    Raises ``DatasetError`` for missing or damaged KITTI files, ``SubmissionError`` with all problems of the
+    predictions, and ``InputError`` for an invalid cap or crop or if no image has a scored pixel.
     """
-    _check(protocol)
-    wanted = eigen_test_images() if images is None else images
-    truths, missing = find_truth(root, wanted, protocol.ground_truth)
-    with _open_predictions(predictions, wanted, truths) as source:
-        outcomes: list[_Outcome] = []
-        work = ordered_map(lambda truth: _score(truth, source, protocol), truths, workers)
+    _check_protocol(protocol)
+    split = eigen_test_images() if images is None else images
+    truths, missing = find_truth(root, split, protocol.ground_truth)
+    with _open_predictions(predictions, split, truths) as source:
+        outcomes: list[_ImageOutcome] = []
+        work = ordered_map(lambda truth: _score_file(truth, source, protocol), truths, workers)
         for done, outcome in enumerate(work, start=1):
             outcomes.append(outcome)
             progress("scoring KITTI", done, len(truths))
@@ -123,66 +131,74 @@ def kitti_study(
         scores = [outcome.score for outcome in outcomes if outcome.score is not None]
         if not scores:
             raise InputError(f"{root}: no image has ground truth inside the crop {protocol.crop}, expected some")
-        archive = ArchiveStamp(source.method, source.sha256())
+        archive = ArchiveIdentity(source.method, source.sha256())
     version = f"KITTI Eigen test, {protocol.ground_truth}"
     digest = "sha256:" + hashlib.sha256("".join(outcome.digest for outcome in outcomes).encode()).hexdigest()
     return KittiResult(
-        stamp=Stamp(PROTOCOL, digest, version, (archive,)),
+        provenance=Provenance(PROTOCOL, digest, version, (archive,)),
         method=archive.method,
         protocol=protocol,
-        found=len(truths),
+        images_with_truth=len(truths),
         missing=missing,
         table=tabulate_images(scores),
         images=scores,
     )
 
 
-def _check(protocol: KittiProtocol) -> None:
+def _check_protocol(protocol: KittiProtocol) -> None:
     if not 0.001 < protocol.cap_m < math.inf:
         raise InputError(f"the cap is {protocol.cap_m} m, expected a finite number above 0.001")
     if protocol.crop not in CROPS:
         raise InputError(f"the crop is {protocol.crop!r}, expected one of {', '.join(CROPS)}")
 
 
-def _score(truth: TruthFile, source: DepthSource, protocol: KittiProtocol) -> _Outcome:
+def _score_file(truth: TruthFile, source: DepthSource, protocol: KittiProtocol) -> _ImageOutcome:
     depth_m = read_truth(truth, protocol.lidar_depth)
-    where = np.flatnonzero(depth_m)
+    index = np.flatnonzero(depth_m)
     digest = hashlib.sha256(f"{truth.image.name} {truth.shape}".encode())
-    digest.update(where.astype("<u4").data)
-    digest.update(depth_m.ravel()[where].astype("<f4").data)
+    digest.update(index.astype("<u4").data)
+    digest.update(depth_m.ravel()[index].astype("<f4").data)
     try:
         prediction_m = source.read(truth.image.view_id)
     except EntryError as error:
-        return _Outcome(problem=error.problem)
+        return _ImageOutcome(problem=error.problem)
     score = score_image(truth.image.name, depth_m, prediction_m, CROPS[protocol.crop], protocol.cap_m)
-    return _Outcome(score, digest.hexdigest())
+    return _ImageOutcome(score, digest.hexdigest())
 
 
 def _open_predictions(path: str | Path, images: Sequence[KittiImage], truths: Sequence[TruthFile]) -> DepthSource:
-    """Open predictions that must have every image with ground truth and may have the others of the list."""
+    """Open the predictions: images with ground truth are required, the other images of the split are optional.
+
+    Raises ``SubmissionError`` with all problems if a required prediction is missing or the archive is damaged.
+    """
     expected = {truth.image.view_id: truth.shape for truth in truths}
-    also = {image.view_id: _ANY_SHAPE for image in images if image.view_id not in expected}
+    optional = {image.view_id: _MAX_SHAPE for image in images if image.view_id not in expected}
     if Path(path).is_dir():
-        source = open_depths(path, also | expected, PNG_SCALE)
-        lacking = sorted(expected.keys() - set(source.view_ids))
-        if lacking:
+        source = open_depths(path, optional | expected, PNG_SCALE)
+        missing = sorted(expected.keys() - set(source.view_ids))
+        if missing:
             problems = [
-                f"{view_id.partition('/')[2]}: no file, expected one of {_SUFFIXES}" for view_id in lacking
+                f"{view_id.partition('/')[2]}: no file, expected one of {_SUFFIXES}" for view_id in missing
             ]
             raise SubmissionError(str(path), problems)
         return source
-    present = _names_in(Path(path), 4 * len(images) + 1024)
-    return open_depths(path, {view_id: shape for view_id, shape in also.items() if view_id in present} | expected)
+    present = _entry_stems(Path(path), 4 * len(images) + 1024)
+    return open_depths(
+        path, {view_id: shape for view_id, shape in optional.items() if view_id in present} | expected
+    )
 
 
-def _names_in(archive: Path, most: int) -> set[str]:
-    """Return an archive's entries without their suffixes; none of what is no sound zip, which is said later."""
+def _entry_stems(archive: Path, max_entries: int) -> set[str]:
+    """Return the entry names of an archive without their suffixes.
+
+    The set is empty for a file that is not a valid zip; ``open_depths`` reports that error later.
+    """
     try:
         source = FileSource(archive)
     except (OSError, ValueError):
         return set()
     try:
-        return {entry.name.rpartition(".")[0] for entry in read_directory(source, most).entries}
+        return {entry.name.rpartition(".")[0] for entry in read_directory(source, max_entries).entries}
     except (DirectoryError, EOFError, ValueError):
         return set()
     finally:

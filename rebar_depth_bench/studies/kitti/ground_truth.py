@@ -1,15 +1,16 @@
-"""Ground truth of a KITTI image: its own laser scan, or the improved depth map of several scans.
+"""KITTI ground-truth depth and calibration: projected laser scans and improved depth maps.
 
-- ``raw``: ``ROOT/<date>/<drive>/velodyne_points/data/<frame>.bin`` (float32 x y z reflectance) and the day's two
-  calibration files; all 697 images of the list have one.
-- ``improved``: ``proj_depth/groundtruth/image_02/<frame>.png`` of the drive (Uhrig et al., "Sparsity Invariant
-  CNNs", 3DV 2017), below ``ROOT``, ``ROOT/train``, ``ROOT/val`` or either inside ``ROOT/data_depth_annotated``;
-  16-bit, metres times 256, 0 where there is none; 652 images of the list have one.
+Two kinds of ground truth are supported:
 
-KITTI's calibration of a day: where a laser point falls in a rectified colour picture.
+- ``raw``, a single laser scan: ``ROOT/<date>/<drive>/velodyne_points/data/<frame>.bin`` (float32 x y z
+  reflectance) and the two calibration files of the day; available for all 697 images of the Eigen split.
+- ``improved``, accumulated from several scans: ``proj_depth/groundtruth/image_02/<frame>.png`` of the drive (Uhrig
+  et al., "Sparsity Invariant CNNs", 3DV 2017), below ``ROOT``, ``ROOT/train``, ``ROOT/val``, or ``train`` or
+  ``val`` inside ``ROOT/data_depth_annotated``; 16-bit PNG in metres times 256, 0 where there is no depth;
+  available for 652 images of the Eigen split.
 
-Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013, equation 8:
-``y = P_rect_i  R_rect_00  T_velo_to_cam  x``, homogeneous.
+Laser points are projected into the rectified colour images as in Geiger et al., "Vision meets Robotics: The KITTI
+Dataset", IJRR 2013, equation 8: ``y = P_rect_i  R_rect_00  T_velo_to_cam  x`` in homogeneous coordinates.
 """
 
 from __future__ import annotations
@@ -31,15 +32,16 @@ from rebar_depth_bench.submission import EntryError
 from rebar_depth_bench.submission.image_formats import decode_png, max_png_bytes
 
 CAM_TO_CAM, VELO_TO_CAM = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt"
-_LARGEST_SIDE = 8192
+_MAX_SIDE_PX = 8192
 
 
 @dataclass(frozen=True, eq=False)
 class KittiCamera:
-    """One rectified colour camera: its picture's size and ``(u z, v z, z) = image_from_velo @ (x, y, z, 1)``.
+    """Rectified colour camera: image size and projection from the laser scanner's frame.
 
-    z on the left is planar depth; x, y, z on the right is a laser point; metres. ``kitti_truth.project_scan`` says
-    which pixel u, v is.
+    ``(u d, v d, d) = image_from_velo @ (x, y, z, 1)``, where (x, y, z) is a laser point in the scanner's frame and
+    d its planar depth in the camera, both in metres. ``project_scan`` defines the conversion of (u, v) to pixel
+    indices.
     """
 
     width: int
@@ -47,29 +49,30 @@ class KittiCamera:
     image_from_velo: Float64[ndarray, "3 4"]
 
 
-def read_camera(day: Path, camera: int) -> KittiCamera:
-    """Read camera 2 or 3 from the two calibration files of a day's folder.
+def read_camera(day_folder: Path, camera: int) -> KittiCamera:
+    """Return colour camera 2 or 3, read from the two calibration files in the folder of a day.
 
-    Raises ``DatasetError`` naming the file and the key that is missing, has another count of numbers or a number
-    that is none.
+    Raises ``DatasetError`` naming the file and the key if the key is missing or does not have the expected count
+    of finite numbers.
     """
-    cam = _read_values(day / CAM_TO_CAM)
-    velo = _read_values(day / VELO_TO_CAM)
-    size = _numbers(cam, day / CAM_TO_CAM, f"S_rect_{camera:02d}", 2)
-    projection = _numbers(cam, day / CAM_TO_CAM, f"P_rect_{camera:02d}", 12).reshape(3, 4)
+    cam = _read_calibration_file(day_folder / CAM_TO_CAM)
+    velo = _read_calibration_file(day_folder / VELO_TO_CAM)
+    size = _parse_numbers(cam, day_folder / CAM_TO_CAM, f"S_rect_{camera:02d}", 2)
+    projection = _parse_numbers(cam, day_folder / CAM_TO_CAM, f"P_rect_{camera:02d}", 12).reshape(3, 4)
     rectification, cam_from_velo = np.eye(4), np.eye(4)
-    rectification[:3, :3] = _numbers(cam, day / CAM_TO_CAM, "R_rect_00", 9).reshape(3, 3)
-    cam_from_velo[:3, :3] = _numbers(velo, day / VELO_TO_CAM, "R", 9).reshape(3, 3)
-    cam_from_velo[:3, 3] = _numbers(velo, day / VELO_TO_CAM, "T", 3)
+    rectification[:3, :3] = _parse_numbers(cam, day_folder / CAM_TO_CAM, "R_rect_00", 9).reshape(3, 3)
+    cam_from_velo[:3, :3] = _parse_numbers(velo, day_folder / VELO_TO_CAM, "R", 9).reshape(3, 3)
+    cam_from_velo[:3, 3] = _parse_numbers(velo, day_folder / VELO_TO_CAM, "T", 3)
     width, height = (int(side) for side in size)
-    if not (0 < width <= _LARGEST_SIDE and 0 < height <= _LARGEST_SIDE):
+    if not (0 < width <= _MAX_SIDE_PX and 0 < height <= _MAX_SIDE_PX):
         raise DatasetError(
-            f"{day / CAM_TO_CAM}: S_rect_{camera:02d} is {width} x {height}, expected 1 to {_LARGEST_SIDE} each"
+            f"{day_folder / CAM_TO_CAM}: S_rect_{camera:02d} is {width} x {height}, "
+            f"expected 1 to {_MAX_SIDE_PX} each"
         )
     return KittiCamera(width, height, projection @ rectification @ cam_from_velo)
 
 
-def _read_values(path: Path) -> dict[str, str]:
+def _read_calibration_file(path: Path) -> dict[str, str]:
     try:
         text = path.read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
@@ -79,12 +82,12 @@ def _read_values(path: Path) -> dict[str, str]:
     return {key.strip(): value.strip() for key, colon, value in pairs if colon}
 
 
-def _numbers(values: dict[str, str], path: Path, key: str, count: int) -> Float64[ndarray, " n"]:
+def _parse_numbers(values: dict[str, str], path: Path, key: str, count: int) -> Float64[ndarray, " n"]:
     if key not in values:
         raise DatasetError(f"{path}: has no {key}, expected {count} numbers under that key")
-    found = values[key].split()
+    parts = values[key].split()
     try:
-        numbers = [float(part) for part in found]
+        numbers = [float(part) for part in parts]
     except ValueError:
         numbers = [math.nan]
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
@@ -92,18 +95,25 @@ def _numbers(values: dict[str, str], path: Path, key: str, count: int) -> Float6
     return np.array(numbers)
 
 
-GroundTruth = Literal["raw", "improved"]
-LidarDepth = Literal["camera", "velodyne"]
-EXPECTED_IMAGES: Mapping[GroundTruth, int] = {"raw": 697, "improved": 652}
+GroundTruthKind = Literal["raw", "improved"]
+"""A single projected laser scan, or the improved depth map of several scans."""
+LidarDepthConvention = Literal["camera", "velodyne"]
+"""Depth of a laser point: planar z in the camera, or x in the scanner's frame (see ``project_scan``)."""
+EXPECTED_IMAGES: Mapping[GroundTruthKind, int] = {"raw": 697, "improved": 652}
+"""Number of images of the Eigen split with ground truth of each kind."""
 PNG_SCALE = 1 / 256
-_FOLDERS = (".", "train", "val", "data_depth_annotated/train", "data_depth_annotated/val")
+"""Metres per unit of a 16-bit PNG depth map."""
+_IMPROVED_FOLDERS = (".", "train", "val", "data_depth_annotated/train", "data_depth_annotated/val")
 _POINT_BYTES = 16
-_LARGEST_SCAN_BYTES = 64_000_000
+_MAX_SCAN_BYTES = 64_000_000
 
 
 @dataclass(frozen=True)
 class TruthFile:
-    """Where an image's ground truth lies, and its (H, W); ``camera`` projects a raw scan."""
+    """Ground-truth file of an image.
+
+    ``shape`` is the (H, W) of the depth map. ``camera`` projects a raw scan and is None for an improved depth map.
+    """
 
     image: KittiImage
     path: Path
@@ -111,14 +121,16 @@ class TruthFile:
     camera: KittiCamera | None
 
 
-def find_truth(root: Path, images: tuple[KittiImage, ...], kind: GroundTruth) -> tuple[list[TruthFile], list[str]]:
-    """Return the images' ground truth files, and the names of those that have none.
+def find_truth(
+    root: Path, images: tuple[KittiImage, ...], kind: GroundTruthKind
+) -> tuple[list[TruthFile], list[str]]:
+    """Return the ground-truth files of the images, and the names of the images without one.
 
-    Raises ``DatasetError`` where there is none at all, or a calibration or a PNG header is damaged.
+    Raises ``DatasetError`` if no image has ground truth, or if a calibration file or PNG header is damaged.
     """
     if not root.is_dir():
         raise DatasetError(f"{root}: no such folder, expected one with KITTI's {kind} data")
-    found: list[TruthFile] = []
+    truths: list[TruthFile] = []
     missing: list[str] = []
     cameras: dict[tuple[str, int], KittiCamera] = {}
     for image in images:
@@ -126,28 +138,34 @@ def find_truth(root: Path, images: tuple[KittiImage, ...], kind: GroundTruth) ->
         if not path.is_file():
             missing.append(image.name)
         elif kind == "improved":
-            found.append(TruthFile(image, path, _png_shape(path), None))
+            truths.append(TruthFile(image, path, _png_shape(path), None))
         else:
             key = (image.date, image.camera)
             if key not in cameras:
                 cameras[key] = read_camera(root / image.date, image.camera)
-            found.append(TruthFile(image, path, (cameras[key].height, cameras[key].width), cameras[key]))
-    if not found:
+            truths.append(TruthFile(image, path, (cameras[key].height, cameras[key].width), cameras[key]))
+    if not truths:
         example = _raw_path(Path(), images[0]) if kind == "raw" else _improved_path(Path(), images[0])
         raise DatasetError(f"{root}: has the {kind} ground truth of no image, expected files such as {example}")
-    return found, missing
+    return truths, missing
 
 
-def read_truth(file: TruthFile, lidar_depth: LidarDepth = "camera") -> Float32[ndarray, "h w"]:
-    """Return the ground truth of an image: depth in metres, 0 where there is none. Raises ``DatasetError``."""
+def read_truth(file: TruthFile, lidar_depth: LidarDepthConvention = "camera") -> Float32[ndarray, "h w"]:
+    """Return the ground-truth depth of an image in metres, 0 where there is none.
+
+    Raises ``DatasetError`` if the file cannot be read.
+    """
     if file.camera is None:
         return _improved_depth(file)
     return project_scan(read_scan(file.path), file.camera, lidar_depth)
 
 
 def read_scan(path: Path) -> Float32[ndarray, "n 4"]:
-    """Return a laser scan: x forward, y left, z up in metres, reflectance. Raises ``DatasetError``."""
-    data = _read(path, _LARGEST_SCAN_BYTES)
+    """Return a laser scan with the columns x forward, y left, z up (metres) and reflectance.
+
+    Raises ``DatasetError`` if the file cannot be read, has an invalid size or contains non-finite coordinates.
+    """
+    data = _read_limited(path, _MAX_SCAN_BYTES)
     if not data or len(data) % _POINT_BYTES:
         raise DatasetError(
             f"{path}: has {len(data)} bytes, expected a multiple of {_POINT_BYTES} (float32 x y z reflectance)"
@@ -159,15 +177,18 @@ def read_scan(path: Path) -> Float32[ndarray, "n 4"]:
 
 
 def project_scan(
-    points: Float32[ndarray, "n 4"], camera: KittiCamera, lidar_depth: LidarDepth = "camera"
+    points: Float32[ndarray, "n 4"], camera: KittiCamera, lidar_depth: LidarDepthConvention = "camera"
 ) -> Float32[ndarray, "h w"]:
-    """Return a scan as a sparse depth map, metres, 0 where no point falls; of several points the nearest wins.
+    """Project a scan to a sparse depth map in metres, 0 where there is no point.
 
-    The pixel, counted from 0, is ``round(u) - 1, round(v) - 1`` with halves rounded to even, as in Monodepth
-    (Godard et al., CVPR 2017), which follows KITTI's MATLAB code. Points behind the scanner (x < 0) or the camera
-    are dropped. ``camera`` depth is planar z in the rectified camera; ``velodyne`` is the point's own x, about
-    0.27 m more, which Monodepth and its successors score against. Their code takes the picture's first and last
-    columns for one when it looks for the nearest point; this does not (the Garg and Eigen crops leave both out).
+    If several points fall on one pixel, the nearest is kept. The pixel indices, counted from 0, are
+    ``round(u) - 1, round(v) - 1`` with halves rounded to even, as in Monodepth (Godard et al., CVPR 2017), which
+    follows KITTI's MATLAB code. Points behind the scanner (x < 0) or behind the camera are dropped.
+
+    With ``lidar_depth="camera"``, depth is planar z in the rectified camera. With ``"velodyne"``, it is the
+    point's x in the scanner's frame, about 0.27 m larger, which Monodepth and its successors score against. When
+    searching for the nearest point, their code merges the first and last columns of the image; this function does
+    not. The Garg and Eigen crops exclude both columns.
     """
     ahead = points[points[:, 0] >= 0].astype(np.float64)
     homogeneous = np.concatenate([ahead[:, :3], np.ones((len(ahead), 1))], axis=1)
@@ -185,7 +206,7 @@ def project_scan(
 
 
 def _improved_depth(file: TruthFile) -> Float32[ndarray, "h w"]:
-    data = _read(file.path, max_png_bytes(file.shape))
+    data = _read_limited(file.path, max_png_bytes(file.shape))
     try:
         return decode_png(str(file.path), memoryview(data), file.shape, PNG_SCALE).astype(np.float32)
     except EntryError as error:
@@ -193,19 +214,19 @@ def _improved_depth(file: TruthFile) -> Float32[ndarray, "h w"]:
 
 
 def _png_shape(path: Path) -> tuple[int, int]:
-    """Return (H, W) from a PNG's first bytes."""
+    """Return (H, W) from the header of a PNG. Raises ``DatasetError`` if it is not a valid PNG header."""
     try:
         with path.open("rb") as stream:
             head = stream.read(24)
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from None
     width, height = struct.unpack(">2I", head[16:24]) if len(head) == 24 and head[12:16] == b"IHDR" else (0, 0)
-    if not (0 < width <= _LARGEST_SIDE and 0 < height <= _LARGEST_SIDE):
-        raise DatasetError(f"{path}: says {height} x {width} pixels, expected a PNG of 1 to {_LARGEST_SIDE} each")
+    if not (0 < width <= _MAX_SIDE_PX and 0 < height <= _MAX_SIDE_PX):
+        raise DatasetError(f"{path}: says {height} x {width} pixels, expected a PNG of 1 to {_MAX_SIDE_PX} each")
     return height, width
 
 
-def _read(path: Path, limit: int) -> bytes:
+def _read_limited(path: Path, limit: int) -> bytes:
     try:
         with path.open("rb") as stream:
             data = stream.read(limit + 1)
@@ -221,7 +242,9 @@ def _raw_path(root: Path, image: KittiImage) -> Path:
 
 
 def _improved_path(root: Path, image: KittiImage) -> Path:
-    """Return the first place where the map lies, else the place in ``train``."""
-    inside = Path(image.drive) / "proj_depth" / "groundtruth" / f"image_{image.camera:02d}" / f"{image.frame}.png"
-    places = [root / folder / inside for folder in _FOLDERS]
-    return next((place for place in places if place.is_file()), root / "train" / inside)
+    """Return the first existing path of the improved depth map, or its path in ``train`` if there is none."""
+    relative_path = (
+        Path(image.drive) / "proj_depth" / "groundtruth" / f"image_{image.camera:02d}" / f"{image.frame}.png"
+    )
+    candidates = [root / folder / relative_path for folder in _IMPROVED_FOLDERS]
+    return next((path for path in candidates if path.is_file()), root / "train" / relative_path)

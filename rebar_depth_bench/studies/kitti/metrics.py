@@ -1,9 +1,10 @@
-"""What counts of a KITTI image, and its numbers, as evaluators have them since Eigen et al., NeurIPS 2014.
+"""KITTI depth metrics, crops and the Eigen test split.
 
-The KITTI test images of Eigen et al., "Depth Map Prediction from a Single Image", NeurIPS 2014: 697 names.
+The metrics and the 697 test images are those of Eigen et al., "Depth Map Prediction from a Single Image",
+NeurIPS 2014, as used by public evaluators since.
 
-``kitti_eigen_test_697.txt`` is the list as it goes round with public evaluators (Monodepth and its successors), a
-line an image: ``<date>/<drive> <frame> <side>``. It holds names only, no data of KITTI.
+``kitti_eigen_test_697.txt`` is the list of test images that is distributed with public evaluators (Monodepth and
+its successors), one image per line: ``<date>/<drive> <frame> <side>``. It contains only names, no KITTI data.
 """
 
 from __future__ import annotations
@@ -18,15 +19,16 @@ from jaxtyping import Bool, Float, Float32, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.errors import RebarDepthError
-from rebar_depth_bench.scoring.metrics import is_prediction, median_scale
+from rebar_depth_bench.scoring.metrics import is_valid_prediction, median_scale
 from rebar_depth_bench.scoring.protocol import DELTA1_RATIO
 
 MIN_DEPTH_M = 1e-3
+"""Lower bound of scored ground truth (exclusive) and of clamped predictions, metres."""
 
 
 @dataclass(frozen=True)
 class Crop:
-    """A part of the picture: from the first to before the second share of its rows, and of its columns."""
+    """Crop of an image: (start, stop) of its rows and columns, as fractions of height and width."""
 
     rows: tuple[float, float]
     columns: tuple[float, float]
@@ -37,16 +39,16 @@ CROPS: Mapping[str, Crop] = {
     "eigen": Crop((0.3324324, 0.91351351), (0.03594771, 0.96405229)),
     "none": Crop((0.0, 1.0), (0.0, 1.0)),
 }
-"""Garg et al., ECCV 2016; Eigen et al., NeurIPS 2014. Shares times pixels are cut to whole numbers."""
+"""Crops of Garg et al., ECCV 2016, and Eigen et al., NeurIPS 2014; pixel bounds are truncated to integers."""
 
 
 @dataclass(frozen=True)
 class KittiMetrics:
-    """Errors of one image, or their means: p predicted and z true depth on the scored pixels, metres.
+    """Errors of one image, or their means over images.
 
-    ``abs_rel`` = mean(|p - z| / z); ``rmse_m`` = sqrt(mean((p - z)^2));
-    ``log_rmse`` = sqrt(mean((ln p - ln z)^2)); ``delta1`` to ``delta3`` = share of pixels with max(p/z, z/p) below
-    1.25, 1.25^2, 1.25^3.
+    With predicted depth p and true depth z in metres on the scored pixels: ``abs_rel`` = mean(|p - z| / z);
+    ``rmse_m`` = sqrt(mean((p - z)^2)); ``log_rmse`` = sqrt(mean((ln p - ln z)^2)); ``delta1`` to ``delta3`` =
+    fraction of pixels with max(p/z, z/p) below 1.25, 1.25^2 and 1.25^3.
     """
 
     abs_rel: float
@@ -62,7 +64,11 @@ METRIC_NAMES = tuple(field.name for field in fields(KittiMetrics))
 
 @dataclass(frozen=True)
 class ImageScore:
-    """One image: scored pixels, the share of them with a prediction, s, and the errors; None without any."""
+    """Score of one image.
+
+    ``coverage`` is the fraction of the ``scored_px`` pixels with a valid prediction; ``scale`` is
+    s = median(z) / median(p). ``scale``, ``native`` and ``scaled`` are None if no scored pixel has a prediction.
+    """
 
     name: str
     scored_px: int
@@ -73,17 +79,17 @@ class ImageScore:
 
 
 def crop_mask(shape: tuple[int, int], crop: Crop) -> Bool[ndarray, "h w"]:
-    """Return which pixels of an (H, W) picture a crop keeps."""
+    """Return the mask of the pixels of an (H, W) image that lie inside a crop."""
     height, width = shape
-    top, bottom = (int(share * height) for share in crop.rows)
-    left, right = (int(share * width) for share in crop.columns)
-    kept = np.zeros(shape, dtype=bool)
-    kept[top:bottom, left:right] = True
-    return kept
+    top, bottom = (int(fraction * height) for fraction in crop.rows)
+    left, right = (int(fraction * width) for fraction in crop.columns)
+    mask = np.zeros(shape, dtype=bool)
+    mask[top:bottom, left:right] = True
+    return mask
 
 
 def scored_mask(depth_m: Float32[ndarray, "h w"], crop: Crop, cap_m: float) -> Bool[ndarray, "h w"]:
-    """Return the pixels that count: inside the crop, with ground truth above 1 mm and below the cap."""
+    """Return the mask of scored pixels: inside the crop, with ground truth above 1 mm and below the cap."""
     return np.asarray(
         crop_mask((depth_m.shape[0], depth_m.shape[1]), crop) & (depth_m > MIN_DEPTH_M) & (depth_m < cap_m)
     )
@@ -92,19 +98,19 @@ def scored_mask(depth_m: Float32[ndarray, "h w"], crop: Crop, cap_m: float) -> B
 def score_image(
     name: str, depth_m: Float32[ndarray, "h w"], prediction_m: Float[ndarray, "h w"], crop: Crop, cap_m: float
 ) -> ImageScore | None:
-    """Score a prediction on an image's pixels that count, None where there are none.
+    """Score a prediction on the scored pixels of an image; return None if there are none.
 
-    Scaled: s = median(z)/median(p) of the prediction as it stands. After the alignment predictions are clamped to
-    1 mm and the cap, as public evaluators do. What is not finite or <= 0 is no prediction: it is never clamped to
-    something that could score, and lowers the coverage.
+    The scale s = median(z) / median(p) is computed from the unclamped prediction. Predictions are clamped to
+    [1 mm, cap] after the alignment, as in public evaluators. Values that are not finite or <= 0 are missing
+    predictions: they are not clamped, and they lower the coverage.
     """
     mask = scored_mask(depth_m, crop, cap_m)
     scored_px = int(np.count_nonzero(mask))
     if not scored_px:
         return None
-    given = prediction_m[mask]
-    valid = is_prediction(given)
-    p_m, z_m = given[valid].astype(np.float64), depth_m[mask][valid].astype(np.float64)
+    predicted_m = prediction_m[mask]
+    valid = is_valid_prediction(predicted_m)
+    p_m, z_m = predicted_m[valid].astype(np.float64), depth_m[mask][valid].astype(np.float64)
     coverage = len(p_m) / scored_px
     if not len(p_m):
         return ImageScore(name, scored_px, coverage, None, None, None)
@@ -117,7 +123,7 @@ def score_image(
 
 
 def kitti_metrics(p_m: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"], cap_m: float) -> KittiMetrics:
-    """Return the errors of one or more pixels, the prediction clamped to 1 mm and the cap."""
+    """Return the errors of one or more pixels, with the prediction clamped to [1 mm, cap]."""
     clamped_m = np.clip(p_m, MIN_DEPTH_M, cap_m)
     ratio = np.maximum(clamped_m / z_m, z_m / clamped_m)
     error_m = clamped_m - z_m
@@ -130,15 +136,15 @@ def kitti_metrics(p_m: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"], cap_
     )
 
 
-CONFIG = "kitti"
+CONFIG_NAME = "kitti"
 SPLIT_FILE = "kitti_eigen_test_697.txt"
-_LINE = re.compile(r"(\d{4}_\d\d_\d\d)/(\1_drive_\d{4}_sync) (\d{10}) ([lr])")
+_SPLIT_LINE = re.compile(r"(\d{4}_\d\d_\d\d)/(\1_drive_\d{4}_sync) (\d{10}) ([lr])")
 _CAMERAS = {"l": 2, "r": 3}
 
 
 @dataclass(frozen=True, order=True)
 class KittiImage:
-    """One image: the day it was recorded, its drive, its frame number of ten digits, its side l or r."""
+    """KITTI image: recording date, drive, frame number (ten digits) and side (``l`` or ``r``)."""
 
     date: str
     drive: str
@@ -147,30 +153,33 @@ class KittiImage:
 
     @property
     def name(self) -> str:
-        """The name of its prediction: ``<drive>_<frame>_<side>``."""
+        """Return the name of the prediction: ``<drive>_<frame>_<side>``."""
         return f"{self.drive}_{self.frame}_{self.side}"
 
     @property
     def view_id(self) -> str:
-        """Its id in an archive: ``kitti/<drive>_<frame>_<side>``."""
-        return f"{CONFIG}/{self.name}"
+        """Return the view id in an archive: ``kitti/<drive>_<frame>_<side>``."""
+        return f"{CONFIG_NAME}/{self.name}"
 
     @property
     def camera(self) -> int:
-        """The colour camera's number in KITTI: 2 on the left, 3 on the right."""
+        """Return the KITTI number of the colour camera: 2 on the left, 3 on the right."""
         return _CAMERAS[self.side]
 
 
 def eigen_test_images() -> tuple[KittiImage, ...]:
-    """Return the 697 images, sorted: neighbours in time stand together."""
+    """Return the 697 test images, sorted by drive and frame, so that consecutive frames are adjacent."""
     return read_split(files("rebar_depth_bench.studies.kitti").joinpath(SPLIT_FILE).read_text(encoding="ascii"))
 
 
 def read_split(text: str) -> tuple[KittiImage, ...]:
-    """Return the images of a split list, sorted. Raises ``RebarDepthError`` for a line that is none or twice."""
+    """Return the sorted images of a split list.
+
+    Raises ``RebarDepthError`` for a malformed or duplicate line.
+    """
     images: set[KittiImage] = set()
     for number, line in enumerate(text.splitlines(), start=1):
-        match = _LINE.fullmatch(line.strip())
+        match = _SPLIT_LINE.fullmatch(line.strip())
         if match is None:
             raise RebarDepthError(f"{SPLIT_FILE}: line {number} is {line!r}, expected <date>/<drive> <frame> l|r")
         image = KittiImage(*match.groups())

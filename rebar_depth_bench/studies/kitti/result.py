@@ -1,4 +1,4 @@
-"""What the KITTI check says: means over images, what they were measured on, and whether they may be compared."""
+"""Result of the KITTI study: means over images, evaluation protocol and completeness."""
 
 from __future__ import annotations
 
@@ -12,30 +12,36 @@ import numpy as np
 
 from rebar_depth_bench.scoring.bootstrap import Interval, interval, resample
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE
-from rebar_depth_bench.scoring.provenance import Stamp
-from rebar_depth_bench.studies.kitti.ground_truth import EXPECTED_IMAGES, GroundTruth, LidarDepth
+from rebar_depth_bench.scoring.provenance import Provenance
+from rebar_depth_bench.studies.kitti.ground_truth import EXPECTED_IMAGES, GroundTruthKind, LidarDepthConvention
 from rebar_depth_bench.studies.kitti.metrics import METRIC_NAMES, ImageScore, KittiMetrics
 
-SCALE = "scale_median"
-NUMBERS = (*(f"{way}.{name}" for way in ("native", "scaled") for name in METRIC_NAMES), SCALE)
+SCALE_NAME = "scale_median"
+INTERVAL_NAMES = (
+    *(f"{alignment}.{name}" for alignment in ("native", "scaled") for name in METRIC_NAMES),
+    SCALE_NAME,
+)
 
 
 @dataclass(frozen=True)
 class KittiProtocol:
-    """How it was measured: ground truth, crop, cap in metres, and what a laser point's depth is."""
+    """Evaluation protocol: kind of ground truth, crop, depth cap in metres and laser depth convention."""
 
-    ground_truth: GroundTruth
+    ground_truth: GroundTruthKind
     crop: str
     cap_m: float
-    lidar_depth: LidarDepth
+    lidar_depth: LidarDepthConvention
 
 
 @dataclass(frozen=True)
 class KittiTable:
-    """Means over ``images_scored`` of the ``images`` with a pixel that counts; ``scale_median`` over them too.
+    """Means of the metrics over the images.
 
-    ``intervals`` has a 95 % block bootstrap interval of each of ``NUMBERS``. ``complete`` says that nothing is
-    missing which could help: every image has a value, and coverage is at least that of a ranked row.
+    ``images`` counts the images with a scored pixel and ``images_scored`` those of them with a prediction; the
+    means and ``scale_median`` are over the latter. ``coverage`` is the mean over all ``images``. ``intervals`` has
+    a 95 % block bootstrap interval for each of ``INTERVAL_NAMES``. ``complete`` is true if every image has a
+    prediction and the coverage is at least ``MIN_RANKED_COVERAGE``; otherwise, missing predictions could improve
+    the numbers.
     """
 
     images: int
@@ -50,69 +56,88 @@ class KittiTable:
 
 @dataclass(frozen=True)
 class KittiResult:
-    """The check's numbers. ``missing`` names the images of the list without ground truth in the folder."""
+    """Result of the KITTI study.
 
-    stamp: Stamp
+    ``images_with_truth`` counts the images of the split that have ground truth in the folder; ``missing`` names
+    the others.
+    """
+
+    provenance: Provenance
     method: str
     protocol: KittiProtocol
-    found: int
+    images_with_truth: int
     missing: Sequence[str]
     table: KittiTable
     images: Sequence[ImageScore]
 
     @property
     def is_published_set(self) -> bool:
-        """Whether as many images have ground truth as in the published set."""
-        return self.found == EXPECTED_IMAGES[self.protocol.ground_truth]
+        """Return whether the number of images with ground truth equals that of the published set."""
+        return self.images_with_truth == EXPECTED_IMAGES[self.protocol.ground_truth]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the check's JSON object."""
-        table = {**vars(self.table), "native": _plain(self.table.native), "scaled": _plain(self.table.scaled)}
-        images = [{**vars(one), "native": _plain(one.native), "scaled": _plain(one.scaled)} for one in self.images]
-        kitti = {**vars(self.protocol), "found": self.found, "missing": list(self.missing)}
-        return {**self.stamp.to_dict(), "method": self.method, "kitti": kitti, "table": table, "images": images}
+        """Return the JSON object of the study."""
+        table = {
+            **vars(self.table),
+            "native": _metrics_json(self.table.native),
+            "scaled": _metrics_json(self.table.scaled),
+        }
+        images = [
+            {**vars(image), "native": _metrics_json(image.native), "scaled": _metrics_json(image.scaled)}
+            for image in self.images
+        ]
+        kitti = {**vars(self.protocol), "found": self.images_with_truth, "missing": list(self.missing)}
+        return {
+            **self.provenance.to_dict(),
+            "method": self.method,
+            "kitti": kitti,
+            "table": table,
+            "images": images,
+        }
 
 
 def tabulate_images(images: Sequence[ImageScore]) -> KittiTable:
-    """Return the means over one or more images, in the split's order."""
-    scored = [one for one in images if one.native is not None]
-    coverage = math.fsum(one.coverage for one in images) / len(images)
-    scales = [one.scale for one in scored if one.scale is not None]
+    """Return the means over one or more images, given in the order of the split."""
+    scored = [image for image in images if image.native is not None]
+    coverage = math.fsum(image.coverage for image in images) / len(images)
+    scales = [image.scale for image in scored if image.scale is not None]
     return KittiTable(
         images=len(images),
         images_scored=len(scored),
         coverage=coverage,
         complete=len(scored) == len(images) and coverage >= MIN_RANKED_COVERAGE,
-        native=_mean([one.native for one in scored if one.native]),
-        scaled=_mean([one.scaled for one in scored if one.scaled]),
+        native=_mean_metrics([image.native for image in scored if image.native]),
+        scaled=_mean_metrics([image.scaled for image in scored if image.scaled]),
         scale_median=median(scales) if scales else None,
         intervals=_intervals(images),
     )
 
 
-def _mean(metrics: Sequence[KittiMetrics]) -> KittiMetrics | None:
+def _mean_metrics(metrics: Sequence[KittiMetrics]) -> KittiMetrics | None:
     if not metrics:
         return None
     return KittiMetrics(
-        *(math.fsum(getattr(one, name) for one in metrics) / len(metrics) for name in METRIC_NAMES)
+        *(
+            math.fsum(getattr(image_metrics, name) for image_metrics in metrics) / len(metrics)
+            for name in METRIC_NAMES
+        )
     )
 
 
 def _intervals(images: Sequence[ImageScore]) -> dict[str, Interval | None]:
     resampling = resample(range(len(images)))
-    rows = [[_number(one, name) for name in NUMBERS] for one in images]
-    values = np.array(rows, dtype=np.float64).reshape(len(images), len(NUMBERS))
+    rows = [[_metric_value(image, name) for name in INTERVAL_NAMES] for image in images]
+    values = np.array(rows, dtype=np.float64).reshape(len(images), len(INTERVAL_NAMES))
     draws = resampling.means(values)
-    present = np.flatnonzero(~np.isnan(values[:, -1]))
-    draws[:, -1] = resampling.percentile(values[present, -1], present, 50)
-    return {name: interval(draws[:, place]) for place, name in enumerate(NUMBERS)}
+    draws[:, -1] = resampling.medians(values[:, -1])
+    return {name: interval(draws[:, column]) for column, name in enumerate(INTERVAL_NAMES)}
 
 
-def _number(one: ImageScore, name: str) -> float:
-    way, _, key = name.partition(".")
-    value = one.scale if name == SCALE else getattr(getattr(one, way), key, None)
+def _metric_value(image: ImageScore, name: str) -> float:
+    alignment, _, key = name.partition(".")
+    value = image.scale if name == SCALE_NAME else getattr(getattr(image, alignment), key, None)
     return math.nan if value is None else float(value)
 
 
-def _plain(metrics: KittiMetrics | None) -> dict[str, float | None]:
+def _metrics_json(metrics: KittiMetrics | None) -> dict[str, float | None]:
     return {name: getattr(metrics, name, None) for name in METRIC_NAMES}

@@ -1,14 +1,14 @@
-"""A real capture: a folder of stereo pairs and the camera's calibration, without any depth of its own.
+"""Real captures: folders of stereo pairs with a camera calibration and without ground-truth depth.
 
 ::
 
     CAPTURE/
-      left/<name>.png       or .jpg, .jpeg: one a view
-      right/<name>.png      its right eye, of the same name before the suffix and of the same size
-      calibration.conf      the camera's Stereolabs file, or calibration.toml (``calibration.read_calibration``)
+      left/<name>.png       left image of a view (.png, .jpg or .jpeg)
+      right/<name>.png      right image, with the same stem and size as the left one
+      calibration.conf      Stereolabs calibration file, or calibration.toml (``geometry.calibration``)
 
-A view's id is ``<name of the folder>/<name of the picture>``. Pictures are never decoded: only their names and
-sizes count for a score.
+The id of a view is ``<folder name>/<image stem>``. Images are never decoded, because scoring needs only their
+names and sizes.
 """
 
 from __future__ import annotations
@@ -24,17 +24,21 @@ from rebar_depth_bench.errors import InputError, problem_summary
 from rebar_depth_bench.geometry.calibration import read_calibration
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration, calibrated_baseline_m
 
-LAYOUT = "left/<name>.png|jpg, right/<name>.png|jpg, calibration.conf|toml"
-_PICTURES = (".png", ".jpg", ".jpeg")
-_CALIBRATIONS = ("calibration.conf", "calibration.toml")
+CAPTURE_LAYOUT = "left/<name>.png|jpg, right/<name>.png|jpg, calibration.conf|toml"
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+_CALIBRATION_FILES = ("calibration.conf", "calibration.toml")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _SQUARE_PIXEL_TOLERANCE = 0.03
-"""Real cameras have fx/fy within a fraction of a per cent of 1; pictures of another shape make it stray."""
+"""Maximum deviation of fx / fy from 1.
+
+Real cameras deviate by a fraction of a per cent; images of a different aspect ratio than the calibration's cause
+larger deviations.
+"""
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A capture's views and its calibration on their grid (lens distortion and all)."""
+    """Views of a capture and the stereo calibration on their pixel grid, including lens distortion."""
 
     path: Path
     view_ids: tuple[str, ...]
@@ -46,38 +50,39 @@ class Capture:
         """Return every view id with its (height, width)."""
         return dict.fromkeys(self.view_ids, (self.height, self.width))
 
-    def camera_words(self) -> str:
-        """Return K and baseline in words, with what they ask of depth maps."""
+    def describe_camera(self) -> str:
+        """Return a description of K, the baseline and the pixel grid that depth maps must have."""
         left = self.calibration.left
-        words = (
+        description = (
             f"left fx {left.fx:.2f}, fy {left.fy:.2f}, cx {left.cx:.2f}, cy {left.cy:.2f} px at "
             f"{self.width} x {self.height}; baseline {calibrated_baseline_m(self.calibration) * 1000:.2f} mm"
         )
         if any(left.distortion):
             return (
-                f"{words}. The calibration has lens distortion: it describes raw pictures. Depth maps must be on "
-                "the very grid of left/; depth of rectified pictures needs rectified pictures there"
+                f"{description}. The calibration has lens distortion: it describes raw pictures. Depth maps must "
+                "be on the very grid of left/; depth of rectified pictures needs rectified pictures there"
             )
-        return f"{words}. Depth maps must be on the very grid of left/"
+        return f"{description}. Depth maps must be on the very grid of left/"
 
 
 def is_capture(path: str | os.PathLike[str]) -> bool:
-    """Tell whether a folder is meant as a capture: it has a ``left`` folder in it."""
+    """Return whether a folder is meant as a capture, that is, whether it contains a folder ``left``."""
     return (Path(path) / "left").is_dir()
 
 
 def open_capture(path: str | os.PathLike[str]) -> Capture:
-    """Read a capture's outline.
+    """Return the views and the calibration of a capture.
 
-    Raises ``InputError`` with every problem of the pairs; ``CalibrationError`` for a bad calibration.
+    Raises ``InputError`` with all problems of the stereo pairs, and ``CalibrationError`` for an invalid
+    calibration.
     """
     root = Path(path)
     name = root.resolve().name
     problems = [] if _NAME.fullmatch(name) else [f"the folder is called {name!r}, expected letters, digits, . _ -"]
-    left, right = (_pictures(root / eye, problems) for eye in ("left", "right"))
+    left, right = (_image_files(root / eye, problems) for eye in ("left", "right"))
     problems += [f"left/{left[stem].name}: has no right/{stem}" for stem in sorted(left.keys() - right.keys())]
     problems += [f"right/{right[stem].name}: has no left/{stem}" for stem in sorted(right.keys() - left.keys())]
-    sizes = {file: _size(file, problems) for files in (left, right) for file in files.values()}
+    sizes = {file: _image_size(file, problems) for files in (left, right) for file in files.values()}
     if left:
         width, height = sizes[min(left.values())]
         problems += [
@@ -87,30 +92,30 @@ def open_capture(path: str | os.PathLike[str]) -> Capture:
         ]
     if problems or not left:
         empty = [] if problems else ["left/ holds no picture"]
-        raise InputError(f"{root}: {problem_summary([*problems, *empty])}\nexpected a capture: {LAYOUT}")
+        raise InputError(f"{root}: {problem_summary([*problems, *empty])}\nexpected a capture: {CAPTURE_LAYOUT}")
     view_ids = tuple(f"{name}/{stem}" for stem in sorted(left))
-    return Capture(root, view_ids, height, width, _calibration(root, width, height))
+    return Capture(root, view_ids, height, width, _read_calibration(root, width, height))
 
 
-def _pictures(folder: Path, problems: list[str]) -> dict[str, Path]:
-    """Return a folder's pictures by name before the suffix."""
+def _image_files(folder: Path, problems: list[str]) -> dict[str, Path]:
+    """Return the image files of a folder by stem; append the problems of their names to ``problems``."""
     if not folder.is_dir():
         problems.append(f"{folder.name}/: no such folder")
         return {}
-    found: dict[str, Path] = {}
+    files: dict[str, Path] = {}
     for file in sorted(folder.iterdir()):
-        if file.suffix.lower() not in _PICTURES or not file.is_file():
+        if file.suffix.lower() not in _IMAGE_SUFFIXES or not file.is_file():
             continue
-        if file.stem in found:
+        if file.stem in files:
             problems.append(f"{folder.name}/{file.name}: the name stands twice, expected one picture a view")
         if not _NAME.fullmatch(file.stem):
             problems.append(f"{folder.name}/{file.name}: expected a name of letters, digits, . _ -")
-        found[file.stem] = file
-    return found
+        files[file.stem] = file
+    return files
 
 
-def _size(file: Path, problems: list[str]) -> tuple[int, int]:
-    """Return (width, height) from the picture's header, zeros and a problem where it has none."""
+def _image_size(file: Path, problems: list[str]) -> tuple[int, int]:
+    """Return (width, height) from the image header; if unreadable, return zeros and append to ``problems``."""
     try:
         with Image.open(file) as image:
             return image.size
@@ -119,15 +124,17 @@ def _size(file: Path, problems: list[str]) -> tuple[int, int]:
         return 0, 0
 
 
-def _calibration(root: Path, width: int, height: int) -> StereoCalibration:
-    found = [root / name for name in _CALIBRATIONS if (root / name).exists()]
-    if len(found) != 1:
-        raise InputError(f"{root}: {len(found)} calibration files, expected one of {' or '.join(_CALIBRATIONS)}")
-    calibration = read_calibration(found[0], width, height)
+def _read_calibration(root: Path, width: int, height: int) -> StereoCalibration:
+    paths = [root / name for name in _CALIBRATION_FILES if (root / name).exists()]
+    if len(paths) != 1:
+        raise InputError(
+            f"{root}: {len(paths)} calibration files, expected one of {' or '.join(_CALIBRATION_FILES)}"
+        )
+    calibration = read_calibration(paths[0], width, height)
     ratio = calibration.left.fx / calibration.left.fy
     if abs(ratio - 1) > _SQUARE_PIXEL_TOLERANCE:
         raise InputError(
-            f"{found[0]}: at the pictures' {width} x {height} pixels fx is {ratio:.3f} times fy, expected 1: "
+            f"{paths[0]}: at the pictures' {width} x {height} pixels fx is {ratio:.3f} times fy, expected 1: "
             "the calibration belongs to pictures of another shape"
         )
     return calibration

@@ -1,52 +1,60 @@
-"""``rebar-bench study pseudo-reference``: what a method's score owes to the reference it is held against.
+"""Command ``rebar-bench study pseudo-reference``: dependence of scores on the reference depth.
 
-The paper's Table II: monocular models on a physical sequence, scored on the full frame against two estimates of
-its depth (FoundationStereo and COLMAP). Where a dataset folder's exact depth is known, the same scores against it
-show what each pseudo-reference hides.
+The paper's Table II scores monocular models on a physical sequence, on the full frame, against two estimates of
+its depth (FoundationStereo and COLMAP). For a dataset folder with exact depth, the same scores against the exact
+depth show the errors that each pseudo-reference hides.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
-from rebar_depth_bench.cli.console import ProgressBars
-from rebar_depth_bench.data.ground_truth import checked_rows
+from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
-from rebar_depth_bench.errors import InputError, problem_summary
+from rebar_depth_bench.errors import InputError, printable, problem_summary
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.scoring.provenance import ArchiveStamp, Stamp
-from rebar_depth_bench.scoring.result import tabulate
+from rebar_depth_bench.scoring.ground_truth import verified_rows
+from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
+from rebar_depth_bench.scoring.result import mean, tabulate
 from rebar_depth_bench.studies.common import add_output_arguments, write_outputs
 from rebar_depth_bench.studies.depth_source import DepthSource, open_depths
-from rebar_depth_bench.studies.pseudo_reference.capture import LAYOUT, Capture, is_capture, open_capture
-from rebar_depth_bench.studies.pseudo_reference.output import csv_rows, study_page
-from rebar_depth_bench.studies.pseudo_reference.result import AgreementRow, PseudoReferenceResult, Reference, Row
+from rebar_depth_bench.studies.pseudo_reference.capture import CAPTURE_LAYOUT, Capture, is_capture, open_capture
+from rebar_depth_bench.studies.pseudo_reference.output import to_csv_rows, to_page
+from rebar_depth_bench.studies.pseudo_reference.result import (
+    AgreementRow,
+    DepthReference,
+    MethodRow,
+    PseudoReferenceResult,
+)
 from rebar_depth_bench.studies.pseudo_reference.study import (
-    EXACT,
+    EXACT_LABEL,
     DepthRange,
     FrameOutcome,
     FrameView,
-    score_views,
+    score_frame_views,
 )
 from rebar_depth_bench.submission import ExpectedViews, config_of
 
 PROTOCOL = "rebar-pseudo-reference-1"
 SUMMARY = "score methods on the full frame against two pseudo-references (the paper's Table II)"
-NEAR_M, FAR_M = 0.1, 20.0
+DEFAULT_NEAR_M, DEFAULT_FAR_M = 0.1, 20.0
+"""Ends of the default evaluation range, metres."""
 
 Views = Iterator[FrameView]
 
 
 @dataclass(frozen=True)
-class _Data:
-    """What is scored on: its views, in words, and what goes on the stamp."""
+class _StudyData:
+    """Opened dataset config or capture.
+
+    ``views`` are the views to score; ``archive_views`` are all views that an archive may contain. Exactly one of
+    ``folder`` and ``capture`` is set.
+    """
 
     name: str
     views: ExpectedViews
@@ -55,10 +63,14 @@ class _Data:
     capture: Capture | None
 
     def frames(self, exact: bool) -> Views:
-        """Yield the views, with their exact depth, held against the manifest's digests, if asked for."""
+        """Yield the views to score.
+
+        If ``exact`` is true and the data are a dataset folder, the views have their exact depth, verified against
+        the digests of the manifest.
+        """
         if self.folder is not None and exact:
             config = config_of(next(iter(self.views)))
-            for row, _ in checked_rows(self.folder, config, silent, "full frame"):
+            for row, _ in verified_rows(self.folder, config, silent, "full frame"):
                 yield FrameView(row["view_id"], row["left_depth"].shape, row["left_depth"])
         else:
             for view_id, shape in self.views.items():
@@ -68,9 +80,9 @@ class _Data:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the study's arguments."""
     parser.description = (
-        f"{SUMMARY}. A real capture is a folder with {LAYOUT}; its view ids are <folder>/<name>. A folder of "
-        "depth files may name them by <name> alone, and hold a submission.json with method and, for 16-bit PNG, "
-        "depth_scale."
+        f"{SUMMARY}. A real capture is a folder with {CAPTURE_LAYOUT}; its view ids are <folder>/<name>. A folder "
+        "of depth files may name them by <name> alone, and hold a submission.json with method and, for 16-bit "
+        "PNG, depth_scale."
     )
     maps = "archive in the submission format, or a folder of <view_id>.npy|npz|exr|png"
     parser.add_argument("methods", nargs="+", metavar="METHOD", help=f"the methods' depth: {maps}")
@@ -86,87 +98,97 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--config", metavar="NAME", help="which config of a dataset folder (default: its only one)"
     )
     parser.add_argument(
-        "--near", type=float, default=NEAR_M, metavar="M", help="evaluation range (default: %(default)s)"
+        "--near", type=float, default=DEFAULT_NEAR_M, metavar="M", help="evaluation range (default: %(default)s)"
     )
     parser.add_argument(
-        "--far", type=float, default=FAR_M, metavar="M", help="evaluation range (default: %(default)s)"
+        "--far", type=float, default=DEFAULT_FAR_M, metavar="M", help="evaluation range (default: %(default)s)"
     )
     parser.add_argument("--no-exact", action="store_true", help="leave a dataset folder's exact depth out")
-    parser.add_argument("--workers", type=int, metavar="N", help="threads (default: one a core)")
+    add_workers(parser)
     add_output_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the study and print its tables."""
+    """Run the study, write the requested outputs and print the tables."""
     with ProgressBars() as bars:
-        result = pseudo_reference_study(
+        result = run_pseudo_reference_study(
             options.methods,
             options.reference,
             options.data,
             config=options.config,
-            allowed=DepthRange(options.near, options.far),
+            depth_range=DepthRange(options.near, options.far),
             exact=not options.no_exact,
             workers=options.workers,
             progress=bars.update,
         )
-    write_outputs(options, result.to_dict(), csv_rows(result), study_page(result))
+    write_outputs(options, result.to_dict(), to_csv_rows(result), to_page(result))
 
 
-def pseudo_reference_study(
+def run_pseudo_reference_study(
     methods: Sequence[str],
     references: Sequence[str],
     data: str,
     *,
     config: str | None = None,
-    allowed: DepthRange = DepthRange(NEAR_M, FAR_M),  # noqa: B008 frozen
+    depth_range: DepthRange = DepthRange(DEFAULT_NEAR_M, DEFAULT_FAR_M),  # noqa: B008 frozen
     exact: bool = True,
     workers: int | None = None,
     progress: Progress = silent,
 ) -> PseudoReferenceResult:
-    """Score methods on the full frame against pseudo-references, and against exact depth where there is any.
+    """Score methods on the full frame against pseudo-references, and against exact depth if available.
 
     Methods and references are archives in the submission format or folders of depth files
-    (``depth_source.open_depths``). The first reference is what the others' ratios and rankings are held against.
+    (``depth_source.open_depths``). Ratios and rankings under the other references are relative to the first one.
 
-    Raises ``DatasetError`` or ``InputError`` for the data, a refused archive or folder, or a reference that has no
-    depth in range.
+    Raises ``DatasetError`` or ``InputError`` for invalid data, an invalid archive or folder, or a reference
+    without depth in range.
     """
-    on = _open_data(data, config)
+    study_data = _open_data(data, config)
     with ExitStack() as stack:
-        opened = [
-            stack.enter_context(open_depths(path, on.views if Path(path).is_dir() else on.archive_views))
+        depth_sources = [
+            stack.enter_context(
+                open_depths(path, study_data.views if Path(path).is_dir() else study_data.archive_views)
+            )
             for path in (*methods, *references)
         ]
-        sources = _labelled(opened, on.views)
+        sources = _label_sources(depth_sources, study_data.views)
         names = list(sources)
         by_method = {name: sources[name] for name in names[: len(methods)]}
         by_reference = {name: sources[name] for name in names[len(methods) :]}
-        outcomes = score_views(
-            on.frames(exact), len(on.views), by_method, by_reference, allowed, workers, progress
+        outcomes = score_frame_views(
+            study_data.frames(exact),
+            len(study_data.views),
+            by_method,
+            by_reference,
+            depth_range,
+            workers,
+            progress,
         )
-        _refuse(outcomes, sources)
-        stamps = [ArchiveStamp(name, source.sha256()) for name, source in sources.items()]
-    held_against = _references(outcomes, by_reference)
-    _refuse_empty(held_against, allowed)
-    digest, version = (None, None) if on.folder is None else (on.folder.digest, on.folder.version)
+        _raise_problems(outcomes, sources)
+        stamps = [ArchiveIdentity(name, source.sha256()) for name, source in sources.items()]
+    depth_references = _depth_references(outcomes, by_reference)
+    _check_references_have_depth(depth_references, depth_range)
+    digest, version = (
+        (None, None) if study_data.folder is None else (study_data.folder.digest, study_data.folder.version)
+    )
     return PseudoReferenceResult(
-        stamp=Stamp(PROTOCOL, digest, version, stamps),
-        data=on.name,
-        camera=None if on.capture is None else on.capture.camera_words(),
-        allowed=allowed,
-        references=held_against,
-        rows=_rows(outcomes),
-        agreements=_agreements(outcomes),
+        provenance=Provenance(PROTOCOL, digest, version, stamps),
+        data=study_data.name,
+        camera=None if study_data.capture is None else study_data.capture.describe_camera(),
+        depth_range=depth_range,
+        references=depth_references,
+        rows=_method_rows(outcomes),
+        agreements=_agreement_rows(outcomes),
     )
 
 
-def _open_data(data: str, config: str | None) -> _Data:
+def _open_data(data: str, config: str | None) -> _StudyData:
     if is_capture(data):
         if config is not None:
             raise InputError(f"{data}: is a capture, expected no --config (found {config!r})")
         capture = open_capture(data)
         views = capture.expected_views()
-        return _Data(f"capture {capture.path.resolve().name}", views, views, None, capture)
+        return _StudyData(f"capture {capture.path.resolve().name}", views, views, None, capture)
     folder = open_folder(data)
     if config is None and len(folder.configs) != 1:
         raise InputError(
@@ -174,11 +196,14 @@ def _open_data(data: str, config: str | None) -> _Data:
         )
     name = config or folder.configs[0]
     views = {view.view_id: folder.grid(name) for view in folder.views(name)}
-    return _Data(f"config {name}", views, folder.expected_views(), folder, None)
+    return _StudyData(f"config {name}", views, folder.expected_views(), folder, None)
 
 
-def _labelled(sources: Sequence[DepthSource], views: ExpectedViews) -> dict[str, DepthSource]:
-    """Return the sources by method; where two have one name, by method and file, then with a number too.
+def _label_sources(sources: Sequence[DepthSource], views: ExpectedViews) -> dict[str, DepthSource]:
+    """Return the sources by unique label.
+
+    The label is the method's name. If several sources have the same name, or if it could be confused with the
+    exact depth, the file name is appended, and then a number if necessary.
 
     Raises ``InputError`` for a source without any of the views.
     """
@@ -188,7 +213,7 @@ def _labelled(sources: Sequence[DepthSource], views: ExpectedViews) -> dict[str,
         if not any(view_id in views for view_id in source.view_ids):
             raise InputError(f"{source.path}: has no view of this data, expected some such as {next(iter(views))}")
         label = source.method
-        if methods.count(label) > 1 or label.startswith(EXACT):
+        if methods.count(label) > 1 or label.startswith(EXACT_LABEL):
             label = f"{source.method} ({source.path.name})"
         number = 2
         while label in labelled:
@@ -197,49 +222,47 @@ def _labelled(sources: Sequence[DepthSource], views: ExpectedViews) -> dict[str,
     return labelled
 
 
-def _refuse(outcomes: Sequence[FrameOutcome], sources: Mapping[str, DepthSource]) -> None:
-    """Raise ``InputError`` with what is wrong with the entries, each under its archive or folder."""
-    found = [problem for outcome in outcomes for problem in outcome.problems]
-    if found:
-        raise InputError(problem_summary([f"{sources[label].path}: {sentence}" for label, sentence in found]))
+def _raise_problems(outcomes: Sequence[FrameOutcome], sources: Mapping[str, DepthSource]) -> None:
+    """Raise ``InputError`` with the problems of all entries, each prefixed by its archive or folder, if any."""
+    problems = [problem for outcome in outcomes for problem in outcome.problems]
+    if problems:
+        raise InputError(problem_summary([f"{sources[label].path}: {sentence}" for label, sentence in problems]))
 
 
-def _references(outcomes: Sequence[FrameOutcome], pseudo: Mapping[str, DepthSource]) -> list[Reference]:
+def _depth_references(outcomes: Sequence[FrameOutcome], pseudo: Mapping[str, DepthSource]) -> list[DepthReference]:
     shares = {name: [outcome.shares[name] for outcome in outcomes] for name in outcomes[0].shares}
     return [
-        Reference(name, name not in pseudo, len(values), sum(value > 0 for value in values), _mean(values) or 0.0)
+        DepthReference(
+            name, name not in pseudo, len(values), sum(value > 0 for value in values), mean(values) or 0.0
+        )
         for name, values in shares.items()
     ]
 
 
-def _refuse_empty(references: Sequence[Reference], allowed: DepthRange) -> None:
-    empty = [one.name for one in references if one.views_with == 0]
+def _check_references_have_depth(references: Sequence[DepthReference], depth_range: DepthRange) -> None:
+    empty = [reference.name for reference in references if reference.views_with == 0]
     if empty:
         raise InputError(
-            f"{', '.join(map(formatting.printable, empty))}: no pixel of any view is {allowed.words()}, "
+            f"{', '.join(map(printable, empty))}: no pixel of any view is {depth_range.describe()}, "
             "expected some to score against"
         )
 
 
-def _rows(outcomes: Sequence[FrameOutcome]) -> list[Row]:
+def _method_rows(outcomes: Sequence[FrameOutcome]) -> list[MethodRow]:
     rows = []
     for method, reference in outcomes[0].scores:
         frames = [outcome.scores[method, reference] for outcome in outcomes]
         table = tabulate([frame.score for frame in frames if frame.score is not None])
-        rows.append(Row(method, reference, table, _mean([frame.frame_share for frame in frames]) or 0.0))
+        rows.append(MethodRow(method, reference, table, mean([frame.frame_share for frame in frames]) or 0.0))
     return rows
 
 
-def _agreements(outcomes: Sequence[FrameOutcome]) -> list[AgreementRow]:
+def _agreement_rows(outcomes: Sequence[FrameOutcome]) -> list[AgreementRow]:
     rows = []
     for pair in outcomes[0].agreements:
-        of_views = [outcome.agreements[pair] for outcome in outcomes]
-        errors = [one.abs_rel for one in of_views if one.abs_rel is not None]
-        ratios = [one.median_ratio for one in of_views if one.median_ratio is not None]
-        share = _mean([one.common_share for one in of_views]) or 0.0
-        rows.append(AgreementRow(*pair, len(errors), share, _mean(errors), median(ratios) if ratios else None))
+        view_agreements = [outcome.agreements[pair] for outcome in outcomes]
+        errors = [view.abs_rel for view in view_agreements if view.abs_rel is not None]
+        ratios = [view.median_ratio for view in view_agreements if view.median_ratio is not None]
+        share = mean([view.common_share for view in view_agreements]) or 0.0
+        rows.append(AgreementRow(*pair, len(errors), share, mean(errors), median(ratios) if ratios else None))
     return rows
-
-
-def _mean(values: Sequence[float]) -> float | None:
-    return math.fsum(values) / len(values) if values else None

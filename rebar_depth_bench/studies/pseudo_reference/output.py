@@ -1,18 +1,20 @@
-"""The study of pseudo-references in words and cells: its page, which the terminal prints too, and its CSV rows."""
+"""Page (also printed to the terminal) and CSV rows of the pseudo-reference study."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.study_page import PageTable, StudyPage
-from rebar_depth_bench.reporting.published import Published, load_published
+from rebar_depth_bench.reporting.published import PublishedNumbers, load_published
+from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.studies.pseudo_reference.result import (
     ALIGNMENTS,
     AgreementRow,
+    DepthReference,
+    MethodRow,
     PseudoReferenceResult,
-    Reference,
-    Row,
 )
 
 _SCORE_HEADS = (
@@ -33,21 +35,21 @@ _SCORE_HEADS = (
 )
 
 
-def study_page(result: PseudoReferenceResult) -> StudyPage:
-    """Return the study's page."""
+def to_page(result: PseudoReferenceResult) -> StudyPage:
+    """Return the page of the study."""
     camera = [] if result.camera is None else [("Camera", result.camera)]
     return StudyPage(
         study="pseudo-reference",
         title=(
-            f"Full frame against {_reference_words(result)}, {formatting.printable(result.data)}: "
+            f"Full frame against {_describe_references(result)}, {printable(result.data)}: "
             "native (no alignment) beside scaled (oracle median scale per view), "
-            f"depths of {result.allowed.words()}"
+            f"depths of {result.depth_range.describe()}"
         ),
         lead=_lead(result),
-        stamps=[*result.stamp.lines(), ("Data", formatting.printable(result.data)), *camera],
+        stamps=[*result.provenance.lines(), ("Data", printable(result.data)), *camera],
         figures=(),
         tables=[
-            *(_score_table(result, one) for one in result.references),
+            *(_score_table(result, reference) for reference in result.references),
             _ranking_table(result),
             _reference_table(result),
             *([_agreement_table(result)] if result.agreements else []),
@@ -57,61 +59,64 @@ def study_page(result: PseudoReferenceResult) -> StudyPage:
     )
 
 
-def csv_rows(result: PseudoReferenceResult) -> list[dict[str, Any]]:
-    """Return a line per method and reference, with the study's stamps."""
+def to_csv_rows(result: PseudoReferenceResult) -> list[dict[str, Any]]:
+    """Return the rows of the CSV: one per method and reference, with the provenance in columns."""
     return [_csv_row(result, row) for row in result.rows]
 
 
 def _lead(result: PseudoReferenceResult) -> str:
     first = result.references[0].name
-    whole = {one.reference for one in result.agreements} | {one.against for one in result.agreements}
+    compared = {row.reference for row in result.agreements} | {row.against for row in result.agreements}
     changes = [
-        f"{one.name}: AbsRel × {formatting.number(min(ratios), 2)} to {formatting.number(max(ratios), 2)}, "
-        f"{one.frame_share * 100:.1f} % of the frame, ranking {_same(result, one.name)}"
-        for one in result.references[1:]
-        if one.name in whole
-        and (ratios := [ratio for method in result.methods if (ratio := result.ratio(method, one.name, "native"))])
+        f"{reference.name}: AbsRel × {formatting.number(min(ratios), 2)} to {formatting.number(max(ratios), 2)}, "
+        f"{reference.frame_share * 100:.1f} % of the frame, ranking {_ranking_change(result, reference.name)}"
+        for reference in result.references[1:]
+        if reference.name in compared
+        and (
+            ratios := [
+                ratio for method in result.methods if (ratio := result.ratio(method, reference.name, "native"))
+            ]
+        )
     ]
     share = f"{result.references[0].frame_share * 100:.1f} % of the frame"
-    return formatting.printable("; ".join([f"Held against {first} ({share})", *changes]) + ".", limit=2000)
+    return printable("; ".join([f"Held against {first} ({share})", *changes]) + ".", limit=2000)
 
 
-def _reference_words(result: PseudoReferenceResult) -> str:
-    pseudo = sum(not one.exact for one in result.references)
-    words = f"{pseudo} pseudo-reference{'' if pseudo == 1 else 's'}"
-    return f"{words} and exact depth" if pseudo < len(result.references) else words
+def _describe_references(result: PseudoReferenceResult) -> str:
+    pseudo = sum(not reference.exact for reference in result.references)
+    pseudo_text = formatting.counted(pseudo, "pseudo-reference")
+    return f"{pseudo_text} and exact depth" if pseudo < len(result.references) else pseudo_text
 
 
-def _same(result: PseudoReferenceResult, reference: str) -> str:
+def _ranking_change(result: PseudoReferenceResult, reference: str) -> str:
     tau = result.tau(reference, "native")
-    both = {frozenset(result.ranking(name, "native")) for name in (result.references[0].name, reference)}
-    who = "" if len(both) == 1 else " among those ranked under both"
-    return "undefined" if tau is None else f"unchanged{who}" if tau == 1 else f"changed{who} (tau {tau:.2f})"
+    ranked_sets = {frozenset(result.ranking(name, "native")) for name in (result.references[0].name, reference)}
+    scope = "" if len(ranked_sets) == 1 else " among those ranked under both"
+    return "undefined" if tau is None else f"unchanged{scope}" if tau == 1 else f"changed{scope} (tau {tau:.2f})"
 
 
-def _score_table(result: PseudoReferenceResult, reference: Reference) -> PageTable:
+def _score_table(result: PseudoReferenceResult, reference: DepthReference) -> PageTable:
     rows = [row for row in result.rows if row.reference == reference.name]
     kind = "exact depth" if reference.exact else "pseudo-reference"
     share = f"depth on {reference.frame_share * 100:.1f} % of the frame"
-    caption = f"Against {formatting.printable(reference.name)} ({kind}; {share})"
+    caption = f"Against {printable(reference.name)} ({kind}; {share})"
     return PageTable(caption, _SCORE_HEADS, [_score_cells(result, row) for row in rows])
 
 
-def _score_cells(result: PseudoReferenceResult, row: Row) -> list[str]:
+def _score_cells(result: PseudoReferenceResult, row: MethodRow) -> list[str]:
     table = row.table
     native, scaled = formatting.metric_cells(table.native), formatting.metric_cells(table.scaled)
-    ends = table.intervals.get("native.abs_rel")
     return [
-        formatting.printable(row.method),
+        printable(row.method),
         formatting.coverage_percent(table.coverage),
         formatting.percent(row.frame_share),
         native[0],
-        formatting.DASH if ends is None else " to ".join(formatting.number(end, 4) for end in ends),
+        formatting.interval_text(table.intervals.get("native.abs_rel"), 4),
         *native[1:],
         scaled[0],
         scaled[1],
         formatting.scale_cell(table.scale_median),
-        *(formatting.number(result.ratio(row.method, row.reference, way), 2) for way in ALIGNMENTS),
+        *(formatting.number(result.ratio(row.method, row.reference, alignment), 2) for alignment in ALIGNMENTS),
         "yes" if table.ranked else "no",
     ]
 
@@ -119,11 +124,11 @@ def _score_cells(result: PseudoReferenceResult, row: Row) -> list[str]:
 def _ranking_table(result: PseudoReferenceResult) -> PageTable:
     def cells(reference: str) -> list[str]:
         orders = [
-            formatting.printable(" < ".join(result.ranking(reference, way)), 500) or formatting.DASH
-            for way in ALIGNMENTS
+            printable(" < ".join(result.ranking(reference, alignment)), 500) or formatting.DASH
+            for alignment in ALIGNMENTS
         ]
-        taus = [formatting.number(result.tau(reference, way), 2) for way in ALIGNMENTS]
-        return [formatting.printable(reference), orders[0], taus[0], orders[1], taus[1]]
+        taus = [formatting.number(result.tau(reference, alignment), 2) for alignment in ALIGNMENTS]
+        return [printable(reference), orders[0], taus[0], orders[1], taus[1]]
 
     heads = (
         ("reference", ""),
@@ -132,27 +137,31 @@ def _ranking_table(result: PseudoReferenceResult) -> PageTable:
         ("by AbsRel_s", "best first"),
         ("tau", ""),
     )
-    caption = f"Ranking; Kendall's tau against that under {formatting.printable(result.references[0].name)}"
-    return PageTable(caption, heads, [cells(one.name) for one in result.references])
+    caption = f"Ranking; Kendall's tau against that under {printable(result.references[0].name)}"
+    return PageTable(caption, heads, [cells(reference.name) for reference in result.references])
 
 
 def _reference_table(result: PseudoReferenceResult) -> PageTable:
     heads = (("reference", ""), ("coverage", "% of frame"), ("views", "with depth / all"))
     rows = [
-        [formatting.printable(one.name), formatting.percent(one.frame_share), f"{one.views_with}/{one.views}"]
-        for one in result.references
+        [
+            printable(reference.name),
+            formatting.percent(reference.frame_share),
+            f"{reference.views_with}/{reference.views}",
+        ]
+        for reference in result.references
     ]
     return PageTable("The references: depth in range, mean over all views", heads, rows)
 
 
 def _agreement_table(result: PseudoReferenceResult) -> PageTable:
-    def cells(one: AgreementRow) -> list[str]:
+    def cells(row: AgreementRow) -> list[str]:
         return [
-            f"{formatting.printable(one.reference)} against {formatting.printable(one.against)}",
-            formatting.percent(one.common_share),
-            formatting.number(one.abs_rel, 4),
-            formatting.number(one.median_ratio, 4),
-            str(one.views),
+            f"{printable(row.reference)} against {printable(row.against)}",
+            formatting.percent(row.common_share),
+            formatting.number(row.abs_rel, 4),
+            formatting.number(row.median_ratio, 4),
+            str(row.views),
         ]
 
     heads = (
@@ -163,33 +172,33 @@ def _agreement_table(result: PseudoReferenceResult) -> PageTable:
         ("views", ""),
     )
     return PageTable(
-        "How the references differ where both have depth", heads, [cells(one) for one in result.agreements]
+        "How the references differ where both have depth", heads, [cells(row) for row in result.agreements]
     )
 
 
-def _published_tables(published: Published) -> list[PageTable]:
+def _published_tables(published: PublishedNumbers) -> list[PageTable]:
     part = published.parts["physical"]
     heads = (("method", ""), ("RMSE ↓", "cm"), ("AbsRel ↓", ""), ("AbsRel_s ↓", "scaled"), ("s", ""))
     return [
         PageTable(
-            f"Published, {part.place}, against {name} ({one.coverage_percent} % of the frame): {part.mark}",
+            f"Published, {part.place}, against {name} ({reference.coverage_percent} % of the frame): {part.mark}",
             heads,
-            [[row.method, row.rmse_cm, row.abs_rel, row.abs_rel_scaled, row.scale] for row in one.rows],
+            [[row.method, *row.cells] for row in reference.rows],
         )
-        for name, one in published.references.items()
+        for name, reference in published.references.items()
     ]
 
 
 def _notes(result: PseudoReferenceResult) -> list[str]:
-    first = formatting.printable(result.references[0].name)
+    first = printable(result.references[0].name)
     notes = [
         "z: the reference, p: the prediction. Scored are pixels of the whole frame where both are finite, > 0 and "
-        f"within {result.allowed.words()}. Means over views; s: median over views of median(z)/median(p).",
+        f"within {result.depth_range.describe()}. Means over views; s: median over views of median(z)/median(p).",
         f"Ratio: AbsRel here over AbsRel against {first}. Intervals: block bootstrap over views.",
         "A prediction that is missing or out of range lowers the coverage and no error: a method that "
         "covers less than 95 % of a reference's pixels, or nothing in a view, is shown and not ranked.",
     ]
-    if any(one.exact for one in result.references):
+    if any(reference.exact for reference in result.references):
         notes.append(
             "Exact depth where a pseudo-reference has depth tells two effects apart: from there to the pseudo-"
             "reference only the depth changes, from there to the exact depth only the pixels."
@@ -199,25 +208,23 @@ def _notes(result: PseudoReferenceResult) -> list[str]:
     for row in result.rows:
         reasons = formatting.unranked_reasons(row.table)
         if reasons:
-            names = f"{formatting.printable(row.method)} against {formatting.printable(row.reference)}"
+            names = f"{printable(row.method)} against {printable(row.reference)}"
             notes.append(f"{names}: not ranked: {'; '.join(reasons)}.")
     return notes
 
 
-def _csv_row(result: PseudoReferenceResult, row: Row) -> dict[str, Any]:
-    table, stamp = row.table, result.stamp.to_dict()
+def _csv_row(result: PseudoReferenceResult, row: MethodRow) -> dict[str, Any]:
+    table, provenance = row.table, result.provenance.to_dict()
     metrics = {
-        f"{way}_{name}": value
-        for way, content in (("native", table.native), ("scaled", table.scaled))
-        for name, value in (
-            vars(content) if content else dict.fromkeys(("abs_rel", "rmse_cm", "mae_cm", "delta1"))
-        ).items()
+        f"{alignment}_{name}": value
+        for alignment, table_metrics in (("native", table.native), ("scaled", table.scaled))
+        for name, value in (vars(table_metrics) if table_metrics else dict.fromkeys(METRIC_NAMES)).items()
     }
     return {
-        "protocol": stamp["protocol"],
+        "protocol": provenance["protocol"],
         "data": result.data,
-        "near_m": result.allowed.near_m,
-        "far_m": result.allowed.far_m,
+        "near_m": result.depth_range.near_m,
+        "far_m": result.depth_range.far_m,
         "method": row.method,
         "reference": row.reference,
         "views": table.views,
@@ -227,7 +234,7 @@ def _csv_row(result: PseudoReferenceResult, row: Row) -> dict[str, Any]:
         "ranked": table.ranked,
         **metrics,
         "scale_median": table.scale_median,
-        **{f"{way}_ratio": result.ratio(row.method, row.reference, way) for way in ALIGNMENTS},
-        "dataset_digest": result.stamp.dataset_digest,
-        "software_version": stamp["software"]["version"],
+        **{f"{alignment}_ratio": result.ratio(row.method, row.reference, alignment) for alignment in ALIGNMENTS},
+        "dataset_digest": result.provenance.dataset_digest,
+        "software_version": provenance["software"]["version"],
     }

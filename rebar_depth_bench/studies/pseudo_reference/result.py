@@ -1,4 +1,4 @@
-"""What the study of two pseudo-references says, as numbers: rows, ratios, rankings, the references themselves."""
+"""Result of the pseudo-reference study: scores per reference, ratios, rankings and agreement of the references."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from itertools import combinations
 from typing import Any, Literal
 
 from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.provenance import Stamp
+from rebar_depth_bench.scoring.provenance import Provenance
 from rebar_depth_bench.scoring.result import Table
 from rebar_depth_bench.studies.pseudo_reference.study import DepthRange
 
@@ -17,11 +17,11 @@ ALIGNMENTS: tuple[Alignment, ...] = ("native", "scaled")
 
 
 @dataclass(frozen=True)
-class Reference:
-    """What predictions were scored against: a pseudo-reference, or exact depth (on one's pixels).
+class DepthReference:
+    """Reference depth: a pseudo-reference, or exact depth (possibly restricted to a pseudo-reference's pixels).
 
-    ``frame_share`` is the share of the frame where it has depth, mean over all ``views``; ``views_with`` are the
-    views where it has any.
+    ``frame_share`` is the fraction of the frame with depth, mean over all ``views``; ``views_with`` counts the
+    views with any depth.
     """
 
     name: str
@@ -32,10 +32,11 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class Row:
-    """A method against a reference. ``table.coverage`` is the share of the reference's pixels with a prediction.
+class MethodRow:
+    """Scores of a method against a reference.
 
-    ``frame_share`` is the share of the frame that is scored, mean over all views.
+    ``table.coverage`` is the fraction of the reference's pixels with a prediction; ``frame_share`` is the fraction
+    of the frame that is scored, mean over all views.
     """
 
     method: str
@@ -46,7 +47,11 @@ class Row:
 
 @dataclass(frozen=True)
 class AgreementRow:
-    """A reference against another where both have depth: means over views, the median of the views' ratios."""
+    """Agreement of a reference with another one on the pixels where both have depth.
+
+    ``views`` counts the views with common pixels. ``common_share`` (fraction of the frame with depth in both) and
+    ``abs_rel`` are means over views; ``median_ratio`` is the median over views of their median ratios.
+    """
 
     reference: str
     against: str
@@ -58,85 +63,98 @@ class AgreementRow:
 
 @dataclass(frozen=True)
 class PseudoReferenceResult:
-    """The study's numbers. ``references[0]`` is what the others' ratios and rankings are held against."""
+    """Result of the pseudo-reference study.
 
-    stamp: Stamp
+    Ratios and rankings under the other references are relative to ``references[0]``. ``depth_range`` is the
+    evaluation range; ``camera`` describes the camera of a capture and is None for a dataset folder.
+    """
+
+    provenance: Provenance
     data: str
     camera: str | None
-    allowed: DepthRange
-    references: Sequence[Reference]
-    rows: Sequence[Row]
+    depth_range: DepthRange
+    references: Sequence[DepthReference]
+    rows: Sequence[MethodRow]
     agreements: Sequence[AgreementRow]
 
-    def row(self, method: str, reference: str) -> Row:
-        """Return a method's row against a reference."""
+    def row(self, method: str, reference: str) -> MethodRow:
+        """Return the row of a method against a reference."""
         return next(row for row in self.rows if (row.method, row.reference) == (method, reference))
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """The methods in the order they were named."""
+        """Return the methods in the order in which they were given."""
         return tuple(dict.fromkeys(row.method for row in self.rows))
 
     def ratio(self, method: str, reference: str, alignment: Alignment) -> float | None:
-        """Return AbsRel against ``reference`` over AbsRel against the first reference, None where undefined."""
+        """Return AbsRel against ``reference`` divided by AbsRel against the first reference, None if undefined."""
         values = [
-            abs_rel(self.row(method, name).table, alignment) for name in (self.references[0].name, reference)
+            table_abs_rel(self.row(method, name).table, alignment) for name in (self.references[0].name, reference)
         ]
         return values[1] / values[0] if values[0] and values[1] is not None else None
 
     def ranking(self, reference: str, alignment: Alignment) -> tuple[str, ...]:
-        """Return the ranked methods, smallest AbsRel first; who may not be ranked is not in it."""
+        """Return the ranked methods by ascending AbsRel; methods that may not be ranked are left out."""
         ranked = [row for row in self.rows if row.reference == reference and row.table.ranked]
-        return tuple(row.method for row in sorted(ranked, key=lambda row: abs_rel(row.table, alignment) or 0.0))
+        return tuple(
+            row.method for row in sorted(ranked, key=lambda row: table_abs_rel(row.table, alignment) or 0.0)
+        )
 
     def tau(self, reference: str, alignment: Alignment) -> float | None:
-        """Return Kendall's tau between the ranking under a reference and that under the first one."""
+        """Return Kendall's tau between the rankings under the first reference and under ``reference``."""
         return kendall_tau(self.ranking(self.references[0].name, alignment), self.ranking(reference, alignment))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the study's JSON object; who writes it rounds its numbers."""
+        """Return the JSON object of the study; its numbers are not yet rounded."""
         return {
-            **self.stamp.to_dict(),
+            **self.provenance.to_dict(),
             "data": self.data,
             "camera": self.camera,
-            "range_m": [self.allowed.near_m, self.allowed.far_m],
-            "references": [dict(vars(one)) for one in self.references],
+            "range_m": [self.depth_range.near_m, self.depth_range.far_m],
+            "references": [dict(vars(reference)) for reference in self.references],
             "rows": [self._row_dict(row) for row in self.rows],
-            "rankings": {one.name: self._ranking_dict(one.name) for one in self.references},
-            "agreement": [dict(vars(one)) for one in self.agreements],
+            "rankings": {reference.name: self._ranking_dict(reference.name) for reference in self.references},
+            "agreement": [dict(vars(row)) for row in self.agreements],
         }
 
-    def _row_dict(self, row: Row) -> dict[str, Any]:
-        ratios = {way: self.ratio(row.method, row.reference, way) for way in ALIGNMENTS}
+    def _row_dict(self, row: MethodRow) -> dict[str, Any]:
+        ratios = {alignment: self.ratio(row.method, row.reference, alignment) for alignment in ALIGNMENTS}
         names = {"method": row.method, "reference": row.reference}
         return {**names, "frame_share": row.frame_share, "ratio": ratios, **_table_dict(row.table)}
 
     def _ranking_dict(self, reference: str) -> dict[str, Any]:
         return {
-            way: {"order": list(self.ranking(reference, way)), "tau": self.tau(reference, way)}
-            for way in ALIGNMENTS
+            alignment: {
+                "order": list(self.ranking(reference, alignment)),
+                "tau": self.tau(reference, alignment),
+            }
+            for alignment in ALIGNMENTS
         }
 
 
-def abs_rel(table: Table, alignment: Alignment) -> float | None:
-    """Return a table's native or scaled AbsRel."""
+def table_abs_rel(table: Table, alignment: Alignment) -> float | None:
+    """Return the native or scaled AbsRel of a table, None if undefined."""
     metrics: DepthMetrics | None = table.native if alignment == "native" else table.scaled
     return None if metrics is None else metrics.abs_rel
 
 
 def kendall_tau(first: Sequence[str], other: Sequence[str]) -> float | None:
-    """Return Kendall's tau of two rankings on the names that both hold: (agreeing - other pairs) / pairs, -1 to 1.
+    """Return Kendall's tau of two rankings on their common names, from -1 to 1.
 
-    None with fewer than two common names. Kendall, "A new measure of rank correlation", Biometrika 1938.
+    Tau is (concordant - discordant pairs) / pairs; it is None with fewer than two common names. Kendall, "A new
+    measure of rank correlation", Biometrika 1938.
     """
     common = [name for name in first if name in other]
-    place = {name: other.index(name) for name in common}
-    signs = [1 if place[a] < place[b] else -1 for a, b in combinations(common, 2)]
+    rank = {name: other.index(name) for name in common}
+    signs = [1 if rank[a] < rank[b] else -1 for a, b in combinations(common, 2)]
     return sum(signs) / len(signs) if signs else None
 
 
 def _table_dict(table: Table) -> dict[str, Any]:
-    """Return a table's numbers under the contract's names; ``ci95`` as ``native.abs_rel``: [a, b]."""
+    """Return the numbers of a table under the same names as in the result JSON of ``score``.
+
+    ``ci95`` maps names such as ``native.abs_rel`` to [low, high].
+    """
     return {
         "views": table.views,
         "views_scored": table.views_scored,
@@ -145,7 +163,7 @@ def _table_dict(table: Table) -> dict[str, Any]:
         "native": _metrics_dict(table.native),
         "scaled": _metrics_dict(table.scaled),
         "scale_median": table.scale_median,
-        "ci95": {name: ends for name, ends in table.intervals.items() if not name.startswith("within_mm")},
+        "ci95": {name: interval for name, interval in table.intervals.items() if not name.startswith("within_mm")},
     }
 
 

@@ -1,10 +1,9 @@
-"""The full-frame score of the physical evaluation: no mask, only where a reference and a prediction have depth.
+"""Pseudo-reference study: full-frame scores of every method against every reference, view by view.
 
-Paper, II.C: "Physical monocular scores use the full frame: pixels where that pseudo-reference is valid and the
-prediction is finite and positive in the evaluation range". Numbers of a view are those of ``rebar-1`` on these
-pixels (``scoring.score_view``), scaled by the view's own s = median(z)/median(p).
-
-Every method against every reference, view by view: what the study of pseudo-references counts.
+Instead of a steel mask, the scored pixels are those where both reference and prediction have depth. Paper, II.C:
+"Physical monocular scores use the full frame: pixels where that pseudo-reference is valid and the prediction is
+finite and positive in the evaluation range". The metrics of a view are those of ``rebar-1`` on these pixels
+(``scoring.score.score_view``), scaled by the view's own s = median(z) / median(p).
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.data.ground_truth import ViewTruth
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.parallel import ordered_map
 from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.ground_truth import ViewTruth
 from rebar_depth_bench.scoring.result import ViewScore
 from rebar_depth_bench.scoring.score import score_view
 from rebar_depth_bench.studies.depth_source import DepthSource
@@ -30,7 +29,7 @@ from rebar_depth_bench.submission import EntryError
 
 @dataclass(frozen=True)
 class DepthRange:
-    """The evaluation range: depths from ``near_m`` to ``far_m``, ends included, count; all others are none.
+    """Evaluation range [``near_m``, ``far_m``] in metres; values outside it are treated as missing.
 
     Raises ``InputError`` unless 0 <= near < far.
     """
@@ -42,16 +41,17 @@ class DepthRange:
         if not (0 <= self.near_m < self.far_m and not math.isnan(self.far_m)):
             raise InputError(f"the range is {self.near_m} to {self.far_m} m, expected 0 <= near < far")
 
-    def words(self) -> str:
-        """Return the range in words."""
+    def describe(self) -> str:
+        """Return the range as text, such as ``0.1 to 20 m``."""
         return f"{self.near_m:g} to {self.far_m:g} m"
 
 
 @dataclass(frozen=True)
 class FrameScore:
-    """A prediction against a reference on one view. ``score`` is None where the reference has no pixel at all.
+    """Score of a prediction against a reference on one view.
 
-    ``score.coverage`` is the share of the reference's pixels that the prediction covers.
+    ``score`` is None if the reference has no depth in the view; ``score.coverage`` is the fraction of the
+    reference's pixels with a valid prediction.
     """
 
     view_id: str
@@ -61,15 +61,16 @@ class FrameScore:
 
     @property
     def frame_share(self) -> float:
-        """The share of the frame that is scored: reference and prediction both have depth."""
+        """Return the fraction of the frame that is scored, where reference and prediction both have depth."""
         return 0.0 if self.score is None else self.score.coverage * self.reference_px / self.frame_px
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """One reference against another on one view: where both have depth.
+    """Agreement of a reference a with another reference b on one view.
 
-    ``abs_rel`` = mean(|a - b| / b) and ``median_ratio`` = median(a / b) on the common pixels, None without any.
+    ``common_share`` is the fraction of the frame where both have depth. On these pixels, ``abs_rel`` =
+    mean(|a - b| / b) and ``median_ratio`` = median(a / b); both are None if there are no common pixels.
     """
 
     common_share: float
@@ -77,22 +78,28 @@ class Agreement:
     median_ratio: float | None
 
 
-def usable(depth_m: Float[ndarray, "h w"], allowed: DepthRange) -> Float[ndarray, "h w"]:
-    """Return the depth where it is finite, > 0 and in the range, NaN everywhere else. float16 becomes float32."""
-    if depth_m.dtype == np.float16:  # the range's ends would be rounded to three digits
+def mask_invalid_depth(depth_m: Float[ndarray, "h w"], depth_range: DepthRange) -> Float[ndarray, "h w"]:
+    """Return the depth map with NaN wherever it is not finite, not > 0 or outside the range.
+
+    A float16 map is converted to float32.
+    """
+    if depth_m.dtype == np.float16:
+        # In float16 the ends of the range would be rounded to three digits.
         depth_m = depth_m.astype(np.float32)
     with np.errstate(invalid="ignore"):
-        kept = np.isfinite(depth_m) & (depth_m > 0) & (depth_m >= allowed.near_m) & (depth_m <= allowed.far_m)
-    return np.asarray(np.where(kept, depth_m, np.nan))
+        valid = (
+            np.isfinite(depth_m) & (depth_m > 0) & (depth_m >= depth_range.near_m) & (depth_m <= depth_range.far_m)
+        )
+    return np.asarray(np.where(valid, depth_m, np.nan))
 
 
-def has_depth(usable_m: Float[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Return where a map that went through ``usable`` has depth."""
-    return np.asarray(~np.isnan(usable_m))
+def has_depth(masked_m: Float[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Return the mask of the pixels with depth of a map from ``mask_invalid_depth``."""
+    return np.asarray(~np.isnan(masked_m))
 
 
-def reference_pixels(view_id: str, reference_m: Float[ndarray, "h w"]) -> ViewTruth | None:
-    """Return the pixels of a usable reference as what predictions are scored against, None without any."""
+def reference_as_truth(view_id: str, reference_m: Float[ndarray, "h w"]) -> ViewTruth | None:
+    """Return a masked reference as the ground truth to score predictions against, None if it has no depth."""
     index = np.flatnonzero(has_depth(reference_m)).astype(np.uint32)
     if not len(index):
         return None
@@ -100,19 +107,23 @@ def reference_pixels(view_id: str, reference_m: Float[ndarray, "h w"]) -> ViewTr
     return ViewTruth(view_id, index, z_m, float(np.median(z_m)))
 
 
-def frame_score(
+def score_frame(
     view_id: str, shape: tuple[int, int], truth: ViewTruth | None, prediction_m: Float[ndarray, "h w"] | None
 ) -> FrameScore:
-    """Score a usable prediction, None where the view has none, on a reference's pixels."""
+    """Score a masked prediction on the pixels of a reference.
+
+    ``shape`` is the (H, W) of the view. ``truth`` is None if the reference has no depth in the view,
+    ``prediction_m`` is None if there is no prediction for the view.
+    """
     frame_px = shape[0] * shape[1]
     if truth is None:
         return FrameScore(view_id, frame_px, 0, None)
-    given_m = no_depth(shape) if prediction_m is None else prediction_m
-    return FrameScore(view_id, frame_px, len(truth.index), score_view(truth, given_m))
+    predicted_m = empty_depth_map(shape) if prediction_m is None else prediction_m
+    return FrameScore(view_id, frame_px, len(truth.index), score_view(truth, predicted_m))
 
 
-def agreement(first_m: Float[ndarray, "h w"], other_m: Float[ndarray, "h w"]) -> Agreement:
-    """Compare a usable reference a = ``first_m`` with another, b = ``other_m``, in float64."""
+def compare_references(first_m: Float[ndarray, "h w"], other_m: Float[ndarray, "h w"]) -> Agreement:
+    """Compare a masked reference a = ``first_m`` with another one, b = ``other_m``, in float64."""
     common = has_depth(first_m) & has_depth(other_m)
     a_m: Float64[ndarray, " n"] = first_m[common].astype(np.float64)
     b_m: Float64[ndarray, " n"] = other_m[common].astype(np.float64)
@@ -124,34 +135,37 @@ def agreement(first_m: Float[ndarray, "h w"], other_m: Float[ndarray, "h w"]) ->
         return Agreement(share, float(np.mean(np.abs(ratio - 1))), float(np.median(ratio)))
 
 
-def no_depth(shape: tuple[int, int]) -> Float[ndarray, "h w"]:
-    """Return a map of (H, W) without depth anywhere."""
+def empty_depth_map(shape: tuple[int, int]) -> Float[ndarray, "h w"]:
+    """Return a map of shape (H, W) without depth (all NaN)."""
     return np.full(shape, np.nan, dtype=np.float32)
 
 
-def only_on(usable_m: Float[ndarray, "h w"], pixels: Bool[ndarray, "h w"]) -> Float[ndarray, "h w"]:
-    """Return a usable map with no depth outside ``pixels``."""
-    return np.where(pixels, usable_m, np.nan)
+def restrict_to_pixels(masked_m: Float[ndarray, "h w"], pixels: Bool[ndarray, "h w"]) -> Float[ndarray, "h w"]:
+    """Return a masked map without depth outside the mask ``pixels``."""
+    return np.where(pixels, masked_m, np.nan)
 
 
-EXACT = "exact"
-Map = Float[ndarray, "h w"]
+EXACT_LABEL = "exact"
+"""Label of the exact depth of a dataset folder as a reference."""
+DepthMap = Float[ndarray, "h w"]
 
 
 @dataclass(frozen=True, eq=False)
 class FrameView:
-    """A view to score: its id, (H, W), and its exact depth in metres where there is any truth."""
+    """View to score: id, (H, W), and its exact depth in metres if there is ground truth."""
 
     view_id: str
     shape: tuple[int, int]
-    exact_m: Map | None = None
+    exact_m: DepthMap | None = None
 
 
 @dataclass(frozen=True)
 class FrameOutcome:
-    """One view: (method, reference) scores, the share of the frame that each reference covers, and how two agree.
+    """Outcome of one view.
 
-    ``problems`` are (label of the source, sentence): then there is nothing else.
+    ``scores`` is keyed by (method, reference), ``shares`` (fraction of the frame with depth) by reference, and
+    ``agreements`` by pairs of references. ``problems`` are (source label, message); if there are any, the other
+    fields are empty.
     """
 
     scores: Mapping[tuple[str, str], FrameScore] = field(default_factory=dict)
@@ -160,73 +174,86 @@ class FrameOutcome:
     problems: tuple[tuple[str, str], ...] = ()
 
 
-def exact_on(reference: str) -> str:
-    """Return the name of the exact depth restricted to the pixels of a pseudo-reference."""
-    return f"{EXACT} where {reference} has depth"
+def exact_label_within(reference: str) -> str:
+    """Return the label of the exact depth restricted to the pixels of a pseudo-reference."""
+    return f"{EXACT_LABEL} where {reference} has depth"
 
 
-def score_views(
+def score_frame_views(
     views: Iterable[FrameView],
     total: int,
     methods: Mapping[str, DepthSource],
     references: Mapping[str, DepthSource],
-    allowed: DepthRange,
+    depth_range: DepthRange,
     workers: int | None = None,
     progress: Progress = silent,
 ) -> list[FrameOutcome]:
-    """Score ``total`` views on ``workers`` threads; a few views are in memory at a time."""
+    """Score ``total`` views on ``workers`` threads, with only a few views in memory at a time."""
     outcomes = []
-    done = ordered_map(lambda view: score_one(view, methods, references, allowed), views, workers)
-    for count, outcome in enumerate(done, start=1):
+    ordered_outcomes = ordered_map(
+        lambda view: score_frame_view(view, methods, references, depth_range), views, workers
+    )
+    for done, outcome in enumerate(ordered_outcomes, start=1):
         outcomes.append(outcome)
-        progress("scoring the full frame", count, total)
+        progress("scoring the full frame", done, total)
     return outcomes
 
 
-def score_one(
+def score_frame_view(
     view: FrameView,
     methods: Mapping[str, DepthSource],
     references: Mapping[str, DepthSource],
-    allowed: DepthRange,
+    depth_range: DepthRange,
 ) -> FrameOutcome:
-    """Score one view of every method against every reference, and against the exact depth if there is any."""
+    """Score one view of every method against every reference, and against the exact depth if available."""
     problems: list[tuple[str, str]] = []
-    predictions = {name: _read(name, source, view, allowed, problems) for name, source in methods.items()}
-    read = {name: _read(name, source, view, allowed, problems) for name, source in references.items()}
-    pseudo = {name: no_depth(view.shape) if depth_m is None else depth_m for name, depth_m in read.items()}
+    predictions = {
+        name: _read_depth(name, source, view, depth_range, problems) for name, source in methods.items()
+    }
+    reference_maps = {
+        name: _read_depth(name, source, view, depth_range, problems) for name, source in references.items()
+    }
+    pseudo = {
+        name: empty_depth_map(view.shape) if depth_m is None else depth_m
+        for name, depth_m in reference_maps.items()
+    }
     if problems:
         return FrameOutcome(problems=tuple(problems))
-    maps = {**pseudo, **_exact_maps(view, pseudo, allowed)}
+    maps = {**pseudo, **_exact_maps(view, pseudo, depth_range)}
     scores, shares = {}, {}
     for name, reference_m in maps.items():
-        truth = reference_pixels(view.view_id, reference_m)
+        truth = reference_as_truth(view.view_id, reference_m)
         shares[name] = float(has_depth(reference_m).mean())
         for method, prediction_m in predictions.items():
-            scores[method, name] = frame_score(view.view_id, view.shape, truth, prediction_m)
-    compared = [*pseudo, *([EXACT] if EXACT in maps else [])]
-    pairs = [(one, other) for one, other in permutations(compared, 2) if one != EXACT]
-    return FrameOutcome(scores, shares, {pair: agreement(maps[pair[0]], maps[pair[1]]) for pair in pairs})
+            scores[method, name] = score_frame(view.view_id, view.shape, truth, prediction_m)
+    compared = [*pseudo, *([EXACT_LABEL] if EXACT_LABEL in maps else [])]
+    pairs = [(first, other) for first, other in permutations(compared, 2) if first != EXACT_LABEL]
+    return FrameOutcome(scores, shares, {pair: compare_references(maps[pair[0]], maps[pair[1]]) for pair in pairs})
 
 
-def _exact_maps(view: FrameView, pseudo: Mapping[str, Map], allowed: DepthRange) -> dict[str, Map]:
-    """Return the exact depth, whole and on each pseudo-reference's pixels; nothing where there is no truth.
+def _exact_maps(view: FrameView, pseudo: Mapping[str, DepthMap], depth_range: DepthRange) -> dict[str, DepthMap]:
+    """Return the exact depth by label: whole, and restricted to the pixels of each pseudo-reference.
 
-    The restricted ones tell the two effects of a pseudo-reference apart: other pixels, and wrong depth on them.
+    The restricted maps separate the two effects of a pseudo-reference: a different set of pixels, and wrong depth
+    on these pixels. The result is empty if the view has no ground truth.
     """
     if view.exact_m is None:
         return {}
-    exact_m = usable(view.exact_m, allowed)
-    return {EXACT: exact_m} | {exact_on(name): only_on(exact_m, has_depth(one)) for name, one in pseudo.items()}
+    exact_m = mask_invalid_depth(view.exact_m, depth_range)
+    return {EXACT_LABEL: exact_m} | {
+        exact_label_within(name): restrict_to_pixels(exact_m, has_depth(pseudo_m))
+        for name, pseudo_m in pseudo.items()
+    }
 
 
-def _read(
-    name: str, source: DepthSource, view: FrameView, allowed: DepthRange, problems: list[tuple[str, str]]
-) -> Map | None:
-    """Return a source's usable map of a view, None where it has none or what it has is refused."""
+def _read_depth(
+    name: str, source: DepthSource, view: FrameView, depth_range: DepthRange, problems: list[tuple[str, str]]
+) -> DepthMap | None:
+    """Return the masked map of a view from a source, None if it is missing or invalid (then add a problem)."""
     if view.view_id not in source.view_ids:
         return None
     try:
-        return usable(source.read(view.view_id), allowed)
+        return mask_invalid_depth(source.read(view.view_id), depth_range)
     except EntryError as error:
         problems.append((name, error.problem))
         return None

@@ -1,4 +1,4 @@
-"""``rebar-bench study anchor``: how many views of known depth give an archive its scale (the paper's Figure 3)."""
+"""Command ``rebar-bench study anchor``: scale of an archive from k views of known depth (the paper's Figure 3)."""
 
 from __future__ import annotations
 
@@ -11,146 +11,157 @@ from pathlib import Path
 
 import numpy as np
 
-from rebar_depth_bench.cli.console import ProgressBars
-from rebar_depth_bench.data.ground_truth import config_truth
+from rebar_depth_bench.console import ProgressBars, add_data
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.ground_truth import config_truth
 from rebar_depth_bench.studies.common import (
     add_output_arguments,
-    archive_stamp,
+    archive_provenance,
     map_views,
-    one_config,
-    opened,
+    open_valid_submission,
+    select_config,
     write_outputs,
 )
-from rebar_depth_bench.studies.scale_anchor import output as words
+from rebar_depth_bench.studies.scale_anchor import output
 from rebar_depth_bench.studies.scale_anchor.study import (
     AnchorStudy,
     ScaledArchive,
     anchor_row,
-    drawn_scales,
-    errors_at,
+    draw_scales,
+    errors_at_scales,
     mean_errors,
     view_ratio,
 )
 
 SUMMARY = "how many views of known depth give a whole archive its scale"
 
-DRAWS = 24
-COUNTS = (1, 2, 3, 5, 10, 20, 30, 50, 100, 150, 200, 300)
+DEFAULT_DRAWS = 24
+"""Draws for each k."""
+DEFAULT_COUNTS = (1, 2, 3, 5, 10, 20, 30, 50, 100, 150, 200, 300)
+"""Numbers k of known-depth views."""
 MAX_DRAWS = 1000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the study's arguments."""
     parser.add_argument("archive", metavar="ARCHIVE", help="a submission's zip, metric or up to scale")
-    parser.add_argument("--data", required=True, metavar="ROOT", help="dataset folder or Hub repository id")
+    add_data(parser)
     parser.add_argument("--config", metavar="NAME", help="which config (default: the archive's only one)")
     parser.add_argument(
-        "--given-scale",
+        "--baseline-scale",
+        dest="given_scale",
         type=float,
         default=1.0,
         metavar="S",
         help="what changes are told against: the archive times S (default: 1, as it stands)",
     )
     parser.add_argument(
-        "--k",
+        "--num-anchor-views",
+        dest="k",
         type=int,
         nargs="+",
         action="extend",
         metavar="K",
-        help=f"numbers of known-depth views (default: {' '.join(map(str, COUNTS))})",
+        help=f"numbers of known-depth views (default: {' '.join(map(str, DEFAULT_COUNTS))})",
     )
     parser.add_argument(
-        "--draws", type=int, default=DRAWS, metavar="N", help="independent draws for each k (default: %(default)s)"
+        "--draws",
+        type=int,
+        default=DEFAULT_DRAWS,
+        metavar="N",
+        help="independent draws for each k (default: %(default)s)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the draws (default: %(default)s)")
     add_output_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the study and write what is asked for. Raises as ``study_anchor``."""
+    """Run the study and write the requested outputs. Raises the errors of ``run_anchor_study``."""
     with ProgressBars() as bars:
-        study = study_anchor(
+        study = run_anchor_study(
             options.archive,
             options.data,
             config=options.config,
             given_scale=options.given_scale,
-            counts=options.k or COUNTS,
+            counts=options.k or DEFAULT_COUNTS,
             draws=options.draws,
             seed=options.seed,
             progress=bars.update,
         )
-    write_outputs(options, words.content(study), words.rows(study), words.page(study))
+    write_outputs(options, output.to_json(study), output.to_csv_rows(study), output.to_page(study))
 
 
-def study_anchor(
+def run_anchor_study(
     archive: str | os.PathLike[str],
     root: str | Path,
     *,
     config: str | None = None,
     given_scale: float = 1.0,
-    counts: Sequence[int] = COUNTS,
-    draws: int = DRAWS,
+    counts: Sequence[int] = DEFAULT_COUNTS,
+    draws: int = DEFAULT_DRAWS,
     seed: int = 0,
     progress: Progress = silent,
 ) -> AnchorStudy:
-    """Return the study of one config of an archive.
+    """Return the scale-anchor study of one config of an archive.
 
-    For each k of ``counts`` and each draw, the scale is the median over k drawn views of r = median(z / p), and
-    the whole archive times it is scored (mean over views of AbsRel and RMSE, on scored pixels with a prediction).
-    Views without any prediction are never drawn; a k larger than the number of the others is left out.
+    For each k in ``counts`` and each draw, the scale is the median of r = median(z / p) over k drawn views. The
+    whole archive is multiplied by this scale and scored: mean over views of AbsRel and RMSE, on the scored pixels
+    with a prediction. Views without any prediction are never drawn; a k larger than the number of the other views
+    is skipped. Changes are relative to the errors at ``given_scale``.
 
-    Raises ``InputError`` for arguments that cannot be, or where no view has a prediction; ``SubmissionError`` with
-    every problem where ``score`` would refuse the archive; ``DatasetError`` for the folder.
+    Raises ``InputError`` for invalid arguments or if fewer views have a prediction than the smallest k;
+    ``SubmissionError`` with all problems if the archive is invalid; ``DatasetError`` for the dataset folder.
     """
-    _check(given_scale, counts, draws, seed)
+    _check_arguments(given_scale, counts, draws, seed)
     folder = open_folder(root)
-    with opened(archive, folder, progress) as submission:
-        name = one_config(submission, folder, config)
+    with open_valid_submission(archive, folder, progress) as submission:
+        name = select_config(submission, folder, config)
         truths = config_truth(folder, name, progress)
-        found = map_views(submission, truths, len(truths), view_ratio, f"ratios of {name}", progress)
-        ratios = np.array([one.ratio for one in found if one.ratio is not None])
-        possible = [k for k in sorted(set(counts)) if k <= len(ratios)]
-        if not possible:
+        view_ratios = map_views(submission, truths, len(truths), view_ratio, f"ratios of {name}", progress)
+        ratios = np.array([view.ratio for view in view_ratios if view.ratio is not None])
+        usable_counts = [k for k in sorted(set(counts)) if k <= len(ratios)]
+        if not usable_counts:
             raise InputError(
                 f"{archive}: {len(ratios)} of {len(truths)} views of {name} have a prediction, expected at least "
                 f"{min(counts)}, the smallest k"
             )
-        drawn = [drawn_scales(ratios, k, draws, seed) for k in possible]
-        scales = np.concatenate([[given_scale, np.median(ratios)], *drawn])
-        predicted = (truth for truth, one in zip(truths, found, strict=True) if one.ratio is not None)
-        work = partial(errors_at, scales=scales)
-        errors = mean_errors(map_views(submission, predicted, len(ratios), work, f"errors of {name}", progress))
-        stamp = archive_stamp(submission, folder)
+        drawn_scales = [draw_scales(ratios, k, draws, seed) for k in usable_counts]
+        scales = np.concatenate([[given_scale, np.median(ratios)], *drawn_scales])
+        predicted = (truth for truth, view in zip(truths, view_ratios, strict=True) if view.ratio is not None)
+        compute_errors = partial(errors_at_scales, scales=scales)
+        errors = mean_errors(
+            map_views(submission, predicted, len(ratios), compute_errors, f"errors of {name}", progress)
+        )
+        provenance = archive_provenance(submission, folder)
     given, all_views, *rest = map(ScaledArchive, scales.tolist(), errors.abs_rel.tolist(), errors.rmse_cm.tolist())
     per_k = tuple(tuple(rest[start : start + draws]) for start in range(0, len(rest), draws))
     return AnchorStudy(
-        stamp=stamp,
+        provenance=provenance,
         config=name,
         seed=seed,
         views=len(truths),
-        unpredicted=tuple(one.view_id for one in found if one.ratio is None),
-        coverage=math.fsum(one.coverage for one in found) / len(found),
+        views_without_prediction=tuple(view.view_id for view in view_ratios if view.ratio is None),
+        coverage=math.fsum(view.coverage for view in view_ratios) / len(view_ratios),
         given=given,
         all_views=all_views,
-        rows=tuple(anchor_row(k, given, ones) for k, ones in zip(possible, per_k, strict=True)),
+        rows=tuple(anchor_row(k, given, k_draws) for k, k_draws in zip(usable_counts, per_k, strict=True)),
         draws=per_k,
-        left_out=tuple(k for k in sorted(set(counts)) if k > len(ratios)),
+        skipped_counts=tuple(k for k in sorted(set(counts)) if k > len(ratios)),
     )
 
 
-def _check(given_scale: float, counts: Sequence[int], draws: int, seed: int) -> None:
-    wrong = []
+def _check_arguments(given_scale: float, counts: Sequence[int], draws: int, seed: int) -> None:
+    problems = []
     if not (math.isfinite(given_scale) and given_scale > 0):
-        wrong.append(f"--given-scale is {given_scale:g}, expected a finite number above 0")
-    wrong += [f"--k has {k}, expected 1 or more" for k in counts if k < 1]
+        problems.append(f"--baseline-scale is {given_scale:g}, expected a finite number above 0")
+    problems += [f"--num-anchor-views has {k}, expected 1 or more" for k in counts if k < 1]
     if not counts:
-        wrong.append("--k names no number of views, expected one or more")
+        problems.append("--num-anchor-views names no number of views, expected one or more")
     if not 1 <= draws <= MAX_DRAWS:
-        wrong.append(f"--draws is {draws}, expected 1 to {MAX_DRAWS}")
+        problems.append(f"--draws is {draws}, expected 1 to {MAX_DRAWS}")
     if not 0 <= seed < 2**31:
-        wrong.append(f"--seed is {seed}, expected 0 to {2**31 - 1}")
-    if wrong:
-        raise InputError("; ".join(wrong))
+        problems.append(f"--seed is {seed}, expected 0 to {2**31 - 1}")
+    if problems:
+        raise InputError("; ".join(problems))

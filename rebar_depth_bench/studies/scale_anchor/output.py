@@ -1,42 +1,45 @@
-"""The study ``anchor`` in words: its JSON, its CSV rows, its page."""
+"""JSON, CSV rows and page of the scale-anchor study."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from typing import Any
 
+from markupsafe import Markup
+
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.lines import (
     HEIGHT,
     LEFT,
     RIGHT,
     TOP,
-    ChartWords,
+    ChartText,
     Series,
     chart,
-    span_axis,
-    zero_axis,
+    linear_axis,
+    log_axis,
 )
 from rebar_depth_bench.reporting.html.study_page import PageFigure, PageTable, StudyPage
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE
 from rebar_depth_bench.studies.scale_anchor.study import AnchorRow, AnchorStudy, Spread
 
-_SPREADS = ("scale", "deviation_percent", "abs_rel_change", "rmse_cm_change")
+_SPREAD_FIELDS = ("scale", "deviation_percent", "abs_rel_change", "rmse_cm_change")
 
 
-def content(study: AnchorStudy) -> dict[str, Any]:
-    """Return the JSON object: the stamp, the two fixed scales, a row per k with every draw."""
+def to_json(study: AnchorStudy) -> dict[str, Any]:
+    """Return the JSON object: provenance, errors at the two fixed scales, and one row per k with all draws."""
     return {
         "study": "anchor",
-        **study.stamp.to_dict(),
+        **study.provenance.to_dict(),
         "config": study.config,
         "seed": study.seed,
         "views": study.views,
-        "views_without_prediction": list(study.unpredicted),
+        "views_without_prediction": list(study.views_without_prediction),
         "coverage": study.coverage,
         "given": asdict(study.given),
         "all_views": asdict(study.all_views),
-        "left_out_k": list(study.left_out),
+        "left_out_k": list(study.skipped_counts),
         "rows": [
             {**asdict(row), "draws": [asdict(draw) for draw in draws]}
             for row, draws in zip(study.rows, study.draws, strict=True)
@@ -44,35 +47,39 @@ def content(study: AnchorStudy) -> dict[str, Any]:
     }
 
 
-def rows(study: AnchorStudy) -> list[dict[str, Any]]:
-    """Return the CSV's rows: one per k, with the stamps as columns."""
-    stamp = study.stamp
+def to_csv_rows(study: AnchorStudy) -> list[dict[str, Any]]:
+    """Return the rows of the CSV: one per k, with the provenance in columns."""
+    provenance = study.provenance
     return [
         {
             "study": "anchor",
-            "protocol": stamp.protocol,
-            "method": stamp.archives[0].method,
+            "protocol": provenance.protocol,
+            "method": provenance.archives[0].method,
             "config": study.config,
             "k": row.k,
             "draws": len(draws),
             "given_scale": study.given.scale,
             "given_abs_rel": study.given.abs_rel,
             "given_rmse_cm": study.given.rmse_cm,
-            **{f"{name}_{key}": value for name in _SPREADS for key, value in asdict(getattr(row, name)).items()},
-            **stamp.csv_cells(),
+            **{
+                f"{name}_{key}": value
+                for name in _SPREAD_FIELDS
+                for key, value in asdict(getattr(row, name)).items()
+            },
+            **provenance.csv_cells(),
         }
         for row, draws in zip(study.rows, study.draws, strict=True)
     ]
 
 
-def page(study: AnchorStudy) -> StudyPage:
-    """Return the page: the figure of changes over k, the figure of scales, the table."""
-    method, config = (formatting.printable(name) for name in (study.stamp.archives[0].method, study.config))
+def to_page(study: AnchorStudy) -> StudyPage:
+    """Return the page: figures of the AbsRel change and of the scale deviation over k, and the table."""
+    method, config = (printable(name) for name in (study.provenance.archives[0].method, study.config))
     return StudyPage(
         study="anchor",
         title=f"{method} on {config}: one scale for the whole archive, from k views of known depth",
         lead=_lead(study),
-        stamps=study.stamp.lines(),
+        stamps=study.provenance.lines(),
         figures=(_change_figure(study), _scale_figure(study)),
         tables=(_table(study),),
         notes=_notes(study),
@@ -81,26 +88,27 @@ def page(study: AnchorStudy) -> StudyPage:
 
 def _lead(study: AnchorStudy) -> str:
     first = study.rows[0]
+    least, most = (formatting.counted(row.k, "view") for row in (first, study.rows[-1]))
     return (
-        f"Each draw takes {first.k} to {_views(study.rows[-1].k)} of known depth, and the median over them of "
-        "r = median(z / p) multiplies every view of the archive alike. "
-        f"With {_views(first.k)} the scale is {_signed(first.deviation_percent.mean, 2)} % off the given "
-        f"{study.given.scale:g} in the mean of {len(study.draws[0])} draws "
-        f"(from {_signed(first.deviation_percent.low, 2)} to {_signed(first.deviation_percent.high, 2)} %), "
-        f"and AbsRel changes by {_signed(first.abs_rel_change.mean, 5)} "
+        f"Each draw takes {first.k} to {most} of known depth, and the median over them "
+        "of r = median(z / p) multiplies every view of the archive alike. "
+        f"With {least} the scale is {_format_signed(first.deviation_percent.mean, 2)} % off the "
+        f"given {study.given.scale:g} in the mean of {len(study.draws[0])} draws "
+        f"(from {_format_signed(first.deviation_percent.low, 2)} to "
+        f"{_format_signed(first.deviation_percent.high, 2)} %), "
+        f"and AbsRel changes by {_format_signed(first.abs_rel_change.mean, 5)} "
         f"from {formatting.number(study.given.abs_rel, 4)}."
     )
 
 
 def _change_figure(study: AnchorStudy) -> PageFigure:
     changes = [(row.k, row.abs_rel_change) for row in study.rows]
-    svg = _figure(
+    svg = _spread_chart(
         study,
         changes,
-        0.0,
-        ChartWords(
+        ChartText(
             "Change of AbsRel over the number of known-depth views",
-            "; ".join(f"k = {k}: {_signed(one.mean, 6)}" for k, one in changes),
+            "; ".join(f"k = {k}: {_format_signed(change.mean, 6)}" for k, change in changes),
             "known-depth views k",
             "change of mean AbsRel",
         ),
@@ -114,13 +122,12 @@ def _change_figure(study: AnchorStudy) -> PageFigure:
 
 def _scale_figure(study: AnchorStudy) -> PageFigure:
     deviations = [(row.k, row.deviation_percent) for row in study.rows]
-    svg = _figure(
+    svg = _spread_chart(
         study,
         deviations,
-        0.0,
-        ChartWords(
+        ChartText(
             "Deviation of the scale over the number of known-depth views",
-            "; ".join(f"k = {k}: {_signed(one.mean, 3)} %" for k, one in deviations),
+            "; ".join(f"k = {k}: {_format_signed(deviation.mean, 3)} %" for k, deviation in deviations),
             "known-depth views k",
             "scale against the given one, %",
         ),
@@ -132,17 +139,18 @@ def _scale_figure(study: AnchorStudy) -> PageFigure:
     )
 
 
-def _figure(study: AnchorStudy, spreads: list[tuple[int, Spread]], reference: float, words: ChartWords) -> Any:
+def _spread_chart(study: AnchorStudy, spreads: list[tuple[int, Spread]], labels: ChartText) -> Markup:
+    """Return the chart of the mean and range of draws over k, with a line at 0."""
     ks = [float(k) for k, _ in spreads]
-    ends = [end for _, one in spreads for end in (one.low, one.high)]
+    ends = [end for _, spread in spreads for end in (spread.low, spread.high)]
     band = Series(
         name=study.config,
         colour=0,
-        line=[(k, one.mean) for k, one in spreads],
-        area=[(k, one.low, one.high) for k, one in spreads],
+        line=[(k, spread.mean) for k, spread in spreads],
+        area=[(k, spread.low, spread.high) for k, spread in spreads],
     )
-    y_axis = zero_axis(ends, HEIGHT, TOP)
-    return chart([band], span_axis(ks, LEFT, RIGHT), y_axis, words, x_ticks=ks, reference=reference)
+    y_axis = linear_axis(ends, HEIGHT, TOP)
+    return chart([band], log_axis(ks, LEFT, RIGHT), y_axis, labels, x_ticks=ks, reference=0.0)
 
 
 def _table(study: AnchorStudy) -> PageTable:
@@ -161,57 +169,56 @@ def _table(study: AnchorStudy) -> PageTable:
             ("RMSE change", "cm, mean ± sd"),
             ("RMSE change", "cm, range"),
         ),
-        rows=[_cells(row) for row in study.rows],
+        rows=[_row_cells(row) for row in study.rows],
     )
 
 
-def _cells(row: AnchorRow) -> list[str]:
+def _row_cells(row: AnchorRow) -> list[str]:
     return [
         str(row.k),
         f"{formatting.number(row.scale.mean, 5)} ± {formatting.number(row.scale.sd, 5)}",
-        f"{_signed(row.deviation_percent.mean, 3)} ± {formatting.number(row.deviation_percent.sd, 3)}",
-        _range(row.deviation_percent, 3),
-        f"{_signed(row.abs_rel_change.mean, 6)} ± {formatting.number(row.abs_rel_change.sd, 6)}",
-        _range(row.abs_rel_change, 6),
-        f"{_signed(row.rmse_cm_change.mean, 4)} ± {formatting.number(row.rmse_cm_change.sd, 4)}",
-        _range(row.rmse_cm_change, 4),
+        f"{_format_signed(row.deviation_percent.mean, 3)} ± {formatting.number(row.deviation_percent.sd, 3)}",
+        _format_range(row.deviation_percent, 3),
+        f"{_format_signed(row.abs_rel_change.mean, 6)} ± {formatting.number(row.abs_rel_change.sd, 6)}",
+        _format_range(row.abs_rel_change, 6),
+        f"{_format_signed(row.rmse_cm_change.mean, 4)} ± {formatting.number(row.rmse_cm_change.sd, 4)}",
+        _format_range(row.rmse_cm_change, 4),
     ]
 
 
 def _notes(study: AnchorStudy) -> list[str]:
-    given, every = study.given, study.all_views
+    given, all_views = study.given, study.all_views
     notes = [
         f"Given scale {given.scale:g}: AbsRel {formatting.number(given.abs_rel, 4)}, RMSE "
-        f"{formatting.number(given.rmse_cm, 2)} cm. Scale of all {study.views - len(study.unpredicted)} views, "
-        f"their median r: {formatting.number(every.scale, 5)}, AbsRel {formatting.number(every.abs_rel, 4)}, RMSE "
-        f"{formatting.number(every.rmse_cm, 2)} cm.",
+        f"{formatting.number(given.rmse_cm, 2)} cm. "
+        f"Scale of all {study.views - len(study.views_without_prediction)} views, their median r: "
+        f"{formatting.number(all_views.scale, 5)}, AbsRel {formatting.number(all_views.abs_rel, 4)}, RMSE "
+        f"{formatting.number(all_views.rmse_cm, 2)} cm.",
         "Means over views on the scored pixels that have a prediction; z: truth, p: prediction. The anchors' "
         "truth is exact and free of noise: a tape or a marker on a site is not.",
     ]
-    if study.unpredicted:
+    if study.views_without_prediction:
         notes.append(
-            f"{len(study.unpredicted)} of {study.views} views have no prediction: neither drawn nor scored."
+            f"{len(study.views_without_prediction)} of {study.views} views have no prediction: "
+            "neither drawn nor scored."
         )
     if study.coverage < MIN_RANKED_COVERAGE:
         notes.append(
             f"Coverage {formatting.coverage_percent(study.coverage)} %: what is missing has no error here."
         )
-    if study.left_out:
-        left = ", ".join(map(str, study.left_out))
+    if study.skipped_counts:
+        skipped = ", ".join(map(str, study.skipped_counts))
         notes.append(
-            f"Left out: k = {left}, more than the {study.views - len(study.unpredicted)} views to draw from."
+            f"Left out: k = {skipped}, more than the "
+            f"{study.views - len(study.views_without_prediction)} views to draw from."
         )
     return notes
 
 
-def _range(spread: Spread, decimals: int) -> str:
-    return f"{_signed(spread.low, decimals)} to {_signed(spread.high, decimals)}"
+def _format_range(spread: Spread, decimals: int) -> str:
+    return f"{_format_signed(spread.low, decimals)} to {_format_signed(spread.high, decimals)}"
 
 
-def _signed(value: float, decimals: int) -> str:
+def _format_signed(value: float, decimals: int) -> str:
     text = formatting.number(value, decimals)
     return f"+{text}" if value > 0 else text.replace("-", "−", 1)
-
-
-def _views(count: int) -> str:
-    return f"{count} view" if count == 1 else f"{count} views"

@@ -1,0 +1,169 @@
+"""Command-line basics of all programs: progress, exit codes, shared and renamed options, output checks."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import TimeRemainingColumn as Remaining
+
+from rebar_depth_bench.errors import InputError, RebarDepthError
+
+EXIT_DONE, EXIT_OTHER, EXIT_INPUT = 0, 1, 2
+"""Exit codes: success, any other error, invalid input."""
+
+
+class ProgressBars:
+    """Progress bars on standard error, one per task; plain lines if standard error is not a terminal."""
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True)
+        self._bars: dict[str, TaskID] = {}
+        self._lines: dict[str, int] = {}
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            Remaining(),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+
+    def __enter__(self) -> ProgressBars:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def update(self, name: str, done: int, total: int) -> None:
+        """Show that ``done`` of ``total`` steps of the task ``name`` are finished."""
+        if not self._console.is_terminal:
+            self._print_line(name, done, total)
+            return
+        if name not in self._bars:
+            self._bars[name] = self._progress.add_task(name, total=total)
+        self._progress.update(self._bars[name], completed=done, total=total)
+
+    def _print_line(self, name: str, done: int, total: int) -> None:
+        """Print a line at each tenth of the task, which keeps log files short."""
+        tenth = done * 10 // max(total, 1)
+        if self._lines.get(name) != tenth:
+            self._lines[name] = tenth
+            print(f"{name}: {done} of {total}", file=sys.stderr, flush=True)
+
+
+def run_command(command: Callable[[], None], interrupted: str = "interrupted") -> int:
+    """Run a command and return its exit code.
+
+    A ``RebarDepthError`` is printed to standard error without a traceback. ``interrupted`` is the message printed
+    on Ctrl-C.
+    """
+    try:
+        command()
+    except RebarDepthError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_OTHER
+    except KeyboardInterrupt:
+        print(interrupted, file=sys.stderr)
+        return EXIT_OTHER
+    return EXIT_DONE
+
+
+OUTPUT_OPTIONS = ("out", "json", "csv", "html", "latex", "extended_csv")
+"""Names (argparse dest) of the options that are output paths."""
+
+
+def add_archive(parser: argparse.ArgumentParser) -> None:
+    """Add the positional argument ``archive``."""
+    parser.add_argument("archive", metavar="ARCHIVE", help="the submission's zip")
+
+
+def add_data(parser: argparse.ArgumentParser) -> None:
+    """Add the option ``--data``."""
+    parser.add_argument("--data", required=True, metavar="ROOT", help="dataset folder or Hub repository id")
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Add the option ``--workers``."""
+    parser.add_argument("--workers", type=int, metavar="N", help="threads (default: one a core)")
+
+
+def add_output_file(parser: argparse.ArgumentParser, option: str, summary: str) -> None:
+    """Add ``option``, the path of a file to write."""
+    parser.add_argument(option, type=Path, metavar="FILE", help=summary)
+
+
+def warn_deprecated(old: str, new: str) -> None:
+    """Print a warning to standard error that the name ``old`` of an option or setting is replaced by ``new``."""
+    print(f"warning: {old} is deprecated, use {new}", file=sys.stderr)
+
+
+def replace_renamed_options(arguments: Sequence[str] | None, renamed: Mapping[str, str]) -> list[str]:
+    """Return command-line arguments with renamed options under their new names, with a warning for each.
+
+    ``arguments`` are those of the process if None; ``renamed`` maps old option strings to new ones.
+    """
+    replaced = []
+    for argument in sys.argv[1:] if arguments is None else arguments:
+        option, equals, value = argument.partition("=")
+        if option in renamed:
+            warn_deprecated(option, renamed[option])
+            argument = f"{renamed[option]}{equals}{value}"
+        replaced.append(argument)
+    return replaced
+
+
+def check_outputs(options: Mapping[str, object]) -> None:
+    """Check the output paths of a command's ``options``.
+
+    Outputs are the options in ``OUTPUT_OPTIONS``; inputs are all other strings and lists of strings. Raises
+    ``InputError`` if an output would overwrite an input, another output or a file of the dataset, is a folder, or
+    lies in a folder that cannot be written.
+    """
+    outputs = {name: value for name in OUTPUT_OPTIONS if isinstance(value := options.get(name), Path)}
+    input_values = [value for name, value in options.items() if name not in outputs]
+    inputs = [Path(string) for value in input_values for string in _strings(value)]
+    seen: dict[Path, str] = {}
+    for name, output in outputs.items():
+        option, target = f"--{name.replace('_', '-')}", output.resolve()
+        if target in seen:
+            raise InputError(f"{option} and {seen[target]} both name {output}, expected a file each")
+        seen[target] = option
+        for path in inputs:
+            if path.exists() and target == path.resolve():
+                raise InputError(f"{option} names {output}, which is read: it would be overwritten")
+            if path.is_dir() and name != "out" and path.resolve() in target.parents:
+                raise InputError(
+                    f"{option} names {output}, which is inside {path}: expected a place outside the data"
+                )
+        if name != "out" or not target.is_dir():
+            _check_writable(option, output, target)
+
+
+def _check_writable(option: str, output: Path, target: Path) -> None:
+    if target.is_dir():
+        raise InputError(f"{option} names {output}, which is a folder: expected a file to write")
+    ancestor = next(parent for parent in target.parents if parent.exists())
+    if not ancestor.is_dir():
+        raise InputError(f"{option} names {output}, but {ancestor} is a file: expected a folder")
+    if not os.access(ancestor, os.W_OK):
+        raise InputError(f"{option} names {output}, but {ancestor} cannot be written to")
+
+
+def _strings(value: object) -> Iterable[str]:
+    if isinstance(value, str):
+        return [value]
+    return [item for item in value if isinstance(item, str)] if isinstance(value, list) else []

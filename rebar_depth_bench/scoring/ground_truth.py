@@ -1,0 +1,154 @@
+"""Ground truth for scoring: the scored pixels of each view and their depth.
+
+It is extracted once per config and cached as arrays next to the dataset (or in the user's cache), keyed by the
+ground-truth digest; later runs read the cache one view at a time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+from jaxtyping import Float32, UInt32
+from numpy import ndarray
+
+from rebar_depth_bench.data.array_cache import ArrayCache, ViewArrays, open_cache
+from rebar_depth_bench.data.dataset import iterate_rows
+from rebar_depth_bench.data.digests import eye_digest
+from rebar_depth_bench.data.manifest import DatasetFolder, ViewRecord
+from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.metrics import median
+from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels
+
+CACHE_FOLDER = ".rebar-cache"
+_DIGEST_CHARACTERS = 32
+_KINDS = ("rgb", "depth", "mask", "bars", "K", "distortion", "cam_from_world")
+_TRUTH_COLUMNS = ("view_id", *(f"left_{kind}" for kind in _KINDS if kind != "rgb"))
+
+
+@dataclass(frozen=True, eq=False)
+class ViewTruth:
+    """Scored pixels of one view.
+
+    ``index`` holds flat indices into the H x W image, ``depth_m`` their planar depth and ``median_m`` its median,
+    in metres.
+    """
+
+    view_id: str
+    index: UInt32[ndarray, " n"]
+    depth_m: Float32[ndarray, " n"]
+    median_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class ConfigTruth(Sequence[ViewTruth]):
+    """Sequence of the views of a config that have scored pixels, each read from the cache on access."""
+
+    cache: ArrayCache
+
+    @property
+    def view_ids(self) -> tuple[str, ...]:
+        """Ids of the views, in order."""
+        return self.cache.view_ids
+
+    @property
+    def medians_m(self) -> tuple[float, ...]:
+        """Median ground-truth depth of the scored pixels of each view, metres."""
+        return tuple(float(metadata) for metadata in self.cache.metadata)
+
+    def __len__(self) -> int:
+        return len(self.cache)
+
+    @overload
+    def __getitem__(self, index: int) -> ViewTruth: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[ViewTruth]: ...
+
+    def __getitem__(self, index: int | slice) -> ViewTruth | list[ViewTruth]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        view = self.cache.view(range(len(self))[index])
+        return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], float(view.metadata))
+
+
+def config_truth(folder: DatasetFolder, config: str, progress: Progress = silent) -> ConfigTruth:
+    """Return the ground truth of a config, from the cache or else extracted from the dataset.
+
+    Views without scored pixels are omitted. Raises ``DatasetError`` naming the view if its ground truth does not
+    match its digest in the manifest.
+    """
+    cache = open_cache(
+        cache_path(folder, config, PROTOCOL),
+        {"index": np.uint32, "depth_m": np.float32},
+        lambda: _extract_views(folder, config, progress),
+        stale_pattern=cache_name_pattern(config, PROTOCOL),
+    )
+    return ConfigTruth(cache)
+
+
+def cache_path(folder: DatasetFolder, config: str, protocol: str, extra_digest: str = "") -> Path:
+    """Return the path of the array cache of a config under a protocol.
+
+    It lies in the dataset folder if that is local and writable, or else in the user's cache. ``extra_digest`` is
+    the hex SHA-256 of further inputs, other than the views, that the cached arrays depend on.
+    """
+    digest = str(folder.config(config)["ground_truth_digest"]).removeprefix("sha256:")
+    if extra_digest:
+        digest = hashlib.sha256(f"{digest} {extra_digest}".encode()).hexdigest()
+    local = folder.local
+    if local is not None and os.access(local, os.W_OK):
+        base = local / CACHE_FOLDER
+    else:
+        user = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "rebar-depth-bench"
+        # The folder is keyed by the dataset root as well: different datasets share config names.
+        base = user / hashlib.sha256(str(folder.root).encode()).hexdigest()[:16]
+    return base / f"{protocol}-{config}-{digest[:_DIGEST_CHARACTERS]}"
+
+
+def cache_name_pattern(config: str, protocol: str) -> str:
+    """Return the glob pattern of the folder names that ``cache_path`` gives for any digest."""
+    return f"{protocol}-{config}-{'?' * _DIGEST_CHARACTERS}"
+
+
+def verified_rows(
+    folder: DatasetFolder, config: str, progress: Progress, task: str
+) -> Iterator[tuple[dict[str, Any], UInt32[ndarray, " n"]]]:
+    """Yield every row of a config with the flat indices of its scored pixels, verified against the manifest.
+
+    ``task`` is its name in ``progress``. Raises ``DatasetError`` naming a view that is not in the manifest or
+    does not match its digest, or, after the last row, if views of the manifest are missing.
+    """
+    records = {view.view_id: view for view in folder.views(config)}
+    total = len(records)
+    for done, row in enumerate(iterate_rows(folder.root, config, _TRUTH_COLUMNS), start=1):
+        yield row, _verify_digest(row, records.pop(row["view_id"], None), folder.root)
+        progress(f"{task} of {config}", done, total)
+    if records:
+        raise DatasetError(f"{folder.root}: {config} lacks {len(records)} views, among them {min(records)}")
+
+
+def _extract_views(folder: DatasetFolder, config: str, progress: Progress) -> Iterator[ViewArrays]:
+    for row, pixels in verified_rows(folder, config, progress, "ground truth"):
+        if len(pixels):
+            depth_m = row["left_depth"].ravel()[pixels]
+            yield ViewArrays(row["view_id"], {"index": pixels, "depth_m": depth_m}, median(depth_m))
+
+
+def _verify_digest(row: dict[str, ndarray], record: ViewRecord | None, root: str) -> UInt32[ndarray, " n"]:
+    if record is None:
+        raise DatasetError(f"{root}: view {row['view_id']} is not in the manifest")
+    digest = eye_digest(*(row[f"left_{kind}"] for kind in _KINDS if kind != "rgb"))
+    pixels = scored_pixels(row["left_mask"], row["left_depth"])
+    if digest != record.left or len(pixels) != record.scored_px:
+        raise DatasetError(
+            f"{root}: view {record.view_id}: ground truth has digest {digest[:16]} and {len(pixels)} "
+            f"scored pixels, the manifest says {record.left[:16]} and {record.scored_px}"
+        )
+    return pixels
