@@ -1,1 +1,1 @@
-"""Builds dataset folders: scenes, cameras, colour, exact ground truth, shards."""
+"""Dataset builder: scenes, camera trajectories, rendered colour, exact ground truth and Parquet shards."""

@@ -1,4 +1,4 @@
-"""``python -m dataset_builder`` is ``rebar-build``."""
+"""Module entry point: ``python -m dataset_builder`` runs ``rebar-build``."""
 
 from dataset_builder.cli import main
 

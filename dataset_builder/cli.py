@@ -1,4 +1,4 @@
-"""The ``rebar-build`` command."""
+"""Command-line interface of ``rebar-build``."""
 
 from __future__ import annotations
 
@@ -13,27 +13,34 @@ from typing import TYPE_CHECKING
 
 from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, SWEEPS, BuildRequest
 from dataset_builder.scene.variants import VARIANTS
-from rebar_depth_bench.cli.console import ProgressBars, run_command
+from rebar_depth_bench.console import ProgressBars, replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
 
 if TYPE_CHECKING:
-    from dataset_builder.build.build import BuildSummary
-    from dataset_builder.build.local_renderer import Renderer
+    from dataset_builder.pipeline.build import BuildSummary
+    from dataset_builder.pipeline.local_renderer import Renderer
 
-_EXTRA = ("bpy", "cv2", "embreex", "trimesh")
+_EXTRA_MODULES = ("bpy", "cv2", "embreex", "trimesh")
+
+
+RENAMED_OPTIONS = {"--to": "--out"}
+"""Old option strings that are still accepted, and their new names."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-build``; return its exit status."""
-    options = argument_parser().parse_args(arguments)
+    options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
     command = {"audit": _audit, "export": _export}.get(options.command, _build)
     return run_command(lambda: command(options), interrupted="interrupted; run the same command again to go on")
 
 
 def _check_extra() -> None:
-    """Raise ``InputError`` where the build extra is not installed; what needs it is imported only after this."""
-    missing = [name for name in _EXTRA if find_spec(name) is None]
+    """Raise ``InputError`` if the build extra is not installed.
+
+    Modules that need the extra are imported only after this check.
+    """
+    missing = [name for name in _EXTRA_MODULES if find_spec(name) is None]
     if missing:
         raise InputError(
             f"not installed: {', '.join(missing)}; expected the build extra: "
@@ -43,7 +50,7 @@ def _check_extra() -> None:
 
 def _build(options: argparse.Namespace) -> None:
     _check_extra()
-    from dataset_builder.build.build import build
+    from dataset_builder.pipeline.build import build
 
     if options.out is None:
         raise InputError("--out ROOT is missing: the dataset folder to build")
@@ -55,17 +62,21 @@ def _build(options: argparse.Namespace) -> None:
     workers = 1 if options.workers is None else options.workers
     if workers < 1:
         raise InputError(f"--workers is {workers}, expected 1 or more")
-    request = _request(options)
+    request = _build_request(options)
     threads = max(1, (os.cpu_count() or 1) // workers)
-    with _cluster(options.cluster) as cluster, ProgressBars() as bars:
+    with _cluster_context(options.cluster) as cluster, ProgressBars() as bars:
         summary = build(
             request, options.out, workers=workers, threads=threads, cluster=cluster, progress=bars.update
         )
     _print_summary(options.out, summary)
 
 
-def _request(options: argparse.Namespace) -> BuildRequest:
-    """Return what the options ask for; own scenes come alone unless configs are named."""
+def _build_request(options: argparse.Namespace) -> BuildRequest:
+    """Return the build request of the options.
+
+    With ``--scene`` and without ``--config``, only the given scene files are built. With ``--mesh``, the default
+    configs are those of the lattice.
+    """
     from dataset_builder.config.scene_file import scene_config
     from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
 
@@ -83,20 +94,24 @@ def _request(options: argparse.Namespace) -> BuildRequest:
     )
 
 
-def _cluster(address: str | None) -> AbstractContextManager[Renderer | None]:
-    """Return what connects to the cluster at ``address``, or nothing where none is asked for."""
+def _cluster_context(address: str | None) -> AbstractContextManager[Renderer | None]:
+    """Return a context manager that connects to the cluster at ``address``, or yields None without an address.
+
+    Raises ``InputError`` if ``distributed`` is not installed.
+    """
     if address is None:
         return nullcontext()
     if find_spec("distributed") is None:
         raise InputError(
             "not installed: distributed; --cluster needs it: pip install 'rebar-depth-bench[cluster]'"
         )
-    from dataset_builder.build.dask_renderer import on_cluster
+    from dataset_builder.pipeline.dask_renderer import connect_to_cluster
 
-    return on_cluster(address)
+    return connect_to_cluster(address)
 
 
 def _print_summary(out: Path, summary: BuildSummary) -> None:
+    """Print the configs built and up to date, and the seconds per stage to standard error."""
     if summary.up_to_date:
         print(f"up to date: {', '.join(summary.up_to_date)}")
     if summary.built:
@@ -122,14 +137,14 @@ def _export(options: argparse.Namespace) -> None:
     from dataset_builder.export import export
 
     with ProgressBars() as bars:
-        summary = export(options.root, options.to, options.config, options.views, progress=bars.update)
+        summary = export(options.root, options.out, options.config, options.views, progress=bars.update)
     for config in summary.configs:
         print(f"{config.config}: {config.views} views, {config.written} files written, {config.kept} kept")
-    print(options.to)
+    print(options.out)
 
 
 def argument_parser() -> argparse.ArgumentParser:
-    """Return the command's argument parser."""
+    """Return the argument parser of ``rebar-build``."""
     parser = argparse.ArgumentParser(
         prog="rebar-build",
         description="Render a dataset folder of stereo views with exact depth, or continue one.",
@@ -200,7 +215,7 @@ def _add_commands(parser: argparse.ArgumentParser) -> None:
     exporting = commands.add_parser("export", help="write a dataset folder as PNG, OpenEXR, COLMAP and nerfstudio")
     exporting.add_argument("root", metavar="ROOT", help="the dataset folder")
     exporting.add_argument(
-        "--to", type=Path, required=True, metavar="DIR", help="a new folder, or one to go on with"
+        "--out", type=Path, required=True, metavar="DIR", help="a new folder, or one to go on with"
     )
     exporting.add_argument(
         "--config", nargs="+", action="extend", metavar="NAME", help="which configs (default: all)"

@@ -1,4 +1,4 @@
-"""Checks a finished dataset folder: its files, its rows, and its ground truth against other sources."""
+"""Audit of a finished dataset folder: files, rows, and ground truth against independent sources."""
 
 from dataset_builder.audit.report import AuditReport, Check, print_audit
 from dataset_builder.audit.run import audit

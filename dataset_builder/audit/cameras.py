@@ -1,8 +1,9 @@
-"""Cameras against the manifest: the protocol's pose of each view, seen through the config's rig.
+"""Camera checks of the audit: poses and intrinsics against the manifest, pixel rays against OpenCV.
 
-From the manifest's plain JSON values back to the specs they were written from.
-
-Depth against the lens model of OpenCV: each pixel's point, projected by ``cv2``, comes back to its pixel.
+The expected cameras are rebuilt from the manifest entry of a config: its JSON values are parsed back to the specs
+of trajectory, rig and board that they were written from, and the trajectory's poses are passed through the rig.
+The lens model is checked by projecting the 3-D point of each pixel with ``cv2.projectPoints``: it must return to
+its pixel.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView
 from dataset_builder.config.catalog import view_id
 from dataset_builder.config.rigs import Camera, rig_cameras
-from dataset_builder.config.specs import DomeSpec, ProtocolSpec, RigSpec, RingSpec, SweepSpec
+from dataset_builder.config.specs import DistanceSweepSpec, DomeSpec, RigSpec, RingSpec, TrajectorySpec
 from dataset_builder.config.trajectories import poses, subset
 from dataset_builder.scene.assemblies import aim_point_m
 from dataset_builder.scene.mesh_ply import read_mesh_ply
@@ -33,62 +34,87 @@ from rebar_depth_bench.geometry.cameras import camera_centre
 from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
 
 _Spec = TypeVar("_Spec")
-_PROTOCOLS: Mapping[str, Callable[..., ProtocolSpec]] = {"dome": DomeSpec, "ring": RingSpec, "sweep": SweepSpec}
+_TRAJECTORY_SPECS: Mapping[str, Callable[..., TrajectorySpec]] = {
+    "dome": DomeSpec,
+    "ring": RingSpec,
+    "sweep": DistanceSweepSpec,
+}
 
 
-def protocol_spec(config: str, entry: Mapping[str, Any]) -> ProtocolSpec:
-    """Return the camera protocol of a config's manifest entry; raise ``DatasetError`` if it holds none."""
-    return _read(config, "protocol", entry, _protocol)
+def trajectory_spec(config: str, entry: Mapping[str, Any]) -> TrajectorySpec:
+    """Return the camera trajectory of a config's manifest entry.
+
+    Raises ``DatasetError`` if the entry holds no valid one.
+    """
+    return _spec_from_manifest(config, "protocol", entry, _trajectory_from_json)
 
 
 def rig_spec(config: str, entry: Mapping[str, Any]) -> RigSpec:
-    """Return the rig of a config's manifest entry; raise ``DatasetError`` if it holds none."""
-    return _read(config, "rig", entry, _rig)
+    """Return the stereo rig of a config's manifest entry.
+
+    Raises ``DatasetError`` if the entry holds no valid one.
+    """
+    return _spec_from_manifest(config, "rig", entry, _rig_from_json)
 
 
 def board_spec(config: str, entry: Mapping[str, Any]) -> BoardSpec | None:
-    """Return the board of a config's scene, None where it has none; raise ``DatasetError`` for a damaged one."""
-    return _read(config, "board", entry["scene"], lambda board: None if board is None else BoardSpec(**board))
+    """Return the ArUco board of a config's scene, None for a scene without one.
+
+    Raises ``DatasetError`` if the board's values are invalid.
+    """
+    return _spec_from_manifest(
+        config, "board", entry["scene"], lambda board: None if board is None else BoardSpec(**board)
+    )
 
 
-def _read(config: str, what: str, holder: Mapping[str, Any], maker: Callable[[Any], _Spec]) -> _Spec:
+def _spec_from_manifest(
+    config: str, key: str, entry: Mapping[str, Any], make_spec: Callable[[Any], _Spec]
+) -> _Spec:
     try:
-        return maker(holder[what])
+        return make_spec(entry[key])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DatasetError(
-            f"manifest: the {what} of config {config} is {holder.get(what)!r}, expected one this version writes: "
+            f"manifest: the {key} of config {config} is {entry.get(key)!r}, expected one this version writes: "
             f"{type(error).__name__}: {error}"
         ) from None
 
 
-def _protocol(values: Mapping[str, Any]) -> ProtocolSpec:
-    return _PROTOCOLS[values["kind"]](**_with_tuples(values))
+def _trajectory_from_json(values: Mapping[str, Any]) -> TrajectorySpec:
+    return _TRAJECTORY_SPECS[values["kind"]](**_lists_to_tuples(values))
 
 
-def _rig(values: Mapping[str, Any]) -> RigSpec:
+def _rig_from_json(values: Mapping[str, Any]) -> RigSpec:
     calibration = values.get("calibration")
-    return RigSpec(**{**values, "calibration": None if calibration is None else _calibration(calibration)})
+    return RigSpec(
+        **{**values, "calibration": None if calibration is None else _calibration_from_json(calibration)}
+    )
 
 
-def _calibration(values: Mapping[str, Any]) -> StereoCalibration:
-    lenses = {eye: Lens(**_with_tuples(values[eye])) for eye in ("left", "right")}
-    return StereoCalibration(**{**_with_tuples(values), **lenses})
+def _calibration_from_json(values: Mapping[str, Any]) -> StereoCalibration:
+    lenses = {eye: Lens(**_lists_to_tuples(values[eye])) for eye in ("left", "right")}
+    return StereoCalibration(**{**_lists_to_tuples(values), **lenses})
 
 
-def _with_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values with JSON's lists as the tuples that specs hold."""
+def _lists_to_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values with JSON lists converted to the tuples that the specs hold."""
     return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 
 
 CAMERA_TOLERANCE = 1e-12
-"""Of every number of K, distortion and pose: what another machine's sines may differ by."""
+"""Largest absolute difference of any entry of K, distortion or pose.
+
+The results of sine and cosine differ by this much between machines.
+"""
 _AIM_TOLERANCE_M = 0.0011
-"""The aim point is rounded to the millimetre; the mesh is float32 and may fall on the other side."""
+"""Largest difference of the aim point per axis, metres.
+
+The aim point is rounded to the millimetre, and the float32 vertices of the mesh may round to the neighbouring one.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class ExpectedView:
-    """What a view must be called, where its cameras must stand and how far apart."""
+    """Expected id, cameras by eye and baseline of a view."""
 
     view_id: str
     cameras: Mapping[str, Camera]
@@ -96,9 +122,9 @@ class ExpectedView:
 
 
 def mesh_aim_point_m(mesh: Path) -> Float64[ndarray, " 3"]:
-    """Return what cameras look at, of a dataset's mesh file: the middle of its steel, to the millimetre.
+    """Return the point that the cameras aim at, world metres: the middle of the mesh's steel, rounded to 1 mm.
 
-    Raises ``DatasetError`` where the file is no mesh of this dataset or holds no steel.
+    Raises ``DatasetError`` if the file is not a mesh of this dataset or holds no steel.
     """
     vertices_m, faces, face_bar_id = read_mesh_ply(mesh)
     steel = vertices_m[np.unique(faces[face_bar_id != NOT_STEEL])]
@@ -107,10 +133,11 @@ def mesh_aim_point_m(mesh: Path) -> Float64[ndarray, " 3"]:
     return aim_point_m(Assembly((), (Part("steel", Mesh(steel, faces[:0]), 1, "steel"),)))
 
 
-def aim_point_of(entry: Mapping[str, Any], mesh: Path) -> tuple[Float64[ndarray, " 3"], tuple[str, ...]]:
-    """Return a config's aim point, world metres, and what is wrong with it.
+def checked_aim_point_m(entry: Mapping[str, Any], mesh: Path) -> tuple[Float64[ndarray, " 3"], tuple[str, ...]]:
+    """Return a config's aim point, world metres, and the problems found with it.
 
-    It is the manifest's where it says one, held against the middle of the mesh's steel; else that middle.
+    This is ``aim_point_m`` of the manifest entry if it agrees with the middle of the mesh's steel. If the manifest
+    has no aim point, or a different one (a problem), the middle of the steel is returned.
     """
     middle_m = mesh_aim_point_m(mesh)
     if "aim_point_m" not in entry:
@@ -122,12 +149,12 @@ def aim_point_of(entry: Mapping[str, Any], mesh: Path) -> tuple[Float64[ndarray,
 
 
 def expected_views(config: str, entry: Mapping[str, Any], aim_m: Float64[ndarray, " 3"]) -> list[ExpectedView]:
-    """Return what the views of a config must be, in order, rebuilt from its manifest entry alone.
+    """Return the expected views of a config in order, from its manifest entry and aim point (world metres).
 
-    Raises ``DatasetError`` where the manifest's protocol or rig is not one this version writes.
+    Raises ``DatasetError`` if the manifest's trajectory or rig is not one that this version writes.
     """
     rig = rig_spec(config, entry)
-    left_poses = poses(protocol_spec(config, entry), aim_m, rig)
+    left_poses = poses(trajectory_spec(config, entry), aim_m, rig)
     try:
         return [
             ExpectedView(view_id(config, index), rig_cameras(rig, left_poses[index]), rig.baseline_m)
@@ -137,25 +164,35 @@ def expected_views(config: str, entry: Mapping[str, Any], aim_m: Float64[ndarray
         raise DatasetError(f"manifest: the rig of config {config} gives no cameras: {error}") from None
 
 
-def protocol_problems(entry: Mapping[str, Any], views: Sequence[ExpectedView]) -> Iterator[str]:
-    """Yield what is wrong with the manifest's list of views."""
-    found = [view["view_id"] for view in entry["views"]]
-    expected = [view.view_id for view in views]
-    if found != expected:
-        wrong = next((pair for pair in zip(found, expected, strict=False) if pair[0] != pair[1]), None)
-        said = f": the first that differs is {wrong[0]}, expected {wrong[1]}" if wrong else ""
-        yield f"the manifest names {len(found)} views, its protocol gives {len(expected)} of these{said}"
+def view_list_problems(entry: Mapping[str, Any], views: Sequence[ExpectedView]) -> Iterator[str]:
+    """Yield a problem if the manifest's view ids are not those of the expected views, in order."""
+    listed_ids = [view["view_id"] for view in entry["views"]]
+    expected_ids = [view.view_id for view in views]
+    if listed_ids != expected_ids:
+        first_mismatch = next(
+            (pair for pair in zip(listed_ids, expected_ids, strict=False) if pair[0] != pair[1]), None
+        )
+        detail = (
+            f": the first that differs is {first_mismatch[0]}, expected {first_mismatch[1]}"
+            if first_mismatch
+            else ""
+        )
+        yield (
+            f"the manifest names {len(listed_ids)} views, its protocol gives {len(expected_ids)} of these{detail}"
+        )
 
 
 def camera_problems(row: Mapping[str, Any], expected: ExpectedView) -> Iterator[str]:
-    """Yield where a row's cameras differ from those of the protocol and the rig."""
+    """Yield the differences of a row's cameras, grids and baseline from the expected ones."""
     for eye in EYES:
         camera = expected.cameras[eye]
         for kind in ("K", "distortion", "cam_from_world"):
-            found, wanted = row[f"{eye}_{kind}"], getattr(camera, kind)
-            off = float(np.abs(found - wanted).max()) if found.shape == wanted.shape else np.inf
-            if not off <= CAMERA_TOLERANCE:
-                yield f"{eye}_{kind} is {off:.1e} off that of the protocol and the rig"
+            value, expected_value = row[f"{eye}_{kind}"], getattr(camera, kind)
+            deviation = (
+                float(np.abs(value - expected_value).max()) if value.shape == expected_value.shape else np.inf
+            )
+            if not deviation <= CAMERA_TOLERANCE:
+                yield f"{eye}_{kind} is {deviation:.1e} off that of the protocol and the rig"
         if row[f"{eye}_depth"].shape != (camera.height, camera.width):
             yield f"{eye} grid is {row[f'{eye}_depth'].shape}, expected {(camera.height, camera.width)}"
     yield from _rig_problems(row, expected.baseline_m)
@@ -165,48 +202,52 @@ def _rig_problems(row: Mapping[str, Any], baseline_m: float) -> Iterator[str]:
     if abs(row["baseline_m"] - baseline_m) > CAMERA_TOLERANCE:
         yield f"baseline_m is {row['baseline_m']}, expected {baseline_m}"
     left_m, right_m = (camera_centre(row[f"{eye}_cam_from_world"]) for eye in EYES)
-    apart_m = float(np.linalg.norm(right_m - left_m))
-    if not abs(apart_m - row["baseline_m"]) <= 1e-9:
-        yield f"the eyes stand {apart_m:.9f} m apart, baseline_m is {row['baseline_m']}"
+    centre_distance_m = float(np.linalg.norm(right_m - left_m))
+    if not abs(centre_distance_m - row["baseline_m"]) <= 1e-9:
+        yield f"the eyes stand {centre_distance_m:.9f} m apart, baseline_m is {row['baseline_m']}"
     for eye in EYES:
         rotation = row[f"{eye}_cam_from_world"][:3, :3]
-        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-        if not off <= CAMERA_TOLERANCE or not np.linalg.det(rotation) > 0:
-            yield f"{eye}_cam_from_world is no rigid pose (off by {off:.1e})"
+        deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        if not deviation <= CAMERA_TOLERANCE or not np.linalg.det(rotation) > 0:
+            yield f"{eye}_cam_from_world is no rigid pose (off by {deviation:.1e})"
 
 
 MAX_PROJECTION_ERROR_PX = 1e-6
-_PIXELS = 60_000
-"""Of an eye, evenly spread: OpenCV also makes 15 derivatives a coordinate, seconds and 200 MB for all pixels."""
+"""Largest distance of a reprojected point from its pixel centre, pixels."""
+_MAX_PROJECTED_PIXELS = 60_000
+"""Pixels projected per eye, evenly spaced.
+
+OpenCV also computes 15 derivatives per coordinate, which takes seconds and 200 MB for all pixels.
+"""
 
 
 def view_projection_error_px(_: AuditedConfig, view: AuditedView) -> float:
-    """Return the largest ``projection_error_px`` of both eyes."""
+    """Return the larger ``projection_error_px`` of both eyes."""
     return max(projection_error_px(eye) for eye in view.eyes.values())
 
 
-def projection_error_px(eye: AuditedEye) -> float:
-    """Return how far from its pixel a point lands at most, pixels; 0 for an eye that sees nothing.
+def projection_error_px(eye: EyeView) -> float:
+    """Return the largest distance of a reprojected point from its pixel centre, pixels.
 
-    At most 60,000 pixels, evenly spread, are looked at. The point comes from the stored depth, our rays and the
-    stored pose. Rodrigues vector and projection are OpenCV's (``cv2.projectPoints``, the model of its calib3d
-    documentation), not ours.
+    The result is 0 for an eye without depth. At most 60,000 evenly spaced pixels are used. A point is computed
+    from the stored depth, the pixel rays of this project and the stored pose. The Rodrigues vector and the
+    projection are OpenCV's (``cv2.projectPoints``, the model of its calib3d documentation).
     """
-    seen = np.flatnonzero(eye.depth_m)
-    if not len(seen):
+    pixels = np.flatnonzero(eye.depth_m)
+    if not len(pixels):
         return 0.0
-    if len(seen) > _PIXELS:
-        seen = seen[np.linspace(0, len(seen) - 1, _PIXELS).astype(int)]
+    if len(pixels) > _MAX_PROJECTED_PIXELS:
+        pixels = pixels[np.linspace(0, len(pixels) - 1, _MAX_PROJECTED_PIXELS).astype(int)]
     pose = eye.camera.cam_from_world
     rotation_rad = cv2.Rodrigues(pose[:3, :3])[0]
-    points_m = eye.points_m.reshape(-1, 3)[seen]
-    found, _ = cv2.projectPoints(points_m, rotation_rad, pose[:3, 3], eye.camera.K, eye.camera.distortion)
-    v, u = np.divmod(seen, eye.camera.width)
-    return float(np.abs(found[:, 0] - np.stack([u, v], axis=1)).max())
+    points_m = eye.points_m.reshape(-1, 3)[pixels]
+    projected_px, _ = cv2.projectPoints(points_m, rotation_rad, pose[:3, 3], eye.camera.K, eye.camera.distortion)
+    v, u = np.divmod(pixels, eye.camera.width)
+    return float(np.abs(projected_px[:, 0] - np.stack([u, v], axis=1)).max())
 
 
 def projection_verdict(config: AuditedConfig, errors_px: Sequence[float]) -> Check:
-    """Hold the largest error of the views looked at against its bound."""
+    """Return the check of the largest reprojection error of the measured views."""
     worst_px = max(errors_px, default=0.0)
     problem = f"a pixel's point lands {worst_px:.2e} px from it in cv2.projectPoints"
     return Check(

@@ -1,7 +1,4 @@
-"""Checks of the folder as a set of files.
-
-Checks of one view's row by itself: types, masks, ids, digests.
-"""
+"""File and row checks of the audit: SHA-256 and digests, array types, masks, bar ids and pixel counts."""
 
 from __future__ import annotations
 
@@ -12,26 +9,26 @@ from typing import Any
 import numpy as np
 
 from dataset_builder.audit.report import Check
-from dataset_builder.build.plan import BUILD_FOLDER
+from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.data.dataset import EYES
 from rebar_depth_bench.data.digests import eye_digest, file_sha256, views_digest
-from rebar_depth_bench.data.manifest import MANIFEST, DatasetFolder, ViewRecord
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, ViewRecord
 from rebar_depth_bench.scoring.protocol import scored_pixels
 
 
 def check_files(folder: DatasetFolder, root: Path) -> Check:
-    """Every file the manifest names is there with its SHA-256, and none stands there unnamed."""
-    named = folder.manifest["files"]
-    problems = [problem for name, sha256 in named.items() if (problem := _file_problem(root, name, sha256))]
-    strangers = sorted(_present(root) - set(named) - {MANIFEST})
-    problems += [f"{name}: is not in the manifest" for name in strangers]
+    """Check that every file of the manifest exists with its SHA-256, and that the folder has no other file."""
+    listed = folder.manifest["files"]
+    problems = [problem for name, sha256 in listed.items() if (problem := _file_problem(root, name, sha256))]
+    unlisted = sorted(_existing_files(root) - set(listed) - {MANIFEST_FILE})
+    problems += [f"{name}: is not in the manifest" for name in unlisted]
     if (root / BUILD_FOLDER).exists():
         problems.append(f"{BUILD_FOLDER}: an unfinished build stands there; run rebar-build again or remove it")
-    return Check("files against the manifest", f"{len(named)} files", "every SHA-256 equal", tuple(problems))
+    return Check("files against the manifest", f"{len(listed)} files", "every SHA-256 equal", tuple(problems))
 
 
 def check_digests(folder: DatasetFolder) -> Check:
-    """The ground-truth digest and each config's are those of the views' digests."""
+    """Check the ground-truth digest of the dataset and of each config against the digests of the views."""
     entries = {config: folder.config(config) for config in folder.configs}
     problems = [
         f"{config}: ground_truth_digest is {entry['ground_truth_digest']}, expected {views_digest(entry['views'])}"
@@ -48,12 +45,15 @@ def _file_problem(root: Path, name: str, sha256: str) -> str | None:
     path = root / name
     if not path.is_file():
         return f"{name}: is missing"
-    found = file_sha256(path)
-    return None if found == sha256 else f"{name}: SHA-256 is {found[:16]}, expected {sha256[:16]}"
+    actual_sha256 = file_sha256(path)
+    return None if actual_sha256 == sha256 else f"{name}: SHA-256 is {actual_sha256[:16]}, expected {sha256[:16]}"
 
 
-def _present(root: Path) -> set[str]:
-    """Return the folder's files, those of the scoring cache and other hidden folders left out."""
+def _existing_files(root: Path) -> set[str]:
+    """Return the relative POSIX paths of the folder's files.
+
+    The scoring cache and other hidden files and folders at the top level are left out.
+    """
     names = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
     return {name for name in names if not name.startswith(".")}
 
@@ -68,7 +68,7 @@ _MATRICES: Mapping[str, tuple[int, ...]] = {"K": (3, 3), "distortion": (5,), "ca
 
 
 def array_problems(row: Mapping[str, Any], rig: Mapping[str, Any]) -> Iterator[str]:
-    """Yield why a decoded row's arrays cannot be judged at all: wrong types or shapes, numbers not finite."""
+    """Yield the faults that make a decoded row unusable: wrong dtypes or shapes, non-finite or negative values."""
     for eye in EYES:
         for kind, (dtype, extra) in _IMAGES.items():
             array, expected = row[f"{eye}_{kind}"], (rig["height"], rig["width"], *extra)
@@ -84,14 +84,14 @@ def array_problems(row: Mapping[str, Any], rig: Mapping[str, Any]) -> Iterator[s
 
 
 def row_problems(row: Mapping[str, Any], record: ViewRecord, bar_ids: set[int]) -> Iterator[str]:
-    """Yield what is wrong with a row whose arrays can be judged: masks, ids, and what the manifest says of it."""
+    """Yield the problems of a row with well-formed arrays: masks, bar ids, differences from the manifest."""
     for eye in EYES:
-        for problem in _truth_problems(row, eye, bar_ids):
+        for problem in _ground_truth_problems(row, eye, bar_ids):
             yield f"{eye}: {problem}"
     yield from _record_problems(row, record)
 
 
-def _truth_problems(row: Mapping[str, Any], eye: str, bar_ids: set[int]) -> Iterator[str]:
+def _ground_truth_problems(row: Mapping[str, Any], eye: str, bar_ids: set[int]) -> Iterator[str]:
     depth_m, mask, bars = row[f"{eye}_depth"], row[f"{eye}_mask"], row[f"{eye}_bars"]
     if not np.array_equal(mask, bars > 0):
         yield "the mask differs from the pixels that have a bar id"

@@ -1,7 +1,4 @@
-"""``audit``: every check of a dataset folder, in one pass over its rows.
-
-The checks that every view of a config goes through, in the order of the report.
-"""
+"""Audit of a dataset folder: runs every check in one pass over the rows of each config."""
 
 from __future__ import annotations
 
@@ -12,25 +9,25 @@ from typing import Any
 
 from dataset_builder.audit.cameras import (
     ExpectedView,
-    aim_point_of,
     board_spec,
     camera_problems,
+    checked_aim_point_m,
     expected_views,
     projection_verdict,
-    protocol_problems,
+    view_list_problems,
     view_projection_error_px,
 )
 from dataset_builder.audit.cycles_depth import cycles_difference_m, cycles_verdict
 from dataset_builder.audit.files import array_problems, check_digests, check_files, row_problems
-from dataset_builder.audit.geometry import axis_verdict, board_verdict, largest_axis_excess, largest_board_error
-from dataset_builder.audit.markers import marker_verdict, view_markers
-from dataset_builder.audit.photometric import photometric_verdict, view_fit
+from dataset_builder.audit.geometry import axis_verdict, board_verdict, max_axis_distance_ratio, view_board_error
+from dataset_builder.audit.markers import detect_view_markers, marker_verdict
+from dataset_builder.audit.photometric import photometric_fit, photometric_verdict
 from dataset_builder.audit.report import AuditReport, Check
 from dataset_builder.audit.stereo_consistency import epipolar_verdict, view_epipolar_counts
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView, RayMemory, audited_view
-from dataset_builder.build.bars_table import BARS, read_bars
+from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView, RayCache, view_from_row
 from dataset_builder.config.trajectories import subset
-from rebar_depth_bench.data.dataset import features, iterate
+from rebar_depth_bench.data.bars import BARS_FILE, read_bars
+from rebar_depth_bench.data.dataset import features, iterate_rows
 from rebar_depth_bench.data.manifest import DatasetFolder, ViewRecord, open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
@@ -38,9 +35,9 @@ from rebar_depth_bench.progress import Progress, silent
 
 @dataclass(frozen=True)
 class ViewCheck:
-    """``measure`` takes a view's figures, ``verdict`` holds all of them against a bound.
+    """Check over the views of a config: ``measure`` is applied to each view, ``verdict`` to all measurements.
 
-    ``views`` of a config, spread evenly, are measured; all of them where it is None.
+    ``views`` evenly spaced views of a config are measured, all of them if it is None.
     """
 
     measure: Callable[[AuditedConfig, AuditedView], Any]
@@ -49,24 +46,26 @@ class ViewCheck:
 
 
 VIEW_CHECKS: tuple[ViewCheck, ...] = (
-    ViewCheck(largest_axis_excess, axis_verdict),
-    ViewCheck(largest_board_error, board_verdict),
+    ViewCheck(max_axis_distance_ratio, axis_verdict),
+    ViewCheck(view_board_error, board_verdict),
     ViewCheck(view_epipolar_counts, epipolar_verdict),
-    # All views of a config have the same lenses, which another check holds to the last digit.
+    # The camera check compares K and distortion of every view, so a few views suffice for the lens model.
     ViewCheck(view_projection_error_px, projection_verdict, views=12),
-    ViewCheck(view_fit, photometric_verdict),
-    ViewCheck(view_markers, marker_verdict),
+    ViewCheck(photometric_fit, photometric_verdict),
+    ViewCheck(detect_view_markers, marker_verdict),
 )
+"""Checks of every view, in the order of the report."""
 
 
 _NOT_AUDITED = {"left_preview"}
 
 
 def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent) -> AuditReport:
-    """Check every invariant of a local dataset folder and its ground truth against other sources.
+    """Check every invariant of a local dataset folder, and its ground truth against independent sources.
 
-    ``depth_views`` views per config, spread evenly, are rendered again by Cycles' depth pass.
-    Raises ``DatasetError`` where the folder cannot be read at all, ``InputError`` for a negative ``depth_views``.
+    ``depth_views`` evenly spaced views per config are rendered again with Cycles' depth pass. The rows are not
+    checked if a file is damaged or missing. Raises ``DatasetError`` if the folder cannot be read, ``InputError``
+    for a negative ``depth_views``.
     """
     if depth_views < 0:
         raise InputError(f"--depth-views is {depth_views}, expected 0 or more")
@@ -75,7 +74,7 @@ def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent
         raise DatasetError(f"{root}: is not a folder on this machine, expected one to audit")
     files = check_files(folder, folder.local)
     checks = [files, check_digests(folder)]
-    if files.passed:  # rows of a damaged folder cannot be judged
+    if files.passed:  # Rows of damaged files cannot be checked.
         for config in folder.configs:
             checks += _config_checks(folder, folder.local, config, depth_views, progress)
     return AuditReport(str(root), tuple(checks))
@@ -85,27 +84,29 @@ def _config_checks(
     folder: DatasetFolder, root: Path, name: str, depth_views: int, progress: Progress
 ) -> Iterator[Check]:
     entry = folder.config(name)
-    steel = read_bars(root / BARS)[entry["scene"]["name"]]
+    steel = read_bars(root / BARS_FILE)[entry["scene"]["name"]]
     config = AuditedConfig(name, entry, steel, board_spec(name, entry))
-    aim_m, aim_problems = aim_point_of(entry, root / entry["mesh"])
+    aim_m, aim_problems = checked_aim_point_m(entry, root / entry["mesh"])
     expected = expected_views(name, entry, aim_m)
-    audited = _Pass(config, folder.views(name), expected, depth_views)
-    for row in iterate(root, name, [column for column in features() if column not in _NOT_AUDITED]):
-        audited.add(row)
-        progress(f"audit of {name}", audited.rows, len(entry["views"]))
-    yield audited.rows_check()
-    yield _cameras_check(name, expected, [*aim_problems, *protocol_problems(entry, expected), *audited.cameras])
-    for check, figures in zip(VIEW_CHECKS, audited.figures, strict=True):
-        yield check.verdict(config, figures)
-    eyes = audited.kept
-    off_m = cycles_difference_m(
-        root / entry["mesh"], eyes, lambda done, total: progress(f"Cycles depth of {name}", done, total)
+    accumulator = _AuditAccumulator(config, folder.views(name), expected, depth_views)
+    for row in iterate_rows(root, name, [column for column in features() if column not in _NOT_AUDITED]):
+        accumulator.add(row)
+        progress(f"audit of {name}", accumulator.rows, len(entry["views"]))
+    yield accumulator.rows_check()
+    yield _cameras_check(
+        name, expected, [*aim_problems, *view_list_problems(entry, expected), *accumulator.cameras]
     )
-    yield cycles_verdict(name, off_m, len(eyes) // 2)
+    for check, measurements in zip(VIEW_CHECKS, accumulator.measurements, strict=True):
+        yield check.verdict(config, measurements)
+    cycles_eyes = accumulator.cycles_eyes
+    difference_and_depth_m = cycles_difference_m(
+        root / entry["mesh"], cycles_eyes, lambda done, total: progress(f"Cycles depth of {name}", done, total)
+    )
+    yield cycles_verdict(name, difference_and_depth_m, len(cycles_eyes) // 2)
 
 
-class _Pass:
-    """One pass over a config's rows: gathers problems, every check's figures, and the eyes that Cycles repeats."""
+class _AuditAccumulator:
+    """Accumulator over a config's rows: problems, measurements of every check, and eyes to render in Cycles."""
 
     def __init__(
         self,
@@ -116,38 +117,38 @@ class _Pass:
     ) -> None:
         self._config, self._records, self._expected = config, records, expected
         self._bar_ids = {bar.bar_id for bar in config.steel}
-        self._rays = RayMemory()
+        self._rays = RayCache()
         self._measured = [set(subset(len(records), check.views)) for check in VIEW_CHECKS]
-        self._again = set(subset(len(records), depth_views) if depth_views else ())
+        self._cycles_indices = set(subset(len(records), depth_views) if depth_views else ())
         self._problems: list[str] = []
         self.rows = 0
         self.cameras: list[str] = []
-        self.figures: list[list[Any]] = [[] for _ in VIEW_CHECKS]
-        self.kept: list[AuditedEye] = []
+        self.measurements: list[list[Any]] = [[] for _ in VIEW_CHECKS]
+        self.cycles_eyes: list[EyeView] = []
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Check the next row; one whose arrays are of the wrong kind is not judged further."""
+        """Check the next row; a row with malformed arrays is not measured."""
         n = self.rows
         self.rows += 1
         if n >= len(self._records):
             return
-        where = self._records[n].view_id
-        broken = list(array_problems(row, self._config.entry["rig"]))
-        found = broken or row_problems(row, self._records[n], self._bar_ids)
-        self._problems += [f"{where}: {problem}" for problem in found]
-        if broken:
+        view_id = self._records[n].view_id
+        array_faults = list(array_problems(row, self._config.entry["rig"]))
+        row_faults = array_faults or row_problems(row, self._records[n], self._bar_ids)
+        self._problems += [f"{view_id}: {problem}" for problem in row_faults]
+        if array_faults:
             return
         if n < len(self._expected):
-            self.cameras += [f"{where}: {problem}" for problem in camera_problems(row, self._expected[n])]
-        view = audited_view(row, self._rays)
-        for check, figures, chosen in zip(VIEW_CHECKS, self.figures, self._measured, strict=True):
-            if n in chosen:
-                figures.append(check.measure(self._config, view))
-        if n in self._again:
-            self.kept += [view.left, view.right]
+            self.cameras += [f"{view_id}: {problem}" for problem in camera_problems(row, self._expected[n])]
+        view = view_from_row(row, self._rays)
+        for check, measurements, selected in zip(VIEW_CHECKS, self.measurements, self._measured, strict=True):
+            if n in selected:
+                measurements.append(check.measure(self._config, view))
+        if n in self._cycles_indices:
+            self.cycles_eyes += [view.left, view.right]
 
     def rows_check(self) -> Check:
-        """Return the verdict on the rows' own invariants."""
+        """Return the check of the number of rows and of their invariants."""
         problems = list(self._problems)
         if self.rows != len(self._records):
             problems.append(

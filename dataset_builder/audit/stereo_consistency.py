@@ -1,4 +1,4 @@
-"""The left eye's steel looked up in the right eye's ground truth, through depth and cameras."""
+"""Stereo consistency check: steel of the left eye projected into the ground truth of the right eye."""
 
 from __future__ import annotations
 
@@ -10,26 +10,30 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
-from dataset_builder.scene.model import Bar
+from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView
+from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.geometry.cameras import project, transform
 from rebar_depth_bench.scoring.protocol import interior
 
 MAX_CONTRADICTED_SHARE = 1e-4
-_MIN_WIDTH_PX = 2.0
-_AROUND = tuple((dv, du) for dv in (-1, 0, 1, 2) for du in (-1, 0, 1, 2))
-"""The pixel centres round a projection, relative to the one above and left of it."""
-_SAME_RAY_PX = 3.0
-"""A point projected into the frame must lie this near to that pixel's ray: far outside the frame a distortion
-polynomial may turn back and land inside it again."""
+"""Largest share of contradicted pixels among those that project into the right frame."""
+_MIN_BAR_WIDTH_PX = 2.0
+_NEIGHBOUR_OFFSETS = tuple((dv, du) for dv in (-1, 0, 1, 2) for du in (-1, 0, 1, 2))
+"""Offsets (dv, du) of the 4 x 4 pixel centres around a projection, relative to the one above and left of it."""
+_MAX_RAY_DEVIATION_PX = 3.0
+"""Largest distance of a projected point from the ray of its pixel, pixels.
+
+A distortion polynomial is not monotonic far outside the frame and may project a point there back into it.
+"""
 
 
 @dataclass(frozen=True)
 class EpipolarCounts:
-    """Interior steel pixels of the left view, looked up in the right one through their depth.
+    """Numbers of interior steel pixels of the left view by the result of their projection into the right view.
 
-    ``seen`` have the same bar at the same depth there, ``hidden`` lie behind something nearer, ``outside``
-    the right frame. ``contradicted`` would be visible but the right view sees past them.
+    ``seen``: the right view has the same bar at the same depth; ``hidden``: it has a nearer surface; ``outside``:
+    the projection is outside the right frame; ``contradicted``: the point should be visible, but the right view
+    shows another or a farther surface.
     """
 
     seen: int = 0
@@ -39,16 +43,19 @@ class EpipolarCounts:
 
 
 @dataclass(frozen=True, eq=False)
-class Landed:
-    """Points in another eye: ``px`` in its picture, ``depth_m`` along its axis, ``inside`` its frame or not."""
+class ProjectedPoints:
+    """Points projected into an eye: pixels, planar depth, and whether they lie inside the frame."""
 
     px: Float64[ndarray, "n 2"]
     depth_m: Float64[ndarray, " n"]
     inside: Bool[ndarray, " n"]
 
 
-def landed_in(eye: AuditedEye, points_m: Float64[ndarray, "n 3"], margin_px: int) -> Landed:
-    """Project world points into an eye; ``inside`` keeps ``margin_px`` whole pixels from the frame's border."""
+def project_into(eye: EyeView, points_m: Float64[ndarray, "n 3"], margin_px: int) -> ProjectedPoints:
+    """Project world points (metres) into an eye.
+
+    A point counts as inside if it is at least ``margin_px`` whole pixels away from the frame's border.
+    """
     points_cam = transform(eye.camera.cam_from_world, points_m)
     in_front = points_cam[:, 2] > 0
     points_cam = np.where(in_front[:, None], points_cam, [0.0, 0.0, 1.0])
@@ -58,39 +65,39 @@ def landed_in(eye: AuditedEye, points_m: Float64[ndarray, "n 3"], margin_px: int
     inside = in_front & ((corner >= margin_px) & (corner < size - 1 - margin_px)).all(axis=1)
     u, v = corner[inside].astype(int).T
     slope_off = np.abs(eye.rays_cam[v, u, :2] - points_cam[inside, :2] / points_cam[inside, 2:]).max(axis=1)
-    inside[inside] = slope_off * eye.camera.K[0, 0] < _SAME_RAY_PX
-    return Landed(px, points_cam[:, 2], inside)
+    inside[inside] = slope_off * eye.camera.K[0, 0] < _MAX_RAY_DEVIATION_PX
+    return ProjectedPoints(px, points_cam[:, 2], inside)
 
 
 def view_epipolar_counts(config: AuditedConfig, view: AuditedView) -> EpipolarCounts:
-    """Return ``epipolar_counts`` of a view with its scene's bars."""
+    """Return ``epipolar_counts`` of a view with the bars of its scene."""
     return epipolar_counts(view, config.steel)
 
 
 def epipolar_counts(view: AuditedView, steel: Iterable[Bar]) -> EpipolarCounts:
-    """Look the left view's interior steel pixels up in the right view.
+    """Return the counts of the left view's interior steel pixels, projected into the right view.
 
-    The right view is read at the 4 x 4 pixel centres round the projection, and depth compared along its own axis:
-    the eyes of a raw rig are not parallel. A point is seen if its bar is there at its depth, give or take the
-    bar's diameter and what depth changes by from pixel to pixel on the bar; hidden if something there is nearer;
-    contradicted otherwise. Bars thinner than two pixels can slip between pixel centres and are left out.
+    The right view is read at the 4 x 4 pixel centres around the projection. Depth is compared along the right
+    optical axis, because the eyes of a raw rig are not parallel. A point is seen if one of these pixels shows its
+    bar at its depth within one bar diameter, hidden if one of them is nearer, and contradicted otherwise. Bars
+    thinner than two pixels can fall between pixel centres and are left out.
     """
     left, right = view.left, view.right
     diameter_of = np.zeros(np.iinfo(np.uint16).max + 1)
     for bar in steel:
         diameter_of[bar.bar_id] = bar.diameter_m
     diameter_m = diameter_of[left.bars]
-    wide = diameter_m * left.camera.K[0, 0] >= _MIN_WIDTH_PX * left.depth_m
-    chosen = interior(left.mask) & wide
-    landed = landed_in(right, left.points_m[chosen], margin_px=1)
-    inside = landed.inside
-    u, v = np.floor(landed.px[inside]).astype(int).T
-    around_m = np.stack([right.depth_m[v + dv, u + du] for dv, du in _AROUND], axis=1)
-    around_bars = np.stack([right.bars[v + dv, u + du] for dv, du in _AROUND], axis=1)
-    depth_m = landed.depth_m[inside, None]
-    near_enough = np.abs(around_m - depth_m) <= diameter_m[chosen][inside, None]
-    seen = (near_enough & (around_bars == left.bars[chosen][inside, None])).any(axis=1)
-    hidden = ~seen & ((around_m > 0) & (around_m < depth_m)).any(axis=1)
+    wide_enough = diameter_m * left.camera.K[0, 0] >= _MIN_BAR_WIDTH_PX * left.depth_m
+    chosen = interior(left.mask) & wide_enough
+    projected = project_into(right, left.points_m[chosen], margin_px=1)
+    inside = projected.inside
+    u, v = np.floor(projected.px[inside]).astype(int).T
+    neighbour_depth_m = np.stack([right.depth_m[v + dv, u + du] for dv, du in _NEIGHBOUR_OFFSETS], axis=1)
+    neighbour_bars = np.stack([right.bars[v + dv, u + du] for dv, du in _NEIGHBOUR_OFFSETS], axis=1)
+    depth_m = projected.depth_m[inside, None]
+    same_depth = np.abs(neighbour_depth_m - depth_m) <= diameter_m[chosen][inside, None]
+    seen = (same_depth & (neighbour_bars == left.bars[chosen][inside, None])).any(axis=1)
+    hidden = ~seen & ((neighbour_depth_m > 0) & (neighbour_depth_m < depth_m)).any(axis=1)
     return EpipolarCounts(
         seen=int(np.count_nonzero(seen)),
         hidden=int(np.count_nonzero(hidden)),
@@ -100,7 +107,7 @@ def epipolar_counts(view: AuditedView, steel: Iterable[Bar]) -> EpipolarCounts:
 
 
 def epipolar_verdict(config: AuditedConfig, views: Sequence[EpipolarCounts]) -> Check:
-    """Hold the share of contradicted pixels of all views against its bound."""
+    """Return the check of the share of contradicted pixels of all views."""
     name = f"{config.name}: left in right through depth"
     seen, hidden, contradicted = (
         sum(getattr(counts, kind) for counts in views) for kind in ("seen", "hidden", "contradicted")

@@ -1,4 +1,4 @@
-"""What checks look at: a config with what its manifest entry promises, and a view with its two eyes."""
+"""Inputs of the audit checks: a config with its manifest entry, and a stereo view with its two eyes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 from numpy import ndarray
 
 from dataset_builder.config.rigs import Camera
-from dataset_builder.scene.model import ESTIMATED, Bar
-from dataset_builder.scene.variants import LIGHT, THINGS, of_slot
+from dataset_builder.scene.model import ESTIMATED_ROLE
+from dataset_builder.scene.variants import LIGHT_SLOT, PROPS_SLOT, variants_of_slot
+from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.dataset import EYES
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, transform
@@ -21,7 +22,7 @@ from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, transf
 
 @dataclass(frozen=True, eq=False)
 class AuditedConfig:
-    """A config's manifest entry, the bars of its scene, and its board."""
+    """Config under audit: its manifest entry, the bars of its scene, and its board (None without one)."""
 
     name: str
     entry: Mapping[str, Any]
@@ -29,19 +30,19 @@ class AuditedConfig:
     board: BoardSpec | None
 
     @property
-    def drawn_steel(self) -> tuple[Bar, ...]:
-        """The bars whose axes are known; an estimated axis is straight where its bar may be bent."""
-        return tuple(bar for bar in self.steel if bar.role != ESTIMATED)
+    def bars_with_known_axis(self) -> tuple[Bar, ...]:
+        """Bars whose axes are known exactly; an estimated axis is straight even if its bar is bent."""
+        return tuple(bar for bar in self.steel if bar.role != ESTIMATED_ROLE)
 
     @property
-    def has_things(self) -> bool:
-        """Whether the scene's appearance has things in it that may stand on the board or before it."""
-        return bool(of_slot(self._variants, THINGS))
+    def has_props(self) -> bool:
+        """Whether the scene has props, which may stand on the board or hide it."""
+        return bool(variants_of_slot(self._variants, PROPS_SLOT))
 
     @property
-    def has_other_light(self) -> bool:
-        """Whether the scene's appearance has light in which markers may not be found."""
-        return bool(of_slot(self._variants, LIGHT))
+    def has_lighting_variant(self) -> bool:
+        """Whether the scene has a lighting variant, under which markers may not be detected."""
+        return bool(variants_of_slot(self._variants, LIGHT_SLOT))
 
     @property
     def _variants(self) -> Sequence[str]:
@@ -49,8 +50,11 @@ class AuditedConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class AuditedEye:
-    """One eye of a view as its row holds it; ``rays_cam`` has z = 1, so that a ray's parameter is planar depth."""
+class EyeView:
+    """Arrays and camera of one eye of a view.
+
+    ``rays_cam`` are the pixel rays in the camera frame with z = 1, so that planar depth scales them to points.
+    """
 
     camera: Camera
     rgb: UInt8[ndarray, "h w 3"]
@@ -61,53 +65,57 @@ class AuditedEye:
 
     @cached_property
     def points_m(self) -> Float64[ndarray, "h w 3"]:
-        """Every pixel's point in the world frame, metres; the camera's centre where there is no depth."""
+        """World point of every pixel, metres; the camera centre for pixels without depth."""
         points_cam = self.rays_cam * self.depth_m[..., None].astype(np.float64)
         return transform(inverse_rigid(self.camera.cam_from_world), points_cam)
 
 
 @dataclass(frozen=True, eq=False)
 class AuditedView:
-    """A stereo view: its id and its eyes."""
+    """Stereo view under audit: its id and both eyes."""
 
     view_id: str
-    left: AuditedEye
-    right: AuditedEye
+    left: EyeView
+    right: EyeView
 
     @property
-    def eyes(self) -> dict[str, AuditedEye]:
-        """Both eyes by name."""
+    def eyes(self) -> dict[str, EyeView]:
+        """Both eyes by name (``left``, ``right``)."""
         return {"left": self.left, "right": self.right}
 
 
-class RayMemory:
-    """Pixel rays by grid: a config's views share theirs, and those of a distorted grid take seconds."""
+class RayCache:
+    """Cache of pixel rays by grid.
+
+    The views of a config share their grids, and the rays of a distorted grid take seconds to compute.
+    """
 
     def __init__(self) -> None:
         self._rays: dict[tuple[bytes, bytes, int, int], Float64[ndarray, "h w 3"]] = {}
 
     def rays_cam(self, camera: Camera) -> Float64[ndarray, "h w 3"]:
-        """Return ``pixel_rays`` of the camera's grid; the same array for the same grid, not to be written to."""
+        """Return ``pixel_rays`` of the camera's grid, a shared array that must not be modified."""
         key = (camera.K.tobytes(), camera.distortion.tobytes(), camera.width, camera.height)
         if key not in self._rays:
-            if len(self._rays) >= len(EYES):  # a config has no more; damaged rows must not fill the memory
+            # A config has one grid per eye; damaged rows with other cameras must not fill the memory.
+            if len(self._rays) >= len(EYES):
                 self._rays.clear()
             self._rays[key] = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
         return self._rays[key]
 
 
-def audited_view(row: Mapping[str, Any], rays: RayMemory) -> AuditedView:
-    """Return a decoded row as a view to check; its arrays must have the shapes of the schema."""
-    return AuditedView(row["view_id"], *(_eye(row, eye, rays) for eye in EYES))
+def view_from_row(row: Mapping[str, Any], rays: RayCache) -> AuditedView:
+    """Return the stereo view of a decoded row, whose arrays must have the shapes of the schema."""
+    return AuditedView(row["view_id"], *(_eye_from_row(row, eye, rays) for eye in EYES))
 
 
-def row_camera(row: Mapping[str, Any], eye: str) -> Camera:
-    """Return one eye's camera as the row holds it."""
+def camera_from_row(row: Mapping[str, Any], eye: str) -> Camera:
+    """Return the camera of one eye of a row."""
     height, width = row[f"{eye}_depth"].shape
     return Camera(row[f"{eye}_K"], row[f"{eye}_distortion"], row[f"{eye}_cam_from_world"], width, height)
 
 
-def _eye(row: Mapping[str, Any], eye: str, rays: RayMemory) -> AuditedEye:
-    camera = row_camera(row, eye)
+def _eye_from_row(row: Mapping[str, Any], eye: str, rays: RayCache) -> EyeView:
+    camera = camera_from_row(row, eye)
     cells = {kind: row[f"{eye}_{kind}"] for kind in ("rgb", "mask", "bars")}
-    return AuditedEye(camera=camera, depth_m=row[f"{eye}_depth"], rays_cam=rays.rays_cam(camera), **cells)
+    return EyeView(camera=camera, depth_m=row[f"{eye}_depth"], rays_cam=rays.rays_cam(camera), **cells)

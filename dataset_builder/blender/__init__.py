@@ -1,5 +1,5 @@
-"""Everything that needs Blender: the scene, its materials, the camera, the renders, the evaluated mesh.
+"""Blender code: scene, materials, camera, renders and the evaluated mesh.
 
-No other package imports ``bpy``. These modules change Blender's one open file, so a process holds one scene
-at a time: ``build_scene`` starts it anew.
+No other package imports ``bpy``. These modules change Blender's single open file, so a process holds one scene
+at a time; ``build_scene`` replaces it.
 """

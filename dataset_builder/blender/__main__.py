@@ -1,4 +1,4 @@
-"""The Blender process: one pickled task in, events as JSON lines out, Blender's own prints to a log."""
+"""Blender process: runs one pickled task from stdin, writes events as JSON lines and Blender's output to a log."""
 
 from __future__ import annotations
 
@@ -13,15 +13,19 @@ from typing import Any, BinaryIO
 from rebar_depth_bench.errors import BuildError, InputError
 
 Report = Callable[[Mapping[str, Any]], None]
+"""Function that sends one event to the parent process."""
 
 
 def main() -> int:
-    """Run the task that stands on standard input; ``sys.argv[1]`` is the log's path."""
-    report = _claim_standard_output(sys.argv[1])
+    """Run the task pickled on standard input and return exit code 0; ``sys.argv[1]`` is the path of the log.
+
+    ``InputError`` and ``BuildError`` are reported as events; other exceptions are raised.
+    """
+    report = _redirect_output(sys.argv[1])
     task = pickle.load(sys.stdin.buffer)
-    _end_with_parent(sys.stdin.buffer)
+    _exit_with_parent(sys.stdin.buffer)
     try:
-        _runner(task)(task, report)
+        _runner_for(task)(task, report)
     except InputError as error:
         report({"input_error": str(error)})
     except BuildError as error:
@@ -29,11 +33,13 @@ def main() -> int:
     return 0
 
 
-def _runner(task: object) -> Callable[[Any, Report], None]:
-    """Return the function that runs a task. Imported late: by now Blender's prints go to the log."""
-    from dataset_builder.blender.depth_task import run_depth_task
-    from dataset_builder.blender.render_task import run_render_task
-    from dataset_builder.build.blender_process import DepthTask, RenderTask
+def _runner_for(task: object) -> Callable[[Any, Report], None]:
+    """Return the function that runs a task.
+
+    The imports are local because Blender's output on import must go to the log.
+    """
+    from dataset_builder.blender.tasks import run_depth_task, run_render_task
+    from dataset_builder.pipeline.blender_process import DepthTask, RenderTask
 
     runners: Mapping[type, Callable[[Any, Report], None]] = {
         RenderTask: run_render_task,
@@ -42,8 +48,8 @@ def _runner(task: object) -> Callable[[Any, Report], None]:
     return runners[type(task)]
 
 
-def _claim_standard_output(log: str) -> Report:
-    """Send file descriptors 1 and 2 to the log and return a function that writes events to the old 1."""
+def _redirect_output(log: str) -> Report:
+    """Redirect file descriptors 1 and 2 to the log; return a function that writes events to the old stdout."""
     events = os.fdopen(os.dup(1), "w", buffering=1)
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     os.dup2(descriptor, 1)
@@ -52,15 +58,15 @@ def _claim_standard_output(log: str) -> Report:
     return lambda event: print(json.dumps(event), file=events, flush=True)
 
 
-def _end_with_parent(stream: BinaryIO) -> None:
-    """End this process at once when its standard input closes: its parent is gone."""
+def _exit_with_parent(stream: BinaryIO) -> None:
+    """Start a thread that ends this process when its standard input closes, as the parent has then ended."""
 
-    def wait() -> None:
+    def watch_stdin() -> None:
         while stream.read(1):
             pass
         os._exit(1)
 
-    threading.Thread(target=wait, daemon=True).start()
+    threading.Thread(target=watch_stdin, daemon=True).start()
 
 
 if __name__ == "__main__":
@@ -68,4 +74,4 @@ if __name__ == "__main__":
     status = main()
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(status)  # Blender's own teardown can crash after the work is done
+    os._exit(status)  # Skip Blender's teardown, which can crash after the task is done.

@@ -1,8 +1,7 @@
-"""Puts Blender's camera where an OpenCV camera stands.
+"""Blender camera from an OpenCV camera: pose, image size, intrinsics and lens distortion.
 
-A lens with distortion as Blender's custom camera: an OSL shader that makes Cycles' rays.
-
-So colour is rendered on the distorted grid itself and nothing is resampled. Only Cycles on the CPU knows it.
+A lens with distortion is a custom camera of Blender: an OSL shader that generates Cycles' rays. Colour is
+therefore rendered on the distorted grid itself, without resampling. Only Cycles on the CPU supports it.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import tempfile
 from importlib import resources
 from pathlib import Path
 
-import _cycles  # type: ignore[import-not-found]
 import bpy
 import numpy as np
 from jaxtyping import Float64
@@ -24,96 +22,116 @@ from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import inverse_rigid
 
 SHADER = "brown_conrady.osl"
+"""File name of the OSL camera shader in this package."""
+
 _LENS_TERMS = ("k1", "k2", "p1", "p2", "k3")
 
 
-def set_distorted_optics(optics: bpy.types.Camera, asked: Camera) -> None:
-    """Make ``optics`` a camera with the asked ``K`` and distortion; the scene's grid is the caller's.
+def set_distorted_optics(optics: bpy.types.Camera, camera: Camera) -> None:
+    """Set the ``K`` and distortion of ``camera`` on Blender's ``optics``; the caller sets the image size.
 
-    Raises ``BuildError`` where Blender cannot compile the shader.
+    Raises ``BuildError`` if Blender cannot compile the shader.
     """
     optics.type = "CUSTOM"
     optics.custom_mode = "INTERNAL"
-    optics.shift_x = optics.shift_y = 0.0  # they would move the raster position that the shader gets
+    optics.shift_x = optics.shift_y = 0.0  # Shifts would change the raster position that the shader gets.
     if not optics.custom_bytecode:
-        bytecode = _compiled()
+        bytecode = _compiled_shader()
         optics.custom_bytecode = bytecode
         optics.custom_bytecode_hash = hashlib.md5(bytecode.encode(), usedforsecurity=False).hexdigest()
-    for name, value in _parameters(asked).items():
+    for name, value in _shader_parameters(camera).items():
         optics.cycles_custom[name] = value
     optics.update_tag()
 
 
-def _parameters(asked: Camera) -> dict[str, float]:
-    """Return the shader's parameters by name, pixels; one that is missing would keep its default unseen."""
-    K = asked.K
+def _shader_parameters(camera: Camera) -> dict[str, float]:
+    """Return all parameters of the shader by name; lengths in pixels, lens terms without unit.
+
+    A missing parameter would silently keep its default.
+    """
+    K = camera.K
     pinhole = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    lens = dict(zip(_LENS_TERMS, asked.distortion, strict=True))
-    grid = {"width": asked.width, "height": asked.height}
+    lens = dict(zip(_LENS_TERMS, camera.distortion, strict=True))
+    grid = {"width": camera.width, "height": camera.height}
     return {name: float(value) for name, value in (grid | pinhole | lens).items()}
 
 
-def _compiled() -> str:
+def _compiled_shader() -> str:
+    """Return the shader's OSL bytecode; raise ``BuildError`` if Blender cannot compile it."""
+    import _cycles  # type: ignore[import-not-found]  # can be found only after bpy has been imported
+
     source = resources.files(__package__).joinpath(SHADER).read_text(encoding="utf-8")
     with tempfile.TemporaryDirectory() as scratch:
-        written, compiled = Path(scratch, SHADER), Path(scratch, "camera.oso")
-        written.write_text(source, encoding="utf-8")
-        if not _cycles.osl_compile(str(written), str(compiled)):
+        source_file, oso_file = Path(scratch, SHADER), Path(scratch, "camera.oso")
+        source_file.write_text(source, encoding="utf-8")
+        if not _cycles.osl_compile(str(source_file), str(oso_file)):
             raise BuildError(f"Blender cannot compile its camera shader {SHADER}; its log has the reason")
-        return compiled.read_text(encoding="utf-8")
+        return oso_file.read_text(encoding="utf-8")
 
 
 SENSOR_MM = 36.0
+"""Width of Blender's sensor; it fixes the scale of the focal length and nothing else."""
+
 CLIP_M = (0.001, 1000.0)
-MAX_DEVIATION = 1e-5
-NAME = "camera"
+"""Near and far clipping distance."""
+
+MAX_POSE_DEVIATION = 1e-5
+"""Largest deviation of an entry of the 4 x 4 pose that Blender stores (metres for the translation)."""
+
+CAMERA_NAME = "camera"
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def place_camera(asked: Camera) -> float:
-    """Make the scene's camera the one asked for (pixel centres at integers): a pinhole, or a lens with distortion.
+def place_camera(camera: Camera) -> float:
+    """Set the scene's camera to ``camera`` (pixel centres at integers), a pinhole or a lens with distortion.
 
-    Returns the largest deviation between the asked 4 x 4 pose and the one Blender holds (it rounds to
-    float32) and raises ``BuildError`` where that exceeds ``MAX_DEVIATION``. Raises ``ValueError`` for a
-    skewed ``K``, or a pinhole's focal lengths whose ratio Blender's pixel aspect cannot hold.
+    Returns the largest absolute difference between the entries of ``camera.cam_from_world`` and of the pose that
+    Blender stores (rounded to float32), and raises ``BuildError`` if it exceeds ``MAX_POSE_DEVIATION``. Raises
+    ``ValueError`` for a skewed ``K``, or for a pinhole whose ratio of focal lengths exceeds the range of Blender's
+    pixel aspect.
     """
-    if asked.K[0, 1] != 0.0 or asked.K[1, 0] != 0.0:
-        raise ValueError(f"Blender's camera has no skew, K has:\n{asked.K}")
-    camera = _scene_camera()
-    distorted = asked.distortion.any()
-    _set_grid(asked.width, asked.height, aspect=1.0 if distorted else asked.K[1, 1] / asked.K[0, 0])
-    # The lens needs none of it, but what an earlier camera left would show in a few pixels' last bit.
-    _set_pinhole_optics(camera.data, asked.K, asked.width, asked.height)
+    if camera.K[0, 1] != 0.0 or camera.K[1, 0] != 0.0:
+        raise ValueError(f"Blender's camera has no skew, K has:\n{camera.K}")
+    blender_camera = _scene_camera()
+    distorted = camera.distortion.any()
+    _set_resolution(camera.width, camera.height, aspect=1.0 if distorted else camera.K[1, 1] / camera.K[0, 0])
+    # A lens with distortion does not use these settings, but values left by an earlier camera would change the
+    # last bit of a few pixels.
+    _set_pinhole_optics(blender_camera.data, camera.K, camera.width, camera.height)
     if distorted:
-        set_distorted_optics(camera.data, asked)
-    wanted = inverse_rigid(asked.cam_from_world) @ _OPENGL_FROM_OPENCV
-    camera.matrix_world = Matrix(wanted.tolist())
+        set_distorted_optics(blender_camera.data, camera)
+    world_from_gl = inverse_rigid(camera.cam_from_world) @ _OPENGL_FROM_OPENCV
+    blender_camera.matrix_world = Matrix(world_from_gl.tolist())
     bpy.context.view_layer.update()
-    deviation = float(np.abs(placed_cam_from_world() - asked.cam_from_world).max())
-    if deviation > MAX_DEVIATION:
+    deviation = float(np.abs(blender_cam_from_world() - camera.cam_from_world).max())
+    if deviation > MAX_POSE_DEVIATION:
         raise BuildError(
-            f"Blender holds a camera pose {deviation:.2e} off the one asked for:\n{asked.cam_from_world}"
+            f"Blender holds a camera pose {deviation:.2e} off the one asked for:\n{camera.cam_from_world}"
         )
     return deviation
 
 
-def placed_cam_from_world() -> Float64[ndarray, "4 4"]:
-    """Return the pose that Blender holds, in OpenCV axes: its ``matrix_world``, a float32 matrix, inverted."""
+def blender_cam_from_world() -> Float64[ndarray, "4 4"]:
+    """Return the pose that Blender stores, in OpenCV axes: the inverse of its float32 ``matrix_world``."""
     world_from_gl = np.array(_scene_camera().matrix_world, dtype=np.float64)
     return np.asarray(np.linalg.inv(world_from_gl @ _OPENGL_FROM_OPENCV))
 
 
 def _scene_camera() -> bpy.types.Object:
+    """Return the scene's camera object, created on first use."""
     scene = bpy.context.scene
     if scene.camera is None:
-        scene.camera = bpy.data.objects.new(NAME, bpy.data.cameras.new(NAME))
+        scene.camera = bpy.data.objects.new(CAMERA_NAME, bpy.data.cameras.new(CAMERA_NAME))
         scene.collection.objects.link(scene.camera)
     return scene.camera
 
 
-def _set_grid(width: int, height: int, aspect: float) -> None:
-    """Set the image size and the pixel aspect: fy / fx, which Blender takes as two numbers from 1 upwards."""
+def _set_resolution(width: int, height: int, aspect: float) -> None:
+    """Set the image size and the pixel aspect fy / fx, which Blender stores as two numbers of at least 1.
+
+    Raises ``ValueError`` if the aspect is outside Blender's range.
+    """
     if not 1 / 200 <= aspect <= 200:
         raise ValueError(f"fy / fx is {aspect}, Blender's pixel aspect reaches from 1/200 to 200")
     render = bpy.context.scene.render
@@ -123,6 +141,7 @@ def _set_grid(width: int, height: int, aspect: float) -> None:
 
 
 def _set_pinhole_optics(optics: bpy.types.Camera, K: Float64[ndarray, "3 3"], width: int, height: int) -> None:
+    """Set Blender's perspective camera to the intrinsics ``K`` (pixels)."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     optics.type = "PERSP"
     optics.sensor_fit = "HORIZONTAL"
@@ -130,7 +149,7 @@ def _set_pinhole_optics(optics: bpy.types.Camera, K: Float64[ndarray, "3 3"], wi
     optics.lens_unit = "MILLIMETERS"
     optics.lens = fx * SENSOR_MM / width
     optics.shift_x = ((width - 1) / 2 - cx) / width
-    # Both shifts are shares of the sensor's width; a pixel is fx / fy as high as it is wide.
+    # Both shifts are fractions of the sensor width; a pixel's height is fx / fy times its width.
     optics.shift_y = (cy - (height - 1) / 2) * (fx / fy) / width
     optics.clip_start, optics.clip_end = CLIP_M
     optics.dof.use_dof = False

@@ -1,37 +1,36 @@
-"""The room round the board: bench, walls and furniture, all of them real surfaces with depth.
+"""Laboratory environment: the room round the board with bench, walls and furniture, all surfaces with depth.
 
-World frame, metres; the bench top lies just under the sheet at z = 0. Nothing that could pass for steel
-reinforcement stands in the room, and nothing stands where the dome's cameras do (0.5 m round the origin).
-The room is open above the heads of the walls: no view of the dome sees that high, and light that leaves
-the room costs no further bounces.
+World frame, metres; the bench top lies just under the sheet at z = 0. No object resembles steel reinforcement,
+and none is within the dome of cameras (0.5 m round the origin). The room is open above the walls: no view of
+the dome reaches that high, and light that leaves the room costs no further bounces.
 """
 
 from __future__ import annotations
 
 from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
-from dataset_builder.scene.shapes.solids import Point, box, cylinder, turned_box
+from dataset_builder.scene.shapes.solids import Point, box, cylinder, rotated_box
 
 SHEET_THICKNESS_M = 0.0003
 BENCH_TOP_M = -SHEET_THICKNESS_M - 0.0001
 FLOOR_M = -0.78
-WALL_HEAD_M = 1.6
+WALL_TOP_M = 1.6
 WEST_M, EAST_M, SOUTH_M, NORTH_M = -2.3, 2.5, -2.1, 2.3
 WALL_THICKNESS_M = 0.1
 
 
 def laboratory() -> tuple[Part, ...]:
-    """Return every surface of the room, none of them steel."""
-    return (*_shell(), *_bench(), *_furniture(), *_on_the_bench())
+    """Return all surfaces of the room; none is steel."""
+    return (*_floor_and_walls(), *_bench(), *_furniture(), *_bench_items())
 
 
 def _part(name: str, mesh: Mesh, material: str) -> Part:
     return Part(name, mesh, NOT_STEEL, material)
 
 
-def _shell() -> tuple[Part, ...]:
-    """Return floor and four walls; slabs butt against each other from outside and never overlap."""
+def _floor_and_walls() -> tuple[Part, ...]:
+    """Return floor and four walls, as slabs that lie outside of the room and do not overlap."""
     t = WALL_THICKNESS_M
-    low, high = FLOOR_M, WALL_HEAD_M
+    low, high = FLOOR_M, WALL_TOP_M
     return (
         _part("floor", box((WEST_M, SOUTH_M, low - t), (EAST_M, NORTH_M, low)), "floor"),
         _part("wall-west", box((WEST_M - t, SOUTH_M, low), (WEST_M, NORTH_M, high)), "plaster"),
@@ -42,7 +41,7 @@ def _shell() -> tuple[Part, ...]:
 
 
 def _bench() -> tuple[Part, ...]:
-    """Return a laboratory bench: a wooden top on a steel-grey frame."""
+    """Return a laboratory bench: a wooden top on four legs of painted metal."""
     x, y, thickness = 0.95, 0.70, 0.036
     under = BENCH_TOP_M - thickness
     legs = [
@@ -58,7 +57,7 @@ def _leg(x_m: float, y_m: float, top_m: float, half_m: float = 0.03) -> Mesh:
 
 
 def _furniture() -> tuple[Part, ...]:
-    """Return what the low cameras see behind the bench: cabinets, a shelf with boxes, a pinboard, a radiator."""
+    """Return the furniture along the walls, which low cameras see behind the bench."""
     foot = FLOOR_M + 0.001
     north, east, west, south = NORTH_M - 0.002, EAST_M - 0.002, WEST_M + 0.002, SOUTH_M + 0.002
     cabinets = [
@@ -82,7 +81,7 @@ def _furniture() -> tuple[Part, ...]:
 
 
 def _crates(east_m: float) -> list[tuple[Mesh, str]]:
-    """Return the storage boxes on the shelf: each stands half a millimetre clear of its board."""
+    """Return mesh and material of the storage boxes on the shelf, each half a millimetre above its board."""
     rows = {-0.3945: "blue plastic", 0.0255: "cardboard", 0.4455: "grey plastic"}
     widths = [0.34, 0.42, 0.30, 0.46]
     crates = []
@@ -95,19 +94,19 @@ def _crates(east_m: float) -> list[tuple[Mesh, str]]:
     return crates
 
 
-def _on_the_bench() -> tuple[Part, ...]:
-    """Return the things that lie about on the bench, beyond the reach of the dome's cameras."""
+def _bench_items() -> tuple[Part, ...]:
+    """Return the objects on the bench, outside of the dome of cameras."""
     z = BENCH_TOP_M + 0.0005
 
     def standing(x: float, y: float, size: Point, turn: float) -> Mesh:
-        return turned_box((x, y, z + size[2] / 2), size, turn)
+        return rotated_box((x, y, z + size[2] / 2), size, turn)
 
     return (
         _part("cube-a", standing(-0.70, 0.50, (0.10, 0.10, 0.10), 14), "concrete"),
         _part("cube-b", standing(-0.55, 0.58, (0.10, 0.10, 0.10), -8), "concrete"),
         _part("cylinder", cylinder((-0.80, 0.36, z), 0.05, 0.20), "concrete"),
         _part("toolbox", standing(0.70, 0.54, (0.34, 0.17, 0.14), -12), "red paint"),
-        _part("toolbox-lid", turned_box((0.70, 0.54, z + 0.1555), (0.35, 0.18, 0.03), -12), "dark laminate"),
+        _part("toolbox-lid", rotated_box((0.70, 0.54, z + 0.1555), (0.35, 0.18, 0.03), -12), "dark laminate"),
         _part("notebook", standing(-0.72, -0.45, (0.21, 0.15, 0.014), 24), "blue plastic"),
         _part("carton", standing(0.76, -0.48, (0.20, 0.15, 0.11), 31), "cardboard"),
         _part("mug", cylinder((0.80, 0.10, z), 0.041, 0.095), "white glaze"),

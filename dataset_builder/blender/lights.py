@@ -1,8 +1,6 @@
-"""Lights a scene: a sky, the sun, panels and spots. None of them is a surface, so none has depth.
+"""Scene lights: sky, sun, panels and spots, and the tables of lights of each environment and light variant.
 
-What a place's light is made of, as it is and in each variant, is told in ``light_rigs``.
-
-The light of each place, as it is and in each light variant: plain tables of lamps and skies.
+Lights are not surfaces and have no depth.
 """
 
 from __future__ import annotations
@@ -14,15 +12,14 @@ from math import radians
 import bpy
 from mathutils import Vector
 
-from dataset_builder.blender.shader_nodes import Colour, Socket, Tree
+from dataset_builder.blender.shader_nodes import Colour, NodeTreeBuilder, Socket
+from dataset_builder.scene.shapes.solids import Point
 from dataset_builder.scene.variants import SHADOWS, SUN_FROM
-
-Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Sky:
-    """What rays meet that meet nothing: ``horizon`` fades to ``zenith``; one colour where they are the same."""
+    """Sky background: a vertical gradient from ``horizon`` to ``zenith``, uniform if they are equal."""
 
     horizon: Colour
     zenith: Colour
@@ -44,7 +41,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Sun:
-    """A light as from infinity: the direction it comes from, its soft edge and its strength (W / m2)."""
+    """A light at infinity: direction it comes from, angular diameter in degrees and strength (W / m2)."""
 
     from_direction: Point
     angle_deg: float
@@ -54,7 +51,10 @@ class Sun:
 
 @dataclass(frozen=True)
 class Spot:
-    """A lamp that throws a cone, of ``radius_m``, at ``at_m``, facing ``towards_m`` (world, metres)."""
+    """A spot lamp at ``at_m``, facing ``towards_m`` (world, metres).
+
+    ``radius_m`` is the radius of the lamp, ``cone_deg`` the full angle of its cone.
+    """
 
     at_m: Point
     towards_m: Point
@@ -66,14 +66,14 @@ class Spot:
 
 @dataclass(frozen=True)
 class LightRig:
-    """All the light of a scene."""
+    """The sky and the lamps of a scene."""
 
     sky: Sky
     lamps: tuple[Panel | Sun | Spot, ...]
 
 
 def add_light(rig: LightRig) -> None:
-    """Light the open scene, which has no light yet."""
+    """Add the sky and the lamps of ``rig`` to the open scene, which must have no light yet."""
     _add_sky(rig.sky)
     for number, lamp in enumerate(rig.lamps):
         if isinstance(lamp, Panel):
@@ -85,21 +85,22 @@ def add_light(rig: LightRig) -> None:
 
 
 def _add_sky(sky: Sky) -> None:
+    """Set the sky as the background of the open scene."""
     world = bpy.data.worlds.new("sky")
     world.use_nodes = True
     background = world.node_tree.nodes["Background"]
     background.inputs["Color"].default_value = (*sky.horizon, 1.0)
     background.inputs["Strength"].default_value = sky.strength
     if sky.zenith != sky.horizon:
-        tree = Tree(world.node_tree)
-        world.node_tree.links.new(_gradient(tree, sky), background.inputs["Color"])
-    # So smooth a sky is found well enough by chance; lamps get all the shadow rays.
+        tree = NodeTreeBuilder(world.node_tree)
+        world.node_tree.links.new(_sky_gradient(tree, sky), background.inputs["Color"])
+    # The sky is smooth enough for unguided sampling, so that lamps get all the shadow rays.
     world.cycles.sampling_method = "NONE"
     bpy.context.scene.world = world
 
 
-def _gradient(tree: Tree, sky: Sky) -> Socket:
-    """Return the sky's colour along a direction: most of the change lies low, as in clear air."""
+def _sky_gradient(tree: NodeTreeBuilder, sky: Sky) -> Socket:
+    """Return the sky's colour by direction; most of the change is near the horizon, as in clear air."""
     direction = tree.direction()
     height = tree.node("ShaderNodeSeparateXYZ", {0: direction}).outputs["Z"]
     colour = tree.mix(
@@ -117,7 +118,7 @@ def _add_panel(panel: Panel) -> None:
     light.size, light.size_y = panel.size_m
     light.energy = panel.power_w
     light.color = panel.colour
-    _hang(light, panel.at_m, Vector(panel.towards_m) - Vector(panel.at_m))
+    _add_lamp_object(light, panel.at_m, Vector(panel.towards_m) - Vector(panel.at_m))
 
 
 def _add_sun(sun: Sun, name: str) -> None:
@@ -125,7 +126,7 @@ def _add_sun(sun: Sun, name: str) -> None:
     light.angle = radians(sun.angle_deg)
     light.energy = sun.strength
     light.color = sun.colour
-    _hang(light, (0.0, 0.0, 0.0), -Vector(sun.from_direction))
+    _add_lamp_object(light, (0.0, 0.0, 0.0), -Vector(sun.from_direction))
 
 
 def _add_spot(spot: Spot, name: str) -> None:
@@ -135,13 +136,14 @@ def _add_spot(spot: Spot, name: str) -> None:
     light.spot_blend = 0.35
     light.energy = spot.power_w
     light.color = spot.colour
-    _hang(light, spot.at_m, Vector(spot.towards_m) - Vector(spot.at_m))
+    _add_lamp_object(light, spot.at_m, Vector(spot.towards_m) - Vector(spot.at_m))
 
 
-def _hang(light: bpy.types.Light, at_m: Point, direction: Vector) -> None:
+def _add_lamp_object(light: bpy.types.Light, at_m: Point, direction: Vector) -> None:
+    """Add a light to the open scene at ``at_m``, shining along ``direction``, invisible to cameras."""
     added = bpy.data.objects.new(light.name, light)
     added.location = at_m
-    # A light shines along its -z axis.
+    # Lights in Blender shine along their -z axis.
     added.rotation_euler = direction.to_track_quat("-Z", "Y").to_euler()
     added.visible_camera = False
     bpy.context.scene.collection.objects.link(added)
@@ -151,30 +153,32 @@ WARM, COOL, WHITE = (1.0, 0.93, 0.85), (0.82, 0.91, 1.0), (1.0, 0.98, 0.95)
 EMBER = (1.0, 0.60, 0.30)
 
 
-def _even(colour: Colour, strength: float) -> Sky:
+def _uniform_sky(colour: Colour, strength: float) -> Sky:
+    """Return a sky of one colour."""
     return Sky(colour, colour, strength)
 
 
 LABORATORY_LIGHT: Mapping[str | None, LightRig] = {
     None: LightRig(
-        # One lamp and a bright sky: a second lamp from the side made steel noisier.
-        _even((0.86, 0.93, 1.0), 0.80),
+        # One lamp and a bright sky, because a second lamp from the side increased the noise on steel.
+        _uniform_sky((0.86, 0.93, 1.0), 0.80),
         (Panel("ceiling-panel", (-0.35, 0.45, 1.9), (0.0, 0.05, 0.0), (0.9, 0.45), 62.0, WARM),),
     ),
     "dusk": LightRig(
-        _even((0.42, 0.55, 1.0), 0.13),
+        _uniform_sky((0.42, 0.55, 1.0), 0.13),
         (Panel("window", (-1.9, -0.9, 0.9), (0.0, 0.0, 0.05), (1.1, 0.5), 14.0, EMBER),),
     ),
     "spotlight": LightRig(
-        _even((0.7, 0.8, 1.0), 0.05),
+        _uniform_sky((0.7, 0.8, 1.0), 0.05),
         (Spot((-0.95, 0.10, 0.85), (0.0, 0.0, 0.03), 0.012, 62.0, 75.0, WHITE),),
     ),
     "backlight": LightRig(
-        _even((0.86, 0.93, 1.0), 0.07),
+        _uniform_sky((0.86, 0.93, 1.0), 0.07),
         (Panel("low-window", (0.2, 2.0, 0.85), (0.0, 0.0, 0.05), (1.4, 0.6), 75.0, WHITE),),
     ),
-    SHADOWS: LightRig(_even((0.80, 0.90, 1.0), 0.30), (Sun(SUN_FROM, 0.5, 3.6, WARM),)),
+    SHADOWS: LightRig(_uniform_sky((0.80, 0.90, 1.0), 0.30), (Sun(SUN_FROM, 0.5, 3.6, WARM),)),
 }
+"""Lights of the laboratory by light variant; None is the default."""
 
 _DAY = Sky((0.70, 0.82, 0.95), (0.17, 0.35, 0.74), 0.80, clouds=True)
 
@@ -194,3 +198,4 @@ OUTDOOR_LIGHT: Mapping[str | None, LightRig] = {
     ),
     SHADOWS: LightRig(_DAY, (Sun(SUN_FROM, 0.5, 3.8, WARM),)),
 }
+"""Lights of the building site by light variant; None is the default."""

@@ -1,4 +1,4 @@
-"""What the scene's surfaces look like: colour and gloss only, no material moves or bumps a surface."""
+"""Materials of the scene's surfaces: colour and gloss only, without displacement or bump mapping."""
 
 from __future__ import annotations
 
@@ -9,50 +9,54 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from dataset_builder.blender.shader_nodes import Colour, Shader
+from dataset_builder.blender.shader_nodes import Colour, MaterialBuilder
 
-RUST, PATTERN, TONE = "rust_amount", "pattern_shift_m", "scale_tone"
-"""Custom properties of a steel object that its material reads."""
+RUST_PROPERTY, PATTERN_PROPERTY, TONE_PROPERTY = "rust_amount", "pattern_shift_m", "scale_tone"
+"""Names of the custom properties of a steel object that its material reads."""
 
-
-STEEL_LOOKS = {"mill-scale": "steel, mill-scale", "rusted": "steel, rusted", "wet": "steel, wet"}
-"""The material of each steel variant."""
+STEEL_VARIANT_MATERIALS = {"mill-scale": "steel, mill-scale", "rusted": "steel, rusted", "wet": "steel, wet"}
+"""Material name of each steel variant."""
 
 
 def surface_variation(seed: int, bar_id: int) -> dict[str, float]:
-    """Return one bar's share of rust (0 to 1), shift of pattern and tone of scale, drawn from both numbers."""
+    """Return random values of a bar's custom properties, determined by ``seed`` and ``bar_id``.
+
+    They are the amount of rust (0 to 1), the shift of the pattern (0 to 10 m) and the tone of the mill scale
+    (0 to 1).
+    """
     random = np.random.default_rng([seed, bar_id])
     return {
-        RUST: float(random.beta(1.6, 2.2)),
-        PATTERN: float(random.uniform(0.0, 10.0)),
-        TONE: float(random.uniform(0.0, 1.0)),
+        RUST_PROPERTY: float(random.beta(1.6, 2.2)),
+        PATTERN_PROPERTY: float(random.uniform(0.0, 10.0)),
+        TONE_PROPERTY: float(random.uniform(0.0, 1.0)),
     }
 
 
 def material(name: str) -> bpy.types.Material:
-    """Return the material ``name`` of the open file, made on first use."""
-    found = bpy.data.materials.get(name)
-    if found is None:
-        found = _MAKERS[name](name)
-    return found
+    """Return the material ``name`` of the open file, created on first use."""
+    blender_material = bpy.data.materials.get(name)
+    if blender_material is None:
+        blender_material = _MATERIAL_BUILDERS[name](name)
+    return blender_material
 
 
 def paper(texture: UInt8[ndarray, "h w"]) -> bpy.types.Material:
-    """Return matt paper with ``texture`` (row 0 on top) printed on it."""
-    shader = Shader("paper")
+    """Return matt paper printed with ``texture`` (row 0 at the top, 0 is black)."""
+    shader = MaterialBuilder("paper")
     image = _image("board", texture)
     printed = shader.node("ShaderNodeTexImage", {"Vector": shader.uv()}, image=image, extension="EXTEND")
-    # Ink is no black hole and paper no mirror: keep both inside what a printer delivers.
+    # The reflectances of ink and paper are those of a realistic print.
     colour = shader.mix(printed.outputs["Color"], (0.018, 0.018, 0.02), (0.74, 0.735, 0.71))
     return shader.matt(colour)
 
 
 def _image(name: str, texture: UInt8[ndarray, "h w"]) -> bpy.types.Image:
+    """Return a grey texture as a packed Blender image."""
     height, width = texture.shape
     image = bpy.data.images.new(name, width, height)
-    # Values are mixing shares, not light: no transfer curve.
+    # The values are mixing factors and not light, so no transfer curve applies.
     image.colorspace_settings.name = "Non-Color"
-    # Blender's row 0 is at the bottom.
+    # Row 0 of a Blender image is at the bottom.
     grey = np.flipud(texture).astype(np.float32)[..., None] / np.float32(255)
     rgba = np.concatenate([grey, grey, grey, np.ones_like(grey)], axis=2)
     image.pixels.foreach_set(np.ascontiguousarray(rgba).ravel())
@@ -67,23 +71,26 @@ def _steel(
     metallic: float = 0.40,
     roughness: tuple[float, float] = (0.50, 0.74),
 ) -> Callable[[str], bpy.types.Material]:
-    """Return a maker of blue-grey mill scale with patches of rust.
+    """Return a builder of blue-grey mill scale with patches of rust.
 
-    Amount, pattern and tone come from each bar's properties: ``rust_shift`` is how much rust the amounts 0 and 1
-    make, ``roughness`` that of scale and of rust; ``tint`` darkens both.
+    Amount, pattern and tone are read from each bar's custom properties. ``rust_shift`` are the offsets of the rust
+    threshold for the amounts 0 and 1, ``roughness`` the values for scale and rust; ``tint`` multiplies both
+    colours.
     """
 
     def tinted(red: float, green: float, blue: float) -> Colour:
         return red * tint, green * tint, blue * tint
 
     def make(name: str) -> bpy.types.Material:
-        shader = Shader(name)
-        at = shader.shifted(shader.position(), shader.object_value(PATTERN))
-        patches, grain = shader.noise(at, 70.0, 3.0), shader.noise(at, 700.0, 1.0)
-        dark = shader.mix(shader.object_value(TONE), tinted(0.105, 0.118, 0.140), tinted(0.190, 0.200, 0.218))
+        shader = MaterialBuilder(name)
+        pattern_point = shader.shifted(shader.position(), shader.object_value(PATTERN_PROPERTY))
+        patches, grain = shader.noise(pattern_point, 70.0, 3.0), shader.noise(pattern_point, 700.0, 1.0)
+        dark = shader.mix(
+            shader.object_value(TONE_PROPERTY), tinted(0.105, 0.118, 0.140), tinted(0.190, 0.200, 0.218)
+        )
         scale = shader.mix(shader.step(grain, 0.25, 0.85), dark, tinted(0.255, 0.262, 0.275))
         rust = shader.mix(shader.step(grain, 0.3, 0.7), tinted(0.095, 0.042, 0.022), tinted(0.250, 0.105, 0.045))
-        threshold = shader.add(patches, shader.remap(shader.object_value(RUST), 0.0, 1.0, *rust_shift))
+        threshold = shader.add(patches, shader.remap(shader.object_value(RUST_PROPERTY), 0.0, 1.0, *rust_shift))
         rusty = shader.step(shader.add(threshold, shader.remap(grain, 0.0, 1.0, -0.05, 0.05)), 0.46, 0.62)
         gloss = shader.add(shader.remap(rusty, 0.0, 1.0, *roughness), shader.remap(grain, 0, 1, -0.06, 0.08))
         return shader.surface(
@@ -96,20 +103,20 @@ def _steel(
 
 
 def _wood(name: str) -> bpy.types.Material:
-    """Oiled beech: grain along x."""
-    shader = Shader(name)
-    at = shader.position()
-    figure = shader.noise(shader.stretched(at, (1.0, 12.0, 12.0)), 4.0)
-    pores = shader.noise(shader.stretched(at, (22.0, 330.0, 330.0)), 2.0, 0.0)
+    """Return oiled beech with the grain along x."""
+    shader = MaterialBuilder(name)
+    pattern_point = shader.position()
+    figure = shader.noise(shader.stretched(pattern_point, (1.0, 12.0, 12.0)), 4.0)
+    pores = shader.noise(shader.stretched(pattern_point, (22.0, 330.0, 330.0)), 2.0, 0.0)
     base = shader.mix(shader.step(figure, 0.3, 0.7), (0.31, 0.195, 0.108), (0.40, 0.265, 0.155))
     return shader.matt(shader.mix(shader.step(pores, 0.55, 0.85), base, (0.25, 0.15, 0.083)))
 
 
 def _speckled(light: Colour, dark: Colour, per_metre: float) -> Callable[[str], bpy.types.Material]:
-    """Return a maker of matt two-tone speckled matter."""
+    """Return a builder of a matt, speckled material of two colours."""
 
     def make(name: str) -> bpy.types.Material:
-        shader = Shader(name)
+        shader = MaterialBuilder(name)
         share = shader.step(shader.noise(shader.position(), per_metre), 0.35, 0.65)
         return shader.matt(shader.mix(share, dark, light))
 
@@ -119,13 +126,13 @@ def _speckled(light: Colour, dark: Colour, per_metre: float) -> Callable[[str], 
 def _mottled(
     light: Colour, dark: Colour, per_metre: float, stains_per_metre: float, stain: Colour
 ) -> Callable[[str], bpy.types.Material]:
-    """Return a maker of ground: matt two-tone grain under large stains."""
+    """Return a builder of a matt ground material: grain of two colours under large stains."""
 
     def make(name: str) -> bpy.types.Material:
-        shader = Shader(name)
-        at = shader.position()
-        grain = shader.mix(shader.step(shader.noise(at, per_metre, 1.0), 0.3, 0.7), dark, light)
-        stains = shader.step(shader.noise(at, stains_per_metre, 2.0), 0.42, 0.72)
+        shader = MaterialBuilder(name)
+        pattern_point = shader.position()
+        grain = shader.mix(shader.step(shader.noise(pattern_point, per_metre, 1.0), 0.3, 0.7), dark, light)
+        stains = shader.step(shader.noise(pattern_point, stains_per_metre, 2.0), 0.42, 0.72)
         return shader.matt(shader.mix(stains, grain, stain))
 
     return make
@@ -134,10 +141,10 @@ def _mottled(
 def _grained(
     light: Colour, dark: Colour, scale: tuple[float, float, float]
 ) -> Callable[[str], bpy.types.Material]:
-    """Return a maker of sawn wood; ``scale`` is features a metre along x, y and z."""
+    """Return a builder of sawn wood; ``scale`` is the number of features per metre along x, y and z."""
 
     def make(name: str) -> bpy.types.Material:
-        shader = Shader(name)
+        shader = MaterialBuilder(name)
         grain = shader.noise(shader.stretched(shader.position(), scale), 1.0)
         return shader.matt(shader.mix(shader.step(grain, 0.25, 0.75), dark, light))
 
@@ -145,14 +152,16 @@ def _grained(
 
 
 def _matt(colour: Colour) -> Callable[[str], bpy.types.Material]:
-    return lambda name: Shader(name).matt(colour)
+    """Return a builder of a matt material of one colour."""
+    return lambda name: MaterialBuilder(name).matt(colour)
 
 
 def _glossy(colour: Colour, roughness: float) -> Callable[[str], bpy.types.Material]:
-    return lambda name: Shader(name).surface(Base_Color=colour, Roughness=roughness)
+    """Return a builder of a Principled material of one colour."""
+    return lambda name: MaterialBuilder(name).surface(Base_Color=colour, Roughness=roughness)
 
 
-_MAKERS: dict[str, Callable[[str], bpy.types.Material]] = {
+_MATERIAL_BUILDERS: dict[str, Callable[[str], bpy.types.Material]] = {
     "steel": _steel(),
     "steel, mill-scale": _steel(rust_shift=(-0.45, -0.16), tint=1.15, metallic=0.8, roughness=(0.30, 0.60)),
     "steel, rusted": _steel(rust_shift=(0.10, 0.30), tint=1.15),

@@ -1,8 +1,8 @@
-"""The building site round a pier: footing slab, ground, and what stands about beyond the cameras.
+"""Outdoor environment: the building site round a pier with footing slab, ground and objects beyond the cameras.
 
 World frame, metres. The slab's top is z = 0 and the ground lies below it. The steel stands on the origin and
-cameras stand up to 17 m from it; but for slab and ground nothing is nearer than ``CLEAR_M`` to the origin in
-plan, and nothing is steel reinforcement. A ridge of trees closes the view; the sky above is no surface.
+cameras are up to 17 m from it. Except for slab and ground, all objects are at least ``CLEAR_M`` from the origin
+in plan, and none is steel reinforcement. A ring of trees encloses the site; the sky above is not a surface.
 """
 
 from __future__ import annotations
@@ -12,20 +12,25 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
-from dataset_builder.scene.shapes.solids import about_z, box, joined, placed, turned_box
+from dataset_builder.scene.shapes.solids import box, merge_meshes, rotated_box, rotation_about_z, transformed
 
 CLEAR_M = 19.0
+"""Least distance in plan of objects from the origin."""
+
 SLAB_HALF_M = 3.2
 GROUND_M = -0.12
+"""Height of the ground."""
+
 GROUND_HALF_M = 100.0
 TREES_M = (72.0, 84.0)
 """Inner and outer radius of the ring of trees."""
 
-_STANDS_M = GROUND_M + 0.002
+_PROP_BASE_M = GROUND_M + 0.002
+"""Height of the lower sides of objects on the ground, so that they do not coincide with it."""
 
 
 def outdoors() -> tuple[Part, ...]:
-    """Return every surface of the site, none of them steel."""
+    """Return all surfaces of the site; none is steel."""
     return (*_ground(), *_containers(), *_hoarding(), *_stacks(), _spoil_heap(), _trees())
 
 
@@ -34,7 +39,7 @@ def _part(name: str, mesh: Mesh, material: str) -> Part:
 
 
 def _ground() -> tuple[Part, ...]:
-    """Return the footing slab on its blinding, and the ground, which the slab's foot is let into."""
+    """Return the footing slab on its blinding, and the ground, into which the slab extends."""
     s, g, b = SLAB_HALF_M, GROUND_HALF_M, SLAB_HALF_M + 0.35
     return (
         _part("slab", box((-s, -s, -0.6), (s, s, 0.0)), "site concrete"),
@@ -44,20 +49,22 @@ def _ground() -> tuple[Part, ...]:
 
 
 def _containers() -> tuple[Part, ...]:
-    """Return two site containers; the corrugation of their long sides shows from afar."""
+    """Return two site containers with corrugated long sides, frames and doors."""
     places = {"blue": ((-17.0, 21.0), 12.0, "container blue"), "sand": ((-8.5, 25.0), -6.0, "container sand")}
     parts = []
     for name, ((x, y), turn_deg, material) in places.items():
         for piece, mesh, look in (("body", _corrugated(5.9, 2.3, 2.45), material), ("frame", _frame(), material)):
-            moved = placed(mesh, about_z(turn_deg), (x, y, _STANDS_M))
+            moved = transformed(mesh, rotation_about_z(turn_deg), (x, y, _PROP_BASE_M))
             parts.append(_part(f"container-{name}-{piece}", moved, look))
-        door = placed(box((3.035, -1.0, 0.2), (3.06, 1.0, 2.35)), about_z(turn_deg), (x, y, _STANDS_M))
+        door = transformed(
+            box((3.035, -1.0, 0.2), (3.06, 1.0, 2.35)), rotation_about_z(turn_deg), (x, y, _PROP_BASE_M)
+        )
         parts.append(_part(f"container-{name}-door", door, "painted metal"))
     return tuple(parts)
 
 
 def _corrugated(length_m: float, width_m: float, height_m: float, pitch_m: float = 0.28) -> Mesh:
-    """Return a box along x on z = 0.08 whose long sides are folded to trapezoids."""
+    """Return a box along x, its base at z = 0.08, with trapezoidal corrugation on its long sides."""
     folds = round(length_m / pitch_m)
     x = np.append((np.arange(folds)[:, None] + [0.0, 0.3, 0.5, 0.8]).ravel(), folds) * length_m / folds
     inset = np.append(np.tile([0.0, 0.0, 0.045, 0.045], folds), 0.0)
@@ -77,15 +84,17 @@ def _corrugated(length_m: float, width_m: float, height_m: float, pitch_m: float
 
 
 def _strip(here: ndarray, row: int, other: int, count: int) -> list[ndarray]:
-    """Return the triangles between two rows of ``count`` vertices each."""
+    """Return the triangles between the vertex rows ``row`` and ``other`` of ``count`` vertices each."""
     a, b = row * count + here, other * count + here
     return [np.stack([a, b, b + 1], axis=1), np.stack([a, b + 1, a + 1], axis=1)]
 
 
 def _frame() -> Mesh:
-    """Return a container's corner posts and rails; the corrugated body ends inside them."""
+    """Return a container's corner posts and rails, which enclose the ends of the corrugated body."""
     x, y, t, h = 3.03, 1.22, 0.16, 2.6
-    posts = [box(_low(sx, x, t, sy, y, 0.0), _high(sx, x, t, sy, y, h)) for sx in (-1, 1) for sy in (-1, 1)]
+    posts = [
+        box(_post_low(sx, x, t, sy, y, 0.0), _post_high(sx, x, t, sy, y, h)) for sx in (-1, 1) for sy in (-1, 1)
+    ]
     inner = x - t - 0.001
     rails = [
         box((-inner, min(s * y, s * (y - 0.12)), z), (inner, max(s * y, s * (y - 0.12)), z + 0.15))
@@ -97,62 +106,78 @@ def _frame() -> Mesh:
         for s in (-1, 1)
         for z in (0.01, h - 0.16)
     ]
-    return joined([*posts, *rails, *ends])
+    return merge_meshes([*posts, *rails, *ends])
 
 
-def _low(sx: int, x: float, t: float, sy: int, y: float, z: float) -> tuple[float, float, float]:
+def _post_low(sx: int, x: float, t: float, sy: int, y: float, z: float) -> tuple[float, float, float]:
+    """Return the lower corner of a post of thickness ``t`` at the signs ``sx``, ``sy``."""
     return min(sx * x, sx * (x - t)), min(sy * y, sy * (y - t)), z
 
 
-def _high(sx: int, x: float, t: float, sy: int, y: float, z: float) -> tuple[float, float, float]:
+def _post_high(sx: int, x: float, t: float, sy: int, y: float, z: float) -> tuple[float, float, float]:
+    """Return the upper corner of a post of thickness ``t`` at the signs ``sx``, ``sy``."""
     return max(sx * x, sx * (x - t)), max(sy * y, sy * (y - t)), z
 
 
 def _hoarding() -> tuple[Part, ...]:
-    """Return two runs of closed panels, a hand's breadth between panels, each on a concrete foot."""
+    """Return two rows of closed panels, 60 mm apart, each panel on a concrete foot."""
     runs = {"east": ((31.0, -16.0), 97.0, 14), "south": ((-24.0, -29.0), 4.0, 18)}
     sheets: dict[str, list[Mesh]] = {"hoarding white": [], "hoarding blue": []}
     feet = []
     for (x, y), turn_deg, panels in runs.values():
-        along = about_z(turn_deg)[:, 0]
+        along = rotation_about_z(turn_deg)[:, 0]
         for k in range(panels):
-            at = np.array([x, y, _STANDS_M]) + 2.46 * k * along
+            at = np.array([x, y, _PROP_BASE_M]) + 2.46 * k * along
             colour = "hoarding blue" if k % 5 == 3 else "hoarding white"
-            sheets[colour].append(turned_box((at[0], at[1], at[2] + 1.2), (2.4, 0.04, 2.0), turn_deg))
-            feet.append(turned_box((at[0], at[1], at[2] + 0.09), (0.7, 0.25, 0.18), turn_deg))
-    panels_of = tuple(_part(f"hoarding-{colour[9:]}", joined(meshes), colour) for colour, meshes in sheets.items())
-    return (*panels_of, _part("hoarding-feet", joined(feet), "site concrete"))
+            sheets[colour].append(rotated_box((at[0], at[1], at[2] + 1.2), (2.4, 0.04, 2.0), turn_deg))
+            feet.append(rotated_box((at[0], at[1], at[2] + 0.09), (0.7, 0.25, 0.18), turn_deg))
+    panels_of = tuple(
+        _part(f"hoarding-{colour[9:]}", merge_meshes(meshes), colour) for colour, meshes in sheets.items()
+    )
+    return (*panels_of, _part("hoarding-feet", merge_meshes(feet), "site concrete"))
 
 
 def _stacks() -> tuple[Part, ...]:
-    """Return stacked timber on bearers, and concrete blocks two high."""
+    """Return a stack of timber on bearers, and two layers of concrete blocks."""
     timber = []
     for layer in range(6):
         for k in range(5):
             at = (0.0, (k - 2) * 0.27, 0.12 + 0.145 * layer)
-            timber.append(turned_box(at, (4.2 + 0.07 * ((3 * k + layer) % 4), 0.24, 0.12), 0.0))
-    bearers = [turned_box((x, 0.0, 0.025), (0.1, 1.5, 0.05), 0.0) for x in (-1.4, 1.4)]
+            timber.append(rotated_box(at, (4.2 + 0.07 * ((3 * k + layer) % 4), 0.24, 0.12), 0.0))
+    bearers = [rotated_box((x, 0.0, 0.025), (0.1, 1.5, 0.05), 0.0) for x in (-1.4, 1.4)]
     blocks = [
-        turned_box(((k - 1.5) * 1.66, 0.0, 0.4 + 0.81 * row), (1.6, 0.8, 0.8), 0.0)
+        rotated_box(((k - 1.5) * 1.66, 0.0, 0.4 + 0.81 * row), (1.6, 0.8, 0.8), 0.0)
         for row in range(2)
         for k in range(4 - row)
     ]
     return (
-        _part("timber", placed(joined(timber), about_z(35.0), (22.5, 7.5, _STANDS_M)), "timber"),
-        _part("bearers", placed(joined(bearers), about_z(35.0), (22.5, 7.5, _STANDS_M)), "timber"),
-        _part("blocks", placed(joined(blocks), about_z(-64.0), (-25.0, -6.5, _STANDS_M)), "site concrete"),
+        _part(
+            "timber",
+            transformed(merge_meshes(timber), rotation_about_z(35.0), (22.5, 7.5, _PROP_BASE_M)),
+            "timber",
+        ),
+        _part(
+            "bearers",
+            transformed(merge_meshes(bearers), rotation_about_z(35.0), (22.5, 7.5, _PROP_BASE_M)),
+            "timber",
+        ),
+        _part(
+            "blocks",
+            transformed(merge_meshes(blocks), rotation_about_z(-64.0), (-25.0, -6.5, _PROP_BASE_M)),
+            "site concrete",
+        ),
     )
 
 
 def _spoil_heap() -> Part:
-    """Return a low heap of earth with its foot in the ground."""
+    """Return a low mound of soil whose base is below the ground."""
     random = np.random.default_rng(11)
     heap = _mound(rings=9, columns=36, radius_m=7.0, height_m=3.1, random=random)
-    return _part("spoil-heap", placed(heap, np.diag([1.35, 1.0, 1.0]), (12.0, 31.5, GROUND_M)), "soil")
+    return _part("spoil-heap", transformed(heap, np.diag([1.35, 1.0, 1.0]), (12.0, 31.5, GROUND_M)), "soil")
 
 
 def _mound(rings: int, columns: int, radius_m: float, height_m: float, random: np.random.Generator) -> Mesh:
-    """Return a closed mound: rings of vertices from its buried foot to its top, a fan above and one below."""
+    """Return a closed mound: rings of vertices from the buried base to the top, with a fan above and below."""
     share = np.linspace(1.0, 0.06, rings)[:, None]
     angle = np.arange(columns) * 2 * np.pi / columns
     radius = radius_m * share * (1 + 0.10 * np.sin(3 * angle + 1.0) + random.normal(0, 0.03, (rings, columns)))
@@ -176,7 +201,7 @@ def _mound(rings: int, columns: int, radius_m: float, height_m: float, random: n
 
 
 def _trees() -> Part:
-    """Return a closed ring whose ragged crest reads as the edge of a wood."""
+    """Return a closed ring with an irregular crest, which represents the edge of a wood."""
     columns = 420
     random = np.random.default_rng(7)
     angle = np.arange(columns) * 2 * np.pi / columns
@@ -197,7 +222,7 @@ def _trees() -> Part:
 def _ring(
     outline: list[tuple[Float64[ndarray, " c"], Float64[ndarray, " c"]]], angle: Float64[ndarray, " c"]
 ) -> Mesh:
-    """Return a closed ring about z from an outline of (radius, height) that varies from column to column."""
+    """Return a closed ring about z from an outline of (radius, height), metres, given for each angle (radians)."""
     rows, columns = len(outline), len(angle)
     vertices = np.concatenate([np.stack([r * np.cos(angle), r * np.sin(angle), h], axis=1) for r, h in outline])
     row, column = (grid.ravel() for grid in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))

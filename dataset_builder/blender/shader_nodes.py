@@ -1,4 +1,4 @@
-"""A few words for Blender's shader nodes, so that a material reads as what it is made of."""
+"""Builders of Blender shader node trees, with one method per kind of node."""
 
 from __future__ import annotations
 
@@ -7,26 +7,29 @@ from typing import Any
 import bpy
 
 Socket = Any
+"""An output socket of a node (``bpy.types.NodeSocket``)."""
+
 Colour = tuple[float, float, float]
-"""Linear Rec. 709."""
+"""Red, green and blue, linear Rec. 709."""
 
 
-class Tree:
+class NodeTreeBuilder:
     """A node tree under construction; the methods add nodes and return output sockets."""
 
     def __init__(self, tree: bpy.types.NodeTree) -> None:
         self._tree = tree
 
     def node(self, kind: str, inputs: dict[str | int, Any], **settings: Any) -> Any:
-        """Add a node; ``inputs`` are sockets to link or values to set, ``settings`` its own properties."""
+        """Add and return a node; ``inputs`` are sockets to link or values to set, ``settings`` its properties."""
         node = self._tree.nodes.new(kind)
         for name, value in settings.items():
             setattr(node, name, value)
         for key, value in inputs.items():
-            self._feed(node.inputs[key], value)
+            self._set_input(node.inputs[key], value)
         return node
 
-    def _feed(self, socket: Socket, value: Any) -> None:
+    def _set_input(self, socket: Socket, value: Any) -> None:
+        """Link ``value`` to an input socket, or set it as the socket's default."""
         if isinstance(value, bpy.types.NodeSocket):
             self._tree.links.new(value, socket)
         elif socket.type == "RGBA":
@@ -39,7 +42,7 @@ class Tree:
         return self.node("ShaderNodeTexCoord", {}).outputs["Object"]
 
     def direction(self) -> Socket:
-        """Return the direction of a ray that leaves the scene; for a world's tree."""
+        """Return the direction of a ray that leaves the scene; only for the node tree of a world."""
         return self.node("ShaderNodeTexCoord", {}).outputs["Generated"]
 
     def uv(self) -> Socket:
@@ -55,12 +58,12 @@ class Tree:
         """Return ``position`` scaled axis by axis."""
         return self.node("ShaderNodeMapping", {"Vector": position, "Scale": scale}).outputs["Vector"]
 
-    def shifted(self, position: Socket, by_m: Socket) -> Socket:
-        """Return ``position`` shifted by ``by_m`` along all three axes, which picks another part of a noise."""
-        return self.node("ShaderNodeVectorMath", {0: position, 1: by_m}, operation="ADD").outputs[0]
+    def shifted(self, position: Socket, offset_m: Socket) -> Socket:
+        """Return ``position`` shifted by ``offset_m`` along all three axes, to select another part of a noise."""
+        return self.node("ShaderNodeVectorMath", {0: position, 1: offset_m}, operation="ADD").outputs[0]
 
     def noise(self, position: Socket, per_metre: float, detail: float = 2.0) -> Socket:
-        """Return fractal noise round 0.5, ``per_metre`` features a metre; ``detail`` more octaves."""
+        """Return fractal noise round 0.5 with ``per_metre`` features per metre and ``detail`` further octaves."""
         inputs: dict[str | int, Any] = {
             "Vector": position,
             "Scale": per_metre,
@@ -74,11 +77,11 @@ class Tree:
         return self.remap(value, low, high, 0.0, 1.0, "SMOOTHSTEP")
 
     def remap(
-        self, value: Socket, low: float, high: float, to_low: float, to_high: float, how: str = "LINEAR"
+        self, value: Socket, low: float, high: float, to_low: float, to_high: float, interpolation: str = "LINEAR"
     ) -> Socket:
         """Return ``value`` mapped from [low, high] to [to_low, to_high], clamped."""
         inputs: dict[str | int, Any] = {0: value, 1: low, 2: high, 3: to_low, 4: to_high}
-        return self.node("ShaderNodeMapRange", inputs, interpolation_type=how).outputs["Result"]
+        return self.node("ShaderNodeMapRange", inputs, interpolation_type=interpolation).outputs["Result"]
 
     def add(self, a: Socket, b: Socket | float) -> Socket:
         """Return the sum of two values."""
@@ -94,13 +97,13 @@ class Tree:
 
     def mix(self, share: Socket, a: Socket | Colour, b: Socket | Colour) -> Socket:
         """Return the colour ``a`` where ``share`` is 0 and ``b`` where it is 1."""
-        # A colour mix has its sockets at 6 and 7, and its result at 2.
+        # In colour mode, inputs 6 and 7 are the colours and output 2 is the result.
         inputs: dict[str | int, Any] = {0: share, 6: a, 7: b}
         return self.node("ShaderNodeMix", inputs, data_type="RGBA").outputs[2]
 
 
-class Shader(Tree):
-    """One material's node tree, empty at first; ``matt`` or ``surface`` finishes it."""
+class MaterialBuilder(NodeTreeBuilder):
+    """The node tree of a new material, empty at first; ``matt`` or ``surface`` completes it."""
 
     def __init__(self, name: str) -> None:
         self.material = bpy.data.materials.new(name)
@@ -109,11 +112,11 @@ class Shader(Tree):
         self._tree.nodes.clear()
 
     def matt(self, colour: Socket | Colour) -> bpy.types.Material:
-        """Finish with a plain diffuse surface, cheaper to render than ``surface``."""
+        """Add a diffuse surface, which renders faster than ``surface``, and return the material."""
         return self._finish(self.node("ShaderNodeBsdfDiffuse", {"Color": colour}).outputs["BSDF"])
 
     def surface(self, **inputs: Any) -> bpy.types.Material:
-        """Finish with a Principled surface; keywords are its inputs, with ``_`` for a space."""
+        """Add a Principled surface and return the material; keywords are its inputs, with ``_`` for a space."""
         named: dict[str | int, Any] = {key.replace("_", " "): value for key, value in inputs.items()}
         return self._finish(self.node("ShaderNodeBsdfPrincipled", named).outputs["BSDF"])
 

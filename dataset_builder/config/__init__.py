@@ -1,1 +1,1 @@
-"""Configs: scenes, camera trajectories, rigs, and the schema of scene files."""
+"""Configs: scenes, camera trajectories, stereo rigs, and the schema of scene files."""

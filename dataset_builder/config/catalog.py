@@ -1,4 +1,4 @@
-"""The configs this builder knows, by name, and how a request changes them."""
+"""Catalog of the named configs, and the build request that modifies them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from dataset_builder.config.specs import (
     AssemblySpec,
     ColourSpec,
     ConfigSpec,
+    DistanceSweepSpec,
     DomeSpec,
     LatticeSpec,
     MeshFileSpec,
@@ -19,7 +20,6 @@ from dataset_builder.config.specs import (
     RigSpec,
     RingSpec,
     SceneSpec,
-    SweepSpec,
 )
 from dataset_builder.scene.variants import VARIANTS, check_variants
 from rebar_depth_bench.errors import InputError
@@ -30,28 +30,37 @@ LATTICE_DOME = DomeSpec(
     elevations_deg=(15.0, 27.0, 39.0, 51.0, 63.0, 75.0),
     azimuths=12,
 )
-"""The paper's 504 views at 0.22-0.43 m; far shells lie closer, so that steel covers 4.5-7.2 % of the frame."""
+"""The 504 views of the paper at 0.22-0.43 m.
+
+The far shells are spaced more closely, so that steel covers 4.5-7.2 % of the frame.
+"""
 PILE_DOME = DomeSpec(
     radii_m=(0.50, 0.57, 0.59, 0.62, 0.65, 0.67, 0.90),
     elevations_deg=(28.0, 37.0, 46.0, 55.0, 64.0, 73.0),
     azimuths=12,
 )
-"""The paper's 504 views at 0.50-0.90 m, above what stands on the bench; steel covers 4.5-7.2 % in two of three."""
+"""The 504 views of the paper at 0.50-0.90 m, above the objects on the bench.
+
+Steel covers 4.5-7.2 % of the frame in two of three views.
+"""
 PIER_DOME = DomeSpec(
     radii_m=(8.0, 11.0, 13.0, 14.5, 15.5, 16.25, 17.0),
     elevations_deg=(-7.5, -1.0, 7.0, 17.0, 29.0, 44.0),
     azimuths=12,
 )
-"""The paper's 504 views at 8-17 m: from a person's height, a mast and a drone."""
+"""The 504 views of the paper at 8-17 m, at the heights of a person, a mast and a drone."""
 LATTICE_RING = RingSpec(radius_m=0.325, elevation_deg=35.0, azimuths=100)
 
 
-def geometric_sweep(nearest_m: float, farthest_m: float, elevation_deg: float) -> SweepSpec:
-    """Return 96 views: 8 directions at each of 12 distances in equal ratios, rounded to the millimetre."""
+def geometric_sweep(nearest_m: float, farthest_m: float, elevation_deg: float) -> DistanceSweepSpec:
+    """Return a sweep of 96 views: 8 directions at each of 12 distances.
+
+    The distances form a geometric sequence and are rounded to the millimetre.
+    """
     steps = 11
     ratio = farthest_m / nearest_m
     radii_m = tuple(round(nearest_m * ratio ** (step / steps), 3) for step in range(steps + 1))
-    return SweepSpec(radii_m, elevation_deg, azimuths=8)
+    return DistanceSweepSpec(radii_m, elevation_deg, azimuths=8)
 
 
 def _lattice_scene(markers: int = 6, name: str = "lattice") -> SceneSpec:
@@ -75,28 +84,30 @@ CONFIGS: Mapping[str, Callable[[], ConfigSpec]] = {
     "pile": lambda: ConfigSpec("pile", _pile_scene(), PILE_DOME),
     "pier": lambda: ConfigSpec("pier", _pier_scene(), PIER_DOME),
 }
-"""The contract's seven: what is built where no config is named."""
+"""Factories of the seven standard configs, which are built by default."""
 
 SWEEPS: Mapping[str, Callable[[], ConfigSpec]] = {
     "lattice-distance": lambda: ConfigSpec("lattice-distance", _lattice_scene(), geometric_sweep(0.22, 1.6, 40.0)),
     "pile-distance": lambda: ConfigSpec("pile-distance", _pile_scene(), geometric_sweep(0.50, 2.2, 45.0)),
     "pier-distance": lambda: ConfigSpec("pier-distance", _pier_scene(), geometric_sweep(5.0, 17.0, 7.0)),
 }
-"""Sweeps of distance, for ``rebar-bench study distance``; built where they are named.
+"""Factories of the distance sweeps for ``rebar-bench study distance``; built only if named.
 
-They start where the steel fills the frame and end where the laboratory does, or where bars lose their interior
-pixels.
+A sweep starts where the steel fills the frame. It ends at the limit of the laboratory, or where bars become too
+thin to have interior pixels.
 """
 LATTICE_CONFIGS = tuple(name for name in CONFIGS if name.startswith("lattice"))
-"""Where ``--mesh`` takes the place of the rods."""
+"""Names of the configs in which ``--mesh`` replaces the rods."""
 
 
 @dataclass(frozen=True)
 class BuildRequest:
-    """What a user asks of ``rebar-build``: which configs, how many views, at which size and quality.
+    """Request to ``rebar-build``: configs, number of views, image size (pixels) and render quality.
 
-    ``scenes`` are configs of the user's own. ``mesh`` takes the place of the lattice's rods. ``variants`` are
-    names of ``appearance.VARIANTS``; configs and scenes that have any carry them in their names.
+    ``views`` is the number of views per config, spread evenly over the trajectory; None selects all views.
+    ``samples`` are Cycles samples per pixel. ``mesh`` replaces the rods of the lattice. ``variants`` are names of
+    ``scene.variants.VARIANTS``; they are appended to the names of configs and scenes. ``scenes`` are the configs
+    of user scene files.
     """
 
     configs: tuple[str, ...] = tuple(CONFIGS)
@@ -110,18 +121,26 @@ class BuildRequest:
     scenes: tuple[ConfigSpec, ...] = ()
 
     def config_specs(self) -> list[ConfigSpec]:
-        """Return the specs of everything requested; raise ``InputError`` for what is unknown or does not fit."""
+        """Return the specs of all requested configs.
+
+        Raises ``InputError`` for unknown configs, invalid variants and duplicate config names, and if ``mesh`` is
+        combined with a config that is not a lattice.
+        """
         check_variants(self.variants)
         known = [_known_config(name) for name in dict.fromkeys(self.configs)]
-        specs = [self._requested(spec) for spec in (*known, *self.scenes)]
+        specs = [self._with_request(spec) for spec in (*known, *self.scenes)]
         names = [spec.name for spec in specs]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise InputError(f"more than one config would be named {', '.join(twice)}: give a scene another name")
+        duplicates = sorted({name for name in names if names.count(name) > 1})
+        if duplicates:
+            raise InputError(
+                f"more than one config would be named {', '.join(duplicates)}: give a scene another name"
+            )
         return specs
 
-    def _requested(self, spec: ConfigSpec) -> ConfigSpec:
-        variants = tuple(name for name in VARIANTS if name in self.variants)  # one look, one name
+    def _with_request(self, spec: ConfigSpec) -> ConfigSpec:
+        variants = tuple(
+            name for name in VARIANTS if name in self.variants
+        )  # fixed order: equal sets of variants give equal names
         suffix = "".join(f"-{name}" for name in variants)
         scene = replace(
             spec.scene,
@@ -154,12 +173,15 @@ def _known_config(name: str) -> ConfigSpec:
 
 
 def view_id(config: str, index: int) -> str:
-    """Return the id of a view: its config and its index in the full protocol."""
+    """Return the id of a view, ``<config>/<index>``, from its index in the full trajectory."""
     return f"{config}/{index:04d}"
 
 
 def check_request(request: BuildRequest) -> None:
-    """Raise ``InputError`` naming every value of a request that cannot be built."""
+    """Raise ``InputError`` naming every value of the request that is out of range.
+
+    Also raises the errors of ``BuildRequest.config_specs``.
+    """
     limits: Sequence[tuple[str, int | None, int, int]] = (
         ("--views", request.views, 1, 1_000_000),
         ("--width", request.width, 16, 8192),
@@ -167,11 +189,11 @@ def check_request(request: BuildRequest) -> None:
         ("--samples", request.samples, 1, 65_536),
         ("--seed", request.seed, 0, 2**31 - 1),
     )
-    wrong = [
+    problems = [
         f"{name} is {value}, expected {low} to {high}"
         for name, value, low, high in limits
         if value is not None and not low <= value <= high
     ]
-    if wrong:
-        raise InputError("; ".join(wrong))
+    if problems:
+        raise InputError("; ".join(problems))
     request.config_specs()

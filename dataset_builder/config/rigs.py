@@ -1,4 +1,4 @@
-"""From a rig's description to its two cameras, view by view."""
+"""Cameras of a stereo rig, computed from its ``RigSpec`` and the left pose of each view."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from numpy import ndarray
 
 from dataset_builder.config.specs import RigSpec
 from rebar_depth_bench.geometry.calibration import read_calibration
-from rebar_depth_bench.geometry.cameras import NOMINAL_HEIGHT, NOMINAL_WIDTH, ideal_K, right_of_rig, rigid
+from rebar_depth_bench.geometry.cameras import NOMINAL_HEIGHT, NOMINAL_WIDTH, ideal_K, right_camera_pose, rigid
 from rebar_depth_bench.geometry.stereo_calibration import (
     StereoCalibration,
     calibrated_baseline_m,
     lens_distortion,
     lens_K,
     right_from_left,
-    scaled,
+    scale_calibration,
 )
 
 ZED_CALIBRATION = "zed-hd720.conf"
@@ -28,7 +28,11 @@ ZED_CALIBRATION = "zed-hd720.conf"
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One eye: pinhole matrix (pixels), k1 k2 p1 p2 k3, pose and grid."""
+    """One camera of a rig.
+
+    ``K`` is the pinhole matrix in pixels, ``distortion`` holds k1 k2 p1 p2 k3, ``width`` and ``height`` are in
+    pixels.
+    """
 
     K: Float64[ndarray, "3 3"]
     distortion: Float64[ndarray, " 5"]
@@ -38,28 +42,30 @@ class Camera:
 
 
 Pose = Float64[ndarray, "4 4"]
+"""``cam_from_world`` of a camera, metres."""
 
 
 def zed_rig(width: int = NOMINAL_WIDTH, height: int = NOMINAL_HEIGHT, grid: str = "rectified") -> RigSpec:
-    """Return the rig of the ZED unit that comes with the builder, on its ``raw`` or ``rectified`` grid.
+    """Return the rig of the bundled ZED calibration on its ``raw`` or ``rectified`` grid.
 
-    The factory calibration is that of HD720; ``rig_cameras`` scales it to ``width`` x ``height``.
+    The factory calibration is for HD720; ``rig_cameras`` scales it to ``width`` x ``height`` pixels.
     """
-    shipped = resources.files("dataset_builder.config").joinpath("calibrations", ZED_CALIBRATION)
-    with resources.as_file(shipped) as path:
+    resource = resources.files("dataset_builder.config").joinpath("calibrations", ZED_CALIBRATION)
+    with resources.as_file(resource) as path:
         calibration = read_calibration(path, NOMINAL_WIDTH, NOMINAL_HEIGHT)
     return RigSpec(width, height, calibrated_baseline_m(calibration), calibration, grid)
 
 
 def rig_cameras(rig: RigSpec, cam_from_world: Float64[ndarray, "4 4"]) -> dict[str, Camera]:
-    """Return the left and right camera of a rig whose physical left camera stands on a protocol's pose.
+    """Return the cameras of a rig as ``{"left": ..., "right": ...}``.
 
-    On the ``raw`` grid the cameras are the lenses, distortion and all. On the ``rectified`` one they are the
-    parallel pinholes of ``rectification.rectify``, which stand in the same two points but are turned: the left
-    pose is then not the protocol's. A calibration of another grid is scaled to the rig's.
+    ``cam_from_world`` is the pose of the physical left camera, as given by the trajectory. On the ``raw`` grid the
+    cameras are the physical lenses including their distortion. On the ``rectified`` grid they are the parallel
+    pinholes of ``rectification.rectify``: the camera centres are the same but the axes are rotated, so the left
+    pose differs from ``cam_from_world``. A calibration of another image size is scaled to that of the rig.
 
-    Raises ``ValueError`` for an unknown grid, a calibrated grid without a calibration or the other way round,
-    and a ``baseline_m`` that is not the calibration's.
+    Raises ``ValueError`` for an unknown grid, for a calibrated grid without a calibration, for the ideal grid with
+    a calibration, and for a ``baseline_m`` that differs from that of the calibration.
     """
     if rig.grid not in GRIDS:
         raise ValueError(f"no grid {rig.grid!r}, expected one of {', '.join(GRIDS)}")
@@ -90,8 +96,8 @@ def _rectified_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
 
 
 def _pinholes(rig: RigSpec, K: Float64[ndarray, "3 3"], left: Pose) -> dict[str, Camera]:
-    """Return two parallel pinholes, the right one exactly ``baseline_m`` along the left one's x axis."""
-    right = right_of_rig(left, rig.baseline_m)
+    """Return two parallel pinholes, the right one exactly ``baseline_m`` along the x axis of the left one."""
+    right = right_camera_pose(left, rig.baseline_m)
     return {
         eye: Camera(K, np.zeros(5), pose, rig.width, rig.height)
         for eye, pose in (("left", left), ("right", right))
@@ -104,7 +110,7 @@ def _scaled_calibration(rig: RigSpec) -> StereoCalibration:
     baseline_m = calibrated_baseline_m(rig.calibration)
     if not isclose(rig.baseline_m, baseline_m, rel_tol=1e-12):
         raise ValueError(f"the rig's baseline_m is {rig.baseline_m}, its calibration's {baseline_m}")
-    return scaled(rig.calibration, rig.width, rig.height)
+    return scale_calibration(rig.calibration, rig.width, rig.height)
 
 
 GRIDS: Mapping[str, Callable[[RigSpec, Pose], dict[str, Camera]]] = {
@@ -112,4 +118,4 @@ GRIDS: Mapping[str, Callable[[RigSpec, Pose], dict[str, Camera]]] = {
     "raw": _raw_cameras,
     "rectified": _rectified_cameras,
 }
-"""How a rig becomes cameras, by the name of its grid."""
+"""Functions that return the cameras of a rig, by the name of the grid in ``RigSpec.grid``."""

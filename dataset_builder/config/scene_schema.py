@@ -1,12 +1,12 @@
-"""The keys of a scene's TOML file, and what they must be. The whole file is read here, nothing beside it.
+"""Schema and reader of scene TOML files. Files named by ``mesh`` and ``ifc`` are not opened here.
 
 ```toml
-name = "my-beam"              # default: the file's name; small letters, digits and hyphens
+name = "my-beam"              # default: the file name; lower-case letters, digits and hyphens
 unit = "mm"                   # of every length: m, cm, mm, in, ft
 environment = "laboratory"    # or "outdoors"
 board = 6                     # markers on the A3 sheet: 6, 12, or false for no sheet
 
-[cameras]                     # default: a dome round the assembly
+[cameras]                     # default: a dome around the assembly
 kind = "dome"                 # or "ring" with radius, elevation_deg, azimuths
 radii = [300, 400]
 elevations_deg = [15, 45]
@@ -16,14 +16,12 @@ azimuths = 12
 diameter = 10
 points = [[-150, 0, 5], [150, 0, 5], [150, 0, 80]]   # corners of the path; world, z up, board at z = 0
 role = "main"                 # default "bar"
-id = 7                        # default: the lowest free one
+id = 7                        # default: the lowest free id
 bend_diameter = 40            # of the mandrel; default EN 1992-1-1: 4 d up to 16 mm, 7 d above
 ribs = true                   # default
 ```
 
-Kinds of values that only a scene's TOML file has: lengths, angles, points and lists.
-
-The units of length that users' files may be in.
+The module also defines the field types of lengths, angles, points and lists, and the supported units of length.
 """
 
 from __future__ import annotations
@@ -35,44 +33,49 @@ from dataclasses import dataclass
 from typing import Any
 
 from dataset_builder.config.specs import DomeSpec, RigSpec, RingSpec
-from dataset_builder.scene.model import MAX_BARS
+from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS
 from dataset_builder.scene.variants import VARIANTS
 from rebar_depth_bench.errors import InputError, problem_summary
 from rebar_depth_bench.validation import (
     FLAG,
     POSITIVE,
     TABLE,
-    Keys,
-    Kind,
+    FieldType,
     T,
+    TableReader,
+    describe_value,
     finite,
-    found_words,
     number,
-    text_that,
+    one_of,
+    string_matching,
     whole_number,
-    words,
 )
 
 Point = tuple[float, float, float]
 
 
-def list_of(kind: Kind[T], what: str, expected: str, least: int = 1, most: int = 10_000) -> Kind[tuple[T, ...]]:
-    """Return the kind of lists of ``least`` to ``most`` values of ``kind``; problems call one of them ``what``."""
+def list_of(
+    field_type: FieldType[T], element_name: str, expected: str, min_length: int = 1, max_length: int = 10_000
+) -> FieldType[tuple[T, ...]]:
+    """Return the field type of lists of ``min_length`` to ``max_length`` values of type ``field_type``.
+
+    The list is converted to a tuple. ``element_name`` is the noun for one element in problem messages.
+    """
 
     def convert(values: object) -> tuple[T, ...]:
         if not isinstance(values, list):
             raise ValueError
-        if not least <= len(values) <= most:
+        if not min_length <= len(values) <= max_length:
             raise ValueError(f"got a list of {len(values)}")
-        found = []
-        for place, value in enumerate(values, start=1):
+        converted = []
+        for position, value in enumerate(values, start=1):
             try:
-                found.append(kind.convert(value))
+                converted.append(field_type.convert(value))
             except ValueError as error:
-                raise ValueError(f"{what} {place}: {found_words(error, value)}") from None
-        return tuple(found)
+                raise ValueError(f"{element_name} {position}: {describe_value(error, value)}") from None
+        return tuple(converted)
 
-    return Kind(expected, convert)
+    return FieldType(expected, convert)
 
 
 def _point(value: object) -> Point:
@@ -82,27 +85,29 @@ def _point(value: object) -> Point:
     return x, y, z
 
 
-LENGTH: Kind[float] = Kind("a length above 0, in the file's unit", POSITIVE.convert)
-DISTANCE: Kind[float] = Kind("a distance above 0", POSITIVE.convert)
-ELEVATION: Kind[float] = Kind("degrees above 0, up to 89", number(0, 89).convert)
-POINT: Kind[Point] = Kind("three numbers", _point)
+LENGTH: FieldType[float] = FieldType("a length above 0, in the file's unit", POSITIVE.convert)
+DISTANCE: FieldType[float] = FieldType("a distance above 0", POSITIVE.convert)
+ELEVATION: FieldType[float] = FieldType("degrees above 0, up to 89", number(0, 89).convert)
+POINT: FieldType[Point] = FieldType("three numbers", _point)
 
 
 UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-"""Metres in one of each named unit."""
+"""Length of one unit in metres, by unit name."""
 
 
 ENVIRONMENTS = ("laboratory", "outdoors")
 SOURCES = ("bar", "mesh", "ifc")
 MAX_VIEWS = 10_000
-"""The number in a view's id has four digits."""
+"""Maximum number of views of a config: the index in a view id has four digits."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
-_PICOMETRES = 12
 
 
 @dataclass(frozen=True)
 class TomlBar:
-    """One ``[[bar]]``: the corners of its path, world, metres; ``mandrel_m`` None is the standard's least."""
+    """One ``[[bar]]`` table; ``corners_m`` are the corners of its path in the world frame, metres.
+
+    ``mandrel_m`` is the mandrel diameter; None selects the minimum of EN 1992-1-1.
+    """
 
     bar_id: int
     role: str
@@ -114,7 +119,10 @@ class TomlBar:
 
 @dataclass(frozen=True)
 class SceneToml:
-    """A scene's TOML file; None is what it leaves to the defaults, and ``board`` is 0 for no sheet."""
+    """Content of a scene TOML file; None marks keys left to their defaults.
+
+    ``unit_m`` is one file unit in metres, ``board`` the number of markers (0: no board).
+    """
 
     name: str | None
     unit_m: float
@@ -123,50 +131,51 @@ class SceneToml:
     ifc: str | None
     environment: str | None
     board: int | None
-    protocol: DomeSpec | RingSpec | None
+    trajectory: DomeSpec | RingSpec | None
 
 
-def name_kind(taken: Collection[str]) -> Kind[str]:
-    """Return the kind of names a scene may have: none of those ``taken``."""
+def scene_name_type(reserved: Collection[str]) -> FieldType[str]:
+    """Return the field type of scene names: none of ``reserved``, not ending in the name of a variant."""
     expected = "a name of small letters, digits and hyphens that starts with a letter or digit"
-    if taken:
-        expected += f", is none of {', '.join(taken)} and ends in no variant's name"
-    return text_that(
-        expected, lambda name: bool(_NAME.fullmatch(name)) and name not in taken and not _is_variant(name)
+    if reserved:
+        expected += f", is none of {', '.join(reserved)} and ends in no variant's name"
+    return string_matching(
+        expected, lambda name: bool(_NAME.fullmatch(name)) and name not in reserved and not _is_variant(name)
     )
 
 
 def _is_variant(name: str) -> bool:
-    """Tell whether a config and one of its variants could have this name."""
+    """Return whether the name ends in the suffix of a variant and could thus be that of a config variant."""
     return any(name.endswith(f"-{variant}") for variant in VARIANTS)
 
 
-def read_scene_toml(content: bytes, where: str, taken: Collection[str] = ()) -> SceneToml:
-    """Return what a scene's TOML file says, lengths in metres (whole picometres).
+def read_scene_toml(content: bytes, where: str, reserved: Collection[str] = ()) -> SceneToml:
+    """Parse the content of a scene TOML file; lengths are converted to metres (whole picometres).
 
-    Raises ``InputError`` with every problem at once where it is no TOML, or any key is missing, unknown or wrong.
+    ``where`` names the file in errors; ``reserved`` are names the scene may not have. Raises ``InputError`` if the
+    content is not TOML, and one listing every missing, unknown or invalid key.
     """
     problems: list[str] = []
-    table = Keys(_parsed(content, where), "", problems)
-    table.only(("name", "unit", *SOURCES, "environment", "board", "cameras"))
-    name = table.optional("name", name_kind(taken))
-    unit_m = _unit_m(table)
-    sources = {key: table.optional(key, kind) for key, kind in _SOURCE_KINDS.items()}
-    given = [key for key in SOURCES if key in table.values]
-    if len(given) != 1:
-        found = " and ".join(given) or "none of them"
-        problems.append(f"{found} given, expected exactly one of [[bar]] tables, mesh and ifc")
-    environment = table.optional("environment", words(*ENVIRONMENTS))
-    board = table.optional("board", Kind("6, 12 or false", _markers))
+    table = TableReader(_parse_toml(content, where), "", problems)
+    table.reject_unknown(("name", "unit", *SOURCES, "environment", "board", "cameras"))
+    name = table.optional("name", scene_name_type(reserved))
+    unit_m = _read_unit_m(table)
+    sources = {key: table.optional(key, field_type) for key, field_type in _SOURCE_KINDS.items()}
+    source_keys = [key for key in SOURCES if key in table.values]
+    if len(source_keys) != 1:
+        given_keys = " and ".join(source_keys) or "none of them"
+        problems.append(f"{given_keys} given, expected exactly one of [[bar]] tables, mesh and ifc")
+    environment = table.optional("environment", one_of(*ENVIRONMENTS))
+    board = table.optional("board", FieldType("6, 12 or false", _marker_count))
     cameras = table.optional("cameras", TABLE)
-    protocol = None if cameras is None else _protocol(Keys(cameras, "cameras.", problems), unit_m)
-    bars = _bars(sources["bar"] or (), unit_m, problems)
+    trajectory = None if cameras is None else _read_trajectory(TableReader(cameras, "cameras.", problems), unit_m)
+    bars = _read_bars(sources["bar"] or (), unit_m, problems)
     if problems:
         raise InputError(f"{where}: {problem_summary(problems)}")
-    return SceneToml(name, unit_m, bars, sources["mesh"], sources["ifc"], environment, board, protocol)
+    return SceneToml(name, unit_m, bars, sources["mesh"], sources["ifc"], environment, board, trajectory)
 
 
-def _parsed(content: bytes, where: str) -> dict[str, Any]:
+def _parse_toml(content: bytes, where: str) -> dict[str, Any]:
     try:
         return tomllib.loads(content.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
@@ -175,57 +184,57 @@ def _parsed(content: bytes, where: str) -> dict[str, Any]:
         raise InputError(f"{where}: not a TOML file: {error}") from error
 
 
-def _unit_m(table: Keys) -> float:
-    """Return metres per file unit; only a file that has no length of its own may leave the unit out."""
+def _read_unit_m(table: TableReader) -> float:
+    """Return metres per file unit; ``unit`` is optional if the file has no lengths (``ifc``, no ``cameras``)."""
     needed = "ifc" not in table.values or "cameras" in table.values
-    unit = (table.required if needed else table.optional)("unit", words(*UNITS_M))
+    unit = (table.required if needed else table.optional)("unit", one_of(*UNITS_M))
     return UNITS_M[unit] if unit else 1.0
 
 
-def _markers(value: object) -> int:
+def _marker_count(value: object) -> int:
     if value is False or (isinstance(value, int) and value is not True and value in (0, 6, 12)):
         return int(value)
     raise ValueError
 
 
-_FILE = text_that("a path, relative to this file", lambda path: bool(path) and path.isprintable())
-_SOURCE_KINDS: Mapping[str, Kind[Any]] = {
-    "bar": list_of(TABLE, "bar", f"1 to {MAX_BARS} tables, each under [[bar]]", most=MAX_BARS),
+_FILE = string_matching("a path, relative to this file", lambda path: bool(path) and path.isprintable())
+_SOURCE_KINDS: Mapping[str, FieldType[Any]] = {
+    "bar": list_of(TABLE, "bar", f"1 to {MAX_BARS} tables, each under [[bar]]", max_length=MAX_BARS),
     "mesh": _FILE,
     "ifc": _FILE,
 }
 _AZIMUTHS = whole_number(1, 3600)
-_PROTOCOL_KEYS: Mapping[str, tuple[str, ...]] = {
+_TRAJECTORY_KEYS: Mapping[str, tuple[str, ...]] = {
     "dome": ("kind", "radii", "elevations_deg", "azimuths"),
     "ring": ("kind", "radius", "elevation_deg", "azimuths"),
 }
 
 
-def _protocol(table: Keys, unit_m: float) -> DomeSpec | RingSpec | None:
-    """Return the camera protocol of ``[cameras]``, or None where it has problems."""
-    kind = table.required("kind", words(*_PROTOCOL_KEYS))
+def _read_trajectory(table: TableReader, unit_m: float) -> DomeSpec | RingSpec | None:
+    """Return the trajectory of the ``[cameras]`` table, or None if the table is invalid."""
+    kind = table.required("kind", one_of(*_TRAJECTORY_KEYS))
     if kind is not None:
-        table.only(_PROTOCOL_KEYS[kind])
-    protocol: DomeSpec | RingSpec | None = None
+        table.reject_unknown(_TRAJECTORY_KEYS[kind])
+    trajectory: DomeSpec | RingSpec | None = None
     if kind == "dome":
         radii = table.required("radii", list_of(DISTANCE, "radius", "a list of distances above 0"))
         rings = list_of(ELEVATION, "elevation", "a list of degrees above 0, up to 89")
         elevations_deg = table.required("elevations_deg", rings)
         azimuths = table.required("azimuths", _AZIMUTHS)
         if radii and elevations_deg and azimuths:
-            protocol = DomeSpec(tuple(_metres(r, unit_m) for r in radii), elevations_deg, azimuths)
-            _check_cameras(table, min(protocol.radii_m), len(radii) * len(elevations_deg) * azimuths)
+            trajectory = DomeSpec(tuple(_to_metres(r, unit_m) for r in radii), elevations_deg, azimuths)
+            _check_cameras(table, min(trajectory.radii_m), len(radii) * len(elevations_deg) * azimuths)
     elif kind == "ring":
         radius = table.required("radius", DISTANCE)
         elevation_deg = table.required("elevation_deg", ELEVATION)
         azimuths = table.required("azimuths", _AZIMUTHS)
         if radius and elevation_deg and azimuths:
-            protocol = RingSpec(_metres(radius, unit_m), elevation_deg, azimuths)
-            _check_cameras(table, protocol.radius_m, azimuths)
-    return protocol
+            trajectory = RingSpec(_to_metres(radius, unit_m), elevation_deg, azimuths)
+            _check_cameras(table, trajectory.radius_m, azimuths)
+    return trajectory
 
 
-def _check_cameras(table: Keys, nearest_m: float, views: int) -> None:
+def _check_cameras(table: TableReader, nearest_m: float, views: int) -> None:
     if nearest_m < RigSpec.baseline_m:
         table.problems.append(
             f"{table.where[:-1]}: the nearest stand {nearest_m:.4g} m from the aim point, expected at least the "
@@ -235,34 +244,45 @@ def _check_cameras(table: Keys, nearest_m: float, views: int) -> None:
         table.problems.append(f"{table.where[:-1]}: {views} views asked for, expected at most {MAX_VIEWS}")
 
 
-_ROLE = text_that("a name of up to 60 letters", lambda role: role == role.strip() != "" and _is_name(role))
-_POINTS = list_of(POINT, "point", "two or more points of three finite numbers each, [x, y, z]", least=2)
+_ROLE = string_matching(
+    "a name of up to 60 letters", lambda role: role == role.strip() != "" and _is_role_name(role)
+)
+_POINTS = list_of(POINT, "point", "two or more points of three finite numbers each, [x, y, z]", min_length=2)
 
 
-def _is_name(role: str) -> bool:
+def _is_role_name(role: str) -> bool:
     return len(role) <= 60 and role.isprintable()
 
 
-def _bars(tables: tuple[Mapping[str, Any], ...], unit_m: float, problems: list[str]) -> tuple[TomlBar, ...]:
-    """Return the bars; ids that the file gives are taken first, the others are the lowest free, in file order."""
-    rows = [_bar_values(values, f"[[bar]] {place}: ", problems) for place, values in enumerate(tables, start=1)]
-    owner: dict[int, int] = {}
-    for place, row in enumerate(rows, start=1):
+def _read_bars(tables: tuple[Mapping[str, Any], ...], unit_m: float, problems: list[str]) -> tuple[TomlBar, ...]:
+    """Return the bars in file order.
+
+    Explicit ids are assigned first; the other bars get the lowest free ids. Returns an empty tuple if there are
+    problems.
+    """
+    rows = [
+        _read_bar_table(values, f"[[bar]] {bar_number}: ", problems)
+        for bar_number, values in enumerate(tables, start=1)
+    ]
+    number_of_id: dict[int, int] = {}
+    for bar_number, row in enumerate(rows, start=1):
         bar_id = row["id"]
-        if bar_id in owner:
-            problems.append(f"[[bar]] {place}: id {bar_id} is that of [[bar]] {owner[bar_id]}, expected another")
+        if bar_id in number_of_id:
+            problems.append(
+                f"[[bar]] {bar_number}: id {bar_id} is that of [[bar]] {number_of_id[bar_id]}, expected another"
+            )
         elif bar_id is not None:
-            owner[bar_id] = place
+            number_of_id[bar_id] = bar_number
     if problems:
         return ()
-    free = (bar_id for bar_id in range(1, MAX_BARS + 1) if bar_id not in owner)
-    return tuple(_bar(row, next(free) if row["id"] is None else row["id"], unit_m) for row in rows)
+    free = (bar_id for bar_id in range(1, MAX_BARS + 1) if bar_id not in number_of_id)
+    return tuple(_make_bar(row, next(free) if row["id"] is None else row["id"], unit_m) for row in rows)
 
 
-def _bar_values(values: Mapping[str, Any], where: str, problems: list[str]) -> dict[str, Any]:
-    table = Keys(values, where, problems)
-    table.only(("diameter", "points", "role", "id", "bend_diameter", "ribs"))
-    found = {
+def _read_bar_table(values: Mapping[str, Any], where: str, problems: list[str]) -> dict[str, Any]:
+    table = TableReader(values, where, problems)
+    table.reject_unknown(("diameter", "points", "role", "id", "bend_diameter", "ribs"))
+    row = {
         "diameter": table.required("diameter", LENGTH),
         "points": table.required("points", _POINTS),
         "role": table.optional("role", _ROLE),
@@ -270,26 +290,31 @@ def _bar_values(values: Mapping[str, Any], where: str, problems: list[str]) -> d
         "bend_diameter": table.optional("bend_diameter", LENGTH),
         "ribs": table.optional("ribs", FLAG),
     }
-    mandrel, diameter = found["bend_diameter"], found["diameter"]
+    mandrel, diameter = row["bend_diameter"], row["diameter"]
     if isinstance(mandrel, float) and isinstance(diameter, float) and mandrel < diameter:
         problems.append(
             f"{where}bend_diameter: got {mandrel:g}, expected at least the bar's diameter, {diameter:g}"
         )
-    return found
+    return row
 
 
-def _bar(row: Mapping[str, Any], bar_id: int, unit_m: float) -> TomlBar:
+def _make_bar(row: Mapping[str, Any], bar_id: int, unit_m: float) -> TomlBar:
     mandrel = row["bend_diameter"]
     return TomlBar(
         bar_id=bar_id,
         role=row["role"] or "bar",
-        diameter_m=_metres(row["diameter"], unit_m),
-        corners_m=tuple((_metres(x, unit_m), _metres(y, unit_m), _metres(z, unit_m)) for x, y, z in row["points"]),
-        mandrel_m=None if mandrel is None else _metres(mandrel, unit_m),
+        diameter_m=_to_metres(row["diameter"], unit_m),
+        corners_m=tuple(
+            (_to_metres(x, unit_m), _to_metres(y, unit_m), _to_metres(z, unit_m)) for x, y, z in row["points"]
+        ),
+        mandrel_m=None if mandrel is None else _to_metres(mandrel, unit_m),
         ribs=row["ribs"] is not False,
     )
 
 
-def _metres(length: float, unit_m: float) -> float:
-    """Return a length in metres to the picometre, so that 9 mm is 0.009 m and 16 mm not a hair more than 0.016."""
-    return round(length * unit_m, _PICOMETRES)
+def _to_metres(length: float, unit_m: float) -> float:
+    """Return a length in metres, rounded to the picometre.
+
+    The rounding removes the floating-point error of the conversion: 9 mm is exactly 0.009 m, 16 mm exactly 0.016.
+    """
+    return round(length * unit_m, METRE_DECIMALS)

@@ -1,22 +1,24 @@
-"""Frozen descriptions of everything a build does: assembly, board, cameras, colour.
+"""Frozen specification dataclasses of a config: assembly, scene, trajectory, rig and colour.
 
-They are plain values: they pickle to a render process, compare, and go into the manifest through
-``dataclasses.asdict``.
+Specs are plain values. They are pickled to render processes, compared with ``==``, and written to the manifest
+with ``dataclasses.asdict``: field names and defaults are part of the dataset format.
 """
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 
+from rebar_depth_bench.errors import MeshError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration
 
 
 @dataclass(frozen=True)
 class LatticeSpec:
-    """A cube of three orthogonal families of straight ribbed rods (the paper's printed mock-up).
+    """Cubic lattice of three orthogonal sets of straight ribbed rods (the printed mock-up of the paper).
 
-    Rods sit on a ``pitch_m`` grid and alternate between the two diameters, so that neighbours differ.
+    The rods lie on a grid of ``pitch_m`` and alternate between the two diameters, so that neighbours differ.
     """
 
     kind: str = "lattice"
@@ -27,9 +29,9 @@ class LatticeSpec:
 
 @dataclass(frozen=True)
 class PileSpec:
-    """Overlapping-hook stirrups that fell in a heap; ``state`` names the stored poses they came to rest in.
+    """Pile of stirrups with overlapping hooks; ``state`` names the stored resting poses.
 
-    ``size_m`` is a hoop's outside size, long side first, by the nominal diameter.
+    ``size_m`` is the outside size of a hoop for the nominal diameter, long side first.
     """
 
     kind: str = "pile"
@@ -41,7 +43,7 @@ class PileSpec:
 
 @dataclass(frozen=True)
 class PierSpec:
-    """A square pier cage of 231 bars: verticals, two lapped half hoops a level, and a tie a level."""
+    """Square pier cage of 231 bars: verticals, and two lapped half hoops and one tie per level."""
 
     kind: str = "pier"
     side_m: float = 4.80
@@ -54,20 +56,33 @@ class PierSpec:
 
 
 @dataclass(frozen=True)
-class CageFileSpec:
-    """An assembly read bar by bar from a TOML or IFC file; ``sha256`` pins its content."""
+class PinnedFile:
+    """User's file with the digest of the content that it had when it was chosen."""
 
     path: str
     sha256: str
+
+    def check(self, content: bytes) -> bytes:
+        """Return ``content``; raise ``MeshError`` if its digest is not ``sha256``."""
+        actual_sha256 = hashlib.sha256(content).hexdigest()
+        if actual_sha256 != self.sha256:
+            raise MeshError(
+                f"{self.path}: changed since it was chosen: sha256 {actual_sha256} found, {self.sha256} expected"
+            )
+        return content
+
+
+@dataclass(frozen=True)
+class CageFileSpec(PinnedFile):
+    """Assembly read bar by bar from a TOML or IFC file."""
+
     kind: str = "cage-file"
 
 
 @dataclass(frozen=True)
-class MeshFileSpec:
-    """An assembly read from a mesh file; ``sha256`` pins its content, ``unit_m`` is one file unit in metres."""
+class MeshFileSpec(PinnedFile):
+    """Assembly read from a mesh file; ``unit_m`` is one file unit in metres."""
 
-    path: str
-    sha256: str
     unit_m: float
     kind: str = "mesh-file"
 
@@ -77,16 +92,19 @@ AssemblySpec = LatticeSpec | PileSpec | PierSpec | CageFileSpec | MeshFileSpec
 
 @dataclass(frozen=True)
 class AppearanceSpec:
-    """What the paper's scenes leave out: names of ``appearance.VARIANTS``, none in the standard configs."""
+    """Appearance variants of a scene, as names of ``scene.variants.VARIANTS``.
+
+    The standard configs, like the scenes of the paper, have none.
+    """
 
     variants: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """One scene: the steel, what it stands on and in, and the seed of its surface variation.
+    """Scene: assembly, ArUco board (None: no board), environment, and the seed of its surface variation.
 
-    ``environment`` is a name of ``blender.environments.ENVIRONMENTS``: ``laboratory`` or ``outdoors``.
+    ``environment`` is a name of ``blender.scene.ENVIRONMENTS``: ``laboratory`` or ``outdoors``.
     """
 
     name: str
@@ -99,7 +117,10 @@ class SceneSpec:
 
 @dataclass(frozen=True)
 class DomeSpec:
-    """A truncated-sphere dome: shells x elevation rings x azimuths, left camera at ``radii_m`` from the target."""
+    """Truncated-sphere dome of views: shells x elevation rings x azimuths.
+
+    The left camera is at ``radii_m`` from the target.
+    """
 
     radii_m: tuple[float, ...]
     elevations_deg: tuple[float, ...]
@@ -109,7 +130,7 @@ class DomeSpec:
 
 @dataclass(frozen=True)
 class RingSpec:
-    """One ring of evenly spaced azimuths at a fixed distance and elevation."""
+    """Ring of views at evenly spaced azimuths, with a fixed distance and elevation."""
 
     radius_m: float
     elevation_deg: float
@@ -118,8 +139,8 @@ class RingSpec:
 
 
 @dataclass(frozen=True)
-class SweepSpec:
-    """A sweep of distances: the same directions at each of ``radii_m``, so that distance alone changes."""
+class DistanceSweepSpec:
+    """Distance sweep: the same viewing directions at each of ``radii_m``, so that only the distance changes."""
 
     radii_m: tuple[float, ...]
     elevation_deg: float
@@ -127,16 +148,16 @@ class SweepSpec:
     kind: str = "sweep"
 
 
-ProtocolSpec = DomeSpec | RingSpec | SweepSpec
+TrajectorySpec = DomeSpec | RingSpec | DistanceSweepSpec
 
 
 @dataclass(frozen=True)
 class RigSpec:
-    """A stereo rig and the grid it is seen on.
+    """Stereo rig and the pixel grid of its images; ``width`` and ``height`` in pixels.
 
-    Without a ``calibration`` it is two parallel ideal pinholes, ``baseline_m`` apart. With one, ``grid`` tells
-    whether the images are the ``raw`` distorted ones or the ``rectified`` pair; ``baseline_m`` is then the
-    calibration's.
+    Without a ``calibration`` the rig is a pair of parallel ideal pinholes, ``baseline_m`` apart (``grid`` is
+    ``ideal``). With a calibration, ``grid`` is ``raw`` for the distorted images or ``rectified`` for the rectified
+    pair, and ``baseline_m`` must equal the baseline of the calibration.
     """
 
     width: int = 1280
@@ -148,7 +169,7 @@ class RigSpec:
 
 @dataclass(frozen=True)
 class ColourSpec:
-    """How Cycles renders colour; ``prefilter`` is how OIDN treats its albedo and normal guides."""
+    """Colour rendering with Cycles: samples per pixel, denoising, and the OIDN prefilter of albedo and normals."""
 
     samples: int = 16
     denoise: bool = True
@@ -157,10 +178,10 @@ class ColourSpec:
 
 @dataclass(frozen=True)
 class ConfigSpec:
-    """One config of the dataset: a scene under one camera protocol and one optics."""
+    """Config of the dataset: a scene, a camera trajectory (``protocol``), a rig and colour settings."""
 
     name: str
     scene: SceneSpec
-    protocol: ProtocolSpec
+    protocol: TrajectorySpec
     rig: RigSpec = field(default_factory=RigSpec)
     colour: ColourSpec = field(default_factory=ColourSpec)

@@ -1,4 +1,4 @@
-"""Exports a dataset folder as plain pictures, OpenEXR depth, COLMAP models and nerfstudio transforms."""
+"""Export of a dataset folder as plain images, OpenEXR depth, COLMAP models and nerfstudio transforms."""
 
 from dataset_builder.export.run import ConfigExport, ExportSummary, export
 

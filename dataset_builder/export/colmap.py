@@ -1,7 +1,7 @@
-"""A COLMAP text model of true cameras: ``cameras.txt``, ``images.txt``, ``points3D.txt``.
+"""COLMAP text model of the true cameras: ``cameras.txt``, ``images.txt``, ``points3D.txt``.
 
-Source: COLMAP's documentation, "Output Format" and "Camera Models". COLMAP's camera axes are OpenCV's, its first
-pixel centre is (0.5, 0.5) where ours is (0, 0): cx and cy grow by ``HALF_PIXEL``.
+Source: COLMAP's documentation, "Output Format" and "Camera Models". COLMAP uses OpenCV's camera axes. The centre
+of its first pixel is (0.5, 0.5), that of ours is (0, 0), so ``HALF_PIXEL`` is added to cx and cy.
 """
 
 from __future__ import annotations
@@ -14,65 +14,79 @@ from numpy import ndarray
 
 from dataset_builder.config.rigs import Camera
 from dataset_builder.export.views import CameraView
-from dataset_builder.scene.model import Bar
-from dataset_builder.scene.shapes.bending import resampled_m
+from dataset_builder.scene.shapes.bending import resample_polyline_m
+from rebar_depth_bench.data.bars import Bar
 
 HALF_PIXEL = 0.5
-POINTS_WANTED = 10_000
-_SHORTEST_STEP_M = 0.001
+"""Offset of COLMAP's and nerfstudio's pixel coordinates from ours, pixels."""
+
+TARGET_POINT_COUNT = 10_000
+"""Approximate number of points in ``points3D.txt``."""
+
+_MIN_STEP_M = 0.001
+"""Minimum distance of neighbouring points on a centreline, metres."""
+
 _GREY = "128 128 128"
-_NO_ERROR = "0"
+"""Colour of all points, R G B."""
+
+_REPROJECTION_ERROR = "0"
+"""Error column of ``points3D.txt``: no image observes the points."""
 
 
 def cameras_txt(views: Sequence[CameraView]) -> str:
     """Return ``cameras.txt``: each distinct camera once, numbered from 1.
 
-    A grid without distortion is PINHOLE (fx fy cx cy), any other FULL_OPENCV (fx fy cx cy k1 k2 p1 p2 k3 0 0 0).
+    Cameras without distortion are PINHOLE (fx fy cx cy), all others FULL_OPENCV
+    (fx fy cx cy k1 k2 p1 p2 k3 0 0 0).
     """
     lines = [
         f"{camera_id} {camera_line}" for camera_line, camera_id in _camera_ids(views).items()
-    ]  # a camera is its own line's text
-    return _text("CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", lines)
+    ]  # Cameras with the same line are the same camera.
+    return _with_header("CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", lines)
 
 
 def images_txt(views: Sequence[CameraView]) -> str:
     """Return ``images.txt``: both eyes of every view, with ``cam_from_world`` as quaternion and translation.
 
-    An image's second line would list its feature points and is empty. Names are those below ``images/``.
+    The second line of an image, which lists its feature points, is empty. Names are relative to ``images/``.
     """
     camera_ids = _camera_ids(views)
     lines: list[str] = []
     for view in views:
         for eye, camera in view.cameras.items():
             pose = camera.cam_from_world
-            numbers = _numbers([*quaternion_wxyz(pose[:3, :3]), *pose[:3, 3]])
+            numbers = _format_floats([*quaternion_wxyz(pose[:3, :3]), *pose[:3, 3]])
             image_id = len(lines) // 2 + 1
             lines += [f"{image_id} {numbers} {camera_ids[_camera_line(camera)]} {view.stem(eye)}.png", ""]
-    return _text("IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then POINTS2D[] as (X Y POINT3D_ID)", lines)
+    return _with_header("IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then POINTS2D[] as (X Y POINT3D_ID)", lines)
 
 
 def points_txt(bars: Sequence[Bar]) -> str:
-    """Return ``points3D.txt``: about ``POINTS_WANTED`` grey points on the bars' centrelines, seen by no image.
+    """Return ``points3D.txt``: about ``TARGET_POINT_COUNT`` grey points on the bars' centrelines.
 
-    Some tools (Gaussian splatting among them) start from points and refuse a model that has none.
+    No image observes them. Some tools (Gaussian splatting among them) initialise from the points and reject a
+    model without any.
     """
     points_m = axis_points_m(bars)
-    lines = [f"{number} {_numbers(point)} {_GREY} {_NO_ERROR}" for number, point in enumerate(points_m, start=1)]
-    return _text("POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID POINT2D_IDX)", lines)
+    lines = [
+        f"{number} {_format_floats(point)} {_GREY} {_REPROJECTION_ERROR}"
+        for number, point in enumerate(points_m, start=1)
+    ]
+    return _with_header("POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID POINT2D_IDX)", lines)
 
 
 def axis_points_m(bars: Sequence[Bar]) -> Float64[ndarray, "n 3"]:
-    """Return points spread evenly over each bar's centreline, its ends included; world frame, metres."""
+    """Return points spread evenly over each bar's centreline, including its ends; world frame, metres."""
     axes_m = [np.array(bar.axis_m, dtype=np.float64) for bar in bars]
     length_m = sum(float(np.linalg.norm(np.diff(axis_m, axis=0), axis=1).sum()) for axis_m in axes_m)
-    step_m = max(length_m / POINTS_WANTED, _SHORTEST_STEP_M)
-    return np.concatenate([np.empty((0, 3)), *(resampled_m(axis_m, step_m) for axis_m in axes_m)])
+    step_m = max(length_m / TARGET_POINT_COUNT, _MIN_STEP_M)
+    return np.concatenate([np.empty((0, 3)), *(resample_polyline_m(axis_m, step_m) for axis_m in axes_m)])
 
 
 def quaternion_wxyz(rotation: Float64[ndarray, "3 3"]) -> Float64[ndarray, " 4"]:
     """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
 
-    The row of 4 q q^T with the largest diagonal is a multiple of q, however the rotation turns
+    The row of 4 q q^T with the largest diagonal element is a multiple of q and well conditioned for every rotation
     (Shepperd, "Quaternion from rotation matrix", 1978).
     """
     r = rotation
@@ -90,26 +104,27 @@ def quaternion_wxyz(rotation: Float64[ndarray, "3 3"]) -> Float64[ndarray, " 4"]
 
 
 def _camera_ids(views: Iterable[CameraView]) -> dict[str, int]:
-    """Return the number of each distinct camera by its line of ``cameras.txt``, in order of appearance."""
+    """Return the camera id of each distinct camera by its line of ``cameras.txt``, in order of appearance."""
     lines = dict.fromkeys(_camera_line(camera) for view in views for camera in view.cameras.values())
     return {line: number for number, line in enumerate(lines, start=1)}
 
 
 def _camera_line(camera: Camera) -> str:
-    """Return a camera's model, size and parameters as COLMAP writes them."""
+    """Return a camera's model, size and parameters in COLMAP's format, without the id."""
     K = camera.K
     parameters = [K[0, 0], K[1, 1], K[0, 2] + HALF_PIXEL, K[1, 2] + HALF_PIXEL]
     model = "PINHOLE"
     if np.any(camera.distortion):
         model = "FULL_OPENCV"
         parameters += [*camera.distortion, 0.0, 0.0, 0.0]
-    return f"{model} {camera.width} {camera.height} {_numbers(parameters)}"
+    return f"{model} {camera.width} {camera.height} {_format_floats(parameters)}"
 
 
-def _numbers(values: Iterable[float]) -> str:
-    """Return numbers with all the digits that bring the same float64 back."""
+def _format_floats(values: Iterable[float]) -> str:
+    """Return the values separated by spaces, with enough digits to restore the same float64."""
     return " ".join(repr(float(value)) for value in values)
 
 
-def _text(columns: str, lines: Iterable[str]) -> str:
+def _with_header(columns: str, lines: Iterable[str]) -> str:
+    """Return the lines as a file's text, after a comment that names the columns."""
     return "".join(f"{line}\n" for line in (f"# {columns}", *lines))

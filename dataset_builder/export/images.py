@@ -1,4 +1,4 @@
-"""Which files a view becomes, and how each is encoded."""
+"""Exported image files of a view and their encoders."""
 
 from __future__ import annotations
 
@@ -14,13 +14,16 @@ from numpy import ndarray
 from PIL import Image
 
 _PNG_LEVEL = 1
-"""Three times quicker than the usual level 6, a fifth larger (``benchmarks/codecs.py``)."""
+"""Compression level: three times faster than the default 6, files a fifth larger (``benchmarks/codecs.py``)."""
 
 _EXR_CHANNEL = "Y"
-"""OpenCV reads a lone channel Y or R as it is, and one named Z as zeros without a word."""
+"""Channel name: OpenCV reads a single channel Y or R correctly, but one named Z silently as zeros."""
 
 MILLIMETRE_M = 0.001
+"""One millimetre in metres."""
+
 _LARGEST_MM = np.iinfo(np.uint16).max
+"""Largest depth that a 16-bit PNG can store, millimetres."""
 
 
 def colour_png(rgb: UInt8[ndarray, "h w 3"]) -> bytes:
@@ -29,7 +32,7 @@ def colour_png(rgb: UInt8[ndarray, "h w 3"]) -> bytes:
 
 
 def mask_png(mask: Bool[ndarray, "h w"]) -> bytes:
-    """Encode a mask as 8-bit grey PNG, 255 where true: every reader of masks knows that."""
+    """Encode a mask as 8-bit grey PNG, 255 where true, which all common mask readers accept."""
     return _png(np.where(mask, np.uint8(255), np.uint8(0)))
 
 
@@ -39,7 +42,7 @@ def bars_png(bars: UInt16[ndarray, "h w"]) -> bytes:
 
 
 def depth_exr(depth_m: Float32[ndarray, "h w"]) -> bytes:
-    """Encode float32 planar depth, metres, as an OpenEXR image of one channel, ZIP compressed: no bit changes."""
+    """Encode float32 planar depth, metres, as a single-channel OpenEXR image, losslessly (ZIP compression)."""
     stream = io.BytesIO()
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, {_EXR_CHANNEL: np.ascontiguousarray(depth_m)}).write(stream)
@@ -49,15 +52,15 @@ def depth_exr(depth_m: Float32[ndarray, "h w"]) -> bytes:
 def depth_mm_png(depth_m: Float32[ndarray, "h w"]) -> bytes:
     """Encode planar depth as 16-bit grey PNG in whole millimetres, rounded to the nearest.
 
-    0 where there is no surface, or where it lies further than 65.535 m.
+    0 where there is no surface, or where it is farther than 65.535 m.
     """
     depth_mm = np.rint(depth_m.astype(np.float64) / MILLIMETRE_M)
     return _png(np.where(depth_mm <= _LARGEST_MM, depth_mm, 0).astype(np.uint16))
 
 
 @dataclass(frozen=True)
-class Picture:
-    """One file of an eye: its folder and ending, the column it is made from, and its encoder."""
+class ExportFile:
+    """One file per eye of a view: its folder and suffix, the dataset column it contains, and its encoder."""
 
     folder: str
     suffix: str
@@ -65,21 +68,22 @@ class Picture:
     encode: Callable[[Any], bytes]
 
     def path(self, stem: str) -> str:
-        """Return the file's path in the config's folder."""
+        """Return the path of the file in the config's folder."""
         return f"{self.folder}/{stem}{self.suffix}"
 
 
-PICTURES: Mapping[str, Picture] = {
-    "image": Picture("images", ".png", "rgb", colour_png),
-    "depth": Picture("depth", ".exr", "depth", depth_exr),
-    "depth_mm": Picture("depth_mm", ".png", "depth", depth_mm_png),
-    "mask": Picture("masks", ".png", "mask", mask_png),
-    "bars": Picture("bars", ".png", "bars", bars_png),
+EXPORT_FILES: Mapping[str, ExportFile] = {
+    "image": ExportFile("images", ".png", "rgb", colour_png),
+    "depth": ExportFile("depth", ".exr", "depth", depth_exr),
+    "depth_mm": ExportFile("depth_mm", ".png", "depth", depth_mm_png),
+    "mask": ExportFile("masks", ".png", "mask", mask_png),
+    "bars": ExportFile("bars", ".png", "bars", bars_png),
 }
-"""What is written of each eye, by the name ``cameras.json`` gives it."""
+"""Files exported for each eye, by their key in ``cameras.json``."""
 
 
 def _png(pixels: ndarray) -> bytes:
+    """Encode an array as PNG."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, "PNG", compress_level=_PNG_LEVEL)
     return stream.getvalue()

@@ -1,4 +1,4 @@
-"""What an exported folder says of itself: ``cameras.json`` for programs, ``README.txt`` for people."""
+"""Metadata of an exported folder: ``cameras.json`` for programs and ``README.txt`` for people."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from typing import Any
 
 from dataset_builder.config.rigs import Camera
-from dataset_builder.export.images import PICTURES
+from dataset_builder.export.images import EXPORT_FILES
 from dataset_builder.export.nerfstudio import json_lines
 from dataset_builder.export.views import CameraView
 from rebar_depth_bench.data.manifest import DatasetFolder
 
 LICENCE = "CC BY 4.0 (https://creativecommons.org/licenses/by/4.0/)"
+"""Licence of the dataset."""
+
 CONVENTIONS = {
     "axes": "OpenCV: x to the right, y down, z forward along the optical axis",
     "pixels": "u along the width, v along the height; the middle of the first pixel is (0, 0)",
@@ -23,11 +25,14 @@ CONVENTIONS = {
     "depth": "planar: along the optical axis, not along the ray; 0 where there is no surface",
     "baseline_m": "from the left to the right camera along the left one's x axis",
 }
+"""Descriptions of units and frames, part of ``cameras.json``."""
+
 _NOT_PARAMETERS = ("views", "shards", "ground_truth_digest", "key", "mesh", "bytes")
+"""Keys of a config's manifest entry that are not scene parameters."""
 
 
 def cameras_json(folder: DatasetFolder, config: str, views: Sequence[CameraView]) -> str:
-    """Return ``cameras.json``: conventions, where the data comes from, and an entry per view and eye."""
+    """Return ``cameras.json``: conventions, origin of the data, and one entry per view and eye."""
     entry = folder.config(config)
     head = {
         "conventions": CONVENTIONS,
@@ -41,6 +46,7 @@ def cameras_json(folder: DatasetFolder, config: str, views: Sequence[CameraView]
 
 
 def _camera(view: CameraView, eye: str, camera: Camera) -> dict[str, Any]:
+    """Return the entry of one eye of a view."""
     return {
         "view_id": view.view_id,
         "eye": eye,
@@ -50,12 +56,12 @@ def _camera(view: CameraView, eye: str, camera: Camera) -> dict[str, Any]:
         "distortion": camera.distortion.tolist(),
         "cam_from_world": camera.cam_from_world.tolist(),
         "baseline_m": view.baseline_m,
-        **{name: picture.path(view.stem(eye)) for name, picture in PICTURES.items()},
+        **{name: export_file.path(view.stem(eye)) for name, export_file in EXPORT_FILES.items()},
     }
 
 
 def readme_txt(folder: DatasetFolder, config: str, views: int) -> str:
-    """Return ``README.txt``: what each file holds, in which unit and frame."""
+    """Return ``README.txt``: the content, unit and frame of each file."""
     return _README.format(
         config=config, views=views, digest=folder.digest, version=folder.version, licence=LICENCE
     )

@@ -1,10 +1,9 @@
-"""``transforms.json`` for nerfstudio.
+"""nerfstudio's ``transforms.json``, and line-oriented JSON output.
 
 Source: nerfstudio's documentation, "Data conventions", and its ``Nerfstudio`` data parser. Cameras look along -z
-with y up (OpenGL); a pixel's coordinates are those of its centre, the first being (0.5, 0.5): its
-``get_image_coords`` adds 0.5, and it takes 0.5 off cx and cy before it calls OpenCV. k1 k2 k3 p1 p2 are OpenCV's.
-
-JSON that people can read: a short head, then a long list with one entry a line.
+with y up (OpenGL). Pixel coordinates are those of pixel centres, the first being (0.5, 0.5): nerfstudio's
+``get_image_coords`` adds 0.5, and it subtracts 0.5 from cx and cy before it calls OpenCV. k1 k2 k3 p1 p2 are
+OpenCV's.
 """
 
 from __future__ import annotations
@@ -19,28 +18,33 @@ from numpy import ndarray
 
 from dataset_builder.config.rigs import Camera
 from dataset_builder.export.colmap import HALF_PIXEL
-from dataset_builder.export.images import MILLIMETRE_M, PICTURES
+from dataset_builder.export.images import EXPORT_FILES, MILLIMETRE_M
 from dataset_builder.export.views import CameraView
 from rebar_depth_bench.geometry.cameras import inverse_rigid
 
 _EMPTY_END = "[]\n}"
+"""End of a JSON object whose last member is an empty list."""
 
 
 def json_lines(head: Mapping[str, Any], name: str, entries: Sequence[Mapping[str, Any]]) -> str:
-    """Return ``head`` as a JSON object with one more member ``name``: the list of ``entries``, a line each."""
-    outline = json.dumps({**head, name: []}, indent=1, allow_nan=False).removesuffix(_EMPTY_END)
+    """Return ``head`` as a JSON object with an additional member ``name``: the list of ``entries``, one per line.
+
+    The result is readable: a short head, then a long list.
+    """
+    head_text = json.dumps({**head, name: []}, indent=1, allow_nan=False).removesuffix(_EMPTY_END)
     lines = ",\n".join(json.dumps(entry, allow_nan=False) for entry in entries)
-    return f"{outline}[\n{lines}\n]}}\n"
+    return f"{head_text}[\n{lines}\n]}}\n"
 
 
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Change of camera axes from OpenGL to OpenCV."""
 
 
 def transforms_json(views: Sequence[CameraView]) -> str:
-    """Return ``transforms.json``; intrinsics stand at the top if all frames share them, else in each frame."""
+    """Return ``transforms.json``; intrinsics are at the top level if all frames share them, else in each frame."""
     frames = [(view.stem(eye), camera) for view in views for eye, camera in view.cameras.items()]
     intrinsics = [_intrinsics(camera) for _, camera in frames]
-    shared = intrinsics[0] if all(one == intrinsics[0] for one in intrinsics) else None
+    shared = intrinsics[0] if all(entry == intrinsics[0] for entry in intrinsics) else None
     head = {"camera_model": "OPENCV", "depth_unit_scale_factor": MILLIMETRE_M, **(shared or {})}
     entries = [
         {**_frame(stem, camera), **({} if shared else own)}
@@ -55,15 +59,17 @@ def world_from_opengl_cam(cam_from_world: Float64[ndarray, "4 4"]) -> Float64[nd
 
 
 def _frame(stem: str, camera: Camera) -> dict[str, Any]:
+    """Return the file names and the pose of one frame."""
     return {
-        "file_path": PICTURES["image"].path(stem),
-        "mask_path": PICTURES["mask"].path(stem),
-        "depth_file_path": PICTURES["depth_mm"].path(stem),
+        "file_path": EXPORT_FILES["image"].path(stem),
+        "mask_path": EXPORT_FILES["mask"].path(stem),
+        "depth_file_path": EXPORT_FILES["depth_mm"].path(stem),
         "transform_matrix": world_from_opengl_cam(camera.cam_from_world).tolist(),
     }
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
+    """Return nerfstudio's intrinsics of a camera."""
     K = camera.K
     focal = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1])}
     centre = {"cx": float(K[0, 2]) + HALF_PIXEL, "cy": float(K[1, 2]) + HALF_PIXEL}

@@ -1,4 +1,4 @@
-"""Export a dataset folder for people who do not use ``datasets``: plain files that other tools read."""
+"""Dataset export: writes configs of a dataset folder as plain files for use without ``datasets``."""
 
 from __future__ import annotations
 
@@ -7,28 +7,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import pyarrow as pa
-
-from dataset_builder.build.bars_table import BARS, read_bars
 from dataset_builder.config.trajectories import subset
 from dataset_builder.export.colmap import cameras_txt, images_txt, points_txt
-from dataset_builder.export.images import PICTURES
+from dataset_builder.export.images import EXPORT_FILES
 from dataset_builder.export.metadata import cameras_json, readme_txt
 from dataset_builder.export.nerfstudio import transforms_json
 from dataset_builder.export.target import export_target
 from dataset_builder.export.views import CameraView, StoredView, stored_views
-from dataset_builder.scene.model import Bar
 from rebar_depth_bench.atomic_io import write_bytes, write_text
+from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
 
 _FOLDER_NAME = re.compile(r"\w[\w.-]*")
+"""Config names that are used as folder names."""
 
 
 @dataclass(frozen=True)
 class ConfigExport:
-    """What an export did for one config: how many picture files it wrote and how many it found there."""
+    """Export summary of one config: the number of views, and of image files written and already present."""
 
     config: str
     views: int
@@ -38,7 +36,7 @@ class ConfigExport:
 
 @dataclass(frozen=True)
 class ExportSummary:
-    """What an export did, config by config."""
+    """Summary of an export, config by config."""
 
     folder: Path
     configs: tuple[ConfigExport, ...]
@@ -53,28 +51,31 @@ def export(
 ) -> ExportSummary:
     """Export configs (default: all) of the dataset folder ``root``, each into its own folder below ``to``.
 
-    ``views`` takes that many of a config's views, spread evenly. Every file is written whole or not at all,
-    pictures before what describes them. Stopped at any moment and called again, the export goes on: pictures that
-    are there are kept, and the bytes are those of an export that was never stopped. ``progress`` counts views.
+    ``views`` selects that many of a config's views, spread evenly. Files are written atomically, images before
+    the metadata that refers to them. An interrupted export is resumed by calling it again: images that exist are
+    kept, and the result is byte-identical to that of an uninterrupted export. ``progress`` counts views.
 
-    Raises ``DatasetError`` for a folder that is no finished local dataset folder, an unknown config or data that
-    contradicts the manifest; ``InputError`` for fewer than one view, a ``to`` that holds anything but an earlier
-    export of the same data, or one that cannot be written.
+    Raises ``DatasetError`` for a folder that is not a complete local dataset folder, an unknown config or data
+    that contradicts the manifest; ``InputError`` for fewer than one view, for a ``to`` that contains anything but
+    an earlier export of the same data, and for one that cannot be written.
     """
     folder = _local_folder(root)
     names = tuple(dict.fromkeys(configs or folder.configs))
-    wanted = {name: _chosen_views(folder, name, views) for name in names}
-    bars = _bars(folder)
+    wanted = {name: _select_view_ids(folder, name, views) for name in names}
+    bars = _read_bars(folder)
     target = Path(to)
     try:
         with export_target(target, folder, wanted):
-            done = [_export_config(folder, name, wanted[name], bars, target / name, progress) for name in names]
-    except OSError as error:  # of writing alone: reading raises DatasetError
+            exported = [
+                _export_config(folder, name, wanted[name], bars, target / name, progress) for name in names
+            ]
+    except OSError as error:  # Only writing raises OSError here: reading raises DatasetError.
         raise InputError(f"{to}: cannot be written: {error}") from error
-    return ExportSummary(target, tuple(done))
+    return ExportSummary(target, tuple(exported))
 
 
 def _local_folder(root: str | Path) -> DatasetFolder:
+    """Open a local dataset folder. Raises ``DatasetError`` if ``root`` is not a folder."""
     if not Path(root).is_dir():
         raise DatasetError(
             f"{root}: no such folder, expected a dataset folder on this machine; download a Hub repository first"
@@ -82,7 +83,11 @@ def _local_folder(root: str | Path) -> DatasetFolder:
     return open_folder(root)
 
 
-def _chosen_views(folder: DatasetFolder, config: str, views: int | None) -> list[str]:
+def _select_view_ids(folder: DatasetFolder, config: str, views: int | None) -> list[str]:
+    """Return the ids of the selected views of a config.
+
+    Raises ``DatasetError`` if the config's name cannot name a folder, ``InputError`` for fewer than one view.
+    """
     view_ids = [record.view_id for record in folder.views(config)]
     if not _FOLDER_NAME.fullmatch(config):
         raise DatasetError(f"{folder.root}: the name of config {config!r} cannot be a folder's name")
@@ -91,12 +96,10 @@ def _chosen_views(folder: DatasetFolder, config: str, views: int | None) -> list
     return [view_ids[index] for index in subset(len(view_ids), views)]
 
 
-def _bars(folder: DatasetFolder) -> dict[str, tuple[Bar, ...]]:
-    path = Path(folder.root) / BARS
-    try:
-        return read_bars(path)
-    except (OSError, pa.ArrowException, KeyError) as error:
-        raise DatasetError(f"{path}: cannot be read: {error}") from error
+def _read_bars(folder: DatasetFolder) -> dict[str, tuple[Bar, ...]]:
+    """Return the bars by scene, none if the file is missing. Raises ``DatasetError`` if it cannot be read."""
+    path = Path(folder.root) / BARS_FILE
+    return read_bars(path) if path.is_file() else {}
 
 
 def _export_config(
@@ -107,7 +110,7 @@ def _export_config(
     into: Path,
     progress: Progress,
 ) -> ConfigExport:
-    """Write a config's pictures, then what describes them."""
+    """Write a config's images, then the metadata that refers to them."""
     views: list[CameraView] = []
     written = 0
     for stored in stored_views(folder, config, wanted):
@@ -125,19 +128,19 @@ def _export_config(
     }
     for name, text in texts.items():
         write_text(into / name, text)
-    pictures = sum(len(view.cameras) for view in views) * len(PICTURES)
-    return ConfigExport(config, len(views), written, pictures - written)
+    file_count = sum(len(view.cameras) for view in views) * len(EXPORT_FILES)
+    return ConfigExport(config, len(views), written, file_count - written)
 
 
 def _write_missing(stored: StoredView, into: Path) -> int:
-    """Write those pictures of a view that are not there yet; return how many."""
+    """Write those image files of a view that do not exist yet; return their number."""
     targets = [
-        (into / picture.path(stored.view.stem(eye)), f"{eye}_{picture.column}", picture.encode)
+        (into / export_file.path(stored.view.stem(eye)), f"{eye}_{export_file.column}", export_file.encode)
         for eye in stored.view.cameras
-        for picture in PICTURES.values()
+        for export_file in EXPORT_FILES.values()
     ]
-    missing = [one for one in targets if not one[0].is_file()]
-    decoded = stored.pictures() if missing else {}
+    missing = [target for target in targets if not target[0].is_file()]
+    decoded = stored.decode() if missing else {}
     for path, column, encode in missing:
         write_bytes(path, encode(decoded[column]))
     return len(missing)

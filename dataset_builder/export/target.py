@@ -1,28 +1,30 @@
-"""The folder an export goes to: new, empty, or an earlier export of the very same data that goes on."""
+"""Export target folder: new, empty, or an earlier export of the same data that is resumed."""
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from rebar_depth_bench.atomic_io import write_text
+from rebar_depth_bench.atomic_io import TEMPORARY_PATTERN, exclusive_lock, write_text
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import InputError
 
 MARKER = "export.json"
+"""File in the target folder that identifies an export."""
+
 FORMAT = "rebar-depth-export-1"
-_TEMPORARY = ".*.tmp"
-_HALF_MARKER = f".{MARKER}.*.tmp"
+"""Format version of ``MARKER``."""
+
+_PARTIAL_MARKER = f".{MARKER}.*.tmp"
+"""Temporary file of an interrupted first write of ``MARKER``."""
 
 
 @dataclass(frozen=True)
-class _Part:
-    """What the folder holds of a config: the key of its build and the ids of its views."""
+class _ExportedConfig:
+    """Content of the target for one config: the key of its build and the ids of its views."""
 
     key: str
     views: tuple[str, ...]
@@ -30,35 +32,41 @@ class _Part:
 
 @contextmanager
 def export_target(to: Path, folder: DatasetFolder, wanted: Mapping[str, Sequence[str]]) -> Iterator[None]:
-    """Prepare ``to`` for the wanted view ids of each config and hold it until the export is done.
+    """Prepare and lock ``to`` for an export of the wanted view ids of each config.
 
-    ``export.json`` there names the dataset, and for each config its build and its views; what a killed export left
-    half written is removed. Raises ``InputError`` for a folder that holds anything else, another dataset, another
-    build, or views that are not wanted now; or at which another export is at work.
+    Context manager; the lock is held until it exits. ``export.json`` in the folder records the dataset and, for
+    each config, its build and its views. Temporary files left by a killed export are removed. Raises
+    ``InputError`` if the folder contains anything else, another dataset, another build or views that are not
+    wanted now, or if another export holds the lock.
     """
-    _check_place(to, folder)
+    _check_target(to, folder)
     try:
         to.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{to}: cannot be made: {error.strerror}") from None
-    with _only_one(to):
-        parts = _continued(to, folder, wanted)
-        for temporary in to.rglob(_TEMPORARY):
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(exclusive_lock(to))  # Locking the folder itself leaves no file behind.
+        except BlockingIOError:
+            raise InputError(f"{to}: another export is at work there") from None
+        exported = _merged_configs(to, folder, wanted)
+        for temporary in to.rglob(TEMPORARY_PATTERN):
             temporary.unlink()
-        configs = {name: asdict(part) for name, part in parts.items()}
+        configs = {name: asdict(entry) for name, entry in exported.items()}
         marker = {"format": FORMAT, "dataset": folder.digest, "configs": configs}
         write_text(to / MARKER, json.dumps(marker) + "\n")
         yield
 
 
-def _check_place(to: Path, folder: DatasetFolder) -> None:
+def _check_target(to: Path, folder: DatasetFolder) -> None:
+    """Raise ``InputError`` if ``to`` is a file, is in the dataset folder or contains anything but an export."""
     if to.exists() and not to.is_dir():
         raise InputError(f"{to}: is a file, expected a folder")
     root = Path(folder.root).resolve()
     if to.resolve().is_relative_to(root):
         raise InputError(f"{to}: lies in the dataset folder {folder.root}, expected a folder outside of it")
     if to.is_dir() and not (to / MARKER).is_file():
-        foreign = sorted(path.name for path in to.iterdir() if not path.match(_HALF_MARKER))
+        foreign = sorted(path.name for path in to.iterdir() if not path.match(_PARTIAL_MARKER))
         if foreign:
             raise InputError(
                 f"{to}: is not empty (it holds {foreign[0]}) and has no {MARKER}, "
@@ -66,55 +74,53 @@ def _check_place(to: Path, folder: DatasetFolder) -> None:
             )
 
 
-def _continued(to: Path, folder: DatasetFolder, wanted: Mapping[str, Sequence[str]]) -> dict[str, _Part]:
-    """Return what ``to`` will hold: earlier configs stay, the wanted ones join or grow."""
-    parts = {name: _Part(str(folder.config(name)["key"]), tuple(views)) for name, views in wanted.items()}
-    earlier = _earlier_parts(to / MARKER, folder) if (to / MARKER).is_file() else {}
-    for name in earlier.keys() & parts.keys():
-        _check_part(to, name, earlier[name], parts[name])
-    return {**earlier, **parts}
+def _merged_configs(
+    to: Path, folder: DatasetFolder, wanted: Mapping[str, Sequence[str]]
+) -> dict[str, _ExportedConfig]:
+    """Return the configs in ``to`` after the export: earlier ones remain, wanted ones are added or extended."""
+    configs = {
+        name: _ExportedConfig(str(folder.config(name)["key"]), tuple(views)) for name, views in wanted.items()
+    }
+    earlier = _read_marker(to / MARKER, folder) if (to / MARKER).is_file() else {}
+    for name in earlier.keys() & configs.keys():
+        _check_same_build(to, name, earlier[name], configs[name])
+    return {**earlier, **configs}
 
 
-def _earlier_parts(path: Path, folder: DatasetFolder) -> dict[str, _Part]:
+def _read_marker(path: Path, folder: DatasetFolder) -> dict[str, _ExportedConfig]:
+    """Return the configs of an earlier export from its ``export.json``.
+
+    Raises ``InputError`` if the file is invalid, has another format or names another dataset.
+    """
     try:
         marker = json.loads(path.read_bytes())
-        found, dataset = marker["format"], marker["dataset"]
-        parts = {name: _Part(str(one["key"]), tuple(one["views"])) for name, one in marker["configs"].items()}
+        format_name, dataset = marker["format"], marker["dataset"]
+        exported = {
+            name: _ExportedConfig(str(entry["key"]), tuple(entry["views"]))
+            for name, entry in marker["configs"].items()
+        }
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: cannot be read as the record of an export: {error!r}") from None
-    if found != FORMAT:
-        raise InputError(f"{path}: format is {found!r}, expected {FORMAT!r}")
+    if format_name != FORMAT:
+        raise InputError(f"{path}: format is {format_name!r}, expected {FORMAT!r}")
     if dataset != folder.digest:
         raise InputError(
             f"{path.parent}: holds an export of dataset {dataset}, but {folder.root} is {folder.digest}; "
             "choose another folder"
         )
-    return parts
+    return exported
 
 
-def _check_part(to: Path, name: str, earlier: _Part, now: _Part) -> None:
-    if earlier.key != now.key:
+def _check_same_build(to: Path, name: str, earlier: _ExportedConfig, wanted: _ExportedConfig) -> None:
+    """Raise ``InputError`` if a config was exported from another build or has unselected views."""
+    if earlier.key != wanted.key:
         raise InputError(
-            f"{to}: holds config {name} of another build (key {earlier.key[:16]}, now {now.key[:16]}): "
+            f"{to}: holds config {name} of another build (key {earlier.key[:16]}, now {wanted.key[:16]}): "
             "the same ground truth under other pictures; choose another folder"
         )
-    dropped = set(earlier.views) - set(now.views)
+    dropped = set(earlier.views) - set(wanted.views)
     if dropped:
         raise InputError(
             f"{to}: holds {len(earlier.views)} views of {name}, {len(dropped)} of which are not among the "
-            f"{len(now.views)} asked for, such as {min(dropped)}; ask for more views or choose another folder"
+            f"{len(wanted.views)} asked for, such as {min(dropped)}; ask for more views or choose another folder"
         )
-
-
-@contextmanager
-def _only_one(to: Path) -> Iterator[None]:
-    """Lock the folder itself, which leaves no file behind; a killed holder lets go of it."""
-    descriptor = os.open(to, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{to}: another export is at work there") from None
-        yield
-    finally:
-        os.close(descriptor)

@@ -1,4 +1,4 @@
-"""The views of a dataset folder as an export needs them: cameras at once, pictures only when asked for."""
+"""Views of a dataset folder for an export: cameras are read directly, images are decoded on request."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ _COLUMNS = ("view_id", "baseline_m", *(f"{eye}_{kind}" for eye in EYES for kind 
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """The cameras of one stereo view, by eye, without its pictures."""
+    """Cameras of one stereo view by eye, without images."""
 
     view_id: str
     baseline_m: float
     cameras: Mapping[str, Camera]
 
     def stem(self, eye: str) -> str:
-        """Return what all files of one eye are called, without folder and ending: ``0000_left``."""
+        """Return the common file name of one eye's files, without folder and suffix, e.g. ``0000_left``."""
         return f"{self.view_id.rpartition('/')[2]}_{eye}"
 
 
 @dataclass(frozen=True, eq=False)
 class StoredView:
-    """One row of a dataset folder, its pictures still encoded."""
+    """One row of a dataset folder, its images still encoded."""
 
     view: CameraView
     record: ViewRecord
     row: Mapping[str, Any]
 
-    def pictures(self) -> dict[str, Any]:
+    def decode(self) -> dict[str, Any]:
         """Return the decoded row (see ``rebar_depth_bench.load``), checked against the manifest.
 
-        Raises ``DatasetError`` naming the view that cannot be decoded, or whose ground truth has not the digest of
-        the manifest.
+        Raises ``DatasetError``, naming the view, if an image cannot be decoded or the digest of the ground truth
+        differs from the manifest.
         """
         try:
             decoded = decode_row(self.row)
         except (OSError, ValueError) as error:
             raise DatasetError(f"view {self.record.view_id}: a picture cannot be decoded: {error}") from error
         for eye, expected in (("left", self.record.left), ("right", self.record.right)):
-            found = eye_digest(*(decoded[f"{eye}_{kind}"] for kind in _TRUTH_KINDS))
-            if found != expected:
+            digest = eye_digest(*(decoded[f"{eye}_{kind}"] for kind in _TRUTH_KINDS))
+            if digest != expected:
                 raise DatasetError(
-                    f"view {self.record.view_id}: the {eye} ground truth has digest {found[:16]}, "
+                    f"view {self.record.view_id}: the {eye} ground truth has digest {digest[:16]}, "
                     f"the manifest says {expected[:16]}"
                 )
         return decoded
@@ -65,7 +65,7 @@ class StoredView:
 def stored_views(folder: DatasetFolder, config: str, wanted: Collection[str]) -> Iterator[StoredView]:
     """Yield the wanted views of a config in the folder's order, one row in memory at a time.
 
-    Raises ``DatasetError`` for shards that cannot be read, lack a wanted view or hold an unknown one.
+    Raises ``DatasetError`` for shards that cannot be read, lack a wanted view or contain an unknown one.
     """
     records = {record.view_id: record for record in folder.views(config)}
     missing = set(wanted)
@@ -82,6 +82,7 @@ def stored_views(folder: DatasetFolder, config: str, wanted: Collection[str]) ->
 
 
 def _rows(folder: DatasetFolder, config: str) -> Iterator[Mapping[str, Any]]:
+    """Yield the undecoded rows of a config. Raises ``DatasetError`` if the shards cannot be read."""
     rows = iter(load_undecoded(folder.root, config, streaming=True, columns=_COLUMNS))
     while True:
         try:
@@ -94,11 +95,13 @@ def _rows(folder: DatasetFolder, config: str) -> Iterator[Mapping[str, Any]]:
 
 
 def _camera_view(row: Mapping[str, Any], grid: tuple[int, int]) -> CameraView:
+    """Return the cameras of a row."""
     cameras = {eye: _camera(row, eye, grid) for eye in EYES}
     return CameraView(row["view_id"], float(row["baseline_m"]), cameras)
 
 
 def _camera(row: Mapping[str, Any], eye: str, grid: tuple[int, int]) -> Camera:
+    """Return the camera of one eye of a row."""
     K, distortion, pose = (np.array(row[f"{eye}_{kind}"], np.float64) for kind in _CAMERA_KINDS)
     height, width = grid
     return Camera(K, distortion, cam_from_world=pose, width=width, height=height)

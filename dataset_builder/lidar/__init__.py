@@ -1,7 +1,7 @@
-"""Simulated laser scanners, offered to the bench as methods through the entry points that anyone's methods use.
+"""Simulated laser scanners, registered with the benchmark as methods through the public entry points.
 
-The paper leaves "a synthetic LiDAR baseline on the existing meshes" as future work. A user's own scanner is
-``METHOD = lidar_method("mine", ScannerSpec(...), "my scanner")`` in a Python file.
+The paper leaves "a synthetic LiDAR baseline on the existing meshes" as future work. A custom scanner is a Python
+file with ``METHOD = lidar_method("mine", ScannerSpec(...), "my scanner")``.
 """
 
 from dataset_builder.lidar.method import LIDAR_MOBILE, LIDAR_SURVEY, lidar_method

@@ -1,4 +1,4 @@
-"""Laser scanners as methods: what one mounted over the left camera would answer, simulated on the scene's mesh."""
+"""Laser scanner methods: a simulated scanner above the left camera, cast against the scene's mesh."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Any
 from jaxtyping import Float32
 from numpy import ndarray
 
-from dataset_builder.lidar.beams import sector_of
+from dataset_builder.lidar.beams import visible_sector
 from dataset_builder.lidar.project import LeftCamera, left_depth_m
 from dataset_builder.lidar.scanner import MOBILE, SURVEY, ScannerSpec
-from dataset_builder.lidar.simulate import noise_generator, scan
+from dataset_builder.lidar.simulate import noise_generator, simulate_scan
 from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from rebar_depth_bench.errors import MethodError
@@ -24,14 +24,17 @@ from rebar_depth_bench.methods import ConfigViews, MethodInfo, MultiViewMethod, 
 from rebar_depth_bench.progress import Progress
 
 _DIGITS = 12
+"""Hexadecimal digits of a scanner's digest."""
+
 _COLUMNS = ("left_K", "left_distortion", "left_cam_from_world")
+"""Dataset columns that the method reads."""
 
 
 def lidar_method(name: str, spec: ScannerSpec, what: str) -> MultiViewMethod:
-    """Return the method of a scanner; ``what`` names it in the summary.
+    """Return the method of a scanner; ``what`` describes it in the summary.
 
-    It reads the scene's mesh, which is ground truth, and the scanner knows its pose exactly: a simulation of what
-    such an instrument could give, no measurement of pictures.
+    The method reads the scene's mesh, which is ground truth, and the scanner's pose is known exactly: it
+    simulates what such an instrument could measure and uses no images.
     """
 
     def check(_: ConfigViews) -> None:
@@ -49,26 +52,31 @@ def lidar_method(name: str, spec: ScannerSpec, what: str) -> MultiViewMethod:
         def run(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
             K, distortion = row["left_K"], row["left_distortion"]
             camera = LeftCamera(K, distortion, pixel_rays(K, width, height, distortion))
-            sector = sector_of(spec, camera.rays)
+            sector = visible_sector(spec, camera.rays)
             lidar_from_world = spec.lidar_from_left @ row["left_cam_from_world"]
-            range_m = scan(caster, spec, sector, lidar_from_world, noise_generator(row["view_id"]))
+            range_m = simulate_scan(caster, spec, sector, lidar_from_world, noise_generator(row["view_id"]))
             return left_depth_m(spec, sector, range_m, camera)
 
-        return Prepared(run, {"scanner": spec.notes()})
+        return Prepared(run, {"scanner": spec.to_dict()})
 
     summary = (
         f"simulated laser scanner, {what}, {-1000 * spec.position_left_m[1]:.0f} mm above the left camera, pose"
         " known exactly; reads the scene's mesh: a simulation, no measurement of pictures; no answer at"
         f" ranges below {spec.min_range_m:g} m"
     )
-    source = f"this project, scanner {_digest(spec)}"  # two scanners of one name are two methods
-    info = MethodInfo(name, summary, _COLUMNS, True, source, "Apache-2.0", reads_truth=True)
+    # The digest distinguishes scanners of the same name with different parameters.
+    source = f"this project, scanner {_digest(spec)}"
+    info = MethodInfo(name, summary, _COLUMNS, True, source, "Apache-2.0", uses_ground_truth=True)
     return MultiViewMethod(info, prepare, check)
 
 
 def _digest(spec: ScannerSpec) -> str:
-    return hashlib.sha256(json.dumps(spec.notes(), sort_keys=True).encode()).hexdigest()[:_DIGITS]
+    """Return a short digest of a scanner's parameters."""
+    return hashlib.sha256(json.dumps(spec.to_dict(), sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 
 LIDAR_SURVEY = lidar_method("lidar-survey", SURVEY, "surveyor's phase-shift class (FARO Focus S)")
+"""Method of ``SURVEY``."""
+
 LIDAR_MOBILE = lidar_method("lidar-mobile", MOBILE, "a robot's spinning class (Ouster OS1-128)")
+"""Method of ``MOBILE``."""

@@ -1,1 +1,1 @@
-"""Scenes before rendering: bars, meshes, parts, and the ray caster of the ground truth."""
+"""Scene geometry independent of Blender: bars, meshes, parts, and the ray caster of the ground truth."""

@@ -1,4 +1,7 @@
-"""The picture printed on the A3 sheet under the assembly: row 0 is the sheet's +y edge, column 0 the -x edge."""
+"""Texture of the printed ArUco board under the assembly (A3).
+
+Row 0 is the +y edge of the board, column 0 the -x edge.
+"""
 
 from __future__ import annotations
 
@@ -10,32 +13,35 @@ from numpy import ndarray
 from rebar_depth_bench.geometry.aruco_board import MARKER_MODULES, BoardSpec, marker_corners_m
 
 LINE_M = 0.0005
+"""Width of the border line, metres."""
 LINE_INSET_M = 0.002
+"""Distance of the border line from the edge of the board, metres."""
 PAPER, INK, GREY_INK = 255, 0, 120
 
 
 def board_texture(spec: BoardSpec, px_per_m: float) -> UInt8[ndarray, "h w"]:
-    """Return the printed sheet in grey levels; every marker edge falls on a pixel edge.
+    """Return the printed board as grey levels; every marker edge coincides with a pixel edge.
 
-    Raises ``ValueError`` where ``px_per_m`` does not resolve the markers' modules into whole pixels.
+    Raises ``ValueError`` if an edge of the board or of a marker is not a whole number of pixels at ``px_per_m``,
+    and for a dictionary other than 4 x 4.
     """
-    height, width = (_whole(side * px_per_m, spec, px_per_m) for side in (spec.height_m, spec.width_m))
+    height, width = (_whole_pixels(side * px_per_m, spec, px_per_m) for side in (spec.height_m, spec.width_m))
     texture = np.full((height, width), PAPER, dtype=np.uint8)
     _draw_border(texture, px_per_m)
-    module_px = _whole(spec.marker_side_m / MARKER_MODULES * px_per_m, spec, px_per_m)
+    module_px = _whole_pixels(spec.marker_side_m / MARKER_MODULES * px_per_m, spec, px_per_m)
     side_px = module_px * MARKER_MODULES
     dictionary = _dictionary(spec)
     for marker_id, corners in marker_corners_m(spec).items():
-        row = _whole((spec.height_m / 2 - corners[0, 1]) * px_per_m, spec, px_per_m)
-        column = _whole((spec.width_m / 2 + corners[0, 0]) * px_per_m, spec, px_per_m)
+        row = _whole_pixels((spec.height_m / 2 - corners[0, 1]) * px_per_m, spec, px_per_m)
+        column = _whole_pixels((spec.width_m / 2 + corners[0, 0]) * px_per_m, spec, px_per_m)
         marker = cv2.aruco.generateImageMarker(dictionary, marker_id, side_px)
         texture[row : row + side_px, column : column + side_px] = marker
         _draw_caption(texture, f"{spec.dictionary} {marker_id}", row + side_px, column, module_px)
     return texture
 
 
-def _whole(pixels: float, spec: BoardSpec, px_per_m: float) -> int:
-    """Return ``pixels`` as the whole number it must be, or say which resolution misses the pixel edges."""
+def _whole_pixels(pixels: float, spec: BoardSpec, px_per_m: float) -> int:
+    """Return ``pixels`` rounded; raise ``ValueError`` if it is not a whole number (to 1e-6)."""
     if abs(pixels - round(pixels)) > 1e-6:
         raise ValueError(
             f"at {px_per_m} px/m an edge of the board {spec} falls {pixels:.4f} pixels in, on no pixel edge"
@@ -50,7 +56,7 @@ def _dictionary(spec: BoardSpec) -> cv2.aruco.Dictionary:
 
 
 def _draw_border(texture: UInt8[ndarray, "h w"], px_per_m: float) -> None:
-    """Draw the thin line round the printed area."""
+    """Draw the thin border line around the printed area."""
     inset, line = round(LINE_INSET_M * px_per_m), max(1, round(LINE_M * px_per_m))
     ring = texture[inset:-inset, inset:-inset]
     inner = ring[line:-line, line:-line].copy()
@@ -59,7 +65,7 @@ def _draw_border(texture: UInt8[ndarray, "h w"], px_per_m: float) -> None:
 
 
 def _draw_caption(texture: UInt8[ndarray, "h w"], text: str, row_below: int, column: int, module_px: int) -> None:
-    """Print ``text`` small and grey under a marker, below its quiet zone; none where the sheet ends."""
+    """Draw ``text`` small and grey below the quiet zone of a marker; omit it if the board ends there."""
     scale, thickness = module_px / 70, max(1, module_px // 20)
     baseline = row_below + round(1.75 * module_px)
     if baseline < texture.shape[0] - module_px:

@@ -1,4 +1,4 @@
-"""The ground-truth mesh file ``meshes/<scene>.ply``: one fixed binary layout, read strictly.
+"""Reader and writer of ground-truth mesh files, ``meshes/<scene>.ply``, in one fixed binary layout.
 
 Binary little-endian PLY: float64 vertices, int32 triangles and a ``ushort`` bar id per triangle (0: not
 steel), in the world frame (right-handed, z up, board at z = 0), metres. Equal arrays give equal bytes.
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64, Int32, Integer, UInt16
 from numpy import ndarray
 
-from rebar_depth_bench.atomic_io import replacing
+from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.errors import DatasetError
 
 COMMENT = (
@@ -36,9 +36,9 @@ end_header
 """
 _VERTEX = np.dtype([("xyz", "<f8", (3,))])
 _FACE = np.dtype([("corners", "u1"), ("index", "<i4", (3,)), ("bar_id", "<u2")])
-# Far above any header in this layout; a file without `end_header` is not searched to its end.
 _HEADER_LIMIT = 1 << 16
-# Ten digits reach past int32, the widest vertex index: more is nonsense and never becomes a number.
+"""Maximum header size in bytes: a file without ``end_header`` is not searched to its end."""
+# Ten digits exceed int32, the type of vertex indices; longer counts are rejected without being converted.
 _HEADER_PATTERN = re.compile(
     r"ply\nformat binary_little_endian 1\.0\n"
     r"element vertex (\d{1,10})\nproperty double x\nproperty double y\nproperty double z\n"
@@ -48,7 +48,7 @@ _HEADER_PATTERN = re.compile(
 _COMMENTS = re.compile(r"^(?:comment|obj_info)(?: [^\n]*)?\n", re.MULTILINE)
 
 MeshArrays = tuple[Float64[ndarray, "v 3"], Int32[ndarray, "n 3"], UInt16[ndarray, " n"]]
-"""Vertices in metres, triangles, and each triangle's bar id."""
+"""Vertices (world frame, metres), triangles, and the bar id of each triangle."""
 
 
 def write_mesh_ply(
@@ -57,10 +57,10 @@ def write_mesh_ply(
     faces: Integer[ndarray, "n 3"],
     face_bar_id: Integer[ndarray, " n"],
 ) -> None:
-    """Write a world-frame mesh in metres as the dataset's PLY; the file appears whole or not at all.
+    """Write a world-frame mesh in metres as a PLY file of the dataset, atomically.
 
-    Raises ``ValueError`` where the arrays are no mesh: wrong shape, a coordinate that is not finite, a
-    corner that no vertex answers to, a bar id outside 0..65535.
+    Raises ``ValueError`` if the arrays are not a mesh: wrong shape or type, a coordinate that is not finite, a
+    vertex index out of range, or a bar id outside 0 to 65535.
     """
     _check_arrays(vertices_m, faces, face_bar_id)
     header = _HEADER.format(comment=COMMENT, vertices=len(vertices_m), faces=len(faces))
@@ -70,14 +70,14 @@ def write_mesh_ply(
     face_rows["corners"] = 3
     face_rows["index"] = faces
     face_rows["bar_id"] = face_bar_id
-    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
+    with atomic_replace(Path(path)) as temporary, temporary.open("wb") as file:
         file.writelines((header.encode("ascii"), vertex_rows.data, face_rows.data))
 
 
 def read_mesh_ply(path: str | os.PathLike[str]) -> MeshArrays:
     """Return vertices (v x 3 float64, world metres), triangles (n x 3 int32) and bar ids (n uint16).
 
-    Raises ``DatasetError`` where the file cannot be read or differs from this layout in any way.
+    Raises ``DatasetError`` if the file cannot be read or differs from this layout in any way.
     """
     try:
         content = Path(path).read_bytes()
@@ -87,14 +87,15 @@ def read_mesh_ply(path: str | os.PathLike[str]) -> MeshArrays:
 
 
 def has_mesh_ply_header(content: bytes) -> bool:
-    """Tell whether ``content`` opens with this layout's header, comments aside."""
+    """Return whether ``content`` starts with the header of this layout; comments are ignored."""
     return _match_header(content) is not None
 
 
 def parse_mesh_ply(content: bytes, where: str) -> MeshArrays:
-    """Return what ``read_mesh_ply`` returns, from a file's bytes; ``where`` names them in errors.
+    """Return the arrays of ``read_mesh_ply`` from the content of a file; ``where`` names the file in errors.
 
-    Nothing is allocated on the header's word alone. Raises ``DatasetError``.
+    The size of the content is compared with the counts in the header before arrays are allocated. Raises
+    ``DatasetError`` as ``read_mesh_ply`` does.
     """
     header = _match_header(content)
     if header is None:
@@ -117,19 +118,19 @@ def parse_mesh_ply(content: bytes, where: str) -> MeshArrays:
 
 
 def _match_header(content: bytes) -> tuple[int, int, int] | None:
-    """Return vertex count, face count and the header's length, or None where the header is another's."""
+    """Return vertex count, face count and header length in bytes, or None if the header has another layout."""
     end_mark = b"\nend_header\n"
     end = content.find(end_mark, 0, _HEADER_LIMIT)
     if not content.startswith(b"ply\n") or end < 0:
         return None
     length = end + len(end_mark)
-    # Comments say nothing about the layout, wherever they stand and in whatever encoding.
+    # Comments do not affect the layout; they may occur anywhere and in any encoding.
     match = _HEADER_PATTERN.fullmatch(_COMMENTS.sub("", content[:length].decode("latin-1")))
     return (int(match[1]), int(match[2]), length) if match else None
 
 
 def _check_rows(vertices: Float64[ndarray, "v 3"], rows: ndarray, where: str) -> None:
-    """Raise ``DatasetError`` where the body is no triangle mesh."""
+    """Raise ``DatasetError`` if the body is not a valid triangle mesh."""
     not_triangles = np.flatnonzero(rows["corners"] != 3)
     if len(not_triangles):
         row = not_triangles[0]
@@ -148,7 +149,7 @@ def _check_rows(vertices: Float64[ndarray, "v 3"], rows: ndarray, where: str) ->
 
 
 def _check_arrays(vertices_m: ndarray, faces: ndarray, face_bar_id: ndarray) -> None:
-    """Raise ``ValueError`` where the arrays cannot be written in this layout."""
+    """Raise ``ValueError`` if the arrays cannot be written in this layout."""
     if vertices_m.ndim != 2 or vertices_m.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise ValueError(f"vertices {vertices_m.shape} and faces {faces.shape}: expected (v, 3) and (n, 3)")
     if face_bar_id.shape != faces.shape[:1]:

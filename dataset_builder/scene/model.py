@@ -1,4 +1,4 @@
-"""What a scene is made of before any renderer sees it: bars, meshes, parts. World frame, metres."""
+"""Scene model, independent of any renderer: bars, meshes and parts. World frame, metres."""
 
 from __future__ import annotations
 
@@ -8,25 +8,33 @@ import numpy as np
 from jaxtyping import Float64, Int32, UInt16
 from numpy import ndarray
 
-from rebar_depth_bench.data.bars import Bar as Bar
+from rebar_depth_bench.data.bars import Bar
 
 NOT_STEEL = 0
-"""The bar id of every surface that is not reinforcement."""
+"""Bar id of all surfaces that are not reinforcement."""
 
 
 MAX_BARS = int(np.iinfo(np.uint16).max)
-"""Bar ids are 16-bit, and 0 is taken."""
+"""Maximum number of bars: bar ids are 16-bit, and 0 is reserved for ``NOT_STEEL``."""
+
+METRE_DECIMALS = 12
+"""Rounding of the lengths in scene files and IFC models after conversion to metres: to the picometre."""
 
 STEEL = "steel"
-"""The material of bars."""
+"""Material name of bars."""
 
-ESTIMATED = "imported"
-"""The role of a bar whose axis and diameter were estimated from its surface."""
+ESTIMATED_ROLE = "imported"
+"""Role of bars whose axis and diameter were estimated from their surface."""
+
+
+def axis_of(line_m: Float64[ndarray, "n 3"]) -> tuple[tuple[float, float, float], ...]:
+    """Return a centreline as ``Bar.axis_m``."""
+    return tuple((x, y, z) for x, y, z in line_m.tolist())
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh, counter-clockwise from outside; ``vertices_m`` in its own frame."""
+    """Triangle mesh, counter-clockwise seen from outside; ``vertices_m`` in a local frame, metres."""
 
     vertices_m: Float64[ndarray, "v 3"]
     faces: Int32[ndarray, "f 3"]
@@ -34,7 +42,7 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One object of a scene: a mesh in the world frame, the bar it is (0: none) and its material's name."""
+    """Object of a scene: a mesh in the world frame, its bar id (0: not steel) and the name of its material."""
 
     name: str
     mesh: Mesh
@@ -44,20 +52,20 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Assembly:
-    """The steel of a scene: its bars, and a part for each of them."""
+    """Steel of a scene: its bars, and one part per bar."""
 
     bars: tuple[Bar, ...]
     parts: tuple[Part, ...]
 
     @property
     def vertices_m(self) -> Float64[ndarray, "v 3"]:
-        """The vertices of all parts, world frame, metres."""
+        """Vertices of all parts, world frame, metres."""
         return np.concatenate([part.mesh.vertices_m for part in self.parts])
 
 
 @dataclass(frozen=True, eq=False)
 class WorldMesh:
-    """All surfaces of a scene as one mesh: what rays are cast against and what ``meshes/*.ply`` holds."""
+    """All surfaces of a scene as one mesh: the input of the ray caster and the content of ``meshes/*.ply``."""
 
     vertices_m: Float64[ndarray, "v 3"]
     faces: Int32[ndarray, "f 3"]

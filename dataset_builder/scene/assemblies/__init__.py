@@ -1,4 +1,4 @@
-"""From the description of an assembly to its bars and meshes."""
+"""Assembly construction: bars and meshes from an assembly spec, with checks against a config's cameras."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dataset_builder.config.specs import (
     PierSpec,
     PileSpec,
 )
-from dataset_builder.config.trajectories import offsets_m
+from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.scene.assemblies.cage_file import load_cage
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.assemblies.mesh_file import load_assembly
@@ -26,52 +26,63 @@ from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.assemblies.pile import pile_assembly
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.variants import SHADOWS
-from dataset_builder.scene.variants.panels import DISTANCE
+from dataset_builder.scene.variants.panels import SCREEN_DISTANCE
 from rebar_depth_bench.errors import InputError, MeshError
 
-_MAKERS: Mapping[type, Callable[[Any], Assembly]] = {
+_BUILDERS: Mapping[type, Callable[[Any], Assembly]] = {
     CageFileSpec: load_cage,
     LatticeSpec: lattice_assembly,
     MeshFileSpec: load_assembly,
     PierSpec: pier_assembly,
     PileSpec: pile_assembly,
 }
-_TARGET_DECIMALS = 3
-_BELOW_BOARD_M = 0.001
+_AIM_POINT_DECIMALS = 3
+"""Rounding of the aim point in metres: to the millimetre."""
+
+_BOARD_TOLERANCE_M = 0.001
+"""Depth below z = 0 that an assembly may reach, metres."""
 
 
 def make_assembly(spec: AssemblySpec) -> Assembly:
-    """Return the bars and meshes of an assembly; raise ``MeshError`` where a user's file cannot serve."""
-    return _MAKERS[type(spec)](spec)
+    """Return the bars and meshes of an assembly (world frame, metres).
+
+    Raises ``MeshError`` if a user's file cannot be used, ``ValueError`` if the bars of a generated assembly
+    would collide or not fit.
+    """
+    return _BUILDERS[type(spec)](spec)
 
 
 def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
-    """Raise ``MeshError`` where an assembly reaches below the board or out to the config's nearest camera."""
+    """Check that an assembly stays above the board and clear of the config's cameras.
+
+    Raises ``MeshError`` if it reaches more than 1 mm below z = 0 or as far as the nearest camera, and
+    ``InputError`` if the screen of the variant ``shadows`` would hang among the cameras.
+    """
     vertices_m = assembly.vertices_m
     lowest = min(assembly.parts, key=lambda part: float(part.mesh.vertices_m[:, 2].min()))
     lowest_m = float(lowest.mesh.vertices_m[:, 2].min())
-    if lowest_m < -_BELOW_BOARD_M:
+    if lowest_m < -_BOARD_TOLERANCE_M:
         raise MeshError(
             f"{config.name}: {lowest.name} reaches down to z = {lowest_m:.4g} m, ribs and all, expected 0 or "
             "above, where the board or the ground is"
         )
     reach_m = float(np.linalg.norm(vertices_m - aim_point_m(assembly), axis=1).max())
-    nearest_m = min(float(np.linalg.norm(offset)) for offset in offsets_m(config.protocol))
+    nearest_m = min(float(np.linalg.norm(offset)) for offset in camera_offsets_m(config.protocol))
     if reach_m >= nearest_m:
         raise MeshError(
             f"the assembly reaches {reach_m:.4g} m from its middle, expected less than the {nearest_m:.4g} m "
             f"at which the cameras of {config.name} stand: is the unit right?"
         )
-    _check_screen(vertices_m, config)
+    _check_shadow_screen(vertices_m, config)
 
 
-def _check_screen(vertices_m: Float64[ndarray, "n 3"], config: ConfigSpec) -> None:
-    """Raise ``InputError`` where the screen of the variant ``shadows`` would hang among the cameras."""
+def _check_shadow_screen(vertices_m: Float64[ndarray, "n 3"], config: ConfigSpec) -> None:
+    """Raise ``InputError`` if the screen of the variant ``shadows`` would hang among the cameras."""
     if SHADOWS not in config.scene.appearance.variants:
         return
-    farthest_m = max(float(np.linalg.norm(offset)) for offset in offsets_m(config.protocol))
+    farthest_m = max(float(np.linalg.norm(offset)) for offset in camera_offsets_m(config.protocol))
     right_eye_m = float(np.hypot(farthest_m, config.rig.baseline_m))
-    screen_m = DISTANCE * float(np.linalg.norm(np.ptp(vertices_m, axis=0))) / 2
+    screen_m = SCREEN_DISTANCE * float(np.linalg.norm(np.ptp(vertices_m, axis=0))) / 2
     if right_eye_m >= screen_m:
         raise InputError(
             f"the screen of the variant {SHADOWS!r} would hang {screen_m:.4g} m from the steel, expected it "
@@ -80,10 +91,10 @@ def _check_screen(vertices_m: Float64[ndarray, "n 3"], config: ConfigSpec) -> No
 
 
 def aim_point_m(assembly: Assembly) -> Float64[ndarray, 3]:
-    """Return what cameras look at: the middle of the steel's bounding box, to the millimetre.
+    """Return the point that cameras aim at (world, metres): the steel's bounding-box centre, to the millimetre.
 
     Rounding keeps ribs and float32 storage from moving the cameras.
     """
     vertices = assembly.vertices_m
     middle: Float64[ndarray, 3] = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    return np.asarray(np.round(middle, _TARGET_DECIMALS) + 0.0)  # no negative zero
+    return np.asarray(np.round(middle, _AIM_POINT_DECIMALS) + 0.0)  # Adding 0.0 turns -0.0 into 0.0.

@@ -1,16 +1,18 @@
-"""Mesh files as parts: from a file's content to one mesh per bar id, in world metres, z up.
+"""Mesh file import: one mesh per bar id from a file's content, in world metres, z up.
 
-- The dataset's own PLY (``dataset_builder.scene.mesh_ply``) is taken as it stands: the faces of one ``bar_id``
-  are a part, which keeps that id; id 0 (board, table) is left out.
-- Every other file is read by trimesh. Where it holds several glTF nodes or OBJ objects (``o``), each is a
-  part. Parts are numbered from 1 by name, numbers within names by value ("bar2" before "bar10"); a nameless
-  node is called by its index, and trimesh appends "_1", "_2", ... to a repeated node name.
-- A file of one object (any STL or PLY) is split into connected components after vertices closer than 10 nm
-  are made one: numbered from 1 in the order of their first faces. Bars that share a vertex are one part.
+- The dataset's own PLY layout (``dataset_builder.scene.mesh_ply``) is used unchanged: the faces with one
+  ``bar_id`` form a part with that id; faces with id 0 (board, table) are left out.
+- Every other file is read by trimesh. If it holds several glTF nodes or OBJ objects (``o``), each is a part.
+  Parts are numbered from 1 in the order of their names, with numbers within names compared by value ("bar2"
+  before "bar10"). An unnamed node is named by its index, and trimesh appends "_1", "_2", ... to a repeated
+  node name.
+- A file with one object (any STL or PLY) is split into connected components after vertices closer than 10 nm
+  are merged. Components are numbered from 1 in the order of their first faces. Bars that share a vertex are
+  one part.
 
-STL, PLY and OBJ coordinates are taken as they stand and should be z up; glTF is y up by its specification
-and is turned: (x, y, z) becomes (x, -z, y). Outside the own PLY, a closed part that is wound inside out is
-turned outward.
+STL, PLY and OBJ coordinates are used unchanged and should be z up. glTF is y up by its specification and is
+rotated: (x, y, z) becomes (x, -z, y). Except in the dataset's own PLY, a closed part that is wound inside out
+is reversed.
 """
 
 from __future__ import annotations
@@ -37,19 +39,19 @@ from dataset_builder.scene.model import MAX_BARS, NOT_STEEL, Mesh
 from rebar_depth_bench.errors import DatasetError, MeshError
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
-"""The suffixes of the mesh files that are read, in lower case."""
+"""Supported suffixes of mesh files, in lower case."""
+
 MIN_EXTENT_M = 0.001
 MAX_EXTENT_M = 100.0
-"""An assembly's largest side lies strictly between these, or its unit is wrong."""
+"""Exclusive bounds of the largest side of an assembly, metres; beyond them its unit is wrong."""
 
-_PLAIN_GLTF = (
+_UNSUPPORTED_GLTF = (
     rb'"sparse"\s*:|EXT_mesh_gpu_instancing|KHR_mesh_quantization|KHR_draco_mesh_compression|EXT_meshopt',
     "it has sparse, instanced, quantised or compressed meshes, expected plain ones",
 )
-# What trimesh would read wrong without a word: what is searched for, and the words of the refusal.
-_UNREAD = {
-    ".glb": _PLAIN_GLTF,
-    ".gltf": _PLAIN_GLTF,
+_UNSUPPORTED_CONTENT = {
+    ".glb": _UNSUPPORTED_GLTF,
+    ".gltf": _UNSUPPORTED_GLTF,
     ".obj": (rb"(?m)^f[ \t][^\n#]*-", "it has relative (negative) vertex indices, expected absolute ones"),
     ".ply": (
         rb"(?m)\Aply\r?\n(?:(?!end_header)[^\n]*\n)*property \w+ bar_id\s*$",
@@ -57,51 +59,53 @@ _UNREAD = {
         "are numbered",
     ),
 }
+"""Content that trimesh would misread silently, by suffix: a search pattern and the text of the error."""
 
-# With a handler of its own, what the loader logs (tracebacks among it) does not go to stderr.
+# A handler on trimesh's logger keeps its messages, including tracebacks, off stderr.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 def read_parts(content: bytes, spec: MeshFileSpec) -> dict[int, Mesh]:
-    """Return one mesh in metres per bar id, ascending, of a file's ``content``; ``spec.path`` tells its kind.
+    """Return one mesh (world, metres) per bar id, ascending, from a file's ``content``.
 
-    Raises ``MeshError`` where the content cannot be read, holds no triangle, only id 0, more than
-    ``MAX_BARS`` parts or a coordinate that is not finite, or where its extent is absurd for the unit.
+    The suffix of ``spec.path`` selects the format. Raises ``MeshError`` if the content cannot be read, holds no
+    triangle, only id 0, more than ``MAX_BARS`` parts or a non-finite coordinate, or if its extent is
+    implausible for the unit.
     """
-    with _errors_in_words(spec.path):
+    with _loader_errors_as_mesh_errors(spec.path):
         if Path(spec.path).suffix.lower() == ".ply" and has_mesh_ply_header(content):
-            return _own_parts(content, spec)
-        objects = _objects(content, spec)
+            return _dataset_ply_parts(content, spec)
+        objects = _read_objects(content, spec)
         _check_extent(objects, spec)
-        parts = objects if len(objects) > 1 else _components(objects[0])
+        parts = objects if len(objects) > 1 else connected_components(_merged_close_vertices(objects[0]))
         if len(parts) > MAX_BARS:
             raise MeshError(f"{spec.path}: {len(parts)} separate parts found, expected at most {MAX_BARS} bars")
-        return {bar_id: _outward(part) for bar_id, part in enumerate(parts, start=1)}
+        return {bar_id: _oriented_outward(part) for bar_id, part in enumerate(parts, start=1)}
 
 
-def _own_parts(content: bytes, spec: MeshFileSpec) -> dict[int, Mesh]:
-    """Return the parts of the dataset's own PLY; where the unit is the metre, to the bit."""
+def _dataset_ply_parts(content: bytes, spec: MeshFileSpec) -> dict[int, Mesh]:
+    """Return the parts of a PLY in the dataset's own layout, bit by bit if the unit is the metre."""
     vertices, faces, bar_id = parse_mesh_ply(content, spec.path)
     whole = Mesh(vertices * spec.unit_m, faces)
-    parts = {int(bar_id[group[0]]): _cut(whole, group) for group in _groups(bar_id)}
+    parts = {int(bar_id[group[0]]): _submesh(whole, group) for group in _indices_by_label(bar_id)}
     if parts.pop(NOT_STEEL, None) is not None and not parts:
         raise MeshError(f"{spec.path}: every face has bar_id 0 (not steel), expected at least one bar")
     _check_extent(parts.values(), spec)
     return parts
 
 
-def _objects(content: bytes, spec: MeshFileSpec) -> list[Mesh]:
-    """Return the objects of any other file in metres, by name; those without triangles are left out."""
+def _read_objects(content: bytes, spec: MeshFileSpec) -> list[Mesh]:
+    """Return the objects of any other file that have triangles (metres, z up), ordered by name."""
     suffix = Path(spec.path).suffix.lower()
     if suffix == ".stl":
-        return [_mesh(*_triangles_of_stl(content), spec)]
-    pattern, words = _UNREAD[suffix]
+        return [_mesh_in_metres(*_stl_triangles(content), spec)]
+    pattern, problem = _UNSUPPORTED_CONTENT[suffix]
     if re.search(pattern, content):
-        raise MeshError(f"{spec.path}: {words}")
+        raise MeshError(f"{spec.path}: {problem}")
     scene = trimesh.load_scene(
         io.BytesIO(content),
         file_type=suffix[1:],
-        resolver=_NoNeighbours(),
+        resolver=_NoSiblingFiles(),
         process=False,
         skip_materials=True,
         group_material=False,
@@ -111,41 +115,47 @@ def _objects(content: bytes, spec: MeshFileSpec) -> list[Mesh]:
     for body in scene.dump():
         if isinstance(body, trimesh.Trimesh) and len(body.faces):
             bodies[_object_name(scene, body)].append((body.vertices, body.faces))
-    # Primitives of one object become one mesh.
-    joined = [trimesh.util.append_faces(*zip(*bodies[name], strict=True)) for name in sorted(bodies, key=_natural)]
-    return [_mesh(vertices, faces, spec) for vertices, faces in joined]
+    # The primitives of one object are joined into one mesh.
+    joined = [
+        trimesh.util.append_faces(*zip(*bodies[name], strict=True))
+        for name in sorted(bodies, key=_natural_sort_key)
+    ]
+    return [_mesh_in_metres(vertices, faces, spec) for vertices, faces in joined]
 
 
-def _triangles_of_stl(content: bytes) -> tuple[ndarray, ndarray]:
-    """Return the corners of all solids, in order, and faces that name them in threes."""
-    # Not through load_scene, which mends several solids: corners that are not finite would vanish.
-    found = trimesh.exchange.stl.load_stl(io.BytesIO(content))
-    solids = found["geometry"].values() if "geometry" in found else [found]
+def _stl_triangles(content: bytes) -> tuple[ndarray, ndarray]:
+    """Return the corners (n, 3) of all solids, in order, and faces (n / 3, 3) of consecutive corners."""
+    # load_scene repairs files with several solids, which would drop corners that are not finite.
+    loaded = trimesh.exchange.stl.load_stl(io.BytesIO(content))
+    solids = loaded["geometry"].values() if "geometry" in loaded else [loaded]
     corners = np.concatenate([np.empty((0, 3)), *(solid["vertices"] for solid in solids)])
     return corners, np.arange(len(corners)).reshape(-1, 3)
 
 
 def _object_name(scene: trimesh.Scene, body: trimesh.Trimesh) -> str:
-    """Return the name of the node that ``body`` belongs to."""
+    """Return the name of the glTF node or OBJ object that ``body`` belongs to."""
     node = str(body.metadata["node"])
     parent = str(scene.graph.transforms.parents.get(node))
-    # trimesh hangs the primitives of a glTF node below it, as "<node>_<six random letters>".
+    # trimesh adds the primitives of a glTF node as its children, named "<node>_<six random letters>".
     is_primitive = body.metadata.get("from_gltf_primitive") and node[:-7] == parent
     return parent if is_primitive else node
 
 
-def _natural(name: str) -> tuple[list[str | int], str]:
-    """Return a key that sorts numbers within names by value."""
-    return [int(text) if at % 2 else text for at, text in enumerate(re.split(r"(\d+)", name))], name
+def _natural_sort_key(name: str) -> tuple[list[str | int], str]:
+    """Return a sort key that compares numbers within names by value."""
+    return [int(text) if index % 2 else text for index, text in enumerate(re.split(r"(\d+)", name))], name
 
 
-def _mesh(vertices: ArrayLike, faces: ArrayLike, spec: MeshFileSpec) -> Mesh:
-    """Return what a file holds in metres, z up; raise ``MeshError`` where it is no mesh."""
+def _mesh_in_metres(vertices: ArrayLike, faces: ArrayLike, spec: MeshFileSpec) -> Mesh:
+    """Return a mesh in metres, z up, from a file's vertices and faces.
+
+    Raises ``MeshError`` if a coordinate is not finite or a face refers to a vertex that does not exist.
+    """
     points = np.asarray(vertices, np.float64).reshape(-1, 3)
     corners = np.asarray(faces, np.int64).reshape(-1, 3)
-    wild = points[~np.isfinite(points).all(axis=1)]
-    if len(wild):
-        raise MeshError(f"{spec.path}: a vertex is {wild[0].tolist()}, expected finite coordinates")
+    non_finite = points[~np.isfinite(points).all(axis=1)]
+    if len(non_finite):
+        raise MeshError(f"{spec.path}: a vertex is {non_finite[0].tolist()}, expected finite coordinates")
     if corners.size and not (corners.min() >= 0 and corners.max() < len(points)):
         raise MeshError(
             f"{spec.path}: triangles name vertices {corners.min()} to {corners.max()}, expected 0 to "
@@ -156,29 +166,34 @@ def _mesh(vertices: ArrayLike, faces: ArrayLike, spec: MeshFileSpec) -> Mesh:
     return Mesh(points * spec.unit_m, corners.astype(np.int32))
 
 
-def _components(mesh: Mesh) -> list[Mesh]:
-    """Return the connected components by their first faces; faces keep their order."""
+def connected_components(mesh: Mesh) -> list[Mesh]:
+    """Return the connected components, ordered by their first faces; faces and vertices keep their order."""
+    edges = trimesh.geometry.faces_to_edges(mesh.faces)
+    vertex_label = trimesh.graph.connected_component_labels(edges, len(mesh.vertices_m))
+    groups = _indices_by_label(vertex_label[mesh.faces[:, 0]])
+    return [_submesh(mesh, group) for group in sorted(groups, key=lambda group: int(group[0]))]
+
+
+def _merged_close_vertices(mesh: Mesh) -> Mesh:
+    """Return the mesh with vertices closer than 10 nm merged."""
     body = trimesh.Trimesh(mesh.vertices_m, mesh.faces)
-    vertex_label = trimesh.graph.connected_component_labels(body.edges, len(body.vertices))
-    groups = _groups(vertex_label[body.faces[:, 0]])
-    whole = Mesh(np.array(body.vertices), np.array(body.faces, np.int32))
-    return [_cut(whole, group) for group in sorted(groups, key=lambda group: int(group[0]))]
+    return Mesh(np.array(body.vertices), np.array(body.faces, np.int32))
 
 
-def _groups(label: Integer[ndarray, " n"]) -> list[Integer[ndarray, " k"]]:
-    """Return the ascending indices of each value, by ascending values."""
+def _indices_by_label(label: Integer[ndarray, " n"]) -> list[Integer[ndarray, " k"]]:
+    """Return the ascending indices at which each label occurs, ordered by label."""
     return [np.sort(group) for group in trimesh.grouping.group(label) if len(group)]
 
 
-def _cut(mesh: Mesh, faces_kept: Integer[ndarray, " k"]) -> Mesh:
-    """Return some faces as a mesh of their own; vertices and faces keep their order."""
+def _submesh(mesh: Mesh, faces_kept: Integer[ndarray, " k"]) -> Mesh:
+    """Return the faces ``faces_kept`` with the vertices they use; vertices and faces keep their order."""
     faces = mesh.faces[faces_kept]
     used, index = np.unique(faces, return_inverse=True)
     return Mesh(mesh.vertices_m[used], index.reshape(faces.shape).astype(np.int32))
 
 
-def _outward(mesh: Mesh) -> Mesh:
-    """Return the mesh with close vertices made one, reversed where it is closed and wound inside out."""
+def _oriented_outward(mesh: Mesh) -> Mesh:
+    """Return the mesh with close vertices merged, reversed if it is closed and wound inside out."""
     body = trimesh.Trimesh(mesh.vertices_m, mesh.faces)
     if body.is_watertight and body.is_winding_consistent and body.volume < 0:
         body.invert()
@@ -186,7 +201,7 @@ def _outward(mesh: Mesh) -> Mesh:
 
 
 def _check_extent(meshes: Iterable[Mesh], spec: MeshFileSpec) -> None:
-    """Raise ``MeshError`` where nothing is there, or of a size that no assembly of reinforcement has."""
+    """Raise ``MeshError`` if there is no triangle or the extent is implausible for a reinforcement assembly."""
     corners = np.concatenate([np.empty((0, 3)), *(mesh.vertices_m[mesh.faces.ravel()] for mesh in meshes)])
     if not len(corners):
         raise MeshError(f"{spec.path}: no triangle found, expected the surface of at least one bar")
@@ -198,20 +213,20 @@ def _check_extent(meshes: Iterable[Mesh], spec: MeshFileSpec) -> None:
         )
 
 
-class _NoNeighbours(dict[str, bytes]):
-    """The files beside a mesh file, none of which is read: ``sha256`` does not cover them."""
+class _NoSiblingFiles(dict[str, bytes]):
+    """A trimesh resolver that refuses files beside the mesh file, since ``spec.sha256`` does not cover them."""
 
     def __missing__(self, name: str) -> bytes:
         raise FileNotFoundError(f"{name!r} would be looked for beside it: save all in one .glb")
 
 
 @contextmanager
-def _errors_in_words(where: str) -> Iterator[None]:
-    """Raise whatever a damaged or hostile file makes of the loader as one sentence."""
+def _loader_errors_as_mesh_errors(where: str) -> Iterator[None]:
+    """Convert any exception that a damaged or hostile file causes in the loader to a one-line ``MeshError``."""
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
-            # What NumPy says of text that it reads only to the first garbled number.
+            # NumPy emits this warning if it stops reading text at a malformed number.
             warnings.filterwarnings("error", "string or file could not be read to its end")
             yield
     except MeshError:

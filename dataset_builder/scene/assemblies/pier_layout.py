@@ -1,8 +1,8 @@
-"""Where the bars of a square pier cage lie, and whether a spec leaves room for them. World frame, metres.
+"""Positions of the bars of a square pier cage, and checks that a spec leaves room for them. World frame, metres.
 
 The cage stands on z = 0, centred on x = y = 0. The verticals stand in four rows, each counted from the
-negative side; hoops lie outside of them, ties hook round them. Every level is a stack of three layers, one
-bar thick: the first half hoop, the second one, the tie.
+negative side; hoops lie outside of them, ties hook round them. Every level is a stack of three layers, each
+one bar thick: the first half hoop, the second half hoop, the tie.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from dataset_builder.scene.shapes.bar_mesh import plain_outer_radius_m
 from dataset_builder.scene.shapes.bending import bend_radius_m
 
 CLEAR_GAP_M = 5e-4
-"""Between bars that a tie wire would pull together: no two surfaces coincide."""
+"""Clear distance between bars that would be tied together, metres, so that no surfaces coincide."""
 
-HOOK_EXTENSION = 10.0
-"""Straight end of a hook in diameters: EN 1998-1, 5.6.1 at 135 degrees, EN 1992-1-1, figure 8.5 at 90."""
+HOOK_EXTENSION_DIAMETERS = 10.0
+"""Straight end of a hook in diameters: EN 1998-1, 5.6.1 at 135 degrees, EN 1992-1-1, figure 8.5 at 90 degrees."""
 
-LEAST_LAP = 40.0
-"""Straight overlap of two half hoops in diameters, at least; it ends on verticals, so it comes out longer."""
+MIN_LAP_DIAMETERS = 40.0
+"""Least straight overlap of two half hoops in diameters; laps end on verticals and are therefore longer."""
 
 STOCK_LENGTH_M = 12.0
-"""The longest bar that mills sell from stock."""
+"""Length of the longest stock bar, metres."""
 
 
 @dataclass(frozen=True)
-class Link:
-    """A kind of bent bar: its nominal diameter, its outer radius as drawn, its centreline's bend radius."""
+class BentBarType:
+    """A type of bent bar: nominal diameter, outer radius of its mesh and bend radius of its centreline."""
 
     diameter_m: float
     outer_radius_m: float
@@ -42,23 +42,23 @@ class Link:
 
     @property
     def hook_extension_m(self) -> float:
-        """The straight end of its hooks, metres."""
-        return HOOK_EXTENSION * self.diameter_m
+        """Length of the straight end of a hook, metres."""
+        return HOOK_EXTENSION_DIAMETERS * self.diameter_m
 
 
 @dataclass(frozen=True)
 class PierLayout:
-    """The positions that all bars of a pier are made from, metres.
+    """Positions of all bars of a pier, metres.
 
-    ``rows_m`` are the places of a side's verticals along it, corners included. Verticals between corners stand
-    ``face_m`` from the middle plane; corner ones stand further in, in the bend of the hoops. Centrelines of
-    hoops run ``hoop_line_m`` from the middle plane, the ends of ties reach to ``tie_line_m``. Half hoops end
-    with hooks round the verticals number ``lap_rows`` of a side. ``level_layers_m`` holds the heights of both
-    half hoops and the tie, level by level.
+    ``rows_m`` are the positions of a side's verticals along it, corners included. Verticals between corners are
+    at a distance ``face_m`` from the middle plane; corner verticals are further in, in the bend of the hoops.
+    Centrelines of hoops are at ``hoop_line_m`` from the middle plane, the ends of ties reach to ``tie_line_m``.
+    ``lap_rows`` are the indices of a side's verticals round which half hoops end with hooks. ``level_layers_m``
+    are the heights of first half hoop, second half hoop and tie of each level.
     """
 
-    hoop: Link
-    tie: Link
+    hoop: BentBarType
+    tie: BentBarType
     rows_m: tuple[float, ...]
     face_m: float
     hoop_line_m: float
@@ -68,16 +68,16 @@ class PierLayout:
 
     @property
     def intervals(self) -> int:
-        """Spaces between the verticals of one side."""
+        """Number of spaces between the verticals of one side."""
         return len(self.rows_m) - 1
 
 
 def pier_layout(spec: PierSpec) -> PierLayout:
-    """Return the positions of all bars of ``spec``; raise ``ValueError`` where they would not fit or collide."""
-    _check_numbers(spec)
+    """Return the positions of all bars of ``spec``; raise ``ValueError`` if they would not fit or collide."""
+    _check_spec_values(spec)
     vertical_m = plain_outer_radius_m(spec.vertical_diameter_m)
-    hoop = _link(spec.hoop_diameter_m, vertical_m)
-    tie = _link(spec.tie_diameter_m, vertical_m)
+    hoop = _bent_bar_type(spec.hoop_diameter_m, vertical_m)
+    tie = _bent_bar_type(spec.tie_diameter_m, vertical_m)
     hoop_line_m = spec.side_m / 2 - hoop.outer_radius_m
     face_m = hoop_line_m - hoop.outer_radius_m - CLEAR_GAP_M - vertical_m
     corner_m = hoop_line_m - _corner_inset_m(hoop, vertical_m)
@@ -96,8 +96,8 @@ def pier_layout(spec: PierSpec) -> PierLayout:
     )
 
 
-def vertical_places_m(layout: PierLayout) -> Float64[ndarray, "n 2"]:
-    """Return where the verticals stand (x, y), counter-clockwise from the corner at -x, -y."""
+def vertical_positions_m(layout: PierLayout) -> Float64[ndarray, "n 2"]:
+    """Return the positions (x, y) of the verticals, counter-clockwise from the corner at -x, -y."""
     side = [(row_m, -layout.face_m) for row_m in layout.rows_m[:-1]]
     side[0] = (layout.rows_m[0], layout.rows_m[0])
     south = np.array(side)
@@ -105,23 +105,25 @@ def vertical_places_m(layout: PierLayout) -> Float64[ndarray, "n 2"]:
     return np.concatenate([south, east, -south, -east])
 
 
-def tie_row(turn: int, intervals: int) -> int:
-    """Return the row that the tie number ``turn`` of its direction holds: never a corner, neighbours far apart.
+def tie_row(tie_number: int, intervals: int) -> int:
+    """Return the row (never a corner) that the tie ``tie_number`` of its direction holds.
 
-    Steps of seven, or of the next number that shares no divisor with the rows, visit all inner rows in turn.
+    Consecutive ties are far apart: steps of seven rows, or of the next number that is coprime to the number of
+    inner rows, visit all inner rows.
     """
     rows = intervals - 1
     step = next(step for step in count(7) if gcd(step, rows) == 1)
-    return 1 + step * turn % rows
+    return 1 + step * tie_number % rows
 
 
 def check_stock_length(role: str, length_m: float) -> None:
-    """Raise ``ValueError`` where a bar is longer than any that can be bought."""
+    """Raise ``ValueError`` if a bar is longer than the longest stock bar."""
     if length_m > STOCK_LENGTH_M:
         raise ValueError(f"a {role} of this pier is {length_m:.2f} m long, stock bars end at {STOCK_LENGTH_M} m")
 
 
-def _check_numbers(spec: PierSpec) -> None:
+def _check_spec_values(spec: PierSpec) -> None:
+    """Raise ``ValueError`` unless the values of ``spec`` are positive, finite and consistent."""
     if not all(0 < value < inf for value in astuple(spec) if not isinstance(value, str)):
         raise ValueError(f"lengths, diameters and counts must be positive and finite: {spec}")
     if spec.verticals % 4:
@@ -133,42 +135,49 @@ def _check_numbers(spec: PierSpec) -> None:
         )
 
 
-def _link(diameter_m: float, vertical_m: float) -> Link:
-    """Return a bent bar with the least mandrel of EN 1992-1-1, or a wider one where a vertical needs it."""
+def _bent_bar_type(diameter_m: float, vertical_m: float) -> BentBarType:
+    """Return the bar type with the smallest mandrel of EN 1992-1-1, or a larger one if a vertical requires it."""
     outer_m = plain_outer_radius_m(diameter_m)
-    return Link(diameter_m, outer_m, max(bend_radius_m(diameter_m), vertical_m + CLEAR_GAP_M + outer_m))
+    return BentBarType(diameter_m, outer_m, max(bend_radius_m(diameter_m), vertical_m + CLEAR_GAP_M + outer_m))
 
 
-def _corner_inset_m(hoop: Link, vertical_m: float) -> float:
-    """Return how far from both legs of a hoop its corner vertical stands, so that the bend clears it."""
-    play_m = hoop.bend_radius_m - hoop.outer_radius_m - CLEAR_GAP_M - vertical_m
-    return hoop.bend_radius_m - play_m / sqrt(2)
+def _corner_inset_m(hoop: BentBarType, vertical_m: float) -> float:
+    """Return the distance of a corner vertical from both legs of a hoop at which the bend clears it, metres."""
+    clearance_m = hoop.bend_radius_m - hoop.outer_radius_m - CLEAR_GAP_M - vertical_m
+    return hoop.bend_radius_m - clearance_m / sqrt(2)
 
 
-def _check_hooks(spacing_m: float, vertical_m: float, link: Link) -> None:
-    """Raise where the end of a hook, 45 degrees into the core, could reach the next vertical or its row."""
-    reach_m = (link.bend_radius_m + link.hook_extension_m) / sqrt(2) + link.outer_radius_m
+def _check_hooks(spacing_m: float, vertical_m: float, bar_type: BentBarType) -> None:
+    """Raise ``ValueError`` if the end of a hook, 45 degrees inwards, could reach the next vertical or row."""
+    reach_m = (bar_type.bend_radius_m + bar_type.hook_extension_m) / sqrt(2) + bar_type.outer_radius_m
     needed_m = reach_m + CLEAR_GAP_M + vertical_m
     if spacing_m < needed_m:
         raise ValueError(
-            f"verticals stand {spacing_m:.4f} m apart, the hooks of {link.diameter_m} m bars need {needed_m:.4f} m"
+            f"verticals stand {spacing_m:.4f} m apart, the hooks of {bar_type.diameter_m} m bars need "
+            f"{needed_m:.4f} m"
         )
 
 
 def _lap_rows(intervals: int, spacing_m: float, diameter_m: float) -> tuple[int, int]:
-    """Return the numbers of the verticals at which a side's lap begins and ends, round the side's middle."""
-    spanned = ceil(LEAST_LAP * diameter_m / spacing_m)
-    low = (intervals - spanned) // 2
+    """Return the indices of the verticals at which a side's lap begins and ends, centred on the side.
+
+    Raises ``ValueError`` if the side has too few intervals for the lap.
+    """
+    spanned_intervals = ceil(MIN_LAP_DIAMETERS * diameter_m / spacing_m)
+    low = (intervals - spanned_intervals) // 2
     if low < 1:
         raise ValueError(
-            f"a lap of {LEAST_LAP * diameter_m:.3f} m takes {spanned} spaces between verticals, "
-            f"a side has {intervals}, expected {spanned + 2} or more"
+            f"a lap of {MIN_LAP_DIAMETERS * diameter_m:.3f} m takes {spanned_intervals} spaces between verticals, "
+            f"a side has {intervals}, expected {spanned_intervals + 2} or more"
         )
-    return low, low + spanned
+    return low, low + spanned_intervals
 
 
-def _level_layers_m(spec: PierSpec, hoop: Link, tie: Link) -> tuple[tuple[float, float, float], ...]:
-    """Return the heights of first half hoop, second half hoop and tie of each level, evenly spread."""
+def _level_layers_m(spec: PierSpec, hoop: BentBarType, tie: BentBarType) -> tuple[tuple[float, float, float], ...]:
+    """Return the heights of first half hoop, second half hoop and tie of each level, evenly spaced.
+
+    Raises ``ValueError`` if the levels are closer than the height of one level's three layers.
+    """
     above_first = np.cumsum(
         [0.0, 2 * hoop.outer_radius_m + CLEAR_GAP_M, hoop.outer_radius_m + CLEAR_GAP_M + tie.outer_radius_m]
     )

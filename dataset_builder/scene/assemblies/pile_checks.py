@@ -1,4 +1,4 @@
-"""How stirrups are thrown on a heap, and what the heap must be like. World frame, metres, board at z = 0."""
+"""Initial poses and geometric checks of a simulated pile. World frame, metres, board at z = 0."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.scene.assemblies.pile import Pose, placed_m
-from dataset_builder.scene.shapes.bending import resampled_m
+from dataset_builder.scene.assemblies.pile import Pose, points_in_world_m
+from dataset_builder.scene.shapes.bending import resample_polyline_m
 from rebar_depth_bench.geometry.aruco_board import MARKER_MODULES, BoardSpec, marker_corners_m
 
-_SAMPLE_M = 0.002
-"""Centrelines are looked at this finely when it is asked what they cover."""
+_COVERAGE_STEP_M = 0.002
+"""Spacing at which centrelines are sampled to find the markers they cover, metres."""
 
 
 @dataclass(frozen=True)
 class DropSpec:
-    """How stirrups start: one over the other, ``spacing_m`` apart, the middles of their hoops near the z axis.
+    """Distribution of the initial poses: stirrups above each other, their hoop centres near the z axis.
 
-    Each lies on either face, turned by up to ``yaw_deg`` either way or half a turn more, tilted by up to
-    ``tilt_deg`` in any direction and moved by up to ``offset_m`` along x and y. At this spacing none touches
-    another at the start, whichever way they tilt.
+    The lowest starts at the height ``first_m``, each further one ``spacing_m`` above the one before. Each has a
+    random face down, a yaw of up to ``yaw_deg`` in either direction, plus 180 degrees at random, a tilt of up to
+    ``tilt_deg`` in any direction, and an offset of up to ``offset_m`` along x and y. At the default spacing
+    stirrups do not touch at the start, whatever their tilt.
     """
 
     spacing_m: float = 0.085
@@ -36,23 +37,23 @@ class DropSpec:
 def drop_poses(
     drop: DropSpec, line_m: Float64[ndarray, "n 3"], stirrups: int, random: np.random.Generator
 ) -> list[Pose]:
-    """Return the poses in which ``stirrups`` of centreline ``line_m`` are let go, the lowest first."""
+    """Return random initial poses of ``stirrups`` stirrups of centreline ``line_m``, the lowest first."""
     hoop_middle_m = _hoop_middle_m(line_m)
     poses = []
     for level in range(stirrups):
-        turn = _drawn_turn(drop, random)
-        over_m = np.array(
+        quaternion = _random_rotation(drop, random)
+        hoop_target_m = np.array(
             [*random.uniform(-drop.offset_m, drop.offset_m, 2), drop.first_m + drop.spacing_m * level]
         )
-        swung_m = placed_m(hoop_middle_m[None], Pose((0.0, 0.0, 0.0), turn))[0]
-        x, y, z = (float(value) for value in over_m - swung_m)
-        poses.append(Pose((x, y, z), turn))
+        rotated_middle_m = points_in_world_m(hoop_middle_m[None], Pose((0.0, 0.0, 0.0), quaternion))[0]
+        x, y, z = (float(value) for value in hoop_target_m - rotated_middle_m)
+        poses.append(Pose((x, y, z), quaternion))
     return poses
 
 
-def centred(poses: Sequence[Pose], line_m: Float64[ndarray, "n 3"]) -> tuple[Pose, ...]:
-    """Return the heap with the middle of its bounding box, along x and y, over the origin."""
-    points_m = np.concatenate([placed_m(line_m, pose) for pose in poses])
+def centre_pile(poses: Sequence[Pose], line_m: Float64[ndarray, "n 3"]) -> tuple[Pose, ...]:
+    """Return the poses shifted so that the bounding box of the pile is centred on x = y = 0."""
+    points_m = np.concatenate([points_in_world_m(line_m, pose) for pose in poses])
     middle_x, middle_y, _ = ((points_m.min(axis=0) + points_m.max(axis=0)) / 2).tolist()
     return tuple(
         Pose(
@@ -64,25 +65,25 @@ def centred(poses: Sequence[Pose], line_m: Float64[ndarray, "n 3"]) -> tuple[Pos
 
 
 def reach_m(lines_m: Sequence[Float64[ndarray, "n 3"]], radius_m: float) -> float:
-    """Return how far from the origin the steel reaches along x or y, metres."""
+    """Return the largest absolute x or y coordinate of the steel, metres."""
     return float(max(np.abs(line[:, :2]).max() for line in lines_m) + radius_m)
 
 
 def height_m(lines_m: Sequence[Float64[ndarray, "n 3"]], radius_m: float) -> float:
-    """Return how high the steel reaches, metres."""
+    """Return the largest z coordinate of the steel, metres."""
     return float(max(line[:, 2].max() for line in lines_m) + radius_m)
 
 
 def tilts_deg(poses: Sequence[Pose]) -> list[float]:
-    """Return by how many degrees the plane of each hoop is off the level."""
-    upright = np.array([[0.0, 0.0, 1.0]])
-    planes = [placed_m(upright, Pose((0.0, 0.0, 0.0), pose.quaternion_wxyz))[0] for pose in poses]
-    return [float(np.rad2deg(np.arccos(min(1.0, abs(plane[2]))))) for plane in planes]
+    """Return the angle between each hoop's plane and the horizontal, degrees."""
+    z_axis = np.array([[0.0, 0.0, 1.0]])
+    normals = [points_in_world_m(z_axis, Pose((0.0, 0.0, 0.0), pose.quaternion_wxyz))[0] for pose in poses]
+    return [float(np.rad2deg(np.arccos(min(1.0, abs(normal[2]))))) for normal in normals]
 
 
 def free_markers(lines_m: Sequence[Float64[ndarray, "n 3"]], radius_m: float, board: BoardSpec) -> tuple[int, ...]:
-    """Return the markers that no steel covers as seen from above, nor their quiet zone of one module."""
-    points_m = np.concatenate([resampled_m(line, _SAMPLE_M)[:, :2] for line in lines_m])
+    """Return the ids of the markers that are clear of steel in plan, with a quiet zone of one module."""
+    points_m = np.concatenate([resample_polyline_m(line, _COVERAGE_STEP_M)[:, :2] for line in lines_m])
     quiet_m = board.marker_side_m / MARKER_MODULES
     free = []
     for marker_id, corners_m in marker_corners_m(board).items():
@@ -93,29 +94,34 @@ def free_markers(lines_m: Sequence[Float64[ndarray, "n 3"]], radius_m: float, bo
     return tuple(free)
 
 
-def _drawn_turn(drop: DropSpec, random: np.random.Generator) -> tuple[float, float, float, float]:
-    """Return a turn w x y z: which face lies down, then the yaw, then the tilt."""
-    face = _about((1.0, 0.0, 0.0), 180.0 * random.integers(2))
-    yaw = _about((0.0, 0.0, 1.0), random.uniform(-drop.yaw_deg, drop.yaw_deg) + 180.0 * random.integers(2))
-    hinge = random.uniform(0.0, 2 * np.pi)
-    tilt = _about((np.cos(hinge), np.sin(hinge), 0.0), random.uniform(0.0, drop.tilt_deg))
-    w, x, y, z = (float(value) for value in _product(tilt, _product(yaw, face)))
+def _random_rotation(drop: DropSpec, random: np.random.Generator) -> tuple[float, float, float, float]:
+    """Return a random rotation as a quaternion (w, x, y, z): the face that is down, then yaw, then tilt."""
+    face = _axis_angle_quaternion((1.0, 0.0, 0.0), 180.0 * random.integers(2))
+    yaw = _axis_angle_quaternion(
+        (0.0, 0.0, 1.0), random.uniform(-drop.yaw_deg, drop.yaw_deg) + 180.0 * random.integers(2)
+    )
+    tilt_axis_rad = random.uniform(0.0, 2 * np.pi)
+    tilt = _axis_angle_quaternion(
+        (np.cos(tilt_axis_rad), np.sin(tilt_axis_rad), 0.0), random.uniform(0.0, drop.tilt_deg)
+    )
+    w, x, y, z = (float(value) for value in _quaternion_product(tilt, _quaternion_product(yaw, face)))
     return (w, x, y, z)
 
 
-def _about(axis: tuple[float, float, float], angle_deg: float) -> Float64[ndarray, " 4"]:
+def _axis_angle_quaternion(axis: tuple[float, float, float], angle_deg: float) -> Float64[ndarray, " 4"]:
+    """Return the quaternion (w, x, y, z) of a rotation about a unit ``axis``."""
     half = np.deg2rad(angle_deg) / 2
     return np.array([np.cos(half), *(np.sin(half) * np.array(axis))])
 
 
-def _product(last: Float64[ndarray, " 4"], first: Float64[ndarray, " 4"]) -> Float64[ndarray, " 4"]:
-    """Return the quaternion that turns as ``first`` and then as ``last``."""
+def _quaternion_product(last: Float64[ndarray, " 4"], first: Float64[ndarray, " 4"]) -> Float64[ndarray, " 4"]:
+    """Return the quaternion (w, x, y, z) of the rotation ``first`` followed by ``last``."""
     scalar = last[0] * first[0] - last[1:] @ first[1:]
     vector = last[0] * first[1:] + first[0] * last[1:] + np.cross(last[1:], first[1:])
     return np.array([scalar, *vector])
 
 
 def _hoop_middle_m(line_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, " 3"]:
-    """Return the middle of the hoop, which the hooks draw the centroid away from."""
+    """Return the bounding-box centre of the hoop, which differs from the centroid because of the hooks."""
     middle: Float64[ndarray, " 3"] = (line_m.min(axis=0) + line_m.max(axis=0)) / 2
     return middle

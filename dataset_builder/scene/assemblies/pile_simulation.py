@@ -1,10 +1,11 @@
-"""Lets stirrups fall in a heap, with MuJoCo, and stores where they come to rest.
+"""Pile simulation: drops stirrups with MuJoCo and stores the poses in which they come to rest.
 
-python -m dataset_builder.scene.assemblies.pile_simulation --seed S --out FILE
+Usage: ``python -m dataset_builder.scene.assemblies.pile_simulation --seed S --out FILE``
 
-Tries the seeds from ``S`` on, in order, and writes the first heap that ``faults`` finds nothing against. A
-stirrup is a rigid chain of capsules along the centreline of its mesh, as thick as the ribs reach. Contacts keep
-a hair's breadth of air, so that no two meshes meet. World frame, metres; the board is the plane z = 0.
+Seeds are tried in order from ``S`` on; the first pile without problems (``find_problems``) is written. A stirrup
+is a rigid chain of capsules along the centreline of its mesh, with the outer radius of the ribs. Contacts keep
+a small clearance (``PhysicsSpec.air_m``), so that meshes do not touch. World frame, metres; the board is the
+plane z = 0.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.config.specs import PileSpec
-from dataset_builder.scene.assemblies.pile import RIBS, Pose, placed_m, stirrup_line_m
+from dataset_builder.scene.assemblies.pile import RIBS, Pose, points_in_world_m, spec_centreline_m
 from dataset_builder.scene.assemblies.pile_checks import (
     DropSpec,
-    centred,
+    centre_pile,
     drop_poses,
     free_markers,
     height_m,
@@ -37,17 +38,19 @@ from dataset_builder.scene.assemblies.pile_checks import (
 )
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from rebar_depth_bench.atomic_io import write_text
-from rebar_depth_bench.cli.console import run_command
+from rebar_depth_bench.console import run_command
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 
 @dataclass(frozen=True)
 class PhysicsSpec:
-    """Steel on steel and paper, and when it counts as at rest.
+    """Contact parameters of steel on steel and paper, and the criterion for rest.
 
-    ``air_m`` is kept free round each stirrup; MuJoCo adds up the two of a contact. A hundred ``noslip_iterations``
-    stop the creep of soft friction: with 20 a heap kept creeping by micrometres a second.
+    ``air_m`` is the clearance kept round each stirrup; MuJoCo adds the two of a contact. The stirrups are at rest
+    when all speeds (m/s and rad/s) have stayed below ``rest_speed`` for ``rest_for_s``; the simulation ends after
+    ``limit_s`` in any case. A hundred ``noslip_iterations`` stop the creep of soft friction: with 20 a pile kept
+    creeping by micrometres per second.
     """
 
     timestep_s: float = 0.001
@@ -64,8 +67,13 @@ class PhysicsSpec:
 
 
 @dataclass(frozen=True)
-class HeapWishes:
-    """What a heap must be like to be kept; ``tilt_deg`` is that of its most tilted stirrup at the least."""
+class PileRequirements:
+    """Acceptance limits of a pile.
+
+    Upper limits: ``overlap_m`` (overlap of two surfaces) and ``reach_m`` (extent from the origin along x or y).
+    Lower limits: ``free_markers`` (number of uncovered markers), ``height_m`` and ``tilt_deg`` (of the most tilted
+    stirrup).
+    """
 
     overlap_m: float = 1e-4
     reach_m: float = 0.170
@@ -75,11 +83,11 @@ class HeapWishes:
 
 
 @dataclass(frozen=True)
-class Settled:
-    """A heap after ``seconds``: poses, speeds (m/s) and spins (rad/s) by stirrup.
+class SettledPile:
+    """State of a pile after ``seconds`` of simulated time: pose, speed (m/s) and spin (rad/s) of each stirrup.
 
-    ``gap_m`` is the least distance of two surfaces (below zero: an overlap), ``deepest_m`` the deepest overlap
-    there was on the way down.
+    ``gap_m`` is the smallest distance of two surfaces (negative for an overlap), ``deepest_m`` the deepest
+    overlap during the simulation.
     """
 
     poses: tuple[Pose, ...]
@@ -90,22 +98,22 @@ class Settled:
     seconds: float
 
 
-PILE, DROP, PHYSICS, WISHES, BOARD = PileSpec(), DropSpec(), PhysicsSpec(), HeapWishes(), BoardSpec()
+PILE, DROP, PHYSICS, REQUIREMENTS, BOARD = PileSpec(), DropSpec(), PhysicsSpec(), PileRequirements(), BoardSpec()
 
 
-def dropped(pile: PileSpec, seed: int) -> Settled:
-    """Return the heap that the stirrups of ``pile`` make when thrown with ``seed``, at rest or out of time.
+def drop_pile(pile: PileSpec, seed: int) -> SettledPile:
+    """Drop the stirrups of ``pile`` with the random ``seed`` and return the pile, at rest or at the time limit.
 
-    It is moved to the middle of the board as a whole, which is the same everywhere.
+    The pile is shifted as a whole to the middle of the board; its plane is unbounded, so contacts stay the same.
     """
-    line_m = stirrup_line_m(pile)
+    line_m = spec_centreline_m(pile)
     starts = drop_poses(DROP, line_m, pile.stirrups, np.random.default_rng(seed))
-    heap = settled(pile, starts, PHYSICS)
-    return replace(heap, poses=centred(heap.poses, line_m))
+    settled_pile = simulate_drop(pile, starts, PHYSICS)
+    return replace(settled_pile, poses=centre_pile(settled_pile.poses, line_m))
 
 
-def settled(pile: PileSpec, starts: Sequence[Pose], physics: PhysicsSpec) -> Settled:
-    """Let stirrups go at ``starts`` and return where they are when all have been at rest, or time is up."""
+def simulate_drop(pile: PileSpec, starts: Sequence[Pose], physics: PhysicsSpec) -> SettledPile:
+    """Simulate stirrups released at ``starts`` until all are at rest or the time limit is reached."""
     model = mujoco.MjModel.from_xml_string(_model_xml(pile, physics))
     data = mujoco.MjData(model)
     data.qpos[:] = np.concatenate([[*pose.position_m, *pose.quaternion_wxyz] for pose in starts])
@@ -113,46 +121,51 @@ def settled(pile: PileSpec, starts: Sequence[Pose], physics: PhysicsSpec) -> Set
     while calm_steps * physics.timestep_s < physics.rest_for_s and data.time < physics.limit_s:
         mujoco.mj_step(model, data)
         calm_steps = calm_steps + 1 if np.abs(data.qvel).max() < physics.rest_speed else 0
-        deepest_m = max(deepest_m, -_gap_m(data))
+        deepest_m = max(deepest_m, -_min_gap_m(data))
     mujoco.mj_forward(model, data)
-    return _as_settled(data, deepest_m)
+    return _settled_pile(data, deepest_m)
 
 
-def faults(heap: Settled, pile: PileSpec, wishes: HeapWishes = WISHES) -> list[str]:
-    """Return in words what speaks against a heap: motion, overlap, reach, markers, or that it is too neat."""
-    line_m, radius_m = stirrup_line_m(pile), outer_radius_m(pile.diameter_m, RIBS)
-    lines_m = [placed_m(line_m, pose) for pose in heap.poses]
+def find_problems(
+    settled_pile: SettledPile, pile: PileSpec, requirements: PileRequirements = REQUIREMENTS
+) -> list[str]:
+    """Return a message for each acceptance limit that a pile violates.
+
+    Checked are motion, overlap, reach, number of free markers, height and tilt.
+    """
+    line_m, radius_m = spec_centreline_m(pile), outer_radius_m(pile.diameter_m, RIBS)
+    lines_m = [points_in_world_m(line_m, pose) for pose in settled_pile.poses]
     free = free_markers(lines_m, radius_m, BOARD)
-    fastest, tilt_deg = max(*heap.speeds, *heap.spins), max(tilts_deg(heap.poses))
+    fastest, tilt_deg = max(*settled_pile.speeds, *settled_pile.spins), max(tilts_deg(settled_pile.poses))
     checks = {
         f"still moves at {fastest:.1e}": fastest < PHYSICS.rest_speed,
-        f"overlaps by {-heap.gap_m:.1e} m": heap.gap_m > -wishes.overlap_m,
-        # Deeper than its radius, a bar may have come through another.
-        f"overlapped by {heap.deepest_m:.1e} m on the way": heap.deepest_m < radius_m,
-        f"reaches {reach_m(lines_m, radius_m):.3f} m": reach_m(lines_m, radius_m) <= wishes.reach_m,
-        f"leaves only the markers {free} free": len(free) >= wishes.free_markers,
-        f"is {height_m(lines_m, radius_m):.3f} m high": height_m(lines_m, radius_m) >= wishes.height_m,
-        f"tilts by {tilt_deg:.1f} degrees at most": tilt_deg >= wishes.tilt_deg,
+        f"overlaps by {-settled_pile.gap_m:.1e} m": settled_pile.gap_m > -requirements.overlap_m,
+        # With an overlap deeper than its radius, a bar may have passed through another one.
+        f"overlapped by {settled_pile.deepest_m:.1e} m on the way": settled_pile.deepest_m < radius_m,
+        f"reaches {reach_m(lines_m, radius_m):.3f} m": reach_m(lines_m, radius_m) <= requirements.reach_m,
+        f"leaves only the markers {free} free": len(free) >= requirements.free_markers,
+        f"is {height_m(lines_m, radius_m):.3f} m high": height_m(lines_m, radius_m) >= requirements.height_m,
+        f"tilts by {tilt_deg:.1f} degrees at most": tilt_deg >= requirements.tilt_deg,
     }
-    return [words for words, fulfilled in checks.items() if not fulfilled]
+    return [problem for problem, fulfilled in checks.items() if not fulfilled]
 
 
-def first_good_seed(pile: PileSpec, first_seed: int, tries: int = 500) -> tuple[int, Settled]:
-    """Try seeds in order and return the first that makes a good heap, with the heap.
+def first_good_seed(pile: PileSpec, first_seed: int, tries: int = 500) -> tuple[int, SettledPile]:
+    """Return the first seed from ``first_seed`` on that gives an acceptable pile, and the pile.
 
-    Raises ``BuildError`` where none of ``tries`` does.
+    The result for each seed is printed to stderr. Raises ``BuildError`` after ``tries`` seeds without success.
     """
     for seed in range(first_seed, first_seed + tries):
-        heap = dropped(pile, seed)
-        found = faults(heap, pile)
-        print(f"seed {seed}: {'; '.join(found) or 'good'}", file=sys.stderr, flush=True)
-        if not found:
-            return seed, heap
+        settled_pile = drop_pile(pile, seed)
+        problems = find_problems(settled_pile, pile)
+        print(f"seed {seed}: {'; '.join(problems) or 'good'}", file=sys.stderr, flush=True)
+        if not problems:
+            return seed, settled_pile
     raise BuildError(f"none of the seeds {first_seed} to {first_seed + tries - 1} makes a good heap of {pile}")
 
 
-def state(pile: PileSpec, seed: int, heap: Settled) -> dict[str, Any]:
-    """Return what is stored of a heap: how it was made, and each stirrup's pose to the last digit."""
+def pile_state(pile: PileSpec, seed: int, settled_pile: SettledPile) -> dict[str, Any]:
+    """Return the JSON content of a stored pile: all parameters, and each stirrup's pose at full precision."""
     return {
         "mujoco": mujoco.__version__,
         "machine": platform.machine(),
@@ -160,39 +173,40 @@ def state(pile: PileSpec, seed: int, heap: Settled) -> dict[str, Any]:
         "pile": asdict(pile),
         "drop": asdict(DROP),
         "physics": asdict(PHYSICS),
-        "wishes": asdict(WISHES),
-        "seconds": heap.seconds,
-        "least_gap_m": heap.gap_m,
-        "largest_overlap_m": max(0.0, -heap.gap_m),
-        "deepest_overlap_on_the_way_m": heap.deepest_m,
+        "wishes": asdict(REQUIREMENTS),
+        "seconds": settled_pile.seconds,
+        "least_gap_m": settled_pile.gap_m,
+        "largest_overlap_m": max(0.0, -settled_pile.gap_m),
+        "deepest_overlap_on_the_way_m": settled_pile.deepest_m,
         "stirrups": [
             asdict(pose) | {"speed_m_s": speed, "spin_rad_s": spin}
-            for pose, speed, spin in zip(heap.poses, heap.speeds, heap.spins, strict=True)
+            for pose, speed, spin in zip(settled_pile.poses, settled_pile.speeds, settled_pile.spins, strict=True)
         ],
     }
 
 
-def _as_settled(data: mujoco.MjData, deepest_m: float) -> Settled:
+def _settled_pile(data: mujoco.MjData, deepest_m: float) -> SettledPile:
+    """Return the pile in MuJoCo's current state."""
     velocities = data.qvel.reshape(-1, 6)
-    return Settled(
+    return SettledPile(
         poses=tuple(
             Pose((x, y, z), (qw, qx, qy, qz)) for x, y, z, qw, qx, qy, qz in data.qpos.reshape(-1, 7).tolist()
         ),
         speeds=tuple(np.linalg.norm(velocities[:, :3], axis=1).tolist()),
         spins=tuple(np.linalg.norm(velocities[:, 3:], axis=1).tolist()),
-        gap_m=_gap_m(data),
+        gap_m=_min_gap_m(data),
         deepest_m=deepest_m,
         seconds=round(float(data.time), 6),
     )
 
 
-def _gap_m(data: mujoco.MjData) -> float:
-    """Return the least signed distance of two surfaces near each other, infinity where none are."""
+def _min_gap_m(data: mujoco.MjData) -> float:
+    """Return the smallest signed distance of the current contacts, metres, or infinity without contacts."""
     return float(data.contact.dist.min()) if data.ncon else float("inf")
 
 
 def _model_xml(pile: PileSpec, physics: PhysicsSpec) -> str:
-    """Return MuJoCo's description of the board and the stirrups, body by body."""
+    """Return the MuJoCo model (MJCF XML) of the board and the stirrups."""
     p = physics
     option = (
         f'timestep="{p.timestep_s}" cone="elliptic" impratio="{p.friction_impedance_ratio}" '
@@ -201,7 +215,7 @@ def _model_xml(pile: PileSpec, physics: PhysicsSpec) -> str:
     )
     contact = (
         f'friction="{p.friction} 0.005 0.0001" margin="{p.air_m}" solref="{p.contact_time_s} 1" '
-        f'solimp="{_numbers(p.impedance)}"'
+        f'solimp="{_format_numbers(p.impedance)}"'
     )
     body = f"<body><freejoint/>{_chain_xml(pile, physics)}</body>"
     return (
@@ -211,57 +225,59 @@ def _model_xml(pile: PileSpec, physics: PhysicsSpec) -> str:
 
 
 def _chain_xml(pile: PileSpec, physics: PhysicsSpec) -> str:
-    """Return a stirrup's capsules, and its mass and inertia about its centroid: those of the nominal bar.
+    """Return the MJCF of a stirrup: its capsules, and the mass and inertia of the nominal bar about its centroid.
 
-    Capsules overlap at their joints, so that their own masses would count steel twice.
+    Mass and inertia are explicit because capsules overlap at their joints, which would count steel twice.
     """
-    line_m = stirrup_line_m(pile)
+    line_m = spec_centreline_m(pile)
     radius_m = outer_radius_m(pile.diameter_m, RIBS)
     capsules = "".join(
-        f'<geom type="capsule" size="{radius_m!r}" fromto="{_numbers([*start, *end])}"/>'
+        f'<geom type="capsule" size="{radius_m!r}" fromto="{_format_numbers([*start, *end])}"/>'
         for start, end in pairwise(line_m)
     )
     lengths_m = np.linalg.norm(np.diff(line_m, axis=0), axis=1)
     mass_kg = float(lengths_m.sum()) * np.pi / 4 * pile.diameter_m**2 * physics.density_kg_m3
     t = _thin_line_inertia_m2(line_m, lengths_m) * mass_kg
-    full = _numbers([t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2]])
+    full = _format_numbers([t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2]])
     return f'<inertial pos="0 0 0" mass="{mass_kg!r}" fullinertia="{full}"/>{capsules}'
 
 
 def _thin_line_inertia_m2(
     line_m: Float64[ndarray, "n 3"], lengths_m: Float64[ndarray, " k"]
 ) -> Float64[ndarray, "3 3"]:
-    """Return the inertia per mass of a bent line about the origin: sum of (r r E - r r^T), the legs exactly."""
+    """Return the inertia per mass of a polyline about the origin, m^2: the exact integral of (r^T r E - r r^T)."""
     middles, steps = (line_m[:-1] + line_m[1:]) / 2, np.diff(line_m, axis=0)
     weights = lengths_m / lengths_m.sum()
-    spread = (
+    second_moment = (
         np.einsum("n,ni,nj->ij", weights, middles, middles) + np.einsum("n,ni,nj->ij", weights, steps, steps) / 12
     )
-    return np.asarray(np.trace(spread) * np.eye(3) - spread)
+    return np.asarray(np.trace(second_moment) * np.eye(3) - second_moment)
 
 
-def _numbers(values: Sequence[float] | Float64[ndarray, " n"]) -> str:
+def _format_numbers(values: Sequence[float] | Float64[ndarray, " n"]) -> str:
+    """Return the values at full precision, separated by spaces."""
     return " ".join(repr(float(value)) for value in values)
 
 
-def _whole_from_0(text: str) -> int:
+def _seed_argument(text: str) -> int:
+    """Return a seed from the command line; raise ``ArgumentTypeError`` unless it is a whole number from 0 on."""
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"{text} is no seed, expected a whole number from 0 on")
     return int(text)
 
 
 def main() -> int:
-    """Find a good heap and write it; the exit status is the contract's."""
+    """Find an acceptable pile, write it and return the exit code (``run_command``)."""
     parser = argparse.ArgumentParser(
         prog="python -m dataset_builder.scene.assemblies.pile_simulation", description=__doc__.split("\n")[0]
     )
-    parser.add_argument("--seed", type=_whole_from_0, default=0, help="the first seed to try")
+    parser.add_argument("--seed", type=_seed_argument, default=0, help="the first seed to try")
     parser.add_argument("--out", type=Path, required=True, help="the state, a JSON file")
     arguments = parser.parse_args()
 
     def settle_and_write() -> None:
-        seed, heap = first_good_seed(PILE, arguments.seed)
-        write_text(arguments.out, json.dumps(state(PILE, seed, heap), indent=1) + "\n")
+        seed, settled_pile = first_good_seed(PILE, arguments.seed)
+        write_text(arguments.out, json.dumps(pile_state(PILE, seed, settled_pile), indent=1) + "\n")
 
     return run_command(settle_and_write)
 

@@ -1,1 +1,1 @@
-"""Triangle meshes of bars and plain solids."""
+"""Triangle meshes of bars and of simple solids."""

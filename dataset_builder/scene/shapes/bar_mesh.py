@@ -1,9 +1,9 @@
-"""Ribbed reinforcing bars as exact triangle meshes, swept along a centreline.
+"""Triangle meshes of ribbed and plain reinforcing bars, swept along a centreline.
 
-A bar is described round its axis by the angle ``theta`` and along it by the arc length ``s``. Its two rows
-of transverse ribs face each other and are parted by two longitudinal ribs (seams) at ``theta`` = 0 and pi.
-The rings of the mesh are inclined with the ribs, so that every rib edge is an edge of the mesh and few
-triangles draw it sharply.
+The surface of a bar is parametrised by the angle ``theta`` around its axis and the arc length ``s`` along it. Two
+opposite rows of transverse ribs are separated by two longitudinal ribs (seams) at ``theta`` = 0 and pi. The rings
+of the mesh are inclined with the ribs, so that every rib edge is an edge of the mesh and is represented exactly
+with few triangles.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from dataset_builder.scene.model import Mesh
 
 @dataclass(frozen=True)
 class RibPattern:
-    """The ribs of a bar in nominal diameters; ASTM A615 asks for spacing <= 0.7 d and 45 degrees or more.
+    """Rib dimensions of a bar in nominal diameters d; ASTM A615 requires spacing <= 0.7 d, angle >= 45 degrees.
 
-    ``angle_deg`` is between rib and bar axis, ``seam_half_deg`` the half width of a longitudinal rib as seen
-    from the axis, ``segments_per_row`` the mesh segments across one of the two rows.
+    ``angle_deg`` is the angle between rib and bar axis, ``seam_half_deg`` the angular half width of a longitudinal
+    rib seen from the axis, ``segments_per_row`` the number of mesh segments across one of the two rows. Raises
+    ``ValueError`` for a spacing or angle outside the limits.
     """
 
     spacing: float = 0.68
@@ -47,29 +48,31 @@ def ribbed_bar_mesh(
 ) -> Mesh:
     """Return the watertight mesh of a ribbed bar along ``centreline_m`` (world or local frame, metres).
 
-    Both ends are flat and closed. The mean cross-section is that of the nominal ``diameter_m``. Bends
-    must come finely sampled; the seams follow a frame carried in parallel along the line.
+    Both ends are flat and closed. The mean cross-section equals that of the nominal ``diameter_m``. Bends must be
+    finely sampled; the seams follow a parallel-transported frame along the line. Raises ``ValueError`` for a
+    diameter that is not positive and for an invalid centreline.
     """
     ribs = RibPattern() if ribs is None else ribs
-    axis = _Axis.along(np.asarray(centreline_m, dtype=np.float64))
+    axis = _Axis.from_points(np.asarray(centreline_m, dtype=np.float64))
     if diameter_m <= 0:
         raise ValueError(f"diameter_m is {diameter_m}, a bar needs a positive one")
     theta = _ring_angles(ribs)
-    ring_at = _ring_positions(axis.length_m / diameter_m, ribs)
-    radius_m = diameter_m * (_core_ratio(ribs) + _rib_height(ring_at[:, None], theta, ribs))
-    s_m = diameter_m * _inclined(ring_at, theta, ribs)
+    ring_position = _ring_positions(axis.length_m / diameter_m, ribs)
+    radius_m = diameter_m * (_core_ratio(ribs) + _rib_height(ring_position[:, None], theta, ribs))
+    s_m = diameter_m * _inclined_ring_positions(ring_position, theta, ribs)
     side = axis.surface_points_m(s_m, theta, radius_m)
     vertices = np.concatenate([side.reshape(-1, 3), axis.points_m[[0, -1]]])
-    return Mesh(vertices, _tube_faces(len(ring_at), len(theta)))
+    return Mesh(vertices, _tube_faces(len(ring_position), len(theta)))
 
 
 def plain_bar_mesh(centreline_m: Float64[ndarray, "n 3"], diameter_m: float, segments: int = 24) -> Mesh:
-    """Return the watertight mesh of a bar without ribs, for bars so far away that ribs are a fraction of a pixel.
+    """Return the watertight mesh of a bar without ribs, for bars so distant that ribs are a fraction of a pixel.
 
-    A ring stands at every point of ``centreline_m`` (metres), both ends are flat and closed. The polygon of
-    ``segments`` corners has the area of the nominal section.
+    There is a ring at every point of ``centreline_m`` (metres); both ends are flat and closed. The cross-section
+    is a polygon of ``segments`` corners with the area of the nominal section. Raises ``ValueError`` as
+    ``ribbed_bar_mesh``.
     """
-    axis = _Axis.along(np.asarray(centreline_m, dtype=np.float64))
+    axis = _Axis.from_points(np.asarray(centreline_m, dtype=np.float64))
     if diameter_m <= 0:
         raise ValueError(f"diameter_m is {diameter_m}, a bar needs a positive one")
     theta = np.arange(segments) * 2 * np.pi / segments
@@ -81,19 +84,19 @@ def plain_bar_mesh(centreline_m: Float64[ndarray, "n 3"], diameter_m: float, seg
 
 
 def plain_outer_radius_m(diameter_m: float, segments: int = 24) -> float:
-    """Return the circumradius of the polygon that has the area of a circle of ``diameter_m``, metres."""
+    """Return the circumradius, metres, of the regular polygon with the area of a circle of ``diameter_m``."""
     wedge = 2 * np.pi / segments
     return float(diameter_m / 2 * np.sqrt(wedge / np.sin(wedge)))
 
 
 def outer_radius_m(diameter_m: float, ribs: RibPattern | None = None) -> float:
-    """Return the distance from the axis that no point of a straight bar exceeds: core plus rib, metres."""
+    """Return the maximum distance of the surface of a straight bar from its axis: core plus rib, metres."""
     ribs = RibPattern() if ribs is None else ribs
     return diameter_m * (_core_ratio(ribs) + max(ribs.height, ribs.seam_height))
 
 
 def _ring_angles(ribs: RibPattern) -> Float64[ndarray, " k"]:
-    """Return one ring's angles: four per seam (foot, crown, crown, foot), the rows between them evenly cut."""
+    """Return the angles of one ring, radians: four per seam (foot, crown, crown, foot), even steps in the rows."""
     foot = np.deg2rad(ribs.seam_half_deg)
     row = np.linspace(foot, np.pi - foot, ribs.segments_per_row + 1)
     half = np.concatenate([[-0.4 * foot, 0.4 * foot], row])
@@ -101,9 +104,9 @@ def _ring_angles(ribs: RibPattern) -> Float64[ndarray, " k"]:
 
 
 def _ring_positions(length: float, ribs: RibPattern) -> Float64[ndarray, " r"]:
-    """Return where rings are needed along a bar of ``length`` diameters: its ends and every rib edge."""
+    """Return the ring positions along a bar of ``length`` diameters: its ends and every rib edge, in diameters."""
     edges = np.array([-ribs.base_width, -ribs.top_width, ribs.top_width, ribs.base_width]) / 2
-    # The second row's ribs stand half a spacing further on.
+    # The ribs of the second row are offset by half a spacing.
     rib_centres = np.arange(-1, 2 * length / ribs.spacing + 2) * ribs.spacing / 2
     positions = np.unique((rib_centres[:, None] + edges).ravel())
     sliver = 0.02
@@ -114,28 +117,28 @@ def _ring_positions(length: float, ribs: RibPattern) -> Float64[ndarray, " r"]:
 def _rib_height(
     along: Float64[ndarray, "r 1"], theta: Float64[ndarray, " k"], ribs: RibPattern
 ) -> Float64[ndarray, "r k"]:
-    """Return how far the surface stands above the core, in diameters."""
+    """Return the height of the surface above the core, in diameters."""
     foot = np.deg2rad(ribs.seam_half_deg)
     from_seam = np.abs((theta + np.pi / 2) % np.pi - np.pi / 2)
     seam = ribs.seam_height * np.clip((foot - from_seam) / (0.6 * foot), 0.0, 1.0)
-    # Crescents: highest in the middle of a row, nothing at the seams.
+    # Crescent-shaped ribs: highest in the middle of a row, zero at the seams.
     crescent = ribs.height * np.sin(np.pi * np.clip((theta % np.pi - foot) / (np.pi - 2 * foot), 0.0, 1.0))
     second_row = theta % (2 * np.pi) > np.pi
     offset = np.where(second_row, ribs.spacing / 2, 0.0)
-    return np.asarray(seam + crescent * _ridge(along + offset, ribs))
+    return np.asarray(seam + crescent * _rib_profile(along + offset, ribs))
 
 
-def _ridge(along: Float64[ndarray, "*n"], ribs: RibPattern) -> Float64[ndarray, "*n"]:
-    """Return the trapezoidal profile of the ribs at 0, spacing, 2 spacing ...: 1 on top, 0 between."""
+def _rib_profile(along: Float64[ndarray, "*n"], ribs: RibPattern) -> Float64[ndarray, "*n"]:
+    """Return the trapezoidal profile of ribs at 0, spacing, 2 spacing ...: 1 on the ribs, 0 between them."""
     from_centre = np.abs((along + ribs.spacing / 2) % ribs.spacing - ribs.spacing / 2)
     flank = (ribs.base_width - ribs.top_width) / 2
     return np.asarray(np.clip((ribs.base_width / 2 - from_centre) / flank, 0.0, 1.0))
 
 
 def _core_ratio(ribs: RibPattern) -> float:
-    """Return the core radius in diameters that gives the bar, ribs and all, its nominal cross-section.
+    """Return the core radius in diameters for which the bar including its ribs has the nominal cross-section.
 
-    The mean area is a quadratic in the core radius; inclining the rings does not change volumes.
+    The mean area is quadratic in the core radius. Inclining the rings does not change the volume.
     """
     theta = _ring_angles(ribs)
     samples = (np.arange(400)[:, None] + 0.5) / 400 * ribs.spacing
@@ -148,19 +151,19 @@ def _core_ratio(ribs: RibPattern) -> float:
     return float((-b + np.sqrt(b * b - 4 * a * c)) / (2 * a))
 
 
-def _inclined(
-    ring_at: Float64[ndarray, " r"], theta: Float64[ndarray, " k"], ribs: RibPattern
+def _inclined_ring_positions(
+    ring_position: Float64[ndarray, " r"], theta: Float64[ndarray, " k"], ribs: RibPattern
 ) -> Float64[ndarray, "r k"]:
-    """Return arc lengths (diameters) of rings tilted to the rib angle, levelling out at the flat ends."""
+    """Return arc lengths, in diameters, of rings inclined to the rib angle; the tilt vanishes at the flat ends."""
     lead = 0.5 / np.tan(np.deg2rad(ribs.angle_deg))
-    to_end = np.minimum(ring_at, ring_at[-1] - ring_at)
-    # Levelling over twice the lead keeps neighbouring rings in order.
-    tilt = lead * np.clip(to_end / (2 * lead), 0.0, 1.0)
-    return np.asarray(ring_at[:, None] - tilt[:, None] * np.cos(theta))
+    distance_to_end = np.minimum(ring_position, ring_position[-1] - ring_position)
+    # Reducing the tilt over twice the lead keeps neighbouring rings from crossing.
+    tilt = lead * np.clip(distance_to_end / (2 * lead), 0.0, 1.0)
+    return np.asarray(ring_position[:, None] - tilt[:, None] * np.cos(theta))
 
 
 def _tube_faces(rings: int, segments: int) -> Int32[ndarray, "f 3"]:
-    """Return the triangles of a tube of vertex rings, closed by fans round the two last vertices."""
+    """Return the triangles of a tube of vertex rings, closed by fans around the last two vertices."""
     ring, segment = np.meshgrid(np.arange(rings - 1), np.arange(segments), indexing="ij")
     here = (ring * segments + segment).ravel()
     beside = (ring * segments + (segment + 1) % segments).ravel()
@@ -181,7 +184,7 @@ def _tube_faces(rings: int, segments: int) -> Int32[ndarray, "f 3"]:
 
 @dataclass(frozen=True, eq=False)
 class _Axis:
-    """A centreline with frames carried along it without twist: tangent, and a normal that theta counts from."""
+    """Centreline with twist-free (parallel-transported) frames; theta is measured from ``normal``."""
 
     points_m: Float64[ndarray, "n 3"]
     arc_m: Float64[ndarray, " n"]
@@ -189,7 +192,7 @@ class _Axis:
     normal: Float64[ndarray, "n 3"]
 
     @classmethod
-    def along(cls, points_m: Float64[ndarray, "n 3"]) -> _Axis:
+    def from_points(cls, points_m: Float64[ndarray, "n 3"]) -> _Axis:
         steps = np.diff(points_m, axis=0)
         lengths = np.linalg.norm(steps, axis=1)
         if len(lengths) == 0 or lengths.min() <= 0:
@@ -199,7 +202,7 @@ class _Axis:
             raise ValueError("the centreline turns back on itself at one of its points")
         tangent = np.concatenate([directions[:1], directions[:-1] + directions[1:], directions[-1:]])
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-        return cls(points_m, np.concatenate([[0.0], np.cumsum(lengths)]), tangent, _carried_normals(tangent))
+        return cls(points_m, np.concatenate([[0.0], np.cumsum(lengths)]), tangent, _transported_normals(tangent))
 
     @property
     def length_m(self) -> float:
@@ -211,7 +214,7 @@ class _Axis:
         theta: Float64[ndarray, " k"],
         radius_m: Float64[ndarray, "r k"],
     ) -> Float64[ndarray, "r k 3"]:
-        """Return the points at arc length ``s_m`` and angle ``theta``, ``radius_m`` off the centreline."""
+        """Return the points at arc length ``s_m``, angle ``theta`` and ``radius_m`` from the centreline."""
         centre = self._interpolated(self.points_m, s_m)
         tangent = _unit(self._interpolated(self.tangent, s_m))
         normal = self._interpolated(self.normal, s_m)
@@ -226,22 +229,22 @@ class _Axis:
         return np.stack([np.interp(s_m, self.arc_m, column) for column in values.T], axis=-1)
 
 
-def _carried_normals(tangent: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"]:
-    """Return normals without twist: each is the one before it, made perpendicular to its own tangent."""
+def _transported_normals(tangent: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"]:
+    """Return twist-free normals: each is the previous one under the smallest rotation between the tangents."""
     least_aligned = np.eye(3)[np.argmin(np.abs(tangent[0]))]
     normals = [_unit(np.cross(np.cross(tangent[0], least_aligned), tangent[0]))]
     for before, here in pairwise(tangent):
-        normals.append(_rotated_between(normals[-1], before, here))
+        normals.append(_rotate_between(normals[-1], before, here))
     return np.stack(normals)
 
 
-def _rotated_between(
+def _rotate_between(
     vector: Float64[ndarray, " 3"], before: Float64[ndarray, " 3"], after: Float64[ndarray, " 3"]
 ) -> Float64[ndarray, " 3"]:
-    """Return ``vector`` turned by the smallest rotation that takes unit ``before`` to unit ``after``."""
+    """Return ``vector`` rotated by the smallest rotation that takes unit ``before`` to unit ``after``."""
     cross, cosine = np.cross(before, after), float(before @ after)
-    turned = vector + np.cross(cross, vector) + np.cross(cross, np.cross(cross, vector)) / (1 + cosine)
-    return np.asarray(turned)
+    rotated = vector + np.cross(cross, vector) + np.cross(cross, np.cross(cross, vector)) / (1 + cosine)
+    return np.asarray(rotated)
 
 
 def _unit(vectors: Float64[ndarray, "*n 3"]) -> Float64[ndarray, "*n 3"]:

@@ -1,4 +1,4 @@
-"""Bends bars: a path of straight legs becomes a centreline with arcs at its corners."""
+"""Bending of bars: conversion of a path of straight legs to a centreline with arcs at the corners."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 SMALL_BAR_M = 0.016
-"""Up to this diameter EN 1992-1-1 (table 8.1N) bends round four diameters, above it round seven."""
+"""Largest diameter, metres, with a mandrel of 4 d in EN 1992-1-1 (table 8.1N); larger bars need 7 d."""
 
 
 def mandrel_diameter_m(diameter_m: float) -> float:
-    """Return the least mandrel diameter of EN 1992-1-1, table 8.1N: 4 d up to 16 mm, 7 d above, metres."""
+    """Return the minimum mandrel diameter of EN 1992-1-1, table 8.1N, metres: 4 d up to 16 mm, 7 d above."""
     return (4.0 if diameter_m <= SMALL_BAR_M else 7.0) * diameter_m
 
 
 def bend_radius_m(diameter_m: float) -> float:
-    """Return the radius of the centreline in a bend round the least mandrel, metres."""
+    """Return the centreline radius of a bend around the minimum mandrel, metres."""
     return (mandrel_diameter_m(diameter_m) + diameter_m) / 2
 
 
@@ -27,9 +27,9 @@ def bent_line_m(
 ) -> Float64[ndarray, "k 3"]:
     """Return the path through ``corners_m`` with an arc of ``radius_m`` at each inner corner, metres.
 
-    Arcs touch both legs and come as points ``step_deg`` apart at most; straight legs keep their two ends.
-    Collinear corners stay as they are. Raises ``ValueError`` where two arcs would overlap on a leg, a leg has
-    no length, or a corner turns straight back.
+    Arcs are tangent to both legs and are sampled at steps of at most ``step_deg``; a straight leg is represented
+    by its two ends. Collinear corners are kept. Raises ``ValueError`` if two arcs would overlap on a leg, if a leg
+    has zero length, or if the path reverses its direction at a corner.
     """
     corners = np.asarray(corners_m, dtype=np.float64)
     legs = np.diff(corners, axis=0)
@@ -37,56 +37,57 @@ def bent_line_m(
     if len(lengths) == 0 or lengths.min() <= 0:
         raise ValueError("a bar needs two or more corners, none repeated in a row")
     directions = legs / lengths[:, None]
-    turns = [_turn(before, after) for before, after in pairwise(directions)]
-    taken = np.array([0.0, *(radius_m * np.tan(turn / 2) for turn in turns), 0.0])
-    short = np.flatnonzero(taken[:-1] + taken[1:] > lengths + 1e-12)
-    if len(short):
-        leg = int(short[0])
+    turns_rad = [_turn_angle(before, after) for before, after in pairwise(directions)]
+    tangent_length_m = np.array([0.0, *(radius_m * np.tan(turn_rad / 2) for turn_rad in turns_rad), 0.0])
+    too_short = np.flatnonzero(tangent_length_m[:-1] + tangent_length_m[1:] > lengths + 1e-12)
+    if len(too_short):
+        leg = int(too_short[0])
         raise ValueError(
             f"leg {leg + 1} is {lengths[leg]:.4f} m long, its bends of radius {radius_m:.4f} m take "
-            f"{taken[leg] + taken[leg + 1]:.4f} m"
+            f"{tangent_length_m[leg] + tangent_length_m[leg + 1]:.4f} m"
         )
     pieces = [corners[:1]]
-    for n, turn in enumerate(turns):
-        pieces.append(_arc(corners[n + 1], directions[n], directions[n + 1], turn, radius_m, step_deg))
+    for n, turn_rad in enumerate(turns_rad):
+        pieces.append(_arc(corners[n + 1], directions[n], directions[n + 1], turn_rad, radius_m, step_deg))
     pieces.append(corners[-1:])
-    return _without_repeats(np.concatenate(pieces))
+    # Two arcs that together fill a leg share a point.
+    return without_repeats(np.concatenate(pieces), 1e-9)
 
 
-def resampled_m(line_m: Float64[ndarray, "n 3"], step_m: float) -> Float64[ndarray, "k 3"]:
-    """Return points spread evenly along a line, both ends included, ``step_m`` apart or closer."""
+def resample_polyline_m(line_m: Float64[ndarray, "n 3"], step_m: float) -> Float64[ndarray, "k 3"]:
+    """Return evenly spaced points along a polyline, including both ends, at most ``step_m`` apart."""
     along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line_m, axis=0), axis=1))])
     at_m = np.linspace(0.0, along_m[-1], int(np.ceil(along_m[-1] / step_m)) + 1)
     return np.stack([np.interp(at_m, along_m, column) for column in line_m.T], axis=-1)
 
 
-def _turn(before: Float64[ndarray, " 3"], after: Float64[ndarray, " 3"]) -> float:
-    """Return the angle by which the direction changes at a corner, radians."""
-    turn = float(np.arctan2(np.linalg.norm(np.cross(before, after)), before @ after))
-    if turn > np.deg2rad(179.0):
+def _turn_angle(before: Float64[ndarray, " 3"], after: Float64[ndarray, " 3"]) -> float:
+    """Return the change of direction at a corner, radians; raise ``ValueError`` above 179 degrees."""
+    turn_rad = float(np.arctan2(np.linalg.norm(np.cross(before, after)), before @ after))
+    if turn_rad > np.deg2rad(179.0):
         raise ValueError("the path turns straight back on itself at a corner; give the turn two corners")
-    return turn
+    return turn_rad
 
 
 def _arc(
     corner: Float64[ndarray, " 3"],
     before: Float64[ndarray, " 3"],
     after: Float64[ndarray, " 3"],
-    turn: float,
+    turn_rad: float,
     radius_m: float,
     step_deg: float,
 ) -> Float64[ndarray, "k 3"]:
-    """Return the arc's points, both ends included, or the bare corner where the path goes straight on."""
-    if turn < 1e-9:
+    """Return the points of the arc including both ends, or only the corner if the legs are collinear."""
+    if turn_rad < 1e-9:
         return corner[None]
-    start = corner - before * radius_m * np.tan(turn / 2)
+    start = corner - before * radius_m * np.tan(turn_rad / 2)
     inward = after - (after @ before) * before
     inward /= np.linalg.norm(inward)
-    angle = np.linspace(0.0, turn, max(2, int(np.ceil(np.rad2deg(turn) / step_deg)) + 1))[:, None]
+    angle = np.linspace(0.0, turn_rad, max(2, int(np.ceil(np.rad2deg(turn_rad) / step_deg)) + 1))[:, None]
     return np.asarray(start + radius_m * (np.sin(angle) * before + (1 - np.cos(angle)) * inward))
 
 
-def _without_repeats(points: Float64[ndarray, "n 3"]) -> Float64[ndarray, "k 3"]:
-    """Drop points that repeat the one before: two arcs may meet on a leg that they take up whole."""
-    new = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-9
-    return np.asarray(points[np.concatenate([[True], new])])
+def without_repeats(points: Float64[ndarray, "n 3"], tolerance: float) -> Float64[ndarray, "k 3"]:
+    """Return the points without those that are at most ``tolerance`` from their predecessor."""
+    is_new = np.linalg.norm(np.diff(points, axis=0), axis=1) > tolerance
+    return np.asarray(points[np.concatenate([[True], is_new])])

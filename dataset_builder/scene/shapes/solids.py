@@ -1,4 +1,4 @@
-"""Plain solids as closed triangle meshes, counter-clockwise from outside; world frame, metres."""
+"""Simple solids as closed triangle meshes, counter-clockwise seen from outside; metres."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ _BOX_FACES = [
 
 
 def box(low_m: Point, high_m: Point) -> Mesh:
-    """Return the box between two opposite corners."""
+    """Return the axis-aligned box between two opposite corners."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
     low, high = np.array(low_m), np.array(high_m)
     return Mesh(low + corners * (high - low), np.array(_BOX_FACES, dtype=np.int32))
 
 
-def turned_box(middle_m: Point, size_m: Point, turn_deg: float) -> Mesh:
-    """Return a box of ``size_m`` about ``middle_m``, turned about the vertical."""
+def rotated_box(middle_m: Point, size_m: Point, turn_deg: float) -> Mesh:
+    """Return a box of ``size_m`` centred at ``middle_m``, rotated about the vertical by ``turn_deg``."""
     half = np.array(size_m) / 2
     upright = box((-half[0], -half[1], -half[2]), (half[0], half[1], half[2]))
-    return placed(upright, about_z(turn_deg), middle_m)
+    return transformed(upright, rotation_about_z(turn_deg), middle_m)
 
 
 def cylinder(foot_m: Point, radius_m: float, height_m: float, segments: int = 64) -> Mesh:
-    """Return an upright cylinder on ``foot_m``, the middle of its lower face."""
+    """Return an upright cylinder; ``foot_m`` is the centre of its lower face."""
     angle = np.arange(segments) * 2 * np.pi / segments
     rim = radius_m * np.stack([np.cos(angle), np.sin(angle), np.zeros(segments)], axis=1)
     up = np.array([0.0, 0.0, height_m])
@@ -56,10 +56,10 @@ def cylinder(foot_m: Point, radius_m: float, height_m: float, segments: int = 64
 
 
 def lathe(profile_m: Float64[ndarray, "n 2"], segments: int = 32) -> Mesh:
-    """Return the solid that a closed outline of (radius, height) points draws when it turns about the z axis.
+    """Return the solid of revolution about the z axis of a closed outline of (radius, height) points.
 
-    The outline runs counter-clockwise with the radius to the right and the height up, its first point not
-    repeated; every radius is positive.
+    The outline is counter-clockwise with the radius to the right and the height up. Its first point is not
+    repeated, and all radii are positive.
     """
     count = len(profile_m)
     angle = np.arange(segments)[:, None] * 2 * np.pi / segments
@@ -72,19 +72,21 @@ def lathe(profile_m: Float64[ndarray, "n 2"], segments: int = 32) -> Mesh:
     return Mesh(vertices, faces.astype(np.int32))
 
 
-def placed(mesh: Mesh, world_from_local: Float64[ndarray, "3 3"], at_m: Point | Float64[ndarray, " 3"]) -> Mesh:
-    """Return ``mesh`` turned by a rotation matrix and then moved so that its origin is ``at_m``."""
+def transformed(
+    mesh: Mesh, world_from_local: Float64[ndarray, "3 3"], at_m: Point | Float64[ndarray, " 3"]
+) -> Mesh:
+    """Return ``mesh`` mapped by the matrix ``world_from_local`` and then translated by ``at_m``, metres."""
     return Mesh(mesh.vertices_m @ world_from_local.T + np.asarray(at_m), mesh.faces)
 
 
-def about_z(turn_deg: float) -> Float64[ndarray, "3 3"]:
-    """Return the rotation matrix of a turn about the vertical, counter-clockwise from above."""
+def rotation_about_z(turn_deg: float) -> Float64[ndarray, "3 3"]:
+    """Return the matrix of a rotation about the z axis, counter-clockwise seen from above."""
     cosine, sine = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
-def joined(meshes: Sequence[Mesh]) -> Mesh:
-    """Return several meshes as one, in order."""
+def merge_meshes(meshes: Sequence[Mesh]) -> Mesh:
+    """Return the meshes concatenated into one, in order."""
     starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
     return Mesh(np.concatenate([mesh.vertices_m for mesh in meshes]), np.concatenate(faces).astype(np.int32))

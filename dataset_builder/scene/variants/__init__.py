@@ -1,8 +1,8 @@
-"""The named variants of a scene's look that a config may ask for; the standard configs use none.
+"""Appearance variants of scenes: lighting, steel surface, and props that occlude the steel.
 
-They are what the paper's scenes leave out: other light, other steel, and things that stand in the way.
-``AppearanceSpec.variants`` holds their names. Light and steel variants change colour alone; things are real
-surfaces of the scene, so that depth and masks take them into account.
+The names of the variants of a scene are in ``AppearanceSpec.variants``; the standard configs, like the scenes of
+the paper, have none. Light and steel variants change only colour, apart from the screen that ``shadows`` adds.
+Props are surfaces of the scene mesh, so depth and masks account for them.
 """
 
 from __future__ import annotations
@@ -12,66 +12,75 @@ from dataclasses import dataclass
 
 from rebar_depth_bench.errors import InputError
 
-LIGHT, STEEL, THINGS = "light", "steel", "things"
-EXCLUSIVE_SLOTS = (LIGHT, STEEL)
-"""Slots that hold one variant at a time; things add up."""
+LIGHT_SLOT, STEEL_SLOT, PROPS_SLOT = "light", "steel", "things"
+EXCLUSIVE_SLOTS = (LIGHT_SLOT, STEEL_SLOT)
+"""Slots that accept one variant at a time; variants of the props slot can be combined."""
 
 SHADOWS = "shadows"
 SUN_FROM = (-0.53, -0.36, 0.77)
-"""Where the sun of ``shadows`` stands as seen from the steel (world axes): its slatted screen hangs there."""
+"""Direction from the steel to the sun of ``shadows``, world axes; the slatted screen is in this direction."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One variant: its name, what it does in words for people, and the slot it fills."""
+    """Appearance variant: name, description for users, and slot."""
 
     name: str
-    words: str
+    description: str
     slot: str
 
 
 _ALL = (
-    Variant("dusk", "little light: a dim blue sky and a weak warm glow from one side", LIGHT),
-    Variant("spotlight", "one hard lamp in the dark, strong shadows", LIGHT),
-    Variant("backlight", "a low strong light from the north (+y), so that views towards it see dark steel", LIGHT),
+    Variant("dusk", "little light: a dim blue sky and a weak warm glow from one side", LIGHT_SLOT),
+    Variant("spotlight", "one hard lamp in the dark, strong shadows", LIGHT_SLOT),
     Variant(
-        SHADOWS, "hard sun through a slatted screen beyond the cameras: stripes of shadow on the steel", LIGHT
+        "backlight", "a low strong light from the north (+y), so that views towards it see dark steel", LIGHT_SLOT
     ),
-    Variant("mill-scale", "fresh steel: smooth blue-grey scale, hardly any rust", STEEL),
-    Variant("rusted", "steel that stood outside for months: rust all over", STEEL),
-    Variant("wet", "steel after rain: darker, with a gloss", STEEL),
     Variant(
-        "clutter", "buckets, offcuts of timber, boxes, rolls of tape and tools round the steel's foot", THINGS
+        SHADOWS, "hard sun through a slatted screen beyond the cameras: stripes of shadow on the steel", LIGHT_SLOT
     ),
-    Variant("formwork", "two plywood panels on two sides of the steel, which hide part of it from there", THINGS),
-    Variant("spacers", "plastic wheel spacers round some of the outer bars", THINGS),
-    Variant("tie-wire", "black wire of 1.2 mm tied round some of the crossings of bars", THINGS),
+    Variant("mill-scale", "fresh steel: smooth blue-grey scale, hardly any rust", STEEL_SLOT),
+    Variant("rusted", "steel that stood outside for months: rust all over", STEEL_SLOT),
+    Variant("wet", "steel after rain: darker, with a gloss", STEEL_SLOT),
+    Variant(
+        "clutter", "buckets, offcuts of timber, boxes, rolls of tape and tools round the steel's foot", PROPS_SLOT
+    ),
+    Variant(
+        "formwork", "two plywood panels on two sides of the steel, which hide part of it from there", PROPS_SLOT
+    ),
+    Variant("spacers", "plastic wheel spacers round some of the outer bars", PROPS_SLOT),
+    Variant("tie-wire", "black wire of 1.2 mm tied round some of the crossings of bars", PROPS_SLOT),
 )
 VARIANTS: Mapping[str, Variant] = {variant.name: variant for variant in _ALL}
 
 
 def check_variants(names: Iterable[str]) -> None:
-    """Raise ``InputError`` for unknown names, repeated ones, and two of a slot that holds one."""
-    asked = tuple(names)
-    unknown = [name for name in dict.fromkeys(asked) if name not in VARIANTS]
+    """Raise ``InputError`` for unknown and repeated names, and for several variants of an exclusive slot."""
+    requested = tuple(names)
+    unknown = [name for name in dict.fromkeys(requested) if name not in VARIANTS]
     problems = [f"no appearance variant {name!r}, expected one of {', '.join(VARIANTS)}" for name in unknown]
-    repeated = [name for name in dict.fromkeys(asked) if asked.count(name) > 1]
+    repeated = [name for name in dict.fromkeys(requested) if requested.count(name) > 1]
     problems += [
-        f"appearance variant {name!r} is named {asked.count(name)} times, expected once" for name in repeated
+        f"appearance variant {name!r} is named {requested.count(name)} times, expected once" for name in repeated
     ]
     for slot in EXCLUSIVE_SLOTS:
-        rivals = of_slot(dict.fromkeys(asked), slot)
-        if len(rivals) > 1:
-            problems.append(f"appearance variants {', '.join(rivals)} all set the {slot}, expected one of them")
+        conflicting = variants_of_slot(dict.fromkeys(requested), slot)
+        if len(conflicting) > 1:
+            problems.append(
+                f"appearance variants {', '.join(conflicting)} all set the {slot}, expected one of them"
+            )
     if problems:
         raise InputError("; ".join(problems))
 
 
-def of_slot(names: Iterable[str], slot: str) -> tuple[str, ...]:
-    """Return the known names that fill ``slot``, in their order."""
+def variants_of_slot(names: Iterable[str], slot: str) -> tuple[str, ...]:
+    """Return the known variants of ``slot`` among ``names``, in the order of ``names``."""
     return tuple(name for name in names if name in VARIANTS and VARIANTS[name].slot == slot)
 
 
-def one_of_slot(names: Iterable[str], slot: str) -> str | None:
-    """Return the one name that fills an exclusive slot, or None; ``names`` passed ``check_variants``."""
-    return next(iter(of_slot(names, slot)), None)
+def exclusive_variant(names: Iterable[str], slot: str) -> str | None:
+    """Return the variant of an exclusive slot among ``names``, or None.
+
+    ``names`` must have passed ``check_variants``.
+    """
+    return next(iter(variants_of_slot(names, slot)), None)

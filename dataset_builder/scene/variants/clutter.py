@@ -1,4 +1,4 @@
-"""Clutter: what lies about on a site or bench, on the ground round the steel. Scaled with the steel."""
+"""Clutter props: objects on the ground around the steel, scaled with the steel."""
 
 from __future__ import annotations
 
@@ -10,82 +10,89 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
-from dataset_builder.scene.shapes.solids import about_z, box, lathe, placed
-from dataset_builder.scene.variants.placement import GAP_M, Rect, Site
+from dataset_builder.scene.shapes.solids import box, lathe, rotation_about_z, transformed
+from dataset_builder.scene.variants.placement import GAP_M, PlacementContext, Rect
 
-CLEAR = 0.04
-"""Clutter keeps this share of the steel's span away from its bounding box."""
-TRIES = 400
+CLEARANCE = 0.04
+"""Minimum distance between clutter and the bounding box of the steel, as a fraction of the steel's span."""
+MAX_TRIES = 400
+"""Maximum number of rng positions tried per object."""
 
 Piece = tuple[Mesh, str]
+"""Mesh and material name."""
 
 
 @dataclass(frozen=True)
 class _Item:
-    """A thing to lay down: its name, its ground plan (length, width) and its pieces, all about its own foot."""
+    """Object to place: name, footprint (length, width), and a function that returns its pieces.
+
+    The pieces are in a local frame with the origin at the centre of the footprint.
+    """
 
     name: str
-    plan_m: tuple[float, float]
+    footprint_m: tuple[float, float]
     pieces: Callable[[], list[Piece]]
 
 
-def clutter(site: Site) -> tuple[Part, ...]:
-    """Return the things, each where it is clear of the steel, of markers, of earlier things and of the others.
+def clutter(context: PlacementContext) -> tuple[Part, ...]:
+    """Return the objects, placed clear of the steel, the markers, earlier props and each other.
 
-    All lie within 0.9 spans (0.7 m at most) of the steel's box and rise to 0.23 spans at most. What finds no
-    place is left out.
+    All objects are within 0.9 spans (at most 0.7 m) of the bounding box of the steel and at most 0.23 spans high.
+    Objects for which no free position is found are omitted.
     """
-    random = site.random("clutter")
-    unit_m = float(np.clip(0.25 * site.span_m, 0.015, 0.4))
-    allowed = site.plan.grown(min(0.9 * site.span_m, 0.7))
-    kept_off = (site.plan.grown(CLEAR * site.span_m), *site.taken)
+    rng = context.rng("clutter")
+    unit_m = float(np.clip(0.25 * context.span_m, 0.015, 0.4))
+    allowed = context.footprint.expanded(min(0.9 * context.span_m, 0.7))
+    blocked = (context.footprint.expanded(CLEARANCE * context.span_m), *context.occupied)
     circles: list[tuple[Float64[ndarray, "k 2"], float]] = []
     parts: list[Part] = []
     for number, item in enumerate(_items(unit_m)):
-        place = _place(item, allowed, kept_off, circles, random)
-        if place is not None:
-            at_m, turn_deg = place
-            circles.append(_circles(item, at_m, turn_deg))
+        pose = _find_pose(item, allowed, blocked, circles, rng)
+        if pose is not None:
+            at_m, turn_deg = pose
+            circles.append(_covering_circles(item, at_m, turn_deg))
             for k, (mesh, material) in enumerate(item.pieces()):
-                moved = placed(mesh, about_z(turn_deg), (at_m[0], at_m[1], GAP_M))
-                parts.append(Part(f"clutter-{number}-{item.name}-{k}", moved, NOT_STEEL, material))
+                placed_mesh = transformed(mesh, rotation_about_z(turn_deg), (at_m[0], at_m[1], GAP_M))
+                parts.append(Part(f"clutter-{number}-{item.name}-{k}", placed_mesh, NOT_STEEL, material))
     return tuple(parts)
 
 
-def _place(
+def _find_pose(
     item: _Item,
     allowed: Rect,
-    kept_off: tuple[Rect, ...],
+    blocked: tuple[Rect, ...],
     circles: list[tuple[Float64[ndarray, "k 2"], float]],
-    random: np.random.Generator,
+    rng: np.random.Generator,
 ) -> tuple[Float64[ndarray, " 2"], float] | None:
-    for _ in range(TRIES):
-        at_m, turn_deg = random.uniform(allowed.low_m, allowed.high_m), float(random.uniform(0.0, 360.0))
-        points_m, radius_m = _circles(item, at_m, turn_deg)
+    for _ in range(MAX_TRIES):
+        at_m, turn_deg = rng.uniform(allowed.low_m, allowed.high_m), float(rng.uniform(0.0, 360.0))
+        points_m, radius_m = _covering_circles(item, at_m, turn_deg)
         if (points_m - radius_m < allowed.low_m).any() or (points_m + radius_m > allowed.high_m).any():
             continue
-        if any(rect.distance_m(points_m).min() < radius_m for rect in kept_off):
+        if any(rect.distance_m(points_m).min() < radius_m for rect in blocked):
             continue
-        if all(_apart_m(points_m, others_m) > radius_m + other_m for others_m, other_m in circles):
+        if all(_min_distance_m(points_m, others_m) > radius_m + other_m for others_m, other_m in circles):
             return at_m, turn_deg
     return None
 
 
-def _circles(item: _Item, at_m: Float64[ndarray, " 2"], turn_deg: float) -> tuple[Float64[ndarray, "k 2"], float]:
-    """Return a row of equal circles that cover the item's ground plan: their middles and their radius."""
-    length_m, width_m = item.plan_m
+def _covering_circles(
+    item: _Item, at_m: Float64[ndarray, " 2"], turn_deg: float
+) -> tuple[Float64[ndarray, "k 2"], float]:
+    """Return the centres and the common radius of a row of circles that cover the footprint of the item."""
+    length_m, width_m = item.footprint_m
     count = int(np.ceil(length_m / width_m))
     along_m = ((np.arange(count) + 0.5) / count - 0.5) * length_m
-    axis = about_z(turn_deg)[:2, 0]
+    axis = rotation_about_z(turn_deg)[:2, 0]
     return at_m + along_m[:, None] * axis, 1.05 * float(np.hypot(width_m, length_m / count)) / 2
 
 
-def _apart_m(points_m: Float64[ndarray, "k 2"], others_m: Float64[ndarray, "j 2"]) -> float:
+def _min_distance_m(points_m: Float64[ndarray, "k 2"], others_m: Float64[ndarray, "j 2"]) -> float:
     return float(np.linalg.norm(points_m[:, None] - others_m, axis=2).min())
 
 
 def _items(u: float) -> tuple[_Item, ...]:
-    """Return what may lie about, largest first, in units of ``u`` metres."""
+    """Return the objects to place, largest first, with dimensions in units of ``u`` metres."""
     return (
         _Item("offcut", (3.2 * u, 0.5 * u), lambda: [(_slab(3.2 * u, 0.5 * u, 0.18 * u), "timber")]),
         _Item("batten", (2.1 * u, 0.26 * u), lambda: [(_slab(2.1 * u, 0.26 * u, 0.26 * u), "timber")]),
@@ -107,7 +114,7 @@ def _slab(length_m: float, width_m: float, height_m: float) -> Mesh:
 
 
 def _bucket(u: float) -> Mesh:
-    """Return an open bucket, wider at its rim."""
+    """Return an open bucket that widens towards its rim."""
     outline = [(0.01, 0.0), (0.33, 0.0), (0.44, 0.82), (0.41, 0.82), (0.31, 0.03), (0.01, 0.03)]
     return lathe(u * np.array(outline), 40)
 
@@ -118,9 +125,9 @@ def _tape(u: float) -> Mesh:
 
 
 def _hammer(u: float) -> list[Piece]:
-    """Return a hammer that lies on its side: the handle ends inside the head."""
+    """Return a hammer lying on its side; the handle ends inside the head."""
     outline = [(0.005, -0.65), (0.055, -0.65), (0.045, 0.5), (0.005, 0.5)]
-    lying = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    handle = placed(lathe(u * np.array(outline), 16), lying, (0.0, 0.0, 0.08 * u))
+    rotation = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    handle = transformed(lathe(u * np.array(outline), 16), rotation, (0.0, 0.0, 0.08 * u))
     head = box((0.42 * u, -0.2 * u, 0.0), (0.6 * u, 0.2 * u, 0.16 * u))
     return [(handle, "timber"), (head, "dark laminate")]

@@ -1,6 +1,7 @@
-"""Formwork: two plywood panels on battens, standing on neighbouring sides of the steel.
+"""Panel props: formwork beside the steel, and a slatted screen that casts stripes of shadow on it.
 
-A slatted screen between the sun and the steel, further off than any camera: it throws stripes of shadow.
+The formwork consists of two plywood panels with battens on adjacent sides of the steel. The slatted screen is
+between the sun and the steel, farther away than any camera.
 """
 
 from __future__ import annotations
@@ -12,20 +13,25 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
-from dataset_builder.scene.shapes.solids import about_z, box, joined, placed
+from dataset_builder.scene.shapes.solids import box, merge_meshes, rotation_about_z, transformed
 from dataset_builder.scene.variants import SUN_FROM
-from dataset_builder.scene.variants.placement import GAP_M, Site
+from dataset_builder.scene.variants.placement import GAP_M, PlacementContext
 
-WIDTHS = (0.8, 0.5)
-"""The panels' widths, as shares of the side they stand at."""
-HEIGHT = 0.75
-"""Their height, as a share of the steel's."""
+PANEL_WIDTHS = (0.8, 0.5)
+"""Widths of the panels, as fractions of the side of the steel at which they stand."""
+PANEL_HEIGHT = 0.75
+"""Height of the panels, as a fraction of the height of the steel."""
 BATTENS = 4
+"""Number of battens per panel."""
 
 
 @dataclass(frozen=True)
 class _Panel:
-    """A panel's measures, metres: how far its inner face is from the steel's middle, and where it is along it."""
+    """Dimensions of a panel, metres.
+
+    ``off_m`` is the distance of its inner face from the centre of the steel, ``along_m`` the offset of its centre
+    along the side.
+    """
 
     off_m: float
     along_m: float
@@ -34,37 +40,50 @@ class _Panel:
     thickness_m: float
 
 
-def formwork(site: Site) -> tuple[Part, ...]:
-    """Return the panels and their battens; the seed picks the sides."""
-    first = int(site.random("formwork").integers(4))
+def formwork(context: PlacementContext) -> tuple[Part, ...]:
+    """Return the panels and their battens; the seed of the scene selects the sides."""
+    first = int(context.rng("formwork").integers(4))
     parts: list[Part] = []
-    for n, share in enumerate(WIDTHS):
+    for n, share in enumerate(PANEL_WIDTHS):
         side = (first + n) % 4
-        panel = _panel(site, side, share, shift=0.25 * n)
-        for name, mesh, material in _meshes(panel):
-            middle_m = np.array([site.middle_m[0], site.middle_m[1], 0.0])
+        panel = _panel(context, side, share, shift=0.25 * n)
+        for name, mesh, material in _panel_meshes(panel):
+            middle_m = np.array([context.middle_m[0], context.middle_m[1], 0.0])
             parts.append(
-                Part(f"formwork-{n}-{name}", placed(mesh, about_z(90.0 * side), middle_m), NOT_STEEL, material)
+                Part(
+                    f"formwork-{n}-{name}",
+                    transformed(mesh, rotation_about_z(90.0 * side), middle_m),
+                    NOT_STEEL,
+                    material,
+                )
             )
     return tuple(parts)
 
 
-def _panel(site: Site, side: int, share: float, shift: float) -> _Panel:
-    """Return the panel of one side: 0 stands at +x, and each next one a quarter turn further."""
-    across_m, along_m = (site.size_m[0], site.size_m[1]) if side % 2 == 0 else (site.size_m[1], site.size_m[0])
-    # Room for spacers and hooks that reach a little beyond the bars' box.
-    gap_m = max(0.03 * site.span_m, 3.5 * site.thickest_m)
+def _panel(context: PlacementContext, side: int, share: float, shift: float) -> _Panel:
+    """Return the panel of one side; side 0 is at +x, the others follow in quarter turns.
+
+    ``share`` is the width and ``shift`` the offset, both as fractions: of the side and of the width.
+    """
+    across_m, along_m = (
+        (context.size_m[0], context.size_m[1]) if side % 2 == 0 else (context.size_m[1], context.size_m[0])
+    )
+    # Leave room for spacers and hooks, which extend beyond the bounding box of the bars.
+    gap_m = max(0.03 * context.span_m, 3.5 * context.thickest_m)
     return _Panel(
         off_m=float(across_m / 2 + gap_m),
         along_m=float(along_m * share * shift),
         width_m=float(along_m * share),
-        height_m=float(max(HEIGHT * site.high_m[2], 0.2 * site.span_m)),
-        thickness_m=float(np.clip(0.012 * site.span_m, 0.0012, 0.021)),
+        height_m=float(max(PANEL_HEIGHT * context.high_m[2], 0.2 * context.span_m)),
+        thickness_m=float(np.clip(0.012 * context.span_m, 0.0012, 0.021)),
     )
 
 
-def _meshes(panel: _Panel) -> list[tuple[str, Mesh, str]]:
-    """Return the sheet, its upright battens and one waler, each clear of the next; the steel is towards -x."""
+def _panel_meshes(panel: _Panel) -> list[tuple[str, Mesh, str]]:
+    """Return (name, mesh, material) of the sheet, its battens and its walers; the steel is towards -x.
+
+    The pieces do not touch each other.
+    """
     x, t, gap = panel.off_m, panel.thickness_m, panel.thickness_m * 0.05
     low, high = panel.along_m - panel.width_m / 2, panel.along_m + panel.width_m / 2
     depth = 2.5 * t
@@ -83,22 +102,23 @@ def _meshes(panel: _Panel) -> list[tuple[str, Mesh, str]]:
     return meshes
 
 
-DISTANCE = 6.0
-"""The screen's plane is this many half diagonals from the steel's middle; cameras stay nearer."""
+SCREEN_DISTANCE = 6.0
+"""Distance of the screen from the centre of the steel, in half diagonals of the steel; cameras are nearer."""
 SLATS = 9
-HALF_SIZE = 1.5
-"""Half the slatted square's side, in half diagonals."""
+"""Number of slats of the screen."""
+SCREEN_HALF_SIZE = 1.5
+"""Half the side of the square screen, in half diagonals of the steel."""
 
 
-def slatted_screen(site: Site) -> tuple[Part, ...]:
-    """Return the screen: slats on two rails that lean on down to the ground in the screen's own plane.
+def slatted_screen(context: PlacementContext) -> tuple[Part, ...]:
+    """Return the screen: slats on two rails that extend to the ground in the plane of the screen.
 
-    The plane is square to the sun's direction, so that none of it is nearer to the steel than its middle.
+    The plane is perpendicular to the direction of the sun, so its centre is its point nearest to the steel.
     """
-    world_from_screen = _axes()
-    reach_m = site.reach_m
-    middle_m = site.middle_m + DISTANCE * reach_m * world_from_screen[:, 2]
-    half_m, pitch_m = HALF_SIZE * reach_m, 2 * HALF_SIZE * reach_m / SLATS
+    world_from_screen = _world_from_screen()
+    reach_m = context.reach_m
+    middle_m = context.middle_m + SCREEN_DISTANCE * reach_m * world_from_screen[:, 2]
+    half_m, pitch_m = SCREEN_HALF_SIZE * reach_m, 2 * SCREEN_HALF_SIZE * reach_m / SLATS
     thick_m = 0.03 * reach_m
     slats = [
         box((-half_m, v_m, 0.0), (half_m, v_m + 0.5 * pitch_m, thick_m))
@@ -110,14 +130,14 @@ def slatted_screen(site: Site) -> tuple[Part, ...]:
         for u_m in (-0.7 * half_m, 0.7 * half_m)
     ]
     return tuple(
-        Part(f"screen-{name}", placed(joined(meshes), world_from_screen, middle_m), NOT_STEEL, "timber")
+        Part(f"screen-{name}", transformed(merge_meshes(meshes), world_from_screen, middle_m), NOT_STEEL, "timber")
         for name, meshes in (("slats", slats), ("rails", rails))
     )
 
 
-def _axes() -> Float64[ndarray, "3 3"]:
-    """Return the screen's frame as columns: level, up the slope, towards the sun."""
+def _world_from_screen() -> Float64[ndarray, "3 3"]:
+    """Return the axes of the screen as columns: horizontal, up the slope, towards the sun."""
     towards_sun = np.array(SUN_FROM) / np.linalg.norm(SUN_FROM)
-    level = np.cross([0.0, 0.0, 1.0], towards_sun)
-    level /= np.linalg.norm(level)
-    return np.stack([level, np.cross(towards_sun, level), towards_sun], axis=1)
+    horizontal = np.cross([0.0, 0.0, 1.0], towards_sun)
+    horizontal /= np.linalg.norm(horizontal)
+    return np.stack([horizontal, np.cross(towards_sun, horizontal), towards_sun], axis=1)

@@ -1,6 +1,6 @@
-"""What the makers of things round the steel know of a scene: where the steel is and what is taken. World, in m.
+"""Placement context of props: bounding box of the steel, occupied ground regions, and bars as capsules.
 
-Where the bars of an assembly are, as capsules round their axes: what is near, what crosses. World, metres.
+World frame, metres.
 """
 
 from __future__ import annotations
@@ -13,18 +13,21 @@ from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from dataset_builder.config.specs import SceneSpec
-from dataset_builder.scene.model import Assembly, Bar, Part
+from dataset_builder.scene.model import Assembly, Part
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m, plain_outer_radius_m
+from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.geometry.aruco_board import marker_corners_m
 
-_PARALLEL = 1e-12
+_EPSILON = 1e-12
+"""Smallest squared sine of the angle, and smallest axis distance in metres, of a crossing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Capsules:
-    """Straight pieces of bars, each the points within ``radius_m`` of the piece of axis from ``a_m`` to ``b_m``.
+    """Straight pieces of bars as capsules: all points within ``radius_m`` of the segment from ``a_m`` to ``b_m``.
 
-    ``bar`` is the index of a piece's bar in the assembly. A radius holds ribs, so no steel is outside.
+    ``bar`` is the index of the bar of each piece in the assembly. The radii include the ribs, so the capsules
+    enclose all steel.
     """
 
     a_m: Float64[ndarray, "n 3"]
@@ -33,7 +36,7 @@ class Capsules:
     bar: Int64[ndarray, " n"]
 
     @classmethod
-    def of(cls, bars: tuple[Bar, ...]) -> Capsules:
+    def from_bars(cls, bars: tuple[Bar, ...]) -> Capsules:
         """Return the capsules of ``bars``, in order."""
         lines = [np.asarray(bar.axis_m, dtype=np.float64) for bar in bars]
         pieces = np.array([len(line) - 1 for line in lines])
@@ -44,19 +47,19 @@ class Capsules:
             np.repeat(np.arange(len(bars)), pieces),
         )
 
-    def kept(self, which: Bool[ndarray, " n"]) -> Capsules:
-        """Return the pieces that ``which`` marks."""
+    def select(self, which: Bool[ndarray, " n"]) -> Capsules:
+        """Return the pieces selected by the mask ``which``."""
         return Capsules(self.a_m[which], self.b_m[which], self.radius_m[which], self.bar[which])
 
-    def near(self, low_m: Float64[ndarray, " 3"], high_m: Float64[ndarray, " 3"]) -> Bool[ndarray, " n"]:
-        """Return which pieces' own boxes meet the box from ``low_m`` to ``high_m``."""
+    def overlapping(self, low_m: Float64[ndarray, " 3"], high_m: Float64[ndarray, " 3"]) -> Bool[ndarray, " n"]:
+        """Return the mask of pieces whose bounding box intersects the box from ``low_m`` to ``high_m``."""
         reach = self.radius_m[:, None]
         below = (np.minimum(self.a_m, self.b_m) - reach <= high_m).all(axis=1)
         above = (np.maximum(self.a_m, self.b_m) + reach >= low_m).all(axis=1)
         return np.asarray(below & above)
 
     def clearance_m(self, points_m: Float64[ndarray, "k 3"]) -> float:
-        """Return the least distance from any of the points to any capsule's surface; infinity without capsules."""
+        """Return the smallest signed distance of the points to the capsules, metres; infinity for no capsules."""
         if not len(self.a_m):
             return float("inf")
         along = self.b_m - self.a_m
@@ -68,27 +71,28 @@ class Capsules:
 
 @dataclass(frozen=True, eq=False)
 class Crossing:
-    """Two pieces (indices into the capsules) that pass each other, and the nearest points of their axes."""
+    """Crossing of two pieces (indices into the capsules), with the closest points of their axes."""
 
     pieces: tuple[int, int]
     points_m: tuple[Float64[ndarray, " 3"], Float64[ndarray, " 3"]]
 
 
-def crossings(capsules: Capsules, gap_m: float, least_angle_deg: float = 30.0) -> list[Crossing]:
-    """Return where straight legs of different bars pass at ``gap_m`` or less between surfaces, steeply enough.
+def find_crossings(capsules: Capsules, gap_m: float, least_angle_deg: float = 30.0) -> list[Crossing]:
+    """Return the crossings of straight legs of different bars.
 
-    Pieces no longer than two diameters belong to bends and are left out.
+    The surfaces are at most ``gap_m`` apart, and the angle between the legs is at least ``least_angle_deg``.
+    Pieces of at most two diameters belong to bends and are omitted.
     """
-    found = []
+    crossings = []
     legs = np.linalg.norm(capsules.b_m - capsules.a_m, axis=1) > 4 * capsules.radius_m
     low = np.minimum(capsules.a_m, capsules.b_m) - capsules.radius_m[:, None] - gap_m
     high = np.maximum(capsules.a_m, capsules.b_m) + capsules.radius_m[:, None] + gap_m
     for piece in np.flatnonzero(legs):
-        later = legs & capsules.near(low[piece], high[piece]) & (capsules.bar > capsules.bar[piece])
+        later = legs & capsules.overlapping(low[piece], high[piece]) & (capsules.bar > capsules.bar[piece])
         others = np.flatnonzero(later)
         if len(others):
-            found += _crossings_of(int(piece), others, capsules, gap_m, np.deg2rad(least_angle_deg))
-    return found
+            crossings += _crossings_of(int(piece), others, capsules, gap_m, np.deg2rad(least_angle_deg))
+    return crossings
 
 
 def _crossings_of(
@@ -99,112 +103,112 @@ def _crossings_of(
     w = capsules.a_m[piece] - capsules.a_m[others]
     uu, uv, vv, uw, vw = u @ u, v @ u, (v * v).sum(axis=1), w @ u, (w * v).sum(axis=1)
     squared_sine = 1.0 - uv**2 / (uu * vv)
-    steep = squared_sine > max(np.sin(least_angle) ** 2, _PARALLEL)
+    steep = squared_sine > max(np.sin(least_angle) ** 2, _EPSILON)
     across = np.where(steep, uu * vv - uv**2, 1.0)
     s, t = (uv * vw - vv * uw) / across, (uu * vw - uv * uw) / across
-    # A crossing beyond either piece's end belongs to its neighbour, or to nobody.
+    # A closest point beyond the end of a piece is a crossing of the adjacent piece, or no crossing.
     inside = (s >= 0) & (s < 1) & (t >= 0) & (t < 1)
     on_piece = capsules.a_m[piece] + s[:, None] * u
     on_other = capsules.a_m[others] + t[:, None] * v
     apart = np.linalg.norm(on_piece - on_other, axis=1)
-    touching = (apart > _PARALLEL) & (apart - capsules.radius_m[piece] - capsules.radius_m[others] <= gap_m)
-    which = np.flatnonzero(steep & inside & touching)
+    close = (apart > _EPSILON) & (apart - capsules.radius_m[piece] - capsules.radius_m[others] <= gap_m)
+    which = np.flatnonzero(steep & inside & close)
     return [Crossing((piece, int(others[k])), (on_piece[k], on_other[k])) for k in which]
 
 
 @cache
 def envelope_radius_m(diameter_m: float) -> float:
-    """Return the distance from its axis that no point of a bar exceeds, ribbed or plain, metres."""
+    """Return the maximum distance of the surface of a bar, ribbed or plain, from its axis, metres."""
     return max(outer_radius_m(diameter_m), plain_outer_radius_m(diameter_m))
 
 
 GAP_M = 5e-4
-"""Things stand this far above the ground, and no surface of theirs lies in another's."""
+"""Height of props above the ground, metres, so that no two surfaces coincide."""
 
 
 @dataclass(frozen=True)
 class Rect:
-    """An upright rectangle of the ground plan, ``low_m`` and ``high_m`` its (x, y) corners."""
+    """Axis-aligned rectangle on the ground; ``low_m`` and ``high_m`` are its (x, y) corners, metres."""
 
     low_m: tuple[float, float]
     high_m: tuple[float, float]
 
     def distance_m(self, points_m: Float64[ndarray, "k 2"]) -> Float64[ndarray, " k"]:
-        """Return how far each (x, y) is from the rectangle, 0 inside."""
+        """Return the distance of each (x, y) point from the rectangle, metres; 0 inside."""
         outside = np.maximum(np.array(self.low_m) - points_m, points_m - np.array(self.high_m))
         return np.asarray(np.linalg.norm(np.maximum(outside, 0.0), axis=1))
 
-    def grown(self, by_m: float) -> Rect:
-        """Return the rectangle with every side moved out by ``by_m``."""
+    def expanded(self, by_m: float) -> Rect:
+        """Return the rectangle with every side moved outwards by ``by_m``."""
         (x0, y0), (x1, y1) = self.low_m, self.high_m
         return Rect((x0 - by_m, y0 - by_m), (x1 + by_m, y1 + by_m))
 
 
 @dataclass(frozen=True, eq=False)
-class Site:
-    """The steel's bars and bounding box, the ground plan's taken places, and the scene's seed."""
+class PlacementContext:
+    """Bars and bounding box of the steel, occupied ground rectangles, and seed of the scene."""
 
     bars: tuple[Bar, ...]
     low_m: Float64[ndarray, " 3"]
     high_m: Float64[ndarray, " 3"]
-    taken: tuple[Rect, ...]
+    occupied: tuple[Rect, ...]
     seed: int
 
     @classmethod
-    def of(cls, assembly: Assembly, spec: SceneSpec) -> Site:
-        """Return the site of an assembly; the board's markers are taken."""
-        vertices_m = np.concatenate([part.mesh.vertices_m for part in assembly.parts])
+    def from_assembly(cls, assembly: Assembly, spec: SceneSpec) -> PlacementContext:
+        """Return the context of an assembly; the markers of the board are occupied."""
+        vertices_m = assembly.vertices_m
         markers = marker_corners_m(spec.board).values() if spec.board else ()
-        taken = tuple(_plan(corners_m) for corners_m in markers)
-        return cls(assembly.bars, vertices_m.min(axis=0), vertices_m.max(axis=0), taken, spec.seed)
+        occupied = tuple(_footprint(corners_m) for corners_m in markers)
+        return cls(assembly.bars, vertices_m.min(axis=0), vertices_m.max(axis=0), occupied, spec.seed)
 
-    def with_parts(self, parts: tuple[Part, ...]) -> Site:
-        """Return the site with the ground plan of ``parts`` taken too."""
-        return replace(self, taken=(*self.taken, *(_plan(part.mesh.vertices_m) for part in parts)))
+    def with_parts(self, parts: tuple[Part, ...]) -> PlacementContext:
+        """Return the context in which the footprints of ``parts`` are occupied too."""
+        return replace(self, occupied=(*self.occupied, *(_footprint(part.mesh.vertices_m) for part in parts)))
 
-    def random(self, what: str) -> np.random.Generator:
-        """Return a generator that depends on the scene's seed and on ``what`` it is for, and on nothing else."""
-        return np.random.default_rng([self.seed, *what.encode()])
+    def rng(self, purpose: str) -> np.random.Generator:
+        """Return a random generator that depends only on the seed of the scene and on ``purpose``."""
+        return np.random.default_rng([self.seed, *purpose.encode()])
 
     @cached_property
     def capsules(self) -> Capsules:
-        """The steel as capsules round the bars' axes."""
-        return Capsules.of(self.bars)
+        """Capsules around the axes of the bars."""
+        return Capsules.from_bars(self.bars)
 
     @property
-    def plan(self) -> Rect:
-        """The steel's bounding box seen from above."""
-        return Rect(_pair(self.low_m), _pair(self.high_m))
+    def footprint(self) -> Rect:
+        """Bounding box of the steel seen from above."""
+        return Rect(_xy(self.low_m), _xy(self.high_m))
 
     @property
     def middle_m(self) -> Float64[ndarray, " 3"]:
-        """The middle of the steel's bounding box."""
+        """Centre of the bounding box of the steel."""
         return np.asarray((self.low_m + self.high_m) / 2)
 
     @property
     def size_m(self) -> Float64[ndarray, " 3"]:
-        """The sides of the steel's bounding box."""
+        """Side lengths of the bounding box of the steel."""
         return np.asarray(self.high_m - self.low_m)
 
     @property
     def span_m(self) -> float:
-        """The longer horizontal side of the steel's bounding box: what things are scaled by."""
+        """Longer horizontal side of the bounding box of the steel, by which props are scaled."""
         return float(self.size_m[:2].max())
 
     @property
     def reach_m(self) -> float:
-        """Half the diagonal of the steel's bounding box."""
+        """Half the diagonal of the bounding box of the steel."""
         return float(np.linalg.norm(self.size_m) / 2)
 
     @property
     def thickest_m(self) -> float:
-        """The largest bar diameter."""
+        """Largest bar diameter."""
         return max(bar.diameter_m for bar in self.bars)
 
 
-def _plan(points_m: Float64[ndarray, "n 3"]) -> Rect:
-    return Rect(_pair(points_m.min(axis=0)), _pair(points_m.max(axis=0)))
+def _footprint(points_m: Float64[ndarray, "n 3"]) -> Rect:
+    return Rect(_xy(points_m.min(axis=0)), _xy(points_m.max(axis=0)))
 
 
-def _pair(point_m: Float64[ndarray, " 3"]) -> tuple[float, float]:
+def _xy(point_m: Float64[ndarray, " 3"]) -> tuple[float, float]:
     return float(point_m[0]), float(point_m[1])

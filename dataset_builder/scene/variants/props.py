@@ -1,8 +1,8 @@
-"""The things of a scene's appearance variants: real surfaces round the steel, none of them steel.
+"""Props of the appearance variants: surfaces around the steel that are not steel.
 
-They are made from the bars and the bounding box alone, scale with them, and repeat for the same seed. Makers
-run in a fixed order, each told what ground the earlier ones took; nothing stands in the steel's bounding box
-but tie wire and spacers, which keep clear of every bar's envelope.
+Props are computed only from the bars and the bounding box of the steel, scale with them, and are reproducible for
+a seed. The builders run in a fixed order; each receives the ground regions occupied by the earlier ones. Only tie
+wire and spacers are placed inside the bounding box of the steel; they stay outside the envelope of every bar.
 """
 
 from __future__ import annotations
@@ -14,34 +14,34 @@ from dataset_builder.scene.model import Assembly, Part
 from dataset_builder.scene.variants import SHADOWS, check_variants
 from dataset_builder.scene.variants.clutter import clutter
 from dataset_builder.scene.variants.panels import formwork, slatted_screen
-from dataset_builder.scene.variants.placement import Site
+from dataset_builder.scene.variants.placement import PlacementContext
 from dataset_builder.scene.variants.spacers import spacers
 from dataset_builder.scene.variants.tie_wire import tie_wire
 
-MAKERS: Mapping[str, Callable[[Site], tuple[Part, ...]]] = {
+PROP_BUILDERS: Mapping[str, Callable[[PlacementContext], tuple[Part, ...]]] = {
     "tie-wire": tie_wire,
     "spacers": spacers,
     "formwork": formwork,
     "clutter": clutter,
     SHADOWS: slatted_screen,
 }
-"""By variant, in the order in which they run, whatever the order of the names in a spec."""
+"""Prop builders by variant, in execution order, which does not depend on the order of the names in a spec."""
 
 
-def occluders(assembly: Assembly, spec: SceneSpec) -> tuple[Part, ...]:
-    """Return the things that ``spec.appearance`` asks for, in the world frame, all with id ``NOT_STEEL``.
+def make_props(assembly: Assembly, spec: SceneSpec) -> tuple[Part, ...]:
+    """Return the props requested by ``spec.appearance``, in the world frame, all with bar id ``NOT_STEEL``.
 
-    Raises ``InputError`` where the variants' names do not pass ``check_variants``.
+    Raises ``InputError`` if the variants do not pass ``check_variants``.
     """
-    asked = spec.appearance.variants
-    check_variants(asked)
+    requested = spec.appearance.variants
+    check_variants(requested)
     parts: tuple[Part, ...] = ()
-    if not any(name in MAKERS for name in asked):
+    if not any(name in PROP_BUILDERS for name in requested):
         return parts
-    site = Site.of(assembly, spec)
-    for name, make in MAKERS.items():
-        if name in asked:
-            made = make(site)
-            parts = (*parts, *made)
-            site = site.with_parts(made)
+    context = PlacementContext.from_assembly(assembly, spec)
+    for name, build_props in PROP_BUILDERS.items():
+        if name in requested:
+            props = build_props(context)
+            parts = (*parts, *props)
+            context = context.with_parts(props)
     return parts

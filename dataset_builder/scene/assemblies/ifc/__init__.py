@@ -1,1 +1,1 @@
-"""IFC import: reinforcing bars of a building model as bars and meshes."""
+"""IFC import: the reinforcing bars of a building model as bars and meshes."""

@@ -1,8 +1,8 @@
-"""An IFC file as a model: opened whole or refused, with its units. The only module that imports ifcopenshell.
+"""IFC models: opening with a completeness check, units, tessellation. The only module that imports ifcopenshell.
 
-The parser leaves out what it cannot read and goes on; a bar would then stand in the wrong place without a word.
-So a file counts as whole only where every instance that its text defines is in the model and every reference leads
-to one.
+The parser silently skips what it cannot read, which could place a bar wrongly without an error. A file is
+therefore accepted only if every instance that its text defines is in the model and every reference leads to a
+defined instance.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 from rebar_depth_bench.errors import InputError, MeshError
 
 Entity = Any
-"""An ``ifcopenshell.entity_instance``: its attributes are those of its IFC class."""
+"""An ``ifcopenshell.entity_instance``, with the attributes of its IFC class."""
 
 Model = Any
 """An ``ifcopenshell.file``."""
@@ -28,33 +28,33 @@ _PREFIXES = {"MILLI": 1e-3, "CENTI": 1e-2, "DECI": 1e-1, None: 1.0, "DECA": 1e1,
 
 
 def open_model(content: bytes, where: str) -> Model:
-    """Return the model of a STEP file's ``content``.
+    """Return the model of a STEP file's ``content``; ``where`` names the file in error messages.
 
-    Raises ``InputError`` where ifcopenshell is not installed, ``MeshError`` where the file is not a whole IFC
-    file: truncated, of no schema that is known, with unreadable instances or references that lead nowhere.
+    Raises ``InputError`` if ifcopenshell is not installed, and ``MeshError`` if the file is not a complete IFC
+    file: truncated, of an unknown schema, with unreadable instances or dangling references.
     """
     text = content.decode("utf-8", errors="replace")
-    _check_text(text, where)
+    defined_ids = _check_text(text, where)
     try:
-        model = ifcopenshell().file.from_string(text)
+        model = import_ifcopenshell().file.from_string(text)
         schema = model.schema
-        found = {entity.id() for entity in model}
+        read_ids = {entity.id() for entity in model}
     except InputError:
         raise
     except Exception as error:
         reason = shorten(str(error), 200) or type(error).__name__
         raise MeshError(f"{where}: not an IFC file that can be read ({reason})") from error
-    lost = sorted(set(_instances(text)) - found)
-    if lost:
+    unread = sorted(defined_ids - read_ids)
+    if unread:
         raise MeshError(
-            f"{where}: {len(lost)} of its instances cannot be read, first #{lost[0]}, expected a whole "
+            f"{where}: {len(unread)} of its instances cannot be read, first #{unread[0]}, expected a whole "
             f"{schema} file"
         )
     return model
 
 
-def ifcopenshell() -> Any:
-    """Return the package; raise ``InputError`` that says how to install it where it is missing."""
+def import_ifcopenshell() -> Any:
+    """Return the package ``ifcopenshell``; raise ``InputError`` with the install command if it is missing."""
     try:
         return importlib.import_module("ifcopenshell")
     except ImportError as error:
@@ -65,10 +65,10 @@ def ifcopenshell() -> Any:
 
 
 def world_meshes(model: Model, ids: list[int]) -> Any:
-    """Yield vertices (flat, world, metres) and triangles (flat) of each instance that ``ids`` names.
+    """Yield vertices (flat, world, metres) and triangles (flat) of each instance number in ``ids``.
 
-    Raises ``RuntimeError`` where the geometry kernel can make nothing of one. It may also run for ever or crash:
-    call it in a process of its own.
+    Raises ``RuntimeError`` if the geometry kernel cannot tessellate an instance. The kernel may also hang or
+    crash, so call this in a separate process.
     """
     geom = importlib.import_module("ifcopenshell.geom")
     settings = geom.settings()
@@ -81,8 +81,8 @@ def world_meshes(model: Model, ids: list[int]) -> Any:
 
 
 def length_unit_m(model: Model, where: str) -> float:
-    """Return one of the project's length units in metres; raise ``MeshError`` where the file does not tell."""
-    metres = _unit(model, "LENGTHUNIT", "METRE")
+    """Return the project's length unit in metres; raise ``MeshError`` if the file does not define a known one."""
+    metres = _project_unit(model, "LENGTHUNIT", "METRE")
     if metres is None:
         raise MeshError(
             f"{where}: the project has no length unit that is known, expected metres, feet or the like"
@@ -91,22 +91,23 @@ def length_unit_m(model: Model, where: str) -> float:
 
 
 def angle_unit_rad(model: Model) -> float:
-    """Return one of the project's plane angle units in radians; the radian where the file does not tell."""
-    return _unit(model, "PLANEANGLEUNIT", "RADIAN") or 1.0
+    """Return the project's plane angle unit in radians, 1.0 if the file does not define a known one."""
+    return _project_unit(model, "PLANEANGLEUNIT", "RADIAN") or 1.0
 
 
-def _unit(model: Model, kind: str, base: str) -> float | None:
-    """Return one project unit of a kind in its SI base unit, or None."""
+def _project_unit(model: Model, kind: str, base: str) -> float | None:
+    """Return the project unit of a kind, expressed in the SI unit ``base``, or None."""
     for project in model.by_type("IfcProject"):
         for unit in getattr(project.UnitsInContext, "Units", None) or ():
             if getattr(unit, "UnitType", None) == kind:
-                return _in_base(unit, base)
+                return _to_base_unit(unit, base)
     return None
 
 
-def _in_base(unit: Entity, base: str) -> float | None:
+def _to_base_unit(unit: Entity, base: str) -> float | None:
+    """Return the factor from an IFC unit to the SI unit ``base``, or None if it is not such a unit."""
     factor = 1.0
-    if unit.is_a("IfcConversionBasedUnit"):  # 1 ft is a number of some SI unit
+    if unit.is_a("IfcConversionBasedUnit"):  # For example, a foot defined as a number of metres.
         factor = float(unit.ConversionFactor.ValueComponent.wrappedValue)
         unit = unit.ConversionFactor.UnitComponent
     if not unit.is_a("IfcSIUnit") or unit.Name != base or unit.Prefix not in _PREFIXES or not factor > 0:
@@ -114,12 +115,11 @@ def _in_base(unit: Entity, base: str) -> float | None:
     return factor * _PREFIXES[unit.Prefix]
 
 
-def _instances(text: str) -> list[int]:
-    return [int(number) for number in _INSTANCE.findall(_STRING_OR_COMMENT.sub("''", text))]
+def _check_text(text: str, where: str) -> set[int]:
+    """Return the instance numbers that a STEP text defines.
 
-
-def _check_text(text: str, where: str) -> None:
-    """Raise ``MeshError`` unless the text begins and ends as STEP and every reference leads to one instance."""
+    Raises ``MeshError`` unless it begins and ends as STEP and each reference has exactly one instance.
+    """
     if not text.lstrip("\ufeff \t\r\n").startswith("ISO-10303-21"):
         raise MeshError(f"{where}: does not begin with ISO-10303-21, expected an IFC file in STEP format")
     if not re.search(r"END-ISO-10303-21\s*;\s*\Z", text):
@@ -130,11 +130,12 @@ def _check_text(text: str, where: str) -> None:
     instances = [int(number) for number in _INSTANCE.findall(bare)]
     defined = set(instances)
     if len(defined) < len(instances):
-        twice = next(number for number, times in Counter(instances).items() if times > 1)
-        raise MeshError(f"{where}: instance #{twice} is defined twice, expected each once")
-    lost = sorted({int(number) for number in _REFERENCE.findall(bare)} - defined)
-    if lost:
+        duplicate = next(number for number, times in Counter(instances).items() if times > 1)
+        raise MeshError(f"{where}: instance #{duplicate} is defined twice, expected each once")
+    undefined = sorted({int(number) for number in _REFERENCE.findall(bare)} - defined)
+    if undefined:
         raise MeshError(
-            f"{where}: {len(lost)} instances are referred to and not there, first #{lost[0]}, expected a whole "
-            "file"
+            f"{where}: {len(undefined)} instances are referred to and not there, first #{undefined[0]}, "
+            "expected a whole file"
         )
+    return defined

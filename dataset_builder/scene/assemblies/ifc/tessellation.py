@@ -1,8 +1,8 @@
-"""Surfaces of IFC objects, from ifcopenshell's geometry kernel in a process of its own.
+"""Tessellation of IFC objects by ifcopenshell's geometry kernel, in a separate process.
 
-The kernel may run for ever or crash on a damaged shape; the process then ends by a signal, and whose turn it was
-is known. ``python -m dataset_builder.scene.assemblies.ifc.tessellation`` reads one pickle (content, where, ids)
-from standard input and writes one a shape: vertices and triangles, or the words of an error.
+The kernel may hang or crash on a damaged shape; the process then ends by a signal, and the number of results
+identifies the shape. ``python -m dataset_builder.scene.assemblies.ifc.tessellation`` reads one pickle
+(content, where, ids) from standard input and writes one pickle per shape: a ``Mesh``, or an error message.
 """
 
 from __future__ import annotations
@@ -21,47 +21,51 @@ from dataset_builder.scene.assemblies.ifc.model import open_model, world_meshes
 from dataset_builder.scene.model import Mesh
 
 SECONDS_PER_SHAPE = 60
+"""Time limit per shape; SIGALRM ends the process after it."""
+
 COMMAND = (sys.executable, "-m", "dataset_builder.scene.assemblies.ifc.tessellation")
 
 
-def meshes_of(content: bytes, where: str, ids: list[int]) -> list[Mesh | str]:
-    """Return each object's surface (world, metres), or why it has none, for the first ``ids`` that were reached.
+def tessellate(content: bytes, where: str, ids: list[int]) -> list[Mesh | str]:
+    """Return each object's surface (world, metres) or an error message, in the order of ``ids``.
 
-    The list ends with the object that brought the process down, if one did.
+    The list is shorter than ``ids`` if an object ended the process; its error message is then the last item.
     """
     finished = subprocess.run(COMMAND, input=pickle.dumps((content, where, ids)), capture_output=True, check=False)
-    found = list(_unpickled(finished.stdout))
-    if len(found) < len(ids):
+    results = list(_iter_pickles(finished.stdout))
+    if len(results) < len(ids):
         status = finished.returncode
         slow = status == -signal.SIGALRM
-        found.append(
+        results.append(
             f"took over {SECONDS_PER_SHAPE} s" if slow else f"brought the geometry kernel down (status {status})"
         )
-    return found
+    return results
 
 
-def _unpickled(content: bytes) -> Iterator[Mesh | str]:
+def _iter_pickles(content: bytes) -> Iterator[Mesh | str]:
+    """Yield the complete pickles in ``content``."""
     stream = BytesIO(content)
     while stream.tell() < len(content):
         try:
             yield pickle.load(stream)
-        except (EOFError, pickle.UnpicklingError):  # it died in the middle of a word
+        except (EOFError, pickle.UnpicklingError):  # The process ended while it wrote a pickle.
             return
 
 
 def main() -> None:
-    """Answer one request; what native code prints does not get among the answers."""
+    """Read one request and write its results; output of native code is redirected to standard error."""
     content, where, ids = pickle.load(sys.stdin.buffer)
     with os.fdopen(os.dup(1), "wb") as answers:
         os.dup2(2, 1)
-        model = open_model(content, where)  # the parent has opened this very content
+        model = open_model(content, where)  # This cannot fail: the parent process has opened the same content.
         for number in ids:
             signal.alarm(SECONDS_PER_SHAPE)
-            pickle.dump(_mesh(model, number), answers)
+            pickle.dump(_tessellate_instance(model, number), answers)
             answers.flush()
 
 
-def _mesh(model: object, number: int) -> Mesh | str:
+def _tessellate_instance(model: object, number: int) -> Mesh | str:
+    """Return the surface of one instance (world, metres), or an error message."""
     try:
         [(vertices, faces)] = world_meshes(model, [number])
     except RuntimeError as error:

@@ -1,18 +1,12 @@
-"""Blender in a process of its own: one task in, events out, and nothing that Blender prints.
+"""Blender subprocesses, the tasks they run and the events they report.
 
-The task is pickled to the process's standard input, which then stays open: the process ends itself when it
-closes, so no render outlives its parent. Events come back as JSON lines on its standard output. Whatever
-Blender or its libraries print goes to a log that is shown only when the process fails.
-
-What a Blender process can be asked to do. Plain values: they are pickled to the process.
+A task is pickled to the standard input of the process. The input then stays open, and the process exits when it is
+closed, so that no render outlives its parent. Events are JSON lines on the standard output of the process. The
+output of Blender and its libraries goes to a log file, whose end is shown only if the process fails.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from dataset_builder.config.rigs import Camera
-from dataset_builder.config.specs import ConfigSpec
 import json
 import pickle
 import signal
@@ -21,16 +15,22 @@ import sys
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any
+
+from dataset_builder.config.rigs import Camera
+from dataset_builder.config.specs import ConfigSpec
 from rebar_depth_bench.errors import BuildError, InputError, RebarDepthError, RenderProcessError
+
 
 @dataclass(frozen=True)
 class RenderTask:
-    """Render views of one shard of a config into ``staging``; views already staged are not done again.
+    """Task that renders views of one shard of a config into the folder ``staging``.
 
-    Idempotent: the same task gives the same bytes, however often it is interrupted. Where ``mesh_sha256`` is
-    known, a scene whose mesh has another digest is refused before anything is rendered.
+    The task is idempotent: views that are already staged are skipped, and interruptions do not change the bytes.
+    If ``mesh_sha256`` is not None, the task fails before rendering if the mesh of the scene has another digest.
     """
 
     config: ConfigSpec
@@ -43,7 +43,7 @@ class RenderTask:
 
 @dataclass(frozen=True)
 class DepthTask:
-    """Render Cycles' own planar depth of a mesh file from some cameras; one float32 .npy each into ``out``."""
+    """Task that renders the planar depth of a mesh file with Cycles: one float32 .npy in ``out`` per camera."""
 
     mesh: Path
     cameras: tuple[Camera, ...]
@@ -56,13 +56,14 @@ Task = RenderTask | DepthTask
 
 Event = Mapping[str, Any]
 _ERRORS: Mapping[str, type[RebarDepthError]] = {"input_error": InputError, "build_error": BuildError}
-"""The events that end a task, and what each is raised as."""
+"""Exception type by the key of the event that reports it; such an event ends the task."""
 ATTEMPTS = 2
+"""Number of times a task is started before a dying process is an error."""
 _LOG_TAIL_LINES = 15
 
 
 class BlenderProcesses:
-    """Runs tasks in Blender processes; on leaving the context whatever still runs is killed."""
+    """Runner of tasks in Blender processes; leaving the context kills the processes still running."""
 
     def __init__(self) -> None:
         self._running: set[subprocess.Popen[bytes]] = set()
@@ -80,24 +81,25 @@ class BlenderProcesses:
             for process in self._running:
                 process.kill()
 
-    def run(self, task: Task, what: str, log: Path, on_event: Callable[[Event], None]) -> None:
-        """Run ``task``; a process that dies is started once more, then ``RenderProcessError`` names ``what``.
+    def run(self, task: Task, label: str, log: Path, on_event: Callable[[Event], None]) -> None:
+        """Run ``task`` in a new process and pass its events to ``on_event``.
 
-        Raises ``InputError`` in the process's own words where it found the input at fault, ``BuildError``
-        where it refused to go on.
+        A process that dies is restarted once. ``label`` names the task in errors; the output of Blender is written
+        to ``log``. Raises ``RenderProcessError`` if the process dies twice, and the ``InputError`` or
+        ``BuildError`` that the process reports.
         """
         for attempt in range(1, ATTEMPTS + 1):
             status = self._run_once(task, log, on_event)
             if status == 0:
                 return
             if self._closed or attempt == ATTEMPTS:
-                raise RenderProcessError(_failure(what, status, attempt, log))
+                raise RenderProcessError(_failure_message(label, status, attempt, log))
 
     def _run_once(self, task: Task, log: Path, on_event: Callable[[Event], None]) -> int:
         log.parent.mkdir(parents=True, exist_ok=True)
         with self._start(log) as process:
             try:
-                return _talk(process, task, on_event)
+                return _exchange(process, task, on_event)
             except BaseException:
                 process.kill()
                 raise
@@ -119,36 +121,38 @@ class BlenderProcesses:
             return process
 
 
-def _talk(process: subprocess.Popen[bytes], task: Task, on_event: Callable[[Event], None]) -> int:
-    """Hand the task over, pass the events on, and return the process's exit status."""
+def _exchange(process: subprocess.Popen[bytes], task: Task, on_event: Callable[[Event], None]) -> int:
+    """Send the task, dispatch the events, and return the exit status of the process."""
     assert process.stdin is not None
     assert process.stdout is not None
-    _send(process.stdin, task)
+    _send_task(process.stdin, task)
     for line in process.stdout:
         if not line.endswith(b"\n"):
-            break  # it died in the middle of a word
-        _pass_on(json.loads(line), on_event)
+            break  # The process died while writing an event.
+        _dispatch_event(json.loads(line), on_event)
     return process.wait()
 
 
-def _send(stream: Any, task: Task) -> None:
+def _send_task(stream: Any, task: Task) -> None:
     try:
         stream.write(pickle.dumps(task))
         stream.flush()
-    except BrokenPipeError:  # the process died at once; its exit status and log say why
+    except BrokenPipeError:  # The process died at once; its exit status and log are reported by the caller.
         with suppress(BrokenPipeError):
-            stream.close()  # what it could not be told must not be tried again when the process is left
+            stream.close()  # Discard the unsent bytes: Popen would otherwise flush them again on exit.
 
 
-def _pass_on(event: Event, on_event: Callable[[Event], None]) -> None:
+def _dispatch_event(event: Event, on_event: Callable[[Event], None]) -> None:
     for name, error in _ERRORS.items():
         if name in event:
             raise error(event[name])
     on_event(event)
 
 
-def _failure(what: str, status: int, attempts: int, log: Path) -> str:
+def _failure_message(label: str, status: int, attempts: int, log: Path) -> str:
     reason = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
     tail = log.read_text(errors="replace").splitlines()[-_LOG_TAIL_LINES:] if log.is_file() else []
-    said = "\n".join(f"  | {line}" for line in tail) or "  | (it printed nothing)"
-    return f"the render process for {what} died {attempts} times, last by {reason}; the end of {log}:\n{said}"
+    log_excerpt = "\n".join(f"  | {line}" for line in tail) or "  | (it printed nothing)"
+    return (
+        f"the render process for {label} died {attempts} times, last by {reason}; the end of {log}:\n{log_excerpt}"
+    )

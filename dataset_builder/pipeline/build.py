@@ -1,4 +1,4 @@
-"""Builds or continues a dataset folder: plan, render units of work here or elsewhere, pack, publish."""
+"""Dataset build: plan, render work units locally or on a cluster, pack shards, publish configs."""
 
 from __future__ import annotations
 
@@ -11,19 +11,27 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dataset_builder.scene.assemblies import check_fits, make_assembly
 from dataset_builder.config.catalog import BuildRequest, check_request
-from dataset_builder.build.publish import build_lock
-from dataset_builder.build.plan import BUILD_FOLDER, ConfigPlan, plan_request
-from dataset_builder.build.publish import check_folder, check_kept_files, check_scenes, is_published, mend_descriptions, publish_config, sweep
-from dataset_builder.build.local_renderer import Renderer, local_processes
-from dataset_builder.build.work_units import receive, units_of
+from dataset_builder.pipeline.local_renderer import Renderer, local_processes
+from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, plan_request
+from dataset_builder.pipeline.publish import (
+    build_lock,
+    check_folder,
+    check_retained_files,
+    check_shared_scenes,
+    is_published,
+    publish_config,
+    remove_leftovers,
+    repair_metadata,
+)
+from dataset_builder.pipeline.work_units import accept_result, remaining_units
+from dataset_builder.scene.assemblies import check_fits, make_assembly
 from rebar_depth_bench.progress import Progress, silent
 
 
 @dataclass
 class BuildSummary:
-    """What a build did: configs built, configs found up to date, and where the seconds of its workers went."""
+    """Summary of a build: configs built, configs already up to date, and worker seconds by stage."""
 
     built: list[str] = field(default_factory=list)
     up_to_date: list[str] = field(default_factory=list)
@@ -39,24 +47,25 @@ def build(
     cluster: Renderer | None = None,
     progress: Progress = silent,
 ) -> BuildSummary:
-    """Build the requested configs in ``out``, or continue an interrupted build of the same ones.
+    """Build the requested configs in the folder ``out``, or continue an interrupted build of them.
 
-    ``workers`` render processes of ``threads`` threads each work at once on this machine, or the machines of a
-    ``cluster`` do; none of them changes a byte of the result. Each config is published as soon as it is complete.
+    Rendering uses ``workers`` concurrent processes of ``threads`` threads each on this machine, or the workers of
+    ``cluster`` if it is not None. Neither choice changes the bytes of the result. Each config is published as soon
+    as it is complete.
 
-    Raises ``InputError`` for a request that cannot be built, ``RenderProcessError`` when a render process
-    dies twice, ``BuildError`` where what came back does not match.
+    Raises ``InputError`` for a request that cannot be built, ``RenderProcessError`` if a render process dies
+    twice, and ``BuildError`` if rendered data does not match its digests.
     """
     check_request(request)
     plans = plan_request(request, out)
-    for plan in plans:  # a bad mesh file is told before anything is written
+    for plan in plans:  # Report an unusable mesh file before anything is written.
         check_fits(make_assembly(plan.spec.scene.assembly), plan.spec)
     check_folder(out)
     with build_lock(out / BUILD_FOLDER):
         try:
-            sweep(out)
-            check_scenes(out, plans)
-            check_kept_files(out, plans)
+            remove_leftovers(out)
+            check_shared_scenes(out, plans)
+            check_retained_files(out, plans)
             with nullcontext(cluster) if cluster else local_processes(workers, threads) as renderer:
                 return _build_plans(plans, out, renderer, progress)
         finally:
@@ -67,7 +76,7 @@ def _build_plans(plans: Sequence[ConfigPlan], out: Path, renderer: Renderer, pro
     summary = BuildSummary()
     for plan in plans:
         if is_published(out, plan):
-            mend_descriptions(out, plan)
+            repair_metadata(out, plan)
             summary.up_to_date.append(plan.spec.name)
         else:
             _render(plan, renderer, progress, summary)
@@ -79,7 +88,7 @@ def _build_plans(plans: Sequence[ConfigPlan], out: Path, renderer: Renderer, pro
 
 
 class _ViewCount:
-    """Counts a plan's staged views, each once, and tells the progress. Safe to call from any thread."""
+    """Thread-safe counter of the distinct staged views of a plan, which reports to a progress callback."""
 
     def __init__(self, plan: ConfigPlan, progress: Progress) -> None:
         self._plan = plan
@@ -88,33 +97,33 @@ class _ViewCount:
         self._lock = threading.Lock()
 
     def add(self, *indices: int) -> None:
-        """Count views as done; with none, tell how far the build is."""
+        """Mark views as done and report the progress; without ``indices``, only report it."""
         with self._lock:
             self._done.update(indices)
             self._progress(self._plan.spec.name, len(self._done), len(self._plan.indices))
 
 
 def _render(plan: ConfigPlan, renderer: Renderer, progress: Progress, summary: BuildSummary) -> None:
-    """Render and stage what is left of the plan; on any failure or interrupt nothing more is started."""
+    """Render and stage the remaining work units of the plan; on failure or interrupt, cancel those not started."""
     plan.staging.root.mkdir(parents=True, exist_ok=True)
     count = _ViewCount(plan, progress)
     count.add()
-    waiting = {renderer.submit(unit, plan.staging, count.add): unit for unit in units_of(plan)}
+    unit_of_future = {renderer.submit(unit, plan.staging, count.add): unit for unit in remaining_units(plan)}
     try:
-        while waiting:
-            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-                unit = waiting.pop(future)  # and with it its bytes, which may be many
-                delivery = future.result()
-                receive(unit, delivery, plan.staging)
-                for stage, spent in delivery.seconds.items():
-                    summary.seconds[stage] += spent
+        while unit_of_future:
+            for future in wait(unit_of_future, return_when=FIRST_COMPLETED).done:
+                unit = unit_of_future.pop(future)  # Drop the future, which holds the rendered bytes.
+                result = future.result()
+                accept_result(unit, result, plan.staging)
+                for stage, duration_s in result.seconds.items():
+                    summary.seconds[stage] += duration_s
                 count.add(*unit.indices)
     finally:
-        for future in waiting:
+        for future in unit_of_future:
             future.cancel()
 
 
 def _remove_build_folder(folder: Path) -> None:
-    """Remove the build folder unless unfinished pieces stand in it."""
+    """Remove the build folder unless it contains staging folders of unfinished configs."""
     if not any(path.is_dir() for path in folder.iterdir()):
         shutil.rmtree(folder)

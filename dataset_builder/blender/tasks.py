@@ -1,6 +1,7 @@
-"""Renders the views of one shard: colour by Cycles, ground truth by ray casting the meshes Cycles renders.
+"""Tasks of the Blender process: rendering of the views of one shard, and Cycles depth of a mesh file.
 
-Where the seconds of a build go.
+Colour is rendered by Cycles; ground truth is ray cast against the meshes that Cycles renders. Cycles' planar depth
+is an independent check of the ground truth.
 """
 
 from __future__ import annotations
@@ -15,22 +16,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import bpy
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
-from dataset_builder.blender.render import configure_colour, render_colour
-from dataset_builder.blender.scene import build_scene
-from dataset_builder.build.blender_process import RenderTask
-from dataset_builder.build.shards import Eye, Staging, View, encode_view, stage_row
+from dataset_builder.blender.render import configure_colour, render_colour, render_depth
+from dataset_builder.blender.scene import add_object, build_scene, mesh_data
 from dataset_builder.config.catalog import view_id
 from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import ConfigSpec
+from dataset_builder.config.specs import ColourSpec, ConfigSpec
 from dataset_builder.config.trajectories import poses
+from dataset_builder.pipeline.blender_process import DepthTask, RenderTask
+from dataset_builder.pipeline.shards import Eye, Staging, View, encode_view, stage_row
 from dataset_builder.scene.assemblies import aim_point_m, make_assembly
-from dataset_builder.scene.mesh_ply import write_mesh_ply
-from dataset_builder.scene.model import WorldMesh
+from dataset_builder.scene.mesh_ply import read_mesh_ply, write_mesh_ply
+from dataset_builder.scene.model import NOT_STEEL, Mesh, Part, WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError
@@ -38,7 +40,7 @@ from rebar_depth_bench.geometry.cameras import pixel_rays
 
 
 class Stopwatch:
-    """Adds up wall-clock seconds by stage until they are taken."""
+    """Accumulator of wall-clock seconds by stage."""
 
     def __init__(self) -> None:
         self._seconds: defaultdict[str, float] = defaultdict(float)
@@ -53,14 +55,17 @@ class Stopwatch:
             self._seconds[stage] += time.perf_counter() - start
 
     def take(self) -> dict[str, float]:
-        """Return the seconds since the last call, by stage, and start again from zero."""
-        taken = dict(self._seconds)
+        """Return the seconds by stage since the last call, and reset them to zero."""
+        seconds = dict(self._seconds)
         self._seconds.clear()
-        return taken
+        return seconds
 
 
 def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None]) -> None:
-    """Stage every view of the task that is not staged yet; report each."""
+    """Render and stage each view of the task that is not staged yet, and report each view.
+
+    Raises ``BuildError`` if the scene's mesh differs from the one of other shards or Blender fails.
+    """
     watch = Stopwatch()
     staging = Staging(task.staging)
     with watch.timing("scene"):
@@ -78,11 +83,11 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
         }
     report({"seconds": watch.take()})
     with tempfile.TemporaryDirectory(dir=task.staging) as scratch:
-        studio = _Studio(task.config, caster, rays_cam, Path(scratch))
+        context = _RenderContext(task.config, caster, rays_cam, Path(scratch))
         for index in task.indices:
             path = staging.row(index)
             if not path.is_file():
-                view = _render_view(studio, index, left_poses[index], watch)
+                view = _render_view(context, index, left_poses[index], watch)
                 with watch.timing("encode"):
                     row, record = encode_view(view)
                 with watch.timing("write"):
@@ -91,8 +96,8 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
 
 
 @dataclass(frozen=True, eq=False)
-class _Studio:
-    """What all views of a task share: the config, the scene's mesh, each eye's rays, a folder for pictures."""
+class _RenderContext:
+    """Data that all views of a task share: config, ray caster, rays of each eye and a scratch folder."""
 
     config: ConfigSpec
     caster: RayCaster
@@ -101,15 +106,16 @@ class _Studio:
 
 
 def _render_view(
-    studio: _Studio, index: int, left_cam_from_world: Float64[ndarray, "4 4"], watch: Stopwatch
+    context: _RenderContext, index: int, left_cam_from_world: Float64[ndarray, "4 4"], watch: Stopwatch
 ) -> View:
-    config = studio.config
+    """Render colour and ray cast ground truth of both eyes of one view."""
+    config = context.config
     eyes = {}
     for eye_index, (eye, camera) in enumerate(rig_cameras(config.rig, left_cam_from_world).items()):
         with watch.timing("colour"):
-            rgb = render_colour(camera, _cycles_seed(config, index, eye_index), studio.scratch)
+            rgb = render_colour(camera, _cycles_seed(config, index, eye_index), context.scratch)
         with watch.timing("truth"):
-            truth = studio.caster.cast(studio.rays_cam[eye], camera.cam_from_world)
+            truth = context.caster.cast(context.rays_cam[eye], camera.cam_from_world)
         eyes[eye] = Eye(
             rgb, truth.depth_m, truth.mask, truth.bars, camera.K, camera.distortion, camera.cam_from_world
         )
@@ -117,20 +123,41 @@ def _render_view(
 
 
 def _cycles_seed(config: ConfigSpec, index: int, eye_index: int) -> int:
-    """Return a seed of its own for every image, so that noise never repeats from view to view."""
+    """Return a separate seed for each image, so that noise does not repeat from view to view."""
     entropy = [config.scene.seed, *config.name.encode(), index, eye_index]
     return int(np.random.SeedSequence(entropy).generate_state(1)[0] >> 1)
 
 
 def _stage_mesh(mesh: WorldMesh, path: Path, expected_sha256: str | None) -> None:
-    """Stage the scene's mesh; every shard of a config must be cast against the very same one."""
-    own = path.with_name(f"mesh-{os.getpid()}.ply")
-    write_mesh_ply(own, mesh.vertices_m, mesh.faces, mesh.face_bar_id)
+    """Stage the scene's mesh as a PLY file.
+
+    Raises ``BuildError`` if its SHA-256 differs from the mesh of other shards of the config: all of them must be
+    cast against the same mesh.
+    """
+    own_path = path.with_name(f"mesh-{os.getpid()}.ply")
+    write_mesh_ply(own_path, mesh.vertices_m, mesh.faces, mesh.face_bar_id)
     expected = file_sha256(path) if path.exists() else expected_sha256
-    found = file_sha256(own)
-    if expected not in (None, found):
+    actual = file_sha256(own_path)
+    if expected not in (None, actual):
         raise BuildError(
-            f"{own}: the scene's mesh has sha256 {found}, expected {expected}, which other views of the config "
-            "were cast against"
+            f"{own_path}: the scene's mesh has sha256 {actual}, expected {expected}, which other views of the "
+            "config were cast against"
         )
-    own.replace(path)
+    own_path.replace(path)
+
+
+def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None]) -> None:
+    """Render planar depth for each camera of a task into ``task.out``, and report each camera.
+
+    Writes ``<n>.npy`` for camera n: (H, W) float32, metres, 0.0 where there is no surface.
+    """
+    vertices_m, faces, _ = read_mesh_ply(task.mesh)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    part = Part("dataset", Mesh(vertices_m, faces), NOT_STEEL, "steel")
+    add_object(part, mesh_data(part.name, part.mesh, part.material), np.zeros(3))
+    configure_colour(ColourSpec(samples=1, denoise=False), task.threads)
+    with tempfile.TemporaryDirectory(dir=task.out) as scratch:
+        for n, camera in enumerate(task.cameras):
+            depth_m = render_depth(camera, Path(scratch))
+            np.save(task.out / f"{n}.npy", depth_m)
+            report({"camera": n})

@@ -1,0 +1,216 @@
+"""Renderer on the workers of a dask cluster. The only module that imports ``distributed``.
+
+No shared file system is required: a unit is sent to a worker as a plain value, is rendered by a Blender process in
+the worker's scratch folder, and is returned as bytes with their digests. The units of a lost worker are rendered
+by other workers, with the same bytes. An assembly file, which exists only on this machine, is uploaded once and
+passed on between the workers.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+import uuid
+import warnings
+from collections.abc import Iterator, Mapping
+from concurrent.futures import CancelledError, Future
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import distributed
+from distributed.comm import get_address_host_port
+from distributed.scheduler import KilledWorker
+
+from dataset_builder.config.specs import ConfigSpec, PinnedFile
+from dataset_builder.pipeline.blender_process import BlenderProcesses
+from dataset_builder.pipeline.local_renderer import OnViewDone, render_unit
+from dataset_builder.pipeline.plan import generator_versions
+from dataset_builder.pipeline.shards import Staging
+from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, check_software_versions, with_payload
+from rebar_depth_bench.errors import BuildError, InputError, RenderProcessError
+
+_CONNECT_S = 10
+
+
+@dataclass
+class ClusterRenderer:
+    """Renderer on the workers connected to the scheduler of ``client``."""
+
+    client: distributed.Client
+    keys: dict[str, WorkUnit] = field(default_factory=dict)
+    """Units by their dask key."""
+    files: dict[str, distributed.Future] = field(default_factory=dict)
+    """Assembly files on the cluster, by SHA-256. A lost file is recreated from the task kept by the scheduler."""
+
+    def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:  # noqa: ARG002
+        """Schedule ``unit`` on the next free worker.
+
+        The worker reports rendered views in a dask topic named by the key of the unit.
+        """
+        key = f"render-{unit.config.name}-{uuid.uuid4().hex}"
+        self.keys[key] = unit
+        self.client.subscribe_topic(key, lambda event: on_view_done(event[1]))
+        future: Future[UnitResult] = self.client.get_executor(pure=False).submit(
+            render_on_worker, unit, self._assembly_file(unit.config), key=key
+        )
+        return future
+
+    def _assembly_file(self, config: ConfigSpec) -> distributed.Future | None:
+        spec = config.scene.assembly
+        if not isinstance(spec, PinnedFile):
+            return None
+        if spec.sha256 not in self.files:
+            key = f"assembly-{uuid.uuid4().hex}"
+            with warnings.catch_warnings():
+                # The file must be sent through the scheduler; it is sent only once.
+                warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
+                content = spec.check(Path(spec.path).read_bytes())
+                self.files[spec.sha256] = self.client.submit(bytes, content, key=key, pure=False)
+        return self.files[spec.sha256]
+
+
+@contextmanager
+def connect_to_cluster(address: str) -> Iterator[ClusterRenderer]:
+    """Yield a renderer on the dask scheduler at ``address``; leaving the context cancels the queued units.
+
+    Raises ``InputError`` if no scheduler answers within 10 s, if it has no worker 10 s later, or if software is
+    missing or has another version on the cluster; ``RenderProcessError`` if several workers died while rendering
+    the same unit; ``BuildError`` if the scheduler is lost.
+    """
+    with _quiet_client(), closing(_connect(address)) as client:
+        renderer = ClusterRenderer(client)
+        with _translate_dask_errors(renderer, address):
+            _check_workers(client, address)
+            yield renderer
+
+
+@contextmanager
+def _translate_dask_errors(renderer: ClusterRenderer, address: str) -> Iterator[None]:
+    """Translate the errors of dask about lost workers and schedulers into errors of this package."""
+    try:
+        yield
+    except KilledWorker as error:
+        raise RenderProcessError(
+            f"{_task_label(renderer, error.task)}: {error.allowed_failures + 1} workers died while they rendered "
+            f"it, the last at {error.last_worker.address}; their own logs say why"
+        ) from None
+    except CancelledError:
+        raise BuildError(
+            f"the dask scheduler at {address} was lost; run the same command again to go on when it is up"
+        ) from None
+
+
+@contextmanager
+def _quiet_client() -> Iterator[None]:
+    """Suppress the tracebacks that dask logs for errors that are reported to the user."""
+    logger = logging.getLogger("distributed.client")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def _task_label(renderer: ClusterRenderer, key: object) -> str:
+    return renderer.keys[key].label if isinstance(key, str) and key in renderer.keys else "the assembly file"
+
+
+def _connect(address: str) -> distributed.Client:
+    expected = "expected the address that `dask scheduler` printed, such as tcp://host:8786"
+    try:
+        get_address_host_port(address)  # A client that fails on an invalid address does not close cleanly.
+    except ValueError as error:
+        raise InputError(f"--cluster {address}: is no address ({_first_line(error)}), {expected}") from None
+    try:
+        return distributed.Client(address, timeout=_CONNECT_S, set_as_default=False, name="rebar-build")
+    except (OSError, ImportError) as error:
+        raise InputError(
+            f"--cluster {address}: no dask scheduler answers there ({_first_line(error)}), {expected}"
+        ) from None
+
+
+def _check_workers(client: distributed.Client, address: str) -> None:
+    """Raise ``InputError`` if there are no workers, or if software versions of scheduler or workers differ."""
+    try:
+        client.wait_for_workers(1, timeout=_CONNECT_S)
+    except TimeoutError:
+        raise InputError(
+            f"--cluster {address}: has no workers after {_CONNECT_S} s, expected one or more: "
+            f"on each machine that renders, run: dask worker {address} --nthreads 1"
+        ) from None
+    expected_versions = generator_versions()
+    for worker, software_versions in client.run(generator_versions, on_error="return").items():
+        if isinstance(software_versions, Mapping):
+            check_software_versions(expected_versions, worker, software_versions)
+        else:
+            raise _software_error(f"worker {worker}", software_versions)
+    try:
+        client.run_on_scheduler(generator_versions)
+    except ImportError as error:
+        raise _software_error(f"the scheduler {address}", error) from None
+
+
+def _software_error(machine: str, error: object) -> InputError:
+    software_versions = generator_versions()
+    return InputError(
+        f"{machine} cannot run this software ({_first_line(error)}), expected "
+        f"rebar-depth-bench[build,cluster] {software_versions['rebar-depth-bench']} there"
+    )
+
+
+def _first_line(error: object) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def render_on_worker(unit: WorkUnit, assembly_file: bytes | None) -> UnitResult:
+    """Render a unit in the scratch folder of this dask worker, and return the result with its bytes.
+
+    Raises ``InputError`` if the software versions of the worker differ from those of the unit, and ``BuildError``
+    or ``InputError`` naming the worker if rendering fails.
+    """
+    worker = distributed.get_worker()
+    check_software_versions(unit.software_versions, worker.address, generator_versions())
+    threads = max(1, (os.cpu_count() or 1) // worker.state.nthreads)
+    with (
+        tempfile.TemporaryDirectory(prefix="rebar-unit-", dir=worker.local_directory) as scratch,
+        BlenderProcesses() as blender,
+    ):
+        local_unit = replace(unit, config=_with_local_assembly_file(unit.config, assembly_file, Path(scratch)))
+        staging = Staging(Path(scratch) / "staging")
+        staging.root.mkdir()
+        try:
+            result = render_unit(
+                local_unit, staging, threads, blender, _make_progress_reporter(worker), worker.address
+            )
+        except BuildError as error:
+            raise type(error)(f"worker {worker.address}: {error}") from None
+        except InputError as error:
+            raise InputError(f"worker {worker.address}: {error}") from None
+        return with_payload(result, unit, staging)
+
+
+def _with_local_assembly_file(config: ConfigSpec, content: bytes | None, folder: Path) -> ConfigSpec:
+    """Write the assembly file to ``folder`` under its own name, and return the config that refers to it."""
+    spec = config.scene.assembly
+    if content is None or not isinstance(spec, PinnedFile):
+        return config
+    path = folder / Path(spec.path).name
+    path.write_bytes(content)
+    return replace(config, scene=replace(config.scene, assembly=replace(spec, path=str(path))))
+
+
+def _make_progress_reporter(worker: Any) -> OnViewDone:
+    """Return a callback that reports each view to the parent and raises ``BuildError`` for a cancelled unit."""
+    key = worker.get_current_task()
+
+    def report_view(index: int) -> None:
+        task = worker.state.tasks.get(key)
+        if task is None or task.state == "cancelled":
+            raise BuildError("the build that asked for this unit has ended")
+        worker.log_event(key, index)
+
+    return report_view

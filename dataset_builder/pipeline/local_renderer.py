@@ -1,0 +1,77 @@
+"""Renderer interface, and its implementation with Blender processes on this machine.
+
+The implementation for clusters is ``dask_renderer``.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Protocol
+
+from dataset_builder.pipeline.blender_process import BlenderProcesses, Event, RenderTask
+from dataset_builder.pipeline.shards import Staging
+from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
+from rebar_depth_bench.data.digests import file_sha256
+
+OnViewDone = Callable[[int], None]
+"""Callback with the index of each rendered view; may run in another thread, and twice for the same view."""
+
+
+class Renderer(Protocol):
+    """Renderer of work units; leaving the context that created it cancels unfinished units."""
+
+    def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
+        """Schedule ``unit``; ``staging`` is the staging folder of the config on this machine."""
+        ...
+
+
+@dataclass(frozen=True)
+class LocalRenderer:
+    """Renderer on this machine that writes directly to the staging folder: a kill loses at most one view."""
+
+    pool: ThreadPoolExecutor
+    blender: BlenderProcesses
+    threads: int
+
+    def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
+        """Schedule ``unit`` on the next free process."""
+        return self.pool.submit(
+            render_unit, unit, staging, self.threads, self.blender, on_view_done, "this machine"
+        )
+
+
+@contextmanager
+def local_processes(workers: int, threads: int) -> Iterator[LocalRenderer]:
+    """Yield a renderer with ``workers`` concurrent Blender processes of ``threads`` threads each."""
+    with ThreadPoolExecutor(workers) as pool, BlenderProcesses() as blender:
+        yield LocalRenderer(pool, blender, threads)
+
+
+def render_unit(
+    unit: WorkUnit,
+    staging: Staging,
+    threads: int,
+    blender: BlenderProcesses,
+    on_view_done: OnViewDone,
+    worker: str,
+) -> UnitResult:
+    """Render a unit in a Blender process into ``staging`` and return its result without row and mesh bytes.
+
+    Raises the ``InputError`` or ``BuildError`` that the process reports, and ``RenderProcessError`` naming the
+    unit if the process dies twice.
+    """
+    seconds: defaultdict[str, float] = defaultdict(float)
+
+    def on_event(event: Event) -> None:
+        for stage, duration_s in event["seconds"].items():
+            seconds[stage] += duration_s
+        if "view" in event:
+            on_view_done(event["view"])
+
+    task = RenderTask(unit.config, unit.shard, unit.indices, staging.root, threads, unit.mesh_sha256)
+    blender.run(task, unit.label, staging.log(unit.shard), on_event)
+    return UnitResult(worker, dict(seconds), file_sha256(staging.mesh))

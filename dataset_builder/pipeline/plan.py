@@ -1,0 +1,85 @@
+"""Build plan of a config, and its key: the digest of everything that determines the bytes of the result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.config.specs import ConfigSpec
+from dataset_builder.config.trajectories import camera_offsets_m, subset
+from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging
+from rebar_depth_bench.data.digests import parameters_digest
+from rebar_depth_bench.version import software_version
+
+_KEY_CHARACTERS = 16
+BUILD_FOLDER = ".rebar-build"
+_VERSIONED_LIBRARIES = (
+    "bpy",
+    "embreex",
+    "numpy",
+    "opencv-contrib-python-headless",
+    "OpenEXR",
+    "pillow",
+    "pyarrow",
+)
+"""Libraries that determine the bytes of the result; their versions enter the key and the manifest."""
+
+
+@dataclass(frozen=True)
+class ConfigPlan:
+    """Plan of one config: its spec, the view indices within the full trajectory, its key and staging folder."""
+
+    spec: ConfigSpec
+    indices: tuple[int, ...]
+    key: str
+    staging: Staging
+
+    def all_stagings(self) -> list[Path]:
+        """Return all staging folders of this config, including those of abandoned builds with other parameters."""
+        return list(self.staging.root.parent.glob(f"{self.spec.name}-{'[0-9a-f]' * _KEY_CHARACTERS}"))
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Parameters of the config as written to the manifest."""
+        return config_parameters(self.spec)
+
+
+def plan_config(spec: ConfigSpec, views: int | None, out: Path) -> ConfigPlan:
+    """Return the plan of one config in the dataset folder ``out``; ``views`` limits the number of views."""
+    indices = tuple(subset(len(camera_offsets_m(spec.protocol)), views))
+    key_inputs = [config_parameters(spec), indices, VIEWS_PER_SHARD, generator_versions()]
+    key = parameters_digest(key_inputs)
+    return ConfigPlan(spec, indices, key, Staging(out / BUILD_FOLDER / f"{spec.name}-{key[:_KEY_CHARACTERS]}"))
+
+
+def plan_request(request: BuildRequest, out: Path) -> list[ConfigPlan]:
+    """Return the plans of all requested configs; raise ``InputError`` as ``BuildRequest.config_specs`` does."""
+    return [plan_config(spec, request.views, out) for spec in request.config_specs()]
+
+
+def config_parameters(spec: ConfigSpec) -> dict[str, Any]:
+    """Return the spec of a config as JSON values; the path of an assembly file is reduced to its name."""
+    parameters = asdict(spec)
+    assembly = parameters["scene"]["assembly"]
+    if "path" in assembly:
+        assembly["path"] = Path(assembly["path"]).name
+    return parameters
+
+
+def generator_versions() -> Mapping[str, str]:
+    """Return the versions of this software and of the libraries in ``_VERSIONED_LIBRARIES``."""
+    return {
+        "rebar-depth-bench": software_version(),
+        **{name: _installed_version(name) for name in _VERSIONED_LIBRARIES},
+    }
+
+
+def _installed_version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "of another distribution"  # For example OpenCV built with a window toolkit.

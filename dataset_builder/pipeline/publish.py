@@ -1,0 +1,226 @@
+"""Publishing of staged configs into the dataset folder, and the lock that allows one build per folder.
+
+Files are written in an order that can be repaired after an interruption at any point: first the shards, whose
+names contain the digest of their content; then mesh, contact sheet and bars; then the other pictures and the card;
+the manifest last. Files that the new manifest does not list are removed afterwards. If the card, bars or pictures
+of a folder do not match its manifest, a build was interrupted in between, and the next build repairs them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from cards import dataset_card
+from dataset_builder.config.catalog import CONFIGS
+from dataset_builder.config.trajectories import camera_offsets_m
+from dataset_builder.pipeline.contact_sheet import write_contact_sheet, write_scenes_strip
+from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, generator_versions
+from dataset_builder.pipeline.shards import pack_shard, read_staged_record, split_into_shards
+from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from rebar_depth_bench.atomic_io import TEMPORARY_PATTERN, exclusive_lock, write_bytes, write_text
+from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
+from rebar_depth_bench.data.digests import file_sha256, parameters_digest, views_digest
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, read_manifest
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.version import software_version
+
+LOCK = "lock"
+
+
+@contextmanager
+def build_lock(folder: Path) -> Iterator[None]:
+    """Hold an exclusive lock on the file ``lock`` in ``folder``; the lock of a killed process is released.
+
+    Raises ``InputError`` if another process holds the lock or the folder is not writable.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder.parent}: cannot be made or written to: {error.strerror}") from None
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(exclusive_lock(folder / LOCK))
+        except BlockingIOError:
+            raise InputError(f"{folder.parent}: another rebar-build is at work there") from None
+        yield
+
+
+MESHES = "meshes"
+CARD = "README.md"
+PICTURES = "pictures"
+STRIP = f"{PICTURES}/scenes.webp"
+"""Strip with one view of each kind of assembly."""
+_SHARDS = "*/test-*-of-*.parquet"
+_DIGEST_CHARACTERS = 12
+
+
+def is_published(out: Path, plan: ConfigPlan) -> bool:
+    """Return whether the folder already contains the shards and the mesh of the plan, with matching digests."""
+    manifest = _read_manifest_or_empty(out)
+    entry = manifest["configs"].get(plan.spec.name)
+    if entry is None or entry["key"] != plan.key:
+        return False
+    return all(_matches_manifest(out, name, manifest) for name in (*entry["shards"], entry["mesh"]))
+
+
+def repair_metadata(out: Path, plan: ConfigPlan) -> None:
+    """Rewrite bars, card, pictures and manifest if any of them does not match the manifest."""
+    manifest = _read_manifest_or_empty(out)
+    descriptions = (BARS_FILE, CARD, STRIP, manifest["configs"][plan.spec.name]["sheet"])
+    if not all(_matches_manifest(out, name, manifest) for name in descriptions):
+        write_contact_sheet(out, manifest["configs"][plan.spec.name]["shards"], out / _sheet_name(plan))
+        _write_bars(out, plan)
+        _write_manifest(out, manifest["configs"])
+
+
+def _matches_manifest(out: Path, name: str, manifest: Mapping[str, Any]) -> bool:
+    return (out / name).is_file() and file_sha256(out / name) == manifest["files"].get(name)
+
+
+def check_folder(out: Path) -> None:
+    """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder: no other files are ever changed."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file, expected a folder")
+    if (out / MANIFEST_FILE).is_file():
+        read_manifest(out / MANIFEST_FILE)
+    elif out.is_dir() and any(out.iterdir()) and not (out / BUILD_FOLDER / LOCK).is_file():
+        raise InputError(f"{out}: is not empty and holds no {MANIFEST_FILE}, expected a new or a dataset folder")
+
+
+def check_retained_files(out: Path, plans: Sequence[ConfigPlan]) -> None:
+    """Raise ``InputError`` if a shard or the mesh of a config that is not being built is missing."""
+    planned = {plan.spec.name for plan in plans}
+    for name, entry in _read_manifest_or_empty(out)["configs"].items():
+        missing_files = [file for file in (*entry["shards"], entry["mesh"]) if not (out / file).is_file()]
+        if missing_files and name not in planned:
+            raise InputError(
+                f"{out}: {missing_files[0]} of config {name} is missing; build it again too: --config {name}"
+            )
+
+
+def check_shared_scenes(out: Path, plans: Sequence[ConfigPlan]) -> None:
+    """Raise ``InputError`` if a config that is not being built uses a scene being built with other parameters."""
+    planned = {plan.spec.name for plan in plans}
+    for name, entry in _read_manifest_or_empty(out)["configs"].items():
+        for plan in plans:
+            scene = plan.parameters["scene"]
+            same_name = entry["scene"]["name"] == scene["name"]
+            if name not in planned and same_name and entry["scene"] != json.loads(json.dumps(scene)):
+                raise InputError(
+                    f"{out}: config {name} was built on scene {scene['name']!r} with other parameters; "
+                    f"build it again too (--config {name} {plan.spec.name}) or choose another folder"
+                )
+
+
+def publish_config(out: Path, plan: ConfigPlan) -> None:
+    """Publish a completely staged config in the folder and remove the files it replaces."""
+    shards = _publish_shards(out, plan)
+    mesh = f"{MESHES}/{plan.spec.scene.name}.ply"
+    write_bytes(out / mesh, plan.staging.mesh.read_bytes())
+    write_contact_sheet(out, shards, out / _sheet_name(plan))
+    _write_bars(out, plan)
+    records = [read_staged_record(plan.staging.row(index)) for index in plan.indices]
+    entry = {
+        **plan.parameters,
+        "key": plan.key,
+        "aim_point_m": aim_point_m(make_assembly(plan.spec.scene.assembly)).tolist(),
+        "protocol_views": len(camera_offsets_m(plan.spec.protocol)),
+        "generator": generator_versions(),
+        "mesh": mesh,
+        "sheet": _sheet_name(plan),
+        "shards": shards,
+        "bytes": sum((out / name).stat().st_size for name in shards),
+        "ground_truth_digest": views_digest([asdict(record) for record in records]),
+        "views": [asdict(record) for record in records],
+    }
+    _write_manifest(out, {**_read_manifest_or_empty(out)["configs"], plan.spec.name: entry})
+
+
+def _write_bars(out: Path, plan: ConfigPlan) -> None:
+    path, scene = out / BARS_FILE, plan.spec.scene
+    published = read_bars(path) if path.is_file() else {}
+    write_bars(path, {**published, scene.name: make_assembly(scene.assembly).bars})
+
+
+def _sheet_name(plan: ConfigPlan) -> str:
+    return f"{PICTURES}/{plan.spec.name}.webp"
+
+
+def remove_leftovers(out: Path) -> None:
+    """Remove the files left by an interrupted build: temporary files and files not listed in the manifest."""
+    _remove_unlisted_files(out, _read_manifest_or_empty(out))
+    configs = {path.parent for path in out.glob(_SHARDS)}
+    for folder in (out, out / MESHES, out / PICTURES, *configs, *(out / name for name in CONFIGS)):
+        for temporary in folder.glob(TEMPORARY_PATTERN):
+            temporary.unlink()
+
+
+def _publish_shards(out: Path, plan: ConfigPlan) -> list[str]:
+    """Pack the shards and give each its name in the folder, which carries the digest of all of them."""
+    shard_indices = split_into_shards(plan.indices)
+    packed_paths = [plan.staging.shard(shard) for shard in range(len(shard_indices))]
+    for target, indices in zip(packed_paths, shard_indices, strict=True):
+        pack_shard([plan.staging.row(index) for index in indices], target)
+    digest = parameters_digest([file_sha256(path) for path in packed_paths])[:_DIGEST_CHARACTERS]
+    names = [
+        f"{plan.spec.name}/test-{shard:05d}-of-{len(shard_indices):05d}-{digest}.parquet"
+        for shard in range(len(shard_indices))
+    ]
+    (out / plan.spec.name).mkdir(exist_ok=True)
+    for path, name in zip(packed_paths, names, strict=True):
+        path.replace(out / name)
+    return names
+
+
+def _write_manifest(out: Path, configs: Mapping[str, Any]) -> None:
+    order = [*CONFIGS, *sorted(set(configs) - set(CONFIGS))]
+    ordered = {name: configs[name] for name in order if name in configs}
+    views = [view for entry in ordered.values() for view in entry["views"]]
+    manifest: dict[str, Any] = {
+        "format": MANIFEST_FORMAT,
+        "version": software_version(),
+        "protocol": PROTOCOL,
+        "ground_truth": {"digest": views_digest(views)},
+        "configs": ordered,
+    }
+    for entry in ordered.values():
+        if not (out / entry["sheet"]).is_file():
+            write_contact_sheet(out, entry["shards"], out / entry["sheet"])
+    by_scene = {_strip_key(entry): entry for entry in reversed(ordered.values())}
+    write_scenes_strip(out, list(reversed(by_scene.values())), out / STRIP)
+    write_text(out / CARD, dataset_card(manifest))
+    listed_files = [CARD, BARS_FILE, STRIP, *_config_files(ordered.values())]
+    manifest["files"] = {name: file_sha256(out / name) for name in sorted(set(listed_files))}
+    write_text(out / MANIFEST_FILE, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
+    _remove_unlisted_files(out, manifest)
+
+
+def _strip_key(entry: Mapping[str, Any]) -> str:
+    """Return the key that selects one panel of the strip: assembly kind, or file digest of a user's assembly."""
+    assembly = entry["scene"]["assembly"]
+    return str(assembly.get("sha256", assembly["kind"]))
+
+
+def _config_files(entries: Iterable[Mapping[str, Any]]) -> list[str]:
+    return [name for entry in entries for name in (*entry["shards"], entry["mesh"], entry["sheet"])]
+
+
+def _remove_unlisted_files(out: Path, manifest: Mapping[str, Any]) -> None:
+    listed_files = set(_config_files(manifest["configs"].values()))
+    listed_files.add(STRIP)
+    for path in [*out.glob(_SHARDS), *(out / MESHES).glob("*.ply"), *(out / PICTURES).glob("*.webp")]:
+        if path.relative_to(out).as_posix() not in listed_files:
+            path.unlink()
+
+
+def _read_manifest_or_empty(out: Path) -> dict[str, Any]:
+    """Return the manifest of the folder, or an empty one if there is none yet."""
+    if not (out / MANIFEST_FILE).is_file():
+        return {"configs": {}}
+    return read_manifest(out / MANIFEST_FILE)

@@ -1,0 +1,170 @@
+"""Work units of a build, and the checks of their results.
+
+A work unit renders views of one shard of a config. It is idempotent and contains only views that are not staged
+yet. Its result is a ``UnitResult``. A unit rendered on this machine writes its rows to the staging folder, view by
+view, and its result contains none; the result of a unit rendered elsewhere contains the bytes of each row. In both
+cases ``accept_result`` checks the result before it is used.
+
+The ground truth of all rows of a config is cast against the same mesh. The digest of the mesh is stored with the
+first result; the mesh itself, tens of megabytes, is returned only by the one unit that has ``with_mesh`` set.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from dataset_builder.config.specs import ConfigSpec
+from dataset_builder.pipeline.plan import ConfigPlan, generator_versions
+from dataset_builder.pipeline.shards import Staging, split_into_shards
+from rebar_depth_bench.atomic_io import write_bytes, write_text
+from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.errors import BuildError, InputError
+
+_MESH_DIGEST = "mesh.sha256"
+
+
+@dataclass(frozen=True)
+class WorkUnit:
+    """Work unit: views ``indices`` of one shard of a config.
+
+    ``with_mesh`` requests the mesh as well, ``mesh_sha256`` is its required digest (None: not known yet), and
+    ``software_versions`` holds the versions of the software that the bytes depend on.
+    """
+
+    config: ConfigSpec
+    shard: int
+    indices: tuple[int, ...]
+    with_mesh: bool
+    mesh_sha256: str | None
+    software_versions: Mapping[str, str]
+
+    @property
+    def label(self) -> str:
+        """Name of the unit in messages."""
+        if not self.indices:
+            return f"the mesh of {self.config.name}"
+        return f"{self.config.name} views {self.indices[0]} to {self.indices[-1]}"
+
+
+@dataclass(frozen=True)
+class StagedRow:
+    """Staged Parquet file of one view: index, content, and the SHA-256 computed where it was rendered."""
+
+    index: int
+    content: bytes
+    sha256: str
+
+
+@dataclass(frozen=True)
+class UnitResult:
+    """Result of a unit: worker, seconds by stage, digest of the mesh, and the mesh and rows not staged yet."""
+
+    worker: str
+    seconds: Mapping[str, float]
+    mesh_sha256: str
+    mesh: bytes | None = None
+    rows: tuple[StagedRow, ...] = ()
+
+
+def remaining_units(plan: ConfigPlan) -> list[WorkUnit]:
+    """Return the units of the views not staged yet; the first one requests the mesh if that is not staged."""
+    known_mesh_sha256, software_versions = _known_mesh_sha256(plan.staging), generator_versions()
+    needs_mesh = not plan.staging.mesh.is_file()
+    incomplete_shards = [
+        (shard, missing)
+        for shard, run in enumerate(split_into_shards(plan.indices))
+        if (missing := tuple(index for index in run if not plan.staging.row(index).is_file()))
+    ]
+    if needs_mesh and not incomplete_shards:
+        incomplete_shards = [(0, ())]
+    return [
+        WorkUnit(plan.spec, shard, missing, needs_mesh and position == 0, known_mesh_sha256, software_versions)
+        for position, (shard, missing) in enumerate(incomplete_shards)
+    ]
+
+
+def check_software_versions(expected: Mapping[str, str], worker: str, actual: Mapping[str, str]) -> None:
+    """Raise ``InputError`` if the software versions ``actual`` on ``worker`` differ from ``expected``."""
+    different = [
+        f"{name} {actual.get(name, 'missing')}, expected {expected.get(name, 'none')}"
+        for name in sorted({*actual, *expected})
+        if actual.get(name) != expected.get(name)
+    ]
+    if different:
+        raise InputError(
+            f"worker {worker} has other software than the machine that builds: {'; '.join(different)}"
+        )
+
+
+def with_payload(result: UnitResult, unit: WorkUnit, staging: Staging) -> UnitResult:
+    """Return the result with the bytes of the rows of the unit, and of the mesh if the unit requests it."""
+    contents = {index: staging.row(index).read_bytes() for index in unit.indices}
+    return UnitResult(
+        result.worker,
+        result.seconds,
+        result.mesh_sha256,
+        mesh=staging.mesh.read_bytes() if unit.with_mesh else None,
+        rows=tuple(StagedRow(index, content, _sha256(content)) for index, content in contents.items()),
+    )
+
+
+def accept_result(unit: WorkUnit, result: UnitResult, staging: Staging) -> None:
+    """Check a result against its digests and against the mesh of the config, then stage its rows and mesh.
+
+    Raises ``BuildError`` naming config, views and worker if anything is missing or does not match; nothing of the
+    result is then staged. The unit is not retried before the next build.
+    """
+    known_mesh_sha256 = _known_mesh_sha256(staging)
+    problems = [*_mesh_problems(unit, result, staging, known_mesh_sha256), *_row_problems(unit, result, staging)]
+    if problems:
+        raise BuildError(f"{unit.label}, rendered by {result.worker}: refused: {'; '.join(problems)}")
+    if known_mesh_sha256 is None or not _mesh_digest_path(staging).is_file():
+        write_text(_mesh_digest_path(staging), result.mesh_sha256)
+    if result.mesh is not None:
+        write_bytes(staging.mesh, result.mesh)
+    for row in result.rows:
+        write_bytes(staging.row(row.index), row.content)
+
+
+def _mesh_problems(
+    unit: WorkUnit, result: UnitResult, staging: Staging, known_mesh_sha256: str | None
+) -> Iterator[str]:
+    if known_mesh_sha256 not in (None, result.mesh_sha256):
+        yield (
+            f"its mesh has sha256 {result.mesh_sha256}, "
+            f"the config's other views were cast against {known_mesh_sha256}"
+        )
+    if result.mesh is not None and _sha256(result.mesh) != result.mesh_sha256:
+        yield f"the mesh arrived as sha256 {_sha256(result.mesh)}, expected {result.mesh_sha256}"
+    if unit.with_mesh and result.mesh is None and not staging.mesh.is_file():
+        yield "the mesh is missing"
+
+
+def _row_problems(unit: WorkUnit, result: UnitResult, staging: Staging) -> Iterator[str]:
+    arrived = {row.index for row in result.rows}
+    for index in unit.indices:
+        if index not in arrived and not staging.row(index).is_file():
+            yield f"view {index} is missing"
+    for row in result.rows:
+        if row.index not in unit.indices:
+            yield f"view {row.index} was not asked for"
+        if _sha256(row.content) != row.sha256:
+            yield f"view {row.index} arrived as sha256 {_sha256(row.content)}, expected {row.sha256}"
+
+
+def _known_mesh_sha256(staging: Staging) -> str | None:
+    """Return the digest of the mesh that the staged rows were cast against, or None if there is none yet."""
+    if _mesh_digest_path(staging).is_file():
+        return _mesh_digest_path(staging).read_text()
+    return file_sha256(staging.mesh) if staging.mesh.is_file() else None
+
+
+def _mesh_digest_path(staging: Staging) -> Path:
+    return staging.root / _MESH_DIGEST
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
