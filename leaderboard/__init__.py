@@ -1,1 +1,1 @@
-"""The leaderboard: a service that takes prediction archives and scores them exactly as the command line does."""
+"""Leaderboard web service: accepts prediction archives and scores them exactly as the command line does."""

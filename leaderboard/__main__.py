@@ -1,4 +1,4 @@
-"""``python -m leaderboard`` is ``rebar-leaderboard``."""
+"""Entry point of ``python -m leaderboard``, equivalent to ``rebar-leaderboard``."""
 
 import sys
 

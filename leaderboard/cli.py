@@ -1,4 +1,4 @@
-"""``rebar-leaderboard``: serve, score, token, remove, backup."""
+"""Command-line interface ``rebar-leaderboard``: serve, score, token, remove, backup."""
 
 from __future__ import annotations
 
@@ -12,50 +12,64 @@ from leaderboard.db import submissions
 from leaderboard.db.engine import Database
 from leaderboard.db.tokens import create_token, replace_token
 from leaderboard.log_setup import set_up_logs
-from leaderboard.settings import Settings, read_settings
-from leaderboard.storage.archive_store import Archives
+from leaderboard.settings import RENAMED_SETTINGS, Settings, read_settings
+from leaderboard.storage.archive_store import ArchiveStore
 from leaderboard.storage.backup import back_up
-from rebar_depth_bench.cli.console import run_command
+from rebar_depth_bench.console import replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
 
-GROUPS: dict[str, tuple[str, ...]] = {
+COMMAND_SETTINGS: dict[str, tuple[str, ...]] = {
     "serve": tuple(Settings.model_fields),
-    "score": ("data", "state", "db", "archives", "cluster", "score_time", "score_memory", "lease", "error_maps"),
-    "token": ("state", "db"),
-    "remove": ("state", "db", "archives"),
-    "backup": ("state", "db", "archives"),
+    "score": (
+        "data",
+        "state_dir",
+        "db",
+        "archives",
+        "dask_scheduler",
+        "score_time",
+        "score_memory",
+        "lease_seconds",
+        "error_maps",
+    ),
+    "token": ("state_dir", "db"),
+    "remove": ("state_dir", "db", "archives"),
+    "backup": ("state_dir", "db", "archives"),
 }
-"""Which settings each command takes; all may also stand in a file or the environment."""
+"""Settings that each command accepts as options; all can also be set in a TOML file or the environment."""
+
+RENAMED_OPTIONS = {f"--{old}": f"--{new.replace('_', '-')}" for old, new in RENAMED_SETTINGS.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; return the exit status: 0 done, 2 the input is at fault, 1 anything else."""
-    options = argument_parser().parse_args(arguments)
+    """Run a command and return the exit status: 0 = success, 2 = invalid input, 1 = any other error."""
+    options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
     return run_command(lambda: _run(options), interrupted="stopped")
 
 
 def _run(options: argparse.Namespace) -> None:
-    taken = GROUPS[options.command]
-    given: dict[str, Any] = {name: value for name in taken if (value := getattr(options, name, None)) is not None}
-    if "data" not in taken:
-        given["data"] = ""
-    settings = read_settings(options.settings, given)
+    setting_names = COMMAND_SETTINGS[options.command]
+    overrides: dict[str, Any] = {
+        name: value for name in setting_names if (value := getattr(options, name, None)) is not None
+    }
+    if "data" not in setting_names:
+        overrides["data"] = ""
+    settings = read_settings(options.settings, overrides)
     set_up_logs()
-    _make_state(settings.state)
+    _make_state_dir(settings.state_dir)
     if options.command == "serve":
         from leaderboard.web.server import serve
 
         serve(settings)
     elif options.command == "score":
-        from leaderboard.scoring.__main__ import run_scorer
+        from leaderboard.scoring.__main__ import run_worker
 
-        run_scorer(settings)
+        run_worker(settings)
     elif options.command == "token":
         database = Database(settings.database_url)
         database.migrate()
-        make = replace_token if options.replace else create_token
-        print(make(database, options.name))
+        make_token = replace_token if options.replace else create_token
+        print(make_token(database, options.name))
         print("It is shown this once; only its hash is kept.", file=sys.stderr)
     elif options.command == "remove":
         _remove(settings, options.id)
@@ -69,11 +83,14 @@ def _remove(settings: Settings, submission_id: str) -> None:
     if submissions.find(database, submission_id) is None:
         raise InputError(f"there is no submission {submission_id!r}")
     submissions.remove(database, submission_id)
-    Archives(settings.archives_url).delete(submission_id)
+    ArchiveStore(settings.archives_url).delete(submission_id)
 
 
-def _make_state(folder: Path) -> None:
-    """Make the state folder, for nobody else to read: ids in it are keys of submissions that are not public."""
+def _make_state_dir(folder: Path) -> None:
+    """Create the state folder with mode 0700, because the ids in it give access to unpublished submissions.
+
+    Raises ``InputError`` if it cannot be created.
+    """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
@@ -81,7 +98,7 @@ def _make_state(folder: Path) -> None:
 
 
 def argument_parser() -> argparse.ArgumentParser:
-    """Return the parser of every command."""
+    """Return the argument parser with all commands."""
     parser = argparse.ArgumentParser(
         "rebar-leaderboard",
         description="A leaderboard that scores archives exactly as rebar-bench does.",
@@ -90,10 +107,10 @@ def argument_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=software_version())
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, words in _COMMANDS.items():
-        command = commands.add_parser(name, help=words, description=words)
+    for name, help_text in _COMMAND_HELP.items():
+        command = commands.add_parser(name, help=help_text, description=help_text)
         command.add_argument("--settings", type=Path, metavar="FILE", help="a TOML file of settings")
-        for setting in GROUPS[name]:
+        for setting in COMMAND_SETTINGS[name]:
             _add_setting(command, setting)
         if name == "token":
             command.add_argument("name", metavar="NAME", help="whose it is; shown on the board")
@@ -105,7 +122,7 @@ def argument_parser() -> argparse.ArgumentParser:
     return parser
 
 
-_COMMANDS = {
+_COMMAND_HELP = {
     "serve": "serve the board, and score what is uploaded",
     "score": "score what is uploaded to a server that shares the database and the archives",
     "token": "make a token for a submitter and print it",
@@ -116,9 +133,11 @@ _COMMANDS = {
 
 def _add_setting(command: argparse.ArgumentParser, name: str) -> None:
     field = Settings.model_fields[name]
-    shown = "" if field.is_required() or field.default == "" else f" (default: {field.default})"
+    default_text = "" if field.is_required() or field.default == "" else f" (default: {field.default})"
     command.add_argument(
-        f"--{name.replace('_', '-')}", metavar=name.upper(), help=f"{field.description}{shown}".replace("%", "%%")
+        f"--{name.replace('_', '-')}",
+        metavar=name.upper(),
+        help=f"{field.description}{default_text}".replace("%", "%%"),
     )
 
 

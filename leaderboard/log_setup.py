@@ -1,4 +1,4 @@
-"""Structured logs: a JSON object a line on standard error, or lines for people on a terminal."""
+"""Structured logging on standard error: one JSON object per line, or readable lines on a terminal."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from structlog.typing import Processor
 
 
 def set_up_logs() -> None:
-    """Configure the process's logs: ours, what libraries log, warnings, and the error that ends the process."""
-    shown: Processor = (
+    """Configure logging of this process: structlog, library loggers, warnings and uncaught exceptions."""
+    renderer: Processor = (
         structlog.dev.ConsoleRenderer()
         if sys.stderr.isatty()
         else structlog.processors.JSONRenderer(sort_keys=True)
@@ -23,8 +23,9 @@ def set_up_logs() -> None:
         structlog.processors.format_exc_info,
     ]
     structlog.configure(
-        processors=[*common, shown],
-        logger_factory=structlog.WriteLoggerFactory(sys.stderr),  # a line is one write: others write there too
+        processors=[*common, renderer],
+        # Each line is a single write, because other processes write to the same stream.
+        logger_factory=structlog.WriteLoggerFactory(sys.stderr),
         cache_logger_on_first_use=True,
     )
     handler = logging.StreamHandler(sys.stderr)
@@ -32,13 +33,15 @@ def set_up_logs() -> None:
     remove_meta = structlog.stdlib.ProcessorFormatter.remove_processors_meta
     handler.setFormatter(
         structlog.stdlib.ProcessorFormatter(
-            foreign_pre_chain=[structlog.stdlib.add_logger_name, *common], processors=[remove_meta, shown]
+            foreign_pre_chain=[structlog.stdlib.add_logger_name, *common], processors=[remove_meta, renderer]
         )
     )
     logging.basicConfig(handlers=[handler], level=logging.WARNING, force=True)
     logging.captureWarnings(True)
-    sys.excepthook = _ended
+    sys.excepthook = _log_uncaught_exception
 
 
-def _ended(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    structlog.get_logger("process").critical("ended by an error", exc_info=(kind, error, trace))
+def _log_uncaught_exception(
+    error_type: type[BaseException], error: BaseException, traceback: TracebackType | None
+) -> None:
+    structlog.get_logger("process").critical("ended by an error", exc_info=(error_type, error, traceback))

@@ -1,4 +1,4 @@
-"""Words that several parts share."""
+"""Redaction of secrets in text that is logged or printed."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ import re
 
 
 def without_password(url: str) -> str:
-    """Return a URL as it may be shown: without what stands before its host."""
+    """Return ``url`` with the user name and password before its host replaced by ``...``."""
     return re.sub(r"://.*@", "://...@", url)

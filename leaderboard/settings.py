@@ -1,9 +1,11 @@
-"""What an operator may set: by environment (``REBAR_LEADERBOARD_...``), a TOML file, or the command line."""
+"""Service settings, read from the environment (``REBAR_LEADERBOARD_...``), a TOML file and the command line."""
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,24 +16,38 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError
 
+from rebar_depth_bench.console import warn_deprecated
 from rebar_depth_bench.errors import InputError
 
 GIB = 1 << 30
 
 
-class Settings(BaseSettings):
-    """Every setting, with its default. Sizes are bytes (8GiB does too), times seconds."""
+RENAMED_SETTINGS = {
+    "cluster": "dask_scheduler",
+    "lease": "lease_seconds",
+    "public": "default_visibility",
+    "reads": "read_rate_limit",
+    "scorers": "workers",
+    "state": "state_dir",
+    "writes": "write_rate_limit",
+}
+"""Old names of settings that are still accepted, and their new names."""
+ENVIRONMENT_PREFIX = "REBAR_LEADERBOARD_"
 
-    model_config = SettingsConfigDict(env_prefix="REBAR_LEADERBOARD_", extra="forbid", frozen=True)
+
+class Settings(BaseSettings):
+    """All settings with their defaults. Sizes are in bytes (``8GiB`` is accepted too), times in seconds."""
+
+    model_config = SettingsConfigDict(env_prefix=ENVIRONMENT_PREFIX, extra="forbid", frozen=True)
 
     data: str = Field(description="the dataset: a folder, or a Hub repository id")
-    state: Path = Field(Path("leaderboard-state"), description="folder for all that the service keeps")
+    state_dir: Path = Field(Path("leaderboard-state"), description="folder for all that the service keeps")
     db: str = Field("", description="database URL; default: SQLite in the state folder")
     archives: str = Field("", description="where archives are kept, any fsspec URL; default: the state folder")
     host: str = Field("127.0.0.1", description="address to listen on")
     port: int = Field(8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
     title: str = Field("Rebar depth leaderboard", description="the page's title")
-    public: Literal["owner", "always"] = Field(
+    default_visibility: Literal["owner", "always"] = Field(
         "always", description="always: every submission is on the board at once; owner: once its owner says so"
     )
     quota: int = Field(10, ge=0, description="accepted submissions a token may make in a day (UTC)")
@@ -43,31 +59,31 @@ class Settings(BaseSettings):
         description="worst views of a config shown as error maps, which tell the truth to whoever predicted",
     )
     rescore: bool = Field(False, description="score again, against this dataset, what was submitted for another")
-    scorers: int = Field(1, ge=0, le=64, description="scoring processes that `serve` starts itself")
-    cluster: str = Field("", description="address of a dask scheduler whose workers score")
+    workers: int = Field(1, ge=0, le=64, description="scoring processes that `serve` starts itself")
+    dask_scheduler: str = Field("", description="address of a dask scheduler whose workers score")
     score_time: float = Field(3600.0, gt=0, description="longest that scoring an archive may take")
     score_memory: ByteSize = Field(
         ByteSize(4 * GIB), gt=0, description="most memory that scoring an archive may take"
     )
-    lease: float = Field(20.0, gt=0, description="a scorer that is silent for so long has lost its job")
-    reads: str = Field("600/minute", description="requests an address may make")
-    writes: str = Field("60/minute", description="uploads and changes an address may make")
+    lease_seconds: float = Field(20.0, gt=0, description="a scorer that is silent for so long has lost its job")
+    read_rate_limit: str = Field("600/minute", description="requests an address may make")
+    write_rate_limit: str = Field("60/minute", description="uploads and changes an address may make")
 
     @field_validator("db")
     @classmethod
-    def _is_database(cls, url: str) -> str:
-        wanted = "expected sqlite:///PATH or postgresql://USER:PASSWORD@HOST:PORT/NAME"
+    def _check_database_url(cls, url: str) -> str:
+        expected = "expected sqlite:///PATH or postgresql://USER:PASSWORD@HOST:PORT/NAME"
         if url and not re.match(r"sqlite:///[^?]|postgresql(\+psycopg)?://", url):
-            raise ValueError(wanted)
+            raise ValueError(expected)
         try:
             make_url(url or "sqlite:///x")
         except (ArgumentError, ValueError):
-            raise ValueError(wanted) from None
+            raise ValueError(expected) from None
         return url
 
-    @field_validator("reads", "writes")
+    @field_validator("read_rate_limit", "write_rate_limit")
     @classmethod
-    def _is_rate(cls, rate: str) -> str:
+    def _check_rate(cls, rate: str) -> str:
         try:
             (parsed,) = parse_many(rate)
             if parsed.amount < 1 or parsed.multiples < 1:
@@ -78,47 +94,68 @@ class Settings(BaseSettings):
 
     @property
     def database_url(self) -> str:
-        """The database's URL as SQLAlchemy takes it."""
+        """Database URL in the form that SQLAlchemy expects."""
         if not self.db:
-            return f"sqlite:///{self.state.absolute() / 'leaderboard.sqlite'}"
+            return f"sqlite:///{self.state_dir.absolute() / 'leaderboard.sqlite'}"
         return self.db.replace("postgresql://", "postgresql+psycopg://", 1)
 
     @property
     def archives_url(self) -> str:
-        """The URL of the folder of archives, as ``fsspec`` takes it: without escapes."""
-        return self.archives or f"file://{self.state.absolute() / 'archives'}"
+        """URL of the archive folder in the form that ``fsspec`` expects, that is, without percent escapes."""
+        return self.archives or f"file://{self.state_dir.absolute() / 'archives'}"
 
     @property
     def spool(self) -> Path:
-        """The folder of what is under way: uploads that are not accepted yet, archives fetched to be scored."""
-        return self.state.absolute() / "spool"
+        """Folder for temporary files: uploads that are not accepted yet and archives fetched for scoring."""
+        return self.state_dir.absolute() / "spool"
 
 
-def read_settings(file: Path | None, given: dict[str, Any]) -> Settings:
-    """Return the settings: what was ``given`` on the command line, else the file's, else the environment's.
+def read_settings(file: Path | None, overrides: dict[str, Any]) -> Settings:
+    """Return the settings; ``overrides`` (command line) precede ``file``, which precedes the environment.
 
-    Raises ``InputError`` that names each setting at fault.
+    Raises ``InputError``, naming every invalid setting, and if ``file`` cannot be read as TOML.
     """
     try:
-        stored = {} if file is None else tomllib.loads(file.read_text(encoding="utf-8"))
+        file_values = {} if file is None else tomllib.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{file}: cannot be read as TOML: {error}") from None
     try:
-        return Settings(**{**stored, **given})
+        return Settings(**{**_renamed_from_environment(), **_with_new_names(file_values), **overrides})
     except ValidationError as error:
-        raise InputError("settings: " + "; ".join(_in_words(one) for one in error.errors())) from None
+        raise InputError("settings: " + "; ".join(_format_error(details) for details in error.errors())) from None
 
 
-_UNSHOWN = ("db", "archives")
-"""Settings that may hold a password."""
+def _with_new_names(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a TOML file with renamed settings under their new names, with a warning for each."""
+    renamed = {}
+    for name, value in values.items():
+        if name in RENAMED_SETTINGS:
+            warn_deprecated(f"setting {name}", RENAMED_SETTINGS[name])
+        renamed[RENAMED_SETTINGS.get(name, name)] = value
+    return renamed
 
 
-def _in_words(error: ErrorDetails) -> str:
-    """Say what is wrong with a setting, and what it is, unless that may be a secret."""
+def _renamed_from_environment() -> dict[str, str]:
+    """Return settings that the environment holds under old names only, with a warning for each."""
+    values = {}
+    for old, new in RENAMED_SETTINGS.items():
+        variables = [f"{ENVIRONMENT_PREFIX}{name.upper()}" for name in (old, new)]
+        if variables[0] in os.environ and variables[1] not in os.environ:
+            warn_deprecated(*variables)
+            values[new] = os.environ[variables[0]]
+    return values
+
+
+_SECRET_SETTINGS = ("db", "archives")
+"""Settings whose value may contain a password."""
+
+
+def _format_error(error: ErrorDetails) -> str:
+    """Return the message for an invalid setting; its value is included unless it may contain a secret."""
     name = ".".join(map(str, error["loc"]))
     if error["type"] == "missing":
         return f"{name}: is not given, expected {Settings.model_fields[name].description}"
     if error["type"] == "extra_forbidden":
         return f"{name}: there is no such setting"
     message = error["msg"].removeprefix("Value error, ")
-    return f"{name}: {message}" + ("" if error["loc"][0] in _UNSHOWN else f", got {error['input']!r}")
+    return f"{name}: {message}" + ("" if error["loc"][0] in _SECRET_SETTINGS else f", got {error['input']!r}")

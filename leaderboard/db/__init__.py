@@ -1,1 +1,1 @@
-"""Database: models, engine, migrations, and queries of submissions, jobs and rankings."""
+"""Database layer: models, engine, migrations, and queries for submissions, jobs and rankings."""

@@ -1,4 +1,4 @@
-"""SQLite or PostgreSQL: transactions that read, transactions that write, and the schema brought up to date."""
+"""Database engine for SQLite and PostgreSQL: read sessions, write sessions and schema migration."""
 
 from __future__ import annotations
 
@@ -18,81 +18,100 @@ from leaderboard.redact import without_password
 from rebar_depth_bench.errors import InputError
 
 MIGRATIONS = Path(__file__).parent / "migrations"
-BUSY_S = 30
-AWAY = (OperationalError, InterfaceError, PoolTimeoutError)
-"""What is raised while the database does not answer: it is down, is starting, or has no connection left."""
-_PATIENCE = {"connect_timeout": 10, "tcp_user_timeout": 30_000}
-"""How long a PostgreSQL that is silent is waited for: seconds, milliseconds."""
+SQLITE_BUSY_TIMEOUT_S = 30
+DATABASE_UNAVAILABLE = (OperationalError, InterfaceError, PoolTimeoutError)
+"""Exceptions raised while the database is unavailable: down, starting, or no connection left in the pool."""
+_POSTGRESQL_TIMEOUTS = {"connect_timeout": 10, "tcp_user_timeout": 30_000}
+"""Timeouts for an unresponsive PostgreSQL server: connect in seconds, unacknowledged TCP data in ms."""
 _IMMEDIATE = "immediate"
 
 
 class Database:
-    """A pool of connections. On SQLite writers take the one write lock first and wait for it, readers never do."""
+    """Connection pool of the database.
+
+    On SQLite, write transactions acquire the single write lock at their start (``BEGIN IMMEDIATE``) and wait for
+    it; read transactions never wait.
+    """
 
     def __init__(self, url: str) -> None:
-        """Raise ``InputError`` for a URL that names no database."""
+        """Create the engine. Raises ``InputError`` if ``url`` is not a valid database URL."""
         try:
             self._engine = _engine(url)
         except (ArgumentError, NoSuchModuleError, ImportError, OSError) as error:
             raise InputError(f"{without_password(url)}: no database's URL: {error}") from None
-        self._writer = self._engine.execution_options(**{_IMMEDIATE: True})
+        self._write_engine = self._engine.execution_options(**{_IMMEDIATE: True})
 
     @contextmanager
     def read(self) -> Iterator[Session]:
-        """Yield a session for reading."""
+        """Yield a read session; its objects stay usable after it is closed."""
         with Session(self._engine, expire_on_commit=False) as session:
             yield session
 
     @contextmanager
     def write(self) -> Iterator[Session]:
-        """Yield a session whose changes are durable when the block ends, or all undone if it raises."""
-        with Session(self._writer, expire_on_commit=False) as session, session.begin():
+        """Yield a session that is committed durably when the block ends, or rolled back if it raises."""
+        with Session(self._write_engine, expire_on_commit=False) as session, session.begin():
             yield session
 
     @property
-    def waits_for_rows(self) -> bool:
-        """Whether rows are locked one by one (PostgreSQL), not the whole database (SQLite)."""
+    def has_row_locks(self) -> bool:
+        """Whether single rows can be locked (PostgreSQL) instead of the whole database only (SQLite)."""
         return self._engine.dialect.name != "sqlite"
 
     def migrate(self) -> None:
-        """Bring the schema up to date; two services that start at once do it one after the other.
+        """Upgrade the schema to the latest revision; services that start simultaneously take turns.
 
-        Raises ``InputError`` where the database does not answer.
+        Raises ``InputError`` if the database is unavailable.
         """
         config = Config()
         config.set_main_option("script_location", str(MIGRATIONS))
         try:
-            with self._writer.begin() as connection:
-                if self.waits_for_rows:
+            with self._write_engine.begin() as connection:
+                if self.has_row_locks:
                     connection.exec_driver_sql("SELECT pg_advisory_xact_lock(7241053)")
                 config.attributes["connection"] = connection
                 command.upgrade(config, "head")
-        except (*AWAY, DatabaseError) as error:
+        except (*DATABASE_UNAVAILABLE, DatabaseError) as error:
             url = self._engine.url.render_as_string(hide_password=True)
             reason = " ".join(str(getattr(error, "orig", error)).split())
             raise InputError(f"{url}: the database does not answer: {reason}") from None
 
     def close(self) -> None:
-        """Give back all connections."""
+        """Close all connections."""
         self._engine.dispose()
 
 
+def sqlite_path(url: str) -> Path | None:
+    """Return the file of an SQLite database, or None for another database."""
+    prefix = "sqlite:///"
+    return Path(url.removeprefix(prefix)) if url.startswith(prefix) else None
+
+
 def _engine(url: str) -> Engine:
-    if not url.startswith("sqlite"):
+    path = sqlite_path(url)
+    if path is None:
         return create_engine(
-            url, hide_parameters=True, connect_args=_PATIENCE, pool_pre_ping=True, pool_size=10, max_overflow=10
+            url,
+            hide_parameters=True,
+            connect_args=_POSTGRESQL_TIMEOUTS,
+            pool_pre_ping=True,
+            pool_size=10,
+            max_overflow=10,
         )
-    Path(url.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     engine = create_engine(
-        url, hide_parameters=True, connect_args={"timeout": BUSY_S}, pool_size=20, max_overflow=20
+        url, hide_parameters=True, connect_args={"timeout": SQLITE_BUSY_TIMEOUT_S}, pool_size=20, max_overflow=20
     )
-    event.listen(engine, "connect", _durable)
-    event.listen(engine, "begin", _begin)
+    event.listen(engine, "connect", _configure_sqlite)
+    event.listen(engine, "begin", _begin_transaction)
     return engine
 
 
-def _durable(connection: Any, _: Any) -> None:
-    """Readers beside a writer, and a commit that a power cut does not undo; SQLAlchemy begins transactions."""
+def _configure_sqlite(connection: Any, _: Any) -> None:
+    """Set the SQLite pragmas for concurrent readers (WAL) and for commits that survive a power failure.
+
+    The driver's own transaction control is disabled; ``_begin_transaction`` issues BEGIN.
+    """
     connection.isolation_level = None
     cursor = connection.cursor()
     for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
@@ -100,6 +119,6 @@ def _durable(connection: Any, _: Any) -> None:
     cursor.close()
 
 
-def _begin(connection: Connection) -> None:
+def _begin_transaction(connection: Connection) -> None:
     immediate = connection.get_execution_options().get(_IMMEDIATE, False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")

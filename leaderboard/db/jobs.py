@@ -1,7 +1,8 @@
-"""The queue: a scorer leases a submission, renews the lease while it works, and ends it once.
+"""Job queue in the database: workers lease submissions, renew the lease while scoring, and store the outcome once.
 
-Of two scorers that want the same job one gets it. Renewing and ending are one conditional update each, so that a
-scorer that was taken for dead cannot end what another has taken over.
+Each submission is leased by at most one worker. Renewal and completion are single conditional updates, so that a
+worker whose lease has expired cannot finish a job that another worker has taken over. The column ``scorer`` holds
+the name of the worker.
 """
 
 from __future__ import annotations
@@ -17,16 +18,18 @@ from sqlalchemy.engine import CursorResult
 from sqlalchemy.orm import Session
 
 from leaderboard.db.engine import Database
-from leaderboard.db.models import PictureRecord, ResultRecord, RowRecord, SubmissionRecord
+from leaderboard.db.models import ErrorMapModel, LeaderboardRowModel, ResultModel, SubmissionModel
 from leaderboard.db.submissions import FAILED, QUEUED, SCORED, SCORING
 
-MOST_ATTEMPTS = 5
-"""A submission whose scorer died so often fails; a service that is killed now and then stays below it."""
+MAX_ATTEMPTS = 5
+"""Number of leases after which a submission fails if no worker finished it.
+
+The limit is high enough for a service that is killed occasionally."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A submission to score, and the dataset that its archive was checked against."""
+    """A submission to score, and the digest of the dataset that its archive was validated against."""
 
     submission_id: str
     dataset_digest: str
@@ -34,31 +37,32 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What scoring came to: the result's JSON and error maps by view, or the reason why there is none."""
+    """Outcome of scoring: the result JSON and WebP error maps by view id, or the reason of the failure."""
 
     result: bytes | None = None
-    pictures: Mapping[str, bytes] = field(default_factory=dict)
+    error_maps: Mapping[str, bytes] = field(default_factory=dict)
     reason: str | None = None
 
 
 def claim(database: Database, scorer: str, lease_s: float) -> str | None:
-    """Lease the oldest of those tried least to ``scorer``; return its id, None where nothing waits.
+    """Lease a waiting submission to ``scorer`` for ``lease_s`` seconds; return its id, or None if none is waiting.
 
-    So what scorers died of holds nobody up.
+    Submissions with the fewest attempts come first, then the oldest, so that an archive that crashes workers does
+    not delay the others. Submissions that have reached ``MAX_ATTEMPTS`` are marked as failed.
     """
     while True:
         with database.write() as session:
             now = time.time()
-            is_free = or_(SubmissionRecord.lease_until.is_(None), SubmissionRecord.lease_until < now)
-            waiting = and_(SubmissionRecord.status.in_((QUEUED, SCORING)), is_free)
-            order = (SubmissionRecord.attempts, SubmissionRecord.created_at)
-            oldest = select(SubmissionRecord).where(waiting).order_by(*order).limit(1)
-            if database.waits_for_rows:
+            is_free = or_(SubmissionModel.lease_until.is_(None), SubmissionModel.lease_until < now)
+            waiting = and_(SubmissionModel.status.in_((QUEUED, SCORING)), is_free)
+            order = (SubmissionModel.attempts, SubmissionModel.created_at)
+            oldest = select(SubmissionModel).where(waiting).order_by(*order).limit(1)
+            if database.has_row_locks:
                 oldest = oldest.with_for_update(skip_locked=True)
             record = session.scalar(oldest)
             if record is None:
                 return None
-            if record.attempts < MOST_ATTEMPTS:
+            if record.attempts < MAX_ATTEMPTS:
                 record.status, record.scorer = SCORING, scorer
                 record.lease_until, record.attempts = now + lease_s, record.attempts + 1
                 return record.id
@@ -67,66 +71,66 @@ def claim(database: Database, scorer: str, lease_s: float) -> str | None:
 
 
 def renew(database: Database, submission_id: str, scorer: str, lease_s: float) -> bool:
-    """Prolong a lease; return whether it is still the scorer's."""
+    """Extend a lease to ``lease_s`` seconds from now; return whether ``scorer`` still holds it."""
     with database.write() as session:
-        return _update(session, _leased(submission_id, scorer), {"lease_until": time.time() + lease_s})
+        return _update_one(session, _has_lease(submission_id, scorer), {"lease_until": time.time() + lease_s})
 
 
-def give_back(database: Database, submission_id: str, scorer: str, wait_s: float = 0.0) -> None:
-    """Queue a leased submission again, as if it had not been tried; nobody has it for ``wait_s`` seconds."""
+def release(database: Database, submission_id: str, scorer: str, wait_s: float = 0.0) -> None:
+    """Requeue a leased submission without counting the attempt; it cannot be leased for ``wait_s`` seconds."""
     with database.write() as session:
         values = {
             "status": QUEUED,
             "scorer": None,
             "lease_until": time.time() + wait_s if wait_s else None,
-            "attempts": SubmissionRecord.attempts - 1,
+            "attempts": SubmissionModel.attempts - 1,
         }
-        _update(session, _leased(submission_id, scorer), values)
+        _update_one(session, _has_lease(submission_id, scorer), values)
 
 
 def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome) -> bool:
-    """End a submission if the lease is still the scorer's; return whether it was. All in one transaction."""
-    found = None if outcome.result is None else json.loads(outcome.result)
+    """Store the outcome in one transaction if ``scorer`` still holds the lease; return whether it did."""
+    result = None if outcome.result is None else json.loads(outcome.result)
     values = {
-        "status": FAILED if found is None else SCORED,
+        "status": FAILED if result is None else SCORED,
         "reason": outcome.reason,
         "finished_at": time.time(),
         "lease_until": None,
     }
     with database.write() as session:
-        if not _update(session, _leased(submission_id, scorer), values):
+        if not _update_one(session, _has_lease(submission_id, scorer), values):
             return False
-        if found is not None:
-            for table in (PictureRecord, RowRecord, ResultRecord):
+        if result is not None:
+            for table in (ErrorMapModel, LeaderboardRowModel, ResultModel):
                 session.execute(delete(table).where(table.submission_id == submission_id))
-            session.add(ResultRecord(submission_id=submission_id, json=outcome.result))
-            session.add_all(_rows(submission_id, found["tables"]))
-        for view_id, webp in outcome.pictures.items():
-            session.add(PictureRecord(submission_id=submission_id, view_id=view_id, webp=webp))
+            session.add(ResultModel(submission_id=submission_id, json=outcome.result))
+            session.add_all(_leaderboard_rows(submission_id, result["tables"]))
+        for view_id, webp in outcome.error_maps.items():
+            session.add(ErrorMapModel(submission_id=submission_id, view_id=view_id, webp=webp))
     return True
 
 
-def count_of_another(database: Database, dataset_digest: str) -> int:
-    """Return how many submissions are of another dataset than this one."""
+def count_stale_submissions(database: Database, dataset_digest: str) -> int:
+    """Return the number of submissions that belong to another dataset than the one with ``dataset_digest``."""
     with database.read() as session:
-        return session.scalar(select(func.count()).where(_is_of_another(dataset_digest))) or 0
+        return session.scalar(select(func.count()).where(_is_stale(dataset_digest))) or 0
 
 
-def queue_again(database: Database, dataset_digest: str) -> None:
-    """Queue the submissions of another dataset to be scored against this one; old results stay until then."""
+def requeue_stale_submissions(database: Database, dataset_digest: str) -> None:
+    """Requeue the submissions of other datasets for scoring against this one; old results stay until replaced."""
     with database.write() as session:
         values = {"status": QUEUED, "attempts": 0, "finished_at": None, "dataset_digest": dataset_digest}
-        session.execute(update(SubmissionRecord).where(_is_of_another(dataset_digest)).values(**values))
+        session.execute(update(SubmissionModel).where(_is_stale(dataset_digest)).values(**values))
 
 
-def _is_of_another(dataset_digest: str) -> ColumnElement[bool]:
-    is_kept = SubmissionRecord.status.in_((QUEUED, SCORING, SCORED))
-    return and_(is_kept, SubmissionRecord.dataset_digest != dataset_digest)
+def _is_stale(dataset_digest: str) -> ColumnElement[bool]:
+    is_active = SubmissionModel.status.in_((QUEUED, SCORING, SCORED))
+    return and_(is_active, SubmissionModel.dataset_digest != dataset_digest)
 
 
-def _rows(submission_id: str, tables: Mapping[str, Any]) -> list[RowRecord]:
+def _leaderboard_rows(submission_id: str, tables: Mapping[str, Any]) -> list[LeaderboardRowModel]:
     return [
-        RowRecord(
+        LeaderboardRowModel(
             submission_id=submission_id,
             config=config,
             ranked=table["ranked"],
@@ -137,15 +141,15 @@ def _rows(submission_id: str, tables: Mapping[str, Any]) -> list[RowRecord]:
     ]
 
 
-def _leased(submission_id: str, scorer: str) -> ColumnElement[bool]:
+def _has_lease(submission_id: str, scorer: str) -> ColumnElement[bool]:
     return and_(
-        SubmissionRecord.id == submission_id,
-        SubmissionRecord.status == SCORING,
-        SubmissionRecord.scorer == scorer,
+        SubmissionModel.id == submission_id,
+        SubmissionModel.status == SCORING,
+        SubmissionModel.scorer == scorer,
     )
 
 
-def _update(session: Session, where: ColumnElement[bool], values: Mapping[str, Any]) -> bool:
-    changed = session.execute(update(SubmissionRecord).where(where).values(**values))
+def _update_one(session: Session, where: ColumnElement[bool], values: Mapping[str, Any]) -> bool:
+    changed = session.execute(update(SubmissionModel).where(where).values(**values))
     assert isinstance(changed, CursorResult)
     return changed.rowcount == 1

@@ -1,4 +1,4 @@
-"""The database's tables. Times are seconds since 1970, UTC."""
+"""SQLAlchemy models of the database tables. Times are Unix timestamps in seconds."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 
 class Base(DeclarativeBase):
-    """The tables' common root."""
+    """Declarative base class of the models."""
 
 
-class TokenRecord(Base):
-    """Who may submit. The token itself is not kept, its SHA-256 is: it holds 256 random bits."""
+class TokenModel(Base):
+    """A submitter and the SHA-256 of their token, which has 256 random bits; the token is not stored."""
 
     __tablename__ = "tokens"
 
@@ -21,8 +21,8 @@ class TokenRecord(Base):
     created_at: Mapped[float] = mapped_column(Float)
 
 
-class SubmissionRecord(Base):
-    """An accepted archive and what became of it. A deleted one keeps its row, so that the quota keeps count."""
+class SubmissionModel(Base):
+    """An accepted archive and its status. Deleted submissions keep their rows, which count for the quota."""
 
     __tablename__ = "submissions"
     __table_args__ = (
@@ -49,8 +49,8 @@ class SubmissionRecord(Base):
     dataset_digest: Mapped[str] = mapped_column(String(100))
 
 
-class ResultRecord(Base):
-    """A scored submission's JSON, byte for byte what the command line writes."""
+class ResultModel(Base):
+    """The result JSON of a scored submission, byte-identical to the output of the command line."""
 
     __tablename__ = "results"
 
@@ -58,8 +58,8 @@ class ResultRecord(Base):
     json: Mapped[bytes] = mapped_column(LargeBinary)
 
 
-class RowRecord(Base):
-    """A config's row on the board: the table's JSON, and what rows are chosen and sorted by."""
+class LeaderboardRowModel(Base):
+    """A submission's leaderboard row of one config: the table's JSON and the columns for filtering and sorting."""
 
     __tablename__ = "board_rows"
 
@@ -70,8 +70,8 @@ class RowRecord(Base):
     json: Mapped[str] = mapped_column(Text)
 
 
-class PictureRecord(Base):
-    """An error map of a view, WebP."""
+class ErrorMapModel(Base):
+    """An error map of one view as a WebP image."""
 
     __tablename__ = "pictures"
 

@@ -1,8 +1,6 @@
-"""The board: public rows of a config, ranked as the protocol says, and those of a submission.
+"""Leaderboard queries: ranked rows of a config, ranks and queue position of a submission, error maps.
 
-What the pages ask the database: public rows in their order, a submission's ranks, its place in the queue.
-
-Columns are read, not records: a page of hundreds of rows takes milliseconds.
+The queries select columns instead of ORM objects, so that a page with hundreds of rows takes milliseconds.
 """
 
 from __future__ import annotations
@@ -16,27 +14,27 @@ from sqlalchemy import and_, false, func, or_, select
 from sqlalchemy.orm import aliased
 
 from leaderboard.db.engine import Database
-from leaderboard.db.models import PictureRecord, RowRecord, SubmissionRecord, TokenRecord
+from leaderboard.db.models import ErrorMapModel, LeaderboardRowModel, SubmissionModel, TokenModel
 from leaderboard.db.submissions import QUEUED, SCORED
 
 
-class StampedRow(Protocol):
-    """A row as its stamp sees it."""
+class VersionedRow(Protocol):
+    """The fields of a row that determine the ranking version."""
 
     @property
     def submission_id(self) -> str:
-        """Whose it is."""
+        """Id of the submission."""
 
     @property
     def finished_at(self) -> float | None:
-        """When it was scored."""
+        """Unix timestamp of the end of scoring."""
 
 
 @dataclass(frozen=True)
-class BoardRow:
-    """A submission's row in a config; ``rank`` is None where the protocol does not rank it.
+class LeaderboardEntry:
+    """A submission's row of one config; ``rank`` is None if the row is not ranked.
 
-    ``table`` is the row as the result's JSON has it.
+    ``table`` is the config's table from the result JSON.
     """
 
     rank: int | None
@@ -53,110 +51,117 @@ class BoardRow:
 
 
 _COLUMNS = (
-    RowRecord.ranked,
-    RowRecord.json,
-    SubmissionRecord.id,
-    RowRecord.config,
-    SubmissionRecord.method,
-    TokenRecord.name,
-    SubmissionRecord.url,
-    SubmissionRecord.uses_intrinsics,
-    SubmissionRecord.created_at,
-    SubmissionRecord.finished_at,
-    SubmissionRecord.public,
+    LeaderboardRowModel.ranked,
+    LeaderboardRowModel.json,
+    SubmissionModel.id,
+    LeaderboardRowModel.config,
+    SubmissionModel.method,
+    TokenModel.name,
+    SubmissionModel.url,
+    SubmissionModel.uses_intrinsics,
+    SubmissionModel.created_at,
+    SubmissionModel.finished_at,
+    SubmissionModel.public,
 )
-"""What is read for a row: records would take longer."""
+"""Columns selected for a ``LeaderboardEntry``; loading ORM objects would take longer."""
 
 
-_IDS = func.aggregate_strings(RowRecord.submission_id, " ")
+_IDS = func.aggregate_strings(LeaderboardRowModel.submission_id, " ")
 
 
 @dataclass(frozen=True)
-class Stamp:
-    """What a config's public rows are, in small: whose they are, and when the last of them was scored.
+class RankingVersion:
+    """Version of a config's public rows: their submission ids, and the time of the latest scoring.
 
-    A row does not change unless it is scored anew, so that the same stamp means the same rows.
+    A row changes only when it is scored again, so that equal versions imply equal rows.
     """
 
     ids: frozenset[str] = frozenset()
     newest: float = 0.0
 
 
-def stamps(database: Database) -> dict[str, Stamp]:
-    """Return the stamp of each config that has a public row, in one query that reads no tables."""
+def ranking_versions(database: Database) -> dict[str, RankingVersion]:
+    """Return the version of each config that has a public row, in one query that does not read the tables."""
     query = (
-        select(RowRecord.config, _IDS, func.max(SubmissionRecord.finished_at))
-        .join(SubmissionRecord, SubmissionRecord.id == RowRecord.submission_id)
-        .where(SubmissionRecord.status == SCORED, SubmissionRecord.public)
-        .group_by(RowRecord.config)
+        select(LeaderboardRowModel.config, _IDS, func.max(SubmissionModel.finished_at))
+        .join(SubmissionModel, SubmissionModel.id == LeaderboardRowModel.submission_id)
+        .where(SubmissionModel.status == SCORED, SubmissionModel.public)
+        .group_by(LeaderboardRowModel.config)
     )
     with database.read() as session:
-        found = session.execute(query).all()
-    return {config: Stamp(frozenset(ids.split(" ")), newest or 0.0) for config, ids, newest in found}
+        rows = session.execute(query).all()
+    return {config: RankingVersion(frozenset(ids.split(" ")), newest or 0.0) for config, ids, newest in rows}
 
 
-def stamp_of(rows: Sequence[StampedRow]) -> Stamp:
-    """Return the stamp of a config's public rows."""
+def ranking_version(rows: Sequence[VersionedRow]) -> RankingVersion:
+    """Return the version of the given public rows of a config."""
     newest = max((row.finished_at or 0.0 for row in rows), default=0.0)
-    return Stamp(frozenset(row.submission_id for row in rows), newest)
+    return RankingVersion(frozenset(row.submission_id for row in rows), newest)
 
 
-def board(database: Database, config: str, viewer: TokenRecord | None = None) -> list[BoardRow]:
-    """Return a config's rows: ranked ones by native AbsRel, then the unranked, older before newer among equals.
+def leaderboard_entries(
+    database: Database, config: str, viewer: TokenModel | None = None
+) -> list[LeaderboardEntry]:
+    """Return the public rows of a config and those of ``viewer``.
 
-    Public rows, and those of the token that asks; a row that is not public takes no rank from others.
+    Ranked rows come first, by native AbsRel, then unranked ones; ties are ordered by age, oldest first. A row that
+    is not public has no rank and does not affect the ranks of others.
     """
-    own = false() if viewer is None else SubmissionRecord.token_id == viewer.id
+    own = false() if viewer is None else SubmissionModel.token_id == viewer.id
     query = (
         select(*_COLUMNS)
-        .join(SubmissionRecord, SubmissionRecord.id == RowRecord.submission_id)
-        .join(TokenRecord, TokenRecord.id == SubmissionRecord.token_id)
-        .where(RowRecord.config == config, SubmissionRecord.status == SCORED, SubmissionRecord.public | own)
-        .order_by(RowRecord.ranked.desc(), RowRecord.abs_rel.nulls_last(), SubmissionRecord.created_at)
+        .join(SubmissionModel, SubmissionModel.id == LeaderboardRowModel.submission_id)
+        .join(TokenModel, TokenModel.id == SubmissionModel.token_id)
+        .where(
+            LeaderboardRowModel.config == config, SubmissionModel.status == SCORED, SubmissionModel.public | own
+        )
+        .order_by(
+            LeaderboardRowModel.ranked.desc(), LeaderboardRowModel.abs_rel.nulls_last(), SubmissionModel.created_at
+        )
     )
     with database.read() as session:
-        found = session.execute(query).all()
-    rows, rank = [], 0
-    for row in found:
-        counts = row.ranked and row.public
-        rank += counts
-        rows.append(_row(row, rank if counts else None))
-    return rows
+        rows = session.execute(query).all()
+    entries, rank = [], 0
+    for row in rows:
+        has_rank = row.ranked and row.public
+        rank += has_rank
+        entries.append(_entry(row, rank if has_rank else None))
+    return entries
 
 
-def picture_views(database: Database, submission_id: str) -> list[str]:
-    """Return the views whose error maps are kept."""
-    query = select(PictureRecord.view_id).where(PictureRecord.submission_id == submission_id)
+def error_map_views(database: Database, submission_id: str) -> list[str]:
+    """Return the ids of the views that have a stored error map, sorted."""
+    query = select(ErrorMapModel.view_id).where(ErrorMapModel.submission_id == submission_id)
     with database.read() as session:
-        return list(session.scalars(query.order_by(PictureRecord.view_id)))
+        return list(session.scalars(query.order_by(ErrorMapModel.view_id)))
 
 
-def picture(database: Database, submission_id: str, view_id: str) -> bytes | None:
-    """Return a view's error map, WebP."""
+def error_map_webp(database: Database, submission_id: str, view_id: str) -> bytes | None:
+    """Return the error map of a view as WebP bytes, or None if none is stored."""
     with database.read() as session:
-        record = session.get(PictureRecord, (submission_id, view_id))
+        record = session.get(ErrorMapModel, (submission_id, view_id))
         return None if record is None else record.webp
 
 
-def _row(found: Any, rank: int | None) -> BoardRow:
-    return BoardRow(
+def _entry(row: Any, rank: int | None) -> LeaderboardEntry:
+    return LeaderboardEntry(
         rank=rank,
-        submission_id=found.id,
-        config=found.config,
-        method=found.method,
-        submitter=found.name,
-        url=found.url,
-        uses_intrinsics=found.uses_intrinsics,
-        created_at=found.created_at,
-        finished_at=found.finished_at,
-        public=found.public,
-        table=json.loads(found.json),
+        submission_id=row.id,
+        config=row.config,
+        method=row.method,
+        submitter=row.name,
+        url=row.url,
+        uses_intrinsics=row.uses_intrinsics,
+        created_at=row.created_at,
+        finished_at=row.finished_at,
+        public=row.public,
+        table=json.loads(row.json),
     )
 
 
 @dataclass(frozen=True)
-class Standing:
-    """A public row of a config: ``rank`` is None where the protocol does not rank it; ``table`` is its JSON."""
+class RankedRow:
+    """A public row of a config; ``rank`` is None if the row is not ranked, ``table`` is the table's JSON text."""
 
     rank: int | None
     submission_id: str
@@ -169,70 +174,82 @@ class Standing:
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where in the queue a submission waits, 1 is next, and how many wait."""
+class QueuePosition:
+    """Position of a submission in the queue, where 1 is next, and the number of waiting submissions."""
 
     number: int
     waiting: int
 
 
-def standings(database: Database, config: str) -> list[Standing]:
-    """Return a config's public rows: ranked ones by native AbsRel, then the unranked, as the board has them."""
+def ranked_rows(database: Database, config: str) -> list[RankedRow]:
+    """Return the public rows of a config in leaderboard order: ranked by native AbsRel, then unranked."""
     columns = (
-        RowRecord.ranked,
-        SubmissionRecord.id,
-        SubmissionRecord.method,
-        TokenRecord.name,
-        SubmissionRecord.url,
-        SubmissionRecord.created_at,
-        SubmissionRecord.finished_at,
-        RowRecord.json,
+        LeaderboardRowModel.ranked,
+        SubmissionModel.id,
+        SubmissionModel.method,
+        TokenModel.name,
+        SubmissionModel.url,
+        SubmissionModel.created_at,
+        SubmissionModel.finished_at,
+        LeaderboardRowModel.json,
     )
     query = (
         select(*columns)
-        .join(SubmissionRecord, SubmissionRecord.id == RowRecord.submission_id)
-        .join(TokenRecord, TokenRecord.id == SubmissionRecord.token_id)
-        .where(RowRecord.config == config, SubmissionRecord.status == SCORED, SubmissionRecord.public)
-        .order_by(RowRecord.ranked.desc(), RowRecord.abs_rel.nulls_last(), SubmissionRecord.created_at)
+        .join(SubmissionModel, SubmissionModel.id == LeaderboardRowModel.submission_id)
+        .join(TokenModel, TokenModel.id == SubmissionModel.token_id)
+        .where(LeaderboardRowModel.config == config, SubmissionModel.status == SCORED, SubmissionModel.public)
+        .order_by(
+            LeaderboardRowModel.ranked.desc(), LeaderboardRowModel.abs_rel.nulls_last(), SubmissionModel.created_at
+        )
     )
     with database.read() as session:
-        found = session.execute(query).all()
-    return [Standing(rank if row[0] else None, *row[1:]) for rank, row in enumerate(found, 1)]
+        rows = session.execute(query).all()
+    return [RankedRow(rank if row[0] else None, *row[1:]) for rank, row in enumerate(rows, 1)]
 
 
-def ranks(database: Database, submission: SubmissionRecord) -> dict[str, int]:
-    """Return the rank of each of a submission's rows that the board ranks, by config, in one query."""
+def ranks(database: Database, submission: SubmissionModel) -> dict[str, int]:
+    """Return the ranks of a submission by config, in one query; configs where it is not ranked are left out."""
     if not submission.public:
         return {}
-    mine, other, others = aliased(RowRecord), aliased(RowRecord), aliased(SubmissionRecord)
+    own_row, other_row, other_submission = (
+        aliased(LeaderboardRowModel),
+        aliased(LeaderboardRowModel),
+        aliased(SubmissionModel),
+    )
     ahead = or_(
-        other.abs_rel < mine.abs_rel,
-        and_(other.abs_rel == mine.abs_rel, others.created_at < submission.created_at),
+        other_row.abs_rel < own_row.abs_rel,
+        and_(other_row.abs_rel == own_row.abs_rel, other_submission.created_at < submission.created_at),
     )
     better = (
         select(func.count())
-        .select_from(other)
-        .join(others, others.id == other.submission_id)
-        .where(other.config == mine.config, other.ranked, others.status == SCORED, others.public, ahead)
+        .select_from(other_row)
+        .join(other_submission, other_submission.id == other_row.submission_id)
+        .where(
+            other_row.config == own_row.config,
+            other_row.ranked,
+            other_submission.status == SCORED,
+            other_submission.public,
+            ahead,
+        )
         .scalar_subquery()
     )
-    query = select(mine.config, 1 + better).where(mine.submission_id == submission.id, mine.ranked)
+    query = select(own_row.config, 1 + better).where(own_row.submission_id == submission.id, own_row.ranked)
     with database.read() as session:
         return dict(session.execute(query).all())
 
 
-def queue_place(database: Database, submission: SubmissionRecord) -> Place | None:
-    """Return where a submission waits, None where it does not."""
+def queue_position(database: Database, submission: SubmissionModel) -> QueuePosition | None:
+    """Return the queue position of a submission, or None if it is not queued."""
     if submission.status != QUEUED:
         return None
-    older = func.count().filter(SubmissionRecord.created_at < submission.created_at)
-    query = select(older, func.count()).where(SubmissionRecord.status == QUEUED)
+    older = func.count().filter(SubmissionModel.created_at < submission.created_at)
+    query = select(older, func.count()).where(SubmissionModel.status == QUEUED)
     with database.read() as session:
         before, waiting = session.execute(query).one()
-    return Place(before + 1, max(waiting, before + 1))
+    return QueuePosition(before + 1, max(waiting, before + 1))
 
 
-def submitter(database: Database, submission: SubmissionRecord) -> str:
-    """Return who made a submission."""
+def submitter_name(database: Database, submission: SubmissionModel) -> str:
+    """Return the name of the token that made a submission."""
     with database.read() as session:
-        return session.get_one(TokenRecord, submission.token_id).name
+        return session.get_one(TokenModel, submission.token_id).name

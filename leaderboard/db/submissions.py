@@ -1,4 +1,4 @@
-"""Submissions in the database: accepted within the quota, shown to whom they may be, published, deleted."""
+"""Database operations on submissions: acceptance within the quota, lookup, publication and deletion."""
 
 from __future__ import annotations
 
@@ -10,22 +10,23 @@ from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
 from leaderboard.db.engine import Database
-from leaderboard.db.models import PictureRecord, ResultRecord, RowRecord, SubmissionRecord, TokenRecord
+from leaderboard.db.models import ErrorMapModel, LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
 from rebar_depth_bench.submission import SubmissionMeta
 
 QUEUED, SCORING, SCORED, FAILED, DELETED = "queued", "scoring", "scored", "failed", "deleted"
 DAY_S = 86400
 
 
-class QuotaSpentError(Exception):
-    """The token has made its submissions of the day."""
+class QuotaExceededError(Exception):
+    """Raised when a token has used its daily quota of submissions."""
 
 
 @dataclass(frozen=True)
 class Upload:
-    """A checked archive that is about to be accepted.
+    """A validated archive that is about to be accepted.
 
-    What it says of itself, its SHA-256, its size in bytes, and the digest of the dataset that it fits.
+    ``meta`` is its ``submission.json``, ``sha256`` its digest in hexadecimal, ``size`` is in bytes, and
+    ``dataset_digest`` is the digest of the dataset that it was validated against.
     """
 
     meta: SubmissionMeta
@@ -35,20 +36,27 @@ class Upload:
 
 
 def new_id() -> str:
-    """Return an id that nobody can guess, for it opens a submission that is not public, and any command takes."""
+    """Return a random id of 128 bits.
+
+    It must be unguessable, because it gives access to a submission that is not public. It is hexadecimal, so that
+    it is valid as an argument of any command.
+    """
     return secrets.token_hex(16)
 
 
 def accept(
-    database: Database, submission_id: str, token: TokenRecord, upload: Upload, quota: int, public: bool
-) -> SubmissionRecord:
-    """Queue a submission whose archive is kept already; durable on return. Raises ``QuotaSpentError``."""
+    database: Database, submission_id: str, token: TokenModel, upload: Upload, quota: int, public: bool
+) -> SubmissionModel:
+    """Insert a queued submission, whose archive is stored already, and return its row. Durable on return.
+
+    Raises ``QuotaExceededError`` if the token has used its daily quota.
+    """
     with database.write() as session:
-        # The token's row is locked, so that two uploads at once do not both take the last place.
-        session.execute(select(TokenRecord).where(TokenRecord.id == token.id).with_for_update())
-        if spent_today(session, token.id) >= quota:
-            raise QuotaSpentError
-        record = SubmissionRecord(
+        # The token's row is locked, so that concurrent uploads cannot exceed the quota.
+        session.execute(select(TokenModel).where(TokenModel.id == token.id).with_for_update())
+        if count_submissions_today(session, token.id) >= quota:
+            raise QuotaExceededError
+        record = SubmissionModel(
             id=submission_id,
             token_id=token.id,
             method=upload.meta.method,
@@ -67,46 +75,45 @@ def accept(
     return record
 
 
-def spent_today(session: Session, token_id: int) -> int:
-    """Return how many submissions a token made since midnight UTC, deleted ones too."""
+def count_submissions_today(session: Session, token_id: int) -> int:
+    """Return the number of submissions made with a token since midnight UTC, including deleted ones."""
     midnight = time.time() // DAY_S * DAY_S
-    mine = select(func.count()).where(
-        SubmissionRecord.token_id == token_id, SubmissionRecord.created_at >= midnight
+    own_today = select(func.count()).where(
+        SubmissionModel.token_id == token_id, SubmissionModel.created_at >= midnight
     )
-    return session.scalar(mine) or 0
+    return session.scalar(own_today) or 0
 
 
-def find(database: Database, submission_id: str) -> SubmissionRecord | None:
-    """Return a submission that is there and not deleted."""
+def find(database: Database, submission_id: str) -> SubmissionModel | None:
+    """Return the row of a submission, or None if it does not exist or is deleted."""
     with database.read() as session:
-        record = session.get(SubmissionRecord, submission_id)
+        record = session.get(SubmissionModel, submission_id)
     return None if record is None or record.status == DELETED else record
 
 
 def result_json(database: Database, submission_id: str) -> bytes | None:
-    """Return a scored submission's result, byte for byte as the command line writes it."""
+    """Return the result JSON of a scored submission, byte-identical to the command line's, or None."""
     query = (
-        select(ResultRecord.json)
-        .join(SubmissionRecord, SubmissionRecord.id == ResultRecord.submission_id)
-        .where(ResultRecord.submission_id == submission_id, SubmissionRecord.status == SCORED)
+        select(ResultModel.json)
+        .join(SubmissionModel, SubmissionModel.id == ResultModel.submission_id)
+        .where(ResultModel.submission_id == submission_id, SubmissionModel.status == SCORED)
     )
     with database.read() as session:
         return session.scalar(query)
 
 
 def publish(database: Database, submission_id: str, public: bool) -> None:
-    """Put a submission's rows on the board, or take them off."""
+    """Set whether the rows of a submission are shown on the leaderboard."""
     with database.write() as session:
-        session.get_one(SubmissionRecord, submission_id).public = public
+        session.get_one(SubmissionModel, submission_id).public = public
 
 
 def remove(database: Database, submission_id: str) -> None:
-    """Delete a submission, its rows, result and pictures; what is left counts for the quota and says nothing."""
+    """Delete a submission's rows, result and error maps; its cleared own row still counts for the quota."""
     with database.write() as session:
-        record = session.get_one(
-            SubmissionRecord, submission_id, with_for_update=True
-        )  # no scorer ends it meanwhile
-        for table in (PictureRecord, RowRecord, ResultRecord):
+        # The row is locked, so that no worker finishes the submission meanwhile.
+        record = session.get_one(SubmissionModel, submission_id, with_for_update=True)
+        for table in (ErrorMapModel, LeaderboardRowModel, ResultModel):
             session.execute(delete(table).where(table.submission_id == submission_id))
         record.status, record.public = DELETED, False
         record.method, record.archive_sha256 = "", ""

@@ -1,1 +1,1 @@
-"""Scoring of accepted archives: workers, the sandboxed scoring process, and dask."""
+"""Scoring of accepted archives: queue workers, the sandboxed scoring process and the dask backend."""

@@ -1,4 +1,7 @@
-"""A scorer as a process: settings as JSON on standard input; SIGTERM gives the job at hand back and ends it."""
+"""Entry point of a worker process, which reads its settings as JSON from standard input.
+
+On SIGTERM the current job is requeued and the process exits.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +13,15 @@ from pathlib import Path
 
 import structlog
 
-from leaderboard.db.engine import Database
+from leaderboard.db.engine import Database, sqlite_path
 from leaderboard.log_setup import set_up_logs
 from leaderboard.redact import without_password
 from leaderboard.scoring.process_limits import die_with_parent
-from leaderboard.scoring.subprocess_backend import local_score
-from leaderboard.scoring.worker import Score, work
+from leaderboard.scoring.subprocess_backend import make_subprocess_backend
+from leaderboard.scoring.worker import ScoringBackend, process_queue
 from leaderboard.settings import Settings
-from leaderboard.storage.work_dirs import own_spool
-from rebar_depth_bench.cli.console import run_command
+from leaderboard.storage.work_dirs import work_dir
+from rebar_depth_bench.console import run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
 
@@ -26,33 +29,37 @@ _LOG = structlog.get_logger("scorer")
 
 
 def main() -> int:
-    """Score until told to stop; the argument is the process that started this one."""
+    """Run a worker until it is stopped. The command-line argument is the id of the parent process."""
     die_with_parent(int(sys.argv[1]))
     set_up_logs()
     settings = Settings.model_validate_json(sys.stdin.read())
-    return run_command(lambda: run_scorer(settings))
+    return run_command(lambda: run_worker(settings))
 
 
-def run_scorer(settings: Settings) -> None:
-    """Score what waits, here or on a cluster, until SIGTERM or SIGINT."""
+def run_worker(settings: Settings) -> None:
+    """Score queued submissions, on this machine or on a dask cluster, until SIGTERM or SIGINT.
+
+    Raises ``InputError`` if the SQLite database does not exist.
+    """
     stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    for signal_number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(signal_number, lambda *_: stop.set())
     url = settings.database_url
-    if url.startswith("sqlite:///") and not Path(url.removeprefix("sqlite:///")).is_file():
+    path = sqlite_path(url)
+    if path is not None and not path.is_file():
         raise InputError(f"{url}: there is no database, expected that of a server")
-    with own_spool(settings.spool) as spool, closing(Database(url)) as database:
+    with work_dir(settings.spool) as spool, closing(Database(url)) as database:
         database.migrate()
         _LOG.info("waiting for submissions", database=without_password(url), version=software_version())
-        work(database, settings, _score(settings, spool), stop)
+        process_queue(database, settings, _make_backend(settings, spool), stop)
 
 
-def _score(settings: Settings, spool: Path) -> Score:
-    if not settings.cluster:
-        return local_score(settings, spool)
-    from leaderboard.scoring.dask_backend import cluster_score
+def _make_backend(settings: Settings, spool: Path) -> ScoringBackend:
+    if not settings.dask_scheduler:
+        return make_subprocess_backend(settings, spool)
+    from leaderboard.scoring.dask_backend import make_dask_backend
 
-    return cluster_score(settings)
+    return make_dask_backend(settings)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Scoring on a dask cluster: its workers reach the archives and the dataset by the same URLs and paths."""
+"""Scoring backend on a dask cluster, whose workers access archives and dataset by the same URLs and paths."""
 
 from __future__ import annotations
 
@@ -8,40 +8,43 @@ from pathlib import Path
 from typing import Any
 
 from leaderboard.db.jobs import Job, Outcome
-from leaderboard.scoring.subprocess_backend import local_score
-from leaderboard.scoring.worker import IDLE_S, RENEWALS_PER_LEASE, AwayError, Score
+from leaderboard.scoring.subprocess_backend import make_subprocess_backend
+from leaderboard.scoring.worker import POLL_INTERVAL_S, RENEWALS_PER_LEASE, BackendUnavailableError, ScoringBackend
 from leaderboard.settings import Settings
 from rebar_depth_bench.errors import InputError
 
 CONNECT_S = 10
 
 
-def cluster_score(settings: Settings) -> Score:
-    """Return scoring that asks a dask worker, with a connection for each job: a scheduler may come and go.
+def make_dask_backend(settings: Settings) -> ScoringBackend:
+    """Return a backend that scores on a dask worker.
 
-    Raises ``InputError`` where dask is not installed.
+    It connects anew for each job, so that the scheduler may be restarted. Raises ``InputError`` if dask is not
+    installed.
     """
     check_dask()
     from distributed import CancelledError, Client, KilledWorker
 
-    told = settings_for_workers(settings).model_dump_json()
-    connect_s = min(CONNECT_S, settings.lease / 2)  # nobody renews the lease meanwhile
-    step_s = min(settings.lease / RENEWALS_PER_LEASE, IDLE_S)
+    worker_settings = settings_for_workers(settings).model_dump_json()
+    connect_s = min(CONNECT_S, settings.lease_seconds / 2)  # The lease is not renewed while connecting.
+    step_s = min(settings.lease_seconds / RENEWALS_PER_LEASE, POLL_INTERVAL_S)
 
-    def score(job: Job, go_on: Callable[[], bool]) -> Outcome | None:
+    def score(job: Job, should_continue: Callable[[], bool]) -> Outcome | None:
         try:
-            with Client(settings.cluster, timeout=connect_s, set_as_default=False) as client:
-                return _await(client.submit(score_here, told, job, pure=False), step_s, go_on)
+            with Client(settings.dask_scheduler, timeout=connect_s, set_as_default=False) as client:
+                return _wait_for_outcome(
+                    client.submit(score_on_worker, worker_settings, job, pure=False), step_s, should_continue
+                )
         except KilledWorker:
-            return None  # several workers died of it
-        except (Exception, CancelledError) as error:  # the network's, and what a worker lacks
-            raise AwayError(f"{settings.cluster}: {type(error).__name__}: {error}") from None
+            return None  # Several workers died while scoring it.
+        except (Exception, CancelledError) as error:  # Network errors and errors raised on the worker.
+            raise BackendUnavailableError(f"{settings.dask_scheduler}: {type(error).__name__}: {error}") from None
 
     return score
 
 
 def check_dask() -> None:
-    """Raise ``InputError`` where dask is not installed."""
+    """Raise ``InputError`` if dask is not installed."""
     try:
         import distributed  # noqa: F401
     except ImportError as error:
@@ -50,32 +53,32 @@ def check_dask() -> None:
         ) from None
 
 
-def _await(future: Any, step_s: float, go_on: Callable[[], bool]) -> Outcome | None:
+def _wait_for_outcome(future: Any, step_s: float, should_continue: Callable[[], bool]) -> Outcome | None:
     try:
         while True:
             try:
                 outcome: Outcome | None = future.result(timeout=step_s)
                 return outcome
             except TimeoutError:
-                if not go_on():
+                if not should_continue():
                     return None
     finally:
-        future.cancel()  # what runs already goes on, bounded by its time
+        future.cancel()  # A running task continues until its time limit.
 
 
 def settings_for_workers(settings: Settings) -> Settings:
-    """Return what a worker has to know: paths from the root, for it runs elsewhere, and no database's password."""
+    """Return the settings for a dask worker: absolute paths, and no database URL, which may hold a password."""
     archives = settings.archives_url
-    places = {
+    absolute = {
         "data": str(Path(settings.data).absolute()) if Path(settings.data).is_dir() else settings.data,
-        "state": settings.state.absolute(),
+        "state_dir": settings.state_dir.absolute(),
         "archives": archives if "://" in archives else str(Path(archives).absolute()),
     }
-    return settings.model_copy(update={**places, "db": ""})
+    return settings.model_copy(update={**absolute, "db": ""})
 
 
-def score_here(settings_json: str, job: Job) -> Outcome | None:
-    """Score a submission on the machine that this runs on, in a process of its own."""
+def score_on_worker(settings_json: str, job: Job) -> Outcome | None:
+    """Score a submission in a subprocess of the dask worker, with the settings of ``settings_for_workers``."""
     settings = Settings.model_validate_json(settings_json)
     with tempfile.TemporaryDirectory() as spool:
-        return local_score(settings, Path(spool))(job, lambda: True)
+        return make_subprocess_backend(settings, Path(spool))(job, lambda: True)

@@ -1,4 +1,4 @@
-"""Bounds for a process that reads a stranger's archive: memory, priority, and death with its parent (Linux)."""
+"""Limits for a process that reads an untrusted archive: memory, priority, termination with its parent (Linux)."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import signal
 
 _PR_SET_PDEATHSIG = 1
 NICENESS = 10
-LEAST_BYTES = 1 << 30
-"""Interpreter, libraries and the stacks of their threads alone take several hundred megabytes."""
+MIN_MEMORY_BYTES = 1 << 30
+"""Minimum memory limit: interpreter, libraries and thread stacks alone take several hundred megabytes."""
 
 
-def confine(memory: int, parent: int) -> None:
-    """Limit this process's memory, bytes, and have it killed when its parent, a process id, dies.
+def limit_process(memory: int, parent: int) -> None:
+    """Limit the memory of this process to ``memory`` bytes and have it killed when process ``parent`` dies.
 
-    It also gives way to whoever answers requests.
+    Its priority is lowered, so that it does not slow down the server, and core dumps are disabled.
     """
     os.nice(NICENESS)
-    limit = max(memory, LEAST_BYTES)
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))  # not RLIMIT_AS: archives are mapped whole
+    limit = max(memory, MIN_MEMORY_BYTES)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))  # Not RLIMIT_AS, because archives are memory-mapped.
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     die_with_parent(parent)
 
@@ -28,8 +28,9 @@ def confine(memory: int, parent: int) -> None:
 def die_with_parent(parent: int) -> None:
     """Have this process killed when the thread that started it ends.
 
-    ``parent`` is told by who started it: asked for here, a parent that died meanwhile would not be missed.
+    ``parent`` is the parent's process id as passed by the parent itself; ``os.getppid()`` alone would not detect a
+    parent that died before this call.
     """
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it died before it could be watched
+    if os.getppid() != parent:  # The parent died before the signal was set.
         os.kill(os.getpid(), signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Scoring on this machine: an archive in a process of its own, within the settings' time and memory."""
+"""Scoring backend on this machine: one subprocess per archive, with the time and memory limits of the settings."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from pathlib import Path
 import structlog
 
 from leaderboard.db.jobs import Job, Outcome
-from leaderboard.scoring.sandbox import AWAY, PICTURES, PROBLEM, RESULT, Task
-from leaderboard.scoring.worker import IDLE_S, RENEWALS_PER_LEASE, AwayError, Score
+from leaderboard.scoring.sandbox import ERROR_MAPS_DIR, PROBLEM_FILE, RESULT_FILE, UNAVAILABLE_FILE, ScoringTask
+from leaderboard.scoring.worker import POLL_INTERVAL_S, RENEWALS_PER_LEASE, BackendUnavailableError, ScoringBackend
 from leaderboard.settings import Settings
 
-COMPLAINTS = "complaints.txt"
+OUTPUT_FILE = "complaints.txt"
 _LOG = structlog.get_logger("scorer")
 
 
-def local_score(settings: Settings, spool: Path) -> Score:
-    """Return scoring in a process of this machine; its files go to ``spool``."""
+def make_subprocess_backend(settings: Settings, spool: Path) -> ScoringBackend:
+    """Return a backend that scores in a subprocess on this machine, with its files in ``spool``."""
 
-    def score(job: Job, go_on: Callable[[], bool]) -> Outcome | None:
+    def score(job: Job, should_continue: Callable[[], bool]) -> Outcome | None:
         with tempfile.TemporaryDirectory(dir=spool) as scratch:
-            task = Task(
+            task = ScoringTask(
                 archives=settings.archives_url,
                 submission_id=job.submission_id,
                 data=settings.data,
@@ -39,35 +39,35 @@ def local_score(settings: Settings, spool: Path) -> Score:
                 parent=os.getpid(),
             )
             try:
-                return _run(task, settings, go_on)
+                return _run_sandbox(task, settings, should_continue)
             except OSError as error:
-                raise AwayError(str(error)) from None
+                raise BackendUnavailableError(str(error)) from None
 
     return score
 
 
-def _run(task: Task, settings: Settings, go_on: Callable[[], bool]) -> Outcome | None:
+def _run_sandbox(task: ScoringTask, settings: Settings, should_continue: Callable[[], bool]) -> Outcome | None:
     command = [sys.executable, "-m", "leaderboard.scoring.sandbox"]
-    with (Path(task.out) / COMPLAINTS).open("wb") as complaints:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=complaints, stderr=complaints)
+    with (Path(task.out) / OUTPUT_FILE).open("wb") as output:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=output)
     assert process.stdin is not None
-    step_s = min(settings.lease / RENEWALS_PER_LEASE, IDLE_S)
-    end = time.monotonic() + settings.score_time
+    step_s = min(settings.lease_seconds / RENEWALS_PER_LEASE, POLL_INTERVAL_S)
+    deadline = time.monotonic() + settings.score_time
     try:
         with suppress(BrokenPipeError):
             process.stdin.write(task.to_json())
             process.stdin.close()
         while not _has_ended(process, step_s):
-            if time.monotonic() >= end:
+            if time.monotonic() >= deadline:
                 return Outcome(
                     reason=f"scoring took longer than the {settings.score_time:g} s this service allows"
                 )
-            if not go_on():
+            if not should_continue():
                 return None
     finally:
         process.kill()
         process.wait()
-    return _outcome(Path(task.out), process.returncode)
+    return _read_outcome(Path(task.out), process.returncode)
 
 
 def _has_ended(process: subprocess.Popen[bytes], within_s: float) -> bool:
@@ -76,16 +76,16 @@ def _has_ended(process: subprocess.Popen[bytes], within_s: float) -> bool:
     return process.returncode is not None
 
 
-def _outcome(out: Path, status: int) -> Outcome | None:
-    if (out / RESULT).is_file() and status == 0:
-        pictures = sorted((out / PICTURES).glob("*.webp")) if (out / PICTURES).is_dir() else []
-        maps = {path.with_suffix(".txt").read_text(): path.read_bytes() for path in pictures}
-        return Outcome(result=(out / RESULT).read_bytes(), pictures=maps)
-    if (out / PROBLEM).is_file():
-        return Outcome(reason=(out / PROBLEM).read_text())
-    if (out / AWAY).is_file():
-        raise AwayError((out / AWAY).read_text())
+def _read_outcome(out: Path, status: int) -> Outcome | None:
+    if (out / RESULT_FILE).is_file() and status == 0:
+        images = sorted((out / ERROR_MAPS_DIR).glob("*.webp")) if (out / ERROR_MAPS_DIR).is_dir() else []
+        error_maps = {path.with_suffix(".txt").read_text(): path.read_bytes() for path in images}
+        return Outcome(result=(out / RESULT_FILE).read_bytes(), error_maps=error_maps)
+    if (out / PROBLEM_FILE).is_file():
+        return Outcome(reason=(out / PROBLEM_FILE).read_text())
+    if (out / UNAVAILABLE_FILE).is_file():
+        raise BackendUnavailableError((out / UNAVAILABLE_FILE).read_text())
     if status in (-signal.SIGKILL, -signal.SIGTERM):
-        return None  # somebody's doing, not the archive's: try again
-    _LOG.error("scoring crashed", status=status, said=(out / COMPLAINTS).read_text(errors="replace")[-2000:])
+        return None  # Killed from outside, not caused by the archive: try again.
+    _LOG.error("scoring crashed", status=status, said=(out / OUTPUT_FILE).read_text(errors="replace")[-2000:])
     return Outcome(reason=f"scoring ended with status {status} and said nothing")

@@ -1,4 +1,4 @@
-"""A scorer: leases submissions, has each scored, renews its lease meanwhile, ends it."""
+"""Queue worker: leases submissions, scores them with a backend, renews the lease meanwhile, stores the outcome."""
 
 from __future__ import annotations
 
@@ -12,90 +12,99 @@ from typing import TypeVar
 import structlog
 
 from leaderboard.db import jobs, submissions
-from leaderboard.db.engine import AWAY, Database
+from leaderboard.db.engine import DATABASE_UNAVAILABLE, Database
 from leaderboard.db.jobs import Job, Outcome
 from leaderboard.settings import Settings
 
-IDLE_S = 1.0
-AWAY_S = 1.0
+POLL_INTERVAL_S = 1.0
+RETRY_INTERVAL_S = 1.0
 RENEWALS_PER_LEASE = 4
 _LOG = structlog.get_logger("scorer")
 
 T = TypeVar("T")
-Score = Callable[[Job, Callable[[], bool]], Outcome | None]
-"""Score a job; asked now and then whether to go on; None where it was told to stop or died.
+ScoringBackend = Callable[[Job, Callable[[], bool]], Outcome | None]
+"""Function that scores a job.
 
-Raises ``AwayError`` where the fault is not the archive's."""
-
-
-class AwayError(Exception):
-    """Nobody is there to score, or archive or dataset cannot be had: the job waits, and it costs no attempt."""
+It calls its second argument regularly and stops when that returns False. It returns None if it was stopped or its
+process died, and raises ``BackendUnavailableError`` for an infrastructure failure."""
 
 
-def scorer_name() -> str:
-    """Return a name that no other scorer has."""
+class BackendUnavailableError(Exception):
+    """Raised when scoring is impossible for now: no backend, or archive or dataset unreachable.
+
+    The job is requeued without counting the attempt.
+    """
+
+
+def new_worker_name() -> str:
+    """Return a unique worker name: host name, process id and a random suffix."""
     return f"{socket.gethostname()[:40]}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
-def work(database: Database, settings: Settings, score: Score, stop: threading.Event) -> None:
-    """Score what waits until ``stop`` is set; then the job at hand is given back.
+def process_queue(database: Database, settings: Settings, score: ScoringBackend, stop: threading.Event) -> None:
+    """Score queued submissions until ``stop`` is set; then requeue the current job.
 
-    A database that is away for a while is waited for; what was scored meanwhile is kept once it is back.
+    While the database is unavailable its operations are retried, so that no outcome is lost.
     """
-    name = scorer_name()
+    name = new_worker_name()
     while not stop.is_set():
-        submission_id = _insist(lambda: jobs.claim(database, name, settings.lease), stop)
+        submission_id = _retry_until_available(lambda: jobs.claim(database, name, settings.lease_seconds), stop)
         if submission_id is None:
-            stop.wait(IDLE_S)
+            stop.wait(POLL_INTERVAL_S)
         else:
-            _work_on(submission_id, name, database, settings, score, stop)
+            _score_submission(submission_id, name, database, settings, score, stop)
 
 
-def _work_on(
-    submission_id: str, name: str, database: Database, settings: Settings, score: Score, stop: threading.Event
+def _score_submission(
+    submission_id: str,
+    name: str,
+    database: Database,
+    settings: Settings,
+    score: ScoringBackend,
+    stop: threading.Event,
 ) -> None:
     log = _LOG.bind(submission=submission_id[:6], scorer=name)
-    record = _insist(lambda: submissions.find(database, submission_id), stop)
-    if record is None:  # deleted a moment ago
+    record = _retry_until_available(lambda: submissions.find(database, submission_id), stop)
+    if record is None:  # Deleted after it was leased.
         return
     log.info("scoring")
     wait_s, outcome = 0.0, None
     try:
         job = Job(submission_id, record.dataset_digest)
-        outcome = score(job, _keeper(database, submission_id, name, settings.lease, stop))
-    except AwayError as error:
+        outcome = score(job, _make_heartbeat(database, submission_id, name, settings.lease_seconds, stop))
+    except BackendUnavailableError as error:
         log.warning("nobody to score", reason=str(error))
-        wait_s = settings.lease
+        wait_s = settings.lease_seconds
     if outcome is not None:
-        kept = _insist(lambda: jobs.finish(database, submission_id, name, outcome), stop)
-        log.info("ended" if kept else "lost", reason=outcome.reason)
+        is_stored = _retry_until_available(lambda: jobs.finish(database, submission_id, name, outcome), stop)
+        log.info("ended" if is_stored else "lost", reason=outcome.reason)
     elif wait_s or stop.is_set():
-        _insist(lambda: jobs.give_back(database, submission_id, name, wait_s), stop)
+        _retry_until_available(lambda: jobs.release(database, submission_id, name, wait_s), stop)
         log.info("given back")
     else:
-        log.warning("died", lease_s=settings.lease)  # it waits for the lease to end, and is tried again
+        log.warning("died", lease_s=settings.lease_seconds)  # Leased again once the lease expires.
 
 
-def _insist(step: Callable[[], T], stop: threading.Event) -> T | None:
-    """Return what ``step`` returns, tried again while the database is away; None where ``stop`` comes first."""
+def _retry_until_available(step: Callable[[], T], stop: threading.Event) -> T | None:
+    """Call ``step`` until the database is available; return its value, or None if ``stop`` is set first."""
     while True:
         try:
             return step()
-        except AWAY as error:
+        except DATABASE_UNAVAILABLE as error:
             _LOG.warning("database away", error=type(error).__name__)
-            if stop.wait(AWAY_S):
+            if stop.wait(RETRY_INTERVAL_S):
                 return None
 
 
-def _keeper(
+def _make_heartbeat(
     database: Database, submission_id: str, name: str, lease_s: float, stop: threading.Event
 ) -> Callable[[], bool]:
-    """Return what renews the lease and tells whether to go on."""
+    """Return a function that renews the lease and returns whether scoring should continue."""
 
-    def go_on() -> bool:
+    def should_continue() -> bool:
         try:
             return not stop.is_set() and jobs.renew(database, submission_id, name, lease_s)
-        except AWAY:
-            return True  # should another take over meanwhile, only one of the two can end the job
+        except DATABASE_UNAVAILABLE:
+            return True  # If another worker takes over, only one of them can finish the job.
 
-    return go_on
+    return should_continue

@@ -1,1 +1,1 @@
-"""Storage on disk and elsewhere: submission archives, work directories, backups."""
+"""Local and remote storage: submission archives, work directories, backups."""

@@ -1,4 +1,4 @@
-"""Where accepted archives are kept: a folder, or whatever ``fsspec`` reaches."""
+"""Archive storage in a local folder or any other filesystem that ``fsspec`` supports."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
 from leaderboard.redact import without_password
-from rebar_depth_bench.atomic_io import sync
+from rebar_depth_bench.atomic_io import fsync_path
 from rebar_depth_bench.errors import InputError
 
 
-class GoneError(Exception):
-    """An archive is not there, though the place is."""
+class ArchiveNotFoundError(Exception):
+    """Raised when an archive does not exist although its storage is available."""
 
 
-class Archives:
-    """Archives by submission id. ``put`` returns when the archive is durable.
+class ArchiveStore:
+    """Storage of submission archives by submission id.
 
-    All raise ``OSError`` where the place does not answer or has no room.
+    All methods raise ``OSError`` if the storage is unavailable or full.
     """
 
     def __init__(self, url: str) -> None:
-        """Raise ``InputError`` for a URL that ``fsspec`` cannot reach."""
+        """Create the folder ``url``. Raises ``InputError`` if ``fsspec`` cannot access it."""
         self._url = url
         try:
             files, self._root = fsspec.core.url_to_fs(url)
             files.makedirs(self._root, exist_ok=True)
-        except Exception as error:  # every filesystem has a tree of errors of its own
+        except Exception as error:  # Each filesystem raises its own exception types.
             raise InputError(f"{without_password(url)}: archives cannot be kept there: {error}") from None
         self._is_local = isinstance(files, LocalFileSystem)
 
     @contextmanager
-    def _files(self) -> Iterator[Any]:
-        """Yield the filesystem as this thread may use it: no two share a connection.
+    def _filesystem(self) -> Iterator[Any]:
+        """Yield the filesystem for use in this thread; threads do not share a connection.
 
-        Whatever goes wrong with it raises ``OSError``: every filesystem has a tree of errors of its own.
+        Errors of the filesystem, whose exception types differ, are raised as ``OSError``.
         """
         files = fsspec.core.url_to_fs(self._url)[0]
         try:
@@ -51,99 +51,103 @@ class Archives:
         except FileNotFoundError:
             raise
         except Exception as error:
-            files.clear_instance_cache()  # its connection may be dead
+            files.clear_instance_cache()  # Its connection may be broken.
             if isinstance(error, OSError):
                 raise
             raise OSError(f"{without_password(self._url)}: {type(error).__name__}: {error}") from None
 
     def put(self, submission_id: str, source: Path) -> None:
-        """Take over a file. On the same disk it is renamed, elsewhere copied."""
+        """Move a file into the storage; durable on return.
+
+        It is renamed on the same disk and copied otherwise.
+        """
         if not self._is_local:
-            with self._files() as files:
+            with self._filesystem() as files:
                 files.put_file(str(source), self._path(submission_id))
             source.unlink()
             return
         target = Path(self._path(submission_id))
         if source.stat().st_dev == target.parent.stat().st_dev:
-            os.utime(source)  # its age counts from now on
-            sync(source)
+            os.utime(source)  # Its age counts from now.
+            fsync_path(source)
             source.replace(target)
         else:
             shutil.copyfile(source, target)
-            sync(target)
+            fsync_path(target)
             source.unlink()
-        sync(target.parent)
+        fsync_path(target.parent)
 
     @contextmanager
-    def local(self, submission_id: str, scratch: Path) -> Iterator[Path]:
-        """Yield the archive as a file of this machine, fetched into ``scratch`` where it is kept elsewhere.
+    def local_copy(self, submission_id: str, scratch: Path) -> Iterator[Path]:
+        """Yield the path of the archive on this machine, downloaded into ``scratch`` if the storage is remote.
 
-        Raises ``GoneError`` for one that is not there.
+        Raises ``ArchiveNotFoundError`` if the archive does not exist.
         """
         if self._is_local:
             path = Path(self._path(submission_id))
             if not path.is_file():
                 if path.parent.is_dir():
-                    raise GoneError(submission_id)
+                    raise ArchiveNotFoundError(submission_id)
                 raise OSError(f"{path.parent}: there is no such folder")
             yield path
             return
         fetched = scratch / f"{submission_id}.zip"
         try:
             try:
-                with self._files() as files:
-                    files.info(self._path(submission_id))  # some have no error of their own for what is not there
+                with self._filesystem() as files:
+                    # Not all filesystems raise FileNotFoundError in get_file.
+                    files.info(self._path(submission_id))
                     files.get_file(self._path(submission_id), str(fetched))
             except FileNotFoundError:
-                raise GoneError(submission_id) from None
+                raise ArchiveNotFoundError(submission_id) from None
             yield fetched
         finally:
             fetched.unlink(missing_ok=True)
 
     def delete(self, submission_id: str) -> None:
-        """Remove an archive; one that is not there is no error."""
-        with suppress(FileNotFoundError), self._files() as files:
+        """Delete an archive; a missing archive is not an error."""
+        with suppress(FileNotFoundError), self._filesystem() as files:
             files.info(self._path(submission_id))
             files.rm_file(self._path(submission_id))
 
     def ids(self) -> set[str]:
-        """Return the ids of all archives that are kept."""
+        """Return the ids of all stored archives."""
         try:
-            with self._files() as files:
+            with self._filesystem() as files:
                 files.invalidate_cache()
-                found = files.ls(self._root, detail=True)
-        except FileNotFoundError:  # where there are no folders, an empty one is none
+                entries = files.ls(self._root, detail=True)
+        except FileNotFoundError:  # Object stores have no empty folders.
             return set()
-        names = [str(entry["name"]) for entry in found]
+        names = [str(entry["name"]) for entry in entries]
         return {Path(name).stem for name in names if name.endswith(".zip")}
 
     def age_s(self, submission_id: str, now: float) -> float:
-        """Return how long ago an archive was written; 0 where the store does not tell."""
-        with self._files() as files:
-            time_s = written_s(files.info(self._path(submission_id)))
+        """Return the age of an archive in seconds at Unix time ``now``; 0 if the filesystem does not report it."""
+        with self._filesystem() as files:
+            time_s = modified_s(files.info(self._path(submission_id)))
         return 0.0 if time_s is None else now - time_s
 
     def _path(self, submission_id: str) -> str:
         return f"{self._root}/{submission_id}.zip"
 
 
-_WRITTEN = ("mtime", "LastModified", "last_modified", "updated", "modify")
-"""What filesystems call the time of the last change: local and SFTP, S3, Azure, Google, FTP."""
+_MODIFIED_KEYS = ("mtime", "LastModified", "last_modified", "updated", "modify")
+"""Keys of the modification time in ``info``: local and SFTP, S3, Azure, Google, FTP."""
 
 
-def written_s(info: Mapping[str, Any]) -> float | None:
-    """Return when a file was written, seconds since 1970, by what a filesystem tells of it; None if by nothing."""
-    told = next((info[name] for name in _WRITTEN if name in info), None)
-    if isinstance(told, str):
-        told = _time(told)
-    return told.timestamp() if isinstance(told, datetime) else told
+def modified_s(info: Mapping[str, Any]) -> float | None:
+    """Return the modification time (Unix timestamp) from a filesystem's ``info``, or None if it has none."""
+    value = next((info[name] for name in _MODIFIED_KEYS if name in info), None)
+    if isinstance(value, str):
+        value = _parse_time(value)
+    return value.timestamp() if isinstance(value, datetime) else value
 
 
-def _time(text: str) -> datetime | None:
-    """Read ISO 8601 or RFC 3659, YYYYMMDDHHMMSS with a fraction or without; both UTC."""
-    plain = re.fullmatch(r"(\d{8})(\d{6})(\.\d+)?", text)
+def _parse_time(text: str) -> datetime | None:
+    """Parse a time in ISO 8601 or RFC 3659 (YYYYMMDDHHMMSS[.F]); UTC if it has no offset. None if invalid."""
+    rfc_3659 = re.fullmatch(r"(\d{8})(\d{6})(\.\d+)?", text)
     try:
-        told = datetime.fromisoformat(f"{plain[1]}T{plain[2]}" if plain else text)
+        parsed = datetime.fromisoformat(f"{rfc_3659[1]}T{rfc_3659[2]}" if rfc_3659 else text)
     except ValueError:
         return None
-    return told if told.tzinfo else told.replace(tzinfo=UTC)
+    return parsed if parsed.tzinfo else parsed.replace(tzinfo=UTC)

@@ -1,75 +1,58 @@
-"""Folders for files under way, one for each process; the next that starts clears what a killed one left."""
+"""Per-process work directories for temporary files; those of killed processes are removed at the next start."""
 
 from __future__ import annotations
 
-import fcntl
-import os
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import structlog
 
+from rebar_depth_bench.atomic_io import exclusive_lock
 from rebar_depth_bench.errors import InputError
 
 _LOG = structlog.get_logger("spool")
-_ENTRANCE = "entrance.lock"
+_STARTUP_LOCK = "entrance.lock"
+_LOCK_MODE = 0o600
 
 
 @contextmanager
-def own_spool(root: Path) -> Iterator[Path]:
-    """Yield a new folder below ``root`` that is this process's alone, and remove it at the end.
+def work_dir(root: Path) -> Iterator[Path]:
+    """Yield a new folder below ``root`` for the exclusive use of this process, and remove it at the end.
 
-    A lock says that its process lives; the kernel lets go of it however the process ends. Folders without a living
-    process are removed first. Raises ``InputError`` where no folder can be made.
+    The process holds a file lock while it runs, which the kernel releases however the process ends. Folders whose
+    lock is free are removed first. Raises ``InputError`` if the folder cannot be created.
     """
     folder = root / secrets.token_hex(8)
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        with _locked(root / _ENTRANCE):  # nobody clears between the folder and its lock
-            _clear(root)
-            folder.mkdir()
-            life = os.open(_lock_of(folder), os.O_RDWR | os.O_CREAT, 0o600)
-            fcntl.flock(life, fcntl.LOCK_EX)
-    except OSError as error:
-        raise InputError(f"{root}: files cannot be kept there: {error.strerror}") from None
-    try:
-        yield folder
-    finally:
-        _remove(folder)
-        os.close(life)
-
-
-def _clear(root: Path) -> None:
-    for folder in [path for path in root.iterdir() if path.is_dir()]:
-        descriptor = os.open(_lock_of(folder), os.O_RDWR | os.O_CREAT, 0o600)
+    with ExitStack() as stack:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            continue
-        else:
+            root.mkdir(parents=True, exist_ok=True)
+            # The new folder is not yet protected by its own lock.
+            with exclusive_lock(root / _STARTUP_LOCK, wait=True, mode=_LOCK_MODE):
+                _remove_abandoned(root)
+                folder.mkdir()
+                stack.enter_context(exclusive_lock(_lock_path(folder), wait=True, mode=_LOCK_MODE))
+        except OSError as error:
+            raise InputError(f"{root}: files cannot be kept there: {error.strerror}") from None
+        try:
+            yield folder
+        finally:
+            _remove(folder)
+
+
+def _remove_abandoned(root: Path) -> None:
+    for folder in [path for path in root.iterdir() if path.is_dir()]:
+        with suppress(BlockingIOError), exclusive_lock(_lock_path(folder), mode=_LOCK_MODE):
             _remove(folder)
             _LOG.info("cleared", spool=folder.name)
-        finally:
-            os.close(descriptor)
 
 
 def _remove(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
-    _lock_of(folder).unlink(missing_ok=True)
+    _lock_path(folder).unlink(missing_ok=True)
 
 
-def _lock_of(folder: Path) -> Path:
+def _lock_path(folder: Path) -> Path:
     return folder.with_suffix(".lock")
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)

@@ -1,1 +1,1 @@
-"""Uploads: multipart parsing, validation in a child process, acceptance."""
+"""Upload handling: multipart parsing, validation in a child process, acceptance."""

@@ -1,4 +1,4 @@
-"""An upload's way in: received, checked, kept, queued. Only then is it accepted."""
+"""Upload pipeline: receive, validate, store and enqueue an archive; it is accepted only after the last step."""
 
 from __future__ import annotations
 
@@ -8,19 +8,28 @@ import structlog
 from anyio import to_thread
 
 from leaderboard.db import submissions
-from leaderboard.db.models import SubmissionRecord, TokenRecord
-from leaderboard.db.submissions import QuotaSpentError, Upload
-from leaderboard.uploads.multipart import MOST_ELSE, Received, UploadError, receive, too_large
-from leaderboard.web.context import Service
+from leaderboard.db.models import SubmissionModel, TokenModel
+from leaderboard.db.submissions import QuotaExceededError, Upload
+from leaderboard.service import Service
+from leaderboard.uploads.multipart import (
+    MAX_OVERHEAD_BYTES,
+    ReceivedArchive,
+    UploadError,
+    receive,
+    too_large_message,
+)
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, RebarDepthError
 
-AWAY = "the service cannot check or keep archives now; try again later"
-"""The dataset cannot be read, the disk is full, or the place of archives does not answer."""
+UNAVAILABLE_MESSAGE = "the service cannot check or keep archives now; try again later"
+"""Detail of the 503 response if the dataset is unreadable, the disk full or the archive storage unavailable."""
 _LOG = structlog.get_logger("intake")
 
 
-class RefusedError(Exception):
-    """An upload is refused: the HTTP status, the sentence that says why, for an archive (422) every problem."""
+class UploadRejectedError(Exception):
+    """Raised when an upload is rejected.
+
+    Holds the HTTP status, the detail message and, for status 422 only, the list of problems.
+    """
 
     def __init__(self, status: int, detail: str, problems: tuple[str, ...] = ()) -> None:
         self.status, self.detail = status, detail
@@ -28,75 +37,76 @@ class RefusedError(Exception):
         super().__init__(detail)
 
 
-async def take_in(
-    service: Service, token: TokenRecord, body: AsyncIterator[bytes], headers: Mapping[str, str]
-) -> SubmissionRecord:
-    """Return the record of an accepted upload: archive and row are on disk by then. Raises ``RefusedError``.
+async def accept_upload(
+    service: Service, token: TokenModel, body: AsyncIterator[bytes], headers: Mapping[str, str]
+) -> SubmissionModel:
+    """Accept an upload and return its database row; archive and row are on disk on return.
 
-    A token without quota is told before its archive is read; only an accepted archive is charged.
+    The quota is checked before the archive is read, and only accepted archives count. Raises
+    ``UploadRejectedError``.
     """
     settings = service.settings
-    if await to_thread.run_sync(_spent, service, token) >= settings.quota:
-        raise _quota_spent(settings.quota)
-    if int(headers.get("content-length", 0)) > settings.max_upload + MOST_ELSE:
-        raise RefusedError(413, too_large(settings.max_upload))
+    if await to_thread.run_sync(_quota_used, service, token) >= settings.quota:
+        raise _quota_exceeded(settings.quota)
+    if int(headers.get("content-length", 0)) > settings.max_upload + MAX_OVERHEAD_BYTES:
+        raise UploadRejectedError(413, too_large_message(settings.max_upload))
     try:
         received = await receive(body, headers.get("content-type", ""), service.spool, settings.max_upload)
         try:
-            return await _accepted(service, token, received)
+            return await _validate_and_store(service, token, received)
         finally:
             await to_thread.run_sync(received.path.unlink, True)
     except UploadError as error:
-        raise RefusedError(error.status, error.detail) from None
+        raise UploadRejectedError(error.status, error.detail) from None
     except (OSError, RebarDepthError) as error:
         _LOG.error("cannot take uploads", error=str(error))
-        raise RefusedError(503, AWAY) from None
+        raise UploadRejectedError(503, UNAVAILABLE_MESSAGE) from None
 
 
-async def _accepted(service: Service, token: TokenRecord, received: Received) -> SubmissionRecord:
+async def _validate_and_store(service: Service, token: TokenModel, received: ReceivedArchive) -> SubmissionModel:
     verdict = await service.checker.check(received.path)
     if isinstance(verdict, tuple):
         _LOG.info("refused", token=token.name, problems=len(verdict))
-        raise RefusedError(422, _headline(verdict), shown(verdict))
+        raise UploadRejectedError(422, _problem_count(verdict), truncate_problems(verdict))
     submission_id = submissions.new_id()
     upload = Upload(verdict, received.sha256, received.size, service.folder.digest)
-    public = service.settings.public == "always"
+    public = service.settings.default_visibility == "always"
 
-    def keep() -> SubmissionRecord:
+    def store() -> SubmissionModel:
         service.archives.put(submission_id, received.path)
         try:
             return submissions.accept(
                 service.database, submission_id, token, upload, service.settings.quota, public
             )
-        except QuotaSpentError:  # whatever else goes wrong, the row may be there, and its archive must be
+        except QuotaExceededError:  # After any other error the row may exist, so its archive must be kept.
             service.archives.delete(submission_id)
             raise
 
     try:
-        record = await to_thread.run_sync(keep)
-    except QuotaSpentError:
-        raise _quota_spent(service.settings.quota) from None
+        record = await to_thread.run_sync(store)
+    except QuotaExceededError:
+        raise _quota_exceeded(service.settings.quota) from None
     _LOG.info("accepted", token=token.name, submission=submission_id[:6], bytes=received.size)
     return record
 
 
-def shown(problems: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the problems that are told, and how many more there are."""
-    left_over = len(problems) - MAX_PROBLEMS_SHOWN
-    more = (f"... and {left_over} more",) if left_over > 0 else ()
+def truncate_problems(problems: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the first ``MAX_PROBLEMS_SHOWN`` problems, followed by the number of the remaining ones if any."""
+    hidden = len(problems) - MAX_PROBLEMS_SHOWN
+    more = (f"... and {hidden} more",) if hidden > 0 else ()
     return problems[:MAX_PROBLEMS_SHOWN] + more
 
 
-def _headline(problems: tuple[str, ...]) -> str:
+def _problem_count(problems: tuple[str, ...]) -> str:
     return f"the archive is refused: {len(problems)} problem{'' if len(problems) == 1 else 's'}"
 
 
-def _spent(service: Service, token: TokenRecord) -> int:
+def _quota_used(service: Service, token: TokenModel) -> int:
     with service.database.read() as session:
-        return submissions.spent_today(session, token.id)
+        return submissions.count_submissions_today(session, token.id)
 
 
-def _quota_spent(quota: int) -> RefusedError:
-    return RefusedError(
+def _quota_exceeded(quota: int) -> UploadRejectedError:
+    return UploadRejectedError(
         429, f"this token has made its {quota} submissions of today (UTC); refused archives were not counted"
     )

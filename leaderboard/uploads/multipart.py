@@ -1,4 +1,4 @@
-"""A multipart upload, straight to disk: the archive never stands in memory, and no more of it than is allowed."""
+"""Multipart upload parser that streams the archive to disk, with a size limit, instead of holding it in memory."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from anyio import to_thread
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
-FIELD = "archive"
-MOST_FIELD = 1 << 10
-"""Bytes of a text field that comes before the archive."""
-BATCH = 1 << 20
-"""Bytes that are written at once, off the event loop."""
-MOST_ELSE = 64 << 10
-"""Bytes of everything in the body that is not the archive's content."""
+ARCHIVE_FIELD = "archive"
+MAX_FIELD_BYTES = 1 << 10
+"""Maximum size in bytes of a text field before the archive."""
+WRITE_CHUNK_BYTES = 1 << 20
+"""Number of buffered bytes that triggers a write, which runs in a worker thread."""
+MAX_OVERHEAD_BYTES = 64 << 10
+"""Maximum size in bytes of everything in the body except the content of the archive."""
 
 
 class UploadError(Exception):
-    """An upload is refused: the HTTP status and the sentence that says why."""
+    """Raised when an upload cannot be received; holds the HTTP status and the detail message."""
 
     def __init__(self, status: int, detail: str) -> None:
         self.status, self.detail = status, detail
@@ -31,8 +31,8 @@ class UploadError(Exception):
 
 
 @dataclass(frozen=True)
-class Received:
-    """An archive as it came: the file, its SHA-256 and its size in bytes."""
+class ReceivedArchive:
+    """A received archive: its file, its SHA-256 in hexadecimal and its size in bytes."""
 
     path: Path
     sha256: str
@@ -40,8 +40,8 @@ class Received:
 
 
 @dataclass
-class _Parts:
-    """The parser's callbacks for the parts' headers: ``name`` is the field at hand, ``number`` its place."""
+class _PartHeaders:
+    """Parser callbacks for part headers: ``name`` is the current part's field, ``number`` its 1-based index."""
 
     header: bytearray = field(default_factory=bytearray)
     value: bytearray = field(default_factory=bytearray)
@@ -76,8 +76,8 @@ class _Parts:
 
 
 @dataclass
-class _Spool(_Parts):
-    """What the parser's callbacks write to: the archive's bytes that are not yet on disk."""
+class _ArchivePart(_PartHeaders):
+    """Parser callbacks that buffer the content of the archive field until it is written to disk."""
 
     archives: int = 0
     complete: bool = False
@@ -93,7 +93,7 @@ class _Spool(_Parts):
 
     @property
     def is_archive(self) -> bool:
-        return self.name == FIELD.encode()
+        return self.name == ARCHIVE_FIELD.encode()
 
     def part_data(self, data: bytes, start: int, end: int) -> None:
         if self.is_archive:
@@ -104,8 +104,8 @@ class _Spool(_Parts):
 
 
 @dataclass
-class _First(_Parts):
-    """What the parser's callbacks write to while the body's first part is read: its text."""
+class _FirstPart(_PartHeaders):
+    """Parser callbacks that collect the text of the first part of the body."""
 
     text: bytearray = field(default_factory=bytearray)
     ended: bool = False
@@ -122,26 +122,26 @@ class _First(_Parts):
             super().part_begin()
 
     def part_data(self, data: bytes, start: int, end: int) -> None:
-        if not self.ended and len(self.text) <= MOST_FIELD:
+        if not self.ended and len(self.text) <= MAX_FIELD_BYTES:
             self.text += data[start:end]
 
     def part_end(self) -> None:
         self.ended = True
 
 
-async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, most: int) -> Received:
-    """Write the field ``archive`` of a multipart body into a new file below ``spool``.
+async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, max_bytes: int) -> ReceivedArchive:
+    """Write the field ``archive`` of a multipart body to a new file in ``spool`` and return the received archive.
 
-    Raises ``UploadError``, and leaves no file, for a body that is none (422) or an archive of more than ``most``
-    bytes (413).
+    Raises ``UploadError``, and leaves no file, if the body is not valid multipart (422) or the archive has more
+    than ``max_bytes`` bytes (413).
     """
     boundary = boundary_of(content_type)
-    parts = _Spool()
-    handle, name = tempfile.mkstemp(dir=spool, suffix=".upload")
-    path, sha256, size, came = Path(name), hashlib.sha256(), 0, 0
+    parts = _ArchivePart()
+    descriptor, name = tempfile.mkstemp(dir=spool, suffix=".upload")
+    path, sha256, size, received_bytes = Path(name), hashlib.sha256(), 0, 0
     try:
         parser = MultipartParser(boundary, parts.callbacks())  # type: ignore[arg-type]
-        with os.fdopen(handle, "wb") as file:
+        with os.fdopen(descriptor, "wb") as file:
 
             def flush() -> int:
                 batch = b"".join(parts.waiting)
@@ -150,21 +150,21 @@ async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, 
                 return file.write(batch)
 
             async for chunk in stream:
-                came += len(chunk)
+                received_bytes += len(chunk)
                 parser.write(chunk)
                 waiting = sum(map(len, parts.waiting))
-                _check(parts, came - size - waiting)
-                if size + waiting > most:
-                    raise UploadError(413, too_large(most))
-                if waiting >= BATCH:
+                _check_parts(parts, received_bytes - size - waiting)
+                if size + waiting > max_bytes:
+                    raise UploadError(413, too_large_message(max_bytes))
+                if waiting >= WRITE_CHUNK_BYTES:
                     size += await to_thread.run_sync(flush)
             parser.finalize()
             size += await to_thread.run_sync(flush)
         if not parts.complete or not parts.archives:
             raise UploadError(
-                422, f"the body ends early or has no field {FIELD!r}, expected one with the zip in it"
+                422, f"the body ends early or has no field {ARCHIVE_FIELD!r}, expected one with the zip in it"
             )
-        return Received(path, sha256.hexdigest(), size)
+        return ReceivedArchive(path, sha256.hexdigest(), size)
     except FormParserError as error:
         path.unlink(missing_ok=True)
         raise UploadError(422, f"the body is no multipart/form-data: {error}") from None
@@ -173,14 +173,16 @@ async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, 
         raise
 
 
-async def leading_field(
+async def read_leading_field(
     stream: AsyncIterator[bytes], content_type: str, name: str
 ) -> tuple[str, AsyncIterator[bytes]]:
-    """Return the text of a multipart body's first field, if that is ``name``, else "", and the whole body again.
+    """Read the first field of a multipart body; return its text and a stream of the whole body.
 
-    So that who uploads is known before anything is kept. Raises ``UploadError`` (422) for a body that is none.
+    The text is "" if the first field is not ``name`` or is too long. The form sends its token this way, so that
+    the uploader is identified before the archive is stored. Raises ``UploadError`` (422) if the body is not
+    multipart.
     """
-    first = _First()
+    first = _FirstPart()
     parser = MultipartParser(boundary_of(content_type), first.callbacks())  # type: ignore[arg-type]
     chunks: list[bytes] = []
     try:
@@ -188,15 +190,20 @@ async def leading_field(
             chunks.append(chunk)
             parser.write(chunk)
             is_other = first.name not in (b"", name.encode())
-            if first.ended or is_other or len(first.text) > MOST_FIELD or sum(map(len, chunks)) > MOST_ELSE:
+            if (
+                first.ended
+                or is_other
+                or len(first.text) > MAX_FIELD_BYTES
+                or sum(map(len, chunks)) > MAX_OVERHEAD_BYTES
+            ):
                 break
     except FormParserError as error:
         raise UploadError(422, f"the body is no multipart/form-data: {error}") from None
-    told = first.ended and first.name == name.encode() and len(first.text) <= MOST_FIELD
-    return (first.text.decode(errors="replace") if told else ""), _again(chunks, stream)
+    is_complete = first.ended and first.name == name.encode() and len(first.text) <= MAX_FIELD_BYTES
+    return (first.text.decode(errors="replace") if is_complete else ""), _replay(chunks, stream)
 
 
-async def _again(chunks: list[bytes], stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+async def _replay(chunks: list[bytes], stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
     while chunks:
         yield chunks.pop(0)
     async for chunk in stream:
@@ -204,7 +211,7 @@ async def _again(chunks: list[bytes], stream: AsyncIterator[bytes]) -> AsyncIter
 
 
 def boundary_of(content_type: str) -> bytes:
-    """Return the boundary of a multipart body; raise ``UploadError`` (422) for the type of another body."""
+    """Return the boundary of a multipart body. Raises ``UploadError`` (422) for any other content type."""
     kind, options = parse_options_header(content_type)
     boundary = options.get(b"boundary")
     if kind != b"multipart/form-data" or not boundary:
@@ -212,13 +219,15 @@ def boundary_of(content_type: str) -> bytes:
     return boundary
 
 
-def too_large(most: int) -> str:
-    """Return the sentence that refuses an archive of more than ``most`` bytes."""
-    return f"the archive is larger than {most} bytes, the most this service takes"
+def too_large_message(max_bytes: int) -> str:
+    """Return the message that rejects an archive of more than ``max_bytes`` bytes."""
+    return f"the archive is larger than {max_bytes} bytes, the most this service takes"
 
 
-def _check(parts: _Spool, else_bytes: int) -> None:
+def _check_parts(parts: _ArchivePart, overhead_bytes: int) -> None:
     if parts.archives > 1:
-        raise UploadError(422, f"the body has the field {FIELD!r} twice, expected once")
-    if else_bytes > MOST_ELSE:  # what stands before the first part or after the last counts too
-        raise UploadError(422, f"the body has more than {MOST_ELSE} bytes beside the field {FIELD!r}")
+        raise UploadError(422, f"the body has the field {ARCHIVE_FIELD!r} twice, expected once")
+    if overhead_bytes > MAX_OVERHEAD_BYTES:  # including preamble and epilogue
+        raise UploadError(
+            422, f"the body has more than {MAX_OVERHEAD_BYTES} bytes beside the field {ARCHIVE_FIELD!r}"
+        )

@@ -1,4 +1,4 @@
-"""Archives checked before they are accepted, in processes of their own: one that crashes takes nothing with it."""
+"""Archive validation before acceptance, in separate processes so that a crash does not affect the server."""
 
 from __future__ import annotations
 
@@ -11,21 +11,24 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from leaderboard.scoring.process_limits import confine
+from leaderboard.scoring.process_limits import limit_process
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.submission import SubmissionMeta, open_submission
 
-PROCESSES = 2
+POOL_PROCESSES = 2
 CRASHED = "the archive cannot be read: reading it ends the reader, which a sound archive does not do"
 NO_MEMORY = "the archive cannot be read in the memory that this service allows"
 
 Verdict = SubmissionMeta | tuple[str, ...]
-"""What ``submission.json`` says, or every problem."""
+"""The content of ``submission.json`` if the archive is valid, otherwise all problems."""
 
 
-class Checker:
-    """A pool of checking processes; ``memory`` bytes for each. Checks at most ``PROCESSES`` archives at once."""
+class ArchiveChecker:
+    """Pool of ``POOL_PROCESSES`` validation processes, each limited to ``memory`` bytes.
+
+    ``data`` is the dataset folder or Hub repository id.
+    """
 
     def __init__(self, data: str, memory: int) -> None:
         self._data, self._memory = data, memory
@@ -40,32 +43,32 @@ class Checker:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     async def check(self, archive: Path) -> Verdict:
-        """Return what the archive says of itself, or all that is wrong with it."""
+        """Validate an archive; return its metadata or all problems."""
         pool = self._pool
         try:
-            return await asyncio.wrap_future(pool.submit(_check, str(archive), self._data))
+            return await asyncio.wrap_future(pool.submit(_check_archive, str(archive), self._data))
         except BrokenProcessPool:
             if self._pool is pool:
                 self._pool = self._new_pool()
             return await self._check_alone(archive)
 
     async def _check_alone(self, archive: Path) -> Verdict:
-        """Check in a pool of its own: a pool that broke does not tell which of its archives broke it."""
-        with ProcessPoolExecutor(1, _context(), confine, (self._memory, os.getpid())) as alone:
+        """Validate an archive in a separate pool, because a broken pool does not reveal which archive broke it."""
+        with ProcessPoolExecutor(1, _context(), limit_process, (self._memory, os.getpid())) as pool:
             try:
-                return await asyncio.wrap_future(alone.submit(_check, str(archive), self._data))
+                return await asyncio.wrap_future(pool.submit(_check_archive, str(archive), self._data))
             except BrokenProcessPool:
                 return (CRASHED,)
 
     def _new_pool(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(PROCESSES, _context(), confine, (self._memory, os.getpid()))
+        return ProcessPoolExecutor(POOL_PROCESSES, _context(), limit_process, (self._memory, os.getpid()))
 
 
 def _context() -> multiprocessing.context.SpawnContext:
-    return multiprocessing.get_context("spawn")  # a fork would carry the server's threads' locks
+    return multiprocessing.get_context("spawn")  # A fork would inherit locks held by the server's threads.
 
 
-def _check(archive: str, data: str) -> Verdict:
+def _check_archive(archive: str, data: str) -> Verdict:
     try:
         with open_submission(archive, open_folder(data).expected_views()) as submission:
             problems = tuple(submission.problems())

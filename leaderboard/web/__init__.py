@@ -1,1 +1,1 @@
-"""HTTP service: application, middleware, response cache, API and pages."""
+"""Web application: middleware, response cache, API and pages."""

@@ -1,4 +1,4 @@
-"""The web application: routes, the gate before them, errors as JSON or, for browsers, as pages."""
+"""FastAPI application: routers, middleware and error handlers that respond with JSON or, to browsers, a page."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from leaderboard.db.engine import AWAY
-from leaderboard.uploads.accept import RefusedError
-from leaderboard.uploads.multipart import MOST_ELSE
+from leaderboard.db.engine import DATABASE_UNAVAILABLE
+from leaderboard.service import Service
+from leaderboard.uploads.accept import UploadRejectedError
+from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES
 from leaderboard.web.api import health, leaderboard, submissions
-from leaderboard.web.cache import new_shelf
-from leaderboard.web.context import Service
-from leaderboard.web.middleware import Drain, Gate
+from leaderboard.web.api.schemas import DATABASE_UNAVAILABLE_MESSAGE
+from leaderboard.web.cache import new_cache_state
+from leaderboard.web.middleware import DrainRequestBodyMiddleware, RequestMiddleware
 from leaderboard.web.pages import routes, static, submit
-from leaderboard.web.pages.rendering import make_templates, refusal
+from leaderboard.web.pages.rendering import error_response, make_templates
 from rebar_depth_bench.version import software_version
 
-DATABASE_AWAY = "the database does not answer; try again in a while"
 _LOG = structlog.get_logger("http")
 DESCRIPTION = """Takes prediction archives and scores them exactly as `rebar-bench score` does.
 
@@ -34,55 +34,63 @@ def make_app(service: Service) -> FastAPI:
         title=service.settings.title,
         version=software_version(),
         description=DESCRIPTION,
-        docs_url=None,  # their pages load scripts from elsewhere
+        docs_url=None,  # These pages load scripts from other hosts.
         redoc_url=None,
     )
     app.state.service = service
     app.state.templates = make_templates()
-    app.state.shelf = new_shelf(service.database)
+    app.state.cache_state = new_cache_state(service.database)
     settings = service.settings
-    app.add_middleware(Gate, reads=settings.reads, writes=settings.writes, meters=service.meters)
+    app.add_middleware(
+        RequestMiddleware,
+        reads=settings.read_rate_limit,
+        writes=settings.write_rate_limit,
+        metrics=service.metrics,
+    )
     for router in (submissions, leaderboard, health, routes, submit, static):
         app.include_router(router.router)
-    app.add_middleware(Drain, most=settings.max_upload + MOST_ELSE)
-    app.add_exception_handler(HTTPException, _refusal)
-    app.add_exception_handler(RefusedError, _refused)
-    app.add_exception_handler(ClientDisconnect, _gone)
-    for kind in AWAY:
-        app.add_exception_handler(kind, _away)
-    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_middleware(DrainRequestBodyMiddleware, max_bytes=settings.max_upload + MAX_OVERHEAD_BYTES)
+    app.add_exception_handler(HTTPException, _handle_http_exception)
+    app.add_exception_handler(UploadRejectedError, _handle_rejected_upload)
+    app.add_exception_handler(ClientDisconnect, _handle_client_disconnect)
+    for error_type in DATABASE_UNAVAILABLE:
+        app.add_exception_handler(error_type, _handle_database_unavailable)
+    app.add_exception_handler(RequestValidationError, _handle_validation_error)
     return app
 
 
-async def _refused(request: Request, error: Exception) -> Response:
-    assert isinstance(error, RefusedError)
+async def _handle_rejected_upload(request: Request, error: Exception) -> Response:
+    assert isinstance(error, UploadRejectedError)
     headers = {"Retry-After": "60"} if error.status == 503 else None
-    return refusal(request, error.status, error.detail, headers, error.problems)
+    return error_response(request, error.status, error.detail, headers, error.problems)
 
 
-async def _refusal(request: Request, error: Exception) -> Response:
+async def _handle_http_exception(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    headers = _allowed(request) if error.status_code == 405 else None
-    return refusal(request, error.status_code, str(error.detail), headers or error.headers)
+    headers = _allow_header(request) if error.status_code == 405 else None
+    return error_response(request, error.status_code, str(error.detail), headers or error.headers)
 
 
-def _allowed(request: Request) -> dict[str, str] | None:
-    """Return the methods of the API's path at hand: Starlette names those of the path's first operation alone."""
+def _allow_header(request: Request) -> dict[str, str] | None:
+    """Return the Allow header with all methods of the requested API path, or None for other paths.
+
+    Starlette lists only the methods of the path's first operation.
+    """
     paths = request.app.openapi()["paths"]
     operations = paths.get(getattr(request.scope.get("route"), "path", ""))
     return operations and {"Allow": ", ".join(sorted(method.upper() for method in operations))}
 
 
-async def _invalid(request: Request, error: Exception) -> Response:
+async def _handle_validation_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
-    problems = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
-    return refusal(request, 422, "the request is malformed", problems=problems)
+    problems = [f"{'.'.join(map(str, details['loc']))}: {details['msg']}" for details in error.errors()]
+    return error_response(request, 422, "the request is malformed", problems=problems)
 
 
-async def _away(request: Request, error: Exception) -> Response:
+async def _handle_database_unavailable(request: Request, error: Exception) -> Response:
     _LOG.warning("database away", error=" ".join(str(getattr(error, "orig", error)).split()))
-    return refusal(request, 503, DATABASE_AWAY, {"Retry-After": "10"})
+    return error_response(request, 503, DATABASE_UNAVAILABLE_MESSAGE, {"Retry-After": "10"})
 
 
-async def _gone(_: Request, __: Exception) -> Response:
-    return Response(status_code=400)  # nobody reads it
+async def _handle_client_disconnect(_: Request, __: Exception) -> Response:
+    return Response(status_code=400)  # The client has disconnected.

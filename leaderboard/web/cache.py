@@ -1,5 +1,7 @@
-"""Answers that are kept as long as what they show is the same, so that a board is rendered once and not for each
-reader. What is shown is read from the database for every request: other processes may have changed it.
+"""In-memory cache of rendered leaderboard responses, keyed by a version of the underlying rows.
+
+A leaderboard is rendered once per version instead of once per request. The version is read from the database for
+every request, because other processes may change the rows.
 """
 
 from __future__ import annotations
@@ -16,66 +18,69 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import Request, Response
 
 from leaderboard.db.engine import Database
-from leaderboard.db.rankings import Stamp, stamps
+from leaderboard.db.rankings import RankingVersion, ranking_versions
 
 T = TypeVar("T")
-Key = tuple[Hashable, ...]
-Made = tuple[Key, bytes]
-FRESH = "no-cache"
-"""What all may see: kept by browsers, but asked for again each time."""
-PRIVATE = "no-store"
-"""What stands on no board: kept nowhere."""
-MOST_BYTES = 32 << 20
+CacheKey = tuple[Hashable, ...]
+RenderedBody = tuple[CacheKey, bytes]
+"""A rendered body and the key of the content that it was rendered from."""
+REVALIDATE = "no-cache"
+"""Cache-Control of public responses: browsers may store them but must revalidate each time."""
+NO_STORE = "no-store"
+"""Cache-Control of responses with unpublished content: not stored anywhere."""
+MAX_CACHE_BYTES = 32 << 20
+"""Default limit for the total size of cached bodies."""
 
 
 @dataclass(frozen=True)
-class Body:
-    """An answer's bytes and what tells them from others."""
+class CachedBody:
+    """The bytes of a response body and their ETag."""
 
     content: bytes
     etag: str
 
 
-class KeptBodies:
-    """The bodies asked for last, ``most`` bytes of them. Threads share it."""
+class ResponseCache:
+    """Thread-safe LRU cache of response bodies, limited to ``max_bytes`` bytes in total."""
 
-    def __init__(self, most: int = MOST_BYTES) -> None:
-        self._bodies: OrderedDict[Key, Body] = OrderedDict()
-        self._most, self._size = most, 0
+    def __init__(self, max_bytes: int = MAX_CACHE_BYTES) -> None:
+        self._bodies: OrderedDict[CacheKey, CachedBody] = OrderedDict()
+        self._max_bytes, self._size = max_bytes, 0
         self._lock = threading.Lock()
 
-    def get(self, key: Key, make: Callable[[], Made]) -> Body:
-        """Return the body of ``key``; where it is not kept, ``make`` it.
+    def get(self, key: CacheKey, make: Callable[[], RenderedBody]) -> CachedBody:
+        """Return the cached body of ``key``, or render it with ``make`` and store it.
 
-        ``make`` returns the key of what it found, and the body: a change since ``key`` was read makes it another.
+        ``make`` returns the body's own key and the body. The body is stored under its own key, which differs from
+        ``key`` if the rows have changed since ``key`` was read.
         """
-        if body := self.found(key):
+        if body := self.lookup(key):
             return body
-        made, content = make()
-        body = Body(content, f'"{hashlib.sha256(content).hexdigest()[:32]}"')
-        self._keep(made, body)
+        rendered_key, content = make()
+        body = CachedBody(content, f'"{hashlib.sha256(content).hexdigest()[:32]}"')
+        self._store(rendered_key, body)
         return body
 
-    def found(self, key: Key) -> Body | None:
-        """Return the body of ``key``, None where it is not kept."""
+    def lookup(self, key: CacheKey) -> CachedBody | None:
+        """Return the cached body of ``key``, or None."""
         with self._lock:
             if key in self._bodies:
                 self._bodies.move_to_end(key)
             return self._bodies.get(key)
 
-    def _keep(self, key: Key, body: Body) -> None:
+    def _store(self, key: CacheKey, body: CachedBody) -> None:
         with self._lock:
-            known = self._bodies.pop(key, None)
-            self._size += len(body.content) - (len(known.content) if known else 0)
+            previous = self._bodies.pop(key, None)
+            self._size += len(body.content) - (len(previous.content) if previous else 0)
             self._bodies[key] = body
-            while self._size > self._most:
+            while self._size > self._max_bytes:
                 self._size -= len(self._bodies.popitem(last=False)[1].content)
 
 
-class SharedRead(Generic[T]):
-    """A read of the database that requests share: who asks while one is under way waits for the next one.
+class CoalescedRead(Generic[T]):
+    """Database read shared by concurrent requests: calls during a running read wait for the next one.
 
-    So whatever is returned was read after it was asked for, and hundreds who ask at once cost one query.
+    A returned value was therefore read after the call, and hundreds of concurrent calls cost one query.
     """
 
     def __init__(self, read: Callable[[], T]) -> None:
@@ -84,60 +89,65 @@ class SharedRead(Generic[T]):
         self._next: asyncio.Task[T] | None = None
 
     async def get(self) -> T:
-        """Return what is read next; raise what reading raises."""
+        """Return the value of the next read, or raise its exception."""
         if self._next is None:
             self._next = asyncio.create_task(self._read_after(self._running))
-        return await asyncio.shield(self._next)  # who asks may go away, others wait on
+        return await asyncio.shield(self._next)  # A cancelled request must not cancel the others.
 
     async def _read_after(self, running: asyncio.Task[T] | None) -> T:
         if running is not None and not running.done():
             await asyncio.wait([running])
-        self._running, self._next = self._next, None  # from now on it is too late to join
+        self._running, self._next = self._next, None  # Later calls wait for the next read.
         return await to_thread.run_sync(self._read)
 
 
 @dataclass(frozen=True)
-class Shelf:
-    """What the boards' routes share: the stamps as they are now, the bodies made of them, and who may make one."""
+class CacheState:
+    """Cache shared by the routes: current versions by config, cached bodies, and the limit on rendering."""
 
-    stamps: SharedRead[dict[str, Stamp]]
-    bodies: KeptBodies
-    makers: CapacityLimiter
-
-
-def new_shelf(database: Database) -> Shelf:
-    """Return an empty shelf for the boards of a database."""
-    return Shelf(SharedRead(lambda: stamps(database)), KeptBodies(), CapacityLimiter(1))
+    versions: CoalescedRead[dict[str, RankingVersion]]
+    bodies: ResponseCache
+    render_limiter: CapacityLimiter
 
 
-def shelf_of(request: Request) -> Shelf:
-    """Return the application's shelf."""
-    shelf: Shelf = request.app.state.shelf
-    return shelf
+def new_cache_state(database: Database) -> CacheState:
+    """Return an empty cache for the leaderboards of ``database``."""
+    return CacheState(CoalescedRead(lambda: ranking_versions(database)), ResponseCache(), CapacityLimiter(1))
 
 
-async def public_body(request: Request, configs: Sequence[str], asked: Key, make: Callable[[], Made]) -> Body:
-    """Return the body of what is ``asked`` of the configs' public rows; ``make`` as in ``KeptBodies.get``.
+def cache_state_of(request: Request) -> CacheState:
+    """Return the cache of the application that handles ``request``."""
+    cache_state: CacheState = request.app.state.cache_state
+    return cache_state
 
-    Its key is ``asked`` and the stamp of each config. Only what is not kept takes a thread of its own.
+
+async def cached_public_body(
+    request: Request, configs: Sequence[str], key_prefix: CacheKey, make: Callable[[], RenderedBody]
+) -> CachedBody:
+    """Return the response body for the public rows of ``configs``; ``make`` is as in ``ResponseCache.get``.
+
+    The cache key is ``key_prefix`` followed by the version of each config. A worker thread is used only if the
+    body is not cached.
     """
-    shelf = shelf_of(request)
-    now = await shelf.stamps.get()
-    key = (*asked, *(now.get(name, Stamp()) for name in configs))
-    return await shelved(shelf, key, make)
+    cache_state = cache_state_of(request)
+    versions = await cache_state.versions.get()
+    key = (*key_prefix, *(versions.get(name, RankingVersion()) for name in configs))
+    return await get_or_render(cache_state, key, make)
 
 
-async def shelved(shelf: Shelf, key: Key, make: Callable[[], Made]) -> Body:
-    """Return the body of ``key``, made where it is not kept; of many who want the same, one makes it."""
-    if body := shelf.bodies.found(key):
+async def get_or_render(cache_state: CacheState, key: CacheKey, make: Callable[[], RenderedBody]) -> CachedBody:
+    """Return the cached body of ``key``, or render it; concurrent requests for the same key render it once."""
+    if body := cache_state.bodies.lookup(key):
         return body
-    # One at a time: who waits, and takes no thread meanwhile, finds it made.
-    return await to_thread.run_sync(shelf.bodies.get, key, make, limiter=shelf.makers)
+    # Rendering is serial: requests that wait, without occupying a thread, find the body cached.
+    return await to_thread.run_sync(cache_state.bodies.get, key, make, limiter=cache_state.render_limiter)
 
 
-def answer(request: Request, body: Body, media_type: str, headers: Mapping[str, str]) -> Response:
-    """Return a body as a response, 304 without it where the client has it."""
-    told = {"ETag": body.etag, **headers}
+def conditional_response(
+    request: Request, body: CachedBody, media_type: str, headers: Mapping[str, str]
+) -> Response:
+    """Return the response with ``body``, or 304 without content if the client's ETag matches."""
+    all_headers = {"ETag": body.etag, **headers}
     if body.etag in request.headers.get("if-none-match", ""):
-        return Response(status_code=304, headers=told)
-    return Response(body.content, media_type=media_type, headers=told)
+        return Response(status_code=304, headers=all_headers)
+    return Response(body.content, media_type=media_type, headers=all_headers)

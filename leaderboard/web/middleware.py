@@ -1,7 +1,4 @@
-"""Before and after every request: rate limits, security headers, a log line, a count.
-
-Refusals that arrive: a client that is still sending when its upload is refused would see a cut connection.
-"""
+"""ASGI middleware: rate limits, security headers, access log and metrics, and draining of rejected uploads."""
 
 from __future__ import annotations
 
@@ -18,119 +15,127 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from leaderboard.web.metrics import Meters
-from leaderboard.web.pages.rendering import refusal
+from leaderboard.metrics import ServiceMetrics
+from leaderboard.web.pages.rendering import error_response
 
 CONTENT_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
     "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
-HEADERS = {
+SECURITY_HEADERS = {
     "Content-Security-Policy": CONTENT_POLICY,
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
-    "Referrer-Policy": "no-referrer",  # the address of a private submission is its key
+    "Referrer-Policy": "no-referrer",  # The URL of an unpublished submission gives access to it.
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
 }
-TOO_MANY = "too many requests from this address"
-_READS = ("GET", "HEAD", "OPTIONS")
-_METHODS = (*_READS, "POST", "PUT", "PATCH", "DELETE")
-_FREE = ("/healthz", "/metrics")
+TOO_MANY_REQUESTS = "too many requests from this address"
+_READ_METHODS = ("GET", "HEAD", "OPTIONS")
+_KNOWN_METHODS = (*_READ_METHODS, "POST", "PUT", "PATCH", "DELETE")
+_UNLIMITED_PATHS = ("/healthz", "/metrics")
 _LOG = structlog.get_logger("http")
 
 
-class Gate:
-    """ASGI middleware. Addresses are the connection's; behind a proxy uvicorn takes them from its headers."""
+class RequestMiddleware:
+    """ASGI middleware for rate limits, security headers, access log and metrics.
 
-    def __init__(self, app: ASGIApp, *, reads: str, writes: str, meters: Meters) -> None:
-        self._app, self._meters = app, meters
+    Rate limits are per client address, that of the connection; behind a proxy uvicorn takes it from the headers.
+    ``reads`` and ``writes`` are limits such as ``600/minute``.
+    """
+
+    def __init__(self, app: ASGIApp, *, reads: str, writes: str, metrics: ServiceMetrics) -> None:
+        self._app, self._metrics = app, metrics
         self._limiter = MovingWindowRateLimiter(MemoryStorage())
         self._reads, self._writes = parse(reads), parse(writes)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or refuse it with 429."""
+        """Handle a request, or reject it with status 429."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
         start, status = time.perf_counter(), 500
 
-        async def send_dressed(message: Message) -> None:
+        async def send_with_headers(message: Message) -> None:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
-                _dress(message)
+                _add_security_headers(message)
             await send(message)
 
         try:
-            if self._admits(scope):
-                await self._app(scope, receive, send_dressed)
+            if self._is_allowed(scope):
+                await self._app(scope, receive, send_with_headers)
             else:
-                await refusal(Request(scope), 429, TOO_MANY, {"Retry-After": "60"})(scope, receive, send_dressed)
+                await error_response(Request(scope), 429, TOO_MANY_REQUESTS, {"Retry-After": "60"})(
+                    scope, receive, send_with_headers
+                )
         finally:
-            self._note(scope, status, time.perf_counter() - start)
+            self._log_request(scope, status, time.perf_counter() - start)
 
-    def _admits(self, scope: Scope) -> bool:
-        if scope["path"] in _FREE:
+    def _is_allowed(self, scope: Scope) -> bool:
+        if scope["path"] in _UNLIMITED_PATHS:
             return True
-        limit, kind = (self._reads, "read") if scope["method"] in _READS else (self._writes, "write")
+        limit, kind = (self._reads, "read") if scope["method"] in _READ_METHODS else (self._writes, "write")
         address = (scope.get("client") or ("unknown",))[0]
         return self._limiter.hit(limit, kind, address)
 
-    def _note(self, scope: Scope, status: int, seconds: float) -> None:
-        route = getattr(scope.get("route"), "path", "none")  # never the path itself: it may hold a private id
-        # Any word may come, and each would be counted for itself, for good.
-        method = scope["method"] if scope["method"] in _METHODS else "other"
-        self._meters.requests.labels(method, route, str(status)).inc()
-        self._meters.seconds.labels(method, route).observe(seconds)
+    def _log_request(self, scope: Scope, status: int, seconds: float) -> None:
+        route = getattr(scope.get("route"), "path", "none")  # Not the path, which may contain a private id.
+        # Clients can send any method name, and each label value would create a permanent time series.
+        method = scope["method"] if scope["method"] in _KNOWN_METHODS else "other"
+        self._metrics.requests.labels(method, route, str(status)).inc()
+        self._metrics.request_seconds.labels(method, route).observe(seconds)
         _LOG.info("request", method=method, route=route, status=status, ms=round(1000 * seconds, 1))
 
 
-def _dress(message: MutableMapping[str, Any]) -> None:
+def _add_security_headers(message: MutableMapping[str, Any]) -> None:
     headers = MutableHeaders(scope=message)
-    for name, value in HEADERS.items():
+    for name, value in SECURITY_HEADERS.items():
         headers.setdefault(name, value)
 
 
-SILENCE_S = 5.0
-MOST_S = 600.0
+IDLE_TIMEOUT_S = 5.0
+MAX_DRAIN_S = 600.0
 
 
-class Drain:
-    """ASGI middleware. Before a refusal is sent, what the client still sends is read, ``most`` bytes of it.
+class DrainRequestBodyMiddleware:
+    """ASGI middleware that reads the rest of the request body before an error response is sent.
 
-    A client that falls silent, be it that it never sends what it has announced, is told after ``SILENCE_S``.
+    Otherwise a client that is still uploading would see a broken connection instead of the response. At most
+    ``max_bytes`` bytes are read, for at most ``MAX_DRAIN_S``; reading stops when the client has sent nothing for
+    ``IDLE_TIMEOUT_S``.
     """
 
-    def __init__(self, app: ASGIApp, *, most: int) -> None:
-        self._app, self._most = app, most
+    def __init__(self, app: ASGIApp, *, max_bytes: int) -> None:
+        self._app, self._max_bytes = app, max_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
+        """Handle a request."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        # A client that waits for 100 Continue has sent nothing yet, and sends nothing once it is refused.
+        # A client that waits for 100 Continue has sent nothing yet, and sends nothing after an error response.
         is_sending = "expect" not in Headers(scope=scope)
-        more = True
+        has_more = True
 
-        async def receive_watched() -> Message:
-            nonlocal is_sending, more
+        async def receive_tracked() -> Message:
+            nonlocal is_sending, has_more
             message = await receive()
             is_sending = True
-            more = message["type"] == "http.request" and message.get("more_body", False)
+            has_more = message["type"] == "http.request" and message.get("more_body", False)
             return message
 
-        async def send_after(message: Message) -> None:
+        async def send_after_drain(message: Message) -> None:
             if message["type"] == "http.response.start" and message["status"] >= 400:
-                left = self._most
-                with move_on_after(MOST_S):
-                    while more and is_sending and left > 0:
-                        with move_on_after(SILENCE_S) as silence:
-                            left -= len((await receive_watched()).get("body", b""))
-                        if silence.cancelled_caught:
+                remaining = self._max_bytes
+                with move_on_after(MAX_DRAIN_S):
+                    while has_more and is_sending and remaining > 0:
+                        with move_on_after(IDLE_TIMEOUT_S) as idle:
+                            remaining -= len((await receive_tracked()).get("body", b""))
+                        if idle.cancelled_caught:
                             break
             await send(message)
 
-        await self._app(scope, receive_watched, send_after)
+        await self._app(scope, receive_tracked, send_after_drain)

@@ -1,4 +1,4 @@
-"""``rebar-leaderboard serve``: the web server, and the scorers beside it."""
+"""Web server of ``rebar-leaderboard serve`` with its local scoring workers."""
 
 from __future__ import annotations
 
@@ -11,50 +11,53 @@ import uvicorn
 
 from leaderboard.redact import without_password
 from leaderboard.scoring.dask_backend import check_dask
-from leaderboard.scoring.supervisor import Crew
+from leaderboard.scoring.supervisor import WorkerSupervisor
+from leaderboard.service import open_service
 from leaderboard.settings import Settings
 from leaderboard.web.app import make_app
-from leaderboard.web.context import open_service
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
 
-GRACE_S = 10
+SHUTDOWN_GRACE_S = 10
 _LOG = structlog.get_logger("server")
 
 
 def serve(settings: Settings) -> None:
-    """Serve until SIGTERM or SIGINT: answers under way are finished, jobs at hand are queued again."""
-    if settings.cluster:
+    """Serve until SIGTERM or SIGINT; then finish open requests and requeue running jobs.
+
+    Open requests have ``SHUTDOWN_GRACE_S`` seconds. Raises ``InputError`` if the service cannot be started.
+    """
+    if settings.dask_scheduler:
         check_dask()
-    with open_service(settings) as service, _listen(settings) as listening:
+    with open_service(settings) as service, _listen(settings) as listener:
         config = uvicorn.Config(
             make_app(service),
             access_log=False,
-            log_config=None,  # its lines go the way of ours
+            log_config=None,  # Its messages go through the logging set up by ``set_up_logs``.
             log_level="warning",
-            timeout_graceful_shutdown=GRACE_S,
+            timeout_graceful_shutdown=SHUTDOWN_GRACE_S,
             server_header=False,
         )
-        host, port = listening.getsockname()[:2]
-        shown = f"[{host}]" if ":" in host else host
-        print(f"http://{shown}:{port}", file=sys.stderr, flush=True)
+        host, port = listener.getsockname()[:2]
+        url_host = f"[{host}]" if ":" in host else host
+        print(f"http://{url_host}:{port}", file=sys.stderr, flush=True)
         server = uvicorn.Server(config)
 
         def stop(*_: object) -> None:
             server.should_exit = True
 
-        # uvicorn raises what it caught once more at its end: the default would end us before the scorers stop.
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, stop)
-        told = {"version": software_version(), "dataset": service.folder.digest, "scorers": settings.scorers}
-        _LOG.info("serving", database=without_password(settings.database_url), **told)
-        with Crew(settings, settings.scorers):
-            server.run(sockets=[listening])
+        # uvicorn re-raises caught signals when it ends; the default handler would exit before the workers stop.
+        for signal_number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(signal_number, stop)
+        details = {"version": software_version(), "dataset": service.folder.digest, "scorers": settings.workers}
+        _LOG.info("serving", database=without_password(settings.database_url), **details)
+        with WorkerSupervisor(settings, settings.workers):
+            server.run(sockets=[listener])
         _LOG.info("stopped")
 
 
 def _listen(settings: Settings) -> socket.socket:
-    """Return a listening socket. Raises ``InputError`` where the address is taken or not this machine's."""
+    """Return a listening socket. Raises ``InputError`` if the address is in use or not available here."""
     try:
         family = socket.getaddrinfo(settings.host, settings.port)[0][0]
         return socket.create_server((settings.host, settings.port), family=family, backlog=512)

@@ -1,4 +1,4 @@
-"""How Alembic runs the migrations: on the connection that ``Database.migrate`` hands it."""
+"""Alembic environment: runs the migrations on the connection provided by ``Database.migrate``."""
 
 from alembic import context
 

@@ -1,1 +1,1 @@
-"""The HTTP interface below ``/api/v1``."""
+"""HTTP API below ``/api/v1``, with health and metrics endpoints."""

@@ -1,4 +1,4 @@
-"""Who asks: the bearer token of a request."""
+"""Bearer-token authentication dependencies."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Annotated, Any
 from fastapi import Depends, HTTPException, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
-from leaderboard.db.models import TokenRecord
+from leaderboard.db.models import TokenModel
 from leaderboard.db.tokens import find_token
-from leaderboard.web.context import Service
+from leaderboard.service import Service
 
 _BEARER = HTTPBearer(auto_error=False, description="A token made by `rebar-leaderboard token NAME`.")
 _Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_BEARER)]
 
 
 def service_of(request: Request) -> Service:
-    """Return the service that the application was made with."""
+    """Return the service of the application that handles ``request``."""
     service: Service = request.app.state.service
     return service
 
@@ -24,8 +24,8 @@ def service_of(request: Request) -> Service:
 ServiceDep = Annotated[Service, Depends(service_of)]
 
 
-def optional_token(service: ServiceDep, credentials: _Credentials) -> TokenRecord | None:
-    """Return the request's token, None where it has none; 401 for an unknown one."""
+def optional_token(service: ServiceDep, credentials: _Credentials) -> TokenModel | None:
+    """Return the token of a request, or None if it has none. Raises status 401 for an unknown token."""
     if credentials is None:
         return None
     token = find_token(service.database, credentials.credentials)
@@ -34,8 +34,8 @@ def optional_token(service: ServiceDep, credentials: _Credentials) -> TokenRecor
     return token
 
 
-def required_token(token: Annotated[TokenRecord | None, Depends(optional_token)]) -> TokenRecord:
-    """Return the request's token; 401 where it has none."""
+def required_token(token: Annotated[TokenModel | None, Depends(optional_token)]) -> TokenModel:
+    """Return the token of a request. Raises status 401 if it has none or an unknown one."""
     if token is None:
         raise _unauthorised("no token, expected the header 'Authorization: Bearer TOKEN'")
     return token
@@ -46,7 +46,7 @@ def _unauthorised(detail: str) -> HTTPException:
 
 
 WITHOUT_TOKEN: dict[str, Any] = {"security": [{}]}
-"""For the OpenAPI document: what takes a token may be done without one; FastAPI tells of the first half alone."""
+"""OpenAPI extra of operations with an optional token, which FastAPI would document as required."""
 
-OptionalToken = Annotated[TokenRecord | None, Depends(optional_token)]
-RequiredToken = Annotated[TokenRecord, Depends(required_token)]
+OptionalToken = Annotated[TokenModel | None, Depends(optional_token)]
+RequiredToken = Annotated[TokenModel, Depends(required_token)]

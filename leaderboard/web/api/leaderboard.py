@@ -1,102 +1,102 @@
-"""``/api/v1/leaderboard``: a config's rows as JSON and CSV.
-
-A board as CSV, with the columns of the command line's.
-"""
+"""Endpoints ``/api/v1/leaderboard`` (JSON) and ``/api/v1/leaderboard.csv``: the rows of a config."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from typing import Annotated
 
 from anyio import to_thread
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 
-from leaderboard.db.models import TokenRecord
-from leaderboard.db.rankings import BoardRow, board, stamp_of
+from leaderboard.db.models import TokenModel
+from leaderboard.db.rankings import LeaderboardEntry, leaderboard_entries, ranking_version
 from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, service_of
 from leaderboard.web.api.schemas import (
-    ANY_TIME,
-    MALFORMED,
-    UNKNOWN_TOKEN,
-    Answers,
+    COMMON_RESPONSES,
+    MALFORMED_RESPONSE,
+    UNKNOWN_TOKEN_RESPONSE,
     Leaderboard,
     Problem,
-    row_model,
+    Responses,
+    row_schema,
 )
-from leaderboard.web.cache import FRESH, PRIVATE, Made, answer, public_body
-from rebar_depth_bench.reporting.tables import csv_cell, number_cells, number_heads
+from leaderboard.web.cache import NO_STORE, REVALIDATE, RenderedBody, cached_public_body, conditional_response
+from rebar_depth_bench.reporting.tables import csv_text, number_columns, number_values
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 
-def board_csv(rows: Sequence[BoardRow]) -> str:
-    """Return the rows as CSV: rank, who and what, then the table's numbers; undefined ones are empty."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["rank", "id", "method", "submitter", "config", *number_heads()])
-    for row in rows:
-        cells = [row.rank, row.submission_id, row.method, row.submitter, row.config, *number_cells(row.table)]
-        writer.writerow([csv_cell(cell) for cell in cells])
-    return out.getvalue()
+def entries_to_csv(rows: Sequence[LeaderboardEntry]) -> str:
+    """Return rows as CSV: rank, id, method, submitter, config, then the number columns of the command line's CSV.
+
+    Undefined numbers are empty cells.
+    """
+    header = ["rank", "id", "method", "submitter", "config", *number_columns()]
+    cells = (
+        [row.rank, row.submission_id, row.method, row.submitter, row.config, *number_values(row.table)]
+        for row in rows
+    )
+    return csv_text([header, *cells])
 
 
-router = APIRouter(prefix="/api/v1", tags=["leaderboard"], responses=ANY_TIME)
+router = APIRouter(prefix="/api/v1", tags=["leaderboard"], responses=COMMON_RESPONSES)
 
 CSV = "text/csv; charset=utf-8"
-Config = Annotated[str, Query(max_length=100, description="the config's name", examples=["lattice"])]
-_REFUSALS: Answers = {
-    **UNKNOWN_TOKEN,
+ConfigName = Annotated[str, Query(max_length=100, description="the config's name", examples=["lattice"])]
+_ERROR_RESPONSES: Responses = {
+    **UNKNOWN_TOKEN_RESPONSE,
     404: {"model": Problem, "description": "the dataset has no such config"},
-    **MALFORMED,
+    **MALFORMED_RESPONSE,
 }
-_CSV: Answers = {200: {"content": {"text/csv": {"schema": {"type": "string"}}}}}
+_CSV_RESPONSE: Responses = {200: {"content": {"text/csv": {"schema": {"type": "string"}}}}}
 
 
-@router.get("/leaderboard", response_model=Leaderboard, responses=_REFUSALS, openapi_extra=WITHOUT_TOKEN)
-async def leaderboard(config: Config, request: Request, token: OptionalToken) -> Response:
-    """Return a config's rows: public ones and, with a token, its own."""
+@router.get("/leaderboard", response_model=Leaderboard, responses=_ERROR_RESPONSES, openapi_extra=WITHOUT_TOKEN)
+async def leaderboard(config: ConfigName, request: Request, token: OptionalToken) -> Response:
+    """Return the public rows of a config and, with a token, those of its owner."""
     folder = service_of(request).folder
 
-    def written(rows: list[BoardRow]) -> bytes:
+    def serialise(rows: list[LeaderboardEntry]) -> bytes:
         dataset = {"digest": folder.digest, "version": folder.version}
-        models = [row_model(row) for row in rows]
-        found = Leaderboard(config=config, protocol=PROTOCOL, dataset=dataset, rows=models)
-        return found.model_dump_json().encode()
+        models = [row_schema(row) for row in rows]
+        response = Leaderboard(config=config, protocol=PROTOCOL, dataset=dataset, rows=models)
+        return response.model_dump_json().encode()
 
-    return await _answer(request, config, token, "application/json", written)
+    return await _leaderboard_response(request, config, token, "application/json", serialise)
 
 
 @router.get(
     "/leaderboard.csv",
-    responses={**_REFUSALS, **_CSV},
+    responses={**_ERROR_RESPONSES, **_CSV_RESPONSE},
     response_class=Response,
     openapi_extra=WITHOUT_TOKEN,
 )
-async def leaderboard_csv(config: Config, request: Request, token: OptionalToken) -> Response:
-    """Return the same rows as CSV."""
-    return await _answer(request, config, token, CSV, lambda rows: board_csv(rows).encode())
+async def leaderboard_csv(config: ConfigName, request: Request, token: OptionalToken) -> Response:
+    """Return the rows of a config as CSV."""
+    return await _leaderboard_response(request, config, token, CSV, lambda rows: entries_to_csv(rows).encode())
 
 
-async def _answer(
+async def _leaderboard_response(
     request: Request,
     config: str,
-    token: TokenRecord | None,
+    token: TokenModel | None,
     media_type: str,
-    written: Callable[[list[BoardRow]], bytes],
+    serialise: Callable[[list[LeaderboardEntry]], bytes],
 ) -> Response:
-    """Return the rows as they are ``written``: kept for all where nobody in particular asks."""
+    """Return the serialised rows of ``config``, from the response cache if the request has no token.
+
+    Raises status 404 for an unknown config.
+    """
     service = service_of(request)
     if config not in service.folder.configs:
         known = ", ".join(service.folder.configs)
         raise HTTPException(404, f"no config {config!r}, expected one of {known}")
     if token is not None:
-        own = await to_thread.run_sync(lambda: written(board(service.database, config, token)))
-        return Response(own, media_type=media_type, headers={"Cache-Control": PRIVATE})
+        content = await to_thread.run_sync(lambda: serialise(leaderboard_entries(service.database, config, token)))
+        return Response(content, media_type=media_type, headers={"Cache-Control": NO_STORE})
 
-    def make() -> Made:
-        rows = board(service.database, config)
-        return (media_type, config, stamp_of(rows)), written(rows)
+    def make() -> RenderedBody:
+        rows = leaderboard_entries(service.database, config)
+        return (media_type, config, ranking_version(rows)), serialise(rows)
 
-    body = await public_body(request, [config], (media_type, config), make)
-    return answer(request, body, media_type, {"Cache-Control": FRESH})
+    body = await cached_public_body(request, [config], (media_type, config), make)
+    return conditional_response(request, body, media_type, {"Cache-Control": REVALIDATE})

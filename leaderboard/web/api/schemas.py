@@ -1,6 +1,6 @@
-"""What the API answers, as Pydantic models with examples for its OpenAPI document.
+"""Pydantic models of API responses, with examples, and error responses that several operations document.
 
-Refusals that several operations share, for the OpenAPI document: by status, the model and when it comes.
+The docstrings of the models are part of the OpenAPI document.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from leaderboard.db.models import SubmissionRecord
-from leaderboard.db.rankings import BoardRow
+from leaderboard.db.models import SubmissionModel
+from leaderboard.db.rankings import LeaderboardEntry
 
 _ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
 
 
 class Problem(BaseModel):
-    """Why a request is refused."""
+    """Reason why a request is rejected."""
 
     model_config = ConfigDict(json_schema_extra={"example": {"detail": "no such submission"}})
 
@@ -25,7 +25,7 @@ class Problem(BaseModel):
 
 
 class Problems(BaseModel):
-    """Why an upload is refused: every problem in words. The quota is not charged."""
+    """Problems of a rejected upload. The quota is not charged."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -41,7 +41,7 @@ class Problems(BaseModel):
 
 
 class Submission(BaseModel):
-    """A submission and what became of it; ``result`` is the command line's JSON once it is scored."""
+    """Submission with its status; ``result`` is the JSON of ``rebar-bench score`` once it is scored."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -73,7 +73,7 @@ class Submission(BaseModel):
 
 
 class Publication(BaseModel):
-    """Whether a submission's rows are on the board."""
+    """Visibility of a submission's rows on the leaderboard."""
 
     model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"example": {"public": True}})
 
@@ -81,7 +81,7 @@ class Publication(BaseModel):
 
 
 class LeaderboardRow(BaseModel):
-    """A row of the board; ``table`` is the config's table of the result's JSON."""
+    """Leaderboard row; ``table`` is the table of the config in the result JSON."""
 
     rank: int | None = Field(description="by native AbsRel; null where the protocol does not rank the row")
     id: str
@@ -95,7 +95,7 @@ class LeaderboardRow(BaseModel):
 
 
 class Leaderboard(BaseModel):
-    """A config's rows, ranked ones first."""
+    """Rows of a config, ranked ones first."""
 
     config: str
     protocol: str
@@ -103,24 +103,24 @@ class Leaderboard(BaseModel):
     rows: list[LeaderboardRow]
 
 
-def submission_model(record: SubmissionRecord, url: str, result: dict[str, Any] | None = None) -> Submission:
-    """Return the model of a submission's record."""
+def submission_schema(record: SubmissionModel, url: str, result: dict[str, Any] | None = None) -> Submission:
+    """Return the API response for a submission; ``url`` is the address of its page, ``result`` its result JSON."""
     return Submission(
         id=record.id,
         status=record.status,  # type: ignore[arg-type]
         url=url,
         method=record.method,
         public=record.public,
-        created_at=_time(record.created_at),
-        finished_at=None if record.finished_at is None else _time(record.finished_at),
+        created_at=_utc_datetime(record.created_at),
+        finished_at=None if record.finished_at is None else _utc_datetime(record.finished_at),
         reason=record.reason,
         archive_sha256=record.archive_sha256,
         result=result,
     )
 
 
-def row_model(row: BoardRow) -> LeaderboardRow:
-    """Return the model of a board's row."""
+def row_schema(row: LeaderboardEntry) -> LeaderboardRow:
+    """Return the API response for a leaderboard row."""
     return LeaderboardRow(
         rank=row.rank,
         id=row.submission_id,
@@ -128,20 +128,25 @@ def row_model(row: BoardRow) -> LeaderboardRow:
         submitter=row.submitter,
         url=row.url,
         uses_intrinsics=row.uses_intrinsics,
-        created_at=_time(row.created_at),
+        created_at=_utc_datetime(row.created_at),
         public=row.public,
         table=dict(row.table),
     )
 
 
-def _time(seconds: float) -> datetime:
+def _utc_datetime(seconds: float) -> datetime:
     return datetime.fromtimestamp(seconds, UTC)
 
 
-Answers = dict[int | str, dict[str, Any]]
+Responses = dict[int | str, dict[str, Any]]
+"""OpenAPI ``responses`` by status, as FastAPI expects them."""
 
-AWAY: Answers = {503: {"model": Problem, "description": "the database does not answer; try again in a while"}}
-ANY_TIME: Answers = {429: {"model": Problem, "description": "too many requests"}, **AWAY}
-MALFORMED: Answers = {422: {"model": Problems, "description": "the request is malformed"}}
-UNKNOWN_TOKEN: Answers = {401: {"model": Problem, "description": "an unknown token"}}
-NO_TOKEN: Answers = {401: {"model": Problem, "description": "no token, or an unknown one"}}
+DATABASE_UNAVAILABLE_MESSAGE = "the database does not answer; try again in a while"
+DATABASE_UNAVAILABLE_RESPONSE: Responses = {503: {"model": Problem, "description": DATABASE_UNAVAILABLE_MESSAGE}}
+COMMON_RESPONSES: Responses = {
+    429: {"model": Problem, "description": "too many requests"},
+    **DATABASE_UNAVAILABLE_RESPONSE,
+}
+MALFORMED_RESPONSE: Responses = {422: {"model": Problems, "description": "the request is malformed"}}
+UNKNOWN_TOKEN_RESPONSE: Responses = {401: {"model": Problem, "description": "an unknown token"}}
+MISSING_TOKEN_RESPONSE: Responses = {401: {"model": Problem, "description": "no token, or an unknown one"}}

@@ -1,1 +1,1 @@
-"""The pages that people see: rendered on the server, complete without JavaScript, better with a little."""
+"""HTML pages, rendered on the server and complete without JavaScript, which adds convenience only."""

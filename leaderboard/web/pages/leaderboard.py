@@ -1,6 +1,6 @@
-"""A config's board as its table and plot show it: the group's rows, and the paper's below them, never ranked.
+"""Ranking of a config as shown in its table and plot: submitted rows, and the paper's rows, which are unranked.
 
-The board's columns: what a link ``?sort=NAME`` sorts by where there is no JavaScript.
+The columns define what ``?sort=NAME`` sorts by on the server, for clients without JavaScript.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Any
 from markupsafe import Markup
 
 from leaderboard.db.engine import Database
-from leaderboard.db.rankings import Stamp, Standing, stamp_of, standings
-from leaderboard.web.pages.rendering import Link, Moment, link, moment
+from leaderboard.db.rankings import RankedRow, RankingVersion, ranked_rows, ranking_version
+from leaderboard.web.pages.rendering import DisplayTime, Link, format_time, link
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
-from rebar_depth_bench.reporting.formatting import printable
-from rebar_depth_bench.reporting.html.published import PaperRow, finite_ends, published_row
-from rebar_depth_bench.reporting.html.rows import Row, table_row
-from rebar_depth_bench.reporting.published import Published, load_published, paper_scene
+from rebar_depth_bench.reporting.html.published import PaperRow, finite_interval, published_row
+from rebar_depth_bench.reporting.html.rows import ScoreRow, table_row
+from rebar_depth_bench.reporting.published import PublishedNumbers, load_published, paper_scene
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Table
 from rebar_depth_bench.scoring.result_io import read_table
@@ -30,111 +30,114 @@ Value = float | str | None
 
 @dataclass(frozen=True)
 class Column:
-    """A column: its name in addresses, and whether its best value is the largest."""
+    """A sortable column: its name in URLs, whether larger values are better, and its value of a row."""
 
     name: str
     largest_first: bool
-    value: Callable[[Row], Value]
+    value: Callable[[ScoreRow], Value]
 
 
-def _native(place: int) -> Callable[[Row], Value]:
-    return lambda row: row.native[place].value
+def _native(index: int) -> Callable[[ScoreRow], Value]:
+    return lambda row: row.native[index].value
 
 
-def _scaled(place: int) -> Callable[[Row], Value]:
-    return lambda row: row.scaled[place].value
+def _scaled(index: int) -> Callable[[ScoreRow], Value]:
+    return lambda row: row.scaled[index].value
 
 
-def _within(place: int) -> Callable[[Row], Value]:
-    return lambda row: row.within[place].value
+def _within(index: int) -> Callable[[ScoreRow], Value]:
+    return lambda row: row.within[index].value
 
 
 NATIVE = tuple(
     Column(name, name == "delta1", _native(k)) for k, name in enumerate(("abs_rel", "rmse", "mae", "delta1"))
 )
-SCALED = tuple(Column(f"scaled_{one.name}", one.largest_first, _scaled(k)) for k, one in enumerate(NATIVE))
+SCALED = tuple(
+    Column(f"scaled_{column.name}", column.largest_first, _scaled(k)) for k, column in enumerate(NATIVE)
+)
 SCALE = Column("scale", False, lambda row: row.scale.value)
 WITHIN = tuple(Column(f"within_{t}mm", True, _within(k)) for k, t in enumerate(WITHIN_MM))
 COVERAGE = Column("coverage", True, lambda row: row.coverage.value)
 METHOD = Column("method", False, lambda row: row.name.casefold())
-COLUMNS = {one.name: one for one in (METHOD, *NATIVE, *SCALED, SCALE, *WITHIN, COVERAGE)}
+COLUMNS = {column.name: column for column in (METHOD, *NATIVE, *SCALED, SCALE, *WITHIN, COVERAGE)}
 RANK = "rank"
 
 
 @dataclass(frozen=True)
 class Order:
-    """The rows' order: by a column of ``COLUMNS``, best first or ``turned``; by rank where ``name`` is that."""
+    """Row order: by rank or by the column ``name`` of ``COLUMNS``; best first, or worst first if ``inverted``."""
 
     name: str = RANK
-    turned: bool = False
+    inverted: bool = False
 
     @property
-    def falling(self) -> bool:
-        """Whether values fall from top to bottom."""
-        return (self.name != RANK and COLUMNS[self.name].largest_first) != self.turned
+    def is_descending(self) -> bool:
+        """Whether values decrease from top to bottom."""
+        return (self.name != RANK and COLUMNS[self.name].largest_first) != self.inverted
 
     def link(self, name: str) -> str:
-        """Return what ``?sort=`` says in the heading of a column: best first, or turned where it is so already."""
-        return f"-{name}" if name == self.name and not self.turned else name
+        """Return the ``?sort=`` value of a column's link: best first, or inverted if it is active."""
+        return f"-{name}" if name == self.name and not self.inverted else name
 
     def heading(self, name: str) -> str | None:
-        """Return the heading's ``aria-sort``, None where the rows are not in this column's order."""
+        """Return the ``aria-sort`` value of a column's heading, or None if the rows are not sorted by it."""
         if name != self.name:
             return None
-        return "descending" if self.falling else "ascending"
+        return "descending" if self.is_descending else "ascending"
 
 
-def read_order(text: str | None) -> Order:
-    """Return the order that ``?sort=`` asks for; by rank for what names no column."""
+def parse_order(text: str | None) -> Order:
+    """Return the order for a ``?sort=`` value; by rank if it is not a column name."""
     name = (text or RANK).removeprefix("-")
     return Order(name, bool(text) and text != name) if name == RANK or name in COLUMNS else Order()
 
 
-def ordered(rows: Sequence[tuple[int | None, Row]], order: Order) -> list[int]:
-    """Return the places of (rank, row) in an order; missing values come last whichever way it runs."""
+def sort_indices(rows: Sequence[tuple[int | None, ScoreRow]], order: Order) -> list[int]:
+    """Return the indices that sort (rank, row) pairs; missing values come last in both directions."""
     keys = [rank if order.name == RANK else COLUMNS[order.name].value(row) for rank, row in rows]
-    present = [(key, place) for place, key in enumerate(keys) if key is not None]
-    missing = [place for place, key in enumerate(keys) if key is None]
-    present.sort(key=_key, reverse=order.falling)
-    return [place for _, place in present] + missing
+    present = [(key, index) for index, key in enumerate(keys) if key is not None]
+    missing = [index for index, key in enumerate(keys) if key is None]
+    present.sort(key=_sort_key, reverse=order.is_descending)
+    return [index for _, index in present] + missing
 
 
-def _key(keyed: tuple[Any, int]) -> Any:
-    """Return what is compared: the value alone, so that equal rows keep their order."""
-    return keyed[0]
+def _sort_key(pair: tuple[Any, int]) -> Any:
+    """Return the value without the index, so that the sort is stable."""
+    return pair[0]
 
 
-MOST_PLOTTED = 16
-"""Rows of a config that its plot shows: more could not be told apart."""
-_KEPT = 2048
-_FIRST_CAPITAL, _FIRST_SMALL = ord("A"), ord("a")
+MAX_PLOTTED = 16
+"""Maximum number of submitted rows in a plot; more would not be distinguishable."""
+_FORMAT_CACHE_SIZE = 2048
+_FIRST_UPPERCASE, _FIRST_LOWERCASE = ord("A"), ord("a")
 
 
 @dataclass(frozen=True)
-class Line:
-    """A row of the group's; ``mark`` names its point in the plot, empty where it has none."""
+class RankingLine:
+    """A submitted row as displayed; ``mark`` labels its point in the plot and is empty if it is not plotted."""
 
     rank: int | None
     mark: str
     submission_id: str
     submitter: str
     link: Link | None
-    when: Moment
-    row: Row
+    when: DisplayTime
+    row: ScoreRow
 
 
 @dataclass(frozen=True)
-class Board:
-    """A config's table and plot; ``rows`` is how many there are, of which ``lines`` are shown.
+class ConfigRanking:
+    """Table and plot of a config.
 
-    ``stamp`` is that of the rows it was made of.
+    ``version`` is the version of the underlying rows, ``row_count`` their number, ``lines`` the rows shown,
+    ``published`` the rows of the paper, ``distance`` their camera distance and ``plotted`` the number of points.
     """
 
-    stamp: Stamp
+    version: RankingVersion
     config: str
     order: Order
-    rows: int
-    lines: list[Line]
+    row_count: int
+    lines: list[RankingLine]
     published: list[PaperRow]
     distance: str
     chart: Markup | None
@@ -142,45 +145,49 @@ class Board:
 
     @property
     def unranked(self) -> bool:
-        """Whether a row is shown that is not ranked."""
+        """Whether any shown row is unranked."""
         return any(line.rank is None for line in self.lines)
 
     @property
     def interval(self) -> bool:
-        """Whether a number is shown with its interval."""
+        """Whether any number is shown with a confidence interval."""
         return any(line.row.has_interval() for line in self.lines)
 
     @property
     def dash(self) -> bool:
-        """Whether a number is shown as undefined."""
+        """Whether any number is shown as undefined."""
         return any(line.row.has_dash() for line in self.lines)
 
     @property
     def dagger(self) -> bool:
-        """Whether a published row took its scale from the ground truth."""
+        """Whether any published row took its scale from the ground truth."""
         return any(row.dagger for row in self.published)
 
 
 @dataclass(frozen=True)
-class _Spelled:
+class _FormattedRow:
     table: Table
-    row: Row
+    row: ScoreRow
 
 
-def make_board(database: Database, config: str, order: Order, most: int | None = None) -> Board:
-    """Return a config's board in an order, its first ``most`` rows."""
-    found = standings(database, config)
-    spelled = [_spelled(one.method, one.table) for one in found]
-    marks = _marks(found, spelled)
-    places = ordered([(one.rank, both.row) for one, both in zip(found, spelled, strict=True)], order)[:most]
+def make_config_ranking(
+    database: Database, config: str, order: Order, max_rows: int | None = None
+) -> ConfigRanking:
+    """Return the ranking of a config in the given order, limited to the first ``max_rows`` rows."""
+    rows = ranked_rows(database, config)
+    formatted = [_format_row(row.method, row.table) for row in rows]
+    marks = _plot_marks(rows, formatted)
+    indices = sort_indices([(row.rank, numbers.row) for row, numbers in zip(rows, formatted, strict=True)], order)[
+        :max_rows
+    ]
     published, distance = _published(config)
-    points = tuple(_point(marks[place], spelled[place]) for place in marks)
-    return Board(
-        stamp=stamp_of(found),
+    points = tuple(_plot_point(marks[index], formatted[index]) for index in marks)
+    return ConfigRanking(
+        version=ranking_version(rows),
         config=printable(config),
         order=order,
-        rows=len(found),
-        lines=[_line(found[place], marks.get(place, ""), spelled[place].row) for place in places],
+        row_count=len(rows),
+        lines=[_ranking_line(rows[index], marks.get(index, ""), formatted[index].row) for index in indices],
         published=published,
         distance=distance,
         chart=_chart(printable(config), points, tuple(_published_points(published))) if points else None,
@@ -189,16 +196,16 @@ def make_board(database: Database, config: str, order: Order, most: int | None =
 
 
 @lru_cache(maxsize=1)
-def published_numbers() -> Published:
-    """Return the paper's numbers, read once: they come with the package."""
+def published_numbers() -> PublishedNumbers:
+    """Return the numbers of the paper, which are part of the package; they are read once."""
     return load_published()
 
 
-@lru_cache(maxsize=_KEPT)
-def _spelled(method: str, table_json: str) -> _Spelled:
-    """Return a row's numbers as text: the same for the same JSON, so each is spelled once."""
+@lru_cache(maxsize=_FORMAT_CACHE_SIZE)
+def _format_row(method: str, table_json: str) -> _FormattedRow:
+    """Return the formatted numbers of a row; cached, because they depend on the arguments only."""
     table = read_table(json.loads(table_json))
-    return _Spelled(table, table_row(method, table))
+    return _FormattedRow(table, table_row(method, table))
 
 
 @lru_cache(maxsize=64)
@@ -206,46 +213,46 @@ def _chart(config: str, own: tuple[ScatterPoint, ...], published: tuple[ScatterP
     return scatter_chart(f"{config}: native and scaled AbsRel", [*own, *published])
 
 
-def _line(one: Standing, mark: str, row: Row) -> Line:
-    return Line(
-        rank=one.rank,
+def _ranking_line(ranked_row: RankedRow, mark: str, row: ScoreRow) -> RankingLine:
+    return RankingLine(
+        rank=ranked_row.rank,
         mark=mark,
-        submission_id=one.submission_id,
-        submitter=printable(one.submitter),
-        link=link(one.url),
-        when=moment(one.created_at),
+        submission_id=ranked_row.submission_id,
+        submitter=printable(ranked_row.submitter),
+        link=link(ranked_row.url),
+        when=format_time(ranked_row.created_at),
         row=row,
     )
 
 
-def _marks(found: Sequence[Standing], spelled: Sequence[_Spelled]) -> dict[int, str]:
-    """Return the plot's marks by place: ranks, then small letters for rows that are not ranked."""
+def _plot_marks(rows: Sequence[RankedRow], formatted: Sequence[_FormattedRow]) -> dict[int, str]:
+    """Return the plot labels by row index: ranks, or lowercase letters for unranked rows."""
     marks: dict[int, str] = {}
-    small = 0
-    for place, (one, both) in enumerate(zip(found, spelled, strict=True)):
-        if len(marks) == MOST_PLOTTED:
+    unranked = 0
+    for index, (row, numbers) in enumerate(zip(rows, formatted, strict=True)):
+        if len(marks) == MAX_PLOTTED:
             break
-        if both.row.native[0].value is None or both.row.scaled[0].value is None:
+        if numbers.row.native[0].value is None or numbers.row.scaled[0].value is None:
             continue
-        marks[place] = str(one.rank) if one.rank else chr(_FIRST_SMALL + small)
-        small += one.rank is None
+        marks[index] = str(row.rank) if row.rank else chr(_FIRST_LOWERCASE + unranked)
+        unranked += row.rank is None
     return marks
 
 
-def _point(mark: str, both: _Spelled) -> ScatterPoint:
-    native, scaled = both.row.native[0].value, both.row.scaled[0].value
+def _plot_point(mark: str, numbers: _FormattedRow) -> ScatterPoint:
+    native, scaled = numbers.row.native[0].value, numbers.row.scaled[0].value
     assert native is not None
     assert scaled is not None
-    intervals = both.table.intervals
-    ends = [finite_ends(intervals.get(name)) for name in ("native.abs_rel", "scaled.abs_rel")]
-    return ScatterPoint(mark, both.row.name, native, scaled, False, *ends)
+    intervals = numbers.table.intervals
+    ends = [finite_interval(intervals.get(name)) for name in ("native.abs_rel", "scaled.abs_rel")]
+    return ScatterPoint(mark, numbers.row.name, native, scaled, False, *ends)
 
 
 def _published(config: str) -> tuple[list[PaperRow], str]:
     scene = published_numbers().scenes.get(paper_scene(config) or "")
     if scene is None:
         return [], ""
-    rows = [published_row(chr(_FIRST_CAPITAL + k), row) for k, row in enumerate(scene.rows)]
+    rows = [published_row(chr(_FIRST_UPPERCASE + k), row) for k, row in enumerate(scene.rows)]
     return rows, scene.distance
 
 

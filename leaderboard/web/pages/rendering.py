@@ -1,9 +1,4 @@
-"""A template and what it shows as a response.
-
-Texts from archives and numbers of the service, as the pages spell them.
-
-Refusals: JSON, or a page for those who asked for a page.
-"""
+"""Template rendering, formatting of values for the pages, and error responses as JSON or HTML."""
 
 from __future__ import annotations
 
@@ -17,11 +12,11 @@ from fastapi import Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from jinja2 import Environment, PackageLoader
 
-from leaderboard.web.cache import FRESH, PRIVATE
-from leaderboard.web.context import Service
-from leaderboard.web.pages.static import address
+from leaderboard.service import Service
+from leaderboard.web.cache import NO_STORE, REVALIDATE
+from leaderboard.web.pages.static import static_path
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.formatting import printable
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
 from rebar_depth_bench.submission.metadata import url_problems
@@ -29,7 +24,7 @@ from rebar_depth_bench.version import software_version
 
 
 def make_templates() -> Environment:
-    """Return the templates of the pages; parts of them are the report's."""
+    """Return the Jinja environment of the pages, which also contains the templates of the report."""
     return environment(PackageLoader("leaderboard.web.pages", "templates"))
 
 
@@ -38,43 +33,46 @@ def render(
     template: str,
     *,
     status_code: int = 200,
-    cache: str = FRESH,
+    cache: str = REVALIDATE,
     headers: Mapping[str, str] | None = None,
-    **shown: Any,
+    **context: Any,
 ) -> HTMLResponse:
-    """Return the page that a template makes of what is ``shown`` and of what every page shows."""
-    content = page_content(request, template, **shown)
+    """Return the page rendered from a template with ``context`` and the context common to all pages."""
+    content = page_content(request, template, **context)
     return HTMLResponse(content, status_code, {"Cache-Control": cache, **(headers or {})})
 
 
-def page_content(request: Request, template: str, **shown: Any) -> bytes:
-    """Return the bytes of what ``render`` responds with, to be kept as long as ``place`` is the same."""
+def page_content(request: Request, template: str, **context: Any) -> bytes:
+    """Return the page of ``render`` as bytes, which can be cached for requests with the same ``root_path``."""
     service: Service = request.app.state.service
     templates: Environment = request.app.state.templates
-    return templates.get_template(template).render({**_common(request, service), **shown}).encode()
+    return templates.get_template(template).render({**_common_context(request, service), **context}).encode()
 
 
-def place(request: Request) -> str:
-    """Return all that pages take from the request itself, not from its address: where the service's root is."""
+def root_path(request: Request) -> str:
+    """Return the URL path below which the service is mounted, without a trailing slash.
+
+    It is the only value, apart from the address, that pages take from the request.
+    """
     return str(request.scope.get("root_path", "").rstrip("/"))
 
 
 def service_address(request: Request) -> str:
-    """Return the service's address as the browser has it, without a slash at its end."""
+    """Return the base URL of the service as seen by the client, without a trailing slash."""
     return str(request.base_url).rstrip("/")
 
 
-def _common(request: Request, service: Service) -> dict[str, Any]:
-    root = place(request)
+def _common_context(request: Request, service: Service) -> dict[str, Any]:
+    root = root_path(request)
     return {
         "root": root,
-        "static": lambda name: root + address(name),
-        "site": formatting.printable(service.settings.title),
+        "static": lambda name: root + static_path(name),
+        "site": printable(service.settings.title),
         "protocol": PROTOCOL,
         "stamps": [
             ("Protocol", PROTOCOL),
-            ("Dataset version", formatting.printable(service.folder.version)),
-            ("Dataset digest", formatting.printable(service.folder.digest)),
+            ("Dataset version", printable(service.folder.version)),
+            ("Dataset digest", printable(service.folder.digest)),
             ("Software", f"rebar-depth-bench {software_version()}"),
         ],
         "metric_heads": formatting.METRIC_HEADS,
@@ -86,13 +84,13 @@ def _common(request: Request, service: Service) -> dict[str, Any]:
     }
 
 
-MOST_TEXT = 4000
+MAX_TEXT_CHARS = 4000
 _STEPS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
 
 
 @dataclass(frozen=True)
-class Moment:
-    """A time as people and as machines read it."""
+class DisplayTime:
+    """A time as display text and in ISO 8601."""
 
     text: str
     iso: str
@@ -100,34 +98,34 @@ class Moment:
 
 @dataclass(frozen=True)
 class Link:
-    """A method's own address and the host that is shown for it."""
+    """A method's URL and the host name that is displayed for it."""
 
     address: str
     host: str
 
 
-def moment(seconds: float) -> Moment:
-    """Return a time, seconds since 1970, in UTC."""
+def format_time(seconds: float) -> DisplayTime:
+    """Return a Unix timestamp in seconds as a time in UTC."""
     when = datetime.fromtimestamp(seconds, UTC)
-    return Moment(when.strftime("%Y-%m-%d %H:%M UTC"), when.strftime("%Y-%m-%dT%H:%M:%SZ"))
+    return DisplayTime(when.strftime("%Y-%m-%d %H:%M UTC"), when.strftime("%Y-%m-%dT%H:%M:%SZ"))
 
 
-def lines(text: str | None, limit: int = MOST_TEXT) -> str:
-    """Return a longer text, its lines kept, cut to ``limit``, without control or direction-changing characters."""
-    kept = (text or "")[: limit + 1]
-    clean = "\n".join(printable(line, limit + 1) for line in kept.splitlines())
+def clean_text(text: str | None, limit: int = MAX_TEXT_CHARS) -> str:
+    """Return untrusted text without control and bidirectional characters, cut to ``limit``; lines are kept."""
+    truncated = (text or "")[: limit + 1]
+    clean = "\n".join(printable(line, limit + 1) for line in truncated.splitlines())
     return clean if len(clean) <= limit else clean[: limit - 1] + "…"
 
 
 def link(url: str | None) -> Link | None:
-    """Return a method's address if it is one of http or https, else None."""
+    """Return the link for a method's URL, or None if it is not a valid http or https URL."""
     if not url or url_problems(url):
         return None
     return Link(url, printable(urlsplit(url).hostname or "", 60))
 
 
-def size(count: int) -> str:
-    """Return a number of bytes in a unit that suits it."""
+def format_size(count: int) -> str:
+    """Return a number of bytes as text in bytes, KiB, MiB or GiB."""
     for step, unit in _STEPS:
         if count >= step:
             return f"{count / step:.1f}".removesuffix(".0") + f" {unit}"
@@ -137,22 +135,22 @@ def size(count: int) -> str:
 _TITLES = {404: "There is no such page", 405: "That cannot be done here", 422: "The address is malformed"}
 
 
-def refusal(
+def error_response(
     request: Request,
     status: int,
     detail: str,
     headers: Mapping[str, str] | None = None,
     problems: Sequence[str] | None = None,
 ) -> Response:
-    """Return the answer that refuses a request: a page where a browser asks, and not the API; JSON else."""
+    """Return an error response: a page if a browser requests a path outside the API, otherwise JSON."""
     if not request.url.path.startswith("/api/") and "text/html" in request.headers.get("accept", ""):
-        return _page(request, status, "\n".join(problems or (detail,)), headers)
+        return _error_page(request, status, "\n".join(problems or (detail,)), headers)
     content = {"detail": detail} if problems is None else {"detail": detail, "problems": list(problems)}
     return JSONResponse(content, status, headers)
 
 
-def _page(request: Request, status: int, detail: str, headers: Mapping[str, str] | None) -> Response:
+def _error_page(request: Request, status: int, detail: str, headers: Mapping[str, str] | None) -> Response:
     title = _TITLES.get(status, "That did not work")
-    said = "" if detail in ("Not Found", "Method Not Allowed") else lines(detail)
-    shown = {"title": title, "detail": said}
-    return render(request, "refusal.html.j2", status_code=status, cache=PRIVATE, headers=headers, **shown)
+    message = "" if detail in ("Not Found", "Method Not Allowed") else clean_text(detail)
+    context = {"title": title, "detail": message}
+    return render(request, "refusal.html.j2", status_code=status, cache=NO_STORE, headers=headers, **context)

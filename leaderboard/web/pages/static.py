@@ -1,6 +1,7 @@
-"""Styles and scripts: this package's, and the report's, whose look the pages share. No build step.
+"""Static files: style sheets and scripts of this package and of the report, served without a build step.
 
-Addresses carry a digest of the content, so that browsers keep a file for good and a new one is fetched at once.
+URLs contain a digest of the content, so that browsers can cache a file permanently and fetch a new version when
+it changes.
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ _SOURCES = {
     "page.css": ("leaderboard.web.pages", "static/page.css", _STYLE),
     "page.js": ("leaderboard.web.pages", "static/page.js", _SCRIPT),
 }
-_KEPT_S, _FOR_GOOD_S = 300, 31536000
+_MAX_AGE_S, _IMMUTABLE_MAX_AGE_S = 300, 31536000
+"""Cache lifetimes without and with the current digest in the URL."""
 
 
 @dataclass(frozen=True)
 class StaticFile:
-    """A file's bytes, its media type and the digits of its content's digest."""
+    """Content, media type and digest (first 16 hexadecimal digits of its SHA-256) of a static file."""
 
     content: bytes
     media_type: str
@@ -55,19 +57,23 @@ STATIC: Mapping[str, StaticFile] = {
 }
 
 
-def address(name: str) -> str:
-    """Return a file's path below the service's root, with its digest."""
+def static_path(name: str) -> str:
+    """Return the URL path of a file below the root path, with its digest."""
     return f"/static/{name}?v={STATIC[name].digest}"
 
 
 @router.get("/static/{name}", name="static")
 def static(name: str, request: Request, v: str = "") -> Response:
-    """Return a file, or 304 where the browser has it."""
+    """Return a file, or 304 if the client's copy is current."""
     if name not in STATIC:
         raise HTTPException(404, "no such file")
     file = STATIC[name]
-    kept = f"public, max-age={_FOR_GOOD_S}, immutable" if v == file.digest else f"public, max-age={_KEPT_S}"
-    headers = {"ETag": f'"{file.digest}"', "Cache-Control": kept}
+    cache_control = (
+        f"public, max-age={_IMMUTABLE_MAX_AGE_S}, immutable"
+        if v == file.digest
+        else f"public, max-age={_MAX_AGE_S}"
+    )
+    headers = {"ETag": f'"{file.digest}"', "Cache-Control": cache_control}
     if file.digest in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=headers)
     return Response(file.content, media_type=file.media_type, headers=headers)

@@ -1,4 +1,4 @@
-"""How to submit, and the form: the API's upload for people."""
+"""Page with submission instructions, and its upload form."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from anyio import to_thread
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 
-from leaderboard.db.models import SubmissionRecord
+from leaderboard.db.models import SubmissionModel
 from leaderboard.db.tokens import find_token
-from leaderboard.uploads.accept import RefusedError, take_in
-from leaderboard.uploads.multipart import UploadError, leading_field
+from leaderboard.service import Service
+from leaderboard.uploads.accept import UploadRejectedError, accept_upload
+from leaderboard.uploads.multipart import UploadError, read_leading_field
 from leaderboard.web.api.auth import ServiceDep
 from leaderboard.web.api.submissions import page_url
-from leaderboard.web.cache import FRESH, PRIVATE
-from leaderboard.web.context import Service
-from leaderboard.web.pages.rendering import lines, render, service_address, size
+from leaderboard.web.cache import NO_STORE, REVALIDATE
+from leaderboard.web.pages.rendering import clean_text, format_size, render, service_address
 
 router = APIRouter(include_in_schema=False)
 
@@ -26,23 +26,23 @@ TOKEN_FIELD = "token"
 
 @router.post("/submit", response_class=HTMLResponse)
 async def submit(request: Request, service: ServiceDep) -> Response:
-    """Take an archive from the form: the checks and refusals are the API's, the answers are pages.
+    """Accept an archive from the form, with the checks and errors of the API, and respond with a page.
 
-    There is no cookie and no session: the token in the form is all that lets a request in, and another site's
-    page does not know it. That is why the form needs no further token against forged requests.
+    The form needs no CSRF token: there are no cookies or sessions, and other sites do not know the token in the
+    form, which alone authenticates the request.
     """
     try:
-        record = await _take_in(service, request.stream(), request)
-    except RefusedError as refusal:
-        return how_to_page(request, refusal.status, refusal.detail, refusal.problems or ())
-    # A path alone: behind a proxy the form's policy would refuse another scheme than the browser's.
+        record = await _accept_form_upload(service, request.stream(), request)
+    except UploadRejectedError as error:
+        return how_to_page(request, error.status, error.detail, error.problems or ())
+    # Path only: behind a proxy, Content-Security-Policy form-action rejects a scheme other than the browser's.
     return RedirectResponse(urlsplit(page_url(request, record)).path, 303)
 
 
 def how_to_page(
-    request: Request, status: int = 200, refusal: str = "", problems: Sequence[str] = ()
+    request: Request, status: int = 200, message: str = "", problems: Sequence[str] = ()
 ) -> HTMLResponse:
-    """Return the page; after a ``refusal`` with why, every problem a line, and the refusal's status."""
+    """Return the page; after a rejected upload with the error message, its problems and its HTTP status."""
     service: Service = request.app.state.service
     settings = service.settings
     headers = {"WWW-Authenticate": "Bearer"} if status == 401 else {}
@@ -50,28 +50,31 @@ def how_to_page(
         request,
         "how_to.html.j2",
         status_code=status,
-        cache=PRIVATE if refusal else FRESH,
+        cache=NO_STORE if message else REVALIDATE,
         headers=headers,
-        refusal=lines(refusal),
-        problems=[lines(problem) for problem in problems if problem != refusal],
+        refusal=clean_text(message),
+        problems=[clean_text(problem) for problem in problems if problem != message],
         address=service_address(request),
         quota=settings.quota,
-        most=size(settings.max_upload),
+        most=format_size(settings.max_upload),
         most_bytes=settings.max_upload,
-        always_public=settings.public == "always",
+        always_public=settings.default_visibility == "always",
         dataset_configs=service.folder.configs,
     )
 
 
-async def _take_in(service: Service, body: AsyncIterator[bytes], request: Request) -> SubmissionRecord:
-    """Accept the form's archive; a token that is wrong is told before any of the archive is kept."""
+async def _accept_form_upload(service: Service, body: AsyncIterator[bytes], request: Request) -> SubmissionModel:
+    """Accept the archive of the form; the token is checked before any of the archive is stored.
+
+    Raises ``UploadRejectedError``.
+    """
     try:
-        text, whole = await leading_field(body, request.headers.get("content-type", ""), TOKEN_FIELD)
+        text, full_body = await read_leading_field(body, request.headers.get("content-type", ""), TOKEN_FIELD)
     except UploadError as error:
-        raise RefusedError(error.status, error.detail) from None
+        raise UploadRejectedError(error.status, error.detail) from None
     if not text.strip():
-        raise RefusedError(401, "no token, expected the one that the operator gave you")
+        raise UploadRejectedError(401, "no token, expected the one that the operator gave you")
     token = await to_thread.run_sync(find_token, service.database, text.strip())
     if token is None:
-        raise RefusedError(401, "the token is unknown")
-    return await take_in(service, token, whole, request.headers)
+        raise UploadRejectedError(401, "the token is unknown")
+    return await accept_upload(service, token, full_body, request.headers)

@@ -1,4 +1,4 @@
-"""The first tables."""
+"""Initial schema."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -10,7 +10,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Make them."""
+    """Create all tables and indexes."""
     op.create_table(
         "tokens",
         sa.Column("id", sa.Integer(), nullable=False),

@@ -1,0 +1,90 @@
+"""Service context shared by the routes: settings, dataset, database, archive storage, validation and metrics."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import structlog
+from sqlalchemy import select
+
+from leaderboard.db import jobs
+from leaderboard.db.engine import Database
+from leaderboard.db.models import SubmissionModel
+from leaderboard.db.submissions import DELETED
+from leaderboard.metrics import ServiceMetrics
+from leaderboard.settings import Settings
+from leaderboard.storage.archive_store import ArchiveStore
+from leaderboard.storage.work_dirs import work_dir
+from leaderboard.uploads.validation import ArchiveChecker
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.errors import InputError
+
+ORPHAN_AGE_S = 3600.0
+"""Age in seconds after which an archive without a submission is regarded as an interrupted upload."""
+_LOG = structlog.get_logger("service")
+
+
+@dataclass(frozen=True)
+class Service:
+    """Dependencies of the request handlers. ``spool`` is the folder for incomplete uploads."""
+
+    settings: Settings
+    folder: DatasetFolder
+    database: Database
+    archives: ArchiveStore
+    spool: Path
+    checker: ArchiveChecker
+    metrics: ServiceMetrics
+
+
+@contextmanager
+def open_service(settings: Settings) -> Iterator[Service]:
+    """Open the service: migrate the database, remove orphaned archives and create the validation pool.
+
+    Raises ``InputError`` if the dataset, the database or the archive storage is unusable, and if the leaderboard
+    has submissions of another dataset, unless the setting ``rescore`` is on.
+    """
+    folder = open_folder(settings.data)
+    with work_dir(settings.spool) as spool, closing(Database(settings.database_url)) as database:
+        archives = ArchiveStore(settings.archives_url)
+        database.migrate()
+        remove_orphan_archives(database, archives)
+        _check_dataset_unchanged(folder, database, settings.rescore)
+        with ArchiveChecker(settings.data, settings.score_memory) as checker:
+            yield Service(settings, folder, database, archives, spool, checker, ServiceMetrics())
+
+
+def _check_dataset_unchanged(folder: DatasetFolder, database: Database, rescore: bool) -> None:
+    """Ensure that all submissions belong to the dataset ``folder``, so that results never mix two datasets.
+
+    Submissions of other datasets are requeued if ``rescore`` is True; otherwise raises ``InputError``.
+    """
+    stale = jobs.count_stale_submissions(database, folder.digest)
+    if stale and not rescore:
+        raise InputError(
+            f"{folder.root}: {stale} submissions of this board are of another dataset, expected the same "
+            f"(this one is {folder.digest}); to score them against this one: --rescore true"
+        )
+    jobs.requeue_stale_submissions(database, folder.digest)
+
+
+def remove_orphan_archives(database: Database, archives: ArchiveStore) -> None:
+    """Delete archives without a submission, except recent ones, whose row may not be inserted yet.
+
+    Nothing is deleted if the database has no submissions, since it is probably not the one of these archives.
+    """
+    now = time.time()
+    with database.read() as session:
+        rows = session.execute(select(SubmissionModel.id, SubmissionModel.status)).all()
+    orphans = archives.ids() - {submission_id for submission_id, status in rows if status != DELETED}
+    if orphans and not rows:
+        _LOG.warning("nothing cleared", reason="the database has no submissions", archives=len(orphans))
+        return
+    for submission_id in orphans:
+        if archives.age_s(submission_id, now) > ORPHAN_AGE_S:
+            archives.delete(submission_id)
+            _LOG.info("cleared", archive=submission_id[:6])
