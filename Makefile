@@ -4,29 +4,41 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check format env env-dev cards clean
+.NOTPARALLEL:
+.PHONY: help demo quick test nightly check format env env-dev system-packages cards sample-data clean
 
 help: ## List the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-demo: env ## Render a small lattice set, predict, score, and write the report
+demo: ## Render a small lattice set, predict, score, and write the report
+	@scripts/system_packages.sh blender
+	@scripts/environment.sh $(PYTHON) $(VENV) build
 	$(BIN)/rebar-bench demo
 
-test: env-dev ## Run everything CI runs: format, lint, types, import rules, tests
-	scripts/check.sh $(BIN)
+quick: env-dev ## Format, lint, types, import contracts, and the fast tests that need no Blender, server, database or browser
+	scripts/check.sh $(BIN) quick
 
-format: env-dev ## Format the code and sort out what the linter can
+test: system-packages env-dev ## Everything that CI runs: quick, and real renders, servers, databases and browser
+	scripts/check.sh $(BIN) test
+
+nightly: system-packages env-dev ## Everything, with the long stress tests
+	scripts/check.sh $(BIN) nightly
+
+format: env-dev ## Format the code and apply the linter's safe fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
 cards: env-dev ## Write the benchmark card from the code
 	$(BIN)/python -m cards > cards/BENCHMARK.md
 
-env: ## Make .venv for building, predicting and scoring
-	@scripts/environment.sh $(PYTHON) $(VENV) build
+sample-data: system-packages env-dev ## Render the dataset in tests/data again, after a change of the format
+	$(BIN)/python -m tests.data.render
 
 env-dev: ## Make .venv for developing and testing
 	@scripts/environment.sh $(PYTHON) $(VENV) dev
+
+system-packages: ## Check the system packages that rendering and testing need; as root on Debian, install them
+	@scripts/system_packages.sh blender browser uploads
 
 clean: ## Remove the environment and the demo's output
 	rm -rf $(VENV) demo-output

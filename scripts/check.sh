@@ -1,13 +1,25 @@
 #!/usr/bin/env bash
-# Everything CI runs, in the order that fails fastest. usage: scripts/check.sh BIN
+# Runs the static checks and one tier of the tests, in the order that fails fastest.
+# usage: scripts/check.sh BIN TIER [PYTEST_OPTION...]       TIER: quick, test or nightly
 set -euo pipefail
 cd "$(dirname "$0")/.."
-bin=$1
+bin=$1 tier=$2
+shift 2
 
-command -v chromium >/dev/null || command -v google-chrome >/dev/null ||
-    echo "warning: no chromium on the PATH: the browser tests will fail; on Debian: apt-get install chromium" >&2
-"$bin/ruff" format --check .
-"$bin/ruff" check .
-"$bin/mypy"
-"$bin/lint-imports"
-"$bin/pytest" "${@:2}"
+"$bin/ruff" format --check --quiet .
+"$bin/ruff" check --quiet .
+
+# Types and import contracts are checked beside the tests, which leave some processor time unused.
+report=$(mktemp)
+{ "$bin/mypy" && "$bin/lint-imports" --no-logo; } >"$report" 2>&1 &
+static=$!
+trap 'kill "$static" 2>/dev/null; rm -f "$report"' EXIT
+
+status=0
+# A file's tests stay together, so that the servers and renders of a module are started once.
+"$bin/pytest" --tier "$tier" --numprocesses 2 --dist loadfile "$@" || status=$?
+if ! wait "$static"; then
+    cat "$report"
+    status=1
+fi
+exit "$status"

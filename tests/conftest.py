@@ -1,11 +1,11 @@
-"""One tiny dataset, rendered for real by ``rebar-build``, that most tests stand on."""
+"""Test tiers, markers derived from fixtures, and the tiny dataset that most tests use."""
 
 from __future__ import annotations
 
+import lzma
 import os
+import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,52 +19,131 @@ _CACHES = tempfile.TemporaryDirectory(prefix="rebar-test-caches-")
 os.environ.update(HF_HOME=_CACHES.name, XDG_CACHE_HOME=_CACHES.name, HF_HUB_OFFLINE="1")
 
 from rebar_depth_bench import SubmissionWriter, load  # noqa: E402
+from tests import building, requirements  # noqa: E402
+from tests.building import RunBuild, StartBuild  # noqa: E402
+from tests.requirements import Repetitions  # noqa: E402
 
-# A shell that runs the tests in the background ignores this signal; what they start would inherit that.
+# A shell that runs the tests in the background ignores this signal, and child processes would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No test is timed: a busy machine is no failure.
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
-TINY = ("--width", "160", "--height", "90", "--samples", "1")
-TINY_VIEWS = 9
-"""One more than a shard holds."""
+TINY_DATASET = Path(__file__).parent / "data" / "tiny"
+
+FIXTURE_MARKERS = {
+    "blender": "blender",
+    "running_server": "server",
+    "running_scorer": "server",
+    "running_postgres": "postgres",
+    "cluster": "dask",
+    "new_cluster": "dask",
+    "chromium_program": "browser",
+}
+"""Markers by the fixtures that start something heavy; a test has them through whichever fixtures it requests."""
+TIERS = {
+    "quick": {*FIXTURE_MARKERS.values(), "slow", "nightly"},
+    "test": {"nightly"},
+    "nightly": set[str](),
+}
+"""Markers that each tier leaves out."""
 
 
-def run_build(*arguments: str | Path, timeout_s: float = 3600) -> subprocess.CompletedProcess[str]:
-    """Run ``rebar-build`` as a user does."""
-    command = [sys.executable, "-m", "dataset_builder", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add ``--tier``."""
+    parser.addoption(
+        "--tier",
+        choices=TIERS,
+        default="test",
+        help="quick: no Blender, server, database, cluster or browser, and nothing slow; "
+        "test: all but long stress tests (default); nightly: everything, with full repetitions",
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark tests by their fixtures and deselect those that the tier leaves out."""
+    left_out = TIERS[config.getoption("--tier")]
+    deselected = []
+    for item in items:
+        fixtures = getattr(item, "fixturenames", ())
+        parameters = item.callspec.params.values() if hasattr(item, "callspec") else ()
+        markers = {FIXTURE_MARKERS[name] for name in fixtures if name in FIXTURE_MARKERS}
+        if any(isinstance(value, str) and value == "postgresql" for value in parameters):
+            markers.add("postgres")
+        for marker in markers:
+            item.add_marker(marker)
+        if left_out & {marker.name for marker in item.iter_markers()}:
+            deselected.append(item)
+    if deselected:
+        config.hook.pytest_deselected(items=deselected)
+        items[:] = [item for item in items if item not in set(deselected)]
+
+
+@pytest.fixture(scope="session")
+def repetitions(request: pytest.FixtureRequest) -> Repetitions:
+    """Choose how often a stress test repeats: ``repetitions(few, many)`` is ``many`` in the nightly tier."""
+    is_nightly = request.config.getoption("--tier") == "nightly"
+    return lambda few, many: many if is_nightly else few
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _private_caches() -> Iterator[None]:
-    """Keep the caches of ``datasets`` and the Hub away from the user's, and the network out."""
+    """Keep the caches of ``datasets`` and the Hub apart from the user's; the Hub is offline."""
     yield
     _CACHES.cleanup()
 
 
 @pytest.fixture(scope="session")
+def blender() -> None:
+    """Mark tests that start Blender; ``make`` has checked its system libraries before."""
+
+
+@pytest.fixture(scope="session")
+def run_build(blender: None) -> RunBuild:
+    """Run ``rebar-build`` to its end."""
+    return building.run_build
+
+
+@pytest.fixture(scope="session")
+def start_build(blender: None) -> StartBuild:
+    """Start ``rebar-build`` in a process group of its own."""
+    return building.start_build
+
+
+@pytest.fixture(scope="session")
+def chromium_program() -> str:
+    """Return the path of the system's Chromium; skip without it or the library of Playwright's driver."""
+    requirements.require("browser")
+    path = requirements.chromium_path()
+    assert path is not None
+    return path
+
+
+@pytest.fixture(scope="session")
 def tiny_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished dataset folder: two configs of the lattice, tiny."""
+    """Return a copy of the rendered dataset in the tree: lattice (nine views) and lattice-orbit (two), 160 x 90.
+
+    ``make sample-data`` renders it anew; the nightly tier compares it with a fresh render.
+    """
     root = tmp_path_factory.mktemp("tiny") / "dataset"
-    for config, views in (("lattice", TINY_VIEWS), ("lattice-orbit", 2)):
-        finished = run_build("--out", root, "--config", config, "--views", str(views), *TINY)
-        assert finished.returncode == 0, finished.stderr
+    shutil.copytree(TINY_DATASET, root)
+    for packed in root.glob("meshes/*.xz"):
+        packed.with_suffix("").write_bytes(lzma.decompress(packed.read_bytes()))
+        packed.unlink()
     return root
 
 
 @pytest.fixture(scope="session")
 def tiny_truth(tiny_root: Path) -> dict[str, np.ndarray]:
-    """The left depth of every view of the tiny ``lattice`` config, by view id."""
+    """Return the left depth of every view of the tiny ``lattice`` config, by view id."""
     rows = load(tiny_root, "lattice", columns=["view_id", "left_depth"])
     return {row["view_id"]: row["left_depth"] for row in rows}
 
 
 @pytest.fixture(scope="session")
 def tiny_masks(tiny_root: Path) -> dict[str, np.ndarray]:
-    """The left steel mask of every view of the tiny ``lattice`` config, by view id."""
+    """Return the left steel mask of every view of the tiny ``lattice`` config, by view id."""
     rows = load(tiny_root, "lattice", columns=["view_id", "left_mask"])
     return {row["view_id"]: row["left_mask"] for row in rows}
 

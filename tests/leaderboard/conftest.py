@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import secrets
-import shutil
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,17 +14,20 @@ import pytest
 from playwright.sync_api import Browser, sync_playwright
 
 from rebar_depth_bench import SubmissionWriter, load
-from tests.leaderboard.postgres import Postgres, running_postgres
-from tests.leaderboard.serving import Server, make_token, running_server
+from tests.leaderboard import dask_cluster, serving
+from tests.leaderboard import postgres as postgres_server
+from tests.leaderboard.dask_cluster import NewCluster
+from tests.leaderboard.postgres import Postgres, RunPostgres
+from tests.leaderboard.serving import RunScorer, RunServer, Server, make_token
 
 HOSTILE = "<script>alert(1)</script>\"'&amp;{{ 7 * 7 }}"
 DESCRIPTION = "first line\n<b>second</b>\u202egnp\x1b[31m"
 
-Write = Callable[..., Path]
+WriteArchive = Callable[..., Path]
 
 
 @dataclass(frozen=True)
-class Shared:
+class SharedServer:
     """A server, a token of it, and the ids of its submissions by what they are."""
 
     server: Server
@@ -41,7 +44,7 @@ class Shared:
 
 
 @pytest.fixture(scope="session")
-def write_archive(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Write:
+def write_archive(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> WriteArchive:
     """Write the true depth times ``scale`` as an archive; a share of ``holes`` has no prediction."""
     columns = ["view_id", "left_depth"]
     truth = {
@@ -68,30 +71,50 @@ def write_archive(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.fixture(scope="session")
-def postgres() -> Iterator[Postgres]:
-    """A PostgreSQL server for all tests."""
+def running_server() -> RunServer:
+    """Run ``rebar-leaderboard serve`` until a block ends."""
+    return serving.running_server
+
+
+@pytest.fixture(scope="session")
+def running_scorer() -> RunScorer:
+    """Run ``rebar-leaderboard score`` until a block ends."""
+    return serving.running_scorer
+
+
+@pytest.fixture(scope="session")
+def running_postgres() -> RunPostgres:
+    """Run a PostgreSQL server of its own until a block ends."""
+    return postgres_server.running_postgres
+
+
+@pytest.fixture(scope="session")
+def new_cluster() -> NewCluster:
+    """Make a dask cluster that ends with a block."""
+    return dask_cluster.new_cluster
+
+
+@pytest.fixture(scope="session")
+def postgres(running_postgres: RunPostgres) -> Iterator[Postgres]:
+    """Run one PostgreSQL server for all tests."""
     with running_postgres() as server:
         yield server
 
 
 @pytest.fixture(scope="session", params=["sqlite", "postgresql"])
 def new_database(request: pytest.FixtureRequest) -> Callable[[], str]:
-    """Make empty databases, given as ``--db`` takes them: what stands on this runs on SQLite and on PostgreSQL."""
+    """Make empty databases, given as ``--db`` takes them: once on SQLite and once on PostgreSQL."""
     if request.param == "sqlite":
         return lambda: ""
     server: Postgres = request.getfixturevalue("postgres")
     return lambda: server.new_database(f"board_{secrets.token_hex(4)}")
 
 
-@pytest.fixture(scope="session")
-def board(
-    tiny_root: Path,
-    write_archive: Write,
-    tmp_path_factory: pytest.TempPathFactory,
-    new_database: Callable[[], str],
-) -> Iterator[Shared]:
-    """A server that scores, with a board of five submissions and error maps of two views."""
-    db, state = new_database(), tmp_path_factory.mktemp("board") / "state"
+@contextmanager
+def filled_board(
+    running_server: RunServer, root: Path, state: Path, write_archive: WriteArchive, db: str
+) -> Iterator[SharedServer]:
+    """Run a server that scores, with five scored submissions and error maps of two views."""
     archives = {
         "good": write_archive("good", 1.01, url="https://example.org/good", description="plain words"),
         "near": write_archive("near", 0.8, uses_intrinsics=True),
@@ -99,48 +122,58 @@ def board(
         "holes": write_archive("holes", 1.0, 0.3),
         "hostile": write_archive(HOSTILE, 1.4, description=DESCRIPTION, url="https://example.org/?a=1&b=<i>"),
     }
-    with running_server(tiny_root, state, db=db, error_maps=2, quota=100, reads="60000/minute") as server:
+    with running_server(root, state, db=db, error_maps=2, quota=100, read_rate_limit="60000/minute") as server:
         token = server.token("Müller & <Söhne>")
-        ids = {name: server.accepted(path, token) for name, path in archives.items()}
+        ids = {name: server.submit_accepted(path, token) for name, path in archives.items()}
         for submission_id in ids.values():
-            assert server.ended(submission_id)["status"] == "scored"
-        yield Shared(server, token, ids)
+            assert server.wait_until_ended(submission_id)["status"] == "scored"
+        yield SharedServer(server, token, ids)
+
+
+@pytest.fixture(scope="session")
+def board(
+    tiny_root: Path,
+    write_archive: WriteArchive,
+    tmp_path_factory: pytest.TempPathFactory,
+    running_server: RunServer,
+) -> Iterator[SharedServer]:
+    """Run the server with five submissions on SQLite."""
+    state = tmp_path_factory.mktemp("board") / "state"
+    with filled_board(running_server, tiny_root, state, write_archive, "") as shared:
+        yield shared
 
 
 @pytest.fixture(scope="session")
 def waiting(
     tiny_root: Path,
-    write_archive: Write,
+    write_archive: WriteArchive,
     tmp_path_factory: pytest.TempPathFactory,
-    new_database: Callable[[], str],
-) -> Iterator[Shared]:
+    running_server: RunServer,
+) -> Iterator[SharedServer]:
     """A server that scores nothing, where owners publish: a failed, a scored and two queued submissions."""
-    db, state = new_database(), tmp_path_factory.mktemp("waiting") / "state"
-    token = make_token(state, "bob", db)
-    common: dict[str, Any] = {"db": db, "public": "owner", "error_maps": 1}
+    state = tmp_path_factory.mktemp("waiting") / "state"
+    token = make_token(state, "bob")
+    common: dict[str, Any] = {"default_visibility": "owner", "error_maps": 1}
     archive = write_archive("slow")
     with running_server(tiny_root, state, score_time=0.01, **common) as server:
-        failed = server.accepted(archive, token)
-        assert server.ended(failed)["status"] == "failed"
+        failed = server.submit_accepted(archive, token)
+        assert server.wait_until_ended(failed)["status"] == "failed"
     with running_server(tiny_root, state, **common) as server:
-        scored = server.accepted(archive, token)
-        assert server.ended(scored)["status"] == "scored"
-    with running_server(tiny_root, state, scorers=0, quota=5, max_upload=2_000_000, **common) as server:
+        scored = server.submit_accepted(archive, token)
+        assert server.wait_until_ended(scored)["status"] == "scored"
+    with running_server(tiny_root, state, workers=0, quota=5, max_upload=2_000_000, **common) as server:
         ids = {"failed": failed, "scored": scored}
-        ids |= {name: server.accepted(archive, token) for name in ("next", "later")}
-        yield Shared(server, token, ids)
+        ids |= {name: server.submit_accepted(archive, token) for name in ("next", "later")}
+        yield SharedServer(server, token, ids)
 
 
 @pytest.fixture(scope="module")
-def chromium() -> Iterator[Browser]:
-    """The system's Chromium, headless. Without one these tests fail: the pages are then not shown to work.
+def chromium(chromium_program: str) -> Iterator[Browser]:
+    """The system's Chromium, headless.
 
     Playwright's event loop runs as long as this lives, so it ends with the module: others have loops of their own.
     """
-    path = shutil.which("chromium") or shutil.which("google-chrome")
-    if path is None:
-        pytest.fail("there is no chromium on the PATH, expected the system's: apt-get install chromium")
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=chromium_program, args=["--no-sandbox"])
         yield browser
         browser.close()

@@ -1,12 +1,12 @@
-"""A dask scheduler and its workers, each a process of its own, started as an operator starts them."""
+"""Local dask scheduler and workers, each started as a separate process with the ``dask`` command line."""
 
 from __future__ import annotations
 
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from tests.leaderboard.watching import wait_until
 
 @dataclass
 class Cluster:
-    """``folder`` holds logs and scratch files; ``port`` is kept by a scheduler that goes and comes again."""
+    """Dask cluster; ``folder`` holds logs and scratch files, and restarted schedulers reuse ``port``."""
 
     folder: Path
     port: int
@@ -31,12 +31,12 @@ class Cluster:
         return self._start("scheduler", "Scheduler at", *options)
 
     def start_worker(self) -> subprocess.Popen[bytes]:
-        """Start a worker and wait until the scheduler knows it; it runs in a folder of its own."""
+        """Start a worker in ``folder`` and wait until it is registered with the scheduler."""
         options = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(self.folder))
         return self._start("worker", "Registered to", self.address, *options)
 
     def logs(self) -> str:
-        """Return all that scheduler and workers wrote."""
+        """Return the concatenated logs of the scheduler and the workers."""
         return "\n".join(path.read_text() for path in sorted(self.folder.glob("*.log")))
 
     def _start(self, role: str, ready: str, *arguments: str) -> subprocess.Popen[bytes]:
@@ -51,11 +51,14 @@ class Cluster:
         return process
 
 
+NewCluster = Callable[[Path], AbstractContextManager[Cluster]]
+
+
 @contextmanager
 def new_cluster(folder: Path) -> Iterator[Cluster]:
-    """Yield a cluster without a scheduler yet; what was started is killed at the end."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    """Yield a cluster without a scheduler; all processes that were started are killed at the end."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
     cluster = Cluster(folder, port)
     try:
         yield cluster

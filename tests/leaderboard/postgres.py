@@ -1,4 +1,4 @@
-"""A real PostgreSQL server, from the binaries that the package ``pgserver`` carries."""
+"""PostgreSQL server for tests, run from the binaries of the package ``pgserver``."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 _UNPRIVILEGED = "nobody"
-"""PostgreSQL refuses to run as root; where the tests do, it runs as this user."""
+"""User of the PostgreSQL process if the tests run as root, which PostgreSQL does not allow."""
 START_S = 60.0
 
 
 @dataclass
 class Postgres:
-    """A server that listens on a socket in its folder; ``url`` is as ``--db`` takes it."""
+    """PostgreSQL server that listens on a socket in ``folder``; ``url`` has the form that ``--db`` accepts."""
 
     binaries: Path
     folder: Path
@@ -32,7 +32,7 @@ class Postgres:
         return f"postgresql://board@/postgres?host={self.folder}"
 
     def start(self) -> None:
-        """Start and wait until it answers."""
+        """Start the server and wait until it accepts connections."""
         command = [
             str(part) for part in (self.binaries / "postgres", "-D", self.folder / "data", "-k", self.folder)
         ]
@@ -40,24 +40,24 @@ class Postgres:
             self.process = subprocess.Popen(
                 [*command, "-h", ""], stdout=log, stderr=log, user=_user(), start_new_session=True
             )
-        limit = time.monotonic() + START_S
+        deadline = time.monotonic() + START_S
         while self._run("pg_isready", "-q", "-h", str(self.folder), check=False) != 0:
             assert self.process.poll() is None, (self.folder / "log").read_text()[-2000:]
-            assert time.monotonic() < limit, (self.folder / "log").read_text()[-2000:]
+            assert time.monotonic() < deadline, (self.folder / "log").read_text()[-2000:]
             time.sleep(0.05)
 
     def kill(self) -> None:
-        """Kill the server and all its backends at once, as a power cut would."""
+        """Kill the server and all its backends without shutdown."""
         assert self.process is not None
         backends = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
         self.process.kill()
         self.process.wait()
-        for backend in backends:  # each leads a session of its own
+        for backend in backends:  # Each backend leads its own session.
             with suppress(ProcessLookupError):
                 os.kill(int(backend), signal.SIGKILL)
 
     def new_database(self, name: str) -> str:
-        """Make an empty database and return its URL."""
+        """Create an empty database and return its URL."""
         self._run("createdb", "-h", str(self.folder), "-U", "board", name)
         return f"postgresql://board@/{name}?host={self.folder}"
 
@@ -66,10 +66,13 @@ class Postgres:
         return subprocess.run(command, check=check, user=_user(), capture_output=True, cwd="/").returncode
 
 
+RunPostgres = Callable[[], AbstractContextManager[Postgres]]
+
+
 @contextmanager
 def running_postgres() -> Iterator[Postgres]:
-    """Yield a server with an empty cluster of its own; stopped and removed at the end."""
-    folder = Path(tempfile.mkdtemp(prefix="pg", dir="/tmp"))  # a socket's path is at most 107 bytes long
+    """Yield a server with a new empty data directory, which is stopped and removed at the end."""
+    folder = Path(tempfile.mkdtemp(prefix="pg", dir="/tmp"))  # Socket paths are limited to 107 bytes.
     try:
         server = Postgres(_binaries(folder), folder)
         if user := _user():
@@ -85,8 +88,8 @@ def running_postgres() -> Iterator[Postgres]:
 
 
 def _binaries(folder: Path) -> Path:
-    """Return where the programs are: a copy that everybody may read where another user has to run them."""
-    spec = importlib.util.find_spec("pgserver")  # not imported: that warns of what it would use
+    """Return the folder of the PostgreSQL programs: a copy readable by ``_UNPRIVILEGED`` if it has to run them."""
+    spec = importlib.util.find_spec("pgserver")  # Importing it would emit warnings.
     assert spec is not None
     assert spec.submodule_search_locations is not None
     package = Path(spec.submodule_search_locations[0])

@@ -1,4 +1,4 @@
-"""What the kernel tells of a process: its memory, its children, its open files."""
+"""Memory, children and open files of processes, read from ``/proc``."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ KIB = 1024
 
 
 def memory_bytes(pid: int, name: str = "RssAnon") -> int:
-    """Return a figure of ``/proc/PID/status``: ``RssAnon`` leaves mapped files out, ``VmHWM`` is the peak."""
-    found = re.search(rf"^{name}:\s+(\d+) kB$", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
-    assert found, f"process {pid} has no {name}"
-    return int(found[1]) * KIB
+    """Return a field of ``/proc/PID/status`` in bytes: ``RssAnon`` without mapped files, ``VmHWM`` the peak."""
+    match = re.search(rf"^{name}:\s+(\d+) kB$", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
+    assert match, f"process {pid} has no {name}"
+    return int(match[1]) * KIB
 
 
 def children(pid: int) -> list[int]:
-    """Return the processes that a process has started and that still run."""
+    """Return the ids of the running child processes of ``pid``."""
     return [
         int(child)
         for task in Path(f"/proc/{pid}/task").iterdir()
@@ -24,23 +24,23 @@ def children(pid: int) -> list[int]:
     ]
 
 
-def runs(pid: int) -> bool:
-    """Return whether a process runs: one that has ended and was not yet asked for its status does not."""
+def is_running(pid: int) -> bool:
+    """Return whether a process is running; zombies are not."""
     try:
         return not re.search(r"^State:\s+[ZX]", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
     except OSError:
         return False
 
 
-def open_files(pid: int) -> int:
-    """Return how many files, sockets and pipes a process holds open."""
+def num_open_files(pid: int) -> int:
+    """Return the number of open files, sockets and pipes of a process."""
     return len(list(Path(f"/proc/{pid}/fd").iterdir()))
 
 
 def descendants(pid: int) -> list[int]:
-    """Return the processes that a process has started, and those that these have started."""
+    """Return the ids of all direct and indirect child processes of ``pid``."""
     try:
         direct = children(pid)
     except OSError:
-        return []  # it has just ended
-    return [*direct, *(below for child in direct for below in descendants(child))]
+        return []  # The process has just ended.
+    return [*direct, *(descendant for child in direct for descendant in descendants(child))]

@@ -1,4 +1,4 @@
-"""HTTP by hand, over a socket: requests that no client would send."""
+"""Raw HTTP over a socket: requests that HTTP clients would not send."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ DISPOSITION = 'Content-Disposition: form-data; name="archive"; filename="a.zip"'
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What came back: the status, None where the connection ended without one, and everything that was said."""
+class RawResponse:
+    """Status, which is None if the connection ended without one, and the full text of a response."""
 
     status: int | None
     text: str
@@ -27,38 +27,38 @@ def connect(url: str, timeout_s: float = 30) -> socket.socket:
     return socket.create_connection((address.hostname or "", address.port or 80), timeout=timeout_s)
 
 
-def head(path: str, headers: Iterable[str], method: str = "POST") -> bytes:
-    """Return a request's head; the server is asked to close after its answer."""
+def request_head(path: str, headers: Iterable[str], method: str = "POST") -> bytes:
+    """Return the request line and headers, with ``Connection: close``."""
     lines = (f"{method} {path} HTTP/1.1", "Host: test", "Connection: close", *headers, "", "")
     return "\r\n".join(lines).encode("latin-1")
 
 
-def exchange(url: str, data: bytes, *, ends: bool = False) -> Answer:
-    """Send ``data``, then the end of all sending if the body ``ends`` early, and return the answer."""
+def exchange(url: str, data: bytes, *, ends: bool = False) -> RawResponse:
+    """Send ``data``, shut down sending if ``ends`` (the body is incomplete), and return the response."""
     with connect(url) as connection:
         try:
             connection.sendall(data)
             if ends:
                 connection.shutdown(socket.SHUT_WR)
         except OSError:
-            pass  # it has answered and closed: what it said is still there to be read
-        return answer_of(connection)
+            pass  # The server has responded and closed; its response can still be read.
+        return read_response(connection)
 
 
-def answer_of(connection: socket.socket) -> Answer:
-    """Read an answer until the server closes."""
-    said = b""
+def read_response(connection: socket.socket) -> RawResponse:
+    """Read a response until the server closes the connection."""
+    data = b""
     try:
-        while part := connection.recv(1 << 16):
-            said += part
+        while chunk := connection.recv(1 << 16):
+            data += chunk
     except ConnectionResetError:
         pass
-    found = re.match(rb"HTTP/1\.1 (\d{3}) ", said.removeprefix(b"HTTP/1.1 100 Continue\r\n\r\n"))
-    return Answer(int(found[1]) if found else None, said.decode("utf-8", "replace"))
+    match = re.match(rb"HTTP/1\.1 (\d{3}) ", data.removeprefix(b"HTTP/1.1 100 Continue\r\n\r\n"))
+    return RawResponse(int(match[1]) if match else None, data.decode("utf-8", "replace"))
 
 
-def part(content: bytes, *headers: str) -> bytes:
-    """Return a part of a multipart body, with the line before it: the archive unless ``headers`` say else."""
+def multipart_part(content: bytes, *headers: str) -> bytes:
+    """Return a multipart part with its boundary line: the field ``archive`` unless ``headers`` are given."""
     lines = (f"--{BOUNDARY}", *(headers or (DISPOSITION,)), "", "")
     return "\r\n".join(lines).encode("latin-1") + content + b"\r\n"
 
@@ -67,5 +67,5 @@ END = f"--{BOUNDARY}--\r\n".encode()
 
 
 def chunked(*pieces: bytes) -> bytes:
-    """Return a body in chunks, with its end."""
+    """Return a body in chunked transfer encoding."""
     return b"".join(b"%x\r\n%s\r\n" % (len(piece), piece) for piece in pieces) + b"0\r\n\r\n"

@@ -1,4 +1,4 @@
-"""A leaderboard as it runs: the real command in a process of its own."""
+"""Leaderboard server and scorer for tests: the real commands in separate processes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import httpx2
+
+from leaderboard.db.engine import Database
+from leaderboard.db.tokens import create_token
+from leaderboard.settings import read_settings
 
 START_S = 120.0
 ENDED = ("scored", "failed")
@@ -23,7 +27,7 @@ ENDED = ("scored", "failed")
 
 @dataclass
 class Server:
-    """A server that runs: its address, its process, its folder, and the lines it has written."""
+    """Running server: URL, process, state folder and the lines it has logged."""
 
     url: str
     process: subprocess.Popen[str]
@@ -32,7 +36,7 @@ class Server:
     log: list[str] = field(default_factory=list)
 
     def token(self, name: str) -> str:
-        """Make a token as an operator does."""
+        """Create a token with the command line."""
         return make_token(self.state, name, self.db)
 
     def submit(self, archive: Path, token: str) -> httpx2.Response:
@@ -45,29 +49,39 @@ class Server:
                 timeout=120,
             )
 
-    def accepted(self, archive: Path, token: str) -> str:
-        """Upload an archive that is sound and return its id."""
-        answer = self.submit(archive, token)
-        assert answer.status_code == 202, answer.text
-        return str(answer.json()["id"])
+    def submit_accepted(self, archive: Path, token: str) -> str:
+        """Upload a valid archive and return the id of the submission."""
+        response = self.submit(archive, token)
+        assert response.status_code == 202, response.text
+        return str(response.json()["id"])
 
-    def ended(self, submission_id: str, timeout_s: float = 120) -> dict[str, Any]:
-        """Wait until a submission is scored or failed, and return it."""
-        limit = time.monotonic() + timeout_s
+    def wait_until_ended(self, submission_id: str, timeout_s: float = 120) -> dict[str, Any]:
+        """Wait until a submission is scored or failed, and return its JSON."""
+        deadline = time.monotonic() + timeout_s
         while True:
-            answer = httpx2.get(f"{self.url}/api/v1/submissions/{submission_id}", timeout=30)
-            assert answer.status_code == 200, "\n".join([answer.text, *self.log[-60:]])
-            found = answer.json()
-            if found["status"] in ENDED:
-                return dict(found)
-            assert time.monotonic() < limit, f"still {found['status']} after {timeout_s} s: {self.log[-5:]}"
+            response = httpx2.get(f"{self.url}/api/v1/submissions/{submission_id}", timeout=30)
+            assert response.status_code == 200, "\n".join([response.text, *self.log[-60:]])
+            submission = response.json()
+            if submission["status"] in ENDED:
+                return dict(submission)
+            assert time.monotonic() < deadline, (
+                f"still {submission['status']} after {timeout_s} s: {self.log[-5:]}"
+            )
             time.sleep(0.2)
 
 
+RunServer = Callable[..., AbstractContextManager[Server]]
+RunScorer = Callable[[Path, Path], AbstractContextManager[list[str]]]
+"""Types of the functions that the fixtures ``running_server`` and ``running_scorer`` return."""
+
+
 def make_token(state: Path, name: str, db: str = "") -> str:
-    """Make a token with ``rebar-leaderboard token``, whether a server runs or not."""
-    command = [*_COMMAND, "token", name, "--state", str(state), *(["--db", db] if db else [])]
-    return subprocess.run(command, capture_output=True, text=True, check=True, env=_environment({})).stdout.strip()
+    """Create a token as ``rebar-leaderboard token`` does, in this process; no server needs to run."""
+    state.mkdir(mode=0o700, parents=True, exist_ok=True)
+    settings = read_settings(None, {"data": "", "state_dir": state, "db": db})
+    with closing(Database(settings.database_url)) as database:
+        database.migrate()
+        return create_token(database, name)
 
 
 @contextmanager
@@ -76,26 +90,28 @@ def running_server(
 ) -> Iterator[Server]:
     """Run ``rebar-leaderboard serve`` on a free port until the block ends; ``settings`` are its options.
 
-    The process leads a group of its own, so that what it started ends with it whatever happens.
+    The process leads its own process group, so that its child processes can be killed with it.
     """
     options = [part for name, value in settings.items() for part in (f"--{name.replace('_', '-')}", str(value))]
-    arguments = ["serve", "--data", str(root), "--state", str(state), "--port", "0", *options]
-    with _started(arguments, environment or {}) as (process, log):
+    arguments = ["serve", "--data", str(root), "--state-dir", str(state), "--port", "0", *options]
+    with _running_command(arguments, environment or {}) as (process, log):
         yield Server(_address(process, log), process, state, str(settings.get("db", "")), log)
 
 
 @contextmanager
 def running_scorer(root: Path, state: Path) -> Iterator[list[str]]:
-    """Run ``rebar-leaderboard score`` until the block ends; yield the lines that it writes."""
-    with _started(["score", "--data", str(root), "--state", str(state), "--lease", "2"], {}) as (_, log):
+    """Run ``rebar-leaderboard score`` until the block ends; yield its log lines."""
+    with _running_command(
+        ["score", "--data", str(root), "--state-dir", str(state), "--lease-seconds", "2"], {}
+    ) as (_, log):
         yield log
 
 
 @contextmanager
-def _started(
+def _running_command(
     arguments: Sequence[str], environment: Mapping[str, str]
 ) -> Iterator[tuple[subprocess.Popen[str], list[str]]]:
-    """Run a command until the block ends; yield its process, and its lines as they come."""
+    """Run a command until the block ends; yield its process and a growing list of its log lines."""
     command = [*_COMMAND, *arguments]
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, start_new_session=True, env=_environment(environment)
@@ -115,21 +131,21 @@ def _started(
 _COMMAND = [sys.executable, "-m", "leaderboard"]
 
 
-def _environment(more: Mapping[str, str]) -> dict[str, str]:
-    return {**os.environ, "PYTHONWARNINGS": "default", **more}
+def _environment(extra: Mapping[str, str]) -> dict[str, str]:
+    return {**os.environ, "PYTHONWARNINGS": "default", **extra}
 
 
 def _collect(process: subprocess.Popen[str], log: list[str]) -> None:
     assert process.stderr is not None
-    log.extend(line.rstrip("\n") for line in process.stderr)  # seen line by line
+    log.extend(line.rstrip("\n") for line in process.stderr)  # Extends line by line.
 
 
 def _address(process: subprocess.Popen[str], log: list[str]) -> str:
-    limit = time.monotonic() + START_S
-    while time.monotonic() < limit:
+    deadline = time.monotonic() + START_S
+    while time.monotonic() < deadline:
         for line in list(log):
-            if found := re.match(r"http://\S+", line):
-                return found[0]
+            if match := re.match(r"http://\S+", line):
+                return match[0]
         assert process.poll() is None, "\n".join(log)
         time.sleep(0.05)
     raise AssertionError(f"no address after {START_S} s: {log}")

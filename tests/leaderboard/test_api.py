@@ -1,4 +1,4 @@
-"""The API of real servers, on SQLite and on PostgreSQL."""
+"""API of real servers, on SQLite and on PostgreSQL."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ import httpx2
 import pytest
 
 from rebar_depth_bench import load
-from tests.leaderboard.conftest import Shared, Write
-from tests.leaderboard.serving import Server, running_server
+from tests.leaderboard.conftest import SharedServer, WriteArchive, filled_board
+from tests.leaderboard.postgres import Postgres
+from tests.leaderboard.serving import RunServer, Server
 
 API = "/api/v1/submissions"
-OWNERS_QUOTA = 6
+QUOTA = 6
 
 
 def call(server: Server, method: str, path: str, token: str | None = None, **content: Any) -> httpx2.Response:
@@ -30,34 +31,53 @@ def call(server: Server, method: str, path: str, token: str | None = None, **con
 
 
 def rows(server: Server, token: str | None = None, config: str = "lattice") -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = call(server, "GET", f"/api/v1/leaderboard?config={config}", token).json()["rows"]
-    return found
+    entries: list[dict[str, Any]] = call(server, "GET", f"/api/v1/leaderboard?config={config}", token).json()[
+        "rows"
+    ]
+    return entries
 
 
 @pytest.fixture(scope="session")
-def owners(
-    tiny_root: Path, tmp_path_factory: pytest.TempPathFactory, new_database: Callable[[], str]
+def board(
+    tiny_root: Path,
+    write_archive: WriteArchive,
+    tmp_path_factory: pytest.TempPathFactory,
+    postgres: Postgres,
+    running_server: RunServer,
+) -> Iterator[SharedServer]:
+    """Return a server with five submissions on PostgreSQL; the tests of pages and client use one on SQLite."""
+    state = tmp_path_factory.mktemp("board") / "state"
+    with filled_board(running_server, tiny_root, state, write_archive, postgres.new_database("api")) as shared:
+        yield shared
+
+
+@pytest.fixture(scope="session")
+def private_server(
+    tiny_root: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    new_database: Callable[[], str],
+    running_server: RunServer,
 ) -> Iterator[Server]:
-    """A server that scores, keeps submissions to their owners, and takes six a day of a token."""
+    """Return a server whose submissions are private by default, with a quota of six per day and token."""
     state = tmp_path_factory.mktemp("owners") / "state"
     settings: dict[str, Any] = {
         "db": new_database(),
-        "public": "owner",
-        "quota": OWNERS_QUOTA,
-        "writes": "1000/minute",
+        "default_visibility": "owner",
+        "quota": QUOTA,
+        "write_rate_limit": "1000/minute",
     }
     with running_server(tiny_root, state, **settings) as server:
         yield server
 
 
 @pytest.fixture(scope="session")
-def small(write_archive: Write) -> Path:
+def small_archive(write_archive: WriteArchive) -> Path:
     return write_archive("small", configs=("lattice-orbit",))
 
 
 @pytest.fixture
-def broken(tiny_root: Path, tmp_path: Path) -> Path:
-    """An archive of one view, which is no array; the config's others are missing."""
+def invalid_archive(tiny_root: Path, tmp_path: Path) -> Path:
+    """Return an archive with a single view that is not an array; the other views are missing."""
     with zipfile.ZipFile(tmp_path / "broken.zip", "w") as archive:
         archive.writestr("submission.json", json.dumps({"method": "x"}))
         archive.writestr(f"{view_ids(tiny_root)[0]}.npy", b"no array")
@@ -69,35 +89,44 @@ def view_ids(root: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", ["good", "far", "holes", "hostile"])
-def test_the_result_is_the_command_lines_byte_for_byte(
-    board: Shared, tiny_root: Path, tmp_path: Path, kind: str
+def test_result_json_equals_command_line_output(
+    board: SharedServer, tiny_root: Path, tmp_path: Path, kind: str
 ) -> None:
-    kept = board.server.state / "archives" / f"{board.ids[kind]}.zip"
-    command = [sys.executable, "-m", "rebar_depth_bench", "score", str(kept), "--data", str(tiny_root), "--json"]
+    stored_archive = board.server.state / "archives" / f"{board.ids[kind]}.zip"
+    command = [
+        sys.executable,
+        "-m",
+        "rebar_depth_bench",
+        "score",
+        str(stored_archive),
+        "--data",
+        str(tiny_root),
+        "--json",
+    ]
     subprocess.run([*command, str(tmp_path / "own.json")], check=True, capture_output=True)
-    own = (tmp_path / "own.json").read_bytes()
-    assert call(board.server, "GET", f"{API}/{board.ids[kind]}/result.json").content == own
-    assert call(board.server, "GET", f"{API}/{board.ids[kind]}").json()["result"] == json.loads(own)
+    expected = (tmp_path / "own.json").read_bytes()
+    assert call(board.server, "GET", f"{API}/{board.ids[kind]}/result.json").content == expected
+    assert call(board.server, "GET", f"{API}/{board.ids[kind]}").json()["result"] == json.loads(expected)
 
 
-def test_rows_are_ranked_by_native_abs_rel_and_incomplete_ones_are_not(board: Shared) -> None:
-    found = rows(board.server)
-    ranked = [row for row in found if row["rank"] is not None]
+def test_rows_are_ranked_by_native_abs_rel_if_complete(board: SharedServer) -> None:
+    entries = rows(board.server)
+    ranked = [row for row in entries if row["rank"] is not None]
     assert [row["rank"] for row in ranked] == list(range(1, len(ranked) + 1))
-    assert found[: len(ranked)] == ranked
+    assert entries[: len(ranked)] == ranked
     errors = [row["table"]["native"]["abs_rel"] for row in ranked]
     assert errors == sorted(errors)
     assert board.ids["good"] == ranked[0]["id"]
-    assert board.ids["holes"] in {row["id"] for row in found if row["rank"] is None}
+    assert board.ids["holes"] in {row["id"] for row in entries if row["rank"] is None}
     assert board.ids["far"] not in {row["id"] for row in rows(board.server, config="lattice-orbit")}
     result = call(board.server, "GET", f"{API}/{ranked[0]['id']}").json()["result"]
     assert ranked[0]["table"] == result["tables"]["lattice"]
 
 
-def test_the_csv_has_the_same_rows_and_no_formula(board: Shared) -> None:
-    answer = call(board.server, "GET", "/api/v1/leaderboard.csv?config=lattice")
-    assert answer.headers["content-type"] == "text/csv; charset=utf-8"
-    lines = list(csv.DictReader(io.StringIO(answer.text)))
+def test_csv_has_same_rows_as_json(board: SharedServer) -> None:
+    response = call(board.server, "GET", "/api/v1/leaderboard.csv?config=lattice")
+    assert response.headers["content-type"] == "text/csv; charset=utf-8"
+    lines = list(csv.DictReader(io.StringIO(response.text)))
     for line, row in zip(lines, rows(board.server), strict=True):
         assert line["id"] == row["id"]
         assert line["rank"] == ("" if row["rank"] is None else str(row["rank"]))
@@ -105,111 +134,129 @@ def test_the_csv_has_the_same_rows_and_no_formula(board: Shared) -> None:
         assert float(line["within_10mm"]) == row["table"]["within_mm"]["10"]
 
 
-def test_an_accepted_upload_says_where_it_is(owners: Server, small: Path) -> None:
-    token = owners.token("where")
-    answer = owners.submit(small, token)
-    assert answer.status_code == 202
-    accepted = answer.json()
+def test_accepted_upload_returns_url_of_submission(private_server: Server, small_archive: Path) -> None:
+    token = private_server.token("where")
+    response = private_server.submit(small_archive, token)
+    assert response.status_code == 202
+    accepted = response.json()
     assert accepted["status"] == "queued"
-    assert accepted["url"] == f"{owners.url}/submissions/{accepted['id']}"
-    assert answer.headers["location"] == f"{API}/{accepted['id']}"
-    ended = owners.ended(accepted["id"])
-    assert (ended["status"], ended["method"], ended["reason"]) == ("scored", "small", None)
-    assert ended["result"]["submission"]["sha256"] == ended["archive_sha256"]
+    assert accepted["url"] == f"{private_server.url}/submissions/{accepted['id']}"
+    assert response.headers["location"] == f"{API}/{accepted['id']}"
+    submission = private_server.wait_until_ended(accepted["id"])
+    assert (submission["status"], submission["method"], submission["reason"]) == ("scored", "small", None)
+    assert submission["result"]["submission"]["sha256"] == submission["archive_sha256"]
     assert httpx2.get(accepted["url"]).status_code == 200
 
 
 @pytest.mark.parametrize("header", [None, "Bearer rdb_wrong", "Basic YTpi", "Bearer", "Bearer \udcff"])
-def test_without_a_token_that_is_known_nothing_is_taken(owners: Server, small: Path, header: str | None) -> None:
-    headers = {} if header is None else {"Authorization": header.encode("utf-8", "surrogateescape")}
-    with small.open("rb") as stream:
-        answer = httpx2.post(f"{owners.url}{API}", files={"archive": stream}, headers=headers, timeout=60)
-    assert answer.status_code == 401
-    assert answer.headers["www-authenticate"] == "Bearer"
-    assert "token" in answer.json()["detail"]
-
-
-def test_a_refused_archive_says_every_problem_and_costs_nothing(
-    owners: Server, tiny_root: Path, small: Path, broken: Path
+def test_upload_without_known_token_is_401(
+    private_server: Server, small_archive: Path, header: str | None
 ) -> None:
-    token = owners.token("clumsy")
-    for _ in range(OWNERS_QUOTA + 1):
-        answer = owners.submit(broken, token)
-        assert answer.status_code == 422
-    problems = answer.json()["problems"]
+    headers = {} if header is None else {"Authorization": header.encode("utf-8", "surrogateescape")}
+    with small_archive.open("rb") as stream:
+        response = httpx2.post(
+            f"{private_server.url}{API}", files={"archive": stream}, headers=headers, timeout=60
+        )
+    assert response.status_code == 401
+    assert response.headers["www-authenticate"] == "Bearer"
+    assert "token" in response.json()["detail"]
+
+
+def test_rejected_archive_lists_problems_and_keeps_quota(
+    private_server: Server, tiny_root: Path, small_archive: Path, invalid_archive: Path
+) -> None:
+    token = private_server.token("clumsy")
+    for _ in range(QUOTA + 1):
+        response = private_server.submit(invalid_archive, token)
+        assert response.status_code == 422
+    problems = response.json()["problems"]
     for view_id in view_ids(tiny_root):
         assert any(view_id in problem for problem in problems), problems
-    assert not any(str(owners.state) in problem for problem in problems)
-    assert owners.submit(small, token).status_code == 202
+    assert not any(str(private_server.state) in problem for problem in problems)
+    assert private_server.submit(small_archive, token).status_code == 202
 
 
-def test_the_quota_holds_for_uploads_at_once_and_deleting_gives_nothing_back(owners: Server, small: Path) -> None:
-    token, other = owners.token("eager"), owners.token("patient")
+def test_quota_holds_for_concurrent_uploads_and_deletions(private_server: Server, small_archive: Path) -> None:
+    token, other_token = private_server.token("eager"), private_server.token("patient")
     with ThreadPoolExecutor(10) as pool:
-        answers = list(pool.map(lambda _: owners.submit(small, token), range(10)))
-    accepted = [answer.json()["id"] for answer in answers if answer.status_code == 202]
-    assert sorted(answer.status_code for answer in answers) == [202] * OWNERS_QUOTA + [429] * 4
-    assert call(owners, "DELETE", f"{API}/{accepted[0]}", token).status_code == 204
-    refused = owners.submit(small, token)
-    assert refused.status_code == 429
-    assert refused.json()["detail"].startswith(f"this token has made its {OWNERS_QUOTA} submissions of today")
-    assert owners.submit(small, other).status_code == 202
-    assert {owners.ended(one)["status"] for one in accepted[1:]} == {"scored"}
-    kept = {path.stem for path in (owners.state / "archives").glob("*.zip")}
-    assert kept >= set(accepted[1:])
-    assert accepted[0] not in kept
+        responses = list(pool.map(lambda _: private_server.submit(small_archive, token), range(10)))
+    accepted = [response.json()["id"] for response in responses if response.status_code == 202]
+    assert sorted(response.status_code for response in responses) == [202] * QUOTA + [429] * 4
+    assert call(private_server, "DELETE", f"{API}/{accepted[0]}", token).status_code == 204
+    rejected = private_server.submit(small_archive, token)
+    assert rejected.status_code == 429
+    assert rejected.json()["detail"].startswith(f"this token has made its {QUOTA} submissions of today")
+    assert private_server.submit(small_archive, other_token).status_code == 202
+    assert {private_server.wait_until_ended(submission_id)["status"] for submission_id in accepted[1:]} == {
+        "scored"
+    }
+    stored_ids = {path.stem for path in (private_server.state / "archives").glob("*.zip")}
+    assert stored_ids >= set(accepted[1:])
+    assert accepted[0] not in stored_ids
 
 
-def test_a_submission_is_its_owners_until_published(owners: Server, write_archive: Write) -> None:
-    mine, other = owners.token("shy"), owners.token("curious")
-    one = owners.accepted(write_archive("hidden", 1.1), mine)
-    assert owners.ended(one)["public"] is False
-    assert one not in {row["id"] for row in rows(owners)}
-    assert one not in {row["id"] for row in rows(owners, other)}
-    [own] = [row for row in rows(owners, mine) if row["id"] == one]
-    assert own["rank"] is None
-    assert one not in call(owners, "GET", "/api/v1/leaderboard.csv?config=lattice").text
-    assert call(owners, "PATCH", f"{API}/{one}", other, json={"public": True}).status_code == 403
-    assert call(owners, "PATCH", f"{API}/{one}", None, json={"public": True}).status_code == 401
-    assert call(owners, "PATCH", f"{API}/{one}", mine, json={"public": "perhaps"}).status_code == 422
-    assert call(owners, "PATCH", f"{API}/{one}", mine, json={"public": True}).json()["public"] is True
-    [shown] = [row for row in rows(owners) if row["id"] == one]
-    assert shown["rank"] is not None
-    assert call(owners, "PATCH", f"{API}/{one}", mine, json={"public": False}).json()["public"] is False
-    assert one not in {row["id"] for row in rows(owners)}
+def test_private_submission_is_visible_to_owner_only(private_server: Server, write_archive: WriteArchive) -> None:
+    token, other_token = private_server.token("shy"), private_server.token("curious")
+    submission_id = private_server.submit_accepted(write_archive("hidden", 1.1), token)
+    assert private_server.wait_until_ended(submission_id)["public"] is False
+    assert submission_id not in {row["id"] for row in rows(private_server)}
+    assert submission_id not in {row["id"] for row in rows(private_server, other_token)}
+    [own_row] = [row for row in rows(private_server, token) if row["id"] == submission_id]
+    assert own_row["rank"] is None
+    assert submission_id not in call(private_server, "GET", "/api/v1/leaderboard.csv?config=lattice").text
+    assert (
+        call(private_server, "PATCH", f"{API}/{submission_id}", other_token, json={"public": True}).status_code
+        == 403
+    )
+    assert call(private_server, "PATCH", f"{API}/{submission_id}", None, json={"public": True}).status_code == 401
+    assert (
+        call(private_server, "PATCH", f"{API}/{submission_id}", token, json={"public": "perhaps"}).status_code
+        == 422
+    )
+    assert (
+        call(private_server, "PATCH", f"{API}/{submission_id}", token, json={"public": True}).json()["public"]
+        is True
+    )
+    [public_row] = [row for row in rows(private_server) if row["id"] == submission_id]
+    assert public_row["rank"] is not None
+    assert (
+        call(private_server, "PATCH", f"{API}/{submission_id}", token, json={"public": False}).json()["public"]
+        is False
+    )
+    assert submission_id not in {row["id"] for row in rows(private_server)}
 
 
-def test_what_is_public_by_setting_stays_public(board: Shared) -> None:
+def test_always_public_submission_cannot_be_hidden(board: SharedServer) -> None:
     path = f"{API}/{board.ids['good']}"
-    refused = call(board.server, "PATCH", path, board.token, json={"public": False})
-    assert (refused.status_code, refused.json()["detail"]) == (403, "every submission is public here")
+    response = call(board.server, "PATCH", path, board.token, json={"public": False})
+    assert (response.status_code, response.json()["detail"]) == (403, "every submission is public here")
     assert call(board.server, "GET", path).json()["public"] is True
 
 
-def test_only_the_owner_deletes_and_then_it_is_gone(owners: Server, write_archive: Write) -> None:
-    mine, other = owners.token("tidy"), owners.token("nosy")
-    one = owners.accepted(write_archive("short-lived"), mine)
-    owners.ended(one)
-    call(owners, "PATCH", f"{API}/{one}", mine, json={"public": True})
-    assert call(owners, "DELETE", f"{API}/{one}", other).status_code == 403
-    assert call(owners, "DELETE", f"{API}/{one}").status_code == 401
-    assert one in {row["id"] for row in rows(owners)}
-    assert call(owners, "DELETE", f"{API}/{one}", mine).status_code == 204
-    for path in (f"{API}/{one}", f"{API}/{one}/result.json", f"/submissions/{one}"):
-        assert call(owners, "GET", path).status_code == 404, path
-    assert call(owners, "DELETE", f"{API}/{one}", mine).status_code == 404
-    assert one not in {row["id"] for row in rows(owners, mine)}
-    assert not (owners.state / "archives" / f"{one}.zip").exists()
+def test_only_owner_can_delete_submission(private_server: Server, write_archive: WriteArchive) -> None:
+    token, other_token = private_server.token("tidy"), private_server.token("nosy")
+    submission_id = private_server.submit_accepted(write_archive("short-lived"), token)
+    private_server.wait_until_ended(submission_id)
+    call(private_server, "PATCH", f"{API}/{submission_id}", token, json={"public": True})
+    assert call(private_server, "DELETE", f"{API}/{submission_id}", other_token).status_code == 403
+    assert call(private_server, "DELETE", f"{API}/{submission_id}").status_code == 401
+    assert submission_id in {row["id"] for row in rows(private_server)}
+    assert call(private_server, "DELETE", f"{API}/{submission_id}", token).status_code == 204
+    for path in (f"{API}/{submission_id}", f"{API}/{submission_id}/result.json", f"/submissions/{submission_id}"):
+        assert call(private_server, "GET", path).status_code == 404, path
+    assert call(private_server, "DELETE", f"{API}/{submission_id}", token).status_code == 404
+    assert submission_id not in {row["id"] for row in rows(private_server, token)}
+    assert not (private_server.state / "archives" / f"{submission_id}.zip").exists()
 
 
-def test_without_the_setting_no_error_map_is_made(owners: Server, small: Path) -> None:
-    one = owners.accepted(small, owners.token("secret truth"))
-    owners.ended(one)
-    views = call(owners, "GET", f"{API}/{one}/result.json").json()["views"]
+def test_error_maps_are_off_by_default(private_server: Server, small_archive: Path) -> None:
+    submission_id = private_server.submit_accepted(small_archive, private_server.token("secret truth"))
+    private_server.wait_until_ended(submission_id)
+    views = call(private_server, "GET", f"{API}/{submission_id}/result.json").json()["views"]
     assert views
     for view in views:
-        path = f"/submissions/{one}/error-maps/{view['view_id']}.webp"
-        assert call(owners, "GET", path).status_code == 404
+        path = f"/submissions/{submission_id}/error-maps/{view['view_id']}.webp"
+        assert call(private_server, "GET", path).status_code == 404
 
 
 @pytest.mark.parametrize(
@@ -222,19 +269,19 @@ def test_without_the_setting_no_error_map_is_made(owners: Server, small: Path) -
         ("/api/v2/leaderboard", "Not Found"),
     ],
 )
-def test_what_is_not_there_is_said(board: Shared, path: str, words: str) -> None:
-    answer = call(board.server, "GET", path)
-    assert answer.status_code == 404
-    assert words in answer.json()["detail"]
+def test_unknown_config_or_submission_is_404(board: SharedServer, path: str, words: str) -> None:
+    response = call(board.server, "GET", path)
+    assert response.status_code == 404
+    assert words in response.json()["detail"]
 
 
-def test_a_config_must_be_named(board: Shared) -> None:
-    answer = call(board.server, "GET", "/api/v1/leaderboard")
-    assert answer.status_code == 422
-    assert answer.json()["problems"] == ["query.config: Field required"]
+def test_leaderboard_without_config_is_422(board: SharedServer) -> None:
+    response = call(board.server, "GET", "/api/v1/leaderboard")
+    assert response.status_code == 422
+    assert response.json()["problems"] == ["query.config: Field required"]
 
 
-def test_no_answer_is_without_security_headers(board: Shared) -> None:
+def test_all_responses_have_security_headers(board: SharedServer) -> None:
     for method, path in (("GET", "/"), ("GET", "/healthz"), ("GET", "/nope"), ("POST", API), ("PUT", "/")):
         headers = call(board.server, method, path).headers
         assert "default-src 'none'" in headers["content-security-policy"], path
@@ -245,39 +292,43 @@ def test_no_answer_is_without_security_headers(board: Shared) -> None:
 
 
 @pytest.mark.parametrize("path", ["/", "/healthz"])
-def test_a_monitor_may_ask_for_the_head_alone(board: Shared, path: str) -> None:
-    answer = call(board.server, "HEAD", path)
-    assert (answer.status_code, answer.content) == (200, b"")
+def test_head_requests_return_empty_body(board: SharedServer, path: str) -> None:
+    response = call(board.server, "HEAD", path)
+    assert (response.status_code, response.content) == (200, b"")
 
 
-def test_an_address_that_asks_too_often_is_held_back(tiny_root: Path, tmp_path: Path) -> None:
-    settings: dict[str, Any] = {"reads": "5/hour", "writes": "2/hour", "scorers": 0}
+def test_requests_over_rate_limit_are_429(tiny_root: Path, tmp_path: Path, running_server: RunServer) -> None:
+    settings: dict[str, Any] = {"read_rate_limit": "5/hour", "write_rate_limit": "2/hour", "workers": 0}
     with running_server(tiny_root, tmp_path / "state", **settings) as server:
         reads = [call(server, "GET", "/openapi.json").status_code for _ in range(7)]
         assert reads == [200] * 5 + [429] * 2
         writes = [call(server, "POST", API).status_code for _ in range(4)]
         assert writes == [401] * 2 + [429] * 2
         assert call(server, "GET", "/healthz").status_code == 200
-        held = httpx2.get(server.url, headers={"Accept": "text/html"})
-        assert (held.status_code, held.headers["retry-after"]) == (429, "60")
-        assert "too many requests from this address" in held.text
-        assert "<h1" in held.text
+        limited = httpx2.get(server.url, headers={"Accept": "text/html"})
+        assert (limited.status_code, limited.headers["retry-after"]) == (429, "60")
+        assert "too many requests from this address" in limited.text
+        assert "<h1" in limited.text
 
 
-def test_a_damaged_archive_fails_alone(
-    tiny_root: Path, tmp_path: Path, small: Path, new_database: Callable[[], str]
+def test_archive_damaged_in_storage_fails_alone(
+    tiny_root: Path,
+    tmp_path: Path,
+    small_archive: Path,
+    new_database: Callable[[], str],
+    running_server: RunServer,
 ) -> None:
     state, db = tmp_path / "state", new_database()
-    with running_server(tiny_root, state, db=db, scorers=0) as server:
+    with running_server(tiny_root, state, db=db, workers=0) as server:
         token = server.token("alice")
-        ids = [server.accepted(small, token) for _ in range(3)]
-    kept = state / "archives" / f"{ids[1]}.zip"
-    content = bytearray(kept.read_bytes())
+        ids = [server.submit_accepted(small_archive, token) for _ in range(3)]
+    stored_archive = state / "archives" / f"{ids[1]}.zip"
+    content = bytearray(stored_archive.read_bytes())
     content[2000:2100] = bytes(100)
-    kept.write_bytes(content)
+    stored_archive.write_bytes(content)
     with running_server(tiny_root, state, db=db) as server:
-        ended = [server.ended(one) for one in ids]
-        assert [one["status"] for one in ended] == ["scored", "failed", "scored"]
-        assert "lattice-orbit/" in ended[1]["reason"]
-        assert str(state) not in ended[1]["reason"]
+        submissions = [server.wait_until_ended(submission_id) for submission_id in ids]
+        assert [submission["status"] for submission in submissions] == ["scored", "failed", "scored"]
+        assert "lattice-orbit/" in submissions[1]["reason"]
+        assert str(state) not in submissions[1]["reason"]
         assert {row["id"] for row in rows(server, config="lattice-orbit")} == {ids[0], ids[2]}

@@ -1,4 +1,4 @@
-"""The pages in a real Chromium: upload, watch, sort, read, by mouse and by keyboard; axe has nothing serious."""
+"""Pages in a real Chromium: upload, sorting and reading by mouse and keyboard, and accessibility (axe)."""
 
 from __future__ import annotations
 
@@ -11,20 +11,22 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect
 
-from tests.leaderboard.conftest import Shared, Write
+from tests.leaderboard.conftest import SharedServer, WriteArchive
 
 SCORED_MS = 60_000
 WIDTHS = {"desk": 1280, "phone": 360}
 
 
 @contextmanager
-def opened(chromium: Browser, *, scheme: str = "light", width: int = 1280, script: bool = True) -> Iterator[Page]:
-    """Yield a fresh tab; at its end nothing has been complained of on its console."""
-    complaints: list[str] = []
+def new_page(
+    chromium: Browser, *, scheme: str = "light", width: int = 1280, script: bool = True
+) -> Iterator[Page]:
+    """Yield a new tab; fail at the end if its console has errors or warnings."""
+    messages: list[str] = []
 
-    def hear(message: ConsoleMessage) -> None:
+    def on_console_message(message: ConsoleMessage) -> None:
         if message.type in ("error", "warning") and "status of 4" not in message.text:
-            complaints.append(message.text)
+            messages.append(message.text)
 
     context = chromium.new_context(
         color_scheme="dark" if scheme == "dark" else "light",
@@ -32,24 +34,24 @@ def opened(chromium: Browser, *, scheme: str = "light", width: int = 1280, scrip
         java_script_enabled=script,
     )
     page = context.new_page()
-    page.on("console", hear)
-    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("console", on_console_message)
+    page.on("pageerror", lambda error: messages.append(str(error)))
     try:
         yield page
     finally:
         context.close()
-    assert complaints == []
+    assert messages == []
 
 
 def methods(page: Page) -> list[str]:
     return page.locator("table.board").first.locator("tbody >> nth=0").locator("th a bdi").all_text_contents()
 
 
-def test_upload_watch_it_score_and_find_it_on_the_board(
-    chromium: Browser, board: Shared, write_archive: Write
+def test_upload_is_scored_and_shown_on_leaderboard(
+    chromium: Browser, board: SharedServer, write_archive: WriteArchive
 ) -> None:
     archive = write_archive("from the browser", 1.2)
-    with opened(chromium) as page:
+    with new_page(chromium) as page:
         page.goto(board.url)
         page.get_by_role("link", name="How to submit").click()
         page.get_by_label("Token", exact=True).fill(board.token)
@@ -65,12 +67,12 @@ def test_upload_watch_it_score_and_find_it_on_the_board(
 
 
 @pytest.mark.parametrize("script", [True, False])
-def test_a_refused_upload_says_every_problem(
-    chromium: Browser, board: Shared, tmp_path: Path, script: bool
+def test_rejected_upload_shows_problems(
+    chromium: Browser, board: SharedServer, tmp_path: Path, script: bool
 ) -> None:
     broken = tmp_path / "broken.zip"
     broken.write_bytes(b"PK no zip at all")
-    with opened(chromium, script=script) as page:
+    with new_page(chromium, script=script) as page:
         page.goto(f"{board.url}/how-to-submit")
         for token, words in (("rdb_wrong", "the token is unknown"), (board.token, "the archive is refused")):
             page.get_by_label("Token", exact=True).fill(token)
@@ -80,15 +82,15 @@ def test_a_refused_upload_says_every_problem(
         assert page.get_by_label("Token", exact=True).input_value() == (board.token if script else "")
 
 
-def test_a_click_sorts_and_the_third_brings_the_ranks_back(chromium: Browser, board: Shared) -> None:
-    with opened(chromium) as page:
+def test_column_header_cycles_sort_orders(chromium: Browser, board: SharedServer) -> None:
+    with new_page(chromium) as page:
         page.goto(f"{board.url}/?config=lattice")
         ranked = methods(page)
-        head = page.get_by_role("columnheader", name="RMSE").first
+        header = page.get_by_role("columnheader", name="RMSE").first
         orders = []
         for direction in ("ascending", "descending", "none"):
-            head.get_by_role("button").click()
-            expect(head).to_have_attribute("aria-sort", direction)
+            header.get_by_role("button").click()
+            expect(header).to_have_attribute("aria-sort", direction)
             orders.append(methods(page))
         values = (
             page.locator("tbody >> nth=0")
@@ -103,8 +105,8 @@ def test_a_click_sorts_and_the_third_brings_the_ranks_back(chromium: Browser, bo
         expect(page.get_by_role("columnheader", name="RMSE").first).to_have_attribute("aria-sort", "descending")
 
 
-def test_the_keyboard_alone_is_enough(chromium: Browser, board: Shared) -> None:
-    with opened(chromium) as page:
+def test_pages_are_operable_by_keyboard(chromium: Browser, board: SharedServer) -> None:
+    with new_page(chromium) as page:
         page.goto(board.url)
         page.keyboard.press("Tab")
         skip = page.get_by_role("link", name="Skip to the content")
@@ -112,31 +114,31 @@ def test_the_keyboard_alone_is_enough(chromium: Browser, board: Shared) -> None:
         assert (skip.bounding_box() or {"y": -1.0})["y"] >= 0
         page.keyboard.press("Enter")
         expect(page.locator("main")).to_be_focused()
-        reached = []
+        focused_texts = []
         for _ in range(60):
             page.keyboard.press("Tab")
             assert page.evaluate(
                 "() => { const s = getComputedStyle(document.activeElement);"
                 " return s.outlineStyle !== 'none' && parseFloat(s.outlineWidth) > 0 }"
             ), page.evaluate("document.activeElement.outerHTML.slice(0, 200)")
-            reached.append(str(page.evaluate("document.activeElement.textContent.trim().slice(0, 12)")))
-            if reached[-1] == "good":
+            focused_texts.append(str(page.evaluate("document.activeElement.textContent.trim().slice(0, 12)")))
+            if focused_texts[-1] == "good":
                 break
-        assert {"lattice", "all configs"} <= set(reached)
-        assert any(text.startswith("AbsRel") for text in reached)
+        assert {"lattice", "all configs"} <= set(focused_texts)
+        assert any(text.startswith("AbsRel") for text in focused_texts)
         page.keyboard.press("Enter")
         page.wait_for_url(re.compile("/submissions/"))
         expect(page.get_by_role("heading", level=1)).to_have_text("good")
 
 
-def test_a_waiting_page_follows_the_queue(chromium: Browser, waiting: Shared) -> None:
-    with opened(chromium) as page, page.expect_response(re.compile("/api/v1/submissions/")) as answer:
+def test_queued_page_updates_queue_position(chromium: Browser, waiting: SharedServer) -> None:
+    with new_page(chromium) as page, page.expect_response(re.compile("/api/v1/submissions/")) as response_info:
         page.goto(waiting.page("later"))
         expect(page.locator("#place")).to_have_text("2")
-        assert answer.value.json()["status"] == "queued"
+        assert response_info.value.json()["status"] == "queued"
 
 
-def addresses(board: Shared, waiting: Shared) -> dict[str, str]:
+def page_urls(board: SharedServer, waiting: SharedServer) -> dict[str, str]:
     return {
         "board": f"{board.url}/",
         "one config": f"{board.url}/?config=lattice&sort=rmse",
@@ -151,13 +153,17 @@ def addresses(board: Shared, waiting: Shared) -> dict[str, str]:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("device", sorted(WIDTHS))
-def test_nothing_serious_for_axe_and_nothing_too_wide(
-    chromium: Browser, board: Shared, waiting: Shared, scheme: str, device: str
+def test_pages_pass_axe_and_fit_width(
+    chromium: Browser, board: SharedServer, waiting: SharedServer, scheme: str, device: str
 ) -> None:
-    with opened(chromium, scheme=scheme, width=WIDTHS[device]) as page:
-        for name, address in addresses(board, waiting).items():
+    with new_page(chromium, scheme=scheme, width=WIDTHS[device]) as page:
+        for name, address in page_urls(board, waiting).items():
             page.goto(address)
-            found = Axe().run(page).response["violations"]
-            serious = [(one["id"], one["nodes"][0]["html"][:200]) for one in found if one["impact"] != "minor"]
+            violations = Axe().run(page).response["violations"]
+            serious = [
+                (violation["id"], violation["nodes"][0]["html"][:200])
+                for violation in violations
+                if violation["impact"] != "minor"
+            ]
             assert serious == [], name
             assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), name

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from rebar_depth_bench.errors import InputError, SubmissionError
-from rebar_depth_bench.leaderboard_client import Leaderboard, ServiceError
-from tests.leaderboard.conftest import Shared, Write
-from tests.leaderboard.serving import Server, running_server
+from rebar_depth_bench.leaderboard_client import LeaderboardClient, ServiceError
+from tests.leaderboard.conftest import SharedServer, WriteArchive
+from tests.leaderboard.serving import RunServer, Server
 
 TOKEN = "REBAR_LEADERBOARD_TOKEN"
 
@@ -35,114 +35,126 @@ def run(*arguments: str | Path, token: str | None = None) -> subprocess.Complete
 
 
 @pytest.fixture(scope="module")
-def strict(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A server that takes one small archive a day of a token, and scores none in time."""
+def strict_server(
+    tiny_root: Path, tmp_path_factory: pytest.TempPathFactory, running_server: RunServer
+) -> Iterator[Server]:
+    """Return a server with a quota of one, a small size limit and a scoring time limit that always expires."""
     settings: dict[str, Any] = {"quota": 1, "max_upload": 2_000_000, "score_time": 0.01}
     with running_server(tiny_root, tmp_path_factory.mktemp("strict") / "state", **settings) as server:
         yield server
 
 
-def test_submit_prints_the_table_that_score_prints(
-    board: Shared, tiny_root: Path, write_archive: Write, tmp_path: Path
+def test_submit_prints_same_table_as_score(
+    board: SharedServer, tiny_root: Path, write_archive: WriteArchive, tmp_path: Path
 ) -> None:
     archive = write_archive("by command", 1.3)
-    sent = run("submit", archive, "--url", f"{board.url}/", "--json", tmp_path / "sent.json", token=board.token)
-    assert sent.returncode == 0, sent.stderr
-    own = run("score", archive, "--data", tiny_root, "--json", tmp_path / "own.json")
-    assert sent.stdout == own.stdout
-    assert "by command" in sent.stdout
+    submitted = run(
+        "submit", archive, "--url", f"{board.url}/", "--json", tmp_path / "sent.json", token=board.token
+    )
+    assert submitted.returncode == 0, submitted.stderr
+    scored = run("score", archive, "--data", tiny_root, "--json", tmp_path / "own.json")
+    assert submitted.stdout == scored.stdout
+    assert "by command" in submitted.stdout
     assert (tmp_path / "sent.json").read_bytes() == (tmp_path / "own.json").read_bytes()
-    lines = sent.stderr.splitlines()
+    lines = submitted.stderr.splitlines()
     size = archive.stat().st_size
     assert f"uploading: {size} of {size}" in lines
     assert any(line.startswith(f"{board.url}/submissions/") for line in lines)
-    assert board.token not in sent.stderr + sent.stdout
+    assert board.token not in submitted.stderr + submitted.stdout
 
 
-def test_without_waiting_the_id_is_printed(board: Shared, write_archive: Write, tmp_path: Path) -> None:
+def test_no_wait_prints_submission_id(board: SharedServer, write_archive: WriteArchive, tmp_path: Path) -> None:
     (tmp_path / "token").write_text(f"{board.token}\n")
     archive = write_archive("impatient", configs=("lattice-orbit",))
-    sent = run("submit", archive, "--url", board.url, "--token-file", tmp_path / "token", "--no-wait")
-    assert sent.returncode == 0, sent.stderr
-    assert board.server.ended(sent.stdout.strip())["method"] == "impatient"
+    submitted = run("submit", archive, "--url", board.url, "--token-file", tmp_path / "token", "--no-wait")
+    assert submitted.returncode == 0, submitted.stderr
+    assert board.server.wait_until_ended(submitted.stdout.strip())["method"] == "impatient"
 
 
-def test_a_refused_archive_is_told_as_check_tells_it(board: Shared, tiny_root: Path, tmp_path: Path) -> None:
+def test_rejected_archive_has_same_message_as_check(board: SharedServer, tiny_root: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.zip"
     broken.write_bytes(b"PK no zip")
-    sent = run("submit", broken, "--url", board.url, token=board.token)
-    own = run("check", broken, "--data", tiny_root)
-    assert (sent.returncode, own.returncode) == (2, 2)
-    reasons = [line.removeprefix("error: ") for line in own.stderr.splitlines() if "zip" in line]
+    submitted = run("submit", broken, "--url", board.url, token=board.token)
+    checked = run("check", broken, "--data", tiny_root)
+    assert (submitted.returncode, checked.returncode) == (2, 2)
+    reasons = [line.removeprefix("error: ") for line in checked.stderr.splitlines() if "zip" in line]
     assert reasons
-    assert reasons[-1].rpartition("broken.zip: ")[2] in sent.stderr
+    assert reasons[-1].rpartition("broken.zip: ")[2] in submitted.stderr
 
 
 @pytest.mark.parametrize(
     ("token", "words"),
     [(None, f"no token: set {TOKEN}, or give --token-file FILE"), ("rdb_wrong", "the token is unknown")],
 )
-def test_a_token_that_is_missing_or_wrong(
-    board: Shared, write_archive: Write, token: str | None, words: str
+def test_missing_or_unknown_token_exits_2(
+    board: SharedServer, write_archive: WriteArchive, token: str | None, words: str
 ) -> None:
-    sent = run("submit", write_archive("x"), "--url", board.url, token=token)
-    assert sent.returncode == 2
-    assert words in sent.stderr
-    assert "Traceback" not in sent.stderr
+    process = run("submit", write_archive("x"), "--url", board.url, token=token)
+    assert process.returncode == 2
+    assert words in process.stderr
+    assert "Traceback" not in process.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("url", "status"),
     [("http://127.0.0.1:9", 1), ("localhost:80", 2), ("no address", 2), ("ftp://127.0.0.1/", 2), ("http://[", 1)],
 )
-def test_a_service_that_is_not_there(write_archive: Write, url: str, status: int) -> None:
-    sent = run("submit", write_archive("x"), "--url", url, token="rdb_x")
-    assert sent.returncode == status
-    assert sent.stderr.splitlines()[-1].startswith("error: ")
-    assert "Traceback" not in sent.stderr
+def test_unreachable_service_or_invalid_url_is_reported(
+    write_archive: WriteArchive, url: str, status: int
+) -> None:
+    process = run("submit", write_archive("x"), "--url", url, token="rdb_x")
+    assert process.returncode == status
+    assert process.stderr.splitlines()[-1].startswith("error: ")
+    assert "Traceback" not in process.stderr
 
 
 @pytest.mark.parametrize(("path", "token"), [("", "rdb_wrong"), ("/nope", None)])
-def test_what_is_wrong_is_told_before_anything_is_sent(
-    board: Shared, write_archive: Write, path: str, token: str | None
+def test_wrong_token_or_url_is_reported_before_upload(
+    board: SharedServer, write_archive: WriteArchive, path: str, token: str | None
 ) -> None:
-    sent = run("submit", write_archive("x"), "--url", f"{board.url}{path}", token=token or board.token)
-    assert sent.returncode == 2
-    assert "uploading" not in sent.stderr
+    process = run("submit", write_archive("x"), "--url", f"{board.url}{path}", token=token or board.token)
+    assert process.returncode == 2
+    assert "uploading" not in process.stderr
 
 
-def test_what_fails_says_why_and_the_quota_is_told(strict: Server, write_archive: Write) -> None:
-    token = strict.token("alice")
+def test_scoring_failure_and_exceeded_quota_are_reported(
+    strict_server: Server, write_archive: WriteArchive
+) -> None:
+    token = strict_server.token("alice")
     small = write_archive("small", configs=("lattice-orbit",))
-    failed = run("submit", small, "--url", strict.url, token=token)
+    failed = run("submit", small, "--url", strict_server.url, token=token)
     assert failed.returncode == 2
     assert "scoring failed: scoring took longer than the 0.01 s this service allows" in failed.stderr
-    again = run("submit", small, "--url", strict.url, token=token)
-    assert again.returncode == 2
-    assert "this token has made its 1 submissions of today (UTC)" in again.stderr
+    over_quota = run("submit", small, "--url", strict_server.url, token=token)
+    assert over_quota.returncode == 2
+    assert "this token has made its 1 submissions of today (UTC)" in over_quota.stderr
 
 
-def test_an_archive_that_is_too_large_is_told(strict: Server, tmp_path: Path) -> None:
+def test_too_large_archive_is_reported(strict_server: Server, tmp_path: Path) -> None:
     large = tmp_path / "large.zip"
     large.write_bytes(bytes(2_200_000))
     with (
-        Leaderboard(strict.url, strict.token("bob")) as leaderboard,
+        LeaderboardClient(strict_server.url, strict_server.token("bob")) as leaderboard,
         pytest.raises(InputError, match="larger than 2000000"),
     ):
         leaderboard.submit(large)
 
 
-def test_the_library_raises_what_the_command_says(board: Shared, tmp_path: Path) -> None:
-    with Leaderboard(board.url, board.token) as leaderboard:
+def test_client_library_raises_errors_of_command(board: SharedServer, tmp_path: Path) -> None:
+    with LeaderboardClient(board.url, board.token) as leaderboard:
         with pytest.raises(InputError, match="cannot be read"):
             leaderboard.submit(tmp_path / "missing.zip")
         (tmp_path / "broken.zip").write_bytes(b"x")
-        with pytest.raises(SubmissionError) as refused:
+        with pytest.raises(SubmissionError) as raised:
             leaderboard.submit(tmp_path / "broken.zip")
-        assert refused.value.problems
+        assert raised.value.problems
         with pytest.raises(ServiceError, match="answered 404"):
             leaderboard.result("nope")
-        found = json.loads(leaderboard.result(board.ids["good"]))
-        assert found["submission"]["method"] == "good"
-    with Leaderboard("http://127.0.0.1:9", "x") as nobody, pytest.raises(ServiceError, match="no answer"):
-        nobody.result("x")
+        scored = json.loads(leaderboard.result(board.ids["good"]))
+        assert scored["submission"]["method"] == "good"
+    with (
+        LeaderboardClient("http://127.0.0.1:9", "x") as unreachable,
+        pytest.raises(ServiceError, match="no answer"),
+    ):
+        unreachable.result("x")

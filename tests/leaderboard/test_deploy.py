@@ -1,4 +1,4 @@
-"""What ``deploy/`` says is what the code knows: settings, commands, extras, images."""
+"""Consistency of ``deploy/`` with the code: settings, commands, extras and images."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ ROOT = Path(__file__).parents[2]
 COMPOSE, CONTAINERFILE = ROOT / "deploy/compose.yaml", ROOT / "deploy/Containerfile"
 README = (ROOT / "deploy/README.md").read_text()
 PREFIX = "REBAR_LEADERBOARD_"
-NO_SETTINGS = {"name", "token"}
-"""What stands for any setting's name, and what the client reads, in the README."""
+NON_SETTINGS = {"name", "token"}
+"""Names in the README that are not server settings: a placeholder and a variable of the client."""
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def compose() -> dict[str, Any]:
 
 
 def instructions(name: str) -> list[str]:
-    """The arguments of every instruction ``name`` of the Containerfile."""
+    """Return the arguments of every instruction ``name`` in the Containerfile."""
     return re.findall(rf"^{name} (.+)$", CONTAINERFILE.read_text(), re.MULTILINE)
 
 
@@ -41,49 +41,51 @@ def image_environment() -> dict[str, str]:
     return dict(pair.split("=", 1) for line in instructions("ENV") for pair in shlex.split(line))
 
 
-def test_every_setting_that_is_deployed_exists() -> None:
+def test_deployed_settings_exist() -> None:
     for file in sorted((ROOT / "deploy").iterdir()):
-        named = {name.lower() for name in re.findall(rf"{PREFIX}(\w+)", file.read_text())}
-        assert named, f"{file.name}: nothing is set"
-        allowed = NO_SETTINGS if file.suffix == ".md" else set()
-        assert named <= set(Settings.model_fields) | allowed, file.name
+        names = {name.lower() for name in re.findall(rf"{PREFIX}(\w+)", file.read_text())}
+        assert names, f"{file.name}: nothing is set"
+        allowed = NON_SETTINGS if file.suffix == ".md" else set()
+        assert names <= set(Settings.model_fields) | allowed, file.name
 
 
 def shell_lines(program: str) -> list[list[str]]:
-    """The README's commands of a program, as words without the program."""
+    """Return the argument lists of the commands of ``program`` in the README."""
     blocks = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
     lines = [shlex.split(line, comments=True) for block in blocks for line in block.splitlines()]
     return [words[1:] for words in lines if words and words[0] == program]
 
 
-def test_the_readmes_commands_are_understood() -> None:
+def test_readme_commands_parse() -> None:
     commands = [argument_parser().parse_args(words).command for words in shell_lines("rebar-leaderboard")]
     assert set(commands) == {"serve", "score", "token", "backup"}
 
 
-def test_the_readmes_table_of_settings_is_the_codes() -> None:
-    told = re.findall(r"^\| `(\w+)` \| (?:`(.*)`)? ?\| (.+) \|$", README, re.MULTILINE)
+def test_readme_settings_table_matches_code() -> None:
+    table_rows = re.findall(r"^\| `(\w+)` \| (?:`(.*)`)? ?\| (.+) \|$", README, re.MULTILINE)
     fields = Settings.model_fields.items()
     expected = [
         (name, "" if field.is_required() else str(field.default), field.description) for name, field in fields
     ]
-    assert told == expected
+    assert table_rows == expected
 
 
-def test_extras_that_the_readme_installs_exist() -> None:
+def test_extras_in_readme_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     installed = {
-        extra for found in re.findall(r"rebar-depth-bench\[([\w,]+)\]", README) for extra in found.split(",")
+        extra
+        for extras_list in re.findall(r"rebar-depth-bench\[([\w,]+)\]", README)
+        for extra in extras_list.split(",")
     }
     assert {"server", "postgresql"} <= installed <= set(extras)
 
 
 @pytest.mark.parametrize("service", ["web", "scorer"])
-def test_a_service_starts_with_sound_settings(
+def test_compose_services_have_valid_settings(
     compose: dict[str, Any], service: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given = {**image_environment(), **environment_of(compose["services"][service])}
-    for name, value in given.items():
+    environment = {**image_environment(), **environment_of(compose["services"][service])}
+    for name, value in environment.items():
         monkeypatch.setenv(name, value.replace("${POSTGRES_PASSWORD}", "a-password"))
     options = argument_parser().parse_args(compose["services"][service]["command"])
     settings = Settings()  # type: ignore[call-arg]
@@ -91,16 +93,16 @@ def test_a_service_starts_with_sound_settings(
     assert settings.database_url == "postgresql+psycopg://board:a-password@database/board"
     assert settings.data == "/data"
     assert settings.host == "0.0.0.0", "a container that listens to itself alone serves nobody"
-    assert settings.state == Path("/state")
+    assert settings.state_dir == Path("/state")
 
 
-def test_the_web_server_leaves_scoring_to_the_scorers(compose: dict[str, Any]) -> None:
+def test_web_service_has_no_workers(compose: dict[str, Any]) -> None:
     options = argument_parser().parse_args(compose["services"]["web"]["command"])
-    assert (options.command, options.scorers) == ("serve", "0")
+    assert (options.command, options.workers) == ("serve", "0")
     assert compose["services"]["scorer"]["command"] == ["score"]
 
 
-def test_ports_volumes_and_database_agree(compose: dict[str, Any]) -> None:
+def test_ports_volumes_and_database_are_consistent(compose: dict[str, Any]) -> None:
     services = compose["services"]
     port = str(Settings.model_fields["port"].default)
     assert services["web"]["ports"] == [f"{port}:{port}"]
@@ -117,7 +119,7 @@ def test_ports_volumes_and_database_agree(compose: dict[str, Any]) -> None:
     assert services["database"]["environment"]["POSTGRES_DB"] == "board"
 
 
-def test_no_image_names_a_registry(compose: dict[str, Any]) -> None:
+def test_images_have_no_registry(compose: dict[str, Any]) -> None:
     images = [service["image"] for service in compose["services"].values() if "image" in service]
     images += instructions("FROM")
     assert len(images) == 2
@@ -127,7 +129,7 @@ def test_no_image_names_a_registry(compose: dict[str, Any]) -> None:
         assert re.fullmatch(r"[\w.-]+", tag), f"{image}: expected a tag"
 
 
-def test_the_image_is_built_from_what_exists(compose: dict[str, Any]) -> None:
+def test_containerfile_refers_to_existing_files(compose: dict[str, Any]) -> None:
     build = compose["services"]["web"]["build"]
     assert (COMPOSE.parent / build["context"]).resolve() == ROOT
     assert ROOT / build["dockerfile"] == CONTAINERFILE
@@ -142,7 +144,7 @@ def test_the_image_is_built_from_what_exists(compose: dict[str, Any]) -> None:
     assert argument_parser().parse_args(json.loads(command)).command == "serve"
 
 
-def test_commands_in_comments_name_files_that_exist() -> None:
+def test_commands_in_comments_refer_to_existing_files() -> None:
     commands = re.findall(r"^#   (.+)$", COMPOSE.read_text() + CONTAINERFILE.read_text(), re.MULTILINE)
     files = [file for command in commands for file in re.findall(r"-f (\S+)", command)]
     assert sorted(files) == ["deploy/Containerfile", "deploy/compose.yaml"]

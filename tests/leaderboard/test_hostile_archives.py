@@ -1,4 +1,4 @@
-"""Hostile archives by the thousand: refused in words, nothing kept or written elsewhere, no memory lost."""
+"""Thousands of hostile archives: readable rejections, no files written elsewhere and no memory growth."""
 
 from __future__ import annotations
 
@@ -17,16 +17,22 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench import load
-from tests.leaderboard.hostile_zips import KINDS, Sound, mutated, odd_and_sound, payload
-from tests.leaderboard.processes import children, memory_bytes, open_files
-from tests.leaderboard.serving import ENDED, Server, running_server
+from tests.leaderboard.hostile_zips import (
+    KINDS,
+    ValidArchive,
+    malformed_archives,
+    pickle_payload_npy,
+    unusual_valid_archives,
+)
+from tests.leaderboard.processes import children, memory_bytes, num_open_files
+from tests.leaderboard.serving import ENDED, RunServer, Server
+from tests.requirements import Repetitions
 
-MUTATED = 1000
 CLIENTS = 4
-SETTLED = 100
-"""Archives after which everything that is made once has been made."""
-MOST_GROWTH_BYTES = 24 << 20
-"""The bodies together are five times as much."""
+NUM_WARM_UP = 60
+"""Number of archives after which one-time allocations of the server are done."""
+MAX_GROWTH_BYTES = 24 << 20
+"""Bound on memory growth; the bodies together have five times this size."""
 SEED = 20261122
 REPOSITORY = Path(__file__).parents[2]
 
@@ -35,7 +41,7 @@ Listing = Mapping[str, tuple[int, int]]
 
 @dataclass(frozen=True)
 class Footprint:
-    """What the server's process and those of its children that check and score hold: bytes and open files."""
+    """Memory and open files of the server process and of its children, which check and score."""
 
     server_bytes: int
     children_bytes: int
@@ -43,8 +49,8 @@ class Footprint:
 
 
 @dataclass(frozen=True)
-class Siege:
-    """What became of it: every answer by kind, and what the machine looked like before and after."""
+class AttackResult:
+    """All responses by kind, and memory and file listings before and after."""
 
     server: Server
     answers: Sequence[tuple[str, httpx2.Response]]
@@ -56,38 +62,58 @@ class Siege:
 
 
 @pytest.fixture(scope="module")
-def siege(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Siege]:
-    world = tmp_path_factory.mktemp("siege")
-    state = world / "state"
+def attack(
+    tiny_root: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    running_server: RunServer,
+    repetitions: Repetitions,
+) -> Iterator[AttackResult]:
+    folder = tmp_path_factory.mktemp("siege")
+    state = folder / "state"
     for name in ("cwd", "home", "tmp", "forbidden"):
-        (world / name).mkdir()
+        (folder / name).mkdir()
     rows = load(tiny_root, "lattice-orbit", columns=["view_id", "left_depth"])
-    good = Sound({row["view_id"]: row["left_depth"] for row in rows}, world / "forbidden")
-    archives = mutated(np.random.default_rng(SEED), good, MUTATED)
-    settings: dict[str, Any] = {"quota": 10**6, "reads": "1000000/minute", "writes": "1000000/minute"}
-    environment = {"HOME": str(world / "home"), "TMPDIR": str(world / "tmp"), "PYTHONPATH": str(REPOSITORY)}
+    valid = ValidArchive({row["view_id"]: row["left_depth"] for row in rows}, folder / "forbidden")
+    archives = malformed_archives(np.random.default_rng(SEED), valid, repetitions(200, 1000))
+    settings: dict[str, Any] = {
+        "quota": 10**6,
+        "read_rate_limit": "1000000/minute",
+        "write_rate_limit": "1000000/minute",
+    }
+    environment = {"HOME": str(folder / "home"), "TMPDIR": str(folder / "tmp"), "PYTHONPATH": str(REPOSITORY)}
     with contextlib.ExitStack() as stack:
-        with contextlib.chdir(world / "cwd"):
+        with contextlib.chdir(folder / "cwd"):
             server = stack.enter_context(
-                running_server(tiny_root, state, environment=environment, scorers=2, **settings)
+                running_server(tiny_root, state, environment=environment, workers=2, **settings)
             )
-        before = listing([world, tiny_root], state)
+        first_listing = listing([folder, tiny_root], state)
         token = server.token("stranger")
-        first = stormed(server, token, archives[:SETTLED])
-        settled = footprint(server)
-        answers = first + stormed(server, token, archives[SETTLED:])
-        after = footprint(server)
-        sound = [answer for _, answer in stormed(server, token, [("sound", data) for data in odd_and_sound(good)])]
-        accepted = [a.json()["id"] for a in [*sound, *(a for _, a in answers)] if a.status_code == 202]
-        ended = {one: server.ended(one) for one in accepted}
-        listings = before, listing([world, tiny_root], state)
-        yield Siege(server, answers, sound, ended, (settled, after), listings, good.forbidden)
+        first_answers = upload_concurrently(server, token, archives[:NUM_WARM_UP])
+        settled_footprint = footprint(server)
+        answers = first_answers + upload_concurrently(server, token, archives[NUM_WARM_UP:])
+        final_footprint = footprint(server)
+        valid_answers = [
+            answer
+            for _, answer in upload_concurrently(
+                server, token, [("sound", data) for data in unusual_valid_archives(valid)]
+            )
+        ]
+        accepted = [
+            response.json()["id"]
+            for response in [*valid_answers, *(response for _, response in answers)]
+            if response.status_code == 202
+        ]
+        ended = {submission_id: server.wait_until_ended(submission_id) for submission_id in accepted}
+        listings = first_listing, listing([folder, tiny_root], state)
+        yield AttackResult(
+            server, answers, valid_answers, ended, (settled_footprint, final_footprint), listings, valid.forbidden
+        )
 
 
-def stormed(
+def upload_concurrently(
     server: Server, token: str, archives: Sequence[tuple[str, bytes]]
 ) -> list[tuple[str, httpx2.Response]]:
-    """Upload archives from several clients at once; return kind and answer of each."""
+    """Upload archives from several clients concurrently; return the kind and the response of each."""
     headers = {"Authorization": f"Bearer {token}"}
     with httpx2.Client(headers=headers, timeout=120) as client, ThreadPoolExecutor(CLIENTS) as pool:
 
@@ -103,32 +129,32 @@ def footprint(server: Server) -> Footprint:
     return Footprint(
         memory_bytes(server.process.pid),
         sum(map(memory_bytes, started)),
-        sum(map(open_files, [server.process.pid, *started])),
+        sum(map(num_open_files, [server.process.pid, *started])),
     )
 
 
-def listing(folders: Sequence[Path], besides: Path) -> Listing:
-    """Return everything in the folders but what stands below ``besides``; of files size and time of change."""
-    found = (path for folder in folders for path in folder.rglob("*") if besides not in (path, *path.parents))
-    return {str(path): _stamp(path) for path in found}
+def listing(folders: Sequence[Path], excluded: Path) -> Listing:
+    """Return size and modification time of everything in ``folders`` except below ``excluded``."""
+    paths = (path for folder in folders for path in folder.rglob("*") if excluded not in (path, *path.parents))
+    return {str(path): _size_and_mtime_ns(path) for path in paths}
 
 
-def _stamp(path: Path) -> tuple[int, int]:
+def _size_and_mtime_ns(path: Path) -> tuple[int, int]:
     return (path.stat().st_size, path.stat().st_mtime_ns) if path.is_file() else (0, 0)
 
 
-def test_no_archive_is_a_server_error(siege: Siege) -> None:
-    assert len(siege.answers) == MUTATED
-    assert {answer.status_code for _, answer in siege.answers} <= {202, 422}
-    assert {kind for kind, answer in siege.answers if answer.status_code == 422} == set(KINDS)
-    lines = [json.loads(line) for line in siege.server.log if line.startswith("{")]
+def test_no_archive_causes_server_error(attack: AttackResult, repetitions: Repetitions) -> None:
+    assert len(attack.answers) == repetitions(200, 1000)
+    assert {response.status_code for _, response in attack.answers} <= {202, 422}
+    assert {kind for kind, response in attack.answers if response.status_code == 422} == set(KINDS)
+    lines = [json.loads(line) for line in attack.server.log if line.startswith("{")]
     assert {line["level"] for line in lines} == {"info"}
-    assert not any("Traceback" in line for line in siege.server.log)
+    assert not any("Traceback" in line for line in attack.server.log)
 
 
-def test_every_refusal_tells_every_problem_in_words(siege: Siege, tiny_root: Path) -> None:
+def test_rejections_list_readable_problems_without_secrets(attack: AttackResult, tiny_root: Path) -> None:
     secrets = (
-        str(siege.server.state),
+        str(attack.server.state),
         str(tiny_root),
         str(REPOSITORY),
         sys.prefix,
@@ -136,66 +162,67 @@ def test_every_refusal_tells_every_problem_in_words(siege: Siege, tiny_root: Pat
         'File "',
         ".upload",
     )
-    for kind, answer in siege.answers:
-        if answer.status_code == 422:
-            said = answer.json()
-            assert set(said) == {"detail", "problems"}
-            assert said["problems"], kind
+    for kind, response in attack.answers:
+        if response.status_code == 422:
+            content = response.json()
+            assert set(content) == {"detail", "problems"}
+            assert content["problems"], kind
             assert all(
-                isinstance(one, str) and one.isprintable() and 10 < len(one) < 2000 for one in said["problems"]
+                isinstance(problem, str) and problem.isprintable() and 10 < len(problem) < 2000
+                for problem in content["problems"]
             )
-            assert "problem" in said["detail"]
-            assert not any(secret in answer.text for secret in secrets), answer.text
+            assert "problem" in content["detail"]
+            assert not any(secret in response.text for secret in secrets), response.text
 
 
-def test_what_is_odd_and_sound_is_scored_and_the_rest_fails_with_a_reason(siege: Siege) -> None:
-    assert [answer.status_code for answer in siege.sound] == [202] * len(siege.sound)
-    for one, found in siege.ended.items():
-        assert found["status"] in ENDED
-        assert (found["status"] == "failed") == bool(found["reason"])
-        if found["status"] == "scored":
-            result = httpx2.get(f"{siege.server.url}/api/v1/submissions/{one}/result.json")
-            json.loads(result.content, parse_constant=refuse)
-        page = httpx2.get(f"{siege.server.url}/submissions/{one}", headers={"Accept": "text/html"})
+def test_unusual_valid_archives_are_scored(attack: AttackResult) -> None:
+    assert [response.status_code for response in attack.sound] == [202] * len(attack.sound)
+    for submission_id, submission in attack.ended.items():
+        assert submission["status"] in ENDED
+        assert (submission["status"] == "failed") == bool(submission["reason"])
+        if submission["status"] == "scored":
+            result = httpx2.get(f"{attack.server.url}/api/v1/submissions/{submission_id}/result.json")
+            json.loads(result.content, parse_constant=reject_constant)
+        page = httpx2.get(f"{attack.server.url}/submissions/{submission_id}", headers={"Accept": "text/html"})
         assert page.status_code == 200
-    assert all(siege.ended[answer.json()["id"]]["status"] == "scored" for answer in siege.sound)
+    assert all(attack.ended[response.json()["id"]]["status"] == "scored" for response in attack.sound)
 
 
-def refuse(constant: str) -> NoReturn:
+def reject_constant(constant: str) -> NoReturn:
     raise AssertionError(f"the result holds {constant}, which is no JSON")
 
 
-def test_the_server_still_answers(siege: Siege) -> None:
-    assert httpx2.get(f"{siege.server.url}/healthz").json()["status"] == "ok"
+def test_server_still_responds(attack: AttackResult) -> None:
+    assert httpx2.get(f"{attack.server.url}/healthz").json()["status"] == "ok"
     for path in ("/", "/api/v1/leaderboard?config=lattice-orbit", "/api/v1/leaderboard.csv?config=lattice-orbit"):
-        assert httpx2.get(siege.server.url + path, timeout=60).status_code == 200
+        assert httpx2.get(attack.server.url + path, timeout=60).status_code == 200
 
 
-def test_what_was_accepted_is_kept_and_nothing_else(siege: Siege) -> None:
-    state = siege.server.state
-    assert {path.stem for path in (state / "archives").iterdir()} == set(siege.ended)
+def test_only_accepted_archives_are_stored(attack: AttackResult) -> None:
+    state = attack.server.state
+    assert {path.stem for path in (state / "archives").iterdir()} == set(attack.ended)
     assert {path.name for path in state.iterdir()} <= {
         "archives", "spool", "leaderboard.sqlite", "leaderboard.sqlite-wal", "leaderboard.sqlite-shm"
     }  # fmt: skip
     spools = [path for path in (state / "spool").iterdir() if path.is_dir()]
-    assert len(spools) == 3  # the server's and the two scorers'
+    assert len(spools) == 3  # Those of the server and its two scorers.
     assert not any(list(spool.iterdir()) for spool in spools)
     assert {path.name for path in (state / "spool").iterdir()} == {
         "entrance.lock", *(name for spool in spools for name in (spool.name, f"{spool.name}.lock"))
     }  # fmt: skip
 
 
-def test_nothing_is_written_elsewhere_and_no_pickle_runs(siege: Siege, tmp_path: Path) -> None:
-    before, after = siege.listings
+def test_no_file_is_written_elsewhere_and_no_pickle_runs(attack: AttackResult, tmp_path: Path) -> None:
+    before, after = attack.listings
     assert after == before
-    assert not list(siege.forbidden.iterdir())
-    marker = tmp_path / "ran"  # the payload is a real one
-    np.load(io.BytesIO(payload(marker)), allow_pickle=True)
+    assert not list(attack.forbidden.iterdir())
+    marker = tmp_path / "ran"  # The payload works when unpickled.
+    np.load(io.BytesIO(pickle_payload_npy(marker)), allow_pickle=True)
     assert marker.exists()
 
 
-def test_memory_and_open_files_do_not_grow(siege: Siege) -> None:
-    settled, after = siege.footprints
-    assert after.server_bytes - settled.server_bytes < MOST_GROWTH_BYTES, siege.footprints
-    assert after.children_bytes - settled.children_bytes < MOST_GROWTH_BYTES, siege.footprints
-    assert after.files <= settled.files + CLIENTS, siege.footprints
+def test_memory_and_open_files_do_not_grow(attack: AttackResult) -> None:
+    before, after = attack.footprints
+    assert after.server_bytes - before.server_bytes < MAX_GROWTH_BYTES, attack.footprints
+    assert after.children_bytes - before.children_bytes < MAX_GROWTH_BYTES, attack.footprints
+    assert after.files <= before.files + CLIENTS, attack.footprints

@@ -1,4 +1,4 @@
-"""Uploads of gigabytes in little memory, and uploads that break off."""
+"""Uploads of gigabytes with bounded memory, and interrupted uploads."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from tests.leaderboard.conftest import Write
-from tests.leaderboard.processes import descendants, memory_bytes, open_files
-from tests.leaderboard.raw_http import END, MULTIPART, answer_of, connect, head, part
-from tests.leaderboard.serving import Server, running_server
+from tests.leaderboard.conftest import WriteArchive
+from tests.leaderboard.processes import descendants, memory_bytes, num_open_files
+from tests.leaderboard.raw_http import END, MULTIPART, connect, multipart_part, read_response, request_head
+from tests.leaderboard.serving import RunServer, Server
+from tests.requirements import Repetitions
 
 API = "/api/v1/submissions"
-LARGE_BYTES = 2_000_000_000
-MOST_MEMORY_BYTES = 300_000_000
-MOST_UPLOAD = 4_000_000
+MAX_MEMORY_BYTES = 300_000_000
+MAX_UPLOAD_BYTES = 4_000_000
 UPLOADS = 10
-PIECE = bytes(1 << 20)
+CHUNK = bytes(1 << 20)
 
 
 @dataclass
-class Watch:
-    """Samples the memory of a process and of all that it starts, until the block ends; peaks by process, bytes."""
+class MemoryWatch:
+    """Sampler of the peak memory, in bytes, of a process and its descendants until the block ends."""
 
     pid: int
     peaks: dict[int, int] = field(default_factory=dict)
 
-    def __enter__(self) -> Watch:
+    def __enter__(self) -> MemoryWatch:
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._sample, daemon=True)
         self._thread.start()
@@ -51,98 +51,107 @@ class Watch:
                 try:
                     self.peaks[pid] = max(self.peaks.get(pid, 0), memory_bytes(pid))
                 except (OSError, AssertionError):
-                    continue  # it has just ended
+                    continue  # The process has just ended.
 
 
-def widened(archive: bytes, gap: int) -> tuple[bytes, bytes]:
-    """Return a sound archive in two parts; it stays sound with ``gap`` bytes of no entry between them."""
-    directory_at = struct.unpack_from("<L", archive, len(archive) - 6)[0]
+def split_with_gap(archive: bytes, gap: int) -> tuple[bytes, bytes]:
+    """Split a valid archive into two parts that stay valid with ``gap`` unused bytes between them."""
+    directory_offset = struct.unpack_from("<L", archive, len(archive) - 6)[0]
     last_record = archive.rindex(b"PK\1\2")
-    (entry_at,) = struct.unpack_from("<L", archive, last_record + 42)
-    wide = bytearray(archive)
-    struct.pack_into("<L", wide, last_record + 42, entry_at + gap)
-    struct.pack_into("<L", wide, len(archive) - 6, directory_at + gap)
-    return archive[:entry_at], bytes(wide[entry_at:])
+    (entry_offset,) = struct.unpack_from("<L", archive, last_record + 42)
+    shifted = bytearray(archive)
+    struct.pack_into("<L", shifted, last_record + 42, entry_offset + gap)
+    struct.pack_into("<L", shifted, len(archive) - 6, directory_offset + gap)
+    return archive[:entry_offset], bytes(shifted[entry_offset:])
 
 
-def send(connection: socket.socket, token: str, before: bytes, zeros: int, after: bytes) -> None:
-    """Post a body of ``before``, zeros and ``after`` piece by piece."""
+def send_upload(connection: socket.socket, token: str, before: bytes, zeros: int, after: bytes) -> None:
+    """Post a body of ``before``, ``zeros`` zero bytes and ``after`` in chunks."""
     length = len(before) + zeros + len(after)
-    told = (f"Authorization: Bearer {token}", f"Content-Type: {MULTIPART}", f"Content-Length: {length}")
-    connection.sendall(head(API, told) + before)
-    for _ in range(zeros // len(PIECE)):
-        connection.sendall(PIECE)
-    connection.sendall(bytes(zeros % len(PIECE)) + after)
+    headers = (f"Authorization: Bearer {token}", f"Content-Type: {MULTIPART}", f"Content-Length: {length}")
+    connection.sendall(request_head(API, headers) + before)
+    for _ in range(zeros // len(CHUNK)):
+        connection.sendall(CHUNK)
+    connection.sendall(bytes(zeros % len(CHUNK)) + after)
 
 
-def body_around() -> tuple[bytes, bytes]:
-    """Return what stands before and after an archive's content in a body."""
-    before, after = (part(b"|") + END).split(b"|")
+def multipart_frame() -> tuple[bytes, bytes]:
+    """Return the bytes before and after the content of the archive in a multipart body."""
+    before, after = (multipart_part(b"|") + END).split(b"|")
     return before, after
 
 
-def until(holds: Callable[[], bool], timeout_s: float = 20) -> bool:
-    """Wait for something to hold; return whether it does."""
-    limit = time.monotonic() + timeout_s
-    while not holds() and time.monotonic() < limit:
+def wait_for(holds: Callable[[], bool], timeout_s: float = 20) -> bool:
+    """Wait until ``holds`` returns True; return whether it does within ``timeout_s``."""
+    deadline = time.monotonic() + timeout_s
+    while not holds() and time.monotonic() < deadline:
         time.sleep(0.05)
     return holds()
 
 
-def spooled(server: Server) -> list[Path]:
+def spool_files(server: Server) -> list[Path]:
     return list((server.state / "spool").glob("*/*"))
 
 
 @pytest.fixture
 def state(tmp_path: Path) -> Iterator[Path]:
-    """The state folder, which no test run leaves lying about: there are gigabytes in it."""
+    """Yield a state folder and delete it afterwards, because it holds gigabytes."""
     yield tmp_path / "state"
     shutil.rmtree(tmp_path / "state")
 
 
-def test_two_gigabytes_are_taken_checked_and_scored_in_little_memory(
-    tiny_root: Path, state: Path, write_archive: Write
+def test_large_upload_is_scored_with_bounded_memory(
+    tiny_root: Path,
+    state: Path,
+    write_archive: WriteArchive,
+    running_server: RunServer,
+    repetitions: Repetitions,
 ) -> None:
+    gap_bytes = repetitions(600_000_000, 2_000_000_000)
     archive = write_archive("large", configs=("lattice-orbit",)).read_bytes()
-    first, second = widened(archive, LARGE_BYTES)
-    before, after = body_around()
-    with running_server(tiny_root, state) as server, Watch(server.process.pid) as watch:
+    first, second = split_with_gap(archive, gap_bytes)
+    before, after = multipart_frame()
+    with running_server(tiny_root, state) as server, MemoryWatch(server.process.pid) as watch:
         token = server.token("patient")
         with connect(server.url, timeout_s=300) as connection:
-            send(connection, token, before + first, LARGE_BYTES, second + after)
-            answer = answer_of(connection)
-        assert answer.status == 202, answer.text
-        submission = json.loads(answer.text.split("\r\n\r\n", 1)[1])["id"]
-        assert (state / "archives" / f"{submission}.zip").stat().st_size == len(archive) + LARGE_BYTES
-        assert server.ended(submission)["status"] == "scored"
-        assert memory_bytes(server.process.pid, "VmHWM") < MOST_MEMORY_BYTES, watch.peaks
+            send_upload(connection, token, before + first, gap_bytes, second + after)
+            response = read_response(connection)
+        assert response.status == 202, response.text
+        submission = json.loads(response.text.split("\r\n\r\n", 1)[1])["id"]
+        assert (state / "archives" / f"{submission}.zip").stat().st_size == len(archive) + gap_bytes
+        assert server.wait_until_ended(submission)["status"] == "scored"
+        assert memory_bytes(server.process.pid, "VmHWM") < MAX_MEMORY_BYTES, watch.peaks
         headers = {"Authorization": f"Bearer {token}"}
         assert httpx2.delete(f"{server.url}{API}/{submission}", headers=headers).status_code == 204
         assert list((state / "archives").iterdir()) == []
-        assert spooled(server) == []
-    assert len(watch.peaks) >= 4  # server, checker, scorer, scoring
-    assert max(watch.peaks.values()) < MOST_MEMORY_BYTES, watch.peaks
+        assert spool_files(server) == []
+    assert len(watch.peaks) >= 4  # server, checker, scorer and scoring process
+    assert max(watch.peaks.values()) < MAX_MEMORY_BYTES, watch.peaks
 
 
 @pytest.fixture(scope="module")
-def small(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+def small_server(
+    tiny_root: Path, tmp_path_factory: pytest.TempPathFactory, running_server: RunServer
+) -> Iterator[Server]:
     state = tmp_path_factory.mktemp("small") / "state"
-    with running_server(tiny_root, state, scorers=0, quota=1, max_upload=MOST_UPLOAD) as server:
+    with running_server(tiny_root, state, workers=0, quota=1, max_upload=MAX_UPLOAD_BYTES) as server:
         yield server
 
 
 @pytest.mark.parametrize("is_cut", [False, True], ids=["closed", "reset"])
-def test_an_upload_that_breaks_off_leaves_no_file_and_no_traceback(small: Server, is_cut: bool) -> None:
-    token = small.token(f"impatient {is_cut}")
-    files = open_files(small.process.pid)
-    before, _ = body_around()
+def test_interrupted_upload_leaves_no_file_or_traceback(small_server: Server, is_cut: bool) -> None:
+    token = small_server.token(f"impatient {is_cut}")
+    files_before = num_open_files(small_server.process.pid)
+    before, _ = multipart_frame()
     for _ in range(UPLOADS):
-        with connect(small.url) as connection:
-            told = (f"Authorization: Bearer {token}", f"Content-Type: {MULTIPART}", "Content-Length: 3000000")
-            connection.sendall(head(API, told) + before + PIECE)
-            assert until(lambda: len(spooled(small)) == 1)
+        with connect(small_server.url) as connection:
+            headers = (f"Authorization: Bearer {token}", f"Content-Type: {MULTIPART}", "Content-Length: 3000000")
+            connection.sendall(request_head(API, headers) + before + CHUNK)
+            assert wait_for(lambda: len(spool_files(small_server)) == 1)
             if is_cut:
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        assert until(lambda: not spooled(small))
-    assert open_files(small.process.pid) < files + UPLOADS  # a connection to the database may have come
-    assert not any("Traceback" in line or '"error"' in line for line in small.log)
+        assert wait_for(lambda: not spool_files(small_server))
+    assert (
+        num_open_files(small_server.process.pid) < files_before + UPLOADS
+    )  # A database connection may have been opened.
+    assert not any("Traceback" in line or '"error"' in line for line in small_server.log)

@@ -1,4 +1,4 @@
-"""The database's schema: what the migrations make is what the records say, on SQLite and on PostgreSQL."""
+"""Database schema: agreement of migrations and models on SQLite and PostgreSQL."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from leaderboard.settings import Settings
 
 _MIGRATE = """
 import sys
-from leaderboard.database import Database
+from leaderboard.db.engine import Database
 database = Database(sys.argv[1])
 print("ready", flush=True)
 sys.stdin.readline()
@@ -33,16 +33,16 @@ database.migrate()
 
 @pytest.fixture
 def url(new_database: Callable[[], str], tmp_path: Path) -> str:
-    """An empty database as SQLAlchemy takes it."""
-    return Settings(data="x", state=tmp_path, db=new_database()).database_url  # type: ignore[call-arg]
+    """Return the SQLAlchemy URL of an empty database."""
+    return Settings(data="x", state_dir=tmp_path, db=new_database()).database_url  # type: ignore[call-arg]
 
 
 @pytest.fixture
 def engine(url: str) -> Iterator[Engine]:
-    """An engine of the test's own, beside the database's."""
-    made = create_engine(url)
-    yield made
-    made.dispose()
+    """Yield a separate engine for the database."""
+    new_engine = create_engine(url)
+    yield new_engine
+    new_engine.dispose()
 
 
 def migrate(url: str) -> None:
@@ -51,20 +51,20 @@ def migrate(url: str) -> None:
 
 
 def differences(engine: Engine, metadata: MetaData) -> list[object]:
-    """What Alembic would change to make the database what ``metadata`` says, types and defaults too."""
+    """Return the changes, including types and defaults, that Alembic would need to match ``metadata``."""
     with engine.connect() as connection:
         options = {"compare_type": True, "compare_server_default": True}
         return list(compare_metadata(MigrationContext.configure(connection, opts=options), metadata))
 
 
-def test_the_migrated_schema_is_the_records(url: str, engine: Engine) -> None:
+def test_migrated_schema_matches_models(url: str, engine: Engine) -> None:
     assert len(differences(engine, Base.metadata)) >= len(Base.metadata.tables), "an empty database lacks them all"
     migrate(url)
     assert differences(engine, Base.metadata) == []
     assert set(inspect(engine).get_table_names()) == {*Base.metadata.tables, "alembic_version"}
 
 
-def test_the_comparison_sees_a_column_that_no_migration_makes(url: str, engine: Engine) -> None:
+def test_schema_comparison_detects_missing_migration(url: str, engine: Engine) -> None:
     migrate(url)
     changed = MetaData()
     for table in Base.metadata.tables.values():
@@ -73,21 +73,21 @@ def test_the_comparison_sees_a_column_that_no_migration_makes(url: str, engine: 
     assert [step[0] for step in differences(engine, changed)] == ["add_column"]  # type: ignore[index]
 
 
-def test_migrating_again_changes_nothing_and_keeps_what_is_there(url: str) -> None:
+def test_repeated_migration_keeps_rows(url: str) -> None:
     with closing(Database(url)) as database:
         database.migrate()
         token = create_token(database, "alice")
         database.migrate()
     with closing(Database(url)) as database:
         database.migrate()
-        found = find_token(database, token)
-    assert found is not None
-    assert found.name == "alice"
+        record = find_token(database, token)
+    assert record is not None
+    assert record.name == "alice"
 
 
 @contextmanager
-def busy(engine: Engine) -> Iterator[None]:
-    """Hold SQLite's write lock, so that all who migrate meanwhile began before the first of them may write."""
+def sqlite_write_lock(engine: Engine) -> Iterator[None]:
+    """Hold SQLite's write lock so that all concurrent migrations start before any of them can write."""
     if engine.dialect.name != "sqlite":
         yield
         return
@@ -99,29 +99,30 @@ def busy(engine: Engine) -> Iterator[None]:
         connection.execute("ROLLBACK")
 
 
-def test_processes_that_migrate_at_once_all_succeed(url: str, engine: Engine) -> None:
+@pytest.mark.slow
+def test_concurrent_migrations_succeed(url: str, engine: Engine) -> None:
     command, pipe = [sys.executable, "-c", _MIGRATE, url], subprocess.PIPE
-    started = [subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) for _ in range(3)]
+    processes = [subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) for _ in range(3)]
     try:
-        for process in started:
+        for process in processes:
             assert process.stdout is not None
             assert process.stdout.readline() == "ready\n"
-        with busy(engine):
-            for process in started:
+        with sqlite_write_lock(engine):
+            for process in processes:
                 assert process.stdin is not None
                 process.stdin.write("\n")
                 process.stdin.flush()
-        for process in started:
-            _, complaints = process.communicate(timeout=60)
-            assert process.returncode == 0, complaints
+        for process in processes:
+            _, stderr = process.communicate(timeout=60)
+            assert process.returncode == 0, stderr
     finally:
-        for process in started:
+        for process in processes:
             process.kill()
             process.communicate()
     assert differences(engine, Base.metadata) == []
 
 
-def test_there_is_one_line_of_migrations() -> None:
+def test_migrations_are_linear() -> None:
     scripts = ScriptDirectory(str(MIGRATIONS))
     assert len(scripts.get_heads()) == 1
     assert len(scripts.get_bases()) == 1

@@ -1,4 +1,4 @@
-"""The pages as a browser without JavaScript gets them, from a real server over HTTP."""
+"""Pages of a real server without JavaScript."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import httpx2
 import pytest
 
 from tests.bench.reporting.pages import Page
-from tests.leaderboard.conftest import HOSTILE, Shared, Write
+from tests.leaderboard.conftest import HOSTILE, SharedServer, WriteArchive
 
 BROWSER = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
 
@@ -22,41 +22,43 @@ def get(url: str, **options: Any) -> httpx2.Response:
 
 
 def page(url: str) -> tuple[httpx2.Response, Page]:
-    """Return a page, checked for what every page has: nesting, landmarks, one h1, nothing inline."""
-    answer = get(url)
-    parsed = Page(answer.text)
+    """Return a page after checks of nesting, landmarks, a single h1 and the absence of inline code."""
+    response = get(url)
+    parsed = Page(response.text)
     assert parsed.count("h1") == parsed.count("main") == parsed.count("footer") == 1
-    assert parsed.named("a")[0]["class"] == "skip"
-    assert not any("style" in found or any(name.startswith("on") for name in found) for _, found in parsed.tags)
-    assert all("src" in script for script in parsed.named("script"))
-    assert all(link.get("href") for link in parsed.named("a"))
-    return answer, parsed
+    assert parsed.attributes_of("a")[0]["class"] == "skip"
+    assert not any(
+        "style" in attributes or any(name.startswith("on") for name in attributes) for _, attributes in parsed.tags
+    )
+    assert all("src" in script for script in parsed.attributes_of("script"))
+    assert all(link.get("href") for link in parsed.attributes_of("a"))
+    return response, parsed
 
 
 def names_in_order(text: str, config: str = "lattice") -> list[str]:
-    """Return the methods of a config's table from top to bottom."""
+    """Return the method names in the table of a config, from top to bottom."""
     table = text[text.index(f'aria-label="Table of {config}"') :]
     table = table[: table.index("</table>")]
     return re.findall(r'<a href="/submissions/[^"]+"><bdi>([^<]+)</bdi>', table)
 
 
-def test_the_board_ranks_and_marks(board: Shared) -> None:
-    answer, parsed = page(board.url + "/")
-    assert answer.headers["cache-control"] == "no-cache"
-    assert names_in_order(answer.text)[0] == "good"
-    assert names_in_order(answer.text)[-1] == "holes"
+def test_leaderboard_page_shows_ranks_and_marks(board: SharedServer) -> None:
+    response, parsed = page(board.url + "/")
+    assert response.headers["cache-control"] == "no-cache"
+    assert names_in_order(response.text)[0] == "good"
+    assert names_in_order(response.text)[-1] == "holes"
     assert "not ranked" in parsed.text
     assert re.search(r"coverage \d\d\.\d % is below 95 %", parsed.text)
-    published = answer.text.index("Published, not ranked")
-    assert answer.text.index("holes") < published < answer.text.index("FoundationStereo")
-    assert answer.text.count('class="chart"') == 2
+    published = response.text.index("Published, not ranked")
+    assert response.text.index("holes") < published < response.text.index("FoundationStereo")
+    assert response.text.count('class="chart"') == 2
     assert "95 % interval, block bootstrap" in parsed.text
     digest = httpx2.get(f"{board.url}/healthz").json()["dataset"]
     assert digest in parsed.text
     assert "rebar-1" in parsed.text
 
 
-def test_numbers_on_the_board_are_those_of_the_api(board: Shared) -> None:
+def test_leaderboard_page_shows_values_of_api(board: SharedServer) -> None:
     rows = httpx2.get(f"{board.url}/api/v1/leaderboard?config=lattice").json()["rows"]
     text = get(f"{board.url}/?config=lattice").text
     for row in rows:
@@ -81,87 +83,91 @@ def test_numbers_on_the_board_are_those_of_the_api(board: Shared) -> None:
         ("scale", lambda table: table["scale_median"], False),
     ],
 )
-def test_links_sort_without_javascript(board: Shared, sort: str, key: Any, falls: bool) -> None:
+def test_sort_links_work_without_javascript(board: SharedServer, sort: str, key: Any, falls: bool) -> None:
     rows = httpx2.get(f"{board.url}/api/v1/leaderboard?config=lattice").json()["rows"]
     values = [key(row["table"]) for row in rows]
-    answer, parsed = page(f"{board.url}/?config=lattice&sort={sort}")
-    ids = re.findall(r'<a href="/submissions/([^"]+)"><bdi>', answer.text)
-    shown = [key(row["table"]) for one in ids for row in rows if row["id"] == one]
+    response, parsed = page(f"{board.url}/?config=lattice&sort={sort}")
+    ids = re.findall(r'<a href="/submissions/([^"]+)"><bdi>', response.text)
+    shown = [key(row["table"]) for submission_id in ids for row in rows if row["id"] == submission_id]
     assert shown == sorted(values, reverse=falls)
-    sorted_heads = [head["aria-sort"] for head in parsed.named("th") if head.get("aria-sort")]
-    assert sorted_heads == ["descending" if falls else "ascending"]
+    sort_directions = [head["aria-sort"] for head in parsed.attributes_of("th") if head.get("aria-sort")]
+    assert sort_directions == ["descending" if falls else "ascending"]
 
 
-def test_a_sort_that_is_no_column_is_by_rank(board: Shared) -> None:
-    odd = get(f"{board.url}/", params={"config": "lattice", "sort": "'; DROP TABLE"}).text
-    assert names_in_order(odd) == names_in_order(get(f"{board.url}/?config=lattice").text)
+def test_unknown_sort_column_sorts_by_rank(board: SharedServer) -> None:
+    text = get(f"{board.url}/", params={"config": "lattice", "sort": "'; DROP TABLE"}).text
+    assert names_in_order(text) == names_in_order(get(f"{board.url}/?config=lattice").text)
 
 
-def test_what_archives_say_is_only_text(board: Shared) -> None:
+def test_texts_of_submissions_are_escaped(board: SharedServer) -> None:
     for address in (f"{board.url}/", board.page("hostile")):
-        answer, parsed = page(address)
-        assert "<script>alert" not in answer.text
-        assert "<b>second" not in answer.text
+        response, parsed = page(address)
+        assert "<script>alert" not in response.text
+        assert "<b>second" not in response.text
         assert HOSTILE in parsed.text
         assert "Müller & <Söhne>" in parsed.text
-        assert not set(answer.text) & set("\u202e\x1b")
-    links = [one for one in page(board.page("hostile"))[1].named("a") if "example.org" in str(one["href"])]
-    assert [(one["href"], one["rel"]) for one in links] == [
+        assert not set(response.text) & set("\u202e\x1b")
+    links = [
+        attributes
+        for attributes in page(board.page("hostile"))[1].attributes_of("a")
+        if "example.org" in str(attributes["href"])
+    ]
+    assert [(attributes["href"], attributes["rel"]) for attributes in links] == [
         ("https://example.org/?a=1&b=<i>", "nofollow noopener noreferrer")
     ]
 
 
-def test_a_scored_submission(board: Shared) -> None:
-    answer, parsed = page(board.page("far"))
+def test_page_of_scored_submission(board: SharedServer) -> None:
+    response, parsed = page(board.page("far"))
     rows = httpx2.get(f"{board.url}/api/v1/leaderboard?config=lattice").json()["rows"]
     rank = next(row["rank"] for row in rows if row["id"] == board.ids["far"])
     assert f"Scored : lattice rank {rank}." in parsed.text
-    assert "http-equiv" not in answer.text
-    assert f"/api/v1/submissions/{board.ids['far']}/result.json" in answer.text
-    found = httpx2.get(f"{board.url}/api/v1/submissions/{board.ids['far']}/result.json").json()
-    worst = max(found["views"], key=lambda view: view["native"]["abs_rel"])["view_id"]
-    table = answer.text[answer.text.index("the worst 9 of 9 views") :]
+    assert "http-equiv" not in response.text
+    assert f"/api/v1/submissions/{board.ids['far']}/result.json" in response.text
+    result = httpx2.get(f"{board.url}/api/v1/submissions/{board.ids['far']}/result.json").json()
+    worst = max(result["views"], key=lambda view: view["native"]["abs_rel"])["view_id"]
+    table = response.text[response.text.index("the worst 9 of 9 views") :]
     assert re.findall(r'class="name">(lattice/\d{4})<', table)[0] == worst
-    maps = [one for one in parsed.named("img") if "error-maps" in str(one["src"])]
+    maps = [image for image in parsed.attributes_of("img") if "error-maps" in str(image["src"])]
     assert len(maps) == 2
-    picture = get(f"{board.url}{maps[0]['src']}")
-    assert picture.headers["content-type"] == "image/webp"
-    assert picture.content[8:12] == b"WEBP"
+    error_map = get(f"{board.url}{maps[0]['src']}")
+    assert error_map.headers["content-type"] == "image/webp"
+    assert error_map.content[8:12] == b"WEBP"
 
 
-def test_all_views_are_listed_when_asked_for(board: Shared) -> None:
+def test_views_parameter_lists_all_views(board: SharedServer) -> None:
     _, parsed = page(board.page("good") + "?views=lattice-orbit")
     assert "lattice-orbit: all 2 views, worst first" in parsed.text
 
 
-def test_a_submission_that_waits(waiting: Shared) -> None:
-    answer, parsed = page(waiting.page("later"))
+def test_page_of_queued_submission(waiting: SharedServer) -> None:
+    response, parsed = page(waiting.page("later"))
     assert re.search(r"number 2 of \d in the queue", parsed.text)
     assert re.search(r"number 1 of \d in the queue", page(waiting.page("next"))[1].text)
     assert "Not on the board" in parsed.text
-    assert '<noscript><meta http-equiv="refresh" content="5"></noscript>' in answer.text
-    assert answer.headers["cache-control"] == "no-store"
+    assert '<noscript><meta http-equiv="refresh" content="5"></noscript>' in response.text
+    assert response.headers["cache-control"] == "no-store"
 
 
-def test_a_submission_that_failed_says_why(waiting: Shared) -> None:
+def test_page_of_failed_submission_shows_reason(waiting: SharedServer) -> None:
     _, parsed = page(waiting.page("failed"))
     assert "scoring took longer than the 0.01 s this service allows" in parsed.text
 
 
-def test_what_is_not_public_is_not_on_the_board(waiting: Shared) -> None:
-    answer, parsed = page(f"{waiting.url}/")
+def test_private_submission_is_not_on_leaderboard_page(waiting: SharedServer) -> None:
+    response, parsed = page(f"{waiting.url}/")
     assert "No submission of lattice is on the board yet." in parsed.text
-    assert waiting.ids["scored"] not in answer.text
+    assert waiting.ids["scored"] not in response.text
     assert "rank" not in page(waiting.page("scored"))[1].text.split("Submitted by")[0].replace("not ranked", "")
-    picture = re.search(r'src="([^"]+error-maps[^"]+)"', get(waiting.page("scored")).text)
-    assert picture is not None
-    assert get(waiting.url + picture[1]).headers["cache-control"] == "no-store"
+    error_map = re.search(r'src="([^"]+error-maps[^"]+)"', get(waiting.page("scored")).text)
+    assert error_map is not None
+    assert get(waiting.url + error_map[1]).headers["cache-control"] == "no-store"
 
 
 @pytest.mark.parametrize("path", ["/nope", "/submissions/nope", "/?config=nope", "/submissions/a%3Cb"])
-def test_errors_are_pages_for_browsers_and_json_for_others(board: Shared, path: str) -> None:
-    answer, _ = page(board.url + path)
-    assert answer.status_code in (404, 422)
+def test_errors_are_html_for_browsers_and_json_otherwise(board: SharedServer, path: str) -> None:
+    response, _ = page(board.url + path)
+    assert response.status_code in (404, 422)
     plain = httpx2.get(board.url + path, headers={"Accept": "*/*"})
     assert plain.json()["detail"]
     assert httpx2.get(f"{board.url}/api/v1/submissions/nope", headers=BROWSER).json() == {
@@ -170,19 +176,21 @@ def test_errors_are_pages_for_browsers_and_json_for_others(board: Shared, path: 
 
 
 @pytest.mark.parametrize("name", ["report.css", "page.css", "page.js", "sortable.js", "icon.svg"])
-def test_static_files_are_kept_by_their_digest(board: Shared, name: str) -> None:
+def test_static_files_are_cached_by_digest(board: SharedServer, name: str) -> None:
     address = re.search(rf'"(/static/{re.escape(name)}\?v=[0-9a-f]+)"', get(board.url).text)
     assert address is not None
-    found = get(board.url + address[1])
-    assert "immutable" in found.headers["cache-control"]
-    again = get(board.url + address[1], headers={"If-None-Match": found.headers["etag"]})
-    assert (again.status_code, again.content) == (304, b"")
+    response = get(board.url + address[1])
+    assert "immutable" in response.headers["cache-control"]
+    conditional_response = get(board.url + address[1], headers={"If-None-Match": response.headers["etag"]})
+    assert (conditional_response.status_code, conditional_response.content) == (304, b"")
     assert "immutable" not in get(f"{board.url}/static/{name}?v=0").headers["cache-control"]
     assert get(f"{board.url}/static/..%2F__init__.py").status_code == 404
 
 
-def send(shared: Shared, archive: Path | None, token: str | None, first: bool = True) -> httpx2.Response:
-    """Send the form as a browser does: fields in their order."""
+def post_form(
+    shared: SharedServer, archive: Path | None, token: str | None, first: bool = True
+) -> httpx2.Response:
+    """Post the form as a browser does; the token comes before the archive if ``first``."""
     fields: list[tuple[str, Any]] = [] if token is None else [("token", (None, token))]
     if archive is not None:
         part = ("archive", (archive.name, archive.read_bytes(), "application/zip"))
@@ -190,53 +198,53 @@ def send(shared: Shared, archive: Path | None, token: str | None, first: bool = 
     return httpx2.post(f"{shared.url}/submit", files=fields, headers=BROWSER, timeout=60)
 
 
-def test_the_form_uploads_without_javascript(board: Shared, write_archive: Write) -> None:
-    answer = send(board, write_archive("by form", 3.0), f" {board.token}\n")
-    assert answer.status_code == 303
-    address = answer.headers["location"]
+def test_form_upload_without_javascript(board: SharedServer, write_archive: WriteArchive) -> None:
+    response = post_form(board, write_archive("by form", 3.0), f" {board.token}\n")
+    assert response.status_code == 303
+    address = response.headers["location"]
     assert address.startswith("/submissions/")
-    assert board.server.ended(address.rpartition("/")[2])["status"] == "scored"
+    assert board.server.wait_until_ended(address.rpartition("/")[2])["status"] == "scored"
     assert "by form" in names_in_order(get(board.url).text)
 
 
-def test_the_form_refuses_as_the_api_does(waiting: Shared, write_archive: Write, tmp_path: Path) -> None:
-    archive, broken, large = write_archive("x"), tmp_path / "broken.zip", tmp_path / "large.zip"
-    with zipfile.ZipFile(broken, "w") as target:
+def test_form_rejects_uploads_like_api(waiting: SharedServer, write_archive: WriteArchive, tmp_path: Path) -> None:
+    archive, invalid, large = write_archive("x"), tmp_path / "broken.zip", tmp_path / "large.zip"
+    with zipfile.ZipFile(invalid, "w") as target:
         target.writestr("submission.json", json.dumps({"method": "x"}))
         target.writestr("lattice/<b>0000.npy", b"x")
     large.write_bytes(bytes(2_100_000))
     cases = [
-        (send(waiting, archive, "rdb_wrong"), 401, "the token is unknown"),
-        (send(waiting, archive, None), 401, "no token"),
-        (send(waiting, archive, waiting.token, first=False), 401, "no token"),
-        (send(waiting, archive, "x" * 5000), 401, "no token"),
-        (send(waiting, broken, waiting.token), 422, "lattice/<b>0000.npy"),
-        (send(waiting, None, waiting.token), 422, "has no field 'archive'"),
-        (send(waiting, large, waiting.token), 413, "the most this service takes"),
+        (post_form(waiting, archive, "rdb_wrong"), 401, "the token is unknown"),
+        (post_form(waiting, archive, None), 401, "no token"),
+        (post_form(waiting, archive, waiting.token, first=False), 401, "no token"),
+        (post_form(waiting, archive, "x" * 5000), 401, "no token"),
+        (post_form(waiting, invalid, waiting.token), 422, "lattice/<b>0000.npy"),
+        (post_form(waiting, None, waiting.token), 422, "has no field 'archive'"),
+        (post_form(waiting, large, waiting.token), 413, "the most this service takes"),
     ]
-    for answer, status, words in cases:
-        assert answer.status_code == status, answer.text
-        parsed = Page(answer.text)
+    for response, status, words in cases:
+        assert response.status_code == status, response.text
+        parsed = Page(response.text)
         assert words in parsed.text
         assert "Not accepted" in parsed.text
-        assert waiting.token not in answer.text
-    by_api = waiting.server.submit(broken, waiting.token).json()["problems"]
+        assert waiting.token not in response.text
+    api_problems = waiting.server.submit(invalid, waiting.token).json()["problems"]
     shown = Page(cases[4][0].text).text
-    assert len(by_api) > 1
-    assert all(" ".join(problem.split()) in shown for problem in by_api)
+    assert len(api_problems) > 1
+    assert all(" ".join(problem.split()) in shown for problem in api_problems)
     assert not list((waiting.server.state / "spool").glob("*.upload"))
 
 
-def test_a_body_that_is_no_form_is_refused(waiting: Shared) -> None:
-    answer = httpx2.post(f"{waiting.url}/submit", content=b"hello", headers=BROWSER)
-    assert answer.status_code == 422
-    assert "expected multipart/form-data" in Page(answer.text).text
+def test_form_with_other_content_type_is_422(waiting: SharedServer) -> None:
+    response = httpx2.post(f"{waiting.url}/submit", content=b"hello", headers=BROWSER)
+    assert response.status_code == 422
+    assert "expected multipart/form-data" in Page(response.text).text
 
 
-def test_how_to_submit_says_what_is_needed(waiting: Shared) -> None:
+def test_how_to_submit_page_shows_command_and_form(waiting: SharedServer) -> None:
     _, parsed = page(f"{waiting.url}/how-to-submit")
     assert f"rebar-bench submit ARCHIVE --url {waiting.url}" in parsed.text
     assert "5 submissions a day" in parsed.text
-    assert [field["name"] for field in parsed.named("input")] == ["token", "archive"]
-    assert parsed.named("input")[0]["autocomplete"] == "off"
-    assert parsed.named("form")[0]["enctype"] == "multipart/form-data"
+    assert [field["name"] for field in parsed.attributes_of("input")] == ["token", "archive"]
+    assert parsed.attributes_of("input")[0]["autocomplete"] == "off"
+    assert parsed.attributes_of("form")[0]["enctype"] == "multipart/form-data"

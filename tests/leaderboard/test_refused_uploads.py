@@ -1,8 +1,7 @@
-"""Refusals reach a client that is still sending, whatever client it is: none sees only a cut connection."""
+"""Rejected uploads: clients that are still sending receive the response instead of a closed connection."""
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -12,18 +11,27 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from tests.leaderboard.conftest import Write
-from tests.leaderboard.raw_http import END, MULTIPART, Answer, answer_of, connect, head, part
-from tests.leaderboard.serving import Server, running_server
+from tests import requirements
+from tests.leaderboard.conftest import WriteArchive
+from tests.leaderboard.raw_http import (
+    END,
+    MULTIPART,
+    RawResponse,
+    connect,
+    multipart_part,
+    read_response,
+    request_head,
+)
+from tests.leaderboard.serving import RunServer, Server
 
 API = "/api/v1/submissions"
-MOST_UPLOAD = 4_000_000
-PIECE = bytes(1 << 16)
+MAX_UPLOAD_BYTES = 4_000_000
+CHUNK = bytes(1 << 16)
 
 
 @dataclass(frozen=True)
-class Refusal:
-    """An upload that is refused before it has come whole: token, size of the body, whether it is chunked."""
+class RejectedUpload:
+    """Upload that is rejected before it is complete: expected response, token, size and encoding of the body."""
 
     status: int
     words: str
@@ -33,139 +41,150 @@ class Refusal:
 
 
 @dataclass(frozen=True)
-class Refusing:
-    """A server, and a token whose quota is spent and one that has a place left."""
+class RejectingServer:
+    """Server, a token with exhausted quota and a token with remaining quota."""
 
     server: Server
     spent: str
     fresh: str
 
-    def refusals(self) -> Mapping[str, Refusal]:
-        small, large = MOST_UPLOAD // 2, 5 * MOST_UPLOAD
+    def rejections(self) -> Mapping[str, RejectedUpload]:
+        small, large = MAX_UPLOAD_BYTES // 2, 5 * MAX_UPLOAD_BYTES
         too_large = "the archive is larger than 4000000 bytes"
         return {
-            "unknown token": Refusal(401, "the token is unknown", "nobody's", small),
-            "unknown token, large": Refusal(401, "the token is unknown", "nobody's", large),
-            "unknown token, chunked": Refusal(401, "the token is unknown", "nobody's", large, True),
-            "too large": Refusal(413, too_large, self.fresh, large),
-            "too large, chunked": Refusal(413, too_large, self.fresh, large, True),
-            "no quota": Refusal(429, "this token has made its 1 submissions of today (UTC)", self.spent, small),
-            "no quota, large": Refusal(429, "this token has made its 1 submissions", self.spent, large, True),
+            "unknown token": RejectedUpload(401, "the token is unknown", "nobody's", small),
+            "unknown token, large": RejectedUpload(401, "the token is unknown", "nobody's", large),
+            "unknown token, chunked": RejectedUpload(401, "the token is unknown", "nobody's", large, True),
+            "too large": RejectedUpload(413, too_large, self.fresh, large),
+            "too large, chunked": RejectedUpload(413, too_large, self.fresh, large, True),
+            "no quota": RejectedUpload(
+                429, "this token has made its 1 submissions of today (UTC)", self.spent, small
+            ),
+            "no quota, large": RejectedUpload(
+                429, "this token has made its 1 submissions", self.spent, large, True
+            ),
         }
 
 
-REFUSALS = tuple(Refusing.refusals(Refusing(None, "", "")))  # type: ignore[arg-type]
-Client = Callable[[str, Refusal, Path], Answer]
+REJECTION_KINDS = tuple(RejectingServer.rejections(RejectingServer(None, "", "")))  # type: ignore[arg-type]
+Client = Callable[[str, RejectedUpload, Path], RawResponse]
 
 
-def by_socket(url: str, refusal: Refusal, _: Path) -> Answer:
-    """A client that sends everything before it listens."""
-    before, after = (part(b"|") + END).split(b"|")
-    length = f"Content-Length: {len(before) + refusal.size + len(after)}"
-    told = "Transfer-Encoding: chunked" if refusal.is_chunked else length
-    lines = (f"Authorization: Bearer {refusal.token}", f"Content-Type: {MULTIPART}", told)
-    pieces = [before, *[PIECE] * (refusal.size // len(PIECE)), bytes(refusal.size % len(PIECE)), after]
+def upload_by_socket(url: str, rejected: RejectedUpload, _: Path) -> RawResponse:
+    """Upload with a client that sends the whole body before it reads the response."""
+    before, after = (multipart_part(b"|") + END).split(b"|")
+    content_length = f"Content-Length: {len(before) + rejected.size + len(after)}"
+    length_header = "Transfer-Encoding: chunked" if rejected.is_chunked else content_length
+    lines = (f"Authorization: Bearer {rejected.token}", f"Content-Type: {MULTIPART}", length_header)
+    pieces = [before, *[CHUNK] * (rejected.size // len(CHUNK)), bytes(rejected.size % len(CHUNK)), after]
     with connect(url) as connection:
         try:
-            connection.sendall(head(API, lines))
+            connection.sendall(request_head(API, lines))
             for piece in pieces:
-                connection.sendall(b"%x\r\n%s\r\n" % (len(piece), piece) if refusal.is_chunked else piece)
-            connection.sendall(b"0\r\n\r\n" if refusal.is_chunked else b"")
+                connection.sendall(b"%x\r\n%s\r\n" % (len(piece), piece) if rejected.is_chunked else piece)
+            connection.sendall(b"0\r\n\r\n" if rejected.is_chunked else b"")
         except ConnectionError:
             pass
-        return answer_of(connection)
+        return read_response(connection)
 
 
-def by_httpx(url: str, refusal: Refusal, _: Path) -> Answer:
-    before, after = (part(b"|") + END).split(b"|")
-    headers = {"Authorization": f"Bearer {refusal.token}", "Content-Type": MULTIPART}
+def upload_by_httpx(url: str, rejected: RejectedUpload, _: Path) -> RawResponse:
+    before, after = (multipart_part(b"|") + END).split(b"|")
+    headers = {"Authorization": f"Bearer {rejected.token}", "Content-Type": MULTIPART}
 
     def pieces() -> Iterator[bytes]:
         yield before
-        yield from [PIECE] * (refusal.size // len(PIECE))
-        yield bytes(refusal.size % len(PIECE)) + after
+        yield from [CHUNK] * (rejected.size // len(CHUNK))
+        yield bytes(rejected.size % len(CHUNK)) + after
 
-    content = pieces() if refusal.is_chunked else b"".join(pieces())
-    answer = httpx2.post(url + API, content=content, headers=headers, timeout=60)
-    return Answer(answer.status_code, answer.text)
+    content = pieces() if rejected.is_chunked else b"".join(pieces())
+    response = httpx2.post(url + API, content=content, headers=headers, timeout=60)
+    return RawResponse(response.status_code, response.text)
 
 
-def by_curl(url: str, refusal: Refusal, folder: Path, *more: str) -> Answer:
-    """What the page tells people to run; curl waits for 100 Continue before a large body."""
-    curl = shutil.which("curl")
-    if curl is None:
-        pytest.skip("there is no curl on the PATH")
-    archive, said = folder / "a.zip", folder / "said.json"
+def upload_by_curl(url: str, rejected: RejectedUpload, folder: Path, *more: str) -> RawResponse:
+    """Upload with the curl command of the page; curl waits for 100 Continue before a large body."""
+    requirements.require("uploads")
+    archive, response_file = folder / "a.zip", folder / "said.json"
     with archive.open("wb") as file:
-        file.truncate(refusal.size)
-    command = [curl, "-sS", "-o", str(said), "-w", "%{http_code}", "-F", f"archive=@{archive}", *more]
-    command += ["-H", f"Authorization: Bearer {refusal.token}"]
-    command += ["-H", "Transfer-Encoding: chunked"] if refusal.is_chunked else []
-    told = subprocess.run([*command, url + API], capture_output=True, text=True, check=False, timeout=60)
-    assert told.returncode == 0, told.stderr
-    return Answer(int(told.stdout), said.read_text())
+        file.truncate(rejected.size)
+    command = ["curl", "-sS", "-o", str(response_file), "-w", "%{http_code}", "-F", f"archive=@{archive}", *more]
+    command += ["-H", f"Authorization: Bearer {rejected.token}"]
+    command += ["-H", "Transfer-Encoding: chunked"] if rejected.is_chunked else []
+    process = subprocess.run([*command, url + API], capture_output=True, text=True, check=False, timeout=60)
+    assert process.returncode == 0, process.stderr
+    return RawResponse(int(process.stdout), response_file.read_text())
 
 
-def by_curl_at_once(url: str, refusal: Refusal, folder: Path) -> Answer:
-    return by_curl(url, refusal, folder, "-H", "Expect:")
+def upload_by_curl_without_expect(url: str, rejected: RejectedUpload, folder: Path) -> RawResponse:
+    return upload_by_curl(url, rejected, folder, "-H", "Expect:")
 
 
 CLIENTS: Mapping[str, Client] = {
-    "socket": by_socket,
-    "httpx2": by_httpx,
-    "curl": by_curl,
-    "curl at once": by_curl_at_once,
+    "socket": upload_by_socket,
+    "httpx2": upload_by_httpx,
+    "curl": upload_by_curl,
+    "curl at once": upload_by_curl_without_expect,
 }
 
 
 @pytest.fixture(scope="module")
-def refusing(
-    tiny_root: Path, write_archive: Write, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Refusing]:
+def rejecting_server(
+    tiny_root: Path,
+    write_archive: WriteArchive,
+    tmp_path_factory: pytest.TempPathFactory,
+    running_server: RunServer,
+) -> Iterator[RejectingServer]:
     state = tmp_path_factory.mktemp("refusing") / "state"
     often = "100000/minute"
     with running_server(
-        tiny_root, state, scorers=0, quota=1, reads=often, writes=often, max_upload=MOST_UPLOAD
+        tiny_root,
+        state,
+        workers=0,
+        quota=1,
+        read_rate_limit=often,
+        write_rate_limit=often,
+        max_upload=MAX_UPLOAD_BYTES,
     ) as server:
         spent = server.token("spent")
-        server.accepted(write_archive("first", configs=("lattice-orbit",)), spent)
-        yield Refusing(server, spent, server.token("fresh"))
+        server.submit_accepted(write_archive("first", configs=("lattice-orbit",)), spent)
+        yield RejectingServer(server, spent, server.token("fresh"))
 
 
 @pytest.mark.parametrize("client", CLIENTS)
-@pytest.mark.parametrize("why", REFUSALS)
-def test_a_refusal_reaches_a_client_that_is_still_sending(
-    refusing: Refusing, tmp_path: Path, why: str, client: str
+@pytest.mark.parametrize("why", REJECTION_KINDS)
+def test_rejection_reaches_client_that_is_still_sending(
+    rejecting_server: RejectingServer, tmp_path: Path, why: str, client: str
 ) -> None:
-    refusal = refusing.refusals()[why]
-    answer = CLIENTS[client](refusing.server.url, refusal, tmp_path)
-    assert answer.status == refusal.status
-    assert refusal.words in answer.text
-    assert list((refusing.server.state / "spool").glob("*/*")) == []
-    assert not any("Traceback" in line for line in refusing.server.log)
+    rejected = rejecting_server.rejections()[why]
+    response = CLIENTS[client](rejecting_server.server.url, rejected, tmp_path)
+    assert response.status == rejected.status
+    assert rejected.words in response.text
+    assert list((rejecting_server.server.state / "spool").glob("*/*")) == []
+    assert not any("Traceback" in line for line in rejecting_server.server.log)
 
 
-def test_a_client_that_waits_for_continue_sends_nothing_when_it_is_refused(refusing: Refusing) -> None:
+def test_rejection_without_100_continue_if_expected(rejecting_server: RejectingServer) -> None:
     lines = ("Authorization: Bearer nobody's", f"Content-Type: {MULTIPART}", "Content-Length: 1000000000")
-    with connect(refusing.server.url, timeout_s=30) as connection:
-        connection.sendall(head(API, (*lines, "Expect: 100-continue")))
-        answer = answer_of(connection)
-    assert answer.status == 401
-    assert "100 Continue" not in answer.text
+    with connect(rejecting_server.server.url, timeout_s=30) as connection:
+        connection.sendall(request_head(API, (*lines, "Expect: 100-continue")))
+        response = read_response(connection)
+    assert response.status == 401
+    assert "100 Continue" not in response.text
 
 
 @pytest.mark.parametrize("why", ["unknown token", "no quota"])
-def test_a_client_that_sends_on_and_on_is_not_cut_off(refusing: Refusing, why: str) -> None:
-    """Many clients report the connection that broke while they were sending, and never read the answer."""
-    refusal = refusing.refusals()[why]
+def test_slow_client_is_not_cut_off_after_rejection(rejecting_server: RejectingServer, why: str) -> None:
+    """Send slowly: many clients report a connection broken while sending and never read the response."""
+    rejected = rejecting_server.rejections()[why]
     lines = (
-        f"Authorization: Bearer {refusal.token}",
+        f"Authorization: Bearer {rejected.token}",
         f"Content-Type: {MULTIPART}",
-        f"Content-Length: {refusal.size}",
+        f"Content-Length: {rejected.size}",
     )
-    with connect(refusing.server.url) as connection:
-        connection.sendall(head(API, lines))
+    with connect(rejecting_server.server.url) as connection:
+        connection.sendall(request_head(API, lines))
         for _ in range(10):
             time.sleep(0.1)
-            connection.sendall(bytes(refusal.size // 10))
-        assert answer_of(connection).status == refusal.status
+            connection.sendall(bytes(rejected.size // 10))
+        assert read_response(connection).status == rejected.status

@@ -1,39 +1,36 @@
-"""A board whose dataset has changed: never numbers of two datasets side by side."""
+"""Change of the dataset of a leaderboard: results of two datasets are never mixed."""
 
 from __future__ import annotations
 
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import httpx2
 
-from benchmarks.synthetic_dataset import write_archive, write_dataset
-from leaderboard.uploads.accept import AWAY
-from tests.leaderboard.serving import Server, running_scorer, running_server
+from leaderboard.uploads.accept import UNAVAILABLE_MESSAGE
+from tests.leaderboard.serving import RunScorer, RunServer, Server
 from tests.leaderboard.watching import submission_row, wait_until
+from tests.synthetic_dataset import write_archive, write_dataset
 
 
-def shown(server: Server) -> list[tuple[str, int]]:
-    answer = httpx2.get(f"{server.url}/api/v1/leaderboard?config=lattice", timeout=60).json()
-    return [(row["id"], row["rank"]) for row in answer["rows"]]
+def ids_and_ranks(server: Server) -> list[tuple[str, int]]:
+    ranking = httpx2.get(f"{server.url}/api/v1/leaderboard?config=lattice", timeout=60).json()
+    return [(row["id"], row["rank"]) for row in ranking["rows"]]
 
 
-def test_another_dataset_is_refused_until_it_is_scored_again(
-    tmp_path: Path, new_database: Callable[[], str]
-) -> None:
-    db, state, archive = new_database(), tmp_path / "state", tmp_path / "archive.zip"
+def test_other_dataset_is_rejected_without_rescore_option(tmp_path: Path, running_server: RunServer) -> None:
+    db, state, archive = "", tmp_path / "state", tmp_path / "archive.zip"
     first, second = tmp_path / "first", tmp_path / "second"
     write_dataset(first, ["lattice"], 3)
     write_dataset(second, ["lattice", "pile"], 3)
     write_archive(archive, ["lattice"], 3, "m", 1)
     with running_server(first, state, db=db) as server:
         token = server.token("alice")
-        ids = [server.accepted(archive, token) for _ in range(2)]
-        before = [server.ended(one)["result"] for one in ids]
-        ranks = shown(server)
+        ids = [server.submit_accepted(archive, token) for _ in range(2)]
+        before = [server.wait_until_ended(submission_id)["result"] for submission_id in ids]
+        ranks = ids_and_ranks(server)
     command = [
         sys.executable,
         "-m",
@@ -41,56 +38,61 @@ def test_another_dataset_is_refused_until_it_is_scored_again(
         "serve",
         "--data",
         second,
-        "--state",
+        "--state-dir",
         state,
         "--port",
         "0",
         "--db",
         db,
     ]
-    refused = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=60, check=False)
-    assert refused.returncode == 2
-    assert "2 submissions of this board are of another dataset" in refused.stderr
-    assert "--rescore true" in refused.stderr
-    assert "Traceback" not in refused.stderr
-    with running_server(second, state, db=db, rescore=True, scorers=0) as server:
-        assert shown(server) == []
-        found = httpx2.get(f"{server.url}/api/v1/submissions/{ids[0]}", timeout=60).json()
-        assert (found["status"], found["result"]) == ("queued", None)
+    process = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=60, check=False)
+    assert process.returncode == 2
+    assert "2 submissions of this board are of another dataset" in process.stderr
+    assert "--rescore true" in process.stderr
+    assert "Traceback" not in process.stderr
+    with running_server(second, state, db=db, rescore=True, workers=0) as server:
+        assert ids_and_ranks(server) == []
+        submission = httpx2.get(f"{server.url}/api/v1/submissions/{ids[0]}", timeout=60).json()
+        assert (submission["status"], submission["result"]) == ("queued", None)
         assert httpx2.get(f"{server.url}/submissions/{ids[0]}", timeout=60).status_code == 200
     with running_server(second, state, db=db) as server:
-        after = [server.ended(one)["result"] for one in ids]
+        after = [server.wait_until_ended(submission_id)["result"] for submission_id in ids]
         digest = json.loads((second / "manifest.json").read_text())["ground_truth"]["digest"]
-        assert [one["dataset"]["digest"] for one in after] == [digest, digest]
-        assert [one["tables"] for one in after] == [one["tables"] for one in before]
-        assert shown(server) == ranks
+        assert [result["dataset"]["digest"] for result in after] == [digest, digest]
+        assert [result["tables"] for result in after] == [result["tables"] for result in before]
+        assert ids_and_ranks(server) == ranks
 
 
-def test_a_scorer_with_another_dataset_scores_nothing_and_costs_nothing(tmp_path: Path) -> None:
+def test_scorer_with_other_dataset_releases_job(
+    tmp_path: Path, running_server: RunServer, running_scorer: RunScorer
+) -> None:
     state, archive = tmp_path / "state", tmp_path / "archive.zip"
     first, second = tmp_path / "first", tmp_path / "second"
     write_dataset(first, ["lattice"], 2)
     write_dataset(second, ["lattice", "pile"], 2)
     write_archive(archive, ["lattice"], 2, "m", 1)
-    with running_server(first, state, scorers=0) as server:
-        one = server.accepted(archive, server.token("alice"))
+    with running_server(first, state, workers=0) as server:
+        submission_id = server.submit_accepted(archive, server.token("alice"))
         with running_scorer(second, state) as log:
             wait_until(lambda: any("given back" in line for line in log), "the job is given back")
         assert any("expected sha256:" in line for line in log)
-        assert (submission_row(state, one)["status"], submission_row(state, one)["attempts"]) == ("queued", 0)
+        assert (
+            submission_row(state, submission_id)["status"],
+            submission_row(state, submission_id)["attempts"],
+        ) == ("queued", 0)
         with running_scorer(first, state):
-            assert server.ended(one)["status"] == "scored"
+            assert server.wait_until_ended(submission_id)["status"] == "scored"
 
 
-def test_a_dataset_that_is_away_fails_nobody(tmp_path: Path) -> None:
+def test_missing_dataset_is_503_and_fails_no_submission(tmp_path: Path, running_server: RunServer) -> None:
     root, state, archive = tmp_path / "root", tmp_path / "state", tmp_path / "archive.zip"
     write_dataset(root, ["lattice"], 2)
     write_archive(archive, ["lattice"], 2, "m", 1)
-    with running_server(root, state, lease=2) as server:
+    with running_server(root, state, lease_seconds=2) as server:
         token = server.token("alice")
         root.rename(tmp_path / "elsewhere")
-        refused = server.submit(archive, token)
-        assert (refused.status_code, refused.json()["detail"]) == (503, AWAY)
+        response = server.submit(archive, token)
+        assert (response.status_code, response.json()["detail"]) == (503, UNAVAILABLE_MESSAGE)
         (tmp_path / "elsewhere").rename(root)
-        one = server.accepted(archive, token)
-        assert server.ended(one)["status"] == "scored"
+        submission_id = server.submit_accepted(archive, token)
+        assert server.wait_until_ended(submission_id)["status"] == "scored"

@@ -1,4 +1,4 @@
-"""Settings: where they come from, which wins, and what is said of those that are wrong."""
+"""Settings: sources, precedence, validation messages and deprecated names."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from typing import Any
 import pytest
 from pydantic import ByteSize
 
-from leaderboard.cli import GROUPS, argument_parser
-from leaderboard.settings import Settings, read_settings
-from leaderboard.storage.archive_store import Archives
+from leaderboard.cli import COMMAND_SETTINGS, RENAMED_OPTIONS, argument_parser
+from leaderboard.settings import RENAMED_SETTINGS, Settings, read_settings
+from leaderboard.storage.archive_store import ArchiveStore
+from rebar_depth_bench.console import replace_renamed_options
 from rebar_depth_bench.errors import InputError
 
 PASSWORD = "Hunter2"
@@ -35,63 +36,69 @@ FILES = {
 
 @dataclass(frozen=True)
 class Case:
-    """A command that must be refused, and what has to be in the words.
+    """Command that must fail, and a pattern of its error message.
 
-    ``DATA`` stands for a dataset, ``HERE`` for a folder with ``FILES`` in it, ``TAKEN`` for a port.
+    ``DATA`` is replaced by a dataset folder, ``HERE`` by a folder with ``FILES``, ``TAKEN`` by a port in use.
     """
 
     words: str
     options: str
-    command: str = "serve --data DATA --state HERE/state --port 0"
+    command: str = "serve --data DATA --state-dir HERE/state --port 0"
     environment: Mapping[str, str] = field(default_factory=dict)
 
 
-BARE = "serve --state HERE/state"
+COMMAND_WITHOUT_DATA = "serve --state-dir HERE/state"
 CASES = {
     "unknown key": Case("quotta: there is no such setting", "--settings HERE/unknown"),
     "unknown key with a secret": Case("dbb: there is no such setting", "--settings HERE/secret"),
     "wrong type": Case("quota: .*'many'", "--settings HERE/type"),
     "wrong type of a secret": Case("db: ", "--settings HERE/list"),
     "two at once": Case("port: .*quota: ", "--port x --quota -1"),
-    "wrong type in the environment": Case("lease: .*'soon'", "", environment={f"{PREFIX}LEASE": "soon"}),
+    "wrong type in the environment": Case(
+        "lease_seconds: .*'soon'", "", environment={f"{PREFIX}LEASE_SECONDS": "soon"}
+    ),
     "port too high": Case("port: .*65535.*65536", "--port 65536"),
-    "neither owner nor always": Case("public: .*'owner' or 'always'", "--public never"),
+    "neither owner nor always": Case("default_visibility: .*'owner' or 'always'", "--default-visibility never"),
     "malformed TOML": Case("malformed: cannot be read as TOML", "--settings HERE/malformed"),
     "TOML that is not UTF-8": Case("latin: cannot be read as TOML", "--settings HERE/latin"),
     "no TOML file": Case("none: cannot be read as TOML", "--settings HERE/none"),
     "folder as TOML file": Case("cannot be read as TOML", "--settings HERE"),
-    "rate in words": Case("reads: expected a rate such as .*'many'", "--reads many"),
-    "rate of nothing": Case("writes: expected a rate", "--writes 0/minute"),
-    "two rates": Case("writes: expected a rate", "--writes 1/second;9/minute"),
-    "empty rate": Case("reads: expected a rate", "", environment={f"{PREFIX}READS": ""}),
-    "no data": Case("data: is not given", f"--db postgresql://u:{PASSWORD}@h/x", BARE),
-    "dataset missing": Case("no such folder", "--data HERE/none", BARE),
-    "dataset empty": Case("no manifest.json", "--data HERE", BARE),
+    "rate in words": Case("read_rate_limit: expected a rate such as .*'many'", "--read-rate-limit many"),
+    "rate of nothing": Case("write_rate_limit: expected a rate", "--write-rate-limit 0/minute"),
+    "two rates": Case("write_rate_limit: expected a rate", "--write-rate-limit 1/second;9/minute"),
+    "empty rate": Case("read_rate_limit: expected a rate", "", environment={f"{PREFIX}READ_RATE_LIMIT": ""}),
+    "no data": Case("data: is not given", f"--db postgresql://u:{PASSWORD}@h/x", COMMAND_WITHOUT_DATA),
+    "dataset missing": Case("no such folder", "--data HERE/none", COMMAND_WITHOUT_DATA),
+    "dataset empty": Case("no manifest.json", "--data HERE", COMMAND_WITHOUT_DATA),
     "no URL": Case("db: expected sqlite", f"--db u:{PASSWORD}@h/x"),
     "another database": Case("db: expected sqlite", f"--db mysql://u:{PASSWORD}@h/x"),
     "database in memory": Case("db: expected sqlite", "--db sqlite://"),
     "database's port": Case("db: expected sqlite", f"--db postgresql://u:{PASSWORD}@h:port/x"),
     "database away": Case("does not answer", f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x"),
-    "database away, token": Case("not answer", f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x", "token me"),
-    "database away, score": Case(
-        "not answer", f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x", "score --data DATA --state HERE/state"
+    "database away, token": Case(
+        "not answer", f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x", "token me --state-dir HERE/state"
     ),
-    "state is a file": Case("files cannot be kept there", "--state HERE/type"),
+    "database away, score": Case(
+        "not answer", f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x", "score --data DATA --state-dir HERE/state"
+    ),
+    "state is a file": Case("files cannot be kept there", "--state-dir HERE/type"),
     "port taken": Case("cannot listen there: Address already in use", "--port TAKEN"),
     "not our address": Case("cannot listen there", "--host 192.0.2.1"),
     "no address at all": Case("cannot listen there", f"--host {'x' * 70}"),
     "unknown protocol": Case("Protocol not known: nope", f"--archives nope://u:{PASSWORD}@h/x"),
     "archives away": Case("cannot be kept there", f"--archives ftp://u:{PASSWORD}@127.0.0.1:1/x"),
     "archives in a file": Case("cannot be kept there", "--archives HERE/type/x"),
-    "backup of PostgreSQL": Case("pg_dump", f"--db postgresql://u:{PASSWORD}@h/x", "backup HERE/b"),
-    "backup of nothing": Case("there is no database", "--state HERE", "backup HERE/b"),
-    "backup into the state": Case("the service itself uses", "--state HERE", "backup HERE/none/.."),
+    "backup of PostgreSQL": Case(
+        "pg_dump", f"--db postgresql://u:{PASSWORD}@h/x", "backup HERE/b --state-dir HERE/state"
+    ),
+    "backup of nothing": Case("there is no database", "--state-dir HERE", "backup HERE/b"),
+    "backup into the state": Case("the service itself uses", "--state-dir HERE", "backup HERE/none/.."),
     "backup into the database": Case("itself uses", "--db sqlite:///HERE/x/b.sqlite", "backup HERE/x"),
 }
 
 _RUNNER = """
 import contextlib, io, json, os, signal, sys, traceback
-from leaderboard.archives import Archives
+from leaderboard.storage.archive_store import ArchiveStore
 from leaderboard.cli import main
 signal.signal(signal.SIGALRM, lambda *_: sys.exit("it was not refused and runs on"))
 answers = []
@@ -112,23 +119,23 @@ for arguments, environment in json.load(sys.stdin):
     answers.append([status, said.getvalue()])
 json.dump(answers, sys.stdout)
 """
-"""The real commands one after another, in a process of their own: each alone would take seconds to start."""
+"""Script that runs all commands in a single process, because each process takes seconds to start."""
 
 
 @pytest.fixture(scope="module")
-def answers(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int | str | None, str]]:
-    """Exit status of every case, and what was said."""
-    here = tmp_path_factory.mktemp("settings")
+def outcomes(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int | str | None, str]]:
+    """Return exit status and standard error of every case."""
+    folder = tmp_path_factory.mktemp("settings")
     for name, content in FILES.items():
-        (here / name).write_bytes(content)
+        (folder / name).write_bytes(content)
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        places = {"DATA": str(tiny_root), "HERE": str(here), "TAKEN": str(taken.getsockname()[1])}
+        values = {"DATA": str(tiny_root), "HERE": str(folder), "TAKEN": str(taken.getsockname()[1])}
 
         def arguments(case: Case) -> list[str]:
             words = f"{case.command} {case.options}".split()
-            return [re.sub("DATA|HERE|TAKEN", lambda found: places[found[0]], word) for word in words]
+            return [re.sub("DATA|HERE|TAKEN", lambda match: values[match[0]], word) for word in words]
 
-        finished = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", _RUNNER],
             input=json.dumps([(arguments(case), case.environment) for case in CASES.values()]),
             capture_output=True,
@@ -136,54 +143,78 @@ def answers(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
             timeout=120,
             env={name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
         )
-    assert finished.returncode == 0, finished.stderr
-    return dict(zip(CASES, json.loads(finished.stdout), strict=True))
+    assert process.returncode == 0, process.stderr
+    return dict(zip(CASES, json.loads(process.stdout), strict=True))
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_is_wrong_is_said_in_words(name: str, answers: dict[str, tuple[int | str | None, str]]) -> None:
-    status, said = answers[name]
-    assert status == 2, said
-    lines = [line for line in said.splitlines() if not line.startswith("{")]
-    assert lines[0].startswith("error: "), said
+def test_invalid_settings_exit_2_with_message(
+    name: str, outcomes: dict[str, tuple[int | str | None, str]]
+) -> None:
+    status, stderr = outcomes[name]
+    assert status == 2, stderr
+    lines = [line for line in stderr.splitlines() if not line.startswith("{")]
+    assert lines[0].startswith("error: "), stderr
     assert sum(line.startswith("error:") for line in lines) == 1
-    assert re.search(CASES[name].words, said), said
-    assert "Traceback" not in said
-    assert PASSWORD not in said
+    assert re.search(CASES[name].words, stderr), stderr
+    assert "Traceback" not in stderr
+    assert PASSWORD not in stderr
 
 
-def test_a_token_of_a_service_that_is_not_there_yet_makes_its_database(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "leaderboard", "token", "me", "--state", str(tmp_path / "new")]
-    finished = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert re.fullmatch(r"rdb_[\w-]{43}\n", finished.stdout), "the token alone goes to standard output"
+@pytest.mark.slow
+def test_token_command_creates_database(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "leaderboard", "token", "me", "--state-dir", str(tmp_path / "new")]
+    process = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert re.fullmatch(r"rdb_[\w-]{43}\n", process.stdout), "the token alone goes to standard output"
     assert (tmp_path / "new" / "leaderboard.sqlite").is_file()
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
+def settings_file(tmp_path: Path) -> Path:
     (tmp_path / "board.toml").write_text('data = "from-file"\ntitle = "from file"\nquota = 7\n')
     return tmp_path / "board.toml"
 
 
-def test_the_command_line_wins_over_the_file_and_the_file_over_the_environment(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name, value in (("TITLE", "from environment"), ("QUOTA", "8"), ("LEASE", "9")):
+def test_precedence_is_command_line_file_environment(settings_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("TITLE", "from environment"), ("QUOTA", "8"), ("LEASE_SECONDS", "9")):
         monkeypatch.setenv(PREFIX + name, value)
-    settings = read_settings(file, {"title": "from command line"})
-    assert (settings.title, settings.quota, settings.lease) == ("from command line", 7, 9.0)
+    settings = read_settings(settings_file, {"title": "from command line"})
+    assert (settings.title, settings.quota, settings.lease_seconds) == ("from command line", 7, 9.0)
     assert (settings.data, settings.port) == ("from-file", Settings.model_fields["port"].default)
     assert read_settings(None, {"data": "x"}).title == "from environment"
 
 
-def given_for(name: str) -> str:
-    """A value that the setting takes and that is not its default."""
+@pytest.mark.parametrize(("old", "new"), RENAMED_SETTINGS.items())
+def test_old_setting_names_work_with_a_warning(
+    old: str, new: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    value = example_value(new)
+    expected = getattr(read_settings(None, {"data": "x", new: value}), new)
+    (tmp_path / "old.toml").write_text(f"{old} = {value if value.isdigit() else repr(value)}\n")
+    assert getattr(read_settings(tmp_path / "old.toml", {"data": "x"}), new) == expected
+    assert f"warning: setting {old} is deprecated, use {new}\n" in capsys.readouterr().err
+    monkeypatch.setenv(PREFIX + old.upper(), value)
+    assert getattr(read_settings(None, {"data": "x"}), new) == expected
+    assert f"{PREFIX}{old.upper()} is deprecated, use {PREFIX}{new.upper()}" in capsys.readouterr().err
+    arguments = replace_renamed_options(["serve", f"--{old}", value], RENAMED_OPTIONS)
+    assert getattr(argument_parser().parse_args(arguments), new) == value
+    assert f"--{old} is deprecated" in capsys.readouterr().err
+
+
+def test_new_environment_name_precedes_the_old_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(f"{PREFIX}LEASE", "9")
+    monkeypatch.setenv(f"{PREFIX}LEASE_SECONDS", "7")
+    assert read_settings(None, {"data": "x"}).lease_seconds == 7.0
+
+
+def example_value(name: str) -> str:
+    """Return a valid value of the setting that is not its default."""
     special = {
         "db": "sqlite:///elsewhere.sqlite",
-        "public": "owner",
-        "reads": "3/second",
-        "writes": "4/second",
-        "state": "/elsewhere",
+        "default_visibility": "owner",
+        "read_rate_limit": "3/second",
+        "write_rate_limit": "4/second",
+        "state_dir": "/elsewhere",
         "rescore": "true",
     }
     kind = Settings.model_fields[name].annotation
@@ -191,10 +222,10 @@ def given_for(name: str) -> str:
 
 
 @pytest.mark.parametrize("name", Settings.model_fields)
-def test_every_setting_is_taken_from_everywhere(
+def test_every_setting_is_read_from_every_source(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    value = given_for(name)
+    value = example_value(name)
     rest: dict[str, Any] = {} if name == "data" else {"data": "x"}
     option = f"--{name.replace('_', '-')}"
     parsed = getattr(argument_parser().parse_args(["serve", option, value]), name)
@@ -207,49 +238,49 @@ def test_every_setting_is_taken_from_everywhere(
     assert Settings.model_fields[name].default != by_command
 
 
-@pytest.mark.parametrize("command", GROUPS)
+@pytest.mark.parametrize("command", COMMAND_SETTINGS)
 def test_help_shows_every_setting_with_its_default(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
         argument_parser().parse_args([command, "--help"])
     assert end.value.code == 0
     shown = " ".join(capsys.readouterr().out.split())
-    for name in GROUPS[command]:
+    for name in COMMAND_SETTINGS[command]:
         default = Settings.model_fields[name].default
         assert f"--{name.replace('_', '-')} " in shown
         if default not in ("", None) and not Settings.model_fields[name].is_required():
             assert f"(default: {default})" in shown, name
-    assert command != "serve" or set(GROUPS["serve"]) == set(Settings.model_fields)
+    assert command != "serve" or set(COMMAND_SETTINGS["serve"]) == set(Settings.model_fields)
 
 
 @pytest.mark.parametrize("rate", ["600/minute", "10/second", "1 per 2 hours", "5/day"])
-def test_rates_that_are_taken(rate: str) -> None:
-    assert read_settings(None, {"data": "x", "reads": rate}).reads == rate
+def test_valid_rate_limits_are_accepted(rate: str) -> None:
+    assert read_settings(None, {"data": "x", "read_rate_limit": rate}).read_rate_limit == rate
 
 
 @pytest.mark.parametrize("url", ["postgresql://u:p@h:5432/x", "postgresql+psycopg://u@/x?host=/run/pg"])
-def test_postgresql_is_reached_by_psycopg(url: str) -> None:
-    reached = read_settings(None, {"data": "x", "db": url}).database_url
-    assert reached.startswith("postgresql+psycopg://")
-    assert reached.split("://")[1] == url.split("://")[1]
+def test_postgresql_urls_use_psycopg(url: str) -> None:
+    database_url = read_settings(None, {"data": "x", "db": url}).database_url
+    assert database_url.startswith("postgresql+psycopg://")
+    assert database_url.split("://")[1] == url.split("://")[1]
 
 
 @pytest.mark.parametrize("url", [f"postgres://u:{PASSWORD}@h/x", "sqlite:///", "sqlite:///?mode=memory"])
-def test_strange_database_urls_are_refused(url: str) -> None:
+def test_invalid_database_urls_are_rejected(url: str) -> None:
     with pytest.raises(InputError, match="db: expected sqlite:///PATH or postgresql://") as refusal:
         read_settings(None, {"data": "x", "db": url})
     assert PASSWORD not in str(refusal.value)
 
 
-def test_all_is_kept_in_the_state_folder_whatever_its_name(tmp_path: Path) -> None:
-    settings = read_settings(None, {"data": "x", "state": tmp_path / "a st%20ate"})
-    archives = Archives(settings.archives_url)
+def test_state_folder_name_may_have_special_characters(tmp_path: Path) -> None:
+    settings = read_settings(None, {"data": "x", "state_dir": tmp_path / "a st%20ate"})
+    archives = ArchiveStore(settings.archives_url)
     (tmp_path / "one.zip").write_bytes(b"zip")
     archives.put("one", tmp_path / "one.zip")
     assert (tmp_path / "a st%20ate" / "archives" / "one.zip").is_file()
     assert settings.database_url == f"sqlite:///{tmp_path}/a st%20ate/leaderboard.sqlite"
 
 
-def test_sizes_may_have_units() -> None:
+def test_sizes_are_parsed_with_units() -> None:
     assert read_settings(None, {"data": "x", "max_upload": "3GiB"}).max_upload == 3 << 30
     with pytest.raises(InputError, match=r"score_memory: .*, got '4 heaps'"):
         read_settings(None, {"data": "x", "score_memory": "4 heaps"})

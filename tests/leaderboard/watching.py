@@ -1,4 +1,4 @@
-"""What tests of a running service look at: its processes, its database, what comes true after a while."""
+"""Helpers of tests of a running service: its processes, its database and polling of conditions."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from tests.leaderboard.processes import descendants
 
 SCORER = b"leaderboard.scoring\0"
 SCORING = b"leaderboard.scoring.sandbox"
-"""What stands on the command lines of a scorer and of the process in which it scores one archive."""
+"""Parts of the command lines of a scorer and of the process in which it scores one archive."""
 
 
 def wait_until(condition: Callable[[], object], what: str, within_s: float = 60.0) -> None:
-    """Wait until ``condition`` holds."""
-    limit = time.monotonic() + within_s
+    """Wait until ``condition`` holds; fail after ``within_s`` seconds."""
+    deadline = time.monotonic() + within_s
     while not condition():
-        assert time.monotonic() < limit, f"not within {within_s} s: {what}"
+        assert time.monotonic() < deadline, f"not within {within_s} s: {what}"
         time.sleep(0.05)
 
 
-def processes_below(pid: int, words: bytes) -> list[int]:
-    """Return the processes that ``pid`` and its children started and that have ``words`` on their command line."""
-    return [one for one in descendants(pid) if words in _command_line(one)]
+def processes_below(pid: int, text: bytes) -> list[int]:
+    """Return the descendants of ``pid`` whose command line contains ``text``."""
+    return [descendant for descendant in descendants(pid) if text in _command_line(descendant)]
 
 
 def submission_row(state: Path, submission_id: str) -> dict[str, Any]:
-    """Return a submission's columns as they stand in the SQLite database of a state folder."""
+    """Return the columns of a submission in the SQLite database of a state folder."""
     with closing(sqlite3.connect(state / "leaderboard.sqlite")) as connection:
         connection.row_factory = sqlite3.Row
         query = "SELECT * FROM submissions WHERE id = ?"
@@ -41,4 +41,4 @@ def _command_line(pid: int) -> bytes:
     try:
         return Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
-        return b""  # it has just ended
+        return b""  # The process has just ended.

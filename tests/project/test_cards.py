@@ -1,4 +1,4 @@
-"""The cards say what the code does and what the folder holds."""
+"""Dataset and benchmark cards: agreement with the code and the dataset folder."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from rebar_depth_bench.data.dataset import features
 from rebar_depth_bench.methods import own_methods
 
 
-def test_the_benchmark_card_in_the_repository_is_up_to_date() -> None:
+def test_benchmark_card_in_repository_is_up_to_date() -> None:
     assert Path("cards/BENCHMARK.md").read_text() == benchmark_card(), "run `make cards`"
 
 
-def test_the_benchmark_card_names_every_method_and_rule() -> None:
+def test_benchmark_card_names_every_method_and_rule() -> None:
     card = benchmark_card()
     assert all(f"| `{name}`" in card for name in own_methods())
     assert "max(p/z, z/p) < 1.25" in card
@@ -34,7 +34,7 @@ def test_every_column_is_described_once() -> None:
     assert {row["type"] for row in rows if "K`" in row["names"]} == {"float64 x 3 x 3"}
 
 
-def test_the_dataset_cards_yaml_lists_what_is_there(tiny_root: Path) -> None:
+def test_dataset_card_yaml_matches_folder(tiny_root: Path) -> None:
     text = (tiny_root / "README.md").read_text()
     metadata = yaml.safe_load(text.split("---")[1])
     assert [config["config_name"] for config in metadata["configs"]] == ["lattice", "lattice-orbit"]
@@ -45,15 +45,13 @@ def test_the_dataset_cards_yaml_lists_what_is_there(tiny_root: Path) -> None:
     assert counts == {"lattice": 9, "lattice-orbit": 2}
 
 
-def test_the_dataset_cards_shares_are_those_of_the_masks(
-    tiny_root: Path, tiny_masks: dict[str, np.ndarray]
-) -> None:
+def test_dataset_card_steel_share_matches_masks(tiny_root: Path, tiny_masks: dict[str, np.ndarray]) -> None:
     steel = np.mean([mask.mean() for mask in tiny_masks.values()])
     row = next(line for line in (tiny_root / "README.md").read_text().splitlines() if "`lattice`" in line)
     assert f"| {100 * steel:.1f} % |" in row
     assert len(rdb.load(tiny_root, "lattice")) == int(row.split("|")[3].split()[0])
 
 
-def test_the_card_is_a_function_of_the_manifest(tiny_root: Path) -> None:
+def test_dataset_card_is_rendered_from_manifest(tiny_root: Path) -> None:
     manifest = json.loads((tiny_root / "manifest.json").read_text())
     assert dataset_card(manifest) == (tiny_root / "README.md").read_text()

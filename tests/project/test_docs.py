@@ -1,4 +1,4 @@
-"""The README's commands parse, its Python runs, its tables and links are true."""
+"""Documentation: commands parse, Python examples run, and tables and links are correct."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from leaderboard.cli import argument_parser as board_parser
 from leaderboard.settings import Settings
 from rebar_depth_bench.cli.main import argument_parser as bench_parser
 from rebar_depth_bench.methods import find_method, own_methods
-from tests.bench.methods.predictors import loaded
+from tests.bench.methods.predictors import load_predictor
 
 PAGES = [
     Path("README.md"),
@@ -44,12 +44,12 @@ def commands() -> list[str]:
 
 
 @pytest.mark.parametrize("command", commands())
-def test_every_command_shown_is_one_that_parses(command: str) -> None:
+def test_documented_commands_parse(command: str) -> None:
     program, *arguments = shlex.split(command, comments=True)
     assert PARSERS[program].parse_args(arguments)
 
 
-def test_the_python_shown_runs(tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_documented_python_runs(tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, second = blocks(Path("README.md"), "python")
     monkeypatch.chdir(tmp_path)
     shown = first.replace('"demo-output/dataset"', repr(str(tiny_root)))
@@ -61,24 +61,24 @@ def test_the_python_shown_runs(tiny_root: Path, tmp_path: Path, monkeypatch: pyt
     assert {"rgb", "depth", "mask", "K", "poses", "view_id", "right_rgb", "baseline_m"} <= set(batch)
 
 
-def test_the_template_of_a_method_is_one(tmp_path: Path) -> None:
+def test_method_template_in_readme_works(tmp_path: Path) -> None:
     [template] = blocks(Path("README.md"), "py")
     path = tmp_path / "my_model.py"
     path.write_text(f"load_my_model = lambda: lambda rgb, K: rgb[..., 0] * K[0, 0]\n{template}")
     method = find_method(f"{path}:METHOD")
     row = {"left_rgb": np.full((2, 3, 3), 2.0), "left_K": 5 * np.eye(3)}
-    assert loaded(method)(row).tolist() == [[10.0] * 3] * 2
+    assert load_predictor(method)(row).tolist() == [[10.0] * 3] * 2
     assert set(method.info.columns) == set(row)
 
 
-def test_every_setting_of_the_leaderboard_is_shown_with_its_default() -> None:
+def test_leaderboard_settings_table_matches_code() -> None:
     page = Path("deploy/README.md").read_text()
     for name, field in Settings.model_fields.items():
         default = "" if field.is_required() or field.default == "" else f"`{field.default}`"
         assert f"| `{name}` | {default} | {field.description} |" in page
 
 
-def test_tables_name_every_config_variant_and_method() -> None:
+def test_readme_tables_list_configs_variants_and_methods() -> None:
     readme = Path("README.md").read_text()
     assert set(re.findall(r"^\| `([\w-]+)` \|", readme, flags=re.MULTILINE)) == {
         *CONFIGS,
@@ -86,16 +86,16 @@ def test_tables_name_every_config_variant_and_method() -> None:
         *own_methods(),
         *VARIANTS,
     }
-    assert all(f"| `{variant.name}` | {variant.words} |" in readme for variant in VARIANTS.values())
+    assert all(f"| `{variant.name}` | {variant.description} |" in readme for variant in VARIANTS.values())
 
 
 @pytest.mark.parametrize("page", PAGES, ids=str)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_local_links_exist(page: Path) -> None:
     links = re.findall(r"\]\(([^)#]+)\)", page.read_text())
     assert all((page.parent / link).exists() for link in links if "://" not in link)
 
 
-def test_make_targets_shown_exist() -> None:
+def test_documented_make_targets_exist() -> None:
     targets = set(re.findall(r"^([a-z-]+):.*##", Path("Makefile").read_text(), flags=re.MULTILINE))
     shown = {name for page in PAGES for name in re.findall(r"\bmake ([a-z-]+)\b(?:`|\s+#)", page.read_text())}
     assert {"demo", "test"} <= shown <= targets

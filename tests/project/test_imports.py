@@ -1,4 +1,4 @@
-"""What importing costs and drags in, seen from a fresh interpreter."""
+"""Modules loaded by imports in a fresh interpreter."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import sys
 
 import pytest
 
-SCORING = (
+SCORING_IMPORTS = (
     "import rebar_depth_bench as rdb; rdb.score; rdb.load; rdb.SubmissionWriter; import rebar_depth_bench.cli.main"
 )
 
-BUILDER = [
+BUILDER_MODULES = [
     "config.catalog",
     "config.rigs",
     "config.scene_schema",
@@ -20,38 +20,41 @@ BUILDER = [
     "scene.assemblies.cage_file",
     "scene.variants.props",
 ]
-"""Each package, and the modules between which imports could run in a circle."""
+"""Packages, and modules that could take part in circular imports."""
 
 
 def modules_after(statement: str) -> set[str]:
     code = f"{statement}\nimport sys\nprint(*sys.modules)"
-    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return set(finished.stdout.split())
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(process.stdout.split())
 
 
-def test_loading_and_scoring_need_neither_torch_nor_blender_nor_the_builder() -> None:
-    found = modules_after(SCORING)
-    assert "rebar_depth_bench.scoring.score" in found
+@pytest.mark.slow
+def test_loading_and_scoring_import_no_heavy_packages() -> None:
+    modules = modules_after(SCORING_IMPORTS)
+    assert "rebar_depth_bench.scoring.score" in modules
     heavy = {"torch", "bpy", "mathutils", "cv2", "embreex", "trimesh", "fastapi", "dataset_builder", "leaderboard"}
-    assert not found & heavy
+    assert not modules & heavy
 
 
-def test_the_packages_own_import_is_light() -> None:
+def test_package_import_is_lightweight() -> None:
     assert not modules_after("import rebar_depth_bench") & {"datasets", "pyarrow", "numpy", "torch"}
 
 
-def test_planning_a_build_does_not_import_blender() -> None:
-    found = modules_after("import dataset_builder.cli, dataset_builder.build.build, dataset_builder.audit")
-    assert "dataset_builder.build.build" in found
-    assert not found & {"bpy", "mathutils", "torch"}
+@pytest.mark.slow
+def test_build_planning_does_not_import_blender() -> None:
+    modules = modules_after("import dataset_builder.cli, dataset_builder.pipeline.build, dataset_builder.audit")
+    assert "dataset_builder.pipeline.build" in modules
+    assert not modules & {"bpy", "mathutils", "torch"}
 
 
-@pytest.mark.parametrize("name", BUILDER)
-def test_every_module_of_the_builder_can_be_the_first_to_be_imported(name: str) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BUILDER_MODULES)
+def test_builder_modules_can_be_imported_first(name: str) -> None:
     assert f"dataset_builder.{name}" in modules_after(f"import dataset_builder.{name}")
 
 
-def test_without_the_build_extra_one_sentence_names_it() -> None:
+def test_missing_build_extra_is_named() -> None:
     code = """
 import importlib.util, sys
 find = importlib.util.find_spec
@@ -60,9 +63,9 @@ sys.modules["trimesh"] = None
 from dataset_builder.cli import main
 sys.exit(main(["--out", "nowhere"]))
 """
-    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert finished.returncode == 2
-    assert finished.stderr == (
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert process.returncode == 2
+    assert process.stderr == (
         "error: not installed: bpy, trimesh; expected the build extra: pip install 'rebar-depth-bench[build]'\n"
     )
 
@@ -70,14 +73,14 @@ sys.exit(main(["--out", "nowhere"]))
 @pytest.mark.parametrize(
     "name", ["load", "score", "SubmissionWriter", "torch_loader", "Result", "SubmissionError"]
 )
-def test_public_names_are_there(name: str) -> None:
+def test_public_names_exist(name: str) -> None:
     import rebar_depth_bench
 
     assert name in rebar_depth_bench.__all__
     assert getattr(rebar_depth_bench, name).__name__ == name
 
 
-def test_an_unknown_name_is_an_attribute_error() -> None:
+def test_unknown_name_raises_attribute_error() -> None:
     import rebar_depth_bench
 
     with pytest.raises(AttributeError, match="has no attribute 'lod'"):

@@ -1,4 +1,4 @@
-"""``rebar-bench`` as a user runs it: outputs, exit statuses, words."""
+"""Tests of the ``rebar-bench`` command line: outputs, exit statuses and messages."""
 
 from __future__ import annotations
 
@@ -14,34 +14,52 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench import score
+from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN
+from tests.commands import run_in_process
 
 Depths = dict[str, np.ndarray]
 
 
-def bench(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "rebar_depth_bench", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+def run_bench(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run ``rebar-bench`` in this process."""
+    return run_in_process(main, *arguments)
+
+
+@pytest.mark.slow
+def test_module_runs_as_program(tiny_root: Path, archives: dict[str, Path]) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "rebar_depth_bench",
+        "check",
+        str(archives["constant"]),
+        "--data",
+        str(tiny_root),
+    ]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout == f"{archives['constant']}: no problem found\n"
 
 
 @pytest.fixture(scope="session")
-def predicted(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The archives of the two methods on the tiny lattice."""
+def archives(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Return the archives that ``sgbm`` and ``constant`` predict on the tiny lattice."""
     folder = tmp_path_factory.mktemp("predicted")
     archives = {method: folder / f"{method}.zip" for method in ("sgbm", "constant")}
     for method, archive in archives.items():
-        finished = bench("predict", method, "--data", tiny_root, "--out", archive, "--config", "lattice")
+        finished = run_bench("predict", method, "--data", tiny_root, "--out", archive, "--config", "lattice")
         assert finished.returncode == 0, finished.stderr
         assert finished.stdout.strip() == str(archive)
     return archives
 
 
 def test_score_writes_table_json_csv_and_report(
-    predicted: dict[str, Path], tiny_root: Path, tmp_path: Path
+    archives: dict[str, Path], tiny_root: Path, tmp_path: Path
 ) -> None:
     targets = {kind: tmp_path / f"out.{kind}" for kind in ("json", "csv", "html")}
     options = [part for kind, path in targets.items() for part in (f"--{kind}", path)]
-    finished = bench("score", predicted["sgbm"], "--data", tiny_root, *options)
+    finished = run_bench("score", archives["sgbm"], "--data", tiny_root, *options)
     assert finished.returncode == 0, finished.stderr
     result = json.loads(targets["json"].read_text())
     table = result["tables"]["lattice"]
@@ -64,44 +82,50 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def test_the_papers_finding_shows_on_the_two_methods(predicted: dict[str, Path], tiny_root: Path) -> None:
-    stereo = score(predicted["sgbm"], tiny_root).tables["lattice"]
-    control = score(predicted["constant"], tiny_root).tables["lattice"]
+def test_sgbm_is_metric_and_constant_needs_scaling(archives: dict[str, Path], tiny_root: Path) -> None:
+    stereo = score(archives["sgbm"], tiny_root).tables["lattice"]
+    constant = score(archives["constant"], tiny_root).tables["lattice"]
     assert stereo.native is not None
-    assert stereo.scale_median == pytest.approx(1, abs=0.15)  # at 160 x 90 a disparity step is centimetres
-    assert control.native is not None
-    assert control.scaled is not None
-    assert control.scale_median == pytest.approx(0.33, abs=0.1)
-    assert control.scaled.abs_rel < 0.1 * control.native.abs_rel
+    # At 160 x 90 one disparity step is centimetres of depth.
+    assert stereo.scale_median == pytest.approx(1, abs=0.15)
+    assert constant.native is not None
+    assert constant.scaled is not None
+    assert constant.scale_median == pytest.approx(0.33, abs=0.1)
+    assert constant.scaled.abs_rel < 0.1 * constant.native.abs_rel
 
 
-def entries(archive: Path) -> dict[str, bytes]:
+def depth_entries(archive: Path) -> dict[str, bytes]:
+    """Return the content of every entry but ``submission.json``."""
     with zipfile.ZipFile(archive) as source:
         return {name: source.read(name) for name in source.namelist() if name != "submission.json"}
 
 
-def test_predicting_twice_gives_the_same_depths(
-    predicted: dict[str, Path], tiny_root: Path, tmp_path: Path
+def test_predicting_twice_gives_identical_depth_entries(
+    archives: dict[str, Path], tiny_root: Path, tmp_path: Path
 ) -> None:
-    again = tmp_path / "again.zip"
-    assert bench("predict", "constant", "--data", tiny_root, "--out", again, "--config", "lattice").returncode == 0
-    assert entries(again) == entries(predicted["constant"])  # submission.json tells how long each view took
+    second = tmp_path / "again.zip"
+    assert (
+        run_bench("predict", "constant", "--data", tiny_root, "--out", second, "--config", "lattice").returncode
+        == 0
+    )
+    # submission.json holds run times, which differ.
+    assert depth_entries(second) == depth_entries(archives["constant"])
 
 
-def test_check_passes_a_good_archive(predicted: dict[str, Path], tiny_root: Path) -> None:
-    finished = bench("check", predicted["sgbm"], "--data", tiny_root)
+def test_check_accepts_valid_archive(archives: dict[str, Path], tiny_root: Path) -> None:
+    finished = run_bench("check", archives["sgbm"], "--data", tiny_root)
     assert finished.returncode == 0
     assert "no problem found" in finished.stdout
 
 
 @pytest.mark.parametrize("command", ["score", "check"])
-def test_a_bad_archive_ends_in_words_with_every_problem(command: str, tiny_root: Path, tmp_path: Path) -> None:
+def test_invalid_archive_exits_2_and_lists_problems(command: str, tiny_root: Path, tmp_path: Path) -> None:
     archive = tmp_path / "bad.zip"
     with zipfile.ZipFile(archive, "w") as target:
         target.writestr("lattice/0028.npy", b"no array")
         for n in range(30):
             target.writestr(f"stranger-{n}.npy", b"")
-    finished = bench(command, archive, "--data", tiny_root)
+    finished = run_bench(command, archive, "--data", tiny_root)
     assert finished.returncode == 2
     assert finished.stdout == ""
     assert "Traceback" not in finished.stderr
@@ -121,31 +145,31 @@ def test_a_bad_archive_ends_in_words_with_every_problem(command: str, tiny_root:
         (("methods",), 0, ""),
     ],
 )
-def test_exit_statuses(arguments: tuple[str, ...], status: int, words: str, tiny_root: Path) -> None:
-    finished = bench(*(str(tiny_root) if part == "ROOT" else part for part in arguments))
+def test_exit_status_and_message(arguments: tuple[str, ...], status: int, words: str, tiny_root: Path) -> None:
+    finished = run_bench(*(str(tiny_root) if part == "ROOT" else part for part in arguments))
     assert finished.returncode == status
     assert words in finished.stderr
     assert "Traceback" not in finished.stderr
     assert not Path("x.zip").exists()
 
 
-def test_methods_lists_each_with_its_licence() -> None:
-    listed = bench("methods").stdout
+def test_methods_lists_licences() -> None:
+    listed = run_bench("methods").stdout
     assert "sgbm" in listed
     assert "constant" in listed
     assert "Apache-2.0" in listed
 
 
-def test_a_closed_pipe_is_no_traceback(predicted: dict[str, Path], tiny_root: Path) -> None:
-    command = f"{sys.executable} -m rebar_depth_bench score {predicted['constant']} --data {tiny_root} | head -n 1"
+def test_closed_stdout_pipe_gives_no_traceback(archives: dict[str, Path], tiny_root: Path) -> None:
+    command = f"{sys.executable} -m rebar_depth_bench score {archives['constant']} --data {tiny_root} | head -n 1"
     finished = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
     assert "Traceback" not in finished.stderr
     assert "constant" in finished.stdout
 
 
-def test_the_archive_fixture_and_cli_agree_on_the_format(
+def test_score_prints_perfect_result_for_ground_truth(
     tiny_truth: Depths, tiny_root: Path, archive_of: Callable[..., Path]
 ) -> None:
-    finished = bench("score", archive_of(tiny_truth), "--data", tiny_root)
+    finished = run_bench("score", archive_of(tiny_truth), "--data", tiny_root)
     assert "0.0000" in finished.stdout
     assert "1.000" in finished.stdout

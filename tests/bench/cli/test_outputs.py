@@ -1,4 +1,4 @@
-"""What a command would write is looked at before any work: nothing that is read is ever overwritten."""
+"""Tests of the check of output paths that precedes any work: input files are never overwritten."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from rebar_depth_bench import InputError
-from rebar_depth_bench.cli.arguments import check_outputs
 from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.console import check_outputs, replace_renamed_options
 
 
-def test_an_input_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_output_that_is_an_input_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     archive, data = tmp_path / "a.zip", tmp_path / "data"
     archive.write_bytes(b"precious")
     data.mkdir()
@@ -27,8 +27,8 @@ def test_an_input_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFix
     ]
     for command in commands:
         assert main(command) == 2, command
-        said = capsys.readouterr().err
-        assert "which is read" in said or "inside" in said
+        stderr = capsys.readouterr().err
+        assert "which is read" in stderr or "inside" in stderr
     assert archive.read_bytes() == b"precious"
     assert (data / "manifest.json").read_text() == "precious"
 
@@ -44,7 +44,7 @@ def test_an_input_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFix
         ),
     ],
 )
-def test_what_cannot_be_written_is_said_first(
+def test_unwritable_output_raises_input_error(
     options: dict[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -53,5 +53,16 @@ def test_what_cannot_be_written_is_said_first(
         check_outputs({name: Path(value) for name, value in options.items()})
 
 
-def test_new_files_and_new_folders_are_fine(tmp_path: Path) -> None:
+def test_new_files_in_new_folders_are_accepted(tmp_path: Path) -> None:
     check_outputs({"json": tmp_path / "a" / "b.json", "csv": tmp_path / "c.csv", "data": str(tmp_path / "data")})
+
+
+def test_renamed_options_work_with_a_warning(capsys: pytest.CaptureFixture[str]) -> None:
+    renamed = {"--given-scale": "--baseline-scale", "--k": "--num-anchor-views"}
+    arguments = ["study", "anchor", "--k", "1", "--given-scale=2", "a.zip"]
+    expected = ["study", "anchor", "--num-anchor-views", "1", "--baseline-scale=2", "a.zip"]
+    assert replace_renamed_options(arguments, renamed) == expected
+    assert capsys.readouterr().err == (
+        "warning: --k is deprecated, use --num-anchor-views\n"
+        "warning: --given-scale is deprecated, use --baseline-scale\n"
+    )

@@ -1,3 +1,5 @@
+"""Tests of the table of bars: round trip and validation."""
+
 from __future__ import annotations
 
 from dataclasses import asdict
@@ -8,8 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from dataset_builder.build.bars_table import write_bars
-from rebar_depth_bench.data.bars import BARS_SCHEMA, Bar, read_bars
+from rebar_depth_bench.data.bars import BARS_SCHEMA, Bar, read_bars, write_bars
 from rebar_depth_bench.errors import DatasetError
 
 STRAIGHT = Bar(1, "tie", 0.016, ((0.0, 0.0, 0.0), (0.0, 0.0, 1.5)))
@@ -17,12 +18,12 @@ BENT = Bar(65535, "hoop", 0.01, ((0.1, 0.0, 0.0), (0.2, 0.0, 0.0), (0.2, 0.3, 0.
 ROW = {"scene": "pier", "axis": STRAIGHT.axis_m, **{k: v for k, v in asdict(STRAIGHT).items() if k != "axis_m"}}
 
 
-def written(path: Path, *rows: dict[str, Any]) -> Path:
+def write_rows(path: Path, *rows: dict[str, Any]) -> Path:
     pq.write_table(pa.Table.from_pylist(list(rows), schema=BARS_SCHEMA), path)
     return path
 
 
-def test_what_the_builder_writes_is_read_back(tmp_path: Path) -> None:
+def test_read_bars_returns_what_write_bars_wrote(tmp_path: Path) -> None:
     scenes = {"pier": (STRAIGHT, BENT), "pile": (STRAIGHT,)}
     write_bars(tmp_path / "bars.parquet", scenes)
     assert read_bars(tmp_path / "bars.parquet") == scenes
@@ -40,21 +41,21 @@ def test_what_the_builder_writes_is_read_back(tmp_path: Path) -> None:
         ({"axis": None, "role": None}, "has no role, axis"),
     ],
 )
-def test_a_bar_that_cannot_be_is_named(tmp_path: Path, change: dict[str, Any], said: str) -> None:
-    path = written(tmp_path / "bars.parquet", {**ROW, **change})
+def test_invalid_bar_is_named_in_error(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    path = write_rows(tmp_path / "bars.parquet", {**ROW, **change})
     with pytest.raises(DatasetError, match=said) as raised:
         read_bars(path)
     assert f"{path}: bar {change.get('bar_id', 1)} of scene 'pier'" in str(raised.value)
 
 
-def test_a_bar_given_twice_is_refused(tmp_path: Path) -> None:
+def test_duplicate_bar_id_in_scene_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="scene 'pier' has bar 1 twice"):
-        read_bars(written(tmp_path / "bars.parquet", ROW, ROW))
+        read_bars(write_rows(tmp_path / "bars.parquet", ROW, ROW))
     other_scene = {**ROW, "scene": "pile"}
-    assert len(read_bars(written(tmp_path / "bars.parquet", ROW, other_scene))) == 2
+    assert len(read_bars(write_rows(tmp_path / "bars.parquet", ROW, other_scene))) == 2
 
 
-def test_a_file_that_is_no_table_of_bars_is_refused_in_words(tmp_path: Path) -> None:
+def test_missing_or_malformed_file_is_named_in_error(tmp_path: Path) -> None:
     garbage, other = tmp_path / "garbage.parquet", tmp_path / "other.parquet"
     garbage.write_bytes(b"PAR1 no more than that")
     pq.write_table(pa.table({"scene": ["pier"], "bar_id": ["one"]}), other)

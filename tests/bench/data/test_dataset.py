@@ -1,4 +1,4 @@
-"""The dataset folder through plain ``datasets`` and through the loader."""
+"""Tests of the dataset folder read with plain ``datasets`` and with ``rebar_depth_bench.load``."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import pytest
 import torch
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.dataset import features, iterate
+from rebar_depth_bench.data.dataset import features, iterate_rows
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.geometry.cameras import ideal_K, right_of_rig
+from rebar_depth_bench.geometry.cameras import ideal_K, right_camera_pose
 
 HEIGHT, WIDTH, VIEWS = 90, 160, 9
 
 
-def test_plain_datasets_loads_it(tiny_root: Path) -> None:
+def test_plain_datasets_loads_folder(tiny_root: Path) -> None:
     loaded = datasets.load_dataset(str(tiny_root), "lattice", split="test")
     assert loaded.features == features()
     assert len(loaded) == VIEWS
@@ -33,11 +33,11 @@ def test_plain_datasets_loads_it(tiny_root: Path) -> None:
 
 
 def test_view_ids_are_indices_of_the_full_protocol(tiny_root: Path) -> None:
-    found = rdb.load(tiny_root, "lattice", columns=["view_id"])["view_id"]
-    assert list(found) == [f"lattice/{(2 * i + 1) * 504 // 18:04d}" for i in range(VIEWS)]
+    view_ids = rdb.load(tiny_root, "lattice", columns=["view_id"])["view_id"]
+    assert list(view_ids) == [f"lattice/{(2 * i + 1) * 504 // 18:04d}" for i in range(VIEWS)]
 
 
-def test_rows_decode_to_the_contracts_arrays(tiny_root: Path) -> None:
+def test_rows_decode_to_contract_dtypes_and_shapes(tiny_root: Path) -> None:
     row = rdb.load(tiny_root, "lattice")[4]
     assert list(row) == list(features())
     for eye in ("left", "right"):
@@ -56,7 +56,7 @@ def test_rows_decode_to_the_contracts_arrays(tiny_root: Path) -> None:
         assert np.array_equal(row[f"{eye}_mask"], row[f"{eye}_bars"] > 0)
         assert 0.03 < row[f"{eye}_mask"].mean() < 0.3
     assert row["baseline_m"] == 0.12
-    assert np.array_equal(row["right_cam_from_world"], right_of_rig(row["left_cam_from_world"], 0.12))
+    assert np.array_equal(row["right_cam_from_world"], right_camera_pose(row["left_cam_from_world"], 0.12))
 
 
 def test_streaming_gives_the_same_rows(tiny_root: Path) -> None:
@@ -71,9 +71,9 @@ def test_streaming_gives_the_same_rows(tiny_root: Path) -> None:
 
 @pytest.mark.parametrize("streaming", [False, True])
 @pytest.mark.parametrize("num_workers", [0, 2])
-def test_torch_batches(tiny_root: Path, streaming: bool, num_workers: int) -> None:
+def test_torch_batch_shapes_and_dtypes(tiny_root: Path, streaming: bool, num_workers: int) -> None:
     ds = rdb.load(tiny_root, "lattice", streaming=streaming)  # type: ignore[call-overload]
-    seen: list[str] = []
+    loaded_ids: list[str] = []
     for batch in rdb.torch_loader(ds, batch_size=4, num_workers=num_workers):
         count = len(batch["view_id"])
         assert batch["rgb"].shape == (count, 3, HEIGHT, WIDTH)
@@ -83,11 +83,11 @@ def test_torch_batches(tiny_root: Path, streaming: bool, num_workers: int) -> No
         assert batch["poses"].shape == (count, 4, 4)
         types = [batch[key].dtype for key in ("rgb", "depth", "mask", "K", "poses")]
         assert types == [torch.uint8, torch.float32, torch.bool, torch.float64, torch.float64]
-        seen += batch["view_id"]
-    assert sorted(seen) == sorted(rdb.load(tiny_root, "lattice", columns=["view_id"])["view_id"])
+        loaded_ids += batch["view_id"]
+    assert sorted(loaded_ids) == sorted(rdb.load(tiny_root, "lattice", columns=["view_id"])["view_id"])
 
 
-def test_torch_batches_hold_the_rows_values(tiny_root: Path) -> None:
+def test_torch_batch_equals_row_values(tiny_root: Path) -> None:
     row = rdb.load(tiny_root, "lattice")[0]
     batch = next(iter(rdb.torch_loader(rdb.load(tiny_root, "lattice"), stereo=True)))
     assert np.array_equal(batch["rgb"][0].permute(1, 2, 0).numpy(), row["left_rgb"])
@@ -96,7 +96,7 @@ def test_torch_batches_hold_the_rows_values(tiny_root: Path) -> None:
     assert batch["baseline_m"].tolist() == [0.12]
 
 
-def test_errors_in_words(tiny_root: Path, tmp_path: Path) -> None:
+def test_load_errors_name_expected_values(tiny_root: Path, tmp_path: Path) -> None:
     with pytest.raises(rdb.DatasetError, match=r"no config 'lattise', expected one of lattice, lattice-orbit"):
         rdb.load(tiny_root, "lattise")
     with pytest.raises(rdb.DatasetError, match=r"no column 'depth', expected some of view_id, left_rgb"):
@@ -107,12 +107,12 @@ def test_errors_in_words(tiny_root: Path, tmp_path: Path) -> None:
         rdb.load(tmp_path / "missing", "lattice")
 
 
-def test_a_hub_repository_that_cannot_be_had_is_told_in_words() -> None:
+def test_unavailable_hub_repository_raises_dataset_error() -> None:
     with pytest.raises(rdb.DatasetError, match=r"as a Hub repository its manifest\.json cannot be had"):
         rdb.load("nobody/nothing-here", "lattice")
 
 
-def test_manifest_knows_every_view(tiny_root: Path) -> None:
+def test_manifest_lists_every_view(tiny_root: Path) -> None:
     folder = open_folder(tiny_root)
     assert folder.configs == ("lattice", "lattice-orbit")
     assert len(folder.expected_views()) == VIEWS + 2
@@ -120,7 +120,7 @@ def test_manifest_knows_every_view(tiny_root: Path) -> None:
     assert folder.digest.startswith("sha256:")
 
 
-def test_loading_does_not_copy_the_dataset_again(tiny_root: Path) -> None:
+def test_loading_columns_writes_no_further_cache_file(tiny_root: Path) -> None:
     ds = rdb.load(tiny_root, "lattice", columns=["view_id", "left_depth", "left_rgb"])
     assert ds[0]["left_rgb"].dtype == np.uint8
     assert ds.cache_files
@@ -128,7 +128,7 @@ def test_loading_does_not_copy_the_dataset_again(tiny_root: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["truncated", "missing"])
-def test_a_damaged_shard_is_told_in_words(tiny_root: Path, tmp_path: Path, damage: str) -> None:
+def test_damaged_shard_raises_dataset_error(tiny_root: Path, tmp_path: Path, damage: str) -> None:
     copy = tmp_path / "dataset"
     shutil.copytree(tiny_root, copy, ignore=shutil.ignore_patterns(".rebar-cache"))
     for shard in copy.glob("lattice/*.parquet"):
@@ -137,7 +137,7 @@ def test_a_damaged_shard_is_told_in_words(tiny_root: Path, tmp_path: Path, damag
         else:
             shard.write_bytes(shard.read_bytes()[:-100])
     with pytest.raises(rdb.DatasetError, match=r"dataset: config lattice cannot be (loaded|read)"):
-        list(iterate(copy, "lattice", ["view_id"]))
+        list(iterate_rows(copy, "lattice", ["view_id"]))
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_a_damaged_shard_is_told_in_words(tiny_root: Path, tmp_path: Path, damag
         ),
     ],
 )
-def test_a_damaged_manifest_is_told_in_words(
+def test_damaged_manifest_raises_dataset_error(
     tiny_root: Path, tmp_path: Path, change: Callable[[dict[str, Any]], object], words: str
 ) -> None:
     manifest = json.loads((tiny_root / "manifest.json").read_text())

@@ -1,4 +1,4 @@
-"""Work on many items with a few of them in memory."""
+"""Tests of ``ordered_map``: order of results, bounded look-ahead and exceptions."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from rebar_depth_bench.parallel import ordered_map
 
 
 @pytest.mark.parametrize("workers", [None, 1, 3])
-def test_results_come_in_order(workers: int | None) -> None:
+def test_results_are_in_input_order(workers: int | None) -> None:
     assert list(ordered_map(lambda n: n * n, range(50), workers)) == [n * n for n in range(50)]
     assert list(ordered_map(lambda n: n, [], workers)) == []
 
 
-def test_no_more_items_are_taken_than_two_a_thread() -> None:
+def test_look_ahead_is_two_items_per_thread() -> None:
     taken = 0
 
     def items() -> Iterator[int]:
@@ -30,7 +30,7 @@ def test_no_more_items_are_taken_than_two_a_thread() -> None:
     assert taken == 100
 
 
-def test_what_work_or_items_raise_is_raised() -> None:
+def test_exceptions_of_function_and_iterator_propagate() -> None:
     with pytest.raises(ZeroDivisionError):
         list(ordered_map(lambda n: 1 // n, [1, 0, 2], 2))
 
@@ -42,6 +42,6 @@ def test_what_work_or_items_raise_is_raised() -> None:
         list(ordered_map(lambda n: n, items(), 2))
 
 
-def test_no_thread_is_no_way_to_work() -> None:
+def test_zero_workers_raises_input_error() -> None:
     with pytest.raises(InputError, match="workers is 0, expected 1 or more"):
         list(ordered_map(lambda n: n, [1], 0))

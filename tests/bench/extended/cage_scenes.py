@@ -1,4 +1,4 @@
-"""Smooth straight bars seen by a pinhole, by the closed formula of ray and cylinder."""
+"""Synthetic views of smooth straight bars: closed-form intersection of pinhole rays and cylinders."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ from collections.abc import Sequence
 import numpy as np
 
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_runs, cage_truth
+from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_segments, cage_truth
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.scoring.protocol import interior
 
 WIDTH, HEIGHT, FOCAL_PX = 240, 160, 210.0
-FRONT = np.eye(4)
+CAMERA_AT_ORIGIN = np.eye(4)
 
 
 def bar(bar_id: int, start_m: Sequence[float], end_m: Sequence[float], diameter_m: float = 0.02) -> Bar:
-    """Return a straight bar."""
+    """Return a straight bar between two points, world, metres."""
     (x, y, z), (u, v, w) = start_m, end_m
     return Bar(bar_id, "bar", diameter_m, ((x, y, z), (u, v, w)))
 
 
 def mat(dx: float = 0.0, dy: float = 0.0, dz: float = 0.0, diameter_m: float = 0.02) -> list[Bar]:
-    """Return two layers of a mat that a camera at the origin looks at along z, moved by a vector.
+    """Return a two-layer mat of bars before a camera at the origin that looks along z, shifted by a vector (m).
 
-    Three bars upright at a distance of 0.4 m, 80 mm apart; behind them, 60 mm further, two lying, 100 mm apart;
-    a sixth upright one 70 mm behind the middle one and 20 mm aside is the other layer's neighbour in depth.
+    Bars 1 to 3 are vertical at z = 0.4 m, 80 mm apart; bars 4 and 5 are horizontal, 60 mm behind them and 100 mm
+    apart; bar 6 is vertical, 100 mm behind bar 2 and 30 mm aside: its neighbour in depth.
     """
     upright = [
         bar(i + 1, (x + dx, -0.14 + dy, 0.4 + dz), (x + dx, 0.14 + dy, 0.4 + dz), diameter_m)
@@ -40,14 +40,14 @@ def mat(dx: float = 0.0, dy: float = 0.0, dz: float = 0.0, diameter_m: float = 0
 
 
 def pixel_directions() -> np.ndarray:
-    """Return x/z, y/z, 1 of every pixel, row by row."""
+    """Return the ray (x/z, y/z, 1) of every pixel, row by row, shape (HEIGHT * WIDTH, 3)."""
     u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     x, y = (u - (WIDTH - 1) / 2) / FOCAL_PX, (v - (HEIGHT - 1) / 2) / FOCAL_PX
     return np.asarray(np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3))
 
 
 def depth_on_bar_m(steel: Bar, cam_from_world: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return the planar depth at which rays meet a bar's side (not its ends), inf where they miss."""
+    """Return the planar depth, metres, at which rays hit the side of a bar (not its ends); inf where they miss."""
     ends_m = np.array(steel.axis_m) @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
     line_m = ends_m[1] - ends_m[0]
     length_m = np.linalg.norm(line_m)
@@ -63,43 +63,43 @@ def depth_on_bar_m(steel: Bar, cam_from_world: np.ndarray, directions: np.ndarra
     return np.asarray(np.where(hit, depth_m, np.inf))
 
 
-def cast(steel: Sequence[Bar], cam_from_world: np.ndarray = FRONT) -> tuple[np.ndarray, np.ndarray]:
-    """Return planar depth (0: nothing) and bar id of every pixel."""
+def cast(bars: Sequence[Bar], cam_from_world: np.ndarray = CAMERA_AT_ORIGIN) -> tuple[np.ndarray, np.ndarray]:
+    """Return planar depth (metres) and bar id of every pixel; both are 0 where there is no bar."""
     directions = pixel_directions()
-    depths_m = np.stack([depth_on_bar_m(one, cam_from_world, directions) for one in steel])
+    depths_m = np.stack([depth_on_bar_m(item, cam_from_world, directions) for item in bars])
     nearest = depths_m.argmin(axis=0)
     depth_m = depths_m.min(axis=0)
-    ids = np.array([one.bar_id for one in steel])[nearest]
-    seen = np.isfinite(depth_m)
-    return np.where(seen, depth_m, 0.0), np.where(seen, ids, 0)
+    ids = np.array([item.bar_id for item in bars])[nearest]
+    visible = np.isfinite(depth_m)
+    return np.where(visible, depth_m, 0.0), np.where(visible, ids, 0)
 
 
-def view(steel: Sequence[Bar], cam_from_world: np.ndarray = FRONT) -> tuple[SteelTruth, CageTruth]:
-    """Return the truth of one view of bars, steel pixels only, and their cage."""
-    cage = cage_truth(steel)
-    depth_m, ids = cast(steel, cam_from_world)
+def view(bars: Sequence[Bar], cam_from_world: np.ndarray = CAMERA_AT_ORIGIN) -> tuple[SteelTruth, CageTruth]:
+    """Return the truth of one view of bars (steel pixels only) and of their cage."""
+    cage = cage_truth(bars)
+    depth_m, ids = cast(bars, cam_from_world)
     index = np.flatnonzero(depth_m)
     rays = pixel_directions()[index, :2]
     z_m = depth_m[index].astype(np.float32)
     points_m = np.column_stack([rays, np.ones(len(index))]) * z_m.astype(np.float64)[:, None]
     world_m = (points_m - cam_from_world[:3, 3]) @ cam_from_world[:3, :3]
     bar_id = ids[index].astype(np.uint16)
-    nothing = np.full(len(index), np.nan, dtype=np.float32)
+    no_layer = np.full(len(index), np.nan, dtype=np.float32)
     inside = interior((ids > 0).reshape(HEIGHT, WIDTH)).ravel()[index]
     K = np.array([[FOCAL_PX, 0, (WIDTH - 1) / 2], [0, FOCAL_PX, (HEIGHT - 1) / 2], [0, 0, 1.0]])
-    run = assign_runs(world_m, bar_id, cage)
+    run = assign_segments(world_m, bar_id, cage)
     truth = SteelTruth(
         "lattice/0000", HEIGHT, WIDTH, K, cam_from_world, index.astype(np.uint32), z_m, bar_id, inside, rays,
-        run, nothing, nothing,
+        run, no_layer, no_layer,
     )  # fmt: skip
     return truth, cage
 
 
 def predicted_m(moved: Sequence[Bar], truth: SteelTruth) -> np.ndarray:
-    """Return the depth of bars elsewhere on the true pixels of the bars with their ids, NaN for rays that miss."""
+    """Return the depth of displaced bars, metres, on the true pixels of the bars with their ids; NaN: missed."""
     rays = np.column_stack([truth.rays, np.ones(len(truth.rays))])
     depth_m = np.full(len(rays), np.nan)
-    for one in moved:
-        own = truth.bar_id == one.bar_id
-        depth_m[own] = depth_on_bar_m(one, truth.cam_from_world, rays[own])
+    for displaced in moved:
+        own = truth.bar_id == displaced.bar_id
+        depth_m[own] = depth_on_bar_m(displaced, truth.cam_from_world, rays[own])
     return np.where(np.isfinite(depth_m), depth_m, np.nan)

@@ -1,4 +1,4 @@
-"""Truth for these tests, made by hand: pixels on steel with a depth each, all of them interior."""
+"""Hand-made ground truth: steel pixels with a depth each, all of them interior."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rebar_depth_bench.extended.steel_truth import SteelTruth
 
 
 def steel_truth(depth_m: np.ndarray, bar_id: np.ndarray | None = None, fx: float = 700.0) -> SteelTruth:
-    """Return a view one pixel high whose pixels have these depths."""
+    """Return the truth of a view one pixel high; ``depth_m`` and ``bar_id`` have one value per pixel."""
     count = len(depth_m)
     K = np.array([[fx, 0, (count - 1) / 2], [0, fx, 0], [0, 0, 1.0]])
     return SteelTruth(

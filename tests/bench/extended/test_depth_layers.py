@@ -1,4 +1,4 @@
-"""Other layers in sight and their confusion: scenes by hand, a plain loop, and what no damage may do."""
+"""Tests of front and rear depth layers and of layer confusion: hand-made scenes, a reference loop, damage."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy import ndarray
 from rebar_depth_bench.extended.depth_layers import DIRECTIONS, RADII_PX, layer_samples, other_layers
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 from tests.bench.extended.thin_scenes import (
-    random_pictures,
+    random_images,
     random_prediction,
     random_truth,
     steel_truth,
@@ -34,43 +34,43 @@ def layers_at(depth_m: ndarray, bars: ndarray, row: int, column: int, gap_m: flo
 
 
 def cross() -> tuple[ndarray, ndarray]:
-    """Return an upright bar at 0.25 m in front of a level one at 0.5 m, before a board at 1 m."""
+    """Return depth and bar ids of a vertical bar at 0.25 m before a horizontal one at 0.5 m and a board at 1 m."""
     depth_m, bars = np.ones((64, 64)), np.zeros((64, 64), int)
     depth_m[30:33], bars[30:33] = 0.5, 2
     depth_m[:, 30:33], bars[:, 30:33] = 0.25, 1
     return depth_m, bars
 
 
-def test_a_cross_by_hand() -> None:
+def test_crossing_bars_by_hand() -> None:
     depth_m, bars = cross()
     assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((NAN, 0.5), nan_ok=True)
     assert layers_at(depth_m, bars, 31, 55, 0.01) == pytest.approx((0.25, NAN), nan_ok=True)  # 24 px to the right
-    assert layers_at(depth_m, bars, 31, 60, 0.01) == pytest.approx((NAN, NAN), nan_ok=True)  # out of sight
+    assert layers_at(depth_m, bars, 31, 60, 0.01) == pytest.approx((NAN, NAN), nan_ok=True)  # out of range
     assert layers_at(depth_m, bars, 31, 31, 0.25) == pytest.approx(
         (NAN, NAN), nan_ok=True
-    )  # not by more than that
+    )  # the gap must be exceeded
     assert layers_at(depth_m, np.minimum(bars, 1), 2, 31, 0.01) == pytest.approx((NAN, NAN), nan_ok=True)
 
 
-def test_of_several_layers_the_nearest_counts() -> None:
+def test_nearest_of_several_layers_is_returned() -> None:
     depth_m, bars = cross()
     for column, z_m in ((20, 0.5), (42, 0.375), (36, 0.125), (27, 0.1875)):
         depth_m[:, column - 1 : column + 2], bars[:, column - 1 : column + 2] = z_m, column
     assert layers_at(depth_m, bars, 10, 31, 0.01) == (0.1875, 0.375)
 
 
-def test_a_bar_that_runs_away_is_not_its_own_other_layer() -> None:
+def test_receding_bar_is_not_its_own_layer() -> None:
     depth_m, bars = np.ones((64, 64)), np.zeros((64, 64), int)
     depth_m[30:33], bars[30:33] = 0.25 + 0.005 * np.arange(64), 1
     assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((NAN, NAN), nan_ok=True)
-    # Another bar crosses in front: that one is a layer, what is seen of the first bar behind it is not.
+    # A bar that crosses in front is a layer; the part of the first bar that is visible beyond it is not.
     depth_m[:, 36:39], bars[:, 36:39] = 0.125, 2
     assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((0.125, NAN), nan_ok=True)
 
 
 @pytest.mark.parametrize("between_m", [1.0, 0.0])
-def test_the_far_side_of_a_hoop_is_another_layer(between_m: float) -> None:
-    """The board, or nothing at all, is seen between them."""
+def test_far_side_of_hoop_is_a_layer(between_m: float) -> None:
+    """Check with the board or an empty background visible between the two sides."""
     depth_m, bars = np.full((64, 64), between_m), np.zeros((64, 64), int)
     depth_m[30:33], bars[30:33] = 0.25, 1
     depth_m[42:45], bars[42:45] = 0.5, 1
@@ -78,8 +78,10 @@ def test_the_far_side_of_a_hoop_is_another_layer(between_m: float) -> None:
     assert layers_at(depth_m, bars, 43, 31, 0.01) == pytest.approx((0.25, NAN), nan_ok=True)
 
 
-def plain_loop(depth_m: ndarray, bars: ndarray, row: int, column: int, gap_m: np.float32) -> tuple[float, float]:
-    """Return front and behind of one pixel, written out."""
+def reference_layers(
+    depth_m: ndarray, bars: ndarray, row: int, column: int, gap_m: np.float32
+) -> tuple[float, float]:
+    """Return the front and rear depth of one pixel, computed by a plain loop."""
     z_m, own = depth_m[row, column], bars[row, column]
     front: list[float] = []
     behind: list[float] = []
@@ -101,41 +103,41 @@ def plain_loop(depth_m: ndarray, bars: ndarray, row: int, column: int, gap_m: np
 
 @settings(max_examples=20)
 @given(SEEDS)
-def test_agrees_with_a_plain_loop(seed: int) -> None:
+def test_layers_agree_with_reference_loop(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    depth_m, bars = random_pictures(rng, 40, 50)
+    depth_m, bars = random_images(rng, 40, 50)
     bars[bars > 3] -= 2  # the same bar in several places
     index = np.flatnonzero(bars)[:: int(rng.integers(5, 9))].astype(np.uint32)
     gap_m = rng.uniform(0.001, 0.1, len(index)).astype(np.float32)
-    found = np.column_stack(other_layers(depth_m, bars, index, gap_m))
+    layers_m = np.column_stack(other_layers(depth_m, bars, index, gap_m))
     expected = [
-        plain_loop(depth_m, bars, i // 50, i % 50, gap) for i, gap in zip(index.tolist(), gap_m, strict=True)
+        reference_layers(depth_m, bars, i // 50, i % 50, gap) for i, gap in zip(index.tolist(), gap_m, strict=True)
     ]
-    np.testing.assert_array_equal(found, np.array(expected, np.float32).reshape(-1, 2))
+    np.testing.assert_array_equal(layers_m, np.array(expected, np.float32).reshape(-1, 2))
 
 
 @settings(max_examples=15)
 @given(SEEDS)
-def test_layers_turn_with_the_picture(seed: int) -> None:
+def test_layers_follow_flip_and_transpose(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    depth_m, bars = random_pictures(rng, 40, 40)
-    pictures = []
-    for turned in (lambda a: a, np.fliplr, np.flipud, np.transpose):
-        here, ids = np.ascontiguousarray(turned(depth_m)), np.ascontiguousarray(turned(bars))
+    depth_m, bars = random_images(rng, 40, 40)
+    images = []
+    for transform in (lambda a: a, np.fliplr, np.flipud, np.transpose):
+        transformed_m, ids = np.ascontiguousarray(transform(depth_m)), np.ascontiguousarray(transform(bars))
         index = np.flatnonzero(ids).astype(np.uint32)
-        picture = np.full((2, 40, 40), np.nan, np.float32)
+        image = np.full((2, 40, 40), np.nan, np.float32)
         for layer, values in zip(
-            picture, other_layers(here, ids, index, np.full(len(index), 0.02, np.float32)), strict=True
+            image, other_layers(transformed_m, ids, index, np.full(len(index), 0.02, np.float32)), strict=True
         ):
             layer.ravel()[index] = values
-        pictures.append(np.stack([turned(layer) for layer in picture]))
-    for picture in pictures[1:]:
-        np.testing.assert_array_equal(picture, pictures[0])
+        images.append(np.stack([transform(layer) for layer in image]))
+    for image in images[1:]:
+        np.testing.assert_array_equal(image, images[0])
 
 
-def test_no_steel_has_no_layers() -> None:
-    nothing = np.empty(0, np.uint32), np.empty(0, np.float32)
-    front_m, behind_m = other_layers(np.ones((4, 4), np.float32), np.zeros((4, 4), np.uint16), *nothing)
+def test_image_without_steel_has_no_layers() -> None:
+    no_pixels = np.empty(0, np.uint32), np.empty(0, np.float32)
+    front_m, behind_m = other_layers(np.ones((4, 4), np.float32), np.zeros((4, 4), np.uint16), *no_pixels)
     assert (len(front_m), len(behind_m)) == (0, 0)
     assert front_m.dtype == behind_m.dtype == np.float32
 
@@ -144,7 +146,7 @@ def scores(p_m: ndarray, truth: SteelTruth) -> dict[str, float]:
     return {name: float(values[0]) for name, values in layer_samples(p_m, truth).items() if len(values)}
 
 
-def pixels(z_m: list[float], front_m: list[float], behind_m: list[float]) -> SteelTruth:
+def truth_of_pixels(z_m: list[float], front_m: list[float], behind_m: list[float]) -> SteelTruth:
     truth = steel_truth(
         np.array([z_m]), np.ones((1, len(z_m)), np.uint16), np.array([front_m]), np.array([behind_m])
     )
@@ -152,20 +154,20 @@ def pixels(z_m: list[float], front_m: list[float], behind_m: list[float]) -> Ste
 
 
 def test_confusion_by_hand() -> None:
-    truth = pixels([2.0] * 6, [1.0, 1.0, NAN, NAN, 1.0, NAN], [4.0, NAN, 4.0, 4.0, 4.0, NAN])
-    found = scores(np.array([1.4, 1.6, 2.9, 3.1, NAN, 9.0]), truth)
-    assert found == pytest.approx(
+    truth = truth_of_pixels([2.0] * 6, [1.0, 1.0, NAN, NAN, 1.0, NAN], [4.0, NAN, 4.0, 4.0, 4.0, NAN])
+    measured = scores(np.array([1.4, 1.6, 2.9, 3.1, NAN, 9.0]), truth)
+    assert measured == pytest.approx(
         {
-            "layer_confusion": 3 / 5,  # the first, the fourth and the missing one
-            "layer_swallowed": 2 / 4,  # the fourth and the missing one, of those with a layer behind
-            "layer_pulled_forward": 2 / 3,  # the first and the missing one
+            "layer_confusion": 3 / 5,  # the first, the fourth and the missing pixel
+            "layer_swallowed": 2 / 4,  # the fourth and the missing pixel, of those with a layer behind
+            "layer_pulled_forward": 2 / 3,  # the first and the missing pixel
             "layers_in_sight": 5 / 6,
         }
     )
 
 
-def test_midway_is_not_confused_and_far_beyond_is() -> None:
-    truth = pixels([2.0, 2.0], [1.0, NAN], [NAN, 4.0])
+def test_midpoint_is_not_confused_and_extremes_are() -> None:
+    truth = truth_of_pixels([2.0, 2.0], [1.0, NAN], [NAN, 4.0])
     assert scores(np.array([1.5, 3.0]), truth)["layer_confusion"] == 0.0
     assert scores(np.array([5e-324, 1e308]), truth)["layer_confusion"] == 1.0
     assert scores(np.array([np.inf, -1.0]), truth)["layer_confusion"] == 1.0  # both missing
@@ -189,21 +191,21 @@ def test_confusion_agrees_with_its_definition(seed: int) -> None:
 
 @settings(max_examples=40)
 @given(SEEDS, st.floats(0.001, 1.0), st.floats(1.0, 3.0))
-def test_neither_holes_nor_going_further_astray_lower_confusion(seed: int, share: float, further: float) -> None:
+def test_holes_and_larger_errors_never_lower_confusion(seed: int, share: float, further: float) -> None:
     rng = np.random.default_rng(seed)
     truth = random_truth(rng)
     p_m = random_prediction(rng, truth)
-    before, holed = scores(p_m, truth), scores(with_holes(rng, p_m, share), truth)
+    before, with_missing = scores(p_m, truth), scores(with_holes(rng, p_m, share), truth)
     z_m = truth.depth_m.astype(np.float64)
     with np.errstate(invalid="ignore"):
-        astray = scores(np.where(p_m > 0, z_m + further * (p_m - z_m), p_m), truth)
+        farther = scores(np.where(p_m > 0, z_m + further * (p_m - z_m), p_m), truth)
     for name in ("layer_confusion", "layer_swallowed", "layer_pulled_forward"):
-        assert holed[name] >= before[name]
-        assert astray[name] >= before[name]
-    assert holed["layers_in_sight"] == before["layers_in_sight"]
+        assert with_missing[name] >= before[name]
+        assert farther[name] >= before[name]
+    assert with_missing["layers_in_sight"] == before["layers_in_sight"]
 
 
-def test_truth_confuses_nothing_and_no_layer_says_nothing() -> None:
+def test_ground_truth_has_no_confusion() -> None:
     truth = random_truth(np.random.default_rng(4))
     assert scores(truth.depth_m.astype(np.float64), truth)["layer_confusion"] == 0.0
     alone = steel_truth(np.ones((5, 5)), np.ones((5, 5), np.uint16))

@@ -1,4 +1,4 @@
-"""Extended measures end to end, on a really rendered folder: truth is perfect, damage never helps."""
+"""End-to-end tests of the extended measures on a rendered dataset folder."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from rebar_depth_bench import DatasetError, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.evaluate import (
-    FAMILIES,
+    MEASURE_FAMILIES,
     NATIVE,
     ONCE,
     SCALED,
     measures_by_alignment,
     score_extended,
 )
-from rebar_depth_bench.extended.ground_truth import steel_config, widened
+from rebar_depth_bench.extended.ground_truth import dilate_mask, load_steel_truth
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import print_extended
@@ -40,17 +40,19 @@ def extended(archive: Path, root: Path, workers: int = 2) -> ExtendedResult:
 
 def values(result: ExtendedResult, alignment: str) -> dict[str, float]:
     numbers = result.tables["lattice"].numbers[alignment]
-    return {name: one.value for name, one in numbers.items() if one.value is not None}
+    return {name: estimate.value for name, estimate in numbers.items() if estimate.value is not None}
 
 
-def test_every_measure_has_one_name_and_says_what_it_is() -> None:
+def test_measure_names_are_unique_and_documented() -> None:
     for measures in measures_by_alignment().values():
         names = [measure.name for measure in measures]
         assert len(set(names)) == len(names)
         assert all(measure.title and measure.definition for measure in measures)
 
 
-def test_truth_is_perfect_in_every_column(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+def test_ground_truth_is_perfect_in_every_measure(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive
+) -> None:
     result = extended(archive_of(tiny_truth), tiny_root)
     once, native = values(result, ONCE), values(result, NATIVE)
     assert native == values(result, SCALED)
@@ -63,14 +65,14 @@ def test_truth_is_perfect_in_every_column(tiny_truth: Depths, tiny_root: Path, a
             )
             assert once[name] == pytest.approx(ideal, abs=1e-9), name
     for family in ("full_mask", "clouds", "layers"):
-        for measure in FAMILIES[family].measures:
+        for measure in MEASURE_FAMILIES[family].measures:
             if measure.name in native and measure.better:
                 assert native[measure.name] == (1.0 if measure.better == "higher" else 0.0), measure.name
     assert all(value == 0 for name, value in native.items() if "abs_rel" in name)
     assert native["kept_share"] < 1
 
 
-def test_a_known_factor_is_all_scale(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+def test_doubled_depth_is_corrected_by_scale(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
     result = extended(archive_of({view: 2 * depth for view, depth in tiny_truth.items()}), tiny_root)
     once = values(result, ONCE)
     assert once["scale_mean"] == 0.5
@@ -80,14 +82,14 @@ def test_a_known_factor_is_all_scale(tiny_truth: Depths, tiny_root: Path, archiv
     assert values(result, SCALED) == values(truth, NATIVE)
 
 
-def test_missing_pixels_never_help(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
-    """Half of all predictions, good and bad, are taken away: no measure that is better somewhere gains by it."""
+def test_missing_pixels_never_improve_a_measure(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+    """Remove a random half of all predictions: no measure that has a better direction may improve."""
     rng = np.random.default_rng(4)
     noisy = {
         view: depth + rng.normal(0, 0.01, depth.shape).astype(np.float32) for view, depth in tiny_truth.items()
     }
     holes = {view: np.where(rng.random(depth.shape) < 0.5, np.nan, depth) for view, depth in noisy.items()}
-    whole, half = (extended(archive_of(one, f"{n}.zip"), tiny_root) for n, one in enumerate((noisy, holes)))
+    whole, half = (extended(archive_of(depths, f"{n}.zip"), tiny_root) for n, depths in enumerate((noisy, holes)))
     gains = {
         measure.name: (before, after)
         for measure in whole.measures[NATIVE]
@@ -100,37 +102,37 @@ def test_missing_pixels_never_help(tiny_truth: Depths, tiny_root: Path, archive_
     assert gains == {}
 
 
-def test_workers_change_nothing_and_the_second_run_reads_the_cache(
+def test_result_is_identical_for_any_number_of_workers(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive
 ) -> None:
     archive = archive_of({view: 1.05 * depth + np.float32(0.002) for view, depth in tiny_truth.items()})
-    one, four = (extended(archive, tiny_root, workers=workers).to_dict() for workers in (1, 4))
-    assert json.dumps(one) == json.dumps(four)
+    one_worker, four_workers = (extended(archive, tiny_root, workers=workers).to_dict() for workers in (1, 4))
+    assert json.dumps(one_worker) == json.dumps(four_workers)
 
 
-def test_the_truth_behind_it_is_the_folders(tiny_root: Path, tiny_truth: Depths, tiny_masks: Depths) -> None:
-    steel = steel_config(open_folder(tiny_root), "lattice")
+def test_steel_truth_matches_dataset_folder(tiny_root: Path, tiny_truth: Depths, tiny_masks: Depths) -> None:
+    steel = load_steel_truth(open_folder(tiny_root), "lattice")
     assert len(steel) == len(tiny_truth)
-    for place in range(len(steel)):
-        view = steel.view(place)
+    for number in range(len(steel)):
+        view = steel.view(number)
         depth_m, mask = tiny_truth[view.view_id], tiny_masks[view.view_id]
-        assert np.array_equal(view.index, np.flatnonzero(widened(mask) & (depth_m > 0)))
+        assert np.array_equal(view.index, np.flatnonzero(dilate_mask(mask) & (depth_m > 0)))
         assert np.array_equal(view.bar_id > 0, mask.ravel()[view.index])
         assert np.array_equal(view.depth_m, depth_m.ravel()[view.index])
-        # Rays and pose bring points of the board, where no steel is, back to z = 0.
+        # Pixels without steel show the board: rays and pose map them to z = 0.
         camera_m = view.depth_m[:, None] * np.column_stack([view.rays, np.ones(len(view.rays))])
         world_m = (camera_m - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
         assert abs(np.median(world_m[view.bar_id == 0, 2])) < 1e-6
 
 
-def test_widening_by_hand() -> None:
+def test_dilate_mask_by_hand() -> None:
     mask = np.zeros((4, 5), dtype=bool)
     mask[0, 0] = mask[2, 3] = True
     expected = ["11...", "11111", "..111", "..111"]
-    assert ["".join("1" if cell else "." for cell in row) for row in widened(mask)] == expected
+    assert ["".join("1" if cell else "." for cell in row) for row in dilate_mask(mask)] == expected
 
 
-def test_the_command_writes_json_and_csv_with_stamps(
+def test_score_command_writes_extended_json_and_csv(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     archive = archive_of(tiny_truth)
@@ -150,15 +152,15 @@ def test_the_command_writes_json_and_csv_with_stamps(
     assert "Boundary" in capsys.readouterr().out
 
 
-def test_the_table_keeps_to_100_columns(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+def test_table_is_at_most_100_columns(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
     console = Console(width=100, record=True, file=io.StringIO())
     print_extended(extended(archive_of(tiny_truth), tiny_root), console)
     text = console.export_text()
-    assert all(family.title in text for family in FAMILIES.values())
+    assert all(family.title in text for family in MEASURE_FAMILIES.values())
     assert max(map(len, text.splitlines())) <= 100
 
 
-def test_a_folder_without_bars_is_refused_in_words(
+def test_folder_without_bars_raises_dataset_error(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
 ) -> None:
     archive = archive_of(tiny_truth)
@@ -170,7 +172,8 @@ def test_a_folder_without_bars_is_refused_in_words(
         score_extended(result, archive, tmp_path)
 
 
-def test_extended_measures_need_neither_torch_nor_opencv() -> None:
+@pytest.mark.slow
+def test_extended_imports_neither_torch_nor_opencv() -> None:
     code = "import sys, rebar_depth_bench.extended.evaluate; print({'torch', 'cv2', 'bpy'} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert process.stdout.strip() == "set()"

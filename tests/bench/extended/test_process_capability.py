@@ -1,4 +1,4 @@
-"""Capabilities: tolerance over p95, from samples to the table, JSON, CSV and the terminal."""
+"""Tests of process capability (tolerance over p95), from samples to table, JSON, CSV and terminal."""
 
 from __future__ import annotations
 
@@ -15,21 +15,26 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from rebar_depth_bench.extended.evaluate import NATIVE, ONCE, SCALED, measures_by_alignment
-from rebar_depth_bench.extended.inspection.measures import MEASURES, MISS_MM, capability_name, told_capability
-from rebar_depth_bench.extended.inspection.tolerances import CAPABILITIES, GB_50204
+from rebar_depth_bench.extended.inspection.measures import (
+    CAPABILITY_MEASURES,
+    MISS_MM,
+    capability_name,
+    defined_capability,
+)
+from rebar_depth_bench.extended.inspection.tolerances import CAPABILITY_INPUTS, GB_50204
 from rebar_depth_bench.extended.measures import Measure
 from rebar_depth_bench.extended.result import (
-    Estimate,
     ExtendedResult,
     ExtendedTable,
     ExtendedView,
-    converted,
+    MeasureEstimate,
+    convert_estimate,
     tabulate_extended,
     view_numbers,
     view_value,
 )
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
-from tests.bench.reporting.results import result, scored
+from tests.bench.reporting.results import result, scored_view
 
 SPACING, STIRRUPS = GB_50204.tolerances[:2]
 BY_NAME = {measure.name: measure for measures in measures_by_alignment().values() for measure in measures}
@@ -37,16 +42,18 @@ VIEWS = 8
 
 
 def view(index: int, filled: Mapping[str, np.ndarray]) -> ExtendedView:
-    """Return a view with no samples but those of ``filled``, native and scaled alike."""
+    """Return a view whose only samples are those of ``filled``, the same for every alignment."""
     samples = {
-        alignment: {one.sample: np.asarray(filled.get(one.sample, np.empty(0)), np.float64) for one in measures}
+        alignment: {
+            measure.sample: np.asarray(filled.get(measure.sample, np.empty(0)), np.float64) for measure in measures
+        }
         for alignment, measures in measures_by_alignment().items()
     }
     return ExtendedView(f"lattice/{index:04d}", samples)
 
 
 def table_of(filled: list[dict[str, np.ndarray]]) -> ExtendedTable:
-    views = [view(100 * index, one) for index, one in enumerate(filled)]
+    views = [view(100 * index, samples) for index, samples in enumerate(filled)]
     return tabulate_extended(views, [100 * index for index in range(len(views))], measures_by_alignment())
 
 
@@ -56,85 +63,87 @@ def spacings(scale: float = 1.0) -> list[dict[str, np.ndarray]]:
 
 
 def measure_of(tolerance_index: int = 0) -> Measure:
-    return MEASURES[tolerance_index]
+    return CAPABILITY_MEASURES[tolerance_index]
 
 
-def test_there_is_one_capability_for_each_tolerance_and_each_alignment() -> None:
-    names = [capability_name(tolerance) for tolerance, _ in CAPABILITIES]
-    assert [measure.name for measure in MEASURES] == names
+def test_each_tolerance_has_one_capability_per_alignment() -> None:
+    names = [capability_name(tolerance) for tolerance, _ in CAPABILITY_INPUTS]
+    assert [measure.name for measure in CAPABILITY_MEASURES] == names
     listed = measures_by_alignment()
     for alignment in (NATIVE, SCALED):
         assert set(names) < {measure.name for measure in listed[alignment]}
     assert not set(names) & {measure.name for measure in listed[ONCE]}
-    for measure, (tolerance, p95) in zip(MEASURES, CAPABILITIES, strict=True):
+    for measure, (tolerance, p95) in zip(CAPABILITY_MEASURES, CAPABILITY_INPUTS, strict=True):
         assert (measure.sample, measure.statistic) == (BY_NAME[p95].sample, BY_NAME[p95].statistic)
         assert f"{tolerance.limit_mm:g} mm / p95" in measure.title
         assert measure.better == "higher"
 
 
-def test_the_table_divides_the_tolerance_by_the_p95_of_all_that_was_judged() -> None:
+def test_capability_is_tolerance_over_p95_of_all_samples() -> None:
     filled = spacings()
     numbers = table_of(filled).numbers[NATIVE]
-    by_hand_mm = float(np.percentile(np.concatenate([one["spacing_judged_mm"] for one in filled]), 95))
-    found = numbers["capability_gb50204_spacing"]
-    assert found.value == pytest.approx(10 / by_hand_mm, rel=0.02)
-    assert found.samples == VIEWS * 40
-    assert numbers["capability_gb50204_stirrup_spacing"].value == pytest.approx(2 * (found.value or 0))
+    by_hand_mm = float(np.percentile(np.concatenate([samples["spacing_judged_mm"] for samples in filled]), 95))
+    capability = numbers["capability_gb50204_spacing"]
+    assert capability.value == pytest.approx(10 / by_hand_mm, rel=0.02)
+    assert capability.samples == VIEWS * 40
+    assert numbers["capability_gb50204_stirrup_spacing"].value == pytest.approx(2 * (capability.value or 0))
 
 
-def test_the_interval_is_that_of_the_p95_turned_round() -> None:
+def test_capability_interval_inverts_p95_interval() -> None:
     numbers = table_of(spacings()).numbers[NATIVE]
-    p95, found = numbers["spacing_p95_mm"], numbers["capability_gb50204_spacing"]
+    p95, capability = numbers["spacing_p95_mm"], numbers["capability_gb50204_spacing"]
     assert p95.interval is not None
     assert p95.value is not None
-    assert found.interval == pytest.approx((10 / p95.interval[1], 10 / p95.interval[0]))
-    assert found.interval is not None
-    assert found.value is not None
-    assert found.interval[0] < found.value < found.interval[1]
+    assert capability.interval == pytest.approx((10 / p95.interval[1], 10 / p95.interval[0]))
+    assert capability.interval is not None
+    assert capability.value is not None
+    assert capability.interval[0] < capability.value < capability.interval[1]
 
 
-def test_nothing_judged_and_nothing_told() -> None:
+def test_capability_without_samples_or_with_misses_is_none() -> None:
     empty = table_of([{} for _ in range(VIEWS)]).numbers[NATIVE]["capability_gb50204_layers"]
-    assert empty == Estimate(None, None, 0)
+    assert empty == MeasureEstimate(None, None, 0)
     missed = np.r_[np.full(30, 1.0), np.full(10, MISS_MM)]
     table = table_of([{"layer_judged_mm": missed} for _ in range(VIEWS)])
     assert table.numbers[NATIVE]["layer_p95_mm"].value == MISS_MM
-    assert table.numbers[NATIVE]["capability_gb50204_layers"] == Estimate(None, None, 40 * VIEWS)
+    assert table.numbers[NATIVE]["capability_gb50204_layers"] == MeasureEstimate(None, None, 40 * VIEWS)
 
 
-def test_an_end_that_is_a_miss_is_no_capability_at_all() -> None:
-    p95 = Estimate(50.0, (8.0, MISS_MM), 40)
-    assert converted(measure_of(), p95) == Estimate(0.2, (0.0, 1.25), 40)
+def test_missed_upper_p95_bound_gives_zero_lower_bound() -> None:
+    p95 = MeasureEstimate(50.0, (8.0, MISS_MM), 40)
+    assert convert_estimate(measure_of(), p95) == MeasureEstimate(0.2, (0.0, 1.25), 40)
 
 
-def test_errors_of_zero_are_an_endless_capability_without_an_interval() -> None:
-    assert converted(measure_of(), Estimate(0.0, (0.0, 2.0), 40)) == Estimate(math.inf, None, 40)
+def test_zero_p95_gives_infinite_capability() -> None:
+    assert convert_estimate(measure_of(), MeasureEstimate(0.0, (0.0, 2.0), 40)) == MeasureEstimate(
+        math.inf, None, 40
+    )
 
 
-def test_the_p95_is_left_as_it_is() -> None:
-    p95 = Estimate(50.0, (8.0, MISS_MM), 40)
-    assert converted(BY_NAME["spacing_p95_mm"], p95) == p95
+def test_p95_measure_is_not_converted() -> None:
+    p95 = MeasureEstimate(50.0, (8.0, MISS_MM), 40)
+    assert convert_estimate(BY_NAME["spacing_p95_mm"], p95) == p95
 
 
 @given(st.floats(1e-3, 99.0), st.floats(1e-3, 99.0), st.floats(0.1, 1000.0))
-def test_a_larger_error_is_never_more_capable(one_mm: float, other_mm: float, limit_mm: float) -> None:
+def test_capability_decreases_with_error(one_mm: float, other_mm: float, limit_mm: float) -> None:
     small, large = sorted((one_mm, other_mm))
-    better, worse = told_capability(limit_mm, small), told_capability(limit_mm, large)
+    better, worse = defined_capability(limit_mm, small), defined_capability(limit_mm, large)
     assert better is not None
     assert worse is not None
     assert better >= worse > 0
     assert worse * large == pytest.approx(limit_mm)
 
 
-def test_taking_bars_away_never_raises_a_capability() -> None:
+def test_missing_bars_never_raise_capability() -> None:
     filled = spacings()
     whole = table_of(filled).numbers[NATIVE]["capability_gb50204_spacing"].value
     rng = np.random.default_rng(5)
     values = []
     for share in (0.01, 0.03, 0.2):
         holes = [
-            {name: np.where(rng.random(len(mm)) < share, MISS_MM, mm) for name, mm in one.items()}
-            for one in filled
+            {name: np.where(rng.random(len(mm)) < share, MISS_MM, mm) for name, mm in samples.items()}
+            for samples in filled
         ]
         values.append(table_of(holes).numbers[NATIVE]["capability_gb50204_spacing"].value)
     assert whole is not None
@@ -142,67 +151,69 @@ def test_taking_bars_away_never_raises_a_capability() -> None:
     assert values[-1] is None
 
 
-def test_a_view_by_itself_has_its_own() -> None:
-    one = view(0, {"spacing_judged_mm": np.full(10, 4.0)})
-    assert view_value(one, NATIVE, BY_NAME[capability_name(SPACING)]) == 2.5
+def test_single_view_has_capability() -> None:
+    measured = view(0, {"spacing_judged_mm": np.full(10, 4.0)})
+    assert view_value(measured, NATIVE, BY_NAME[capability_name(SPACING)]) == 2.5
     missed = view(0, {"spacing_judged_mm": np.full(10, MISS_MM)})
     assert view_value(missed, NATIVE, BY_NAME[capability_name(SPACING)]) is None
     assert view_value(view(0, {}), NATIVE, BY_NAME[capability_name(SPACING)]) is None
 
 
 def extended_of(filled: list[dict[str, np.ndarray]]) -> ExtendedResult:
-    views = [view(100 * index, one) for index, one in enumerate(filled)]
+    views = [view(100 * index, samples) for index, samples in enumerate(filled)]
     table = tabulate_extended(views, [100 * index for index in range(len(views))], measures_by_alignment())
     return ExtendedResult(
-        measures_by_alignment(), {"lattice": table}, [view_numbers(one, measures_by_alignment()) for one in views]
+        measures_by_alignment(),
+        {"lattice": table},
+        [view_numbers(item, measures_by_alignment()) for item in views],
     )
 
 
-def test_json_and_csv_have_it() -> None:
+def test_json_and_csv_contain_capability() -> None:
     extended = extended_of(spacings())
     tables = extended.to_dict()["tables"]["lattice"]
-    shown = tables["native"]["capability_gb50204_spacing"]
-    assert shown["value"] == pytest.approx(10 / tables["native"]["spacing_p95_mm"]["value"])
-    assert len(shown["ci95"]) == 2
+    estimate = tables["native"]["capability_gb50204_spacing"]
+    assert estimate["value"] == pytest.approx(10 / tables["native"]["spacing_p95_mm"]["value"])
+    assert len(estimate["ci95"]) == 2
     view_numbers = extended.to_dict()["views"][0]["scaled"]
     assert view_numbers["capability_gb50204_stirrup_spacing"] == pytest.approx(20 / view_numbers["spacing_p95_mm"])
-    whole = dataclasses.replace(result(scored("lattice/0000")), extended=extended)
+    whole = dataclasses.replace(result(scored_view("lattice/0000")), extended=extended)
     rows = {(row["alignment"], row["measure"]): row for row in csv.DictReader(io.StringIO(extended_csv(whole)))}
     row = rows["native", "capability_gb50204_spacing"]
-    assert float(row["value"]) == shown["value"]
-    assert [float(row["low"]), float(row["high"])] == shown["ci95"]
+    assert float(row["value"]) == estimate["value"]
+    assert [float(row["low"]), float(row["high"])] == estimate["ci95"]
     assert rows["native", "capability_gb50204_layers"]["value"] == ""
 
 
-def printed(extended: ExtendedResult, width: int = 100) -> str:
+def terminal_text(extended: ExtendedResult, width: int = 100) -> str:
     console = Console(width=width, record=True, file=io.StringIO())
     print_extended(extended, console)
     return console.export_text()
 
 
-def test_the_terminal_prints_each_and_says_where_it_tells_none() -> None:
-    text = printed(extended_of(spacings()))
+def test_terminal_prints_defined_and_undefined_capability() -> None:
+    text = terminal_text(extended_of(spacings()))
     numbers = table_of(spacings()).numbers[NATIVE]
     line = next(line for line in text.splitlines() if "bar spacing: 10 mm / p95" in line)
     value = numbers["capability_gb50204_spacing"].value
     assert f"{value:.4g}" in line
     assert "not told" not in text
-    missed = printed(extended_of([{"spacing_judged_mm": np.full(9, MISS_MM)} for _ in range(VIEWS)]))
+    missed = terminal_text(extended_of([{"spacing_judged_mm": np.full(9, MISS_MM)} for _ in range(VIEWS)]))
     line = next(line for line in missed.splitlines() if "bar spacing: 10 mm / p95" in line)
     assert line.count("not told") == 2
     assert "not told: 5 % or more were not found." in missed
 
 
 @pytest.mark.parametrize("width", [80, 100])
-def test_names_give_way_and_numbers_stay_whole(width: int) -> None:
+def test_terminal_truncates_names_not_numbers(width: int) -> None:
     rng = np.random.default_rng(8)
     samples = sorted({measure.sample for measure in BY_NAME.values()})
     filled = [
         dict(zip(samples, rng.normal(-0.123456, 0.01, (len(samples), 3)), strict=True)) for _ in range(VIEWS)
     ]
-    for one in filled:
-        one |= {name: np.abs(values) for name, values in one.items() if "judged" in name}
-    text = printed(extended_of(filled), width)
+    for view_samples in filled:
+        view_samples |= {name: np.abs(values) for name, values in view_samples.items() if "judged" in name}
+    text = terminal_text(extended_of(filled), width)
     assert max(map(len, text.splitlines())) <= width
     assert "…" not in text
     assert f"{STIRRUPS.limit_mm:g} mm / p95" in text

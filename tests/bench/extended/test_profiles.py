@@ -1,4 +1,4 @@
-"""Scale and error by distance and bar width: by hand, and with each pixel in one bin."""
+"""Tests of scale and error by distance and bar width: hand-computed values, and each pixel in one bin."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ from rebar_depth_bench.extended.profiles import (
 from tests.bench.extended.steel import steel_truth
 
 
-def known(p: np.ndarray, z: np.ndarray, bar_id: np.ndarray, diameter_m: np.ndarray) -> dict[str, float]:
+def bin_values(p: np.ndarray, z: np.ndarray, bar_id: np.ndarray, diameter_m: np.ndarray) -> dict[str, float]:
     samples = profile_samples(p, steel_truth(z, bar_id), diameter_m)
     return {name: value[0] for name, value in samples.items() if len(value)}
 
 
-def test_each_distance_and_each_width_has_its_own_numbers() -> None:
+def test_values_by_distance_and_width_bin() -> None:
     near, far = np.full(100, 0.35), np.full(60, 0.8)
     z = np.r_[near, far]
     p = np.r_[2 * near, 4 * far]
     bar_id = np.r_[np.full(100, 1), np.full(60, 2)]
-    found = known(p, z, bar_id, np.array([np.nan, 0.004, 0.016]))  # 700 * 4 / 350 = 8 px, 700 * 16 / 800 = 14 px
-    assert found == pytest.approx(
+    values = bin_values(
+        p, z, bar_id, np.array([np.nan, 0.004, 0.016])
+    )  # 700 * 4 / 350 = 8 px, 700 * 16 / 800 = 14 px
+    assert values == pytest.approx(
         {
             "scale_at_0.3-0.4m": 0.5,
             "abs_rel_at_0.3-0.4m": 1.0,
@@ -41,19 +43,19 @@ def test_each_distance_and_each_width_has_its_own_numbers() -> None:
     )
 
 
-def test_a_bin_with_few_predictions_says_nothing() -> None:
+def test_bin_with_few_predictions_has_no_value() -> None:
     z = np.full(MIN_PIXELS, 0.35)
     p = z.copy()
-    assert known(p, z, np.ones(len(z)), np.array([np.nan, 0.01]))
+    assert bin_values(p, z, np.ones(len(z)), np.array([np.nan, 0.01]))
     p[0] = np.nan
-    assert not known(p, z, np.ones(len(z)), np.array([np.nan, 0.01]))
+    assert not bin_values(p, z, np.ones(len(z)), np.array([np.nan, 0.01]))
 
 
-def test_every_edge_has_a_bin_and_every_bin_a_measure() -> None:
+def test_every_bin_has_a_measure() -> None:
     names = {measure.sample for measure in MEASURES}
     assert len(names) == len(MEASURES) == 2 * (len(DISTANCE_EDGES_M) - 1 + len(WIDTH_EDGES_PX) - 1)
     z = np.full(60, 0.35)
     assert set(profile_samples(z, steel_truth(z), np.array([np.nan, 0.01]))) == names
     for edge in DISTANCE_EDGES_M[:-1]:
         z = np.full(60, np.float32(edge) + np.float32(1e-6))
-        assert any(f"{edge:g}-" in name for name in known(z, z, np.ones(60), np.array([np.nan, 1e-6])))
+        assert any(f"{edge:g}-" in name for name in bin_values(z, z, np.ones(60), np.array([np.nan, 1e-6])))

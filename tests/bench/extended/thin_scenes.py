@@ -10,18 +10,18 @@ from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
 from rebar_depth_bench.scoring.protocol import interior
 
 HOLES = (np.nan, np.inf, -np.inf, 0.0, -1.0)
-"""What an archive may hold where it has no prediction."""
+"""Values of an archive that are no prediction."""
 
 
 def steel_truth(
     depth_m: ndarray, bars: ndarray, front_m: ndarray | None = None, behind_m: ndarray | None = None
 ) -> SteelTruth:
-    """Return the truth of a view from its whole pictures; layers are h x w, none by default."""
+    """Return the truth of a view from whole images (h x w); there are no front or rear layers by default."""
     height, width = depth_m.shape
     padded = np.pad(bars > 0, 1)
     near = np.any([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)], axis=0)
     index = np.flatnonzero(near & (depth_m > 0)).astype(np.uint32)
-    nothing = np.full(depth_m.shape, np.nan)
+    no_layer = np.full(depth_m.shape, np.nan)
     K = ideal_K(width, height)
     return SteelTruth(
         view_id="synthetic/0000",
@@ -35,13 +35,13 @@ def steel_truth(
         interior=(interior(bars > 0) & (depth_m > 0)).ravel()[index],
         rays=pixel_rays(K, width, height).reshape(-1, 3)[index, :2],
         run=np.full(len(index), -1, np.int16),
-        front_m=(nothing if front_m is None else front_m).ravel()[index].astype(np.float32),
-        behind_m=(nothing if behind_m is None else behind_m).ravel()[index].astype(np.float32),
+        front_m=(no_layer if front_m is None else front_m).ravel()[index].astype(np.float32),
+        behind_m=(no_layer if behind_m is None else behind_m).ravel()[index].astype(np.float32),
     )
 
 
-def random_pictures(rng: np.random.Generator, height: int = 24, width: int = 31) -> tuple[ndarray, ndarray]:
-    """Return depth (float32, metres) and bar ids (uint16) of bars before a board, partly before nothing."""
+def random_images(rng: np.random.Generator, height: int = 24, width: int = 31) -> tuple[ndarray, ndarray]:
+    """Return depth (float32, metres) and bar ids (uint16) of bars before a board that may not cover the image."""
     depth_m = np.full((height, width), 0.9) + rng.uniform(0, 0.01, (height, width))
     bars = np.zeros((height, width), np.uint16)
     for bar in range(1, 6):
@@ -51,14 +51,14 @@ def random_pictures(rng: np.random.Generator, height: int = 24, width: int = 31)
         nearer = np.zeros_like(bars, bool)
         nearer[part] = (z_m + slope < depth_m)[part]
         depth_m[nearer], bars[nearer] = (z_m + slope)[nearer], bar
-    nothing = (bars == 0) & (np.arange(width) < rng.integers(0, width))
-    depth_m[nothing] = 0.0
+    empty = (bars == 0) & (np.arange(width) < rng.integers(0, width))
+    depth_m[empty] = 0.0
     return depth_m.astype(np.float32), bars
 
 
 def random_truth(rng: np.random.Generator) -> SteelTruth:
-    """Return the truth of a random view, its other layers chosen at random."""
-    depth_m, bars = random_pictures(rng)
+    """Return the truth of a random view with random front and rear layers."""
+    depth_m, bars = random_images(rng)
     layers = [
         np.where(rng.random(depth_m.shape) < 0.7, depth_m + sign * rng.uniform(0.01, 0.1), np.nan)
         for sign in (-1, 1)
@@ -67,12 +67,12 @@ def random_truth(rng: np.random.Generator) -> SteelTruth:
 
 
 def random_prediction(rng: np.random.Generator, truth: SteelTruth, holes: float = 0.1) -> ndarray:
-    """Return truth with noise of all sizes, shifted by a random factor, and with a share of holes."""
+    """Return the true depth times noise of varying size and a random factor, with a share of holes."""
     spread = 10 ** rng.uniform(-4, -0.5, len(truth.index))
     p_m = truth.depth_m * np.exp(rng.normal(0, spread)) * rng.choice([1.0, 1.01, 1.3])
     return with_holes(rng, p_m, holes)
 
 
 def with_holes(rng: np.random.Generator, p_m: ndarray, share: float) -> ndarray:
-    """Return a prediction of which about a share of pixels is missing, in every way there is."""
+    """Return a prediction in which about ``share`` of the pixels has a random value of ``HOLES``."""
     return np.where(rng.random(len(p_m)) < share, rng.choice(HOLES, len(p_m)), p_m)

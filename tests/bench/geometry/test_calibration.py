@@ -1,4 +1,4 @@
-"""Calibration files: what the vendor writes is read, and other grids scale."""
+"""Tests of reading calibration files in both formats and of scaling them to other grids."""
 
 from __future__ import annotations
 
@@ -21,42 +21,10 @@ from rebar_depth_bench.geometry.stereo_calibration import (
     lens_distortion,
     lens_K,
     right_from_left,
-    scaled,
+    scale_calibration,
 )
+from tests.bench.geometry.calibrations import CONF, SHIPPED_CALIBRATION, TOML, write_and_read
 
-SHIPPED = Path(__file__).parents[1] / "dataset_builder" / "calibrations" / "zed-hd720.conf"
-
-CONF = """\
-[LEFT_CAM_HD]
-fx=700.5
-fy=701.5
-cx=640.25
-cy=350.75
-k1=-0.17
-k2=0.03
-p1=0.001
-p2=-0.002
-k3=0.0001
-
-[RIGHT_CAM_HD]
-fx=702.5
-fy=703.5
-cx=633.25
-cy=359.75
-k1=-0.16
-k2=0.02
-p1=0.003
-p2=-0.004
-k3=0.0002
-
-[STEREO]
-Baseline=120.5
-TY=0.25
-TZ=-0.75
-CV_HD=0.006
-RX_HD=-0.001
-RZ_HD=0.0007
-"""
 EXPECTED = StereoCalibration(
     1280,
     720,
@@ -66,34 +34,9 @@ EXPECTED = StereoCalibration(
     (-0.1205, -0.00025, 0.00075),
 )
 
-TOML = """\
-width = 1280
-height = 720
-[left]
-fx = 700.5
-fy = 701.5
-cx = 640.25
-cy = 350.75
-distortion = [-0.17, 0.03, 0.001, -0.002, 0.0001]
-[right]
-K = [[702.5, 0, 633.25], [0, 703.5, 359.75], [0, 0, 1]]
-distortion = [-0.16, 0.02, 0.003, -0.004, 0.0002]
-[stereo]
-rotation = [-0.001, 0.006, 0.0007]
-translation_m = [-0.1205, -0.00025, 0.00075]
-"""
 
-
-def read(
-    folder: Path, text: str | bytes, name: str = "SN1.conf", grid: tuple[int, int] = (1280, 720)
-) -> StereoCalibration:
-    path = folder / name
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return read_calibration(path, *grid)
-
-
-def test_the_shipped_unit() -> None:
-    calibration = read_calibration(SHIPPED, 1280, 720)
+def test_shipped_zed_calibration_values() -> None:
+    calibration = read_calibration(SHIPPED_CALIBRATION, 1280, 720)
     assert calibration.left == Lens(
         701.88, 701.70, 641.285, 344.1835, (-0.175286, 0.0283094, 6.68e-5, -1.5e-4, 1e-10)
     )
@@ -131,13 +74,13 @@ def test_the_shipped_unit() -> None:
         ),
     ],
 )
-def test_what_vendors_files_differ_in_makes_no_difference(tmp_path: Path, change: object) -> None:
-    assert read(tmp_path, change(CONF)) == EXPECTED  # type: ignore[operator]
+def test_vendor_conf_variants_read_the_same(tmp_path: Path, change: object) -> None:
+    assert write_and_read(tmp_path, change(CONF)) == EXPECTED  # type: ignore[operator]
 
 
-def test_terms_that_old_files_leave_out_are_zero(tmp_path: Path) -> None:
+def test_omitted_terms_are_zero(tmp_path: Path) -> None:
     old = re.sub(r"(p1|p2|k3|TY|TZ)=.*\n", "", CONF)
-    read_back = read(tmp_path, old)
+    read_back = write_and_read(tmp_path, old)
     assert read_back.left.distortion == (-0.17, 0.03, 0.0, 0.0, 0.0)
     assert read_back.translation_m == (-0.1205, 0.0, 0.0)
 
@@ -149,12 +92,12 @@ def test_terms_that_old_files_leave_out_are_zero(tmp_path: Path) -> None:
         ((1920, 1080), "FHD"),
         ((1280, 720), "HD"),
         ((672, 376), "VGA"),
-        ((640, 360), "HD"),  # 16:9 as HD is; VGA is nearer in width but not quite of this shape
+        ((640, 360), "HD"),  # 16:9 like HD; VGA is nearer in width but has a slightly different aspect ratio
         ((320, 180), "HD"),
         ((1900, 1070), "FHD"),
     ],
 )
-def test_the_grid_chooses_the_section(tmp_path: Path, grid: tuple[int, int], suffix: str) -> None:
+def test_grid_selects_conf_section(tmp_path: Path, grid: tuple[int, int], suffix: str) -> None:
     grids = {"2K": (2208, 1242), "FHD": (1920, 1080), "HD": (1280, 720), "VGA": (672, 376)}
     text = ""
     for name, (width, height) in grids.items():
@@ -163,37 +106,37 @@ def test_the_grid_chooses_the_section(tmp_path: Path, grid: tuple[int, int], suf
             text += f"[{eye}_CAM_{name}]\nfx={width}\nfy={width + 1}\n{middle}\nk1=-0.{len(name)}\nk2=0\n"
     text += "[STEREO]\nBaseline=120\n"
     text += "".join(f"{key}_{name}=0.0{n}\n" for key in ("CV", "RX", "RZ") for n, name in enumerate(grids))
-    found = read(tmp_path, text, grid=grid)
-    wide = grids[suffix][0]
-    assert (found.width, found.height) == grid
-    assert found.left.fx == pytest.approx(wide * grid[0] / wide)
-    assert found.left.fy == pytest.approx((wide + 1) * grid[1] / grids[suffix][1])
-    assert found.rotation_rad == pytest.approx([list(grids).index(suffix) / 100] * 3)
-    assert found.left.cx == pytest.approx((wide / 2 + 0.5) * grid[0] / wide - 0.5)
+    calibration = write_and_read(tmp_path, text, grid=grid)
+    grid_width = grids[suffix][0]
+    assert (calibration.width, calibration.height) == grid
+    assert calibration.left.fx == pytest.approx(grid_width * grid[0] / grid_width)
+    assert calibration.left.fy == pytest.approx((grid_width + 1) * grid[1] / grids[suffix][1])
+    assert calibration.rotation_rad == pytest.approx([list(grids).index(suffix) / 100] * 3)
+    assert calibration.left.cx == pytest.approx((grid_width / 2 + 0.5) * grid[0] / grid_width - 0.5)
 
 
-def test_toml_says_the_same(tmp_path: Path) -> None:
-    assert read(tmp_path, TOML, "rig.toml") == EXPECTED
+def test_toml_equals_conf(tmp_path: Path) -> None:
+    assert write_and_read(tmp_path, TOML, "rig.toml") == EXPECTED
 
 
-def test_toml_in_its_other_spellings(tmp_path: Path) -> None:
+def test_toml_rotation_matrix_and_baseline_variants(tmp_path: Path) -> None:
     matrix = cv2.Rodrigues(np.array(EXPECTED.rotation_rad))[0].tolist()
     text = TOML.replace("[-0.001, 0.006, 0.0007]", repr(matrix)).replace(
         "translation_m = [-0.1205, -0.00025, 0.00075]", "baseline_m = 0.1205"
     )
     text = text.replace(", 0.0001]", "]").replace("width = 1280\nheight = 720\n", "")
-    found = read(tmp_path, text, "rig.toml")
-    assert found.rotation_rad == pytest.approx(EXPECTED.rotation_rad, abs=1e-15)
-    assert found.translation_m == (-0.1205, 0.0, 0.0)
-    assert found.left.distortion == (-0.17, 0.03, 0.001, -0.002, 0.0)
-    assert (found.width, found.height) == (1280, 720)
+    calibration = write_and_read(tmp_path, text, "rig.toml")
+    assert calibration.rotation_rad == pytest.approx(EXPECTED.rotation_rad, abs=1e-15)
+    assert calibration.translation_m == (-0.1205, 0.0, 0.0)
+    assert calibration.left.distortion == (-0.17, 0.03, 0.001, -0.002, 0.0)
+    assert (calibration.width, calibration.height) == (1280, 720)
 
 
-def test_toml_of_another_grid_is_scaled(tmp_path: Path) -> None:
-    assert read(tmp_path, TOML, "rig.toml", (640, 360)) == scaled(EXPECTED, 640, 360)
+def test_toml_is_scaled_to_another_grid(tmp_path: Path) -> None:
+    assert write_and_read(tmp_path, TOML, "rig.toml", (640, 360)) == scale_calibration(EXPECTED, 640, 360)
 
 
-def test_half_a_turn_is_no_stereo_rig() -> None:
+def test_right_from_left_of_half_turn() -> None:
     turned = replace(EXPECTED, rotation_rad=(pi, 0.0, 0.0))
     assert right_from_left(turned)[:3, :3] == pytest.approx(np.diag([1.0, -1.0, -1.0]), abs=1e-15)
 
@@ -203,17 +146,17 @@ def test_half_a_turn_is_no_stereo_rig() -> None:
     st.integers(16, 4000),
     st.integers(16, 4000),
 )
-def test_a_scaled_grid_sees_the_same_share_of_the_picture(ray: np.ndarray, width: int, height: int) -> None:
-    """A point's place, measured from the picture's edge in shares of its sides, does not depend on the grid."""
-    other = scaled(EXPECTED, width, height)
-    shares = []
-    for calibration in (EXPECTED, other):
-        place = project(lens_K(calibration.left), ray, lens_distortion(calibration.left))
-        shares.append((place + 0.5) / [calibration.width, calibration.height])
-    assert shares[1] == pytest.approx(shares[0], abs=1e-12)
-    assert other.translation_m == EXPECTED.translation_m
+def test_scaling_keeps_relative_image_position(ray: np.ndarray, width: int, height: int) -> None:
+    """Check that a point's position in the image, as a fraction of the image size, is the same on any grid."""
+    scaled = scale_calibration(EXPECTED, width, height)
+    positions = []
+    for calibration in (EXPECTED, scaled):
+        pixel = project(lens_K(calibration.left), ray, lens_distortion(calibration.left))
+        positions.append((pixel + 0.5) / [calibration.width, calibration.height])
+    assert positions[1] == pytest.approx(positions[0], abs=1e-12)
+    assert scaled.translation_m == EXPECTED.translation_m
 
 
-def test_the_same_grid_is_the_same_value() -> None:
-    assert scaled(EXPECTED, 1280, 720) is EXPECTED
-    assert scaled(scaled(EXPECTED, 640, 360), 1280, 720).left == EXPECTED.left
+def test_scaling_to_same_grid_returns_same_object() -> None:
+    assert scale_calibration(EXPECTED, 1280, 720) is EXPECTED
+    assert scale_calibration(scale_calibration(EXPECTED, 640, 360), 1280, 720).left == EXPECTED.left

@@ -1,4 +1,4 @@
-"""Calibration files that are at fault: each problem is said in words, all of them at once."""
+"""Tests of invalid calibration files: every problem is reported, all of them at once."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import pytest
 
 from rebar_depth_bench.errors import CalibrationError, InputError
 from rebar_depth_bench.geometry.calibration import read_calibration
-from tests.bench.geometry.test_calibration import CONF, TOML, read
+from tests.bench.geometry.calibrations import CONF, TOML, write_and_read
 
 
-def problems(folder: Path, text: str | bytes, name: str = "SN1.conf") -> str:
+def reported_problems(folder: Path, text: str | bytes, name: str = "SN1.conf") -> str:
     with pytest.raises(CalibrationError) as caught:
-        read(folder, text, name)
+        write_and_read(folder, text, name)
     assert isinstance(caught.value, InputError)
     assert str(folder / name) in str(caught.value)
     assert len(caught.value.problems) > 0
     return "\n".join(caught.value.problems)
 
 
-HOSTILE_CONF = [
+INVALID_CONF = [
     ("fx=700.5", "fx=0", r"section \[LEFT_CAM_HD\] fx is '0', expected a number from 1 to 100000 pixels"),
     ("fx=700.5", "fx=nan", r"\[LEFT_CAM_HD\] fx is 'nan', expected"),
     ("fx=700.5", "fx=inf", r"\[LEFT_CAM_HD\] fx is 'inf', expected"),
@@ -57,10 +57,10 @@ HOSTILE_CONF = [
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "words"), HOSTILE_CONF)
-def test_a_hostile_conf_is_refused_in_words(tmp_path: Path, old: str, new: str, words: str) -> None:
+@pytest.mark.parametrize(("old", "new", "words"), INVALID_CONF)
+def test_invalid_conf_is_rejected(tmp_path: Path, old: str, new: str, words: str) -> None:
     assert old in CONF
-    assert re.search(words, problems(tmp_path, CONF.replace(old, new, 1)))
+    assert re.search(words, reported_problems(tmp_path, CONF.replace(old, new, 1)))
 
 
 @pytest.mark.parametrize(
@@ -74,11 +74,11 @@ def test_a_hostile_conf_is_refused_in_words(tmp_path: Path, old: str, new: str, 
         (b"; " + b"x" * 1_000_001, "larger than 1000000 bytes"),
     ],
 )
-def test_what_is_no_calibration_at_all(tmp_path: Path, content: bytes, words: str) -> None:
-    assert re.search(words, problems(tmp_path, content))
+def test_file_that_is_no_calibration_is_rejected(tmp_path: Path, content: bytes, words: str) -> None:
+    assert re.search(words, reported_problems(tmp_path, content))
 
 
-def test_a_path_that_leads_nowhere(tmp_path: Path) -> None:
+def test_unreadable_path_raises_calibration_error(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="cannot be read: No such file"):
         read_calibration(tmp_path / "none.conf", 1280, 720)
     (tmp_path / "folder.conf").mkdir()
@@ -88,16 +88,16 @@ def test_a_path_that_leads_nowhere(tmp_path: Path) -> None:
         read_calibration(tmp_path / "a.yaml", 1280, 720)
 
 
-def test_all_problems_come_at_once(tmp_path: Path) -> None:
+def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
     text = CONF.replace("fx=700.5", "fx=x").replace("fy=703.5\n", "").replace("Baseline=120.5", "Baseline=0")
-    said = problems(tmp_path, text).splitlines()
-    assert len(said) == 3
-    assert "[LEFT_CAM_HD] fx" in said[0]
-    assert "[RIGHT_CAM_HD] has no fy" in said[1]
-    assert "[STEREO] BASELINE" in said[2]
+    lines = reported_problems(tmp_path, text).splitlines()
+    assert len(lines) == 3
+    assert "[LEFT_CAM_HD] fx" in lines[0]
+    assert "[RIGHT_CAM_HD] has no fy" in lines[1]
+    assert "[STEREO] BASELINE" in lines[2]
 
 
-HOSTILE_TOML = [
+INVALID_TOML = [
     ("width = 1280", "width = 1280.5", r"width is 1280.5, expected a whole number"),
     ("width = 1280", "width = true", r"width is True, expected a whole number"),
     ("width = 1280", "widht = 1280", r"the file has 'widht', expected only width, height"),
@@ -132,7 +132,7 @@ HOSTILE_TOML = [
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "words"), HOSTILE_TOML)
-def test_a_hostile_toml_is_refused_in_words(tmp_path: Path, old: str, new: str, words: str) -> None:
+@pytest.mark.parametrize(("old", "new", "words"), INVALID_TOML)
+def test_invalid_toml_is_rejected(tmp_path: Path, old: str, new: str, words: str) -> None:
     assert old in TOML
-    assert re.search(words, problems(tmp_path, TOML.replace(old, new, 1), "rig.toml"))
+    assert re.search(words, reported_problems(tmp_path, TOML.replace(old, new, 1), "rig.toml"))

@@ -11,12 +11,12 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from rebar_depth_bench.methods import Predictor
-from tests.bench.methods.predictors import loaded
+from tests.bench.methods.predictors import load_predictor
 
 Shape = Sequence[int | str | None]
-OPEN: Shape = ("n", 3, "h", "w")
-PLAIN = "width = 6\nheight = 4\nresize = 'stretch'\nrange = 255"
-DEPTH = "meaning = 'depth'"
+OPEN_SHAPE: Shape = ("n", 3, "h", "w")
+PLAIN_INPUT = "width = 6\nheight = 4\nresize = 'stretch'\nrange = 255"
+DEPTH_OUTPUT = "meaning = 'depth'"
 
 
 def write_model(
@@ -24,13 +24,13 @@ def write_model(
     nodes: Sequence[onnx.NodeProto],
     *,
     constants: Mapping[str, np.ndarray] | None = None,
-    input_shape: Shape = OPEN,
+    input_shape: Shape = OPEN_SHAPE,
     input_type: int = TensorProto.FLOAT,
     more_inputs: Sequence[str] = (),
     outputs: Sequence[str] = ("y",),
     output_type: int = TensorProto.FLOAT,
 ) -> Path:
-    """Write a graph from input ``x``; what its outputs' shapes are shows only when it runs."""
+    """Write a graph with input ``x``; the shapes of its outputs are undeclared and known only at run time."""
     graph = helper.make_graph(
         nodes,
         "tiny",
@@ -44,14 +44,16 @@ def write_model(
     return path
 
 
-def mixer(folder: Path, weights: Sequence[float] = (1.0, 0.0, 0.0), offset: float = 0.0, **options: Any) -> Path:
-    """Write a 1 x 1 convolution: weighted red, green and blue, plus an offset."""
+def write_mixer_model(
+    folder: Path, weights: Sequence[float] = (1.0, 0.0, 0.0), offset: float = 0.0, **options: Any
+) -> Path:
+    """Write a 1 x 1 convolution: the weighted sum of red, green and blue plus an offset."""
     constants = {"w": np.array(weights, np.float32).reshape(1, 3, 1, 1), "b": np.array([offset], np.float32)}
     return write_model(folder, [helper.make_node("Conv", ["x", "w", "b"], ["y"])], constants=constants, **options)
 
 
-def fixed(folder: Path, answer: np.ndarray) -> Path:
-    """Write a model that answers every picture with the same array."""
+def write_constant_model(folder: Path, answer: np.ndarray) -> Path:
+    """Write a model that returns the array ``answer`` for every image."""
     nodes = [
         helper.make_node("ReduceMean", ["x"], ["mean"], keepdims=0),
         helper.make_node("Mul", ["mean", "zero"], ["nothing"]),
@@ -61,16 +63,20 @@ def fixed(folder: Path, answer: np.ndarray) -> Path:
     return write_model(folder, nodes, constants={name: np.asarray(value) for name, value in constants.items()})
 
 
-def described(folder: Path, given: str = PLAIN, returned: str = DEPTH, top: str = "") -> Path:
-    """Write the TOML file of ``model.onnx``."""
+def write_toml(
+    folder: Path, input_table: str = PLAIN_INPUT, output_table: str = DEPTH_OUTPUT, top_level: str = ""
+) -> Path:
+    """Write the TOML file that describes ``model.onnx``, and return its path."""
     path = folder / "tiny.toml"
-    path.write_text(f"model = 'model.onnx'\nlicence = 'MIT'\n{top}\n[input]\n{given}\n[output]\n{returned}\n")
+    path.write_text(
+        f"model = 'model.onnx'\nlicence = 'MIT'\n{top_level}\n[input]\n{input_table}\n[output]\n{output_table}\n"
+    )
     return path
 
 
-def run(path: Path, rgb: np.ndarray, fx: float | None = None) -> np.ndarray:
-    """Load the method of a TOML file and return its depth of one picture, metres."""
-    predictor: Predictor = loaded(str(path))
+def predict_depth(path: Path, rgb: np.ndarray, fx: float | None = None) -> np.ndarray:
+    """Return the depth in metres, float32 H x W, that the method of a TOML file predicts for one image."""
+    predictor: Predictor = load_predictor(str(path))
     row: dict[str, Any] = {"left_rgb": rgb}
     if fx is not None:
         row["left_K"] = np.array([[fx, 0.0, 9.0], [0.0, 7.0 * fx, 5.0], [0.0, 0.0, 1.0]])
@@ -80,8 +86,8 @@ def run(path: Path, rgb: np.ndarray, fx: float | None = None) -> np.ndarray:
     return depth_m
 
 
-def picture(width: int, height: int, colour: Callable[[np.ndarray, np.ndarray], Sequence[Any]]) -> np.ndarray:
-    """Return an 8-bit picture whose red, green and blue are functions of column and row."""
+def make_image(width: int, height: int, colour: Callable[[np.ndarray, np.ndarray], Sequence[Any]]) -> np.ndarray:
+    """Return an 8-bit RGB image whose channels ``colour`` computes from column and row indices."""
     rows, columns = np.indices((height, width))
-    channels = [np.broadcast_to(one, (height, width)) for one in colour(columns, rows)]
+    channels = [np.broadcast_to(channel, (height, width)) for channel in colour(columns, rows)]
     return np.asarray(np.stack(channels, -1), dtype=np.uint8)

@@ -1,8 +1,9 @@
-"""Stand-ins for networks that cannot be had here: the same public interface, the red channel as the answer.
+"""Stand-ins for third-party depth networks that are not available in the test environment.
 
-Their code is written into a folder by the test, as its authors' would lie there; nothing of it is the authors'. So
-what is tried is all that this project does around a network, and that alone: the picture it is given, the focal
-length, the margins, the way back to the left grid and the units.
+A stand-in has the public interface of the original network and returns the red channel times its only weight. The
+tests write its code into a folder with the layout of the original; none of it comes from the original authors. The
+tests therefore cover only what this project does around a network: the input image, the focal length, the margins,
+the resampling to the left grid, and the units.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from textwrap import dedent
 
-from rebar_depth_bench.methods.monocular.third_party import importable
+from rebar_depth_bench.methods.monocular.third_party import on_sys_path
 
 GAIN = 0.5
-"""What every stand-in multiplies its answer by: its only weight, and read from the checkpoint."""
+"""Factor by which every stand-in multiplies the red channel: its only weight, read from the checkpoint."""
 
 METRIC3D_HUBCONF = """
     dependencies = ["torch"]
@@ -97,24 +98,24 @@ FOUNDATION_STEREO = """
 
 
 def metric3d_clone(folder: Path, **weights: float) -> Path:
-    """Write a clone with a checkpoint in it."""
+    """Write a clone of Metric3D that contains its checkpoint, and return the folder."""
     _write(folder / "hubconf.py", METRIC3D_HUBCONF)
     _pickle(folder / "metric_depth_vit_small_800k.pth", "model_state_dict", weights)
     return folder
 
 
 def unidepth_weights(folder: Path, **weights: float) -> Path:
-    """Write a folder as the Hub holds it."""
-    return _as_on_the_hub(folder, {"model": {}}, weights)
+    """Write UniDepth's files as they are on the Hub, and return the folder."""
+    return _write_hub_folder(folder, {"model": {}}, weights)
 
 
 def da3_weights(folder: Path, model_name: str = "da3metric-large", **weights: float) -> Path:
-    """Write a folder as the Hub holds it."""
-    return _as_on_the_hub(folder, {"model_name": model_name}, weights)
+    """Write Depth Anything 3's files as they are on the Hub, and return the folder."""
+    return _write_hub_folder(folder, {"model_name": model_name}, weights)
 
 
 def stereo_clone(folder: Path, **weights: float) -> Path:
-    """Write a clone with the folder 23-51-11 in it."""
+    """Write a clone of FoundationStereo with its weights folder 23-51-11, and return the folder."""
     _write(folder / "core" / "foundation_stereo.py", FOUNDATION_STEREO)
     trained = folder / "pretrained_models" / "23-51-11"
     trained.mkdir(parents=True)
@@ -124,14 +125,16 @@ def stereo_clone(folder: Path, **weights: float) -> Path:
 
 
 @contextmanager
-def installed(site: Path) -> Iterator[Path]:
-    """Write the stand-ins of the installed packages, let them be imported, and forget them afterwards."""
+def stand_in_packages(site: Path) -> Iterator[Path]:
+    """Write stand-in packages into ``site`` and make them importable; remove their modules on exit."""
     _write(site / "unidepth" / "models.py", UNIDEPTH_MODELS)
     _write(site / "depth_anything_3" / "api.py", DA3_API)
-    with importable(site):
+    with on_sys_path(site):
         importlib.invalidate_caches()
         yield site
-    for name in [one for one in sys.modules if one.split(".")[0] in ("unidepth", "depth_anything_3", "core")]:
+    for name in [
+        module for module in sys.modules if module.split(".")[0] in ("unidepth", "depth_anything_3", "core")
+    ]:
         del sys.modules[name]
 
 
@@ -146,7 +149,7 @@ def _pickle(path: Path, key: str, weights: dict[str, float]) -> None:
     torch.save({key: tensors, "global_step": 1, "epoch": 1}, path)
 
 
-def _as_on_the_hub(folder: Path, config: dict[str, object], weights: dict[str, float]) -> Path:
+def _write_hub_folder(folder: Path, config: dict[str, object], weights: dict[str, float]) -> Path:
     torch = importlib.import_module("torch")
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps(config))

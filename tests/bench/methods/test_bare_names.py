@@ -1,4 +1,4 @@
-"""A paper's network by its bare name: what says which weights these are is looked up in the caches, and told."""
+"""The paper's networks by bare name: identification of the weights in the local caches."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from huggingface_hub import constants
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import METHODS, find_method
-from rebar_depth_bench.methods.registry import LOCATED, RESOLVED
+from rebar_depth_bench.methods.registry import FROM_FOLDER, FROM_HUB
 from tests.bench.methods import stand_in_models as stand_ins
-from tests.bench.methods.predictors import loaded
-from tests.bench.methods.stand_in_views import BUILDERS, asked, row
+from tests.bench.methods.predictors import load_predictor
+from tests.bench.methods.stand_in_views import BUILDERS, select_columns, stereo_row
 
 COMMITS = ("0123456789abcdef0123456789abcdef01234567", "89abcdef0123456789abcdef0123456789abcdef")
 REPOSITORIES = {
@@ -29,21 +29,21 @@ REPOSITORIES = {
 
 @pytest.fixture(autouse=True)
 def site(tmp_path: Path) -> Iterator[Path]:
-    """Put the stand-ins of the packages on the path, and take them off again."""
-    with stand_ins.installed(tmp_path / "site") as folder:
+    """Make the stand-in packages importable during a test."""
+    with stand_ins.stand_in_packages(tmp_path / "site") as folder:
         yield folder
 
 
 @pytest.fixture
 def hub_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache of the Hub's client."""
+    """Point the Hub client at an empty cache and return its folder."""
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
     return tmp_path / "hub"
 
 
 @pytest.fixture
 def torch_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache of torch.hub with Metric3D in it."""
+    """Point torch.hub at a cache that holds Metric3D, and return the cache's hub folder."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     hub = tmp_path / "torch" / "hub"
     clone = stand_ins.metric3d_clone(hub / "yvanyin_metric3d_main")
@@ -52,8 +52,8 @@ def torch_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return hub
 
 
-def cached(name: str, hub_cache: Path, commit: str, gain: float = 0.5) -> Path:
-    """Put a commit into the Hub's cache as its main branch."""
+def add_to_hub_cache(name: str, hub_cache: Path, commit: str, gain: float = 0.5) -> Path:
+    """Add a commit to the Hub cache as its main branch and return the snapshot's folder."""
     repository = hub_cache / f"models--{REPOSITORIES[name]}"
     folder = BUILDERS[name](repository / "snapshots" / commit, gain=gain)
     (repository / "refs").mkdir(exist_ok=True)
@@ -62,49 +62,56 @@ def cached(name: str, hub_cache: Path, commit: str, gain: float = 0.5) -> Path:
 
 
 @pytest.mark.parametrize("name", REPOSITORIES)
-def test_the_commit_of_the_weights_is_told_and_run(name: str, hub_cache: Path) -> None:
-    """A main branch that moves on makes another method, and does not change one that was found before."""
-    cached(name, hub_cache, COMMITS[0])
+def test_cached_weights_commit_is_reported_and_used(name: str, hub_cache: Path) -> None:
+    """A moved main branch gives a different method and does not change one that was found before."""
+    add_to_hub_cache(name, hub_cache, COMMITS[0])
     first = find_method(name)
-    cached(name, hub_cache, COMMITS[1], gain=2 * 0.5)
+    add_to_hub_cache(name, hub_cache, COMMITS[1], gain=2 * 0.5)
     second = find_method(name)
     for method, commit in ((first, COMMITS[0]), (second, COMMITS[1])):
         assert method.info.name == name
         assert method.info.summary.endswith(f"as in the paper; weights commit {commit}")
         assert method.info.columns == METHODS[name].info.columns
-    ratio = loaded(second)(asked(name, row())) / loaded(first)(asked(name, row()))
+    ratio = load_predictor(second)(select_columns(name, stereo_row())) / load_predictor(first)(
+        select_columns(name, stereo_row())
+    )
     np.testing.assert_allclose(ratio, 2, rtol=2e-3)
-    np.testing.assert_array_equal(loaded(METHODS[name])(asked(name, row())), loaded(second)(asked(name, row())))
+    np.testing.assert_array_equal(
+        load_predictor(METHODS[name])(select_columns(name, stereo_row())),
+        load_predictor(second)(select_columns(name, stereo_row())),
+    )
 
 
-def test_weights_that_the_cache_lacks_are_missed_when_loaded(hub_cache: Path) -> None:
-    (cached("unidepth", hub_cache, COMMITS[0]) / "model.safetensors").unlink()
+def test_weights_missing_from_cache_raise_on_load(hub_cache: Path) -> None:
+    (add_to_hub_cache("unidepth", hub_cache, COMMITS[0]) / "model.safetensors").unlink()
     method = find_method("unidepth")
     with pytest.raises(
         MethodError, match=r"unidepth-v2-vitl14: model.safetensors not on this machine, and HF_HUB"
     ):
-        loaded(method)
+        load_predictor(method)
 
 
-def test_another_model_of_da3s_family_is_refused_at_once(hub_cache: Path) -> None:
-    folder = cached("depth-anything-3", hub_cache, COMMITS[0])
+def test_other_da3_model_raises_when_found(hub_cache: Path) -> None:
+    folder = add_to_hub_cache("depth-anything-3", hub_cache, COMMITS[0])
     (folder / "config.json").write_text('{"model_name": "da3-large"}')
     with pytest.raises(MethodError, match=r"names model 'da3-large', expected 'da3metric-large'"):
         find_method("depth-anything-3")
 
 
-def test_metric3d_tells_the_digests_of_what_torchs_cache_holds(
+def test_metric3d_reports_digests_of_torch_cache(
     torch_cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first = find_method("metric3d")
     assert first.info.name == "metric3d"
     assert "; code yvanyin_metric3d_main sha256:" in first.info.summary
-    own = shutil.copytree(torch_cache / "yvanyin_metric3d_main", tmp_path / "own")
-    shutil.copy(torch_cache / "checkpoints" / "metric_depth_vit_small_800k.pth", own)
+    clone = shutil.copytree(torch_cache / "yvanyin_metric3d_main", tmp_path / "own")
+    shutil.copy(torch_cache / "checkpoints" / "metric_depth_vit_small_800k.pth", clone)
     assert (
-        find_method(f"metric3d:{own}").info.summary.rpartition("; ")[2] == first.info.summary.rpartition("; ")[2]
+        find_method(f"metric3d:{clone}").info.summary.rpartition("; ")[2] == first.info.summary.rpartition("; ")[2]
     )
-    np.testing.assert_allclose(loaded(first)(asked("metric3d", row())), 200 * 0.5 * 87.5 * 6.65 / 1000, rtol=3e-3)
+    np.testing.assert_allclose(
+        load_predictor(first)(select_columns("metric3d", stereo_row())), 200 * 0.5 * 87.5 * 6.65 / 1000, rtol=3e-3
+    )
     assert "fetching" not in capsys.readouterr().err
     (torch_cache / "yvanyin_metric3d_main" / "mono").mkdir()
     (torch_cache / "yvanyin_metric3d_main" / "mono" / "model.py").write_text("")
@@ -115,7 +122,9 @@ def test_metric3d_tells_the_digests_of_what_torchs_cache_holds(
     assert str(tmp_path) not in repr(second.info)
 
 
-def test_listing_looks_nothing_up(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_methods_listing_needs_no_network(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def fail(*_: object, **__: object) -> None:
         raise AssertionError("asked for")
 
@@ -124,30 +133,30 @@ def test_listing_looks_nothing_up(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     monkeypatch.setitem(sys.modules, "torch", None)
     assert main(["methods"]) == 0
     listed = capsys.readouterr().out
-    assert all(name in listed for name in RESOLVED)
-    assert set(RESOLVED) | set(LOCATED) <= set(METHODS)
+    assert all(name in listed for name in FROM_HUB)
+    assert set(FROM_HUB) | set(FROM_FOLDER) <= set(METHODS)
 
 
-def test_the_commands_help_names_the_folders(capsys: pytest.CaptureFixture[str]) -> None:
+def test_predict_help_names_weight_folders(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["predict", "--help"])
     assert "NAME:FOLDER (own weights of depth-anything-3," in " ".join(capsys.readouterr().out.split())
 
 
-def test_what_stereo_may_fetch_is_said_only_where_no_cache_has_it(
+def test_foundation_stereo_announces_only_uncached_downloads(
     hub_cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     method = find_method(f"foundation-stereo:{stand_ins.stereo_clone(tmp_path / 'clone')}")
-    loaded(method)
-    told = capsys.readouterr().err
-    assert "DINOv2's code (https://github.com/facebookresearch/dinov2, whatever HF_HUB_OFFLINE says)" in told
-    assert "and timm's edgenext_small (the Hub)\n" in told
+    load_predictor(method)
+    stderr = capsys.readouterr().err
+    assert "DINOv2's code (https://github.com/facebookresearch/dinov2, whatever HF_HUB_OFFLINE says)" in stderr
+    assert "and timm's edgenext_small (the Hub)\n" in stderr
     (hub_cache / "models--timm--edgenext_small.usi_in1k").mkdir(parents=True)
-    loaded(method)
-    told = capsys.readouterr().err
-    assert "DINOv2's code" in told
-    assert "edgenext" not in told
+    load_predictor(method)
+    stderr = capsys.readouterr().err
+    assert "DINOv2's code" in stderr
+    assert "edgenext" not in stderr
     (tmp_path / "torch" / "hub" / "facebookresearch_dinov2_main").mkdir(parents=True)
-    loaded(method)
+    load_predictor(method)
     assert "fetch" not in capsys.readouterr().err

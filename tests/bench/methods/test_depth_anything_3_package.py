@@ -1,6 +1,6 @@
-"""Depth Anything 3 with its authors' package, where that is installed, and a small network of random numbers.
+"""Depth Anything 3 with the original package, where it is installed, and a small random network.
 
-In a process of its own, so that the stand-in of other tests and the package do not meet.
+The test runs in a separate process, so that the package and the stand-in of other tests do not conflict.
 """
 
 from __future__ import annotations
@@ -60,16 +60,16 @@ np.savez(place / "out.npz", rgb=rgb, found=found, theirs=network.eval().inferenc
 @pytest.mark.skipif(
     importlib.util.find_spec("depth_anything_3") is None, reason="depth-anything-3 is not installed"
 )
-def test_the_packages_answer_becomes_metres_on_the_left_grid(tmp_path: Path) -> None:
+def test_package_output_becomes_metres_on_left_grid(tmp_path: Path) -> None:
     (tmp_path / "small.yaml").write_text(SMALL)
     command = [sys.executable, "-c", RUN, str(tmp_path)]
     finished = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert finished.returncode == 0, finished.stderr
     out = np.load(tmp_path / "out.npz")
-    [seen] = out["theirs"]
-    assert seen.shape == (280, 504)
-    assert np.ptp(seen) > 0.01 * np.median(seen)
+    [network_depth] = out["theirs"]
+    assert network_depth.shape == (280, 504)
+    assert np.ptp(network_depth) > 0.01 * np.median(network_depth)
     focal_px = (FX * 504 / W + FY * 280 / H) / 2
-    expected = cv2.resize(seen, (W, H), interpolation=cv2.INTER_LINEAR) * focal_px / 300
+    expected = cv2.resize(network_depth, (W, H), interpolation=cv2.INTER_LINEAR) * focal_px / 300
     assert out["found"].dtype == np.float32
     np.testing.assert_allclose(out["found"], expected, rtol=1e-3)

@@ -1,4 +1,4 @@
-"""What is wrong with an ONNX method's TOML file is said in words, all at once."""
+"""Validation of the TOML files of ONNX methods: every problem is reported in one error."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.onnx import spec as onnx_toml
-from rebar_depth_bench.validation import Keys, Kind, choice, number, text, three_numbers, whole_number
-from tests.bench.methods.onnx_models import described, mixer
+from rebar_depth_bench.validation import FieldType, TableReader, choice, number, text, three_numbers, whole_number
+from tests.bench.methods.onnx_models import write_mixer_model, write_toml
 
-HOSTILE = [
+INVALID_EDITS = [
     ("licence = 'MIT'", "", "licence is missing, expected the licence of the model's weights"),
     ("'MIT'", "'  '", "licence: got ' ', expected the licence"),
     ("'MIT'", "7", "licence: got 7, expected"),
@@ -70,10 +70,10 @@ HOSTILE = [
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "words"), HOSTILE)
-def test_a_hostile_file_is_refused_in_words(old: str, new: str, words: str, tmp_path: Path) -> None:
-    mixer(tmp_path)
-    path = described(tmp_path)
+@pytest.mark.parametrize(("old", "new", "words"), INVALID_EDITS)
+def test_invalid_toml_raises_with_reason(old: str, new: str, words: str, tmp_path: Path) -> None:
+    write_mixer_model(tmp_path)
+    path = write_toml(tmp_path)
     find_method(str(path))
     content = path.read_text()
     assert old in content
@@ -84,7 +84,7 @@ def test_a_hostile_file_is_refused_in_words(old: str, new: str, words: str, tmp_
     assert max(map(len, str(caught.value).splitlines())) < 1500
 
 
-def test_all_problems_are_told_at_once_and_a_missing_table_is_one(tmp_path: Path) -> None:
+def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
     path = tmp_path / "bad.toml"
     path.write_text("nmae = 1\n[output]\n")
     with pytest.raises(MethodError) as caught:
@@ -98,13 +98,13 @@ def test_all_problems_are_told_at_once_and_a_missing_table_is_one(tmp_path: Path
     ]
 
 
-def test_the_file_that_the_words_show_is_one(tmp_path: Path) -> None:
-    mixer(tmp_path)
+def test_example_in_docstring_is_valid(tmp_path: Path) -> None:
+    write_mixer_model(tmp_path)
     path = tmp_path / "shown.toml"
     path.write_text(dedent((onnx_toml.__doc__ or "").split("::\n", 1)[1]))
     spec = onnx_toml.read_onnx_toml(path)
     assert spec.input.size_px == (1064, 616)
-    assert (spec.output.focal_canonical_px, spec.output.which) == (1000, "predicted_depth")
+    assert (spec.output.focal_canonical_px, spec.output.name_or_index) == (1000, "predicted_depth")
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_the_file_that_the_words_show_is_one(tmp_path: Path) -> None:
         (b"\x00", "is no TOML file"),
     ],
 )
-def test_what_is_no_toml_file_is_said(content: bytes | None, words: str, tmp_path: Path) -> None:
+def test_unreadable_file_raises_with_reason(content: bytes | None, words: str, tmp_path: Path) -> None:
     path = tmp_path / "x.toml"
     if content is not None:
         path.write_bytes(content)
@@ -132,7 +132,7 @@ VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=2),
 )
-KINDS: list[Kind[Any]] = [
+FIELD_TYPES: list[FieldType[Any]] = [
     number(0, 9),
     whole_number(1, 9),
     text(5),
@@ -141,25 +141,23 @@ KINDS: list[Kind[Any]] = [
 ]
 
 
-@given(value=VALUES, kind=st.sampled_from(KINDS))
-def test_any_value_is_taken_or_is_one_sentence(value: object, kind: Kind[Any]) -> None:
+@given(value=VALUES, kind=st.sampled_from(FIELD_TYPES))
+def test_any_value_is_accepted_or_gives_one_line(value: object, kind: FieldType[Any]) -> None:
     problems: list[str] = []
-    found = Keys({"key": value}, "[t] ", problems).required("key", kind, "fallback")
-    assert (found == "fallback") == bool(problems)
+    parsed = TableReader({"key": value}, "[t] ", problems).required("key", kind, "fallback")
+    assert (parsed == "fallback") == bool(problems)
     assert all(problem.startswith("[t] key: got ") and "\n" not in problem for problem in problems)
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
 @given(content=st.binary(max_size=200) | st.text(alphabet="[]\"'=.{}\n\\ab1,#", max_size=80).map(str.encode))
-def test_no_bytes_at_all_make_anything_but_words(content: bytes, tmp_path: Path) -> None:
+def test_random_bytes_raise_method_error(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_bytes(content)
     with pytest.raises(MethodError):
         find_method(str(tmp_path / "x.toml"))
 
 
-def test_on_the_command_line_a_bad_file_is_the_inputs_fault(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = described(tmp_path)
+def test_predict_with_bad_toml_exits_with_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_toml(tmp_path)
     assert main(["predict", str(path), "--data", str(tmp_path), "--out", str(tmp_path / "a.zip")]) == 2
     assert "model: no such file" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""What is missing, wrong or not to be fetched for the paper's networks, by its words. With stand-ins."""
+"""Errors of the paper's networks, tested with stand-ins: missing packages, invalid weights, failed downloads."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import pytest
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import find_method
-from rebar_depth_bench.methods.registry import LOCATED
+from rebar_depth_bench.methods.registry import FROM_FOLDER
 from tests.bench.methods import stand_in_models as stand_ins
-from tests.bench.methods.predictors import loaded
-from tests.bench.methods.stand_in_views import BUILDERS, asked, located, row
+from tests.bench.methods.predictors import load_predictor
+from tests.bench.methods.stand_in_views import BUILDERS, find_stand_in, select_columns, stereo_row
 
 
 @pytest.fixture(autouse=True)
 def site(tmp_path: Path) -> Iterator[Path]:
-    """Put the stand-ins of the packages on the path, and take them off again."""
-    with stand_ins.installed(tmp_path / "site") as folder:
+    """Make the stand-in packages importable during a test."""
+    with stand_ins.stand_in_packages(tmp_path / "site") as folder:
         yield folder
 
 
@@ -31,24 +31,24 @@ def site(tmp_path: Path) -> Iterator[Path]:
         ("unidepth", "unidepth", "pip install 'unidepth @ git+https://github.com/lpiccinelli-eth/UniDepth'"),
         ("depth-anything-3", "depth_anything_3", "pip install depth-anything-3"),
         ("foundation-stereo", "cv2", "pip install 'rebar-depth-bench[methods]'"),
-        *((name, "torch", "pip install 'rebar-depth-bench[torch]'") for name in LOCATED),
+        *((name, "torch", "pip install 'rebar-depth-bench[torch]'") for name in FROM_FOLDER),
     ],
 )
-def test_a_missing_package_says_what_to_install(
+def test_missing_package_names_install_command(
     name: str, module: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    method = located(name, tmp_path)
+    method = find_stand_in(name, tmp_path)
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MethodError, match=f"{name} needs {module} .*{re.escape(words)}"):
         method.load()
 
 
-@pytest.mark.parametrize("name", LOCATED)
-def test_weights_of_another_network_are_refused(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", FROM_FOLDER)
+def test_weights_of_other_network_raise(name: str, tmp_path: Path) -> None:
     with pytest.raises(
         MethodError, match=r"weights fill 0.00% of the network, lacking 1 tensors, first gain|Missing"
     ):
-        located(name, tmp_path, other=1.0).load()
+        find_stand_in(name, tmp_path, other=1.0).load()
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_weights_of_another_network_are_refused(name: str, tmp_path: Path) -> No
         ("foundation-stereo", "pretrained_models/23-51-11/cfg.yaml", "no cfg.yaml in"),
     ],
 )
-def test_a_folder_without_what_is_needed_is_refused(name: str, spoil: str, words: str, tmp_path: Path) -> None:
+def test_folder_with_missing_file_raises(name: str, spoil: str, words: str, tmp_path: Path) -> None:
     folder = BUILDERS[name](tmp_path / "theirs")
     (folder / spoil).unlink()
     with pytest.raises(MethodError, match=re.escape(words)):
@@ -75,43 +75,43 @@ def test_a_folder_without_what_is_needed_is_refused(name: str, spoil: str, words
         find_method(f"{name}:{tmp_path / 'nowhere'}")
 
 
-@pytest.mark.parametrize("name", LOCATED)
-def test_a_damaged_checkpoint_is_said_in_words(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", FROM_FOLDER)
+def test_damaged_checkpoint_raises(name: str, tmp_path: Path) -> None:
     folder = BUILDERS[name](tmp_path / "theirs")
     [weights] = [*folder.rglob("*.pth"), *folder.rglob("*.safetensors")]
     weights.write_bytes(b"no checkpoint")
     with pytest.raises(MethodError, match=r"cannot be (loaded|read)"):
-        loaded(f"{name}:{folder}")
+        load_predictor(f"{name}:{folder}")
 
 
 @pytest.mark.parametrize("config", ['{"model_name": "da3-large"}', "{}", "[]", "{"])
-def test_another_model_of_da3s_family_is_refused(config: str, tmp_path: Path) -> None:
+def test_other_da3_model_raises(config: str, tmp_path: Path) -> None:
     folder = stand_ins.da3_weights(tmp_path / "theirs")
     (folder / "config.json").write_text(config)
     with pytest.raises(MethodError, match=r"expected 'da3metric-large': only its output|cannot be read as a JSON"):
         find_method(f"depth-anything-3:{folder}")
 
 
-def test_code_that_wants_a_gpu_says_so(tmp_path: Path) -> None:
+def test_cuda_only_code_raises_without_gpu(tmp_path: Path) -> None:
     if importlib.import_module("torch").cuda.is_available():
         pytest.skip("there is a GPU")
     folder = stand_ins.metric3d_clone(tmp_path / "theirs")
     code = (folder / "hubconf.py").read_text()
     (folder / "hubconf.py").write_text(code.replace("print(", 'torch.linspace(0, 1, 2, device="cuda"); print('))
-    run = loaded(f"metric3d:{folder}")
+    predictor = load_predictor(f"metric3d:{folder}")
     with pytest.raises(MethodError, match=r"metric3d: .* asks for a CUDA GPU, and torch sees none here"):
-        run(asked("metric3d", row()))
+        predictor(select_columns("metric3d", stereo_row()))
 
 
 @pytest.mark.parametrize(
     ("name", "code"), [("metric3d", "hubconf.py"), ("foundation-stereo", "core/foundation_stereo.py")]
 )
-def test_what_its_code_imports_and_is_not_there_is_named(name: str, code: str, tmp_path: Path) -> None:
+def test_missing_import_of_model_code_is_named(name: str, code: str, tmp_path: Path) -> None:
     folder = BUILDERS[name](tmp_path / "theirs")
     text = (folder / code).read_text()
     (folder / code).write_text(text.replace("import torch", "import torch, no_such_mmcv", 1))
     with pytest.raises(MethodError, match=r"No module named 'no_such_mmcv'; install what its repository's req"):
-        loaded(f"{name}:{folder}")
+        load_predictor(f"{name}:{folder}")
 
 
 @pytest.mark.parametrize(
@@ -128,23 +128,23 @@ def test_what_its_code_imports_and_is_not_there_is_named(name: str, code: str, t
         ("depth-anything-3", "site/depth_anything_3/api.py", "red[None]", "red", "(280, 504), expected 1 x h x w"),
     ],
 )
-def test_an_answer_of_another_shape_is_refused(
+def test_output_of_wrong_shape_raises(
     name: str, code: str, old: str, new: str, words: str, tmp_path: Path
 ) -> None:
-    method = located(name, tmp_path)
+    method = find_stand_in(name, tmp_path)
     text = (tmp_path / code).read_text()
     assert old in text
     (tmp_path / code).write_text(text.replace(old, new))
     with pytest.raises(MethodError, match=re.escape(f"depth of shape {words}")):
-        method.load()(asked(name, row()))
+        method.load()(select_columns(name, stereo_row()))
 
 
-def test_another_package_called_core_is_not_taken_for_it(tmp_path: Path, site: Path) -> None:
+def test_foreign_core_package_raises(tmp_path: Path, site: Path) -> None:
     (site / "core").mkdir()
     (site / "core" / "foundation_stereo.py").write_text("FoundationStereo = None\n")
     importlib.import_module("core.foundation_stereo")
     with pytest.raises(MethodError, match=r"core is imported from .* already, expected it from"):
-        located("foundation-stereo", tmp_path).load()
+        find_stand_in("foundation-stereo", tmp_path).load()
 
 
 @pytest.mark.parametrize(
@@ -159,9 +159,7 @@ def test_another_package_called_core_is_not_taken_for_it(tmp_path: Path, site: P
         ),
     ],
 )
-def test_without_a_folder_nothing_is_fetched_offline(
-    name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bare_name_offline_raises(name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     with pytest.raises(MethodError, match=words):
-        loaded(name)
+        load_predictor(name)

@@ -1,4 +1,4 @@
-"""Methods from anywhere, run into an archive: found, refused in words, interrupted, taken up again."""
+"""Prediction runs: lookup of methods, archives, errors, interruption and resumption."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from rebar_depth_bench.methods import (
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.progress import Progress
 
-OWN = """
+USER_METHOD = """
 import time
 import numpy as np
 from rebar_depth_bench.methods import Method, MethodInfo
@@ -51,26 +51,37 @@ NOTHING = "no method"
 
 
 @pytest.fixture
-def own(tmp_path: Path) -> Path:
-    """A user's file with a method that notes the views it is asked for."""
-    return write_own(tmp_path, 0.0)
+def user_file(tmp_path: Path) -> Path:
+    """Write a user's file with a method that logs the id of every view it predicts."""
+    return write_user_file(tmp_path, 0.0)
 
 
-def write_own(folder: Path, seconds: float) -> Path:
+def write_user_file(folder: Path, seconds: float) -> Path:
+    """Write ``own.py`` with a method that takes ``seconds`` per view and logs view ids into ``log``."""
     path = folder / "own.py"
-    path.write_text(OWN.replace("SECONDS", str(seconds)).replace("LOG", repr(str(folder / "log"))))
+    path.write_text(USER_METHOD.replace("SECONDS", str(seconds)).replace("LOG", repr(str(folder / "log"))))
     return path
 
 
 def runtime_of(archive: Path) -> dict[str, dict[str, float]]:
+    """Return ``runtime`` of an archive's metadata."""
     with zipfile.ZipFile(archive) as source:
-        found: dict[str, dict[str, float]] = json.loads(source.read("submission.json"))["runtime"]
-    return found
+        runtime: dict[str, dict[str, float]] = json.loads(source.read("submission.json"))["runtime"]
+    return runtime
 
 
-def test_a_users_file_is_a_method(own: Path, tiny_root: Path, tmp_path: Path) -> None:
+def test_user_file_is_usable_as_method(user_file: Path, tiny_root: Path, tmp_path: Path) -> None:
     archive = tmp_path / "own.zip"
-    command = ["predict", f"{own}:METHOD", "--data", str(tiny_root), "--config", "lattice", "--out", str(archive)]
+    command = [
+        "predict",
+        f"{user_file}:METHOD",
+        "--data",
+        str(tiny_root),
+        "--config",
+        "lattice",
+        "--out",
+        str(archive),
+    ]
     assert main(command) == 0
     result = score(archive, tiny_root)
     assert result.method == "own"
@@ -81,19 +92,20 @@ def test_a_users_file_is_a_method(own: Path, tiny_root: Path, tmp_path: Path) ->
     assert sorted(path.name for path in tmp_path.iterdir()) == ["log", "own.py", "own.zip"]
 
 
-def test_an_interrupted_prediction_goes_on_with_the_missing_views(tiny_root: Path, tmp_path: Path) -> None:
-    own, archive = write_own(tmp_path, 0.5), tmp_path / "own.zip"
-    command = [sys.executable, "-m", "rebar_depth_bench", "predict", f"{own}:METHOD", "--config", "lattice"]
+@pytest.mark.slow
+def test_interrupted_prediction_resumes_with_missing_views(tiny_root: Path, tmp_path: Path) -> None:
+    user_file, archive = write_user_file(tmp_path, 0.5), tmp_path / "own.zip"
+    command = [sys.executable, "-m", "rebar_depth_bench", "predict", f"{user_file}:METHOD", "--config", "lattice"]
     command += ["--data", str(tiny_root), "--out", str(archive)]
     running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert running.stderr is not None
     while "3 of 9" not in running.stderr.readline():
         pass
     running.send_signal(signal.SIGINT)
-    _, complaint = running.communicate(timeout=60)
+    _, stderr = running.communicate(timeout=60)
     assert running.returncode == 1
-    assert "interrupted" in complaint
-    assert "Traceback" not in complaint
+    assert "interrupted" in stderr
+    assert "Traceback" not in stderr
     assert not archive.exists()
     before = (tmp_path / "log").read_text().split()
     assert subprocess.run(command, check=False, capture_output=True).returncode == 0
@@ -105,18 +117,19 @@ def test_an_interrupted_prediction_goes_on_with_the_missing_views(tiny_root: Pat
     assert not list(tmp_path.glob(".*"))
 
 
-def test_views_of_another_run_are_not_taken_for_this_ones(own: Path, tiny_root: Path, tmp_path: Path) -> None:
+def test_views_of_different_run_are_not_reused(user_file: Path, tiny_root: Path, tmp_path: Path) -> None:
     archive = tmp_path / "out.zip"
-    left_over = tmp_path / ".out.zip.views"
-    (left_over / "lattice-orbit").mkdir(parents=True)
-    (left_over / "key.json").write_text("{}")
-    view_id = score_views(tiny_root)[0]
-    np.savez(left_over / f"{view_id}.npz", depth_m=np.full((90, 160), 99.0), seconds=0.0)
-    predict(find_method(f"{own}:METHOD"), tiny_root, archive, configs=["lattice-orbit"])
+    foreign_views = tmp_path / ".out.zip.views"
+    (foreign_views / "lattice-orbit").mkdir(parents=True)
+    (foreign_views / "key.json").write_text("{}")
+    view_id = orbit_view_ids(tiny_root)[0]
+    np.savez(foreign_views / f"{view_id}.npz", depth_m=np.full((90, 160), 99.0), seconds=0.0)
+    predict(find_method(f"{user_file}:METHOD"), tiny_root, archive, configs=["lattice-orbit"])
     assert view_id in (tmp_path / "log").read_text()
 
 
-def score_views(root: Path) -> list[str]:
+def orbit_view_ids(root: Path) -> list[str]:
+    """Return the view ids of ``lattice-orbit``."""
     manifest = json.loads((root / "manifest.json").read_text())
     return [view["view_id"] for view in manifest["configs"]["lattice-orbit"]["views"]]
 
@@ -134,25 +147,25 @@ def score_views(root: Path) -> list[str]:
         ("BROKEN:METHOD", "cannot be imported: ZeroDivisionError: division by zero"),
     ],
 )
-def test_what_is_no_method_is_said_in_words(name: str, words: str, own: Path, tmp_path: Path) -> None:
+def test_unknown_method_raises_with_reason(name: str, words: str, user_file: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.py"
     broken.write_text("1 / 0")
     with pytest.raises(MethodError, match=re.escape(words)):
-        find_method(name.replace("OWN", str(own)).replace("BROKEN", str(broken)))
+        find_method(name.replace("OWN", str(user_file)).replace("BROKEN", str(broken)))
 
 
 @pytest.mark.parametrize("returned", ["np.ones((3, 4))", "np.ones((90, 160), int)", "None"])
-def test_a_wrong_answer_is_refused_at_once(returned: str, own: Path, tiny_root: Path, tmp_path: Path) -> None:
-    text = own.read_text()
-    own.write_text(re.sub(r"return np\.full.*", f"return {returned}", text))
+def test_invalid_prediction_stops_run(returned: str, user_file: Path, tiny_root: Path, tmp_path: Path) -> None:
+    text = user_file.read_text()
+    user_file.write_text(re.sub(r"return np\.full.*", f"return {returned}", text))
     with pytest.raises(MethodError, match=r"own: lattice.* returned .*, expected float metres of"):
-        predict(find_method(f"{own}:METHOD"), tiny_root, tmp_path / "x.zip", configs=["lattice-orbit"])
+        predict(find_method(f"{user_file}:METHOD"), tiny_root, tmp_path / "x.zip", configs=["lattice-orbit"])
     assert len((tmp_path / "log").read_text().split()) == 1
     assert not (tmp_path / "x.zip").exists()
 
 
-def test_an_installed_package_offers_its_methods(
-    own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_entry_point_methods_are_listed(
+    user_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     site = tmp_path / "site"
     info = site / "stranger-1.0.dist-info"
@@ -165,20 +178,20 @@ def test_an_installed_package_offers_its_methods(
         "gone = nowhere:X",
     ]
     (info / "entry_points.txt").write_text("\n".join(lines))
-    (site / "own_copy.py").write_text(own.read_text())
+    (site / "own_copy.py").write_text(user_file.read_text())
     monkeypatch.syspath_prepend(str(site))
     assert find_method("theirs").info.licence == "MIT"
-    found = all_methods()
-    assert list(found)[: len(METHODS)] == list(METHODS)
-    assert isinstance(found["bad"], MethodError)
-    assert "cannot be imported: ModuleNotFoundError" in str(found["gone"])
+    methods = all_methods()
+    assert list(methods)[: len(METHODS)] == list(METHODS)
+    assert isinstance(methods["bad"], MethodError)
+    assert "cannot be imported: ModuleNotFoundError" in str(methods["gone"])
     assert main(["methods"]) == 0
     listed = capsys.readouterr().out
     assert "theirs" in listed
     assert "cannot be" in listed
 
 
-def test_controls_that_know_the_answer_score_as_they_should(tiny_root: Path, tmp_path: Path) -> None:
+def test_ground_truth_controls_score_as_expected(tiny_root: Path, tmp_path: Path) -> None:
     tables = {}
     for name in ("truth", "noisy-truth"):
         predict(find_method(name), tiny_root, tmp_path / f"{name}.zip", configs=["lattice"])
@@ -190,11 +203,16 @@ def test_controls_that_know_the_answer_score_as_they_should(tiny_root: Path, tmp
     assert noisy.scaled is not None
     assert noisy.scale_median == pytest.approx(0.8, rel=2e-3)
     assert noisy.native.abs_rel == pytest.approx(0.25, rel=0.01)
-    assert noisy.scaled.abs_rel == pytest.approx(0.01 * (2 / np.pi) ** 0.5, rel=0.05)  # of a Gaussian
+    assert noisy.scaled.abs_rel == pytest.approx(
+        0.01 * (2 / np.pi) ** 0.5, rel=0.05
+    )  # Mean absolute value of a Gaussian.
 
 
-def whole_config(log: list[str], *, unfit: str = "") -> MultiViewMethod:
-    """Answers with the number of views that its config has; notes what it was asked for."""
+def counting_method(log: list[str], *, unfit: str = "") -> MultiViewMethod:
+    """Return a multi-view method that predicts the number of views of a config and logs its calls.
+
+    Its check fails for the config ``unfit``.
+    """
 
     def check(views: ConfigViews) -> None:
         log.append(f"check {views.config}")
@@ -218,57 +236,59 @@ def whole_config(log: list[str], *, unfit: str = "") -> MultiViewMethod:
     return MultiViewMethod(MethodInfo("whole", "a test", (), False, "here", "MIT"), prepare, check)
 
 
-def test_a_method_of_all_views_is_prepared_once_a_config(tiny_root: Path, tmp_path: Path) -> None:
+def test_multi_view_method_is_prepared_once_per_config(tiny_root: Path, tmp_path: Path) -> None:
     log: list[str] = []
     archive = tmp_path / "whole.zip"
-    prepared = predict(whole_config(log), tiny_root, archive)
+    prepared = predict(counting_method(log), tiny_root, archive)
     assert log[:3] == ["check lattice", "check lattice-orbit", "prepare lattice False"]
     assert log.count("prepare lattice False") == log.count("prepare lattice-orbit False") == 1
     assert len(log) == 4 + 9 + 2
-    assert {name: found.notes for name, found in prepared.items()} == {
+    assert {name: config_prepared.notes for name, config_prepared in prepared.items()} == {
         "lattice": {"counted": 9},
         "lattice-orbit": {"counted": 2},
     }
     with zipfile.ZipFile(archive) as source:
-        told = json.loads(source.read("submission.json"))
-    assert told["notes"] == {"lattice": {"counted": 9}, "lattice-orbit": {"counted": 2}}
-    assert set(told["runtime"]["preparing"]) == {"lattice", "lattice-orbit"}
+        metadata = json.loads(source.read("submission.json"))
+    assert metadata["notes"] == {"lattice": {"counted": 9}, "lattice-orbit": {"counted": 2}}
+    assert set(metadata["runtime"]["preparing"]) == {"lattice", "lattice-orbit"}
     assert score(archive, tiny_root).tables["lattice"].ranked
 
 
-def test_what_it_keeps_is_there_again_and_finished_configs_are_left_alone(tiny_root: Path, tmp_path: Path) -> None:
+def test_resumed_run_keeps_work_and_finished_configs(tiny_root: Path, tmp_path: Path) -> None:
     def stop(what: str, done: int, _: int) -> None:
         if what == "whole on lattice-orbit" and done == 1:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        predict(whole_config([]), tiny_root, tmp_path / "whole.zip", progress=stop)
+        predict(counting_method([]), tiny_root, tmp_path / "whole.zip", progress=stop)
     log: list[str] = []
-    prepared = predict(whole_config(log), tiny_root, tmp_path / "whole.zip")
-    assert log[2:] == ["prepare lattice-orbit True", score_views(tiny_root)[1]]
+    prepared = predict(counting_method(log), tiny_root, tmp_path / "whole.zip")
+    assert log[2:] == ["prepare lattice-orbit True", orbit_view_ids(tiny_root)[1]]
     assert set(prepared) == {"lattice", "lattice-orbit"}
     assert [path.name for path in tmp_path.iterdir()] == ["whole.zip"]
 
 
-def test_a_config_that_does_not_fit_stops_the_run_before_it_begins(tiny_root: Path, tmp_path: Path) -> None:
+def test_failing_check_stops_run_before_prediction(tiny_root: Path, tmp_path: Path) -> None:
     log: list[str] = []
     with pytest.raises(MethodError, match="lattice-orbit: does not fit"):
-        predict(whole_config(log, unfit="lattice-orbit"), tiny_root, tmp_path / "whole.zip")
+        predict(counting_method(log, unfit="lattice-orbit"), tiny_root, tmp_path / "whole.zip")
     assert log == ["check lattice", "check lattice-orbit"]
     assert not list(tmp_path.iterdir())
 
 
-def test_a_users_file_that_was_changed_is_another_method(own: Path) -> None:
-    before = find_method(f"{own}:METHOD").info
-    assert find_method(f"{own}:METHOD").info == before
-    own.write_text(own.read_text() + "# changed\n")
-    after = find_method(f"{own}:METHOD").info
+def test_changed_user_file_gives_different_source(user_file: Path) -> None:
+    before = find_method(f"{user_file}:METHOD").info
+    assert find_method(f"{user_file}:METHOD").info == before
+    user_file.write_text(user_file.read_text() + "# changed\n")
+    after = find_method(f"{user_file}:METHOD").info
     assert after.name == before.name
     assert after.source != before.source
 
 
-def test_a_dataset_rendered_otherwise_is_predicted_anew(own: Path, tiny_root: Path, tmp_path: Path) -> None:
-    """The ground truth of another light or sample count is the same; the pictures are not."""
+def test_dataset_with_other_render_key_is_predicted_again(
+    user_file: Path, tiny_root: Path, tmp_path: Path
+) -> None:
+    """Other lights or sample counts leave the ground truth unchanged, but not the images."""
 
     def stop(_: str, done: int, __: int) -> None:
         if done == 1:
@@ -276,7 +296,11 @@ def test_a_dataset_rendered_otherwise_is_predicted_anew(own: Path, tiny_root: Pa
 
     def run(root: Path, progress: Progress) -> None:
         predict(
-            find_method(f"{own}:METHOD"), root, tmp_path / "out.zip", configs=["lattice-orbit"], progress=progress
+            find_method(f"{user_file}:METHOD"),
+            root,
+            tmp_path / "out.zip",
+            configs=["lattice-orbit"],
+            progress=progress,
         )
 
     with pytest.raises(KeyboardInterrupt):
@@ -290,11 +314,11 @@ def test_a_dataset_rendered_otherwise_is_predicted_anew(own: Path, tiny_root: Pa
     (other / "manifest.json").unlink()
     (other / "manifest.json").write_text(json.dumps(manifest))
     run(other, lambda *_: None)
-    first, second = score_views(tiny_root)
+    first, second = orbit_view_ids(tiny_root)
     assert (tmp_path / "log").read_text().split() == [first, first, second]
 
 
-WRONG = {
+FAILING_CODE = {
     "load returned NoneType, expected a function of a row": "def load():\n    pass",
     "load: raised FileNotFoundError: weights.pth": "def load():\n    raise FileNotFoundError('weights.pth')",
     "lattice-orbit/0025: the predictor, given view_id, left_rgb: raised KeyError: 'left_depth'": (
@@ -303,8 +327,8 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize(("words", "code"), WRONG.items(), ids=["no predictor", "load", "predictor"])
-def test_what_a_users_code_raises_is_told_with_its_place(
+@pytest.mark.parametrize(("words", "code"), FAILING_CODE.items(), ids=["no predictor", "load", "predictor"])
+def test_error_in_user_code_names_its_location(
     words: str, code: str, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "wrong.py"
@@ -312,28 +336,30 @@ def test_what_a_users_code_raises_is_told_with_its_place(
     path.write_text(f"from rebar_depth_bench.methods import *\n{code}\nMETHOD = Method({info}, load)\n")
     command = ["predict", f"{path}:METHOD", "--data", str(tiny_root), "--out", str(tmp_path / "out.zip")]
     assert main([*command, "--config", "lattice-orbit"]) == 2
-    complaint = capsys.readouterr().err
-    assert f"error: wrong: {words}" in complaint
-    assert "Traceback" not in complaint
-    assert "raised" not in words or f"({path}:" in complaint
+    stderr = capsys.readouterr().err
+    assert f"error: wrong: {words}" in stderr
+    assert "Traceback" not in stderr
+    assert "raised" not in words or f"({path}:" in stderr
 
 
-def test_notes_that_are_no_json_are_refused_at_once(tiny_root: Path, tmp_path: Path) -> None:
+def test_notes_that_are_not_json_raise(tiny_root: Path, tmp_path: Path) -> None:
     log: list[str] = []
-    method = whole_config(log)
-    spoiled = replace(method, prepare=lambda *given: replace(method.prepare(*given), notes={"bad": float("nan")}))
+    method = counting_method(log)
+    with_bad_notes = replace(
+        method, prepare=lambda *args: replace(method.prepare(*args), notes={"bad": float("nan")})
+    )
     with pytest.raises(MethodError, match="whole: lattice: the note 'bad' is no plain JSON value"):
-        predict(spoiled, tiny_root, tmp_path / "whole.zip")
+        predict(with_bad_notes, tiny_root, tmp_path / "whole.zip")
     assert log[-1].startswith("prepare")
 
 
-def test_a_check_that_fails_by_accident_is_told(tiny_root: Path, tmp_path: Path) -> None:
-    method = replace(whole_config([]), check=lambda _: print(1 // 0))
+def test_exception_in_check_is_reported(tiny_root: Path, tmp_path: Path) -> None:
+    method = replace(counting_method([]), check=lambda _: print(1 // 0))
     with pytest.raises(MethodError, match="whole: lattice: check: raised ZeroDivisionError"):
         predict(method, tiny_root, tmp_path / "whole.zip")
     assert not list(tmp_path.iterdir())
 
 
-def test_columns_without_a_comma_are_refused() -> None:
+def test_columns_given_as_string_raise_type_error() -> None:
     with pytest.raises(TypeError, match="columns is the text 'left_rgb', expected a tuple of names"):
         MethodInfo("mine", "a test", "left_rgb", False, "here", "MIT")  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Monocular networks of ``transformers`` by name: real classes with random weights, through the whole way."""
+"""Monocular depth networks of ``transformers``: the real classes with random weights, end to end."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import METHODS, find_method
 from rebar_depth_bench.methods.huggingface.families import (
     FAMILIES,
-    PREPARATIONS,
-    Output,
+    PROCESSING_FACTORIES,
+    OutputKind,
     canonical_to_depth_m,
-    depth_m,
+    network_output_to_depth_m,
 )
 from rebar_depth_bench.methods.huggingface.model import hf_method
-from tests.bench.methods.predictors import loaded
-from tests.bench.methods.tiny_depth_models import LAST_LAYER, MODELS, save
+from tests.bench.methods.predictors import load_predictor
+from tests.bench.methods.tiny_depth_models import LAST_LAYER, MODELS, save_checkpoint
 
 H, W = 90, 160
 FX = 87.5
@@ -37,7 +37,7 @@ SIGMOID_2 = 1 / (1 + np.exp(-2.0))
 
 
 def row(seed: int = 1, fx: float = FX) -> dict[str, Any]:
-    """A picture of blurred noise, and its intrinsics."""
+    """Return a row with an image of blurred noise and its intrinsics."""
     coarse = np.random.default_rng(seed).integers(0, 256, (9, 16, 3), np.uint8)
     rgb = np.asarray(Image.fromarray(coarse).resize((W, H), Image.Resampling.BICUBIC))
     K = np.array([[fx, 0, (W - 1) / 2], [0, fx, (H - 1) / 2], [0, 0, 1]])
@@ -46,27 +46,29 @@ def row(seed: int = 1, fx: float = FX) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A checkpoint of each kind whose answer differs from place to place."""
+    """Save a checkpoint of each kind whose output varies over the image; return the folders by kind."""
     root = tmp_path_factory.mktemp("checkpoints")
-    return {kind: save(root / kind, kind) for kind in MODELS}
+    return {kind: save_checkpoint(root / kind, kind) for kind in MODELS}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", MODELS)
-def test_every_family_answers_on_the_left_grid_the_same_each_time(folders: dict[str, Path], kind: str) -> None:
+def test_families_predict_deterministically_on_left_grid(folders: dict[str, Path], kind: str) -> None:
     method = find_method(f"hf:{folders[kind]}")
-    asked = {name: row()[name] for name in method.info.columns}
-    first, second = loaded(method)(asked), loaded(method)(asked)
+    inputs = {name: row()[name] for name in method.info.columns}
+    first, second = load_predictor(method)(inputs), load_predictor(method)(inputs)
     assert first.shape == (H, W)
     assert first.dtype == np.float32
     assert np.array_equal(first, second, equal_nan=True)
-    told = first[np.isfinite(first)]
-    assert told.size > 0.3 * first.size
-    assert (told > 0).all()
-    assert told.std() > 1e-3 * told.mean(), "the network looks at the picture"
+    known = first[np.isfinite(first)]
+    assert known.size > 0.3 * first.size
+    assert (known > 0).all()
+    assert known.std() > 1e-3 * known.mean(), "the network looks at the picture"
     assert method.info.name == f"hf:{kind}"
     assert str(folders[kind]) not in json.dumps(vars(method.info))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "bias", "changes", "expected"),
     [
@@ -80,24 +82,24 @@ def test_every_family_answers_on_the_left_grid_the_same_each_time(folders: dict[
         ("depth-pro", -1.0, {}, 1e4),
     ],
 )
-def test_a_known_output_becomes_known_metres(
+def test_known_output_becomes_expected_metres(
     tmp_path: Path, kind: str, bias: float, changes: dict[str, Any], expected: float
 ) -> None:
-    found = hf_method(str(save(tmp_path, kind, bias, **changes))).load()(row())
-    np.testing.assert_allclose(found, np.full((H, W), expected), rtol=1e-5)
+    depth_m = hf_method(str(save_checkpoint(tmp_path, kind, bias, **changes))).load()(row())
+    np.testing.assert_allclose(depth_m, np.full((H, W), expected), rtol=1e-5)
 
 
-def test_depth_pros_depth_goes_with_the_focal_length(folders: dict[str, Path]) -> None:
-    run = hf_method(str(folders["depth-pro"])).load()
-    near, far = run(row(fx=70.0)), run(row(fx=140.0))
-    free = (near > 2e-4) & (far < 9e3)  # not at the model's own bounds
-    assert free.mean() > 0.3
-    np.testing.assert_allclose(far[free], 2 * near[free], rtol=1e-6)
+def test_depth_pro_depth_scales_with_focal_length(folders: dict[str, Path]) -> None:
+    predictor = hf_method(str(folders["depth-pro"])).load()
+    near, far = predictor(row(fx=70.0)), predictor(row(fx=140.0))
+    unclipped = (near > 2e-4) & (far < 9e3)  # Exclude depths clipped to the model's bounds.
+    assert unclipped.mean() > 0.3
+    np.testing.assert_allclose(far[unclipped], 2 * near[unclipped], rtol=1e-6)
 
 
 @given(st.integers(1, 40), st.floats(10, 2000), st.floats(0.3, 30))
-def test_a_picture_of_any_size_gives_depth_pros_canonical_camera(width: int, fx: float, z: float) -> None:
-    """A camera whose focal length is one picture width sees 1 / z itself."""
+def test_canonical_output_to_depth_at_any_image_width(width: int, fx: float, z: float) -> None:
+    """The canonical output equals 1 / z for a camera whose focal length is one image width."""
     K = np.diag([fx, fx, 1.0])
     canonical = np.full((2, width), fx / (z * width))
     np.testing.assert_allclose(canonical_to_depth_m(canonical, K), np.clip(z, 1e-4, 1e4), rtol=1e-6)
@@ -106,16 +108,18 @@ def test_a_picture_of_any_size_gives_depth_pros_canonical_camera(width: int, fx:
     )
 
 
-def test_no_answer_is_nan_whatever_the_network_puts_out() -> None:
+def test_invalid_network_output_is_nan() -> None:
     values = np.array([[np.nan, np.inf, -np.inf, -1, 0, 1e-45, 2]], np.float32)
-    inverse, metres = (depth_m(output, values) for output in (Output.INVERSE, Output.METRES))
+    inverse, metres = (
+        network_output_to_depth_m(output, values) for output in (OutputKind.INVERSE, OutputKind.METRES)
+    )
     assert np.isfinite(inverse).tolist() == [[False] * 6 + [True]]
     assert inverse[0, -1] == 0.5
     assert np.isfinite(metres).tolist() == [[False] * 5 + [True, True]]
 
 
 @pytest.mark.parametrize("kind", ["depth-anything", "dpt", "glpn"])
-def test_the_answer_is_that_of_the_librarys_own_pipeline(folders: dict[str, Path], kind: str) -> None:
+def test_depth_matches_transformers_pipeline(folders: dict[str, Path], kind: str) -> None:
     transformers = importlib.import_module("transformers")
     processor = transformers.AutoImageProcessor.from_pretrained(folders[kind], backend="pil")
     pipe = transformers.pipeline("depth-estimation", model=str(folders[kind]), image_processor=processor)
@@ -127,39 +131,39 @@ def test_the_answer_is_that_of_the_librarys_own_pipeline(folders: dict[str, Path
     np.testing.assert_allclose(ours, np.where(theirs > 0, theirs, np.nan), rtol=1e-5)
 
 
-def test_depth_pros_picture_is_that_of_pillow() -> None:
-    """Enlarged, Pillow's bilinear filter is the same interpolation; of each value 2 v / 255 - 1."""
+def test_depth_pro_input_matches_pillow() -> None:
+    """For enlargement Pillow's bilinear filter is the same interpolation; values become 2 v / 255 - 1."""
     settings = {**MODELS["depth-pro"][1], "size": {"height": 128, "width": 192}}
     rgb = row()["left_rgb"]
-    found = PREPARATIONS["depth_pro"](settings, None).pixels(rgb).numpy()
-    assert found.shape == (1, 3, 128, 192)
+    network_input = PROCESSING_FACTORIES["depth_pro"](settings, None).to_network_input(rgb).numpy()
+    assert network_input.shape == (1, 3, 128, 192)
     for channel in range(3):
         plane = Image.fromarray(rgb[..., channel].astype(np.float32))
         expected = np.asarray(plane.resize((192, 128), Image.Resampling.BILINEAR)) * 2 / 255 - 1
-        np.testing.assert_allclose(found[0, channel], expected, atol=2e-5)
+        np.testing.assert_allclose(network_input[0, channel], expected, atol=2e-5)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in MODELS if kind != "depth-pro"])
-def test_what_the_network_sees_at_a_pixel_lies_there_again(folders: dict[str, Path], kind: str) -> None:
-    """A ramp of columns and one of rows, as pictures and straight back as answers: every pixel at its place."""
+def test_preprocessing_round_trip_keeps_pixel_positions(folders: dict[str, Path], kind: str) -> None:
+    """Ramps over rows and columns, passed through pre- and postprocessing only, keep every pixel in place."""
     transformers = importlib.import_module("transformers")
     processor = transformers.AutoImageProcessor.from_pretrained(folders[kind], backend="pil")
     model_type = json.loads((folders[kind] / "config.json").read_text())["model_type"]
-    prepare = PREPARATIONS[model_type](MODELS[kind][1], processor)
+    processing = PROCESSING_FACTORIES[model_type](MODELS[kind][1], processor)
     rows, columns = np.mgrid[:H, :W]
     rgb = np.stack([rows, columns, np.zeros_like(rows)], axis=-1).astype(np.uint8)
     mean, std = (
         np.asarray(MODELS[kind][1].get(f"image_{name}", [x] * 3)) for name, x in (("mean", 0), ("std", 1))
     )
     for channel, expected in ((0, rows), (1, columns)):
-        seen = prepare.pixels(rgb)[0, channel]
-        back = prepare.on_left_grid(seen, (H, W)).numpy() * std[channel] + mean[channel]
+        network_input = processing.to_network_input(rgb)[0, channel]
+        restored = processing.to_left_grid(network_input, (H, W)).numpy() * std[channel] + mean[channel]
         inner = np.s_[12:-12, 12:-12]
-        np.testing.assert_allclose(255 * back[inner], expected[inner], atol=1.5)
+        np.testing.assert_allclose(255 * restored[inner], expected[inner], atol=1.5)
 
 
-def test_whatever_is_up_to_scale_says_so(tmp_path: Path, folders: dict[str, Path]) -> None:
-    metric = save(tmp_path / "metric", "depth-anything", depth_estimation_type="metric")
+def test_summary_states_scale_ambiguity(tmp_path: Path, folders: dict[str, Path]) -> None:
+    metric = save_checkpoint(tmp_path / "metric", "depth-anything", depth_estimation_type="metric")
     summaries = {kind: hf_method(str(folder)).info.summary for kind, folder in folders.items()}
     assert {kind for kind, text in summaries.items() if "up to scale" in text} == {"depth-anything", "dpt"}
     assert "metres" in hf_method(str(metric)).info.summary
@@ -168,9 +172,9 @@ def test_whatever_is_up_to_scale_says_so(tmp_path: Path, folders: dict[str, Path
     }
 
 
-def test_weights_of_the_older_kind_are_read(tmp_path: Path) -> None:
-    """And settings as the library wrote them in its version 4: a feature extractor's."""
-    folder = save(tmp_path, "dpt")
+def test_legacy_weights_and_settings_are_read(tmp_path: Path) -> None:
+    """The preprocessor settings are those of a feature extractor, as written by version 4 of the library."""
+    folder = save_checkpoint(tmp_path, "dpt")
     new = hf_method(str(folder)).load()(row())
     tensors = importlib.import_module("safetensors.torch").load_file(folder / "model.safetensors")
     importlib.import_module("torch").save(tensors, folder / "pytorch_model.bin")
@@ -181,51 +185,54 @@ def test_weights_of_the_older_kind_are_read(tmp_path: Path) -> None:
     assert np.array_equal(hf_method(str(folder)).load()(row()), new, equal_nan=True)
 
 
-def test_other_weights_are_another_method(tmp_path: Path) -> None:
+def test_other_weights_give_different_method_info(tmp_path: Path) -> None:
     """An interrupted prediction is not continued with other weights under the same name."""
-    told = [hf_method(str(save(tmp_path, "glpn", bias))).info for bias in (1.0, 2.0, 2.0)]
-    assert told[0] != told[1]
-    assert told[1] == told[2]
+    infos = [hf_method(str(save_checkpoint(tmp_path, "glpn", bias))).info for bias in (1.0, 2.0, 2.0)]
+    assert infos[0] != infos[1]
+    assert infos[1] == infos[2]
 
 
-def test_predicted_from_the_command_line(
+@pytest.mark.slow
+def test_predict_command_runs_hf_folder(
     tmp_path: Path, tiny_root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder, archive = save(tmp_path / "pro", "depth-pro", 0.5), tmp_path / "pro.zip"
+    folder, archive = save_checkpoint(tmp_path / "pro", "depth-pro", 0.5), tmp_path / "pro.zip"
     command = ["predict", f"hf:{folder}", "--data", str(tiny_root), "--config", "lattice-orbit"]
     assert main([*command, "--out", str(archive)]) == 0, capsys.readouterr().err
     assert score(archive, tiny_root).tables["lattice-orbit"].coverage == 1
     with zipfile.ZipFile(archive) as entries:
-        told = json.loads(entries.read("submission.json"))
+        metadata = json.loads(entries.read("submission.json"))
         with entries.open(next(name for name in entries.namelist() if name.endswith(".npy"))) as entry:
-            np.testing.assert_allclose(np.load(entry), FX / (0.5 * W), rtol=1e-6)  # the contract's fx at this size
-    assert told["uses_intrinsics"] is True
-    assert told["method"] == "hf:pro"
-    assert re.search(r"focal length given; weights sha256:[0-9a-f]{64}$", told["description"])
+            np.testing.assert_allclose(
+                np.load(entry), FX / (0.5 * W), rtol=1e-6
+            )  # fx of the dataset at this image size.
+    assert metadata["uses_intrinsics"] is True
+    assert metadata["method"] == "hf:pro"
+    assert re.search(r"focal length given; weights sha256:[0-9a-f]{64}$", metadata["description"])
 
 
 def break_config(folder: Path) -> None:
     (folder / "config.json").write_text("{")
 
 
-def of_another_kind(folder: Path) -> None:
+def set_unsupported_type(folder: Path) -> None:
     (folder / "config.json").write_text('{"model_type": "bert"}')
 
 
-def asking_for_measured_depth(folder: Path) -> None:
+def set_depth_completion_type(folder: Path) -> None:
     (folder / "config.json").write_text('{"model_type": "prompt_depth_anything"}')
 
 
-def without(name: str) -> Any:
+def delete_file(name: str) -> Any:
     return lambda folder: (folder / name).unlink()
 
 
-def damaged(folder: Path) -> None:
+def truncate_weights(folder: Path) -> None:
     path = folder / "model.safetensors"
     path.write_bytes(path.read_bytes()[:1000])
 
 
-def lacking_a_tensor(folder: Path) -> None:
+def drop_tensor(folder: Path) -> None:
     load_file = importlib.import_module("safetensors.torch").load_file
     tensors = load_file(folder / "model.safetensors")
     del tensors["head.conv3.weight"]
@@ -237,25 +244,28 @@ def lacking_a_tensor(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (without("config.json"), "no config.json, expected a checkpoint's folder"),
+        (delete_file("config.json"), "no config.json, expected a checkpoint's folder"),
         (break_config, "config.json: cannot be read"),
-        (of_another_kind, "model_type is 'bert', expected one of depth_anything, depth_pro, dpt, glpn, zoedepth"),
-        (asking_for_measured_depth, "(it completes measured depth, which a single picture does not bring)"),
-        (without("preprocessor_config.json"), "no preprocessor_config.json"),
-        (without("model.safetensors"), "no weights, expected *.safetensors or *.bin beside config.json"),
-        (damaged, "cannot be loaded: SafetensorError"),
-        (lacking_a_tensor, "the weights lack 1 of the network's tensors, first head.conv3.weight"),
+        (
+            set_unsupported_type,
+            "model_type is 'bert', expected one of depth_anything, depth_pro, dpt, glpn, zoedepth",
+        ),
+        (set_depth_completion_type, "(it completes measured depth, which a single picture does not bring)"),
+        (delete_file("preprocessor_config.json"), "no preprocessor_config.json"),
+        (delete_file("model.safetensors"), "no weights, expected *.safetensors or *.bin beside config.json"),
+        (truncate_weights, "cannot be loaded: SafetensorError"),
+        (drop_tensor, "the weights lack 1 of the network's tensors, first head.conv3.weight"),
     ],
 )
-def test_what_cannot_be_run_is_said_in_words(tmp_path: Path, spoil: Any, words: str) -> None:
-    folder = save(tmp_path / "checkpoint", "depth-anything")
+def test_unusable_checkpoint_raises_with_reason(tmp_path: Path, spoil: Any, words: str) -> None:
+    folder = save_checkpoint(tmp_path / "checkpoint", "depth-anything")
     spoil(folder)
     with pytest.raises(MethodError, match=re.escape(words)):
         hf_method(str(folder)).load()
 
 
 @pytest.mark.parametrize("package", ["torch", "transformers"])
-def test_a_missing_package_is_named(
+def test_missing_package_names_extra_to_install(
     package: str, folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     method = hf_method(str(folders["glpn"]))
@@ -265,13 +275,13 @@ def test_a_missing_package_is_named(
 
 
 @pytest.mark.parametrize("name", ["no/such/folder", "./nowhere", "word", "~/nowhere", "", "a/b:c"])
-def test_a_name_that_is_neither_folder_nor_model_is_refused(name: str) -> None:
+def test_invalid_hf_name_raises(name: str) -> None:
     with pytest.raises(MethodError, match="no such folder, and no name of a model on the Hub"):
         find_method(f"hf:{name}")
 
 
-def test_families_are_all_tried_here() -> None:
-    assert set(FAMILIES) == set(PREPARATIONS)
+def test_all_families_are_covered() -> None:
+    assert set(FAMILIES) == set(PROCESSING_FACTORIES)
     assert set(FAMILIES) <= {kind.replace("-", "_") for kind in MODELS}
     assert set(LAST_LAYER) <= set(MODELS)
     assert METHODS["depth-pro"].info.uses_intrinsics

@@ -16,13 +16,13 @@ IMAGENET: Mapping[str, Any] = {
     "image_mean": [0.485, 0.456, 0.406],
     "image_std": [0.229, 0.224, 0.225],
 }
-SHAPED: Mapping[str, Any] = {"keep_aspect_ratio": True, "resample": 3}
+KEEP_ASPECT_RATIO: Mapping[str, Any] = {"keep_aspect_ratio": True, "resample": 3}
 VIT: Mapping[str, Any] = {"hidden_size": 16, "num_hidden_layers": 4, "num_attention_heads": 2}
 NECK: Mapping[str, Any] = {"neck_hidden_sizes": [4, 4, 8, 8], "fusion_hidden_size": 8}
 
 
 def depth_anything(transformers: Any, **changes: Any) -> Any:
-    """14-pixel patches, as the real ones."""
+    """Return a Depth Anything config with 14-pixel patches, as in the real models."""
     backbone = transformers.Dinov2Config(
         **VIT, patch_size=14, image_size=28, mlp_ratio=2, out_indices=[1, 2, 3, 4], reshape_hidden_states=False
     )
@@ -32,7 +32,7 @@ def depth_anything(transformers: Any, **changes: Any) -> Any:
 
 
 def dpt(transformers: Any, **changes: Any) -> Any:
-    """On a ViT of its own, as MiDaS."""
+    """Return a DPT config with a built-in ViT backbone, as in MiDaS."""
     return transformers.DPTConfig(
         **VIT,
         **NECK,
@@ -46,7 +46,7 @@ def dpt(transformers: Any, **changes: Any) -> Any:
 
 
 def dpt_dinov2(transformers: Any, **changes: Any) -> Any:
-    """On DINOv2, as its authors' metric heads."""
+    """Return a DPT config with a DINOv2 backbone, as in the metric heads published with DINOv2."""
     backbone = transformers.Dinov2Config(
         **VIT, patch_size=14, image_size=28, mlp_ratio=2, out_indices=[1, 2, 3, 4], reshape_hidden_states=False
     )
@@ -54,7 +54,7 @@ def dpt_dinov2(transformers: Any, **changes: Any) -> Any:
 
 
 def glpn(transformers: Any, **changes: Any) -> Any:
-    """One block a stage."""
+    """Return a GLPN config with one block per stage."""
     return transformers.GLPNConfig(
         hidden_sizes=[4, 8, 8, 16],
         depths=[1] * 4,
@@ -65,7 +65,7 @@ def glpn(transformers: Any, **changes: Any) -> Any:
 
 
 def zoedepth(transformers: Any, **changes: Any) -> Any:
-    """One metric head of eight bins."""
+    """Return a ZoeDepth config with one metric head of eight bins."""
     nyu = {"n_bins": 8, "min_depth": 0.001, "max_depth": 10.0, "name": "nyu"}
     backbone = transformers.BeitConfig(
         **VIT,
@@ -87,7 +87,10 @@ def zoedepth(transformers: Any, **changes: Any) -> Any:
 
 
 def zoedepth_two_heads(transformers: Any) -> Any:
-    """One head for rooms and one for roads; what chooses has four layers of 128 in the library's own code."""
+    """Return a ZoeDepth config with an indoor (NYU) and an outdoor (KITTI) head.
+
+    The library's code requires four layers of 128 for the transformer that chooses between them.
+    """
     return zoedepth(
         transformers,
         bin_configurations=[
@@ -102,7 +105,7 @@ def zoedepth_two_heads(transformers: Any) -> Any:
 
 
 def depth_pro(transformers: Any, **changes: Any) -> Any:
-    """With the head that guesses the focal length, as the real one."""
+    """Return a Depth Pro config with the head that estimates the focal length, as in the real model."""
     encoder = transformers.Dinov2Config(**VIT, patch_size=8, image_size=16, mlp_ratio=2).to_dict()
     encoders = {f"{name}_model_config": dict(encoder) for name in ("image", "patch", "fov")}
     return transformers.DepthProConfig(
@@ -125,11 +128,11 @@ def _size(height: int, width: int) -> dict[str, Any]:
 
 
 def _dpt_settings(height: int, width: int, multiple: int) -> dict[str, Any]:
-    shape = {**SHAPED, **_size(height, width), "ensure_multiple_of": multiple}
+    shape = {**KEEP_ASPECT_RATIO, **_size(height, width), "ensure_multiple_of": multiple}
     return {"image_processor_type": "DPTImageProcessor", **IMAGENET, **shape}
 
 
-ZOE: Mapping[str, Any] = {
+ZOE_SETTINGS: Mapping[str, Any] = {
     "image_processor_type": "ZoeDepthImageProcessor",
     **IMAGENET,
     **_size(32, 64),
@@ -156,10 +159,10 @@ MODELS: Mapping[str, tuple[Callable[..., Any], Mapping[str, Any]]] = {
         {**_dpt_settings(56, 56, 14), "do_resize": False, "do_pad": True, "size_divisor": 14},
     ),
     "glpn": (glpn, {"image_processor_type": "GLPNImageProcessor", "do_rescale": True, "size_divisor": 32}),
-    "zoedepth": (zoedepth, ZOE),
-    "zoedepth-two-heads": (zoedepth_two_heads, ZOE),
+    "zoedepth": (zoedepth, ZOE_SETTINGS),
+    "zoedepth-two-heads": (zoedepth_two_heads, ZOE_SETTINGS),
 }
-"""Each one's config, and its ``preprocessor_config.json``."""
+"""Config factory and ``preprocessor_config.json`` of each kind of model."""
 
 LAST_LAYER: Mapping[str, str] = {
     "depth-anything": "head.conv3",
@@ -168,18 +171,21 @@ LAST_LAYER: Mapping[str, str] = {
     "dpt-dinov2": "head.head.4",
     "glpn": "head.head.2",
 }
-"""The convolution before the last activation."""
+"""Name of the convolution before the last activation, by kind of model."""
 
 
-def save(folder: Path, kind: str, bias: float | None = None, **changes: Any) -> Path:
-    """Write a checkpoint; with a bias, what leaves its last convolution is this number everywhere."""
+def save_checkpoint(folder: Path, kind: str, bias: float | None = None, **changes: Any) -> Path:
+    """Write a checkpoint of random weights and return its folder.
+
+    With ``bias``, the output of the last convolution equals this number everywhere.
+    """
     torch, transformers = (importlib.import_module(name) for name in ("torch", "transformers"))
     torch.manual_seed(1)
     config, settings = MODELS[kind]
     model = transformers.AutoModelForDepthEstimation.from_config(config(transformers, **changes))
     with torch.no_grad():
         for parameter in model.parameters():
-            if parameter.ndim > 1:  # lively enough to answer differently from place to place
+            if parameter.ndim > 1:  # Large enough for an output that varies over the image.
                 parameter.normal_(0, (2 / parameter[0].numel()) ** 0.5)
         if kind in LAST_LAYER:
             last = model.get_submodule(LAST_LAYER[kind])

@@ -1,45 +1,47 @@
-"""A page as the tests read it."""
+"""HTML parser that checks the nesting of a page and collects its tags and text."""
 
 from __future__ import annotations
 
 import re
 from html.parser import HTMLParser
 
-VOID = {"meta", "img", "br", "path", "circle", "link", "input"}
+VOID_TAGS = {"meta", "img", "br", "path", "circle", "link", "input"}
 
 
 class Page(HTMLParser):
-    """Fails where tags do not nest, and collects what the tests ask for."""
+    """Parsed HTML page; construction fails if tags do not nest."""
 
     def __init__(self, page: str) -> None:
         super().__init__(convert_charrefs=True)
-        self.open: list[str] = []
+        self.open_tags: list[str] = []
         self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.words: list[str] = []
+        self.text_parts: list[str] = []
         self.feed(page)
         self.close()
-        assert self.open == []
+        assert self.open_tags == []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self.open.append(tag)
+        if tag not in VOID_TAGS:
+            self.open_tags.append(tag)
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, dict(attrs)))
 
     def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
+        assert self.open_tags.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        self.words.append(data)
+        self.text_parts.append(data)
 
     def count(self, tag: str) -> int:
-        return len(self.named(tag))
+        return len(self.attributes_of(tag))
 
-    def named(self, tag: str) -> list[dict[str, str | None]]:
+    def attributes_of(self, tag: str) -> list[dict[str, str | None]]:
+        """Return the attributes of every ``tag``, in document order."""
         return [attributes for name, attributes in self.tags if name == tag]
 
     @property
     def text(self) -> str:
-        return re.sub(r"[ \n]+", " ", " ".join(self.words))
+        """Return the text outside of tags, with runs of white space collapsed."""
+        return re.sub(r"[ \n]+", " ", " ".join(self.text_parts))

@@ -1,17 +1,20 @@
-"""Results for these tests, made as the scorer makes them: scores of views through ``tabulate``."""
+"""Example results for the report tests: scores of views, tabulated by the scorer's ``tabulate``."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from rebar_depth_bench.reporting.html.view_images import ViewPanels
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.result import Result, ViewScore, tabulate
 
 HOSTILE = '=<script src="//evil.example/x.js">alert(1)</script>[red]\x1b[31m\u202e&amp;'
 
 
-def scored(view_id: str, abs_rel: float = 0.75, coverage: float = 1.0, scale: float = 0.625) -> ViewScore:
-    """Return a view with the given native AbsRel and numbers that are told apart from each other."""
+def scored_view(view_id: str, abs_rel: float = 0.75, coverage: float = 1.0, scale: float = 0.625) -> ViewScore:
+    """Return a view score with the given native AbsRel and a distinct value in every other field."""
     return ViewScore(
         view_id=view_id,
         scored_px=43210,
@@ -23,20 +26,20 @@ def scored(view_id: str, abs_rel: float = 0.75, coverage: float = 1.0, scale: fl
     )
 
 
-def unpredicted(view_id: str) -> ViewScore:
-    """Return a view without any prediction."""
+def unpredicted_view(view_id: str) -> ViewScore:
+    """Return the score of a view without any prediction."""
     return ViewScore(view_id, 777, 0.0, None, None, None, {3: 0.0, 5: 0.0, 10: 0.0, 20: 0.0})
 
 
-def overflowed(view_id: str) -> ViewScore:
-    """Return a view whose prediction was too large to square."""
+def overflowed_view(view_id: str) -> ViewScore:
+    """Return the score of a view whose squared native error overflows to infinity."""
     native = DepthMetrics(abs_rel=1e200, rmse_cm=math.inf, mae_cm=1e202, delta1=0.0)
-    view = scored(view_id)
+    view = scored_view(view_id)
     return ViewScore(view_id, 5, 1.0, 1e-200, native, view.scaled, view.within_mm)
 
 
 def result(*views: ViewScore, method: str = "my model") -> Result:
-    """Return the result of ``views``, a table per config in the order of appearance."""
+    """Return the result of ``views`` with one table per config, in order of appearance."""
     configs = dict.fromkeys(view.view_id.rpartition("/")[0] for view in views)
     tables = {name: tabulate([view for view in views if view.view_id.startswith(f"{name}/")]) for name in configs}
     return Result(
@@ -48,3 +51,13 @@ def result(*views: ViewScore, method: str = "my model") -> Result:
         tables=tables,
         views=views,
     )
+
+
+def panels(view_id: str = "lattice/0000", score: ViewScore | None = None, factor: float = 1.6) -> ViewPanels:
+    """Return a 40 x 60 view: a bar at 0.5 m in front of a wall at 1 m, predicted ``factor`` times too far."""
+    truth = np.ones((40, 60), np.float32)
+    steel = np.zeros((40, 60), bool)
+    steel[:, 20:30] = True
+    truth[steel] = 0.5
+    rgb = np.full((40, 60, 3), 128, np.uint8)
+    return ViewPanels(view_id, rgb, truth, truth * np.float32(factor), steel, score or scored_view(view_id))

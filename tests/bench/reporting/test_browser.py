@@ -1,26 +1,18 @@
-"""The page's script, operated in a real browser where the machine has one."""
+"""Script of the HTML report, run in Chromium where it is installed."""
 
 from __future__ import annotations
 
 import html
 import json
 import re
-import shutil
 import subprocess
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from rebar_depth_bench.reporting.html.assets import inline_script
 from rebar_depth_bench.reporting.html.page import render_report
-from tests.bench.reporting.results import overflowed, result, scored, unpredicted
-from tests.bench.reporting.test_report import panels
-
-_BROWSER = next((found for name in ("chromium", "google-chrome") if (found := shutil.which(name))), None)
-
-needs_browser = pytest.mark.skipif(_BROWSER is None, reason="no chromium on this machine")
+from tests.bench.reporting.results import overflowed_view, panels, result, scored_view, unpredicted_view
 
 _TABLE = """
 <table class="sortable"><thead>
@@ -36,27 +28,26 @@ _TABLE = """
 """
 
 
-def _operated(page: str, operations: str, folder: Path) -> Any:
-    """Return what ``operations`` (a function body of JavaScript) returns after ``page`` has loaded."""
-    assert _BROWSER is not None
-    ask = f"<script>document.title = JSON.stringify((() => {{ {operations} }})());</script>"
+def _run_in_browser(browser: str, page: str, operations: str, folder: Path) -> Any:
+    """Load ``page`` in Chromium and return the value of ``operations``, the body of a JavaScript function."""
+    script = f"<script>document.title = JSON.stringify((() => {{ {operations} }})());</script>"
     file = folder / "page.html"
-    file.write_text(f"{page}{ask}", encoding="utf-8")
+    file.write_text(f"{page}{script}", encoding="utf-8")
     profile = f"--user-data-dir={folder / 'profile'}"
     options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", profile]
-    done = subprocess.run(
-        [_BROWSER, *options, "--dump-dom", file.as_uri()], capture_output=True, text=True, timeout=120, check=True
+    completed = subprocess.run(
+        [browser, *options, "--dump-dom", file.as_uri()], capture_output=True, text=True, timeout=120, check=True
     )
-    title = re.search(r"<title>(.*?)</title>", done.stdout, re.DOTALL)
-    assert title, done.stderr
+    title = re.search(r"<title>(.*?)</title>", completed.stdout, re.DOTALL)
+    assert title, completed.stderr
     return json.loads(html.unescape(title[1]))
 
 
-@needs_browser
-def test_tables_sort_numbers_as_numbers_and_dashes_last(tmp_path: Path) -> None:
+def test_sortable_table_sorts_numerically_with_dashes_last(chromium_program: str, tmp_path: Path) -> None:
     script = files("rebar_depth_bench.reporting.html").joinpath("sortable.js").read_text(encoding="utf-8")
     page = f"<title>t</title>{_TABLE}<script>{script}</script>"
-    seen = _operated(
+    orders = _run_in_browser(
+        chromium_program,
         page,
         """
         const names = () => [...document.querySelectorAll("tbody th")].map((one) => one.textContent).join(" ");
@@ -67,18 +58,22 @@ def test_tables_sort_numbers_as_numbers_and_dashes_last(tmp_path: Path) -> None:
         """,
         tmp_path,
     )
-    assert seen["Name"] == ["v1 v2 v9 v10", "v10 v9 v2 v1", "v10 v9 v1 v2"], "third press: as it was"
-    assert seen["Last"] == ["v9 v10 v2 v1", "none ascending none none", "v2 v10 v9 v1"], "under a row span"
-    assert seen["One"] == ["v1 v10 v2 v9", "v10 v2 v1 v9", "none none descending none", "v10 v9 v1 v2"]
-    assert seen["Two"] == ["v1 v2 v10 v9"]
+    assert orders["Name"] == ["v1 v2 v9 v10", "v10 v9 v2 v1", "v10 v9 v1 v2"], "third press: as it was"
+    assert orders["Last"] == ["v9 v10 v2 v1", "none ascending none none", "v2 v10 v9 v1"], "under a row span"
+    assert orders["One"] == ["v1 v10 v2 v9", "v10 v2 v1 v9", "none none descending none", "v10 v9 v1 v2"]
+    assert orders["Two"] == ["v1 v2 v10 v9"]
 
 
-@needs_browser
-def test_views_are_shown_one_at_a_time_by_button_key_thumbnail_and_config(tmp_path: Path) -> None:
-    views = [scored("lattice/0000", abs_rel=0.1), scored("lattice/0001", abs_rel=0.9), unpredicted("pile/0000")]
+def test_view_browser_navigates_by_button_key_and_thumbnail(chromium_program: str, tmp_path: Path) -> None:
+    views = [
+        scored_view("lattice/0000", abs_rel=0.1),
+        scored_view("lattice/0001", abs_rel=0.9),
+        unpredicted_view("pile/0000"),
+    ]
     page = render_report(result(*views), [panels(view.view_id, view) for view in views])
-    page = re.sub(r"<meta http-equiv=[^>]*>", "", page)  # its policy would stop this test's own script
-    seen = _operated(
+    page = re.sub(r"<meta http-equiv=[^>]*>", "", page)  # The policy would block the test's own script.
+    states = _run_in_browser(
+        chromium_program,
         page.replace("</body>\n</html>\n", ""),
         """
         const find = (what) => document.querySelector(what);
@@ -103,7 +98,7 @@ def test_views_are_shown_one_at_a_time_by_button_key_thumbnail_and_config(tmp_pa
         tmp_path,
     )
     worst, best, none = "lattice/0001, 1 of 3", "lattice/0000, 2 of 3", "pile/0000, 3 of 3"
-    assert seen == [
+    assert states == [
         [worst, True],
         best,
         [none, True],
@@ -111,24 +106,22 @@ def test_views_are_shown_one_at_a_time_by_button_key_thumbnail_and_config(tmp_pa
     ]
 
 
-@needs_browser
-def test_the_policy_lets_the_pages_script_run_and_no_other(tmp_path: Path) -> None:
-    assert _BROWSER is not None
-    page = render_report(result(scored("lattice/0000"), overflowed("pier/0000")), [panels()])
+def test_content_security_policy_blocks_foreign_scripts(chromium_program: str, tmp_path: Path) -> None:
+    page = render_report(result(scored_view("lattice/0000"), overflowed_view("pier/0000")), [panels()])
     file = tmp_path / "page.html"
     file.write_text(
         page.replace("</body>", "<script>document.title = 'stranger'</script></body>"), encoding="utf-8"
     )
     options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
-    command = [_BROWSER, *options, "--dump-dom", file.as_uri()]
+    command = [chromium_program, *options, "--dump-dom", file.as_uri()]
     dom = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
     assert 'class="browser browsing"' in dom
     assert "<title>stranger" not in dom
 
 
-def test_scripts_are_joined_in_order_and_the_policy_changes_with_them() -> None:
-    both, one = inline_script("sortable.js", "browser.js"), inline_script("sortable.js")
-    assert both.text.startswith(one.text)
-    assert both.policy != one.policy
+def test_inline_script_joins_files_and_updates_policy() -> None:
+    both, first = inline_script("sortable.js", "browser.js"), inline_script("sortable.js")
+    assert both.text.startswith(first.text)
+    assert both.policy != first.policy
     assert "</script" not in both.text.lower()
     assert "<!--" not in both.text

@@ -1,3 +1,5 @@
+"""Colour maps of depth and error, and depth previews."""
+
 from __future__ import annotations
 
 import io
@@ -9,18 +11,19 @@ from rebar_depth_bench.reporting.colormap import (
     COLOURS,
     DEPTH_COLOURS,
     ERROR_COLOURS,
+    colour_indices,
     depth_preview,
-    positions,
     robust_range,
 )
 
 
 def _luminance(colours: np.ndarray) -> np.ndarray:
+    """Return the relative luminance of 8-bit sRGB colours."""
     linear = np.where(colours <= 10, colours / 255 / 12.92, ((colours / 255 + 0.055) / 1.055) ** 2.4)
     return linear @ [0.2126, 0.7152, 0.0722]
 
 
-def test_depth_colours_are_the_published_ones_at_both_ends_and_the_middle() -> None:
+def test_depth_colours_match_published_anchors() -> None:
     assert DEPTH_COLOURS.shape == (COLOURS, 3)
     assert DEPTH_COLOURS[0].tolist() == [0x15, 0x1C, 0x53]
     assert DEPTH_COLOURS[127].tolist() == [0xD1, 0x40, 0x79]
@@ -32,7 +35,7 @@ def test_depth_luminance_rises_at_every_step() -> None:
     assert (np.diff(_luminance(DEPTH_COLOURS)) > 0).all()
 
 
-def test_error_colours_peak_at_zero_and_fall_to_equal_darkness() -> None:
+def test_error_colours_are_lightest_at_zero_error() -> None:
     luminance = _luminance(ERROR_COLOURS)
     assert luminance.argmax() == 127
     assert (np.diff(luminance[:128]) > 0).all()
@@ -43,11 +46,11 @@ def test_error_colours_peak_at_zero_and_fall_to_equal_darkness() -> None:
     assert ERROR_COLOURS[254, 0] > ERROR_COLOURS[254, 2], "positive is red"
 
 
-def test_positions_clip_both_ends_and_infinities_and_send_nan_to_the_first_colour() -> None:
+def test_colour_indices_clip_and_map_nan_to_zero() -> None:
     values = np.array([-9.0, 0.0, 0.5, 1.0, 9.0, np.inf, -np.inf, np.nan])
-    assert positions(values, 0.0, 1.0).tolist() == [0, 0, 127, 254, 254, 254, 0, 0]
-    assert positions(values[1:4], 1.0, 0.0).tolist() == [254, 127, 0]
-    assert positions(values[1:4], 1.0, 1.0).tolist() == [127, 127, 127]
+    assert colour_indices(values, 0.0, 1.0).tolist() == [0, 0, 127, 254, 254, 254, 0, 0]
+    assert colour_indices(values[1:4], 1.0, 0.0).tolist() == [254, 127, 0]
+    assert colour_indices(values[1:4], 1.0, 1.0).tolist() == [127, 127, 127]
 
 
 def test_robust_range_takes_order_statistics() -> None:
@@ -57,7 +60,7 @@ def test_robust_range_takes_order_statistics() -> None:
     assert robust_range(np.array([3.0])) == (3.0, 3.0)
 
 
-def test_preview_shows_near_bright_far_dark_and_no_surface_black() -> None:
+def test_preview_is_bright_near_and_black_without_depth() -> None:
     depth = np.zeros((4, 50), dtype=np.float32)
     depth[0] = 0.25
     depth[1] = 0.5
@@ -79,15 +82,15 @@ def test_preview_shows_near_bright_far_dark_and_no_surface_black() -> None:
     ]
 
 
-def test_preview_is_not_ruled_by_a_few_extreme_pixels() -> None:
+def test_preview_is_robust_to_outliers() -> None:
     depth = np.linspace(0.5, 1.0, 1000, dtype=np.float32).reshape(20, 50)
     outlier = depth.copy()
     outlier[0, 0] = 0.001
-    plain, spoilt = depth_preview(depth)[0], depth_preview(outlier)[0]
-    assert np.abs(plain.astype(int) - spoilt.astype(int)).ravel()[1:].max() <= 1
+    expected, preview = depth_preview(depth)[0], depth_preview(outlier)[0]
+    assert np.abs(expected.astype(int) - preview.astype(int)).ravel()[1:].max() <= 1
 
 
-def test_preview_of_nothing_is_black_and_of_a_wall_one_colour() -> None:
+def test_preview_of_empty_and_constant_depth() -> None:
     assert not depth_preview(np.zeros((3, 4), np.float32))[0].any()
     assert not depth_preview(np.full((3, 4), np.nan, np.float32))[0].any()
     assert np.unique(depth_preview(np.full((3, 4), 2.0, np.float32))[0]).tolist() == [128]

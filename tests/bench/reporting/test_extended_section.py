@@ -1,4 +1,4 @@
-"""The extended measures' part of the page: what it shows, how it is spelled, and that it stands by itself."""
+"""Extended-measures section of the HTML report: contents, number formatting and determinism."""
 
 from __future__ import annotations
 
@@ -9,24 +9,27 @@ import re
 import numpy as np
 import pytest
 
-from rebar_depth_bench.extended.evaluate import FAMILIES, NATIVE, SCALED, measures_by_alignment
-from rebar_depth_bench.extended.inspection.measures import MEASURES as CAPABILITY_MEASURES
-from rebar_depth_bench.extended.inspection.measures import MISS_MM
+from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, NATIVE, SCALED, measures_by_alignment
+from rebar_depth_bench.extended.inspection.measures import CAPABILITY_MEASURES, MISS_MM
 from rebar_depth_bench.extended.inspection.tolerances import PROFILES
 from rebar_depth_bench.extended.measures import Measure, Statistic
 from rebar_depth_bench.extended.result import (
-    Estimate,
     ExtendedResult,
     ExtendedView,
+    MeasureEstimate,
     tabulate_extended,
     view_numbers,
 )
-from rebar_depth_bench.reporting.html.extended import FIRST, estimate_cell, extended_section, meanings
+from rebar_depth_bench.reporting.html.extended import (
+    MAIN_INSPECTION_MEASURES,
+    estimate_cell,
+    extended_section,
+    measure_definitions,
+)
 from rebar_depth_bench.reporting.html.page import render_report
 from rebar_depth_bench.scoring.result import Result
 from tests.bench.reporting.pages import Page
-from tests.bench.reporting.results import HOSTILE, result, scored
-from tests.bench.reporting.test_report import panels
+from tests.bench.reporting.results import HOSTILE, panels, result, scored_view
 
 VIEWS = 6
 INDICES = [100 * index for index in range(VIEWS)]
@@ -50,57 +53,66 @@ LEVELS = {
     **{f"abs_rel_at_{name}": level for name, level in (("0.3-0.4m", 0.02), ("0.4-0.5m", 0.04), ("8-12px", 0.03))},
     **{f"scale_at_{name}": level for name, level in (("0.3-0.4m", 0.99), ("0.4-0.5m", 1.01), ("8-12px", 0.98))},
 }
-"""What each view's samples are about; scaled ones are half of it."""
+"""Mean of each view's samples by name; scaled samples are half of it."""
 
 
-def view(config: str, index: int, levels: dict[str, float]) -> ExtendedView:
+def make_view(config: str, index: int, levels: dict[str, float]) -> ExtendedView:
     rng = np.random.default_rng(index)
     samples = {}
     for alignment, measures in measures_by_alignment().items():
         factor = 0.5 if alignment == SCALED else 1.0
-        of_view: dict[str, np.ndarray] = {one.sample: np.empty(0) for one in measures}
-        for name in of_view.keys() & levels.keys():
+        samples_by_name: dict[str, np.ndarray] = {measure.sample: np.empty(0) for measure in measures}
+        for name in samples_by_name.keys() & levels.keys():
             level = levels[name]
             spread = 0.0 if level == MISS_MM else 0.01 * level
-            of_view[name] = factor * (level + spread * rng.uniform(-1, 1, 4))
-        samples[alignment] = of_view
+            samples_by_name[name] = factor * (level + spread * rng.uniform(-1, 1, 4))
+        samples[alignment] = samples_by_name
     return ExtendedView(f"{config}/{index:04d}", samples)
 
 
-def extended_of(*configs: str, levels: dict[str, float] | None = None, views: int = VIEWS) -> ExtendedResult:
+def make_extended(*configs: str, levels: dict[str, float] | None = None, views: int = VIEWS) -> ExtendedResult:
     measures = measures_by_alignment()
     by_config = {
-        config: [view(config, index, LEVELS if levels is None else levels) for index in INDICES[:views]]
+        config: [make_view(config, index, LEVELS if levels is None else levels) for index in INDICES[:views]]
         for config in configs
     }
-    tables = {config: tabulate_extended(found, INDICES[:views], measures) for config, found in by_config.items()}
+    tables = {
+        config: tabulate_extended(config_views, INDICES[:views], measures)
+        for config, config_views in by_config.items()
+    }
     return ExtendedResult(
-        measures, tables, [view_numbers(one, measures) for found in by_config.values() for one in found]
+        measures,
+        tables,
+        [
+            view_numbers(extended_view, measures)
+            for config_views in by_config.values()
+            for extended_view in config_views
+        ],
     )
 
 
-def scored_with(extended: ExtendedResult | None, *configs: str) -> Result:
-    views = [scored(f"{config}/{index:04d}") for config in configs for index in INDICES]
+def result_with_extended(extended: ExtendedResult | None, *configs: str) -> Result:
+    views = [scored_view(f"{config}/{index:04d}") for config in configs for index in INDICES]
     return dataclasses.replace(result(*views), extended=extended)
 
 
 @pytest.fixture(scope="module")
 def lattice() -> ExtendedResult:
-    return extended_of("lattice")
+    return make_extended("lattice")
 
 
 @pytest.fixture(scope="module")
 def rendered(lattice: ExtendedResult) -> str:
-    return render_report(scored_with(lattice, "lattice"), [])
+    return render_report(result_with_extended(lattice, "lattice"), [])
 
 
-def section_of(page: str) -> str:
-    found = re.search(r'<section aria-labelledby="extended".*?</section>', page, re.DOTALL)
-    assert found
-    return found[0]
+def extended_section_html(page: str) -> str:
+    match = re.search(r'<section aria-labelledby="extended".*?</section>', page, re.DOTALL)
+    assert match
+    return match[0]
 
 
-def cells_of(page: str, label: str, name: str) -> list[str]:
+def table_row_cells(page: str, label: str, name: str) -> list[str]:
     """Return the cells of the row ``name`` of the table ``label``, value and interval joined by a space."""
     table = re.search(rf'<table[^>]* aria-label="{re.escape(label)}">.*?</table>', page, re.DOTALL)
     assert table, label
@@ -111,58 +123,58 @@ def cells_of(page: str, label: str, name: str) -> list[str]:
     return next(cells[1:] for cells in rows if cells[0] == name)
 
 
-def test_without_extended_measures_there_is_no_section() -> None:
-    page = render_report(scored_with(None, "lattice"), [])
+def test_no_section_without_extended_measures() -> None:
+    page = render_report(result_with_extended(None, "lattice"), [])
     assert 'aria-labelledby="extended"' not in page
     assert "Extended measures" not in page
 
 
-def unfolded(section: str) -> str:
+def remove_details(section: str) -> str:
     inner = re.sub(r'<details class="meanings">.*?</details>', "", section, flags=re.DOTALL)
     return re.sub(r"<details>.*?</details>", "", inner, flags=re.DOTALL)
 
 
-def test_inspection_stands_open_with_native_beside_scaled(rendered: str, lattice: ExtendedResult) -> None:
-    opened, label = unfolded(section_of(rendered)), "lattice: Inspection, bar by bar"
-    found = cells_of(opened, label, "bars found %\xa0↑")
-    assert [cell[:3] for cell in found] == ["87.", "43.", "24"]
+def test_inspection_table_is_open_with_native_and_scaled(rendered: str, lattice: ExtendedResult) -> None:
+    opened, label = remove_details(extended_section_html(rendered)), "lattice: Inspection, bar by bar"
+    cells = table_row_cells(opened, label, "bars found %\xa0↑")
+    assert [cell[:3] for cell in cells] == ["87.", "43.", "24"]
     numbers = lattice.tables["lattice"].numbers
-    spacing = cells_of(opened, label, "bar spacing: bias mm")
+    spacing = table_row_cells(opened, label, "bar spacing: bias mm")
     for alignment, cell in zip((NATIVE, SCALED), spacing, strict=False):
-        one = numbers[alignment]["spacing_bias_mm"]
-        assert one.value is not None
-        assert one.interval is not None
-        value, low, high = (f"{number:.2f}".replace("-", "−") for number in (one.value, *one.interval))
+        estimate = numbers[alignment]["spacing_bias_mm"]
+        assert estimate.value is not None
+        assert estimate.interval is not None
+        value, low, high = (f"{number:.2f}".replace("-", "−") for number in (estimate.value, *estimate.interval))
         assert cell == f"{value} {low} to {high}", alignment
-    assert set(FIRST) < {measure.name for measure in FAMILIES["inspection"].measures}
+    assert set(MAIN_INSPECTION_MEASURES) < {measure.name for measure in MEASURE_FAMILIES["inspection"].measures}
 
 
-def test_what_is_missed_is_said_and_not_shown_as_a_length(rendered: str) -> None:
-    layer = cells_of(rendered, "lattice: Inspection, bar by bar", "layer distance: p95 error mm\xa0↓")
+def test_missed_bars_are_shown_as_missed_not_as_length(rendered: str) -> None:
+    layer = table_row_cells(rendered, "lattice: Inspection, bar by bar", "layer distance: p95 error mm\xa0↓")
     assert layer == ["missed", "50.00 50.00 – 50.00", "24"]
     assert "missed: 100 mm, which stands for what was not found." in Page(rendered).text
 
 
-def test_tolerances_stand_with_pass_rate_capability_and_source(rendered: str, lattice: ExtendedResult) -> None:
+def test_tolerance_rows_have_pass_rate_capability_source(rendered: str, lattice: ExtendedResult) -> None:
     label = "lattice: tolerances of inspection"
-    limit, *passes_and_capabilities = cells_of(rendered, label, "GB 50204 bar spacing")
+    limit, *passes_and_capabilities = table_row_cells(rendered, label, "GB 50204 bar spacing")
     assert limit == "10"
     assert [cell[:3] for cell in passes_and_capabilities[:2]] == ["62.", "31."]
     numbers = lattice.tables["lattice"].numbers
     for alignment, cell, expected in zip((NATIVE, SCALED), passes_and_capabilities[2:], (2.5, 5.0), strict=True):
-        one = numbers[alignment]["capability_gb50204_spacing"]
-        assert one.value == pytest.approx(expected, rel=0.02)
-        assert one.interval is not None
-        assert cell == f"{one.value:.2f} {one.interval[0]:.2f} – {one.interval[1]:.2f}"
-    assert cells_of(rendered, label, "GB 50204 distance of layers")[3:] == ["not told", "0.10 0.10 – 0.10"]
+        estimate = numbers[alignment]["capability_gb50204_spacing"]
+        assert estimate.value == pytest.approx(expected, rel=0.02)
+        assert estimate.interval is not None
+        assert cell == f"{estimate.value:.2f} {estimate.interval[0]:.2f} – {estimate.interval[1]:.2f}"
+    assert table_row_cells(rendered, label, "GB 50204 distance of layers")[3:] == ["not told", "0.10 0.10 – 0.10"]
     text = Page(rendered).text
     assert "not told: 5 % or more were not found" in text
     assert all(profile.source in text for profile in PROFILES)
-    assert "ACI" not in section_of(rendered)
+    assert "ACI" not in extended_section_html(rendered)
 
 
 def test_every_heading_states_its_alignment(rendered: str) -> None:
-    section = section_of(rendered)
+    section = extended_section_html(rendered)
     heads = re.findall(r'<th [^>]*class="alignment ([a-z]+)[^"]*"[^>]*>(.*?)</th>', section, re.DOTALL)
     asides = {
         "native": "no alignment",
@@ -174,20 +186,20 @@ def test_every_heading_states_its_alignment(rendered: str) -> None:
         assert re.search(f'{kind}<span class="unit">({asides[kind]})</span>', content), content
 
 
-def test_families_are_folded_and_every_number_can_be_looked_up(rendered: str) -> None:
-    section = section_of(rendered)
+def test_families_are_collapsed_and_definitions_listed(rendered: str) -> None:
+    section = extended_section_html(rendered)
     assert "<details open" not in section
     for key in ("full_mask", "boundary", "layers", "clouds", "alignment"):
-        assert f"<summary>{FAMILIES[key].title} <" in section
+        assert f"<summary>{MEASURE_FAMILIES[key].title} <" in section
     page = Page(rendered)
-    for measure in (*FAMILIES["layers"].measures, *FAMILIES["alignment"].measures):
+    for measure in (*MEASURE_FAMILIES["layers"].measures, *MEASURE_FAMILIES["alignment"].measures):
         assert re.sub(r"\s+", " ", measure.definition) in page.text, measure.name
     assert "title=" not in section, "reached by touch and keyboard, not by hovering"
 
 
-def test_clouds_are_a_grid_of_tolerances(rendered: str) -> None:
+def test_cloud_measures_form_one_row_per_tolerance(rendered: str) -> None:
     for tolerance_mm in (1, 2, 5, 10, 20):
-        shown = cells_of(rendered, "lattice: Point clouds", str(tolerance_mm))
+        shown = table_row_cells(rendered, "lattice: Point clouds", str(tolerance_mm))
         native = 100 * (0.1 + tolerance_mm / 40)
         values = [float(cell.split()[0]) for cell in shown]
         assert values == pytest.approx([native] * 3 + [native / 2] * 3, abs=1.0)
@@ -195,8 +207,8 @@ def test_clouds_are_a_grid_of_tolerances(rendered: str) -> None:
     assert re.search(r'<table class="sortable" aria-label="lattice: Point clouds"', rendered)
 
 
-def test_charts_show_the_bins_that_have_values(rendered: str) -> None:
-    section = section_of(rendered)
+def test_charts_show_only_bins_with_values(rendered: str) -> None:
+    section = extended_section_html(rendered)
     charts = re.findall(r"<svg.*?</svg>", section, re.DOTALL)
     assert len(charts) == 2
     assert "0.3 to 0.4 m: AbsRel native 0.02" in charts[0]
@@ -206,79 +218,91 @@ def test_charts_show_the_bins_that_have_values(rendered: str) -> None:
     assert ">0.2</text>" not in charts[0].replace("0.02", "")
 
 
-def test_configs_without_anything_to_say_and_with_too_few_views() -> None:
-    nothing = render_report(scored_with(extended_of("lattice", levels={}), "lattice"), [])
+def test_empty_measures_and_too_few_views() -> None:
+    nothing = render_report(result_with_extended(make_extended("lattice", levels={}), "lattice"), [])
     assert "No bar of these views is straight, long and wide enough to be judged." in nothing
-    assert "<svg" not in section_of(nothing)
-    few = extended_of("lattice", views=2)
-    section = section_of(render_report(scored_with(few, "lattice"), []))
+    assert "<svg" not in extended_section_html(nothing)
+    few = make_extended("lattice", views=2)
+    section = extended_section_html(render_report(result_with_extended(few, "lattice"), []))
     assert 'class="interval"' not in section
     assert "slim interval" not in section
 
 
-def test_the_page_nests_and_names_stay_text() -> None:
+def test_page_nests_and_escapes_hostile_config_name() -> None:
     name = HOSTILE.replace("/", "")
-    page = Page(render_report(scored_with(extended_of("lattice", name), "lattice", name), [panels()]))
-    assert len(page.named("script")) == 1
+    page = Page(render_report(result_with_extended(make_extended("lattice", name), "lattice", name), [panels()]))
+    assert len(page.attributes_of("script")) == 1
     assert "\x1b" not in page.text
     ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
     assert len(ids) == len(set(ids))
 
 
-def test_same_input_same_bytes(lattice: ExtendedResult) -> None:
-    first, second = (render_report(scored_with(one, "lattice"), []) for one in (lattice, extended_of("lattice")))
+def test_rendering_is_deterministic(lattice: ExtendedResult) -> None:
+    first, second = (
+        render_report(result_with_extended(extended, "lattice"), [])
+        for extended in (lattice, make_extended("lattice"))
+    )
     assert first == second
 
 
-def test_a_section_has_every_config_in_order() -> None:
-    section = extended_section(extended_of("pile", "lattice"))
+def test_section_keeps_config_order() -> None:
+    section = extended_section(make_extended("pile", "lattice"))
     assert [config.name for config in section.configs] == ["pile", "lattice"]
     assert all(len(config.tolerances) == len(CAPABILITY_MEASURES) for config in section.configs)
 
 
-def measure(unit: str, statistic: Statistic = "mean") -> Measure:
+def make_measure(unit: str, statistic: Statistic = "mean") -> Measure:
     return Measure("m", "s", statistic, "M", unit, "", "for this test")
 
 
 @pytest.mark.parametrize(
     ("estimate", "unit", "text", "interval"),
     [
-        (Estimate(0.1234, (0.1, 0.2), 9), "%", "12.3", "10.0 – 20.0"),
-        (Estimate(-1.005, (-2.0, 0.5), 9), "mm", "−1.00", "−2.00 to 0.50"),
-        (Estimate(1e-9, None, 9), "", "1.0e−09", ""),
-        (Estimate(math.inf, (1.0, math.inf), 9), "cm", "–", ""),
-        (Estimate(None, None, 0), "mm", "–", ""),
+        (MeasureEstimate(0.1234, (0.1, 0.2), 9), "%", "12.3", "10.0 – 20.0"),
+        (MeasureEstimate(-1.005, (-2.0, 0.5), 9), "mm", "−1.00", "−2.00 to 0.50"),
+        (MeasureEstimate(1e-9, None, 9), "", "1.0e−09", ""),
+        (MeasureEstimate(math.inf, (1.0, math.inf), 9), "cm", "–", ""),
+        (MeasureEstimate(None, None, 0), "mm", "–", ""),
     ],
 )
-def test_estimates_are_spelled_by_their_unit(estimate: Estimate, unit: str, text: str, interval: str) -> None:
-    cell = estimate_cell(estimate, measure(unit))
+def test_estimate_cell_formats_by_unit(estimate: MeasureEstimate, unit: str, text: str, interval: str) -> None:
+    cell = estimate_cell(estimate, make_measure(unit))
     assert (cell.text, cell.interval) == (text, interval)
 
 
-def test_capabilities_are_spelled_as_ratios() -> None:
-    spelled = [
-        estimate_cell(one, CAPABILITY_MEASURES[0]).text
-        for one in (
-            Estimate(2.5, None, 9),
-            Estimate(math.inf, None, 9),
-            Estimate(None, None, 9),
-            Estimate(None, None, 0),
+def test_capability_is_formatted_as_ratio() -> None:
+    texts = [
+        estimate_cell(estimate, CAPABILITY_MEASURES[0]).text
+        for estimate in (
+            MeasureEstimate(2.5, None, 9),
+            MeasureEstimate(math.inf, None, 9),
+            MeasureEstimate(None, None, 9),
+            MeasureEstimate(None, None, 0),
         )
     ]
-    assert spelled == ["2.50", "∞", "not told", "–"]
+    assert texts == ["2.50", "∞", "not told", "–"]
 
 
-def test_definitions_that_differ_by_a_step_are_given_once() -> None:
-    found = {one.name: one.definition for one in meanings(FAMILIES["clouds"].measures)}
-    assert list(found) == ["Cloud accuracy, N mm", "Cloud completeness, N mm", "Cloud F-score, N mm"]
-    assert found["Cloud accuracy, N mm"].endswith("; N: 1, 2, 5, 10, 20")
-    boundary = {one.name: one.definition for one in meanings(FAMILIES["boundary"].measures)}
+def test_definitions_differing_only_in_step_are_merged() -> None:
+    definitions = {
+        entry.name: entry.definition for entry in measure_definitions(MEASURE_FAMILIES["clouds"].measures)
+    }
+    assert list(definitions) == ["Cloud accuracy, N mm", "Cloud completeness, N mm", "Cloud F-score, N mm"]
+    assert definitions["Cloud accuracy, N mm"].endswith("; N: 1, 2, 5, 10, 20")
+    boundary = {
+        entry.name: entry.definition for entry in measure_definitions(MEASURE_FAMILIES["boundary"].measures)
+    }
     assert "at t = N % (" in boundary["Boundary F1, steps over N %"]
     assert "max/min > 1 + t" in boundary["Boundary F1, steps over N %"], "what is no step stays"
     assert "t = 1, 2, 5, 10, 20 %" in boundary["Boundary F1"]
-    alike = [
-        dataclasses.replace(measure("%"), title=f"In {t} mm", definition=f"{t} mm, 24 px off") for t in (3, 5)
+    similar_measures = [
+        dataclasses.replace(make_measure("%"), title=f"In {t} mm", definition=f"{t} mm, 24 px off") for t in (3, 5)
     ]
-    assert [one.definition for one in meanings(alike)] == ["N mm, 24 px off; N: 3, 5"]
-    profile = [one.name for one in meanings(FAMILIES["profile"].measures)]
-    assert profile == ["Scale s at N m", "AbsRel at N m", "Scale s on bars of N px", "AbsRel on bars of N px"]
+    assert [entry.definition for entry in measure_definitions(similar_measures)] == ["N mm, 24 px off; N: 3, 5"]
+    profile_names = [entry.name for entry in measure_definitions(MEASURE_FAMILIES["profile"].measures)]
+    assert profile_names == [
+        "Scale s at N m",
+        "AbsRel at N m",
+        "Scale s on bars of N px",
+        "AbsRel on bars of N px",
+    ]

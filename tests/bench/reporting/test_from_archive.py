@@ -1,4 +1,4 @@
-"""The report of a real archive on a really rendered dataset."""
+"""HTML report of an archive scored on the tiny rendered dataset."""
 
 from __future__ import annotations
 
@@ -11,21 +11,19 @@ import pytest
 
 from rebar_depth_bench import score
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.reporting import write_report
-from rebar_depth_bench.scoring.result import badness
-
-pytestmark = pytest.mark.render
+from rebar_depth_bench.reporting.html.page import write_report
+from rebar_depth_bench.scoring.result import sort_key_worst_first
 
 
-def test_as_many_views_as_asked_for_are_embedded_the_worst_first(
+def test_report_embeds_requested_views_worst_first(
     tiny_root: Path, tiny_truth: dict[str, np.ndarray], archive_of: Callable[..., Path], tmp_path: Path
 ) -> None:
     factors = 1.1 + 0.05 * np.random.default_rng(3).permutation(len(tiny_truth))
     archive = archive_of(
-        {view: depth_m * f for (view, depth_m), f in zip(tiny_truth.items(), factors, strict=True)}
+        {view: depth_m * factor for (view, depth_m), factor in zip(tiny_truth.items(), factors, strict=True)}
     )
     result = score(archive, tiny_root)
-    worst_first = [view.view_id for view in sorted(result.views, key=badness, reverse=True)]
+    worst_first = [view.view_id for view in sorted(result.views, key=sort_key_worst_first, reverse=True)]
     page = tmp_path / "page.html"
     write_report(result, archive, tiny_root, page, views_shown=3)
     text = page.read_text(encoding="utf-8")

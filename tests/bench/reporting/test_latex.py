@@ -1,3 +1,5 @@
+"""LaTeX table of results: layout, escaping, bold values and published rows."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -8,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.reporting.latex import escaped, latex_table
+from rebar_depth_bench.reporting.latex import escape_latex, latex_table
 from rebar_depth_bench.scoring.result import Result
-from tests.bench.reporting.results import HOSTILE, overflowed, result, scored, unpredicted
+from tests.bench.reporting.results import HOSTILE, overflowed_view, result, scored_view, unpredicted_view
 
 _COMMANDS = {
     *("begin", "end", "centering", "caption", "label", "setlength", "tabcolsep", "small", "medskip", "tiny"),
@@ -28,8 +30,8 @@ _COMMANDS = {
 }
 
 
-def _checked(table: str) -> str:
-    """Hold a table against what TeX would trip over: braces, commands, environments, columns, line breaks."""
+def _check_latex(table: str) -> str:
+    """Check braces, commands, environments, column counts and line breaks of a table, and return it."""
     depth = 0
     for token in re.findall(r"\\.|[{}]", table, re.DOTALL):
         depth += {"{": 1, "}": -1}.get(token, 0)
@@ -40,34 +42,36 @@ def _checked(table: str) -> str:
     assert set(re.findall(r"\\([A-Za-z]+)", re.sub(r"\\\\", "", rest))) <= _COMMANDS
     assert not re.search(r"\\\\\s*[\[*]", table), "an argument of the line break"
     assert len(re.findall(r"(?<!\\)\$", table)) % 2 == 0
-    opened: list[str] = []
+    open_environments: list[str] = []
     for kind, name in re.findall(r"(?<!\\)\\(begin|end)\{(\w+\*?)\}", table):
         if kind == "begin":
-            opened.append(name)
+            open_environments.append(name)
         else:
-            assert opened.pop() == name
-    assert opened == []
+            assert open_environments.pop() == name
+    assert open_environments == []
     for width, body in re.findall(r"\\begin\{tabular\}\{l(r+)\}\n(.*?)\\end\{tabular\}", table, re.DOTALL):
         rows = re.findall(r"^(.*) \\\\$", body, re.MULTILINE)
         assert len(rows) > 2
         for row in rows:
-            spanned = sum(int(span) - 1 for span in re.findall(r"\\multicolumn\{(\d+)\}", row))
-            assert len(re.findall(r"(?<!\\)&", row)) + 1 + spanned == len(width) + 1, row
+            extra_columns = sum(int(span) - 1 for span in re.findall(r"\\multicolumn\{(\d+)\}", row))
+            assert len(re.findall(r"(?<!\\)&", row)) + 1 + extra_columns == len(width) + 1, row
     for line in rest.splitlines():
         assert not re.search(r"(?<!\\)%", line), "a comment would swallow the rest"
     return table
 
 
-def _two() -> list[Result]:
+def _two_results() -> list[Result]:
     first = result(
-        *[scored(f"lattice/{i:04d}", abs_rel=0.02) for i in range(8)], scored("pier/0000"), method="a_b"
+        *[scored_view(f"lattice/{i:04d}", abs_rel=0.02) for i in range(8)], scored_view("pier/0000"), method="a_b"
     )
-    second = result(*[scored(f"lattice/{i:04d}", abs_rel=0.03) for i in range(8)], unpredicted("pier/0000"))
+    second = result(
+        *[scored_view(f"lattice/{i:04d}", abs_rel=0.03) for i in range(8)], unpredicted_view("pier/0000")
+    )
     return [first, second]
 
 
-def test_the_layout_is_the_papers() -> None:
-    table = _checked(latex_table(_two(), published=False))
+def test_layout_matches_paper() -> None:
+    table = _check_latex(latex_table(_two_results(), published=False))
     assert r" & \multicolumn{4}{c}{lattice (0.22--0.43 m)} & \multicolumn{4}{c}{pier (8--17 m)} \\" in table
     heads = r"RMSE $\downarrow$ & AbsRel $\downarrow$ & AbsRel$_s$ $\downarrow$ & $s$"
     assert rf"Method & {heads} & {heads} \\" in table
@@ -81,20 +85,20 @@ def test_the_layout_is_the_papers() -> None:
     assert "FoundationStereo" not in table
 
 
-def test_the_caption_states_protocol_views_dataset_and_alignment() -> None:
-    table = latex_table(_two(), published=False)
+def test_caption_states_protocol_views_and_alignment() -> None:
+    table = latex_table(_two_results(), published=False)
     for stated in (
         *("protocol rebar-1", "lattice 8 views, pier 1 view.", "dataset 1.2.3 (sha256:fedcba9876543210)"),
         *("native, without any alignment", r"s = \mathrm{med}(\mathrm{GT})/\mathrm{med}(\mathrm{pred})"),
         r"$^{\ddagger}$Not ranked (coverage below 95\,\%",
     ):
         assert stated in table
-    assert "dagger" not in latex_table([result(scored("lattice/0000"))], published=False)
+    assert "dagger" not in latex_table([result(scored_view("lattice/0000"))], published=False)
 
 
-def test_published_rows_are_marked_exact_and_in_no_contest() -> None:
-    poor = [dataclasses.replace(one, method=name) for one, name in zip(_two(), "ab", strict=True)]
-    table = _checked(latex_table(poor, published=True))
+def test_published_rows_are_verbatim_and_never_bold() -> None:
+    results = [dataclasses.replace(entry, method=name) for entry, name in zip(_two_results(), "ab", strict=True)]
+    table = _check_latex(latex_table(results, published=True))
     own, _, paper = table.partition(r"\emph{Published, measured on the authors' renders")
     assert r"Depth Pro & 91.19 & 3.145 & 0.029 & 0.25 & 1151 & 0.901 & 0.179 & 12.17 \\" in paper
     assert r"COLMAP+ArUco & 1.60 & 0.021 & 0.028 & 1.01 & 206.7$^{\dagger}$ & 0.078 & 0.083 & 0.98 \\" in paper
@@ -105,29 +109,31 @@ def test_published_rows_are_marked_exact_and_in_no_contest() -> None:
     assert r"$^{\dagger}$Median-anchored to ground truth" in own
 
 
-def test_a_scene_that_the_paper_lacks_has_no_published_rows() -> None:
-    assert "Published" not in _checked(latex_table([result(scored("beam_1/0000"))], published=True))
-    mixed = _checked(latex_table([result(scored("beam_1/0000"), scored("pile/0000"))], published=True))
+def test_no_published_rows_for_scene_not_in_paper() -> None:
+    assert "Published" not in _check_latex(latex_table([result(scored_view("beam_1/0000"))], published=True))
+    mixed = _check_latex(
+        latex_table([result(scored_view("beam_1/0000"), scored_view("pile/0000"))], published=True)
+    )
     assert r"Depth Pro & -- & -- & -- & -- & 15.46 & 0.262 & 0.043 & 0.92 \\" in mixed
     assert "dagger" not in mixed.split(r"\begin{tabular}")[1]
 
 
-def test_nothing_is_bold_alone_and_nothing_unranked_is_bold() -> None:
-    assert "textbf" not in latex_table(_two()[:1], published=True)
-    low = result(*[scored(f"lattice/{i:04d}", abs_rel=0.001, coverage=0.5) for i in range(8)], method="gaps")
-    table = _checked(latex_table([*_two(), low], published=False))
+def test_single_or_unranked_results_are_not_bold() -> None:
+    assert "textbf" not in latex_table(_two_results()[:1], published=True)
+    low = result(*[scored_view(f"lattice/{i:04d}", abs_rel=0.001, coverage=0.5) for i in range(8)], method="gaps")
+    table = _check_latex(latex_table([*_two_results(), low], published=False))
     line = next(line for line in table.splitlines() if line.startswith("gaps"))
     assert "textbf" not in line
     assert line.startswith(r"gaps & 20.09$^{\ddagger}$ & 0.0010 &")
     assert r"\textbf{0.0200}" in table
 
 
-def test_more_configs_than_fit_go_below_and_intervals_one_by_one() -> None:
-    views = [scored(f"{name}/{i:04d}") for name in ("lattice", "pile", "pier", "beam") for i in range(8)]
-    table = _checked(latex_table([result(*views)], published=True))
+def test_many_configs_split_into_several_tabulars() -> None:
+    views = [scored_view(f"{name}/{i:04d}") for name in ("lattice", "pile", "pier", "beam") for i in range(8)]
+    table = _check_latex(latex_table([result(*views)], published=True))
     assert table.count(r"\begin{tabular}") == 2
     assert table.count(r"\begin{table*}") == 1
-    with_intervals = _checked(latex_table([result(*views)], published=True, intervals=True))
+    with_intervals = _check_latex(latex_table([result(*views)], published=True, intervals=True))
     assert with_intervals.count(r"\begin{tabular}") == 4
     assert r"0.7500 {\tiny[0.7500, 0.7500]}" in with_intervals
     assert r"95\,\% intervals, block bootstrap over views" in with_intervals
@@ -155,33 +161,35 @@ def test_more_configs_than_fit_go_below_and_intervals_one_by_one() -> None:
         ),
     ],
 )
-def test_hostile_names_stay_text(name: str) -> None:
-    table = _checked(latex_table([result(scored("lattice/0000"), method=name), *_two()], published=True))
+def test_hostile_names_are_escaped(name: str) -> None:
+    table = _check_latex(
+        latex_table([result(scored_view("lattice/0000"), method=name), *_two_results()], published=True)
+    )
     assert "\\input" not in table
     assert "\r" not in table
-    plain = latex_table([result(scored("lattice/0000"), method="x"), *_two()], published=True)
+    plain = latex_table([result(scored_view("lattice/0000"), method="x"), *_two_results()], published=True)
     assert len(table.splitlines()) == len(plain.splitlines())
 
 
 @given(st.text(max_size=40))
-def test_any_name_keeps_the_table_whole(name: str) -> None:
-    _checked(latex_table([result(scored("lattice/0000"), method=name)], published=False))
+def test_any_name_gives_valid_latex(name: str) -> None:
+    _check_latex(latex_table([result(scored_view("lattice/0000"), method=name)], published=False))
 
 
-def test_escaping_by_hand() -> None:
-    assert escaped(r"a_b\c") == r"a\_b\textbackslash{}c"
-    assert escaped("[x]*") == "{[}x{]}{*}"
-    assert escaped("my-model, v2--x---y") == "my-model, v2-{}-x-{}-{}-y"
-    assert escaped("a\nb\u202e") == "a?b?"
+def test_escape_latex_known_cases() -> None:
+    assert escape_latex(r"a_b\c") == r"a\_b\textbackslash{}c"
+    assert escape_latex("[x]*") == "{[}x{]}{*}"
+    assert escape_latex("my-model, v2--x---y") == "my-model, v2-{}-x-{}-{}-y"
+    assert escape_latex("a\nb\u202e") == "a?b?"
 
 
-def test_overflows_are_dashes() -> None:
-    table = _checked(latex_table([result(overflowed("pier/0000"))], published=False))
+def test_overflowed_values_are_dashes() -> None:
+    table = _check_latex(latex_table([result(overflowed_view("pier/0000"))], published=False))
     assert r"my model & --$^{\ddagger}$ & 1.0e+200 & 0.0613" in table
 
 
-def test_results_of_different_datasets_and_none_are_refused() -> None:
-    first, second = _two()
+def test_mixed_datasets_and_no_results_raise() -> None:
+    first, second = _two_results()
     other = dataclasses.replace(second, dataset_digest="sha256:" + "0" * 64)
     with pytest.raises(InputError, match=r"results of 2 datasets \(sha256:000000000000, sha256:fedc"):
         latex_table([first, other], published=False)

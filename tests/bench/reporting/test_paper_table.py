@@ -1,4 +1,4 @@
-"""Several submissions side by side, in the terminal and through the command."""
+"""Comparison table of several submissions, in the terminal and from the ``table`` command."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from rich.console import Console
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.reporting.comparison_tables import print_paper_table
 from rebar_depth_bench.reporting.published import load_published, published_rows
-from tests.bench.reporting.results import HOSTILE, result, scored, unpredicted
+from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredicted_view
 
 
-def printed(*results: object, published: bool = True) -> str:
+def table_text(*results: object, published: bool = True) -> str:
     console = Console(width=80, record=True, file=io.StringIO())
     print_paper_table(results, console, published=published)  # type: ignore[arg-type]
     return console.export_text()
 
 
-def test_best_first_and_what_is_not_ranked_last() -> None:
-    text = printed(
-        result(scored("lattice/0000", 0.75), method="far"),
-        result(unpredicted("lattice/0000"), method="silent"),
-        result(scored("lattice/0000", 0.25), method="near"),
+def test_rows_are_sorted_best_first_unranked_last() -> None:
+    text = table_text(
+        result(scored_view("lattice/0000", 0.75), method="far"),
+        result(unpredicted_view("lattice/0000"), method="silent"),
+        result(scored_view("lattice/0000", 0.25), method="near"),
     )
     assert text.index("near") < text.index("far") < text.index("silent ‡")
 
 
-def test_the_papers_rows_stand_with_their_scene_and_their_mark() -> None:
-    text = printed(result(scored("pier/0000"), scored("mine/0000")))
+def test_published_rows_are_shown_with_scene_and_mark() -> None:
+    text = table_text(result(scored_view("pier/0000"), scored_view("mine/0000")))
     for row in published_rows("pier"):
         assert f"paper: {row.method}" in text
         assert row.rmse_cm in text
@@ -42,17 +42,17 @@ def test_the_papers_rows_stand_with_their_scene_and_their_mark() -> None:
     assert text.count("paper: Depth Pro") == 1
     mark = load_published().parts["synthetic"].mark
     assert mark in " ".join(text.split())
-    assert "paper" not in printed(result(scored("pier/0000")), published=False)
+    assert "paper" not in table_text(result(scored_view("pier/0000")), published=False)
 
 
-def test_a_hostile_name_is_shown_harmless_and_the_table_keeps_to_80_columns() -> None:
-    text = printed(result(scored("lattice/0000"), method=HOSTILE))
+def test_hostile_name_is_escaped_within_80_columns() -> None:
+    text = table_text(result(scored_view("lattice/0000"), method=HOSTILE))
     assert "\x1b[31m" not in text
     assert "=<script" in text
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_the_command_writes_latex_and_csv_of_all_archives(
+def test_table_command_writes_latex_and_csv(
     tiny_truth: dict[str, np.ndarray],
     tiny_root: Path,
     archive_of: Callable[..., Path],
@@ -73,6 +73,6 @@ def test_the_command_writes_latex_and_csv_of_all_archives(
     assert "AbsRel_s" in capsys.readouterr().out
 
 
-def test_a_missing_archive_is_said_in_words(tiny_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_archive_exits_with_status_2(tiny_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["table", "nowhere.zip", "--data", str(tiny_root)]) == 2
     assert "does not exist" in capsys.readouterr().err

@@ -1,3 +1,5 @@
+"""Terminal table and CSV of one result."""
+
 from __future__ import annotations
 
 import csv
@@ -7,19 +9,20 @@ import json
 import pytest
 from rich.console import Console
 
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.tables import print_table, result_csv
 from rebar_depth_bench.scoring.result import Result, tabulate
-from tests.bench.reporting.results import HOSTILE, overflowed, result, scored, unpredicted
+from tests.bench.reporting.results import HOSTILE, overflowed_view, result, scored_view, unpredicted_view
 
 
-def _printed(shown: Result, width: int, *, terminal: bool = False) -> str:
+def _print_to_text(shown: Result, width: int, *, terminal: bool = False) -> str:
     out = io.StringIO()
     print_table(shown, Console(file=out, width=width, force_terminal=terminal))
     return out.getvalue()
 
 
-def _row_numbers(printed: str, config: str) -> list[str]:
+def _row_cells(printed: str, config: str) -> list[str]:
     rows = [line.split() for line in printed.splitlines() if line.split()[:1] == [config]]
     return [cell for row in rows for cell in row[1:]]
 
@@ -27,14 +30,14 @@ def _row_numbers(printed: str, config: str) -> list[str]:
 @pytest.fixture
 def two_configs() -> Result:
     return result(
-        scored("lattice/0000"),
-        scored("lattice/0001"),
-        scored("lattice-zed-raw/0000", coverage=0.94996),
-        unpredicted("lattice-zed-raw/0001"),
+        scored_view("lattice/0000"),
+        scored_view("lattice/0001"),
+        scored_view("lattice-zed-raw/0000", coverage=0.94996),
+        unpredicted_view("lattice-zed-raw/0001"),
     )
 
 
-NUMBERS = {
+ROW_CELLS = {
     "0.7500",
     "20.09",
     "18.71",
@@ -55,20 +58,20 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("width", [40, 80, 100, 140, 200])
-def test_every_number_is_printed_whole_at_any_width(two_configs: Result, width: int) -> None:
-    assert set(_row_numbers(_printed(two_configs, width), "lattice")) == NUMBERS
+def test_numbers_are_not_truncated_at_any_width(two_configs: Result, width: int) -> None:
+    assert set(_row_cells(_print_to_text(two_configs, width), "lattice")) == ROW_CELLS
 
 
 @pytest.mark.parametrize(("width", "tables"), [(80, 3), (100, 2), (160, 1)])
-def test_the_table_folds_where_the_console_is_narrow(two_configs: Result, width: int, tables: int) -> None:
-    printed = _printed(two_configs, width)
+def test_table_splits_on_narrow_console(two_configs: Result, width: int, tables: int) -> None:
+    printed = _print_to_text(two_configs, width)
     assert max(map(len, printed.splitlines())) <= width
     assert sum(line.startswith("config") for line in printed.splitlines()) == tables
 
 
 @pytest.mark.parametrize("width", [80, 160])
 def test_alignment_protocol_method_and_dataset_are_stated(two_configs: Result, width: int) -> None:
-    printed = _printed(two_configs, width)
+    printed = _print_to_text(two_configs, width)
     for stated in (
         "native (no alignment)",
         "scaled (oracle median scale per view, s = median(z)/median(p))",
@@ -79,49 +82,49 @@ def test_alignment_protocol_method_and_dataset_are_stated(two_configs: Result, w
         assert stated in printed
 
 
-def test_why_a_row_is_not_ranked_is_said_in_words(two_configs: Result) -> None:
-    printed = _printed(two_configs, 160)
+def test_unranked_row_states_reason(two_configs: Result) -> None:
+    printed = _print_to_text(two_configs, 160)
     assert (
         "lattice-zed-raw: not ranked: 1 of 2 views without any prediction; coverage 47.4 % is below 95 %."
         in printed
     )
     assert "lattice: not ranked" not in printed
-    assert {"no", "1/2"} <= set(_row_numbers(printed, "lattice-zed-raw"))
+    assert {"no", "1/2"} <= set(_row_cells(printed, "lattice-zed-raw"))
 
 
-def test_overflow_reads_as_a_dash_with_a_footnote_and_unranks() -> None:
-    printed = _printed(result(overflowed("pier/0000")), 160)
+def test_overflow_prints_dash_and_footnote_and_unranks() -> None:
+    printed = _print_to_text(result(overflowed_view("pier/0000")), 160)
     assert "pier: not ranked: a number overflowed." in printed
-    assert _row_numbers(printed, "pier")[3:6] == ["1.0e+200", "–", "1.0e+202"]
+    assert _row_cells(printed, "pier")[3:6] == ["1.0e+200", "–", "1.0e+202"]
     assert formatting.DASH_NOTE in printed
 
 
-def test_a_config_without_any_prediction_is_all_dashes() -> None:
-    printed = _printed(result(unpredicted("pier/0000")), 160)
-    assert _row_numbers(printed, "pier") == ["0/1", "0.0", "no", *["–"] * 9, *["0.0"] * 4]
+def test_config_without_prediction_is_all_dashes() -> None:
+    printed = _print_to_text(result(unpredicted_view("pier/0000")), 160)
+    assert _row_cells(printed, "pier") == ["0/1", "0.0", "no", *["–"] * 9, *["0.0"] * 4]
 
 
-def test_no_footnote_without_a_dash() -> None:
-    assert formatting.DASH not in _printed(result(scored("lattice/0000")), 160)
+def test_no_footnote_without_dash() -> None:
+    assert formatting.DASH not in _print_to_text(result(scored_view("lattice/0000")), 160)
 
 
-def test_piped_output_has_no_colour_and_a_hostile_method_controls_nothing() -> None:
-    shown = result(scored("lattice/0000"), method=HOSTILE)
-    piped = _printed(shown, 100)
+def test_output_has_no_control_characters() -> None:
+    shown = result(scored_view("lattice/0000"), method=HOSTILE)
+    piped = _print_to_text(shown, 100)
     assert "\x1b" not in piped
     assert "\u202e" not in piped
     assert "[red]\N{REPLACEMENT CHARACTER}[31m" in piped, "markup is text"
-    assert "\x1b[31m" not in _printed(shown, 100, terminal=True)
+    assert "\x1b[31m" not in _print_to_text(shown, 100, terminal=True)
 
 
-def test_coverage_is_rounded_down_so_that_a_miss_never_reads_as_a_pass() -> None:
+def test_coverage_percent_is_rounded_down() -> None:
     assert formatting.coverage_percent(0.94999) == "94.9"
     assert formatting.coverage_percent(0.99999) == "99.9"
     assert formatting.coverage_percent(0.283) == "28.3"
     assert formatting.coverage_percent(1.0) == "100.0"
 
 
-def test_numbers_that_fixed_decimals_would_hide_are_scientific() -> None:
+def test_extreme_numbers_use_scientific_notation() -> None:
     assert formatting.number(0.00004, 4) == "4.0e-05"
     assert formatting.number(0.00005, 4) == "0.0001"
     assert formatting.number(0.0, 4) == "0.0000"
@@ -129,11 +132,11 @@ def test_numbers_that_fixed_decimals_would_hide_are_scientific() -> None:
     assert formatting.number(float("nan"), 2) == formatting.DASH
 
 
-def test_no_views_at_all_is_a_reason() -> None:
+def test_no_views_is_an_unranked_reason() -> None:
     assert formatting.unranked_reasons(tabulate([])) == ["no views"]
 
 
-def test_csv_has_the_numbers_of_the_json(two_configs: Result) -> None:
+def test_csv_matches_json(two_configs: Result) -> None:
     rows = list(csv.DictReader(io.StringIO(result_csv(two_configs))))
     written = json.loads(two_configs.to_json())
     assert [row["config"] for row in rows] == ["lattice", "lattice-zed-raw"]
@@ -155,8 +158,8 @@ def test_csv_has_the_numbers_of_the_json(two_configs: Result) -> None:
         assert (row["protocol"], row["method"]) == ("rebar-1", "my model")
 
 
-def test_csv_nulls_are_empty_and_lines_end_in_newlines() -> None:
-    content = result_csv(result(unpredicted("pier/0000"), method="a\rb\nc"))
+def test_csv_nulls_are_empty_and_newlines_are_unix() -> None:
+    content = result_csv(result(unpredicted_view("pier/0000"), method="a\rb\nc"))
     assert "\r\n" not in content
     assert content.endswith("\n")
     row = next(csv.DictReader(io.StringIO(content, newline="")))
@@ -165,6 +168,6 @@ def test_csv_nulls_are_empty_and_lines_end_in_newlines() -> None:
 
 
 @pytest.mark.parametrize("method", [HOSTILE, "+1", "-1", "@x"])
-def test_csv_never_hands_a_formula_to_a_spreadsheet(method: str) -> None:
-    row = next(csv.DictReader(io.StringIO(result_csv(result(scored("lattice/0000"), method=method)))))
-    assert row["method"] == "'" + formatting.printable(method)
+def test_csv_quotes_spreadsheet_formulas(method: str) -> None:
+    row = next(csv.DictReader(io.StringIO(result_csv(result(scored_view("lattice/0000"), method=method)))))
+    assert row["method"] == "'" + printable(method)

@@ -1,4 +1,4 @@
-"""Intervals: against independent formulas, against known correlation, and where there can be none."""
+"""Tests of bootstrap confidence intervals: independent formulas, correlated views and undefined intervals."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rebar_depth_bench.scoring.bootstrap import DRAWS, MIN_VIEWS, Resampling, block_length, interval, resample
+from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS, RESAMPLES, Resampling, block_length, interval, resample
 
 
 def mean_interval(values: np.ndarray, indices: range) -> tuple[float, float] | None:
     return interval(resample(indices).means(values[:, None])[:, 0])
 
 
-def test_every_resample_has_as_many_views_in_whole_rings() -> None:
+def test_resamples_have_equal_size_and_draw_whole_blocks() -> None:
     counts = resample(range(504)).counts
-    assert counts.shape == (DRAWS, 504)
+    assert counts.shape == (RESAMPLES, 504)
     assert (counts.sum(axis=1) == 504).all()
     assert abs(counts.mean(axis=0) - 1.0).max() < 0.2
-    # Neighbours are drawn together: eleven times in twelve, where independent draws would agree by chance alone.
+    # Neighbouring views are drawn together 11 times in 12; independent draws would be uncorrelated.
     assert np.corrcoef(counts[:, 100], counts[:, 101])[0, 1] == pytest.approx(11 / 12, abs=0.03)
     assert abs(np.corrcoef(counts[:, 100], counts[:, 113])[0, 1]) < 0.1
 
@@ -31,79 +31,82 @@ def test_every_resample_has_as_many_views_in_whole_rings() -> None:
     [
         (range(504), 12),
         (range(100), 12),
-        (range(6, 504, 12), 1),  # one view of each ring: no two of them are neighbours
+        (range(6, 504, 12), 1),  # one view of each ring: no two views are neighbours
         (range(2, 504, 4), 3),
-        (range(20), 5),  # never fewer than four blocks
+        (range(20), 5),  # at least four blocks
         (range(1), 1),
         (range(0), 1),
     ],
 )
-def test_a_block_spans_one_ring_of_the_full_protocol(indices: range, length: int) -> None:
+def test_block_length_is_one_ring_of_full_protocol(indices: range, length: int) -> None:
     assert block_length(indices) == length
 
 
-def test_independent_views_give_the_textbook_interval() -> None:
+def test_independent_views_give_normal_interval() -> None:
     values = np.random.default_rng(3).normal(5.0, 2.0, 500)
-    found = mean_interval(values, range(0, 6000, 12))
-    assert found is not None
+    bounds = mean_interval(values, range(0, 6000, 12))
+    assert bounds is not None
     half_width = 1.96 * values.std() / math.sqrt(500)
-    assert found == pytest.approx((values.mean() - half_width, values.mean() + half_width), abs=0.02)
+    assert bounds == pytest.approx((values.mean() - half_width, values.mean() + half_width), abs=0.02)
 
 
-def test_views_that_move_together_give_a_wider_interval_that_holds_the_mean() -> None:
-    """Errors shared by six neighbours: single draws miss the true mean far too often, blocks do not."""
+@pytest.mark.slow
+def test_block_interval_covers_mean_of_correlated_views() -> None:
+    """Check that, if neighbours share errors, blocks cover the true mean and single draws miss it too often."""
     rng = np.random.default_rng(8)
-    held_by_blocks = held_by_views = 0
+    covered_by_blocks = covered_by_views = 0
     for _ in range(100):
         shocks = rng.normal(0, 1, 504 + 5)
         values = np.convolve(shocks, np.ones(6) / 6, mode="valid")
         blocks, views = mean_interval(values, range(504)), mean_interval(values, range(0, 504 * 12, 12))
         assert blocks is not None
         assert views is not None
-        held_by_blocks += blocks[0] <= 0 <= blocks[1]
-        held_by_views += views[0] <= 0 <= views[1]
-    assert held_by_blocks >= 85
-    assert held_by_views <= 75
+        covered_by_blocks += blocks[0] <= 0 <= blocks[1]
+        covered_by_views += views[0] <= 0 <= views[1]
+    assert covered_by_blocks >= 85
+    assert covered_by_views <= 75
 
 
-def test_the_median_of_a_resample_is_numpys() -> None:
+def test_resampled_median_equals_numpy() -> None:
     values = np.random.default_rng(4).normal(size=11)
     resampling = resample(range(11))
     by_hand = [np.median(np.repeat(values, counts.astype(int))) for counts in resampling.counts]
     assert resampling.percentile(values, np.arange(11), 50) == pytest.approx(by_hand)
 
 
-def test_pooled_samples_follow_their_view() -> None:
+def test_pooled_percentile_weights_samples_by_view_count() -> None:
     view = np.repeat(np.arange(6), [3, 1, 0, 5, 2, 4])
     samples = np.random.default_rng(5).normal(size=len(view))
     resampling = Resampling(np.array([[0, 2, 1, 1, 0, 0], [1, 1, 1, 1, 1, 1]], dtype=float))
     drawn = np.sort(np.r_[np.repeat(samples[view == 1], 2), samples[view == 3]])
-    found = resampling.percentile(samples, view, 95)
-    assert found[0] == drawn[math.ceil(0.95 * len(drawn)) - 1]
-    assert found[1] == np.sort(samples)[math.ceil(0.95 * len(samples)) - 1]
+    percentiles = resampling.percentile(samples, view, 95)
+    assert percentiles[0] == drawn[math.ceil(0.95 * len(drawn)) - 1]
+    assert percentiles[1] == np.sort(samples)[math.ceil(0.95 * len(samples)) - 1]
 
 
-def test_no_interval_of_too_few_views_of_infinities_or_of_nothing() -> None:
+def test_few_infinite_or_nan_views_have_no_interval() -> None:
     assert mean_interval(np.ones(MIN_VIEWS - 1), range(MIN_VIEWS - 1)) is None
     assert mean_interval(np.r_[np.ones(9), np.inf], range(10)) is None
     assert mean_interval(np.full(10, np.nan), range(10)) is None
     assert interval(resample(range(3)).percentile(np.ones(3), np.arange(3), 50)) is None
 
 
-def test_views_without_a_value_are_left_out() -> None:
+def test_nan_views_are_excluded() -> None:
     values = np.array([1.0, np.nan, 1.0, 1.0, np.nan, 1.0, 1.0])
     assert mean_interval(values, range(7)) == (1.0, 1.0)
 
 
 @settings(max_examples=30)
 @given(st.lists(st.floats(-1e6, 1e6), min_size=MIN_VIEWS, max_size=40), st.floats(0.1, 10), st.floats(-100, 100))
-def test_an_interval_lies_within_the_values_and_follows_their_unit(
+def test_interval_is_within_values_and_follows_their_unit(
     values: list[float], factor: float, shift: float
 ) -> None:
-    found = mean_interval(np.array(values), range(len(values)))
-    moved = mean_interval(factor * np.array(values) + shift, range(len(values)))
-    assert found is not None
-    assert moved is not None
+    bounds = mean_interval(np.array(values), range(len(values)))
+    moved_bounds = mean_interval(factor * np.array(values) + shift, range(len(values)))
+    assert bounds is not None
+    assert moved_bounds is not None
     slack = 1e-9 * (1 + max(map(abs, values)))
-    assert min(values) - slack <= found[0] <= found[1] <= max(values) + slack
-    assert moved == pytest.approx([factor * end + shift for end in found], rel=1e-6, abs=1e-6 + 1e3 * slack)
+    assert min(values) - slack <= bounds[0] <= bounds[1] <= max(values) + slack
+    assert moved_bounds == pytest.approx(
+        [factor * bound + shift for bound in bounds], rel=1e-6, abs=1e-6 + 1e3 * slack
+    )

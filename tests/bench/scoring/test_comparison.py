@@ -1,4 +1,4 @@
-"""Paired comparisons: known differences are found, chance is not called a difference, nonsense is refused."""
+"""Tests of paired comparisons: known differences, chance differences and incompatible results."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from rich.console import Console
 
 from rebar_depth_bench import InputError, score
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.reporting.comparison_tables import TITLES, comparison_csv, print_comparison
+from rebar_depth_bench.reporting.comparison_tables import NUMBER_TITLES, comparison_csv, print_comparison
 from rebar_depth_bench.scoring.comparison import Difference, compare
 from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.result import VIEW_NUMBERS, Result, ViewScore, tabulate
+from rebar_depth_bench.scoring.result import VIEW_METRICS, Result, ViewScore, tabulate
 
 
 def result_of(errors: np.ndarray, method: str = "m", config: str = "lattice", digest: str = "sha256:1") -> Result:
@@ -35,62 +35,64 @@ def result_of(errors: np.ndarray, method: str = "m", config: str = "lattice", di
 
 def difference(first: Result, other: Result, name: str = "native.abs_rel") -> Difference:
     [rows] = compare(first, other).configs.values()
-    return next(one for one in rows if one.name == name)
+    return next(row for row in rows if row.name == name)
 
 
-def test_a_small_paired_difference_stands_out_of_views_that_differ_far_more() -> None:
-    """Views differ by 0.1, the submissions by 0.002: apart their intervals overlap, paired they do not."""
+@pytest.mark.slow
+def test_paired_difference_below_view_spread_is_decided() -> None:
+    """Compare submissions 0.002 apart on views that differ by 0.1: only their separate intervals overlap."""
     rng = np.random.default_rng(1)
-    hard = rng.uniform(0.1, 0.5, 504)
-    first, other = result_of(hard), result_of(hard + 0.002 + rng.normal(0, 0.002, 504))
-    a, b = (one.tables["lattice"].intervals["native.abs_rel"] for one in (first, other))
+    view_errors = rng.uniform(0.1, 0.5, 504)
+    first, other = result_of(view_errors), result_of(view_errors + 0.002 + rng.normal(0, 0.002, 504))
+    a, b = (result.tables["lattice"].intervals["native.abs_rel"] for result in (first, other))
     assert a is not None
     assert b is not None
     assert a[1] > b[0]
-    found = difference(first, other)
-    assert found.interval is not None
-    assert found.interval[0] < 0.002 < found.interval[1]
-    assert found.interval[1] - found.interval[0] < 0.001
-    assert found.verdict == "worse"
+    paired = difference(first, other)
+    assert paired.interval is not None
+    assert paired.interval[0] < 0.002 < paired.interval[1]
+    assert paired.interval[1] - paired.interval[0] < 0.001
+    assert paired.verdict == "worse"
     assert difference(other, first).verdict == "better"
     assert difference(first, other, "native.delta1").verdict == "worse"
     assert difference(first, other, "within_mm.5").verdict == "worse"
     assert difference(first, other, "scale_median").verdict == ""
 
 
-def test_equal_quality_is_rarely_called_a_difference() -> None:
+@pytest.mark.slow
+def test_equal_quality_is_rarely_decided() -> None:
     rng = np.random.default_rng(2)
-    called = 0
+    decided_count = 0
     for _ in range(40):
-        hard = rng.uniform(0.1, 0.5, 252)
-        first, other = (result_of(hard + rng.normal(0, 0.01, 252)) for _ in range(2))
-        called += difference(first, other).verdict != "undecided"
-    assert called <= 6
+        view_errors = rng.uniform(0.1, 0.5, 252)
+        first, other = (result_of(view_errors + rng.normal(0, 0.01, 252)) for _ in range(2))
+        decided_count += difference(first, other).verdict != "undecided"
+    assert decided_count <= 6
 
 
-def test_a_submission_against_itself_differs_by_nothing() -> None:
+def test_submission_equals_itself() -> None:
     same = result_of(np.linspace(0.1, 0.9, 20))
     for rows in compare(same, same).configs.values():
-        assert [one.name for one in rows] == list(VIEW_NUMBERS)
-        assert all(one.difference == 0 and one.interval == (0, 0) for one in rows)
-        assert {one.verdict for one in rows} == {"equal", ""}
+        assert [row.name for row in rows] == list(VIEW_METRICS)
+        assert all(row.difference == 0 and row.interval == (0, 0) for row in rows)
+        assert {row.verdict for row in rows} == {"equal", ""}
 
 
-def test_an_error_over_chosen_pixels_is_no_merit() -> None:
-    """One keeps only its surest fifth: smaller errors, but it is not ranked and so not better."""
-    every, chosen = result_of(np.full(20, 0.3)), result_of(np.full(20, 0.1))
-    views = [replace(view, coverage=0.2) for view in chosen.views]
-    chosen = replace(chosen, tables={"lattice": tabulate(views)}, views=views)
-    assert not chosen.tables["lattice"].ranked
-    assert difference(every, chosen).verdict == "not ranked"
-    assert difference(chosen, every, "scaled.delta1").verdict == "not ranked"
-    assert difference(every, chosen, "coverage").verdict == "worse"
+def test_low_coverage_submission_is_not_ranked() -> None:
+    """Compare with predictions on a fifth of the pixels: their errors are smaller, but they are not ranked."""
+    complete, partial = result_of(np.full(20, 0.3)), result_of(np.full(20, 0.1))
+    views = [replace(view, coverage=0.2) for view in partial.views]
+    partial = replace(partial, tables={"lattice": tabulate(views)}, views=views)
+    assert not partial.tables["lattice"].ranked
+    assert difference(complete, partial).verdict == "not ranked"
+    assert difference(partial, complete, "scaled.delta1").verdict == "not ranked"
+    assert difference(complete, partial, "coverage").verdict == "worse"
 
 
-def test_errors_are_compared_where_both_have_a_prediction_and_shares_everywhere() -> None:
+def test_errors_use_common_views_and_shares_use_all_views() -> None:
     errors = np.linspace(0.1, 0.9, 20)
     holes = errors.copy()
-    holes[3::4] = np.nan  # every fourth view, the worst among them, is left out: that must not look like skill
+    holes[3::4] = np.nan  # every fourth view, the worst included, is omitted: this must not count as better
     first, other = result_of(errors), result_of(holes)
     assert difference(first, other).views == 15
     assert difference(first, other).difference == 0
@@ -101,34 +103,34 @@ def test_errors_are_compared_where_both_have_a_prediction_and_shares_everywhere(
 
 
 def test_few_views_have_a_difference_but_no_verdict() -> None:
-    found = difference(result_of(np.full(3, 0.1)), result_of(np.full(3, 0.9)))
-    assert found.difference == pytest.approx(0.8)
-    assert (found.interval, found.verdict) == (None, "undecided")
+    row = difference(result_of(np.full(3, 0.1)), result_of(np.full(3, 0.9)))
+    assert row.difference == pytest.approx(0.8)
+    assert (row.interval, row.verdict) == (None, "undecided")
 
 
-def test_what_cannot_be_compared_is_refused_in_words() -> None:
-    here = result_of(np.ones(6), "one")
+def test_incompatible_results_raise_input_error() -> None:
+    reference = result_of(np.ones(6), "one")
     with pytest.raises(InputError, match=r"two was scored on the dataset sha256:2, expected sha256:1 as one"):
-        compare(here, result_of(np.ones(6), "two", digest="sha256:2"))
+        compare(reference, result_of(np.ones(6), "two", digest="sha256:2"))
     with pytest.raises(InputError, match="one has lattice and two has pier: expected a config that is in both"):
-        compare(here, result_of(np.ones(6), "two", config="pier"))
+        compare(reference, result_of(np.ones(6), "two", config="pier"))
 
 
-def test_the_table_fits_a_terminal_and_names_every_number() -> None:
+def test_table_is_80_columns_and_names_every_number() -> None:
     comparison = compare(result_of(np.linspace(0.1, 1, 12), "A [red]"), result_of(np.linspace(0.2, 1, 12), "=B"))
     console = Console(width=80, record=True, file=io.StringIO())
     print_comparison(comparison, console)
     text = console.export_text()
     assert "B: =B, against A: A [red]" in text
-    assert all(title in text for title, _, _ in TITLES.values())
+    assert all(title in text for title, _, _ in NUMBER_TITLES.values())
     assert max(map(len, text.splitlines())) <= 80
     rows = list(csv.DictReader(io.StringIO(comparison_csv([comparison]))))
-    assert [row["number"] for row in rows] == list(VIEW_NUMBERS)
+    assert [row["number"] for row in rows] == list(VIEW_METRICS)
     assert rows[0]["other_method"] == "'=B"
     assert float(rows[1]["low"]) <= float(rows[1]["difference"]) <= float(rows[1]["high"])
 
 
-def test_the_command_compares_real_archives(
+def test_compare_command_on_archives(
     tiny_truth: dict[str, np.ndarray],
     tiny_root: Path,
     archive_of: Callable[..., Path],

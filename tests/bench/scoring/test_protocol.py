@@ -1,8 +1,9 @@
-"""Which pixels count."""
+"""Tests of the selection of scored pixels."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -14,34 +15,35 @@ MASKS = hnp.arrays(bool, st.tuples(st.integers(1, 12), st.integers(1, 12)))
 
 def eroded_by_definition(mask: np.ndarray) -> np.ndarray:
     height, width = mask.shape
-    kept = np.zeros_like(mask)
+    eroded = np.zeros_like(mask)
     for v in range(height):
         for u in range(width):
-            around = [
+            neighbourhood = [
                 0 <= v + dv < height and 0 <= u + du < width and mask[v + dv, u + du]
                 for dv in (-1, 0, 1)
                 for du in (-1, 0, 1)
             ]
-            kept[v, u] = all(around)
-    return kept
+            eroded[v, u] = all(neighbourhood)
+    return eroded
 
 
 @given(MASKS)
-def test_interior_is_the_erosion_by_nine_neighbours(mask: np.ndarray) -> None:
+def test_interior_is_erosion_by_3_x_3(mask: np.ndarray) -> None:
     assert np.array_equal(interior(mask), eroded_by_definition(mask))
 
 
-def test_the_frames_border_is_never_scored() -> None:
-    kept = interior(np.ones((5, 7), bool))
-    assert kept.sum() == 3 * 5
-    assert not kept[0].any()
-    assert not kept[:, -1].any()
+def test_image_border_is_never_scored() -> None:
+    eroded = interior(np.ones((5, 7), bool))
+    assert eroded.sum() == 3 * 5
+    assert not eroded[0].any()
+    assert not eroded[:, -1].any()
 
 
+@pytest.mark.slow
 @given(MASKS)
-def test_scored_pixels_need_depth(mask: np.ndarray) -> None:
+def test_scored_pixels_require_depth(mask: np.ndarray) -> None:
     depth_m = np.where(np.arange(mask.size).reshape(mask.shape) % 3, 1.0, 0.0).astype(np.float32)
     expected = np.flatnonzero(eroded_by_definition(mask) & (depth_m > 0))
-    found = scored_pixels(mask, depth_m)
-    assert found.dtype == np.uint32
-    assert np.array_equal(found, expected)
+    pixels = scored_pixels(mask, depth_m)
+    assert pixels.dtype == np.uint32
+    assert np.array_equal(pixels, expected)

@@ -1,4 +1,4 @@
-"""Tables from views: means, medians, what ranks, and the JSON's bytes."""
+"""Tests of result tables: means, medians, ranking and JSON content."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def result_of(*views: ViewScore) -> Result:
     return Result("m", "00", "sha256:11", "1", "2", {"lattice": tabulate(views)}, views)
 
 
-def test_table_is_the_mean_over_views_and_the_median_scale() -> None:
+def test_table_has_mean_metrics_and_median_scale() -> None:
     table = tabulate([view(0, 1.0, scale=0.5), view(1, 2.0, scale=0.7), view(2, 6.0, scale=4.0)])
     assert table.native is not None
     assert table.native.abs_rel == 3.0
@@ -39,16 +39,16 @@ def test_table_is_the_mean_over_views_and_the_median_scale() -> None:
     assert (table.views, table.views_scored, table.ranked) == (3, 3, True)
 
 
-def test_even_number_of_scales_takes_the_middle_two() -> None:
+def test_even_scale_count_averages_middle_two() -> None:
     assert tabulate([view(0, 1.0, scale=1.0), view(1, 1.0, scale=2.0)]).scale_median == 1.5
 
 
 @pytest.mark.parametrize(("coverage", "ranked"), [(0.95, True), (math.nextafter(0.95, 0), False)])
-def test_coverage_decides_rank_at_its_bound(coverage: float, ranked: bool) -> None:
+def test_ranked_at_coverage_threshold(coverage: float, ranked: bool) -> None:
     assert tabulate([view(0, 1.0, coverage), view(1, 1.0, coverage)]).ranked is ranked
 
 
-def test_a_view_without_prediction_is_left_out_of_means_and_costs_the_rank() -> None:
+def test_view_without_prediction_is_not_averaged_nor_ranked() -> None:
     views = [view(n, 1.0) for n in range(99)] + [view(99, None, coverage=0.0)]
     table = tabulate(views)
     assert table.native is not None
@@ -56,15 +56,15 @@ def test_a_view_without_prediction_is_left_out_of_means_and_costs_the_rank() -> 
     assert table.coverage == pytest.approx(0.99)
 
 
-def test_an_overflowed_view_does_not_vanish_from_the_mean() -> None:
+def test_infinite_view_makes_mean_null() -> None:
     table = tabulate([view(0, 1.0), view(1, math.inf)])
     assert table.ranked is False
-    written = result_of(view(0, 1.0), view(1, math.inf)).to_dict()["tables"]["lattice"]
-    assert written["native"]["abs_rel"] is None
-    assert written["native"]["delta1"] == 0.5
+    table_json = result_of(view(0, 1.0), view(1, math.inf)).to_dict()["tables"]["lattice"]
+    assert table_json["native"]["abs_rel"] is None
+    assert table_json["native"]["delta1"] == 0.5
 
 
-def test_no_view_at_all_is_all_null_and_unranked() -> None:
+def test_no_views_give_null_and_unranked_table() -> None:
     table = result_of().to_dict()["tables"]["lattice"]
     assert table["views"] == 0
     assert table["ranked"] is False
@@ -72,7 +72,7 @@ def test_no_view_at_all_is_all_null_and_unranked() -> None:
     assert table["scale_median"] is None
 
 
-def test_json_has_the_contracts_keys_and_units() -> None:
+def test_json_keys_and_units_match_contract() -> None:
     content = json.loads(result_of(view(0, 0.25)).to_json())
     assert list(content) == ["protocol", "dataset", "submission", "software", "tables", "views"]
     assert content["protocol"] == "rebar-1"
@@ -103,7 +103,8 @@ def test_json_has_the_contracts_keys_and_units() -> None:
     ]
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(0, 1e6), min_size=1, max_size=20))
-def test_means_do_not_depend_on_the_order_of_views(values: list[float]) -> None:
+def test_means_are_independent_of_view_order(values: list[float]) -> None:
     views = [view(n, value) for n, value in enumerate(values)]
     assert tabulate(views).native == tabulate(views[::-1]).native

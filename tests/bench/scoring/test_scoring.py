@@ -1,4 +1,4 @@
-"""Scores of real archives on a really rendered dataset: what must be exact, and what must never help."""
+"""Tests of ``score`` on a rendered dataset: exact results, determinism and rejected archives."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rebar_depth_bench import DatasetError, SubmissionError, score
-from rebar_depth_bench.data.ground_truth import CACHE_FOLDER, ViewTruth
+from rebar_depth_bench.scoring.ground_truth import CACHE_FOLDER, ViewTruth
 from rebar_depth_bench.scoring.protocol import interior
 from rebar_depth_bench.scoring.result import Table, tabulate
 from rebar_depth_bench.scoring.score import score_view
@@ -29,7 +29,7 @@ def lattice(archive: Path, root: Path) -> Table:
     return score(archive, root).tables["lattice"]
 
 
-def test_ground_truth_is_exactly_perfect(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+def test_ground_truth_scores_perfectly(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
     table = lattice(archive_of(tiny_truth), tiny_root)
     assert table.native is not None
     for metrics in (table.native, table.scaled):
@@ -41,7 +41,7 @@ def test_ground_truth_is_exactly_perfect(tiny_truth: Depths, tiny_root: Path, ar
     assert set(table.within_mm.values()) == {1.0}
 
 
-def test_twice_the_depth_is_all_scale(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+def test_doubled_depth_is_corrected_by_scale(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
     table = lattice(archive_of({view: 2 * depth for view, depth in tiny_truth.items()}), tiny_root)
     assert table.native is not None
     assert table.scaled is not None
@@ -51,7 +51,7 @@ def test_twice_the_depth_is_all_scale(tiny_truth: Depths, tiny_root: Path, archi
     assert (table.scaled.abs_rel, table.scaled.rmse_cm, table.scaled.delta1) == (0.0, 0.0, 1.0)
 
 
-def test_all_negative_predictions_have_null_metrics_and_no_rank(
+def test_negative_predictions_have_null_metrics_and_no_rank(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive
 ) -> None:
     archive = archive_of({view: -depth - 1 for view, depth in tiny_truth.items()})
@@ -66,7 +66,7 @@ def test_all_negative_predictions_have_null_metrics_and_no_rank(
     assert content["views"][0]["native"]["abs_rel"] is None
 
 
-def test_an_independent_evaluation_agrees(
+def test_score_agrees_with_independent_evaluation(
     tiny_truth: Depths, tiny_masks: Depths, tiny_root: Path, archive_of: Archive
 ) -> None:
     rng = np.random.default_rng(5)
@@ -95,17 +95,18 @@ def test_an_independent_evaluation_agrees(
     means = np.mean(rows, axis=0)
     assert table.native is not None
     assert table.scaled is not None
-    found = [table.native.abs_rel, table.native.rmse_cm, table.native.mae_cm, table.native.delta1]
-    assert [*found, table.scaled.abs_rel, table.within_mm[10]] == pytest.approx(means[:6].tolist(), rel=1e-12)
+    native = [table.native.abs_rel, table.native.rmse_cm, table.native.mae_cm, table.native.delta1]
+    assert [*native, table.scaled.abs_rel, table.within_mm[10]] == pytest.approx(means[:6].tolist(), rel=1e-12)
     assert table.scale_median == pytest.approx(np.median([row[6] for row in rows]), rel=1e-12)
 
 
-def test_same_bytes_for_any_number_of_workers_and_on_the_command_line(
+@pytest.mark.slow
+def test_json_is_identical_for_workers_and_command_line(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
 ) -> None:
     archive = archive_of({view: 1.1 * depth for view, depth in tiny_truth.items()})
-    one, four = (score(archive, tiny_root, workers=workers).to_json() for workers in (1, 4))
-    assert one == four
+    one_worker, four_workers = (score(archive, tiny_root, workers=workers).to_json() for workers in (1, 4))
+    assert one_worker == four_workers
     target = tmp_path / "result.json"
     command = [
         sys.executable,
@@ -119,10 +120,10 @@ def test_same_bytes_for_any_number_of_workers_and_on_the_command_line(
         str(target),
     ]
     subprocess.run(command, check=True, capture_output=True)
-    assert target.read_bytes() == one
+    assert target.read_bytes() == one_worker
 
 
-def test_one_bad_entry_refuses_the_whole_archive(
+def test_damaged_entries_reject_whole_archive(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
 ) -> None:
     good = archive_of(tiny_truth)
@@ -141,34 +142,34 @@ def test_one_bad_entry_refuses_the_whole_archive(
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0, 1.0), blank=st.sampled_from([0, -1, np.nan, np.inf]))
-def test_blanking_pixels_never_improves_what_ranks(seed: int, share: float, blank: float) -> None:
-    """Removing predictions, even the worst ones on purpose, lowers ``within_mm`` or costs the rank."""
+def test_blanking_pixels_never_improves_ranking(seed: int, share: float, blank: float) -> None:
+    """Check that removing predictions, even the worst ones, never raises ``within_mm``, coverage or the rank."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(0.2, 0.5, 400).astype(np.float32)
     p = (z * rng.uniform(0.5, 2.0) + rng.normal(0, 0.02, 400)).astype(np.float32)
     truth = ViewTruth("lattice/0000", np.arange(400, dtype=np.uint32), z, float(np.median(z)))
-    whole = score_view(truth, p.reshape(20, 20))
+    complete = score_view(truth, p.reshape(20, 20))
     blanked = p.copy()
     worst_first = np.argsort(-np.abs(p - z))
     blanked[worst_first[: int(share * 400)]] = blank
-    less = score_view(truth, blanked.reshape(20, 20))
-    assert all(less.within_mm[t] <= whole.within_mm[t] for t in whole.within_mm)
-    assert less.coverage <= whole.coverage
-    if less.coverage < 0.95:
-        assert not tabulate([less]).ranked
+    reduced = score_view(truth, blanked.reshape(20, 20))
+    assert all(reduced.within_mm[t] <= complete.within_mm[t] for t in complete.within_mm)
+    assert reduced.coverage <= complete.coverage
+    if reduced.coverage < 0.95:
+        assert not tabulate([reduced]).ranked
 
 
-def test_leaving_views_out_is_refused(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+def test_missing_views_are_rejected(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
     fewer = dict(list(tiny_truth.items())[1:])
     with pytest.raises(SubmissionError, match="lattice"):
         score(archive_of(fewer), tiny_root)
 
 
-def test_a_config_may_be_left_out_whole(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+def test_config_may_be_omitted(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
     assert list(score(archive_of(tiny_truth), tiny_root).tables) == ["lattice"]
 
 
-def test_a_damaged_ground_truth_is_named(
+def test_damaged_ground_truth_names_view(
     tiny_root: Path, tiny_truth: Depths, archive_of: Archive, tmp_path: Path
 ) -> None:
     copy = tmp_path / "copy"
@@ -182,7 +183,7 @@ def test_a_damaged_ground_truth_is_named(
     assert not list(copy.glob(f"{CACHE_FOLDER}/*lattice-*"))
 
 
-def test_a_damaged_cache_is_made_anew(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+def test_damaged_cache_is_rebuilt(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
     archive = archive_of(tiny_truth)
     before = score(archive, tiny_root).to_json()
     for name in ("views.json", "index"):

@@ -1,4 +1,4 @@
-"""A small real capture: blank stereo pairs and a calibration, and depth maps of it."""
+"""Example capture: blank stereo pairs with a ZED calibration, and depth maps of its views."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from PIL import Image
 
 WIDTH, HEIGHT = 64, 36
 VIEWS = 24
-CONF = """\
+ZED_CALIBRATION = """\
 [LEFT_CAM_HD]
 fx=701.88
 fy=701.70
@@ -39,17 +39,17 @@ Depth = NDArray[Any]
 
 
 def write_capture(root: Path, views: int = VIEWS, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
-    """Write a capture and return its folder."""
+    """Write a capture of blank images and return its folder."""
     for eye in ("left", "right"):
         (root / eye).mkdir(parents=True)
         for view in range(views):
             Image.new("L", size).save(root / eye / f"{view:06d}.png")
-    (root / "calibration.conf").write_text(CONF)
+    (root / "calibration.conf").write_text(ZED_CALIBRATION)
     return root
 
 
 def exact_depth(view: int) -> Depth:
-    """A slope with a box before it, another in each view, metres."""
+    """Return a depth map in metres: a slope with a box in front of it, different for each view."""
     rng = np.random.default_rng(view)
     depth_m = np.linspace(0.8, 3.0, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) * rng.uniform(0.7, 1.3)
     depth_m[8:20, 10:40] = rng.uniform(0.4, 0.7)
@@ -57,7 +57,7 @@ def exact_depth(view: int) -> Depth:
 
 
 def write_depths(folder: Path, depths: dict[int, Depth], method: str | None = None) -> Path:
-    """Write depth maps by view as a folder of .npy and return it."""
+    """Write depth maps by view as a folder of .npy files and return the folder."""
     folder.mkdir()
     for view, depth_m in depths.items():
         np.save(folder / f"{view:06d}.npy", depth_m.astype(np.float32))

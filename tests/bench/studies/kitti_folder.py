@@ -1,4 +1,4 @@
-"""A small KITTI in the true layout: calibration text, laser scans, improved depth maps."""
+"""Small KITTI folder in the original layout: calibration files, LiDAR scans and improved depth maps."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ delta_f: 0.000000e+00 0.000000e+00
 Scan = NDArray[np.float32]
 
 
-def some_images(count: int) -> tuple[KittiImage, ...]:
-    """The first images of the split."""
+def first_images(count: int) -> tuple[KittiImage, ...]:
+    """Return the first ``count`` images of the Eigen test split."""
     return eigen_test_images()[:count]
 
 
-def some_points(seed: int, count: int = 4000) -> Scan:
-    """Points ahead, above, beside and a few behind."""
+def random_scan(seed: int, count: int = 4000) -> Scan:
+    """Return a scan, ``count`` x 4 float32, of random points around the scanner, a few of them behind it."""
     rng = np.random.default_rng(seed)
     x = rng.uniform(-5, 90, count)
     spread = np.abs(x) + 1
@@ -63,39 +63,39 @@ def some_points(seed: int, count: int = 4000) -> Scan:
 
 
 def write_day(day: Path, cam_to_cam: str = CAM_TO_CAM, velo_to_cam: str = VELO_TO_CAM) -> None:
-    """The two calibration files of a day."""
+    """Write the two calibration files of a day."""
     day.mkdir(parents=True, exist_ok=True)
     (day / "calib_cam_to_cam.txt").write_text(cam_to_cam)
     (day / "calib_velo_to_cam.txt").write_text(velo_to_cam)
 
 
 def scan_path(root: Path, image: KittiImage) -> Path:
-    """Where an image's scan lies."""
+    """Return the path of an image's scan."""
     return root / image.date / image.drive / "velodyne_points" / "data" / f"{image.frame}.bin"
 
 
 def write_raw(root: Path, images: tuple[KittiImage, ...]) -> None:
-    """Raw data of some images, each with its own scan."""
+    """Write the raw data of images, each with its own scan."""
     for seed, image in enumerate(images):
         write_day(root / image.date)
         path = scan_path(root, image)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(some_points(seed).tobytes())
+        path.write_bytes(random_scan(seed).tobytes())
 
 
 def improved_path(root: Path, image: KittiImage, part: str = "val") -> Path:
-    """Where an image's improved depth map lies."""
+    """Return the path of an image's improved depth map."""
     return root / part / image.drive / "proj_depth" / "groundtruth" / "image_02" / f"{image.frame}.png"
 
 
 def write_improved(path: Path, depth_m: NDArray[Any]) -> None:
-    """A depth map as KITTI writes it: 16-bit, metres times 256."""
+    """Write a depth map in KITTI's format: 16-bit PNG of metres times 256."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.round(depth_m * 256).astype(np.uint16)).save(path)
 
 
-def projected_by_hand(scan: Scan) -> dict[tuple[int, int], tuple[float, float]]:
-    """The nearest point of each pixel (row, column): planar z and the scanner's x, point by point."""
+def project_reference(scan: Scan) -> dict[tuple[int, int], tuple[float, float]]:
+    """Return the nearest point per pixel (row, column) as (planar depth, scanner x) in metres; plain Python."""
     nearest: dict[tuple[int, int], tuple[float, float]] = {}
     for x, y, z, _ in scan.tolist():
         if x < 0:

@@ -1,4 +1,4 @@
-"""Real captures and folders of depth maps: what is read, and every way in which they can be wrong."""
+"""Real captures and folders of depth maps: reading, and rejection of invalid input."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from rebar_depth_bench.errors import CalibrationError, InputError, SubmissionErr
 from rebar_depth_bench.studies.depth_source import open_depths
 from rebar_depth_bench.studies.pseudo_reference.capture import is_capture, open_capture
 from rebar_depth_bench.submission import EntryError
-from tests.bench.studies.captures import CONF, write_capture
+from tests.bench.studies.captures import ZED_CALIBRATION, write_capture
 from tests.bench.submission.zips import exr, npz, png
 
 DEPTH = np.linspace(0.5, 2.0, 12).reshape(3, 4).astype(np.float32)
 VIEWS = {"walk/a": (3, 4), "walk/b": (3, 4)}
 
 
-def test_a_capture_states_its_views_and_camera(tmp_path: Path) -> None:
+def test_capture_lists_views_and_describes_camera(tmp_path: Path) -> None:
     root = write_capture(tmp_path / "zed-1", views=2)
     assert is_capture(root)
     assert not is_capture(tmp_path)
     capture = open_capture(root)
     assert capture.expected_views() == {"zed-1/000000": (36, 64), "zed-1/000001": (36, 64)}
-    words = capture.camera_words()
-    assert "fx 35.09, fy 35.09" in words  # 701.88 * 64 / 1280, 701.70 * 36 / 720
-    assert "baseline 119.98 mm" in words
-    assert "must be on the very grid of left/" in words
-    assert "lens distortion" in words
+    description = capture.describe_camera()
+    assert "fx 35.09, fy 35.09" in description  # 701.88 * 64 / 1280, 701.70 * 36 / 720
+    assert "baseline 119.98 mm" in description
+    assert "must be on the very grid of left/" in description
+    assert "lens distortion" in description
 
 
-def test_a_capture_takes_toml_and_jpeg(tmp_path: Path) -> None:
+def test_capture_accepts_toml_and_jpeg(tmp_path: Path) -> None:
     root = write_capture(tmp_path / "c", views=1)
     (root / "calibration.conf").unlink()
     (root / "calibration.toml").write_text(
@@ -45,37 +45,37 @@ def test_a_capture_takes_toml_and_jpeg(tmp_path: Path) -> None:
     for eye in ("left", "right"):
         (root / eye / "000000.png").rename(root / eye / "000000.tmp")
         Image.open(root / eye / "000000.tmp").save(root / eye / "000000.JPG", "JPEG")
-    words = open_capture(root).camera_words()
-    assert "baseline 100.00 mm" in words
-    assert "lens distortion" not in words
+    description = open_capture(root).describe_camera()
+    assert "baseline 100.00 mm" in description
+    assert "lens distortion" not in description
 
 
-def unpaired(root: Path) -> None:
+def delete_right_image(root: Path) -> None:
     (root / "right" / "000001.png").unlink()
 
 
-def other_size(root: Path) -> None:
+def resize_right_image(root: Path) -> None:
     Image.new("L", (32, 18)).save(root / "right" / "000001.png")
 
 
-def no_picture(root: Path) -> None:
+def corrupt_left_image(root: Path) -> None:
     (root / "left" / "000001.png").write_bytes(b"none")
 
 
-def bad_name(root: Path) -> None:
+def rename_with_space(root: Path) -> None:
     for eye in ("left", "right"):
         (root / eye / "000001.png").rename(root / eye / "view one.png")
 
 
-def twice(root: Path) -> None:
+def duplicate_name(root: Path) -> None:
     Image.new("L", (64, 36)).save(root / "left" / "000001.jpg")
 
 
-def no_right(root: Path) -> None:
+def rename_right_folder(root: Path) -> None:
     (root / "right").rename(root / "Right")
 
 
-def empty(root: Path) -> None:
+def delete_all_images(root: Path) -> None:
     for file in (*(root / "left").iterdir(), *(root / "right").iterdir()):
         file.unlink()
 
@@ -83,16 +83,16 @@ def empty(root: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (unpaired, r"left/000001.png: has no right/000001"),
-        (other_size, r"right/000001.png: is 32 x 18, expected 64 x 36"),
-        (no_picture, r"left/000001.png: is no readable picture"),
-        (bad_name, r"left/view one.png: expected a name of letters"),
-        (twice, r"left/000001.png: the name stands twice"),
-        (no_right, r"right/: no such folder"),
-        (empty, r"left/ holds no picture"),
+        (delete_right_image, r"left/000001.png: has no right/000001"),
+        (resize_right_image, r"right/000001.png: is 32 x 18, expected 64 x 36"),
+        (corrupt_left_image, r"left/000001.png: is no readable picture"),
+        (rename_with_space, r"left/view one.png: expected a name of letters"),
+        (duplicate_name, r"left/000001.png: the name stands twice"),
+        (rename_right_folder, r"right/: no such folder"),
+        (delete_all_images, r"left/ holds no picture"),
     ],
 )
-def test_a_bad_capture_is_refused_with_its_layout(
+def test_invalid_capture_raises_with_expected_layout(
     damage: Callable[[Path], None], words: str, tmp_path: Path
 ) -> None:
     root = write_capture(tmp_path / "c", views=2)
@@ -102,12 +102,12 @@ def test_a_bad_capture_is_refused_with_its_layout(
     assert "expected a capture: left/<name>.png|jpg" in str(caught.value)
 
 
-def test_a_folder_whose_name_no_id_may_have_is_refused(tmp_path: Path) -> None:
+def test_folder_name_invalid_in_view_id_raises(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the folder is called 'my capture', expected letters"):
         open_capture(write_capture(tmp_path / "my capture", views=1))
 
 
-def test_calibrations_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+def test_unsuitable_calibration_raises(tmp_path: Path) -> None:
     square = write_capture(tmp_path / "square", views=1, size=(64, 64))
     with pytest.raises(
         InputError, match=r"fx is 0\.563 times fy, expected 1: the calibration belongs to pictures"
@@ -118,12 +118,12 @@ def test_calibrations_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"0 calibration files, expected one of calibration\.conf or"):
         open_capture(without)
     broken = write_capture(tmp_path / "broken", views=1)
-    (broken / "calibration.conf").write_text(CONF.replace("fx=701.88", "fx=none"))
+    (broken / "calibration.conf").write_text(ZED_CALIBRATION.replace("fx=701.88", "fx=none"))
     with pytest.raises(CalibrationError, match="fx"):
         open_capture(broken)
 
 
-def test_folders_hold_every_format_by_name_or_by_whole_id(tmp_path: Path) -> None:
+def test_depth_folder_reads_every_format(tmp_path: Path) -> None:
     units = np.round(DEPTH.astype(np.float64) * 1000)
     (tmp_path / "submission.json").write_text('{"method": "mine", "depth_scale": 0.001}')
     (tmp_path / "walk").mkdir()
@@ -143,19 +143,19 @@ def test_folders_hold_every_format_by_name_or_by_whole_id(tmp_path: Path) -> Non
         path.unlink()
 
 
-def test_a_folder_and_an_archive_are_read_alike(tmp_path: Path) -> None:
+def test_folder_and_archive_are_read_alike(tmp_path: Path) -> None:
     archive, folder = tmp_path / "a.zip", tmp_path / "method-x"
     folder.mkdir()
     with SubmissionWriter(archive, method="method-y") as writer:
         for view_id in VIEWS:
             writer.add(view_id, DEPTH)
             np.save(folder / f"{view_id.partition('/')[2]}.npy", DEPTH)
-    with open_depths(archive, VIEWS) as one, open_depths(folder, VIEWS) as other:
-        assert (one.method, other.method) == ("method-y", "method-x")
-        assert one.view_ids == other.view_ids == tuple(VIEWS)
-        assert np.array_equal(one.read("walk/b"), other.read("walk/b"))
-        assert one.sha256() != other.sha256()
-        before = other.sha256()
+    with open_depths(archive, VIEWS) as from_archive, open_depths(folder, VIEWS) as from_folder:
+        assert (from_archive.method, from_folder.method) == ("method-y", "method-x")
+        assert from_archive.view_ids == from_folder.view_ids == tuple(VIEWS)
+        assert np.array_equal(from_archive.read("walk/b"), from_folder.read("walk/b"))
+        assert from_archive.sha256() != from_folder.sha256()
+        before = from_folder.sha256()
     np.save(folder / "b.npy", 2 * DEPTH)
     with open_depths(folder, VIEWS) as changed:
         assert changed.sha256() != before
@@ -172,7 +172,7 @@ def test_a_folder_and_an_archive_are_read_alike(tmp_path: Path) -> None:
         ({"a.npy": b"", "submission.json": b'{"method": 1}'}, "submission.json: method is a number"),
     ],
 )
-def test_a_bad_folder_is_refused_at_once(files: dict[str, bytes], words: str, tmp_path: Path) -> None:
+def test_invalid_depth_folder_raises_on_open(files: dict[str, bytes], words: str, tmp_path: Path) -> None:
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
     with pytest.raises(SubmissionError, match=words):
@@ -190,13 +190,13 @@ def test_a_bad_folder_is_refused_at_once(files: dict[str, bytes], words: str, tm
         ("a.png", bytes(10_000_000), r"a.png: it has more than 262171 bytes, expected a map of 3 x 4 \(H x W\)"),
     ],
 )
-def test_a_damaged_file_is_refused_when_it_is_read(name: str, content: bytes, words: str, tmp_path: Path) -> None:
+def test_damaged_depth_file_raises_on_read(name: str, content: bytes, words: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     with open_depths(tmp_path, VIEWS, png_scale=0.001) as source, pytest.raises(EntryError, match=words):
         source.read("walk/a")
 
 
-def test_a_file_that_is_gone_by_then_is_refused_in_words(tmp_path: Path) -> None:
+def test_deleted_depth_file_raises_on_read(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", DEPTH)
     with open_depths(tmp_path, VIEWS) as source:
         (tmp_path / "a.npy").unlink()

@@ -1,4 +1,4 @@
-"""Crops, the pixels that count and the numbers of an image: golden cases by hand, and what must never help."""
+"""KITTI metrics: crops, scored pixels and the scores of one image, on hand-computed cases."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rebar_depth_bench.studies.kitti.metrics import CROPS, KittiMetrics, crop_mask, score_image, scored_mask
 
-NONE = CROPS["none"]
+NO_CROP = CROPS["none"]
 
 
 @pytest.mark.parametrize(
@@ -28,69 +28,73 @@ NONE = CROPS["none"]
         ("none", (3, 5), (0, 3), (0, 5)),
     ],
 )
-def test_crops(crop: str, shape: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int]) -> None:
-    kept = crop_mask(shape, CROPS[crop])
-    found_rows, found_columns = np.flatnonzero(kept.any(axis=1)), np.flatnonzero(kept.any(axis=0))
-    assert (found_rows[0], found_rows[-1] + 1) == rows
-    assert (found_columns[0], found_columns[-1] + 1) == columns
-    assert kept.sum() == (rows[1] - rows[0]) * (columns[1] - columns[0])
+def test_crop_mask_of_known_image_sizes(
+    crop: str, shape: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int]
+) -> None:
+    mask = crop_mask(shape, CROPS[crop])
+    mask_rows, mask_columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    assert (mask_rows[0], mask_rows[-1] + 1) == rows
+    assert (mask_columns[0], mask_columns[-1] + 1) == columns
+    assert mask.sum() == (rows[1] - rows[0]) * (columns[1] - columns[0])
 
 
-def test_ground_truth_counts_between_a_millimetre_and_the_cap_ends_left_out() -> None:
+def test_scored_mask_excludes_both_depth_limits() -> None:
     depth_m = np.array([[0, 0.001, 0.002, 79.9, 80, 81]], np.float32)
-    assert scored_mask(depth_m, NONE, 80.0).tolist() == [[False, False, True, True, False, False]]
+    assert scored_mask(depth_m, NO_CROP, 80.0).tolist() == [[False, False, True, True, False, False]]
 
 
-def test_a_golden_image() -> None:
+def test_score_of_known_image() -> None:
     z_m = np.array([[2.0, 4.0, 0.0, 10.0]], np.float32)
     p_m = np.array([[1.0, 4.0, 9.0, 14.0]], np.float32)
-    score = score_image("image", z_m, p_m, NONE, 80.0)
+    score = score_image("image", z_m, p_m, NO_CROP, 80.0)
     assert score is not None
     assert score.native is not None
     assert score.scored_px == 3
     assert score.native.abs_rel == pytest.approx((1 / 2 + 0 + 4 / 10) / 3)
     assert score.native.rmse_m == pytest.approx(math.sqrt((1 + 0 + 16) / 3))
     assert score.native.log_rmse == pytest.approx(math.sqrt((math.log(2) ** 2 + math.log(1.4) ** 2) / 3))
-    # ratios 2, 1, 1.4 against 1.25, 1.5625, 1.953125
+    # Ratios 2, 1 and 1.4 against the thresholds 1.25, 1.5625 and 1.953125.
     assert (score.native.delta1, score.native.delta2, score.native.delta3) == pytest.approx((1 / 3, 2 / 3, 2 / 3))
     assert score.scale == 4.0 / 4.0
 
 
-def test_predictions_are_clamped_to_the_cap_after_the_alignment() -> None:
+def test_predictions_are_clamped_after_alignment() -> None:
     z_m = np.array([[10.0, 20.0, 79.0]], np.float32)
     p_m = np.array([[50.0, 100.0, 500.0]], np.float32)
-    score = score_image("image", z_m, p_m, NONE, 80.0)
+    score = score_image("image", z_m, p_m, NO_CROP, 80.0)
     assert score is not None
     assert score.native is not None
     assert score.scaled is not None
-    assert score.scale == 0.2  # 20 / 100, of the prediction as it stands
+    assert score.scale == 0.2  # 20 / 100, from the unclamped prediction.
     assert score.native.rmse_m == pytest.approx(math.sqrt((40**2 + 60**2 + 1**2) / 3))
-    assert score.scaled.rmse_m == pytest.approx(math.sqrt(1 / 3))  # 10, 20 and 100, clamped to 80
+    assert score.scaled.rmse_m == pytest.approx(
+        math.sqrt(1 / 3)
+    )  # The scaled values are 10, 20 and 100, the last clamped to 80.
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 0.0, -5.0])
-def test_no_invalid_value_is_clamped_into_a_score(bad: float) -> None:
+def test_invalid_predictions_are_not_clamped(bad: float) -> None:
     z_m = np.array([[0.002, 20.0, 79.0]], np.float32)
     p_m = np.array([[bad, 20.0, bad]], np.float32)
-    score = score_image("image", z_m, p_m, NONE, 80.0)
+    score = score_image("image", z_m, p_m, NO_CROP, 80.0)
     assert score is not None
     assert score.coverage == pytest.approx(1 / 3)
     assert score.native == KittiMetrics(0, 0, 0, 1, 1, 1)
-    nothing = score_image("image", z_m, np.full_like(z_m, bad), NONE, 80.0)
-    assert nothing is not None
-    assert (nothing.native, nothing.scale, nothing.coverage) == (None, None, 0)
+    all_invalid = score_image("image", z_m, np.full_like(z_m, bad), NO_CROP, 80.0)
+    assert all_invalid is not None
+    assert (all_invalid.native, all_invalid.scale, all_invalid.coverage) == (None, None, 0)
 
 
-def test_an_image_without_a_pixel_that_counts_has_no_score() -> None:
-    assert score_image("image", np.zeros((2, 3), np.float32), np.ones((2, 3)), NONE, 80.0) is None
+def test_image_without_scored_pixels_has_no_score() -> None:
+    assert score_image("image", np.zeros((2, 3), np.float32), np.ones((2, 3)), NO_CROP, 80.0) is None
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 @pytest.mark.parametrize("value", [1e-300, 6e4, 1e300])
-def test_absurd_predictions_stay_finite(value: float, dtype: type) -> None:
+def test_extreme_predictions_give_finite_metrics(value: float, dtype: type) -> None:
     with np.errstate(over="ignore", under="ignore"):
         p_m: np.ndarray = np.full((1, 4), value).astype(dtype)
-    score = score_image("image", np.full((1, 4), 5.0, np.float32), p_m, NONE, 80.0)
+    score = score_image("image", np.full((1, 4), 5.0, np.float32), p_m, NO_CROP, 80.0)
     assert score is not None
     for metrics in (score.native, score.scaled):
         assert metrics is None or all(math.isfinite(number) for number in vars(metrics).values())
@@ -99,12 +103,12 @@ def test_absurd_predictions_stay_finite(value: float, dtype: type) -> None:
 @given(
     st.lists(st.tuples(st.floats(1, 70), st.floats(1, 70)), min_size=1, max_size=20), st.sampled_from([0.5, 2, 4])
 )
-def test_scaled_numbers_do_not_see_a_factor(pairs: list[tuple[float, float]], factor: float) -> None:
+def test_scaled_metrics_are_scale_invariant(pairs: list[tuple[float, float]], factor: float) -> None:
     z_m, p_m = (np.array([values], np.float64) for values in zip(*pairs, strict=True))
-    first, other = (score_image("image", z_m, scale * p_m, NONE, 80.0) for scale in (1.0, factor))
+    first, other = (score_image("image", z_m, scale * p_m, NO_CROP, 80.0) for scale in (1.0, factor))
     assert first is not None
     assert other is not None
-    assert first.scaled == other.scaled  # powers of two: no rounding
+    assert first.scaled == other.scaled  # Powers of two cause no rounding.
     assert first.scale is not None
     assert other.scale == first.scale / factor
     assert first.native is not None

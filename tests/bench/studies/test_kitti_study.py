@@ -1,4 +1,4 @@
-"""``study kitti`` on a small KITTI: what was put in comes out, and what is wrong is said in words."""
+"""``study kitti`` on a small KITTI folder: known scales and noise, output files and bad input."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from PIL import Image
 from rebar_depth_bench import SubmissionWriter
 from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.studies.kitti import command as study_module
-from rebar_depth_bench.studies.kitti.command import kitti_study
+from rebar_depth_bench.studies.kitti.command import run_kitti_study
 from rebar_depth_bench.studies.kitti.ground_truth import find_truth, read_truth
 from rebar_depth_bench.studies.kitti.metrics import CROPS, scored_mask
 from rebar_depth_bench.studies.kitti.result import KittiProtocol
 from tests.bench.studies import kitti_folder as kitti
-from tests.bench.studies.commands import study
+from tests.bench.studies.commands import run_study
 
 COUNT = 24
 FACTORS = np.linspace(0.4, 1.6, COUNT)
@@ -32,20 +32,21 @@ Depths = dict[str, NDArray[Any]]
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Raw data of the first images of the split."""
+    """Write the raw data of the first images of the split and return the folder."""
     folder = tmp_path_factory.mktemp("kitti")
-    kitti.write_raw(folder, kitti.some_images(COUNT))
+    kitti.write_raw(folder, kitti.first_images(COUNT))
     return folder
 
 
 @pytest.fixture(scope="module")
 def truths(root: Path) -> Depths:
-    found, _ = find_truth(root, kitti.some_images(COUNT), "raw")
-    return {one.image.name: read_truth(one) for one in found}
+    """Return the raw ground truth in metres by image name."""
+    files, _ = find_truth(root, kitti.first_images(COUNT), "raw")
+    return {file.image.name: read_truth(file) for file in files}
 
 
 def predictions(truths: Depths, noise: float = 0.0) -> Depths:
-    """Truth over each image's factor, with multiplicative noise; 7 m where there is no truth."""
+    """Return ground truth divided by each image's factor, with multiplicative noise; 7 m outside ground truth."""
     rng = np.random.default_rng(5)
     return {
         name: np.where(z_m > 0, z_m / factor * np.exp(noise * rng.standard_normal(z_m.shape)), 7.0).astype(
@@ -62,12 +63,12 @@ def write_npy(folder: Path, depths: Depths) -> Path:
     return folder
 
 
-def test_known_scales_come_back_and_leave_no_error(root: Path, truths: Depths, tmp_path: Path) -> None:
-    result = kitti_study(write_npy(tmp_path / "mono", predictions(truths)), root, RAW)
+def test_known_scales_are_recovered(root: Path, truths: Depths, tmp_path: Path) -> None:
+    result = run_kitti_study(write_npy(tmp_path / "mono", predictions(truths)), root, RAW)
     assert result.method == "mono"
-    assert result.found == COUNT
+    assert result.images_with_truth == COUNT
     assert len(result.missing) == 697 - COUNT
-    assert [one.scale for one in result.images] == pytest.approx(list(FACTORS), rel=1e-6)
+    assert [image.scale for image in result.images] == pytest.approx(list(FACTORS), rel=1e-6)
     table = result.table
     assert table.complete
     assert table.scale_median == pytest.approx(np.median(FACTORS))
@@ -83,7 +84,9 @@ def test_known_scales_come_back_and_leave_no_error(root: Path, truths: Depths, t
 
 
 def test_known_noise_lies_within_the_interval(root: Path, truths: Depths, tmp_path: Path) -> None:
-    result = kitti_study(write_npy(tmp_path / "mono", predictions(truths, NOISE)), root, replace(RAW, cap_m=1e4))
+    result = run_kitti_study(
+        write_npy(tmp_path / "mono", predictions(truths, NOISE)), root, replace(RAW, cap_m=1e4)
+    )
     expected = np.abs(np.exp(NOISE * np.random.default_rng(0).standard_normal(1_000_000)) - 1).mean()
     low, high = result.table.intervals["scaled.abs_rel"] or (0, 0)
     assert low < expected < high
@@ -92,60 +95,60 @@ def test_known_noise_lies_within_the_interval(root: Path, truths: Depths, tmp_pa
     assert low < np.median(FACTORS) < high
 
 
-def test_missing_parts_are_reported_and_take_the_comparison_away(
-    root: Path, truths: Depths, tmp_path: Path
-) -> None:
+def test_missing_predictions_make_result_incomplete(root: Path, truths: Depths, tmp_path: Path) -> None:
     whole = predictions(truths, NOISE)
     holed = {name: depth_m.copy() for name, depth_m in whole.items()}
     for depth_m in holed.values():
         depth_m[:, :62] = np.nan
     holed[next(iter(holed))][:] = 0
     first, other = (
-        kitti_study(write_npy(tmp_path / name, depths), root, RAW).table
+        run_kitti_study(write_npy(tmp_path / name, depths), root, RAW).table
         for name, depths in (("whole", whole), ("holed", holed))
     )
     assert (first.complete, other.complete) == (True, False)
     assert (first.images_scored, other.images_scored, other.images) == (COUNT, COUNT - 1, COUNT)
-    left = [
+    coverages = [
         scored_mask(z_m, CROPS["garg"], 80.0)[:, 62:].sum() / scored_mask(z_m, CROPS["garg"], 80.0).sum()
         for z_m in truths.values()
     ]
-    assert other.coverage == pytest.approx(sum(left[1:]) / COUNT)
+    assert other.coverage == pytest.approx(sum(coverages[1:]) / COUNT)
 
 
-def test_low_coverage_alone_takes_the_comparison_away(root: Path, truths: Depths, tmp_path: Path) -> None:
-    left = {name: np.where(np.arange(124) < 62, depth_m, np.nan) for name, depth_m in predictions(truths).items()}
-    table = kitti_study(write_npy(tmp_path / "left", left), root, RAW).table
+def test_low_coverage_makes_result_incomplete(root: Path, truths: Depths, tmp_path: Path) -> None:
+    left_half = {
+        name: np.where(np.arange(124) < 62, depth_m, np.nan) for name, depth_m in predictions(truths).items()
+    }
+    table = run_kitti_study(write_npy(tmp_path / "left", left_half), root, RAW).table
     assert table.images_scored == COUNT
     assert 0.3 < table.coverage < 0.7
     assert not table.complete
 
 
-def test_formats_and_archives_say_the_same(root: Path, truths: Depths, tmp_path: Path) -> None:
+def test_archive_and_png_folder_score_alike(root: Path, truths: Depths, tmp_path: Path) -> None:
     depths = {name: np.round(depth_m * 256).clip(1, 65535) / 256 for name, depth_m in predictions(truths).items()}
     archive = tmp_path / "mono.zip"
     with SubmissionWriter(archive, method="mono") as writer:
         for name, depth_m in depths.items():
             writer.add(f"kitti/{name}", depth_m)
         writer.add(
-            f"kitti/{kitti.some_images(COUNT + 1)[-1].name}", np.ones((3, 5))
-        )  # no ground truth here: allowed
+            f"kitti/{kitti.first_images(COUNT + 1)[-1].name}", np.ones((3, 5))
+        )  # An image without ground truth is allowed.
     folder = tmp_path / "pngs"
     folder.mkdir()
     for name, depth_m in depths.items():
         Image.fromarray((depth_m * 256).astype(np.uint16)).save(folder / f"{name}.png")
-    tables = [kitti_study(path, root, RAW).table for path in (archive, folder)]
+    tables = [run_kitti_study(path, root, RAW).table for path in (archive, folder)]
     assert tables[0] == tables[1]
 
 
-def test_the_command_writes_everything_and_states_its_conventions(
+def test_command_writes_files_and_states_conventions(
     root: Path, truths: Depths, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = write_npy(tmp_path / "mono", predictions(truths, NOISE))
     files = {kind: tmp_path / f"out.{kind}" for kind in ("json", "csv", "html")}
-    given = [part for kind, path in files.items() for part in (f"--{kind}", path)]
+    output_options = [part for kind, path in files.items() for part in (f"--{kind}", path)]
     arguments = ("--predictions", folder, "--kitti", root, "--ground-truth", "raw", "--crop", "eigen")
-    assert study(study_module, *arguments, *given) == 0
+    assert run_study(study_module, *arguments, *output_options) == 0
     out = capsys.readouterr().out
     title = f"raw LiDAR ground truth, {COUNT} images, crop eigen, cap 80 m: native (no alignment) beside scaled"
     assert title in " ".join(out.split())
@@ -162,26 +165,27 @@ def test_the_command_writes_everything_and_states_its_conventions(
     assert float(rows[1]["abs_rel"]) == content["table"]["scaled"]["abs_rel"]
     assert title.replace("'", "&#39;") in files["html"].read_text()
     before = [path.read_bytes() for path in files.values()]
-    assert study(study_module, *arguments, *given, "--workers", "1") == 0
+    assert run_study(study_module, *arguments, *output_options, "--workers", "1") == 0
     assert [path.read_bytes() for path in files.values()] == before
 
 
-def test_improved_ground_truth_is_read_as_it_is(tmp_path: Path) -> None:
-    images = kitti.some_images(2)
+def test_improved_ground_truth_is_used_unchanged(tmp_path: Path) -> None:
+    images = kitti.first_images(2)
     z_m = np.full((38, 124), 10.0)
     for image in images:
         kitti.write_improved(kitti.improved_path(tmp_path / "kitti", image), z_m)
     folder = write_npy(tmp_path / "mono", {image.name: z_m * 1.1 for image in images})
-    result = kitti_study(folder, tmp_path / "kitti", replace(RAW, ground_truth="improved"))
+    result = run_kitti_study(folder, tmp_path / "kitti", replace(RAW, ground_truth="improved"))
     assert result.table.native is not None
     assert result.table.native.abs_rel == pytest.approx(0.1)
-    assert result.found == 2
+    assert result.images_with_truth == 2
 
 
-def test_what_a_laser_points_depth_is_changes_the_truth(root: Path, truths: Depths, tmp_path: Path) -> None:
+def test_lidar_depth_option_changes_ground_truth(root: Path, truths: Depths, tmp_path: Path) -> None:
     folder = write_npy(tmp_path / "exact", {name: np.where(z > 0, z, 7) for name, z in truths.items()})
     planar, forward = (
-        kitti_study(folder, root, replace(RAW, lidar_depth=kind)).table.native for kind in ("camera", "velodyne")
+        run_kitti_study(folder, root, replace(RAW, lidar_depth=kind)).table.native
+        for kind in ("camera", "velodyne")
     )
     assert planar is not None
     assert forward is not None
@@ -189,7 +193,7 @@ def test_what_a_laser_points_depth_is_changes_the_truth(root: Path, truths: Dept
     assert 0.2 < forward.rmse_m < 0.5
 
 
-def test_every_bad_prediction_is_named_at_once(root: Path, truths: Depths, tmp_path: Path) -> None:
+def test_all_bad_predictions_are_listed(root: Path, truths: Depths, tmp_path: Path) -> None:
     folder = write_npy(tmp_path / "mono", predictions(truths))
     names = list(truths)
     np.save(folder / f"{names[0]}.npy", np.ones((375, 1242)))
@@ -197,7 +201,7 @@ def test_every_bad_prediction_is_named_at_once(root: Path, truths: Depths, tmp_p
     (folder / f"{names[2]}.npy").unlink()
     Image.fromarray(np.ones((38, 124), np.uint8)).save(folder / f"{names[2]}.png")
     with pytest.raises(SubmissionError) as caught:
-        kitti_study(folder, root, RAW)
+        run_kitti_study(folder, root, RAW)
     text = str(caught.value)
     assert "3 problems" in text
     assert f"{names[0]}.npy: the shape is 375 x 1242, expected 38 x 124 (H x W)" in text
@@ -218,7 +222,7 @@ def test_every_bad_prediction_is_named_at_once(root: Path, truths: Depths, tmp_p
         (("--predictions", "empty"), "no depth file of any view was found"),
     ],
 )
-def test_bad_input_ends_in_words(
+def test_bad_input_exits_with_status_2(
     change: tuple[str, str],
     words: str,
     root: Path,
@@ -231,8 +235,8 @@ def test_bad_input_ends_in_words(
     write_npy(tmp_path / "mono", predictions(truths))
     write_npy(tmp_path / "short", dict(list(predictions(truths).items())[:1]))
     (tmp_path / "empty").mkdir()
-    given = {"--predictions": "mono", "--kitti": str(root), "--ground-truth": "raw"} | dict([change])
-    assert study(study_module, *(part for pair in given.items() for part in pair)) == 2
+    options = {"--predictions": "mono", "--kitti": str(root), "--ground-truth": "raw"} | dict([change])
+    assert run_study(study_module, *(part for pair in options.items() for part in pair)) == 2
     printed = capsys.readouterr()
     assert words in printed.err
     assert printed.out == ""

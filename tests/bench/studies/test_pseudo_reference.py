@@ -1,4 +1,4 @@
-"""``study pseudo-reference``: known scales, noise and gaps come back, on captures and on a rendered dataset."""
+"""``study pseudo-reference`` on captures and on a rendered dataset: known scale, noise and gaps; bad input."""
 
 from __future__ import annotations
 
@@ -6,26 +6,27 @@ import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.studies.pseudo_reference import command as study_module
-from rebar_depth_bench.studies.pseudo_reference.command import pseudo_reference_study
+from rebar_depth_bench.studies.pseudo_reference.command import run_pseudo_reference_study
 from rebar_depth_bench.studies.pseudo_reference.result import PseudoReferenceResult, kendall_tau
 from rebar_depth_bench.studies.pseudo_reference.study import DepthRange
 from tests.bench.studies.captures import HEIGHT, VIEWS, WIDTH, Depth, exact_depth, write_capture, write_depths
-from tests.bench.studies.commands import study
+from tests.bench.studies.commands import run_study
 
 NOISE = 0.1
-A, B, MONO, OTHER = 1.02, 0.9, 1.6, 0.55
+STEREO_FACTOR, COLMAP_FACTOR, MONO_FACTOR, OTHER_FACTOR = 1.02, 0.9, 1.6, 0.55
 
 
 def left_half(depth_m: Depth) -> Depth:
-    gone = depth_m.copy()
-    gone[:, WIDTH // 2 :] = np.nan
-    return gone
+    half_m = depth_m.copy()
+    half_m[:, WIDTH // 2 :] = np.nan
+    return half_m
 
 
 def noisy(depth_m: Depth, seed: int) -> Depth:
@@ -35,30 +36,34 @@ def noisy(depth_m: Depth, seed: int) -> Depth:
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A capture, two references (all of the frame, its left half) and methods of known errors."""
+    """Write a capture, two references (full frame, left half) and methods of known errors; return the folder."""
     folder = tmp_path_factory.mktemp("lab")
     write_capture(folder / "zed")
     z_m = {view: exact_depth(view) for view in range(VIEWS)}
-    write_depths(folder / "stereo", {view: A * one for view, one in z_m.items()}, "stereo")
-    write_depths(folder / "colmap", {view: B * left_half(one) for view, one in z_m.items()}, "colmap")
-    write_depths(folder / "mono", {view: MONO * noisy(one, view) for view, one in z_m.items()})
-    write_depths(folder / "other", {view: OTHER * one + 0.2 for view, one in z_m.items()})
+    write_depths(folder / "stereo", {view: STEREO_FACTOR * depth_m for view, depth_m in z_m.items()}, "stereo")
+    write_depths(
+        folder / "colmap", {view: COLMAP_FACTOR * left_half(depth_m) for view, depth_m in z_m.items()}, "colmap"
+    )
+    write_depths(folder / "mono", {view: MONO_FACTOR * noisy(depth_m, view) for view, depth_m in z_m.items()})
+    write_depths(folder / "other", {view: OTHER_FACTOR * depth_m + 0.2 for view, depth_m in z_m.items()})
     return folder
 
 
-def run(lab: Path, *methods: str, **options: object) -> PseudoReferenceResult:
+def run_lab(lab: Path, *methods: str, **options: Any) -> PseudoReferenceResult:
     references = [str(lab / name) for name in ("stereo", "colmap")]
-    return pseudo_reference_study([str(lab / name) for name in methods], references, str(lab / "zed"), **options)  # type: ignore[arg-type]
+    return run_pseudo_reference_study(
+        [str(lab / name) for name in methods], references, str(lab / "zed"), **options
+    )
 
 
-def test_known_scale_noise_and_gaps_come_back_within_their_intervals(lab: Path) -> None:
-    result = run(lab, "mono")
+def test_known_scale_and_noise_lie_within_intervals(lab: Path) -> None:
+    result = run_lab(lab, "mono")
     samples = np.random.default_rng(0).standard_normal(1_000_000)
-    for reference, factor, share in (("stereo", A, 1.0), ("colmap", B, 0.5)):
+    for reference, factor, share in (("stereo", STEREO_FACTOR, 1.0), ("colmap", COLMAP_FACTOR, 0.5)):
         row = result.row("mono", reference)
         expected = {
-            "scale_median": factor / MONO,
-            "native.abs_rel": np.abs(MONO / factor * np.exp(NOISE * samples) - 1).mean(),
+            "scale_median": factor / MONO_FACTOR,
+            "native.abs_rel": np.abs(MONO_FACTOR / factor * np.exp(NOISE * samples) - 1).mean(),
             "scaled.abs_rel": np.abs(np.exp(NOISE * samples) - 1).mean(),
         }
         for name, value in expected.items():
@@ -68,20 +73,22 @@ def test_known_scale_noise_and_gaps_come_back_within_their_intervals(lab: Path) 
         assert row.frame_share == share
         assert row.table.coverage == 1.0
         assert row.table.ranked
-    assert [one.frame_share for one in result.references] == [1.0, 0.5]
-    both = {(one.reference, one.against): one for one in result.agreements}
-    assert both["stereo", "colmap"].median_ratio == pytest.approx(A / B)
-    assert both["stereo", "colmap"].abs_rel == pytest.approx(A / B - 1)
-    assert both["colmap", "stereo"].abs_rel == pytest.approx(1 - B / A)
-    assert both["colmap", "stereo"].common_share == 0.5
+    assert [entry.frame_share for entry in result.references] == [1.0, 0.5]
+    agreements = {(entry.reference, entry.against): entry for entry in result.agreements}
+    assert agreements["stereo", "colmap"].median_ratio == pytest.approx(STEREO_FACTOR / COLMAP_FACTOR)
+    assert agreements["stereo", "colmap"].abs_rel == pytest.approx(STEREO_FACTOR / COLMAP_FACTOR - 1)
+    assert agreements["colmap", "stereo"].abs_rel == pytest.approx(1 - COLMAP_FACTOR / STEREO_FACTOR)
+    assert agreements["colmap", "stereo"].common_share == 0.5
 
 
-def test_a_shift_is_scored_as_plain_numpy_scores_it(lab: Path) -> None:
-    result = run(lab, "other")
+def test_score_of_shifted_method_matches_plain_numpy(lab: Path) -> None:
+    result = run_lab(lab, "other")
     views = []
     for view in range(VIEWS):
-        z_m = (B * exact_depth(view)).astype(np.float32).astype(np.float64)[:, : WIDTH // 2].ravel()
-        p_m = (OTHER * exact_depth(view) + 0.2).astype(np.float32).astype(np.float64)[:, : WIDTH // 2].ravel()
+        z_m = (COLMAP_FACTOR * exact_depth(view)).astype(np.float32).astype(np.float64)[:, : WIDTH // 2].ravel()
+        p_m = (
+            (OTHER_FACTOR * exact_depth(view) + 0.2).astype(np.float32).astype(np.float64)[:, : WIDTH // 2].ravel()
+        )
         s = np.median(z_m) / np.median(p_m)
         views.append(
             (
@@ -94,13 +101,13 @@ def test_a_shift_is_scored_as_plain_numpy_scores_it(lab: Path) -> None:
     table = result.row("other", "colmap").table
     assert table.native is not None
     assert table.scaled is not None
-    found = (table.native.abs_rel, table.native.rmse_cm, table.scaled.abs_rel)
-    assert found == pytest.approx(tuple(np.mean(views, axis=0)[:3]), rel=1e-6)
-    assert table.scale_median == pytest.approx(np.median([one[3] for one in views]), rel=1e-6)
+    scored = (table.native.abs_rel, table.native.rmse_cm, table.scaled.abs_rel)
+    assert scored == pytest.approx(tuple(np.mean(views, axis=0)[:3]), rel=1e-6)
+    assert table.scale_median == pytest.approx(np.median([values[3] for values in views]), rel=1e-6)
 
 
-def test_ratios_and_rankings_are_those_of_the_rows(lab: Path) -> None:
-    result = run(lab, "mono", "other")
+def test_ratios_and_rankings_follow_rows(lab: Path) -> None:
+    result = run_lab(lab, "mono", "other")
     rows = {(row.method, row.reference): row.table for row in result.rows}
     for method in ("mono", "other"):
         natives = [rows[method, reference].native for reference in ("stereo", "colmap")]
@@ -108,32 +115,34 @@ def test_ratios_and_rankings_are_those_of_the_rows(lab: Path) -> None:
         assert natives[1] is not None
         assert result.ratio(method, "colmap", "native") == natives[1].abs_rel / natives[0].abs_rel
         assert result.ratio(method, "stereo", "native") == 1
-    # mono is 1.57 or 1.78 times too far, other about 0.6 to 0.9: nearer in both.
+    # mono is 1.57 or 1.78 times too far, other 0.6 to 0.9 times the reference: other is better in both.
     assert result.ranking("stereo", "native") == result.ranking("colmap", "native") == ("other", "mono")
     assert result.tau("colmap", "native") == 1
 
 
-def test_a_changed_ranking_shows(lab: Path, tmp_path: Path) -> None:
+def test_changed_ranking_gives_negative_tau(lab: Path, tmp_path: Path) -> None:
     for name, factor in (("near", 0.93), ("far", 1.05)):
         write_depths(tmp_path / name, {view: factor * exact_depth(view) for view in range(VIEWS)})
-    result = run(lab, str(tmp_path / "near"), str(tmp_path / "far"))
+    result = run_lab(lab, str(tmp_path / "near"), str(tmp_path / "far"))
     assert result.ranking("stereo", "native") == ("far", "near")
     assert result.ranking("colmap", "native") == ("near", "far")
     assert result.tau("colmap", "native") == -1
 
 
-def test_missing_parts_never_help(lab: Path, tmp_path: Path) -> None:
+def test_missing_predictions_never_help(lab: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     holed = {
-        view: np.where(rng.random((HEIGHT, WIDTH)) < 0.2, np.nan, MONO * noisy(exact_depth(view), view))
+        view: np.where(rng.random((HEIGHT, WIDTH)) < 0.2, np.nan, MONO_FACTOR * noisy(exact_depth(view), view))
         for view in range(VIEWS)
     }
     write_depths(tmp_path / "holed", holed)
     write_depths(tmp_path / "few", {view: depth_m for view, depth_m in holed.items() if view < VIEWS // 2})
-    far = {view: np.where(one > 2, 500, one) for view, one in ((v, exact_depth(v)) for v in range(VIEWS))}
+    far = {
+        view: np.where(depth_m > 2, 500, depth_m) for view, depth_m in ((v, exact_depth(v)) for v in range(VIEWS))
+    }
     write_depths(tmp_path / "far", far)
-    result = run(lab, "mono", *(str(tmp_path / name) for name in ("holed", "few", "far")))
-    present = np.mean([np.isfinite(one).mean() for one in holed.values()])
+    result = run_lab(lab, "mono", *(str(tmp_path / name) for name in ("holed", "few", "far")))
+    present = np.mean([np.isfinite(depth_m).mean() for depth_m in holed.values()])
     row = result.row("holed", "stereo")
     assert row.table.coverage == pytest.approx(present)
     assert row.frame_share == pytest.approx(present)
@@ -142,94 +151,102 @@ def test_missing_parts_never_help(lab: Path, tmp_path: Path) -> None:
     assert few.coverage is not None
     assert few.coverage < 0.41
     out_of_range = result.row("far", "stereo").table
-    assert out_of_range.coverage == pytest.approx(np.mean([(one < 20).mean() for one in far.values()]))
+    assert out_of_range.coverage == pytest.approx(np.mean([(depth_m < 20).mean() for depth_m in far.values()]))
     assert result.ranking("stereo", "native") == ("mono",)
 
 
-def test_the_range_decides_what_counts(lab: Path) -> None:
-    z_m = np.stack([A * exact_depth(view) for view in range(VIEWS)])
-    result = run(lab, "mono", allowed=DepthRange(1.0, 2.0))
+def test_depth_range_limits_scored_pixels(lab: Path) -> None:
+    z_m = np.stack([STEREO_FACTOR * exact_depth(view) for view in range(VIEWS)])
+    result = run_lab(lab, "mono", depth_range=DepthRange(1.0, 2.0))
     inside = ((z_m >= 1) & (z_m <= 2)).mean()
     assert result.references[0].frame_share == pytest.approx(inside, abs=1e-3)
     assert result.row("mono", "stereo").table.coverage is not None
-    assert not result.row("mono", "stereo").table.ranked  # 1.6 times two metres is out of range
+    assert not result.row("mono", "stereo").table.ranked  # The prediction of 1.6 times 2 m is out of range.
 
 
-def test_a_view_without_reference_is_no_view_of_the_method(lab: Path, tmp_path: Path) -> None:
-    write_depths(tmp_path / "half", {view: A * exact_depth(view) for view in range(0, VIEWS, 2)})
-    result = pseudo_reference_study([str(lab / "mono")], [str(tmp_path / "half")], str(lab / "zed"))
+def test_views_without_reference_are_not_counted(lab: Path, tmp_path: Path) -> None:
+    write_depths(tmp_path / "half", {view: STEREO_FACTOR * exact_depth(view) for view in range(0, VIEWS, 2)})
+    result = run_pseudo_reference_study([str(lab / "mono")], [str(tmp_path / "half")], str(lab / "zed"))
     (reference,) = result.references
     assert (reference.views, reference.views_with, reference.frame_share) == (VIEWS, VIEWS // 2, 0.5)
     row = result.row("mono", "half")
     assert (row.table.views, row.table.ranked, row.frame_share) == (VIEWS // 2, True, 0.5)
 
 
-def test_names_that_meet_are_told_apart(lab: Path) -> None:
-    result = run(lab, "mono", "mono", "stereo")
+def test_equal_names_are_made_unique(lab: Path) -> None:
+    result = run_lab(lab, "mono", "mono", "stereo")
     assert result.methods == ("mono (mono)", "mono (mono) #2", "stereo (stereo)")
-    assert [one.name for one in result.references] == ["stereo (stereo) #2", "colmap"]
+    assert [reference.name for reference in result.references] == ["stereo (stereo) #2", "colmap"]
     native = result.row("stereo (stereo)", "stereo (stereo) #2").table.native
     assert native is not None
     assert native.abs_rel == 0
-    assert result.ratio("stereo (stereo)", "colmap", "native") is None  # nothing to divide by
+    assert result.ratio("stereo (stereo)", "colmap", "native") is None  # The error to divide by is zero.
 
 
-def test_the_number_of_threads_changes_nothing(lab: Path) -> None:
-    assert run(lab, "mono", "other", workers=1) == run(lab, "mono", "other", workers=3)
+def test_result_is_independent_of_worker_count(lab: Path) -> None:
+    assert run_lab(lab, "mono", "other", workers=1) == run_lab(lab, "mono", "other", workers=3)
 
 
-def test_a_dataset_folder_shows_what_a_pseudo_reference_hides(
+def test_dataset_folder_adds_exact_references(
     tiny_root: Path, tiny_truth: dict[str, Depth], archive_of: Callable[..., Path]
 ) -> None:
-    mono = archive_of({view: MONO * one for view, one in tiny_truth.items()}, "mono.zip")
-    stereo = archive_of({view: A * one for view, one in tiny_truth.items()}, "stereo.zip")
-    colmap = archive_of({view: B * one * (np.arange(160) < 80) for view, one in tiny_truth.items()}, "colmap.zip")
-    options = {"config": "lattice", "allowed": DepthRange(0.01, 100)}
-    result = pseudo_reference_study([str(mono)], [str(stereo), str(colmap)], str(tiny_root), **options)  # type: ignore[arg-type]
-    first, second, exact, on_first, on_second = (one.name for one in result.references)
-    assert [one.exact for one in result.references] == [False, False, True, True, True]
+    mono = archive_of({view: MONO_FACTOR * entry for view, entry in tiny_truth.items()}, "mono.zip")
+    stereo = archive_of({view: STEREO_FACTOR * entry for view, entry in tiny_truth.items()}, "stereo.zip")
+    colmap = archive_of(
+        {view: COLMAP_FACTOR * entry * (np.arange(160) < 80) for view, entry in tiny_truth.items()}, "colmap.zip"
+    )
+    options = {"config": "lattice", "depth_range": DepthRange(0.01, 100)}
+    result = run_pseudo_reference_study([str(mono)], [str(stereo), str(colmap)], str(tiny_root), **options)  # type: ignore[arg-type]
+    first, second, exact, on_first, on_second = (entry.name for entry in result.references)
+    assert [entry.exact for entry in result.references] == [False, False, True, True, True]
     method = result.methods[0]
-    found = {name: result.row(method, name).table.native for name in (first, second, exact, on_first, on_second)}
-    expected = {first: MONO / A - 1, second: MONO / B - 1, exact: 0.6, on_first: 0.6, on_second: 0.6}
+    natives = {name: result.row(method, name).table.native for name in (first, second, exact, on_first, on_second)}
+    expected = {
+        first: MONO_FACTOR / STEREO_FACTOR - 1,
+        second: MONO_FACTOR / COLMAP_FACTOR - 1,
+        exact: 0.6,
+        on_first: 0.6,
+        on_second: 0.6,
+    }
     for name, value in expected.items():
-        metrics = found[name]
+        metrics = natives[name]
         assert metrics is not None
         assert metrics.abs_rel == pytest.approx(value, rel=1e-6), name
-    shares = {one.name: one.frame_share for one in result.references}
+    shares = {entry.name: entry.frame_share for entry in result.references}
     assert shares[second] == shares[on_second] < shares[exact]
-    assert {(one.reference, one.against) for one in result.agreements} == {
+    assert {(entry.reference, entry.against) for entry in result.agreements} == {
         *((first, second), (second, first), (first, exact), (second, exact))
     }
-    assert result.stamp.dataset_digest is not None
-    without = pseudo_reference_study([str(mono)], [str(stereo)], str(tiny_root), exact=False, **options)  # type: ignore[arg-type]
+    assert result.provenance.dataset_digest is not None
+    without = run_pseudo_reference_study([str(mono)], [str(stereo)], str(tiny_root), exact=False, **options)  # type: ignore[arg-type]
     assert len(without.references) == 1
 
 
-def test_the_command_writes_everything(lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_writes_json_csv_and_html(lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = {kind: tmp_path / f"out.{kind}" for kind in ("json", "csv", "html")}
-    given = [part for kind, path in files.items() for part in (f"--{kind}", path)]
+    output_options = [part for kind, path in files.items() for part in (f"--{kind}", path)]
     arguments = (lab / "mono", lab / "other", "--reference", lab / "stereo", lab / "colmap", "--data", lab / "zed")
-    assert study(study_module, *arguments, *given) == 0
+    assert run_study(study_module, *arguments, *output_options) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert "native (no alignment) beside scaled (oracle median scale per view), depths of 0.1 to 20 m" in out
     assert "baseline 119.98 mm" in out
     assert "No exact depth is known here" in out
-    assert "0.62" in out  # Table II, as published
+    assert "0.62" in out  # Published in Table II.
     content = json.loads(files["json"].read_text())
     assert content["protocol"] == "rebar-pseudo-reference-1"
     assert content["dataset"] is None
     assert content["range_m"] == [0.1, 20.0]
-    assert [one["method"] for one in content["submissions"]] == ["mono", "other", "stereo", "colmap"]
+    assert [entry["method"] for entry in content["submissions"]] == ["mono", "other", "stereo", "colmap"]
     rows = list(csv.DictReader(files["csv"].read_text().splitlines()))
     assert [(row["method"], row["reference"]) for row in rows][:2] == [("mono", "stereo"), ("other", "stereo")]
     assert float(rows[0]["native_abs_rel"]) == content["rows"][0]["native"]["abs_rel"]
     assert "ranking unchanged" in files["html"].read_text()
     before = [path.read_bytes() for path in files.values()]
-    assert study(study_module, *arguments, *given, "--workers", "1") == 0
+    assert run_study(study_module, *arguments, *output_options, "--workers", "1") == 0
     assert [path.read_bytes() for path in files.values()] == before
 
 
-def damaged(folder: Path) -> None:
+def damage_depths(folder: Path) -> None:
     (folder / "000001.npy").write_bytes(b"none")
     np.save(folder / "000002.npy", np.ones((HEIGHT, WIDTH + 1)))
 
@@ -250,7 +267,7 @@ def damaged(folder: Path) -> None:
         ({"--workers": "-1"}, "workers is -1"),
     ],
 )
-def test_bad_input_ends_in_words(
+def test_bad_input_exits_with_status_2(
     change: dict[str, str],
     words: str,
     lab: Path,
@@ -260,22 +277,22 @@ def test_bad_input_ends_in_words(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_depths(tmp_path / "strange", {99: exact_depth(0)})
-    damaged(write_depths(tmp_path / "damaged", {view: exact_depth(view) for view in range(VIEWS)}))
-    given = {"--reference": str(lab / "stereo"), "--data": str(lab / "zed")} | change
-    assert study(study_module, lab / "mono", *(part for pair in given.items() for part in pair)) == 2
+    damage_depths(write_depths(tmp_path / "damaged", {view: exact_depth(view) for view in range(VIEWS)}))
+    options = {"--reference": str(lab / "stereo"), "--data": str(lab / "zed")} | change
+    assert run_study(study_module, lab / "mono", *(part for pair in options.items() for part in pair)) == 2
     printed = capsys.readouterr()
     assert words in printed.err
     assert printed.out == ""
 
 
-def test_several_configs_need_a_name(tiny_root: Path, lab: Path) -> None:
+def test_dataset_of_several_configs_needs_config_option(tiny_root: Path, lab: Path) -> None:
     with pytest.raises(InputError, match="has 2 configs, expected --config with one of lattice, lattice-orbit"):
-        pseudo_reference_study([str(lab / "mono")], [str(lab / "stereo")], str(tiny_root))
+        run_pseudo_reference_study([str(lab / "mono")], [str(lab / "stereo")], str(tiny_root))
 
 
-def test_kendalls_tau_by_hand() -> None:
+def test_kendall_tau_of_known_rankings() -> None:
     assert kendall_tau("abcd", "abcd") == 1
     assert kendall_tau("abcd", "dcba") == -1
     assert kendall_tau("abcd", "bacd") == (5 - 1) / 6
-    assert kendall_tau("abx", "yba") == -1  # on a and b alone
+    assert kendall_tau("abx", "yba") == -1  # Only a and b are in both.
     assert kendall_tau("a", "a") is None

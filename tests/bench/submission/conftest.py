@@ -1,3 +1,5 @@
+"""Fixtures of the submission tests."""
+
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -13,7 +15,7 @@ Check = Callable[[list[Record] | bytes], list[str]]
 
 @pytest.fixture
 def check(tmp_path: Path) -> Check:
-    """Write an archive and return its problems."""
+    """Return a function that writes an archive and returns its problems."""
 
     def problems_of(archive: list[Record] | bytes) -> list[str]:
         path = tmp_path / "submission.zip"

@@ -1,3 +1,5 @@
+"""Tests of archive validation and of the submission reader."""
+
 from __future__ import annotations
 
 import mmap
@@ -32,7 +34,7 @@ from tests.bench.submission.zips import (
 ENTRY = "lattice/0000.npy"
 
 
-def test_good_archives(check: Check) -> None:
+def test_valid_archives_have_no_problems(check: Check) -> None:
     assert check(GOOD) == []
     assert check(build(GOOD, comment=b"made by hand PK\5\6")) == []
     assert check([Record(b"lattice/", mode=0o40755), *GOOD]) == []
@@ -45,7 +47,7 @@ def test_good_archives(check: Check) -> None:
     assert check([META, streamed, SECOND]) == []
 
 
-def test_zip64_sizes_in_the_directory_and_the_local_header(check: Check) -> None:
+def test_zip64_sizes_in_directory_and_local_header(check: Check) -> None:
     size = len(FIRST.data)
     wide = struct.pack("<2H2Q", 1, 16, size, size)
     full = {"size": 0xFFFFFFFF, "compressed": 0xFFFFFFFF, "local_size": 0xFFFFFFFF}
@@ -54,7 +56,7 @@ def test_zip64_sizes_in_the_directory_and_the_local_header(check: Check) -> None
     assert problem == "the zip directory record of entry 1 lacks its zip64 sizes, expected 2"
 
 
-STRUCTURE = [
+INVALID_ENTRIES = [
     (with_first(flags=1), "the entry is encrypted, expected plain data"),
     (with_first(mode=stat.S_IFLNK | 0o777), "the entry is a symbolic link, expected a regular file"),
     (with_first(mode=stat.S_IFCHR), "the entry is a character device, expected a regular file"),
@@ -83,10 +85,8 @@ STRUCTURE = [
 ]
 
 
-@pytest.mark.parametrize(("records", "words"), STRUCTURE, ids=[words[:30] for _, words in STRUCTURE])
-def test_a_bad_entry_is_named_with_what_was_found_and_expected(
-    check: Check, records: list[Record], words: str
-) -> None:
+@pytest.mark.parametrize(("records", "words"), INVALID_ENTRIES, ids=[words[:30] for _, words in INVALID_ENTRIES])
+def test_invalid_entry_is_named_in_problem(check: Check, records: list[Record], words: str) -> None:
     problems = check(records)
     assert any(problem.startswith(f"{ENTRY}: ") and words in problem for problem in problems), problems
 
@@ -102,19 +102,19 @@ def test_a_bad_entry_is_named_with_what_was_found_and_expected(
         b"C:x.npy",
     ],
 )
-def test_escaping_names(check: Check, name: bytes) -> None:
+def test_escaping_names_are_rejected(check: Check, name: bytes) -> None:
     (problem,) = check([*GOOD, Record(name, b"x")])
     assert problem.startswith(f"{name.decode()}: the name escapes the archive, expected a relative path")
 
 
 @pytest.mark.parametrize("name", [b"pile/0000.npy\0.txt", b"pile/0000.npy\n", b"\x1b[31mred.npy"])
-def test_control_characters_are_refused_and_not_echoed(check: Check, name: bytes) -> None:
+def test_control_characters_are_rejected_and_not_echoed(check: Check, name: bytes) -> None:
     (problem,) = check([*GOOD, Record(name, npy(np.ones((2, 5))))])
     assert "the name has a control character, expected plain text" in problem
     assert problem.isprintable()
 
 
-def test_duplicates_of_a_name_of_a_view_and_of_the_metadata(check: Check) -> None:
+def test_duplicate_names_views_and_metadata_are_reported(check: Check) -> None:
     twin = Record(b"lattice/0001.npz", npz(z=DEPTH))
     assert check([META, FIRST, FIRST, SECOND]) == [
         f"lattice/0000: 2 entries were found ({ENTRY}, {ENTRY}), expected one"
@@ -125,7 +125,7 @@ def test_duplicates_of_a_name_of_a_view_and_of_the_metadata(check: Check) -> Non
     ]
 
 
-def test_two_records_that_quote_the_same_data_overlap(check: Check) -> None:
+def test_records_with_the_same_data_overlap(check: Check) -> None:
     start = 30 + len(META.name) + len(META.data)
     problems = check([META, FIRST, replace(SECOND, offset=start)])
     assert (
@@ -134,8 +134,8 @@ def test_two_records_that_quote_the_same_data_overlap(check: Check) -> None:
     )
 
 
-def test_an_entry_quoted_inside_the_data_of_another_overlaps(check: Check) -> None:
-    """A local header inside a stored entry: names and sums agree, only the ranges give it away."""
+def test_entry_inside_data_of_another_overlaps(check: Check) -> None:
+    """Check a local header inside a stored entry: names and checksums agree, only the byte ranges overlap."""
     inner = npy(DEPTH)
     quoted = build([Record(b"lattice/0001.npy", inner)])
     body = quoted[: 30 + 16 + len(inner)]
@@ -146,15 +146,15 @@ def test_an_entry_quoted_inside_the_data_of_another_overlaps(check: Check) -> No
     assert other.startswith(f"{ENTRY}: bytes that start with b'PK")
 
 
-def test_unknown_entries_say_why(check: Check) -> None:
-    strangers = [
+def test_unknown_entries_are_explained(check: Check) -> None:
+    unknown_names = [
         b"lattice/0002.npy",
         b"LATTICE/0000.npy",
         b"lattice/0000.tiff",
         b"readme.txt",
         b"lattice/0000.NPY",
     ]
-    assert check([*GOOD, *(Record(name) for name in strangers)]) == [
+    assert check([*GOOD, *(Record(name) for name in unknown_names)]) == [
         "lattice/0002.npy: unknown entry, the dataset has no view lattice/0002 in the config lattice",
         "LATTICE/0000.npy: unknown entry, the dataset has no config LATTICE, expected one of lattice, pile",
         "lattice/0000.tiff: unknown entry, the suffix is .tiff, expected one of .npy, .npz, .exr, .png",
@@ -171,7 +171,7 @@ def test_macos_entries_are_one_problem_with_a_remedy(check: Check) -> None:
     )
 
 
-def test_one_folder_too_many_is_one_problem(check: Check) -> None:
+def test_enclosing_folder_is_one_problem(check: Check) -> None:
     wrapped = [replace(record, name=b"sub/" + record.name) for record in GOOD]
     assert check([Record(b"sub/", mode=0o40755), *wrapped]) == [
         "sub/submission.json: all 3 entries are inside the folder sub/, expected submission.json at the top "
@@ -179,7 +179,7 @@ def test_one_folder_too_many_is_one_problem(check: Check) -> None:
     ]
 
 
-def test_completeness(check: Check) -> None:
+def test_missing_views_and_metadata_are_reported(check: Check) -> None:
     (problem,) = check([META, FIRST])
     assert problem.startswith("lattice/0001: missing, expected one of .npy, .npz, .exr, .png, since other views")
     assert check([FIRST, SECOND]) == ['submission.json: missing, expected {"method": "name"}']
@@ -188,7 +188,7 @@ def test_completeness(check: Check) -> None:
     assert len(check([])) == 2
 
 
-def test_all_problems_come_at_once_in_the_same_order(check: Check) -> None:
+def test_all_problems_are_reported_in_fixed_order(check: Check) -> None:
     bad = [
         replace(FIRST, flags=1),
         Record(b"lattice/0001.npy", npy(DEPTH.T)),
@@ -205,7 +205,7 @@ def test_all_problems_come_at_once_in_the_same_order(check: Check) -> None:
     assert check(bad) == problems
 
 
-def test_the_error_shows_twenty_then_a_count(tmp_path: Path) -> None:
+def test_error_shows_20_problems_and_count_of_the_rest(tmp_path: Path) -> None:
     expected = {f"lattice/{index:04d}": (3, 4) for index in range(31)}
     (tmp_path / "s.zip").write_bytes(build([META, FIRST]))
     problems = check_archive(tmp_path / "s.zip", expected)
@@ -229,12 +229,12 @@ def test_the_error_shows_twenty_then_a_count(tmp_path: Path) -> None:
         (build(GOOD, count=60_000), "declares 60000 entries in"),
     ],
 )
-def test_files_that_are_no_archive_are_one_problem(check: Check, content: bytes, words: str) -> None:
+def test_file_that_is_no_zip_is_one_problem(check: Check, content: bytes, words: str) -> None:
     (problem,) = check(content)
     assert words in problem
 
 
-def test_paths_that_are_no_file_are_one_problem(tmp_path: Path) -> None:
+def test_path_that_is_no_file_is_one_problem(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     assert check_archive(tmp_path / "a.zip", EXPECTED) == [
         "the file cannot be read: it does not exist, expected a zip archive"
@@ -245,7 +245,7 @@ def test_paths_that_are_no_file_are_one_problem(tmp_path: Path) -> None:
     assert "cannot be read" in problem
 
 
-def test_the_reader_by_threads_and_after_closing(tmp_path: Path) -> None:
+def test_reader_in_threads_and_after_closing(tmp_path: Path) -> None:
     path = tmp_path / "s.zip"
     path.write_bytes(build(GOOD))
     with open_submission(path, EXPECTED) as reader, ThreadPoolExecutor(4) as pool:
@@ -258,7 +258,7 @@ def test_the_reader_by_threads_and_after_closing(tmp_path: Path) -> None:
         reader.read("lattice/0000")
 
 
-def test_a_large_stored_view_is_mapped_not_copied_and_outlives_the_reader(tmp_path: Path) -> None:
+def test_stored_view_is_memory_mapped_and_outlives_reader(tmp_path: Path) -> None:
     shape = (200, 300)
     values = np.random.default_rng(0).random(shape, dtype=np.float32)
     name = b"lattice/0000.npy"
@@ -276,7 +276,7 @@ def test_a_large_stored_view_is_mapped_not_copied_and_outlives_the_reader(tmp_pa
     np.testing.assert_array_equal(array, values)
 
 
-def test_unaligned_values_come_aligned(tmp_path: Path) -> None:
+def test_unaligned_values_are_returned_aligned(tmp_path: Path) -> None:
     path = tmp_path / "s.zip"
     shape = (200, 300)
     for pad in range(4):
@@ -285,7 +285,7 @@ def test_unaligned_values_come_aligned(tmp_path: Path) -> None:
             assert reader.read("lattice/0000").flags.aligned
 
 
-def test_a_file_cut_while_it_is_open_is_an_entry_error(tmp_path: Path) -> None:
+def test_file_truncated_while_open_raises_entry_error(tmp_path: Path) -> None:
     path = tmp_path / "s.zip"
     path.write_bytes(build(GOOD))
     with open_submission(path, EXPECTED) as reader:
@@ -294,7 +294,7 @@ def test_a_file_cut_while_it_is_open_is_an_entry_error(tmp_path: Path) -> None:
             reader.read("lattice/0000")
 
 
-def test_a_reader_that_is_dropped_closes_its_file(tmp_path: Path) -> None:
+def test_dropped_reader_closes_its_file(tmp_path: Path) -> None:
     path = tmp_path / "s.zip"
     path.write_bytes(build(GOOD))
     before = len(list(Path("/proc/self/fd").iterdir()))

@@ -1,3 +1,5 @@
+"""Tests of the formats .npy, .npz, .exr and .png of a view: decoding, and problems of invalid data."""
+
 from __future__ import annotations
 
 import io
@@ -33,23 +35,23 @@ def decode(suffix: str, data: bytes, shape: tuple[int, int], scale: float = 1.0)
 
 @settings(max_examples=60)
 @given(data=st.data(), code=st.sampled_from(["<f2", ">f2", "<f4", ">f4", "<f8", ">f8"]), fortran=st.booleans())
-def test_npy_and_npz_return_every_float_as_it_is(data: st.DataObject, code: str, fortran: bool) -> None:
+def test_npy_and_npz_preserve_floats(data: st.DataObject, code: str, fortran: bool) -> None:
     shape = data.draw(shapes)
     array = np.array(data.draw(arrays.arrays(np.dtype(code), shape)), order="F" if fortran else "C")
     for suffix, content in ((".npy", npy(array)), (".npz", npz(anything=array))):
-        found = decode(suffix, content, shape)
-        assert found.dtype == array.dtype.newbyteorder("=")
-        assert found.dtype.isnative
-        np.testing.assert_array_equal(found, array)
+        decoded = decode(suffix, content, shape)
+        assert decoded.dtype == array.dtype.newbyteorder("=")
+        assert decoded.dtype.isnative
+        np.testing.assert_array_equal(decoded, array)
 
 
 @pytest.mark.parametrize("version", [b"\1\0", b"\2\0", b"\3\0"])
-def test_every_npy_version(version: bytes) -> None:
+def test_npy_versions_1_to_3(version: bytes) -> None:
     content = npy_header(HEADER.format("'<f4'", "(3, 4)"), version) + VALUES
     np.testing.assert_array_equal(decode(".npy", content, SHAPE), DEPTH)
 
 
-def test_npy_headers_of_other_writers() -> None:
+def test_npy_headers_of_other_writers_are_read() -> None:
     for text in (
         "{'descr':'<f4','fortran_order':False,'shape':(3,4)}",
         "{'shape': (3L, 4L), 'fortran_order': False, 'descr': '<f4'}\n",
@@ -67,9 +69,9 @@ def test_png_is_value_times_scale(data: st.DataObject, interlace: bool, scale: f
         buffer = io.BytesIO()
         Image.fromarray(units).save(buffer, "PNG", compress_level=level)
         content = buffer.getvalue()
-    found = decode(".png", content, (units.shape[0], units.shape[1]), scale)
-    assert found.dtype == np.float64
-    np.testing.assert_array_equal(found, units.astype(np.float64) * scale)
+    decoded = decode(".png", content, (units.shape[0], units.shape[1]), scale)
+    assert decoded.dtype == np.float64
+    np.testing.assert_array_equal(decoded, units.astype(np.float64) * scale)
 
 
 def _adam7(units: Array) -> bytes:
@@ -82,17 +84,17 @@ def _adam7(units: Array) -> bytes:
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
 @pytest.mark.parametrize("compression", ["NO", "RLE", "ZIPS", "ZIP", "PIZ"])
 @pytest.mark.parametrize("channel", ["Z", "R", "depth.Y"])
-def test_exr_of_one_channel(tmp_path: Path, dtype: type, compression: str, channel: str) -> None:
+def test_single_channel_exr_is_decoded(tmp_path: Path, dtype: type, compression: str, channel: str) -> None:
     array: Array = DEPTH.astype(dtype)
     array[0, :3] = np.nan, np.inf, -1
     method = getattr(OpenEXR, f"{compression}_COMPRESSION")
     content = zips.exr(tmp_path / "a.exr", {channel: array}, compression=method)
-    found = decode(".exr", content, SHAPE)
-    assert found.dtype == dtype
-    np.testing.assert_array_equal(found, array)
+    decoded = decode(".exr", content, SHAPE)
+    assert decoded.dtype == dtype
+    np.testing.assert_array_equal(decoded, array)
 
 
-def test_tiled_exr(tmp_path: Path) -> None:
+def test_tiled_exr_is_decoded(tmp_path: Path) -> None:
     tiles = OpenEXR.TileDescription()
     tiles.xSize = tiles.ySize = 16
     content = zips.exr(tmp_path / "a.exr", {"Z": DEPTH}, type=OpenEXR.tiledimage, tiles=tiles)
@@ -136,7 +138,7 @@ def test_tiled_exr(tmp_path: Path) -> None:
         (b"", "bytes that start with b'' was found, expected a .npy array"),
     ],
 )
-def test_npy_refusals(check: Check, data: bytes, words: str) -> None:
+def test_invalid_npy_is_rejected(check: Check, data: bytes, words: str) -> None:
     (problem,) = check(with_view(".npy", data))
     assert problem.startswith("lattice/0000.npy: ")
     assert words in problem
@@ -168,7 +170,7 @@ INNER = zips.Record(b"depth.npy", npy(DEPTH))
         (zips.build([INNER], count=7), "inside the .npz, the zip directory holds 1 entries"),
     ],
 )
-def test_npz_refusals(check: Check, data: bytes, words: str) -> None:
+def test_invalid_npz_is_rejected(check: Check, data: bytes, words: str) -> None:
     (problem,) = check(with_view(".npz", data))
     assert problem.startswith("lattice/0000.npz")
     assert words in problem
@@ -203,24 +205,24 @@ IEND = chunk(b"IEND", b"")
         (b"GIF89a..", "the bytes start with b'GIF89a..', expected a PNG file"),
     ],
 )
-def test_png_refusals(check: Check, data: bytes, words: str) -> None:
+def test_invalid_png_is_rejected(check: Check, data: bytes, words: str) -> None:
     (problem,) = check(with_view(".png", data))
     assert problem.startswith("lattice/0000.png: ")
     assert words in problem
 
 
-def test_png_side_chunks_never_reach_pillow(check: Check) -> None:
+def test_png_ancillary_chunks_never_reach_pillow(check: Check) -> None:
     bomb = chunk(b"zTXt", b"k\0\0" + zlib.compress(bytes(10**7))) + chunk(b"acTL", struct.pack(">2I", 9, 9))
     assert check(with_view(".png", GOOD_PNG[:33] + bomb + GOOD_PNG[33:])) == []
 
 
-def test_exr_refusals(check: Check, tmp_path: Path) -> None:
+def test_invalid_exr_is_rejected(check: Check, tmp_path: Path) -> None:
     def exr(channels: dict[str, Array], **header: object) -> bytes:
         return zips.exr(tmp_path / "a.exr", channels, **header)
 
     flat, good = exr({"Z": np.ones_like(DEPTH)}), exr({"Z": DEPTH})
     window = struct.pack("<4i", 0, 0, 3, 2)
-    listed = b"Z\0" + struct.pack("<iI2i", 2, 0, 1, 1)
+    channel_list = b"Z\0" + struct.pack("<iI2i", 2, 0, 1, 1)
     OpenEXR.File([OpenEXR.Part({}, {"Z": DEPTH}, "a"), OpenEXR.Part({}, {"Z": DEPTH}, "b")]).write(
         str(tmp_path / "b")
     )
@@ -233,7 +235,7 @@ def test_exr_refusals(check: Check, tmp_path: Path) -> None:
         (good[:4] + b"\x01" + good[5:], "the OpenEXR version field is 0x1, expected version 2"),
         (good.replace(window, struct.pack("<4i", 0, 0, 2**31 - 2, 2**31 - 2), 1), "expected 3 x 4"),
         (
-            good.replace(listed, b"Z\0" + struct.pack("<iI2i", 2, 0, 2, 2), 1),
+            good.replace(channel_list, b"Z\0" + struct.pack("<iI2i", 2, 0, 2, 2), 1),
             "is subsampled 2 x 2, expected 1 x 1",
         ),
         (good.replace(b"dataWindow", b"dataWindov", 1), "the OpenEXR header is damaged"),

@@ -1,4 +1,4 @@
-"""Archives that lie about size, and archives with random damage: a problem in words, in little memory."""
+"""Tests of archives that declare false sizes or have random damage: clear problems and bounded memory."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from tests.bench.submission.zips import (
 MEGABYTE = 1 << 20
 
 
-def peak(run: Callable[[], list[str]]) -> tuple[list[str], int]:
-    """Return the result and the most bytes that Python held on the way."""
+def run_with_peak_memory(run: Callable[[], list[str]]) -> tuple[list[str], int]:
+    """Return the result of ``run`` and the peak memory that Python allocated meanwhile, bytes."""
     tracemalloc.start()
     try:
         return run(), tracemalloc.get_traced_memory()[1]
@@ -43,39 +43,39 @@ def peak(run: Callable[[], list[str]]) -> tuple[list[str], int]:
         tracemalloc.stop()
 
 
-def test_a_header_that_claims_640_gb_allocates_nothing(check: Check) -> None:
+def test_header_declaring_640_gb_allocates_nothing(check: Check) -> None:
     data = npy_header("{'descr': '<f4', 'fortran_order': False, 'shape': (400000, 400000), }") + DEPTH.tobytes()
     records = [
         META,
         Record(b"lattice/0000.npy", data),
         Record(b"lattice/0001.npz", build([Record(b"a.npy", data)])),
     ]
-    problems, held = peak(lambda: check(records))
+    problems, peak_bytes = run_with_peak_memory(lambda: check(records))
     assert [problem.split(": ")[1] for problem in problems] == [
         "the shape is 400000 x 400000, expected 3 x 4 (H x W)"
     ] * 2
-    assert held < MEGABYTE
+    assert peak_bytes < MEGABYTE
 
 
 @pytest.mark.parametrize("declared", [20_000_000, 176])
-def test_a_bomb_of_zeros_is_stopped_whatever_size_it_declares(check: Check, declared: int) -> None:
+def test_zip_bomb_is_rejected_for_any_declared_size(check: Check, declared: int) -> None:
     bomb = replace(deflated(b"lattice/0000.npy", bytes(20_000_000)), size=declared)
     content = build([META, bomb, SECOND])
-    problems, held = peak(lambda: check(content))
+    problems, peak_bytes = run_with_peak_memory(lambda: check(content))
     expected = (
         "the declared size is 20000000 bytes, expected at most 4192"
         if declared > 4192
         else f"{len(bomb.data)} bytes are deflated for 176, expected at most 1200"
     )
     assert [problem.split(": ")[1] for problem in problems] == [expected]
-    assert held < MEGABYTE
+    assert peak_bytes < MEGABYTE
 
 
-def test_a_small_bomb_inflates_to_one_byte_too_many_and_no_more(check: Check) -> None:
+def test_inflation_stops_one_byte_past_declared_size(check: Check) -> None:
     bomb = replace(deflated(b"lattice/0000.npy", bytes(1_000_000)), size=3000)
-    problems, held = peak(lambda: check([META, bomb, SECOND]))
+    problems, peak_bytes = run_with_peak_memory(lambda: check([META, bomb, SECOND]))
     assert problems == ["lattice/0000.npy: the data inflates to more than 3000 bytes, expected the declared 3000"]
-    assert held < MEGABYTE // 2
+    assert peak_bytes < MEGABYTE // 2
 
 
 @pytest.mark.parametrize(
@@ -95,30 +95,30 @@ def test_a_small_bomb_inflates_to_one_byte_too_many_and_no_more(check: Check) ->
         ),
     ],
 )
-def test_deflated_data_that_is_not_what_it_declares(check: Check, entry: Record, words: str) -> None:
+def test_deflated_data_of_wrong_length_is_rejected(check: Check, entry: Record, words: str) -> None:
     (problem,) = check([META, entry, SECOND])
     assert problem.startswith("lattice/0000.npy: ")
     assert words in problem
 
 
-def test_a_directory_of_a_million_entries_is_not_parsed(check: Check) -> None:
+def test_directory_of_a_million_entries_is_not_parsed(check: Check) -> None:
     record = struct.pack("<4s4B4H3L5H2L", b"PK\1\2", *[0] * 8, 0, 0, 0, *[0] * 7)
     directory = record * 1_000_000
     wide = struct.pack("<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, 10**6, 10**6, len(directory), 0)
     locator = struct.pack("<4sLQL", b"PK\6\7", 0, len(directory), 1)
     end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 0xFFFF, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFF, 0)
-    shy_end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 3, 3, len(directory), 0, 0)
-    for tail, count in ((wide + locator + end, "1000000"), (shy_end, "3")):
+    understated_end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 3, 3, len(directory), 0, 0)
+    for tail, count in ((wide + locator + end, "1000000"), (understated_end, "3")):
         content = directory + tail
-        problems, held = peak(lambda content=content: check(content))  # type: ignore[misc]
+        problems, peak_bytes = run_with_peak_memory(lambda content=content: check(content))  # type: ignore[misc]
         assert problems == [
             f"the zip directory declares {count} entries in 46000000 bytes, "
             "expected at most 1036 entries in 530432 bytes"
         ]
-        assert held < MEGABYTE
+        assert peak_bytes < MEGABYTE
 
 
-def _samples(folder: Path) -> list[bytes]:
+def _valid_archives(folder: Path) -> list[bytes]:
     units = (DEPTH * 1000).astype(np.uint16)
     views = {
         ".npy": npy(DEPTH),
@@ -147,25 +147,26 @@ def _mutate(content: bytes, random: np.random.Generator) -> bytes:
     return bytes(data)
 
 
-def test_damaged_archives_are_accepted_or_refused_in_words(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_random_damage_gives_printable_problems(tmp_path: Path) -> None:
     random = np.random.default_rng(20251121)
-    samples = _samples(tmp_path)
-    refused = 0
-    for round_ in range(700):
+    samples = _valid_archives(tmp_path)
+    rejected_count = 0
+    for number in range(700):
         path = tmp_path / "s.zip"
-        path.write_bytes(_mutate(samples[round_ % len(samples)], random))
+        path.write_bytes(_mutate(samples[number % len(samples)], random))
         problems = check_archive(path, EXPECTED)
-        refused += bool(problems)
+        rejected_count += bool(problems)
         assert all(problem.isprintable() and len(problem) < 1000 for problem in problems)
-    assert 500 < refused < 700
+    assert 500 < rejected_count < 700
 
 
-DAMAGE_INSIDE = """
+FUZZ_SCRIPT = """
 import resource, sys, numpy as np
 resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
 from pathlib import Path
 from {package}.test_hostile import _mutate
-from rebar_depth_bench.submission.decode import FORMATS
+from rebar_depth_bench.submission.formats import FORMATS
 from rebar_depth_bench.submission import EntryError
 random, outcomes = np.random.default_rng(7), dict()
 for path in sorted(Path(sys.argv[1]).iterdir()):
@@ -182,8 +183,9 @@ print("done")
 """
 
 
-def test_damage_behind_a_right_checksum_ends_in_words_within_2_gb(tmp_path: Path) -> None:
-    """In a process of its own: a crash inside a C library, or a huge allocation, must not pass unseen."""
+@pytest.mark.slow
+def test_damaged_data_is_decoded_or_rejected_within_2_gb(tmp_path: Path) -> None:
+    """Decode in a subprocess, so that a crash inside a C library or a huge allocation is detected."""
     units = (DEPTH * 1000).astype(np.uint16)
     (tmp_path / "a.npy").write_bytes(npy(DEPTH))
     (tmp_path / "a.npz").write_bytes(npz(z=DEPTH))
@@ -191,7 +193,7 @@ def test_damage_behind_a_right_checksum_ends_in_words_within_2_gb(tmp_path: Path
     zips.exr(tmp_path / "a.exr", {"Z": DEPTH})
     root = Path(__file__).parents[len((__package__ or "").split("."))]
     run = subprocess.run(
-        [sys.executable, "-c", DAMAGE_INSIDE.format(package=__package__), str(tmp_path)],
+        [sys.executable, "-c", FUZZ_SCRIPT.format(package=__package__), str(tmp_path)],
         check=False, capture_output=True, text=True, cwd=root, timeout=120,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr[-2000:]

@@ -1,3 +1,5 @@
+"""Tests of ``submission.json``: parsing and problems."""
+
 from __future__ import annotations
 
 import json
@@ -9,7 +11,7 @@ from tests.bench.submission.conftest import Check
 from tests.bench.submission.zips import DEPTH, FIRST, SECOND, Record, deflated, png
 
 
-def test_everything_optional_and_unknown_keys() -> None:
+def test_optional_and_unknown_keys_are_accepted() -> None:
     assert parse_metadata(b'{"method": "m", "colour": [1]}') == SubmissionMeta("m")
     full = {
         "method": "Größe 2", "description": "d", "url": "http://x.org", "uses_intrinsics": False,
@@ -52,26 +54,26 @@ def test_everything_optional_and_unknown_keys() -> None:
         ('{"method": "m", "runtime": [1]}', "runtime is a list, expected"),
     ],
 )
-def test_refusals(check: Check, text: str, words: str) -> None:
+def test_invalid_metadata_is_rejected(check: Check, text: str, words: str) -> None:
     (problem,) = check([Record(b"submission.json", text.encode()), FIRST, SECOND])
     assert problem.startswith("submission.json: ")
     assert words in problem
 
 
-def test_all_problems_at_once() -> None:
+def test_all_problems_are_reported_at_once() -> None:
     with pytest.raises(MetadataError) as caught:
         parse_metadata(b'{"method": 1, "url": 2, "depth_scale": -1}')
     assert len(caught.value.problems) == 3
 
 
-def test_bytes_that_are_not_utf8_and_sizes_past_the_limit(check: Check) -> None:
+def test_non_utf8_and_oversized_metadata_are_rejected(check: Check) -> None:
     (problem,) = check([Record(b"submission.json", b'{"method": "\xff"}'), FIRST, SECOND])
     assert problem == "submission.json: byte 12 is not UTF-8, expected UTF-8 text"
     (problem,) = check([deflated(b"submission.json", bytes(5_000_000)), FIRST, SECOND])
     assert problem == "submission.json: the declared size is 5000000 bytes, expected at most 4194304"
 
 
-def test_png_needs_a_scale_said_once(check: Check) -> None:
+def test_png_without_depth_scale_is_one_problem(check: Check) -> None:
     units = (DEPTH * 1000).astype("u2")
     views = [Record(f"lattice/000{index}.png".encode(), png(units)) for index in range(2)]
     assert check([Record(b"submission.json", b'{"method": "m"}'), *views]) == [

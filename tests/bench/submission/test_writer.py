@@ -1,3 +1,5 @@
+"""Tests of ``SubmissionWriter``: archive contents, atomicity and validation of its input."""
+
 from __future__ import annotations
 
 import json
@@ -28,7 +30,7 @@ def interrupt(path: Path) -> None:
 
 
 @pytest.mark.parametrize("compress", [False, True])
-def test_what_is_written_reads_back(tmp_path: Path, compress: bool) -> None:
+def test_written_archive_reads_back(tmp_path: Path, compress: bool) -> None:
     path = tmp_path / "s.zip"
     write(
         path,
@@ -51,7 +53,7 @@ def test_what_is_written_reads_back(tmp_path: Path, compress: bool) -> None:
     assert (meta.uses_intrinsics, meta.runtime, meta.depth_scale) == (True, {"gpu": "none"}, None)
 
 
-def test_other_zip_readers_and_numpy_agree(tmp_path: Path) -> None:
+def test_zipfile_and_numpy_read_written_archive(tmp_path: Path) -> None:
     write(tmp_path / "s.zip")
     with zipfile.ZipFile(tmp_path / "s.zip") as archive:
         assert archive.testzip() is None
@@ -61,7 +63,7 @@ def test_other_zip_readers_and_numpy_agree(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("compress", [False, True])
-def test_the_same_predictions_give_the_same_bytes(
+def test_same_predictions_give_identical_bytes(
     tmp_path: Path, compress: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(tmp_path / "a.zip", compress=compress)
@@ -74,13 +76,13 @@ def test_the_same_predictions_give_the_same_bytes(
     assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
 
 
-def test_stored_values_are_aligned_in_the_file(tmp_path: Path) -> None:
+def test_stored_values_are_64_byte_aligned_in_file(tmp_path: Path) -> None:
     write(tmp_path / "s.zip")
     content = (tmp_path / "s.zip").read_bytes()
     assert content.index(DEPTH.tobytes()) % 64 == 0
 
 
-def test_an_exception_leaves_the_earlier_archive_and_no_other_file(tmp_path: Path) -> None:
+def test_exception_keeps_existing_archive_and_leaves_no_file(tmp_path: Path) -> None:
     path = tmp_path / "s.zip"
     write(path)
     before = path.read_bytes()
@@ -90,7 +92,7 @@ def test_an_exception_leaves_the_earlier_archive_and_no_other_file(tmp_path: Pat
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_nothing_stands_under_the_name_before_the_end(tmp_path: Path) -> None:
+def test_archive_appears_only_on_exit(tmp_path: Path) -> None:
     path = tmp_path / "s.zip"
     with SubmissionWriter(path, "m") as writer:
         writer.add("lattice/0000", DEPTH)
@@ -98,7 +100,7 @@ def test_nothing_stands_under_the_name_before_the_end(tmp_path: Path) -> None:
     assert path.exists()
 
 
-def test_seconds_go_into_runtime(tmp_path: Path) -> None:
+def test_seconds_are_stored_in_runtime(tmp_path: Path) -> None:
     with SubmissionWriter(tmp_path / "s.zip", "m", runtime={"gpu": "x"}) as writer:
         writer.add("lattice/0000", DEPTH, seconds=0.25)
     with zipfile.ZipFile(tmp_path / "s.zip") as archive:
@@ -106,14 +108,14 @@ def test_seconds_go_into_runtime(tmp_path: Path) -> None:
     assert runtime == {"gpu": "x", "seconds": {"lattice/0000": 0.25}}
 
 
-def test_values_without_prediction_and_other_precisions_are_kept(tmp_path: Path) -> None:
-    odd = np.array([[np.nan, np.inf, -np.inf, 0.0], [-1.0, 1e300, 1e-300, 2.0], [1, 2, 3, 4]])
+def test_invalid_values_and_other_dtypes_are_written(tmp_path: Path) -> None:
+    values = np.array([[np.nan, np.inf, -np.inf, 0.0], [-1.0, 1e300, 1e-300, 2.0], [1, 2, 3, 4]])
     with SubmissionWriter(tmp_path / "s.zip", "m") as writer:
-        writer.add("lattice/0000", odd)
+        writer.add("lattice/0000", values)
         writer.add("lattice/0001", np.asfortranarray(DEPTH.astype(">f4")))
     with open_submission(tmp_path / "s.zip", EXPECTED) as reader:
         with np.errstate(over="ignore", under="ignore"):
-            np.testing.assert_array_equal(reader.read("lattice/0000"), odd.astype(np.float32))
+            np.testing.assert_array_equal(reader.read("lattice/0000"), values.astype(np.float32))
         np.testing.assert_array_equal(reader.read("lattice/0001"), DEPTH)
 
 
@@ -127,7 +129,7 @@ class GpuTensor:
         raise TypeError("can't convert cuda:0 device type tensor to numpy")
 
 
-def test_anything_with_an_array_interface_is_taken(tmp_path: Path) -> None:
+def test_add_accepts_array_interface_and_lists(tmp_path: Path) -> None:
     with SubmissionWriter(tmp_path / "s.zip", "m") as writer:
         writer.add("lattice/0000", Tensor())
         writer.add("lattice/0001", DEPTH.tolist())
@@ -152,7 +154,7 @@ def test_anything_with_an_array_interface_is_taken(tmp_path: Path) -> None:
         ("lattice/0001", [[1.0], [1.0, 2.0]], "cannot become a numpy array"),
     ],
 )
-def test_add_refuses_in_words(tmp_path: Path, view_id: str, depth: object, words: str) -> None:
+def test_add_rejects_invalid_view_id_and_depth(tmp_path: Path, view_id: str, depth: object, words: str) -> None:
     with SubmissionWriter(tmp_path / "s.zip", "m") as writer:
         writer.add("lattice/0000", DEPTH)
         with pytest.raises(InputError, match=words):
@@ -161,7 +163,7 @@ def test_add_refuses_in_words(tmp_path: Path, view_id: str, depth: object, words
     assert check_archive(tmp_path / "s.zip", EXPECTED) == []
 
 
-def test_add_needs_an_open_writer_and_a_sane_time(tmp_path: Path) -> None:
+def test_add_requires_open_writer_and_finite_seconds(tmp_path: Path) -> None:
     writer = SubmissionWriter(tmp_path / "s.zip", "m")
     with pytest.raises(InputError, match="not open, expected add"):
         writer.add("lattice/0000", DEPTH)
@@ -182,24 +184,20 @@ def test_add_needs_an_open_writer_and_a_sane_time(tmp_path: Path) -> None:
         ({"method": "m", "runtime": {"s": object()}}, "the metadata is not JSON"),
     ],
 )
-def test_metadata_is_refused_before_anything_is_written(
-    tmp_path: Path, options: dict[str, object], words: str
-) -> None:
+def test_invalid_metadata_raises_on_construction(tmp_path: Path, options: dict[str, object], words: str) -> None:
     with pytest.raises(InputError, match=words):
         SubmissionWriter(tmp_path / "s.zip", **options)  # type: ignore[arg-type]
 
 
-def test_targets_that_cannot_be_written(tmp_path: Path) -> None:
+def test_unwritable_target_raises_input_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"), SubmissionWriter(tmp_path / "a" / "s.zip", "m"):
         pass
     with pytest.raises(InputError, match="is a directory"), SubmissionWriter(tmp_path, "m"):
         pass
 
 
-def test_an_archive_past_4_gb_has_zip64_offsets_and_reads_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # A low limit stands in for the 4 GB: the same fields are written, in kilobytes.
+def test_archive_past_zip64_limit_reads_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A low limit replaces that of 4 GB, so that an archive of some kilobytes has the same zip64 fields.
     monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 1000)
     path = tmp_path / "s.zip"
     views = {f"lattice/{index:04d}": (16, 16) for index in range(4)}

@@ -1,4 +1,4 @@
-"""Hand-built zips: every field can be made to lie."""
+"""Hand-built zip archives, in which every header field can be set to a wrong value."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DEPTH = np.arange(12, dtype=np.float32).reshape(SHAPE) / 7
 
 @dataclass(frozen=True)
 class Record:
-    """One entry: what stands in the directory, and what in the local header where they differ."""
+    """Zip entry: its data, its central-directory fields and the local-header fields, ``None`` where they agree."""
 
     name: bytes
     data: bytes = b""
@@ -42,14 +42,14 @@ class Record:
 
 
 def deflated(name: bytes, data: bytes, level: int = 6) -> Record:
-    """A sound deflated entry."""
+    """Return a valid deflated entry."""
     packed = zlib.compressobj(level, zlib.DEFLATED, -15)
     body = packed.compress(data) + packed.flush()
     return Record(name, body, 8, size=len(data), crc=zlib.crc32(data))
 
 
 def build(records: list[Record], *, count: int | None = None, comment: bytes = b"", disk: int = 0) -> bytes:
-    """Return the zip of these entries."""
+    """Return the bytes of a zip with these entries; ``count`` and ``disk`` override the end record."""
     out, directory = io.BytesIO(), b""
     for record in records:
         offset = out.tell() if record.offset is None else record.offset
@@ -76,40 +76,40 @@ def build(records: list[Record], *, count: int | None = None, comment: bytes = b
 
 
 def npy(array: Array, **kwargs: object) -> bytes:
-    """The bytes of an ``.npy``."""
+    """Return the bytes of an ``.npy`` file."""
     buffer = io.BytesIO()
     np.save(buffer, array, **kwargs)  # type: ignore[arg-type]
     return buffer.getvalue()
 
 
 def npy_header(text: str, version: bytes = b"\1\0") -> bytes:
-    """An ``.npy`` header with any text."""
+    """Return an ``.npy`` header with this text."""
     length = len(text).to_bytes(2 if version == b"\1\0" else 4, "little")
     return b"\x93NUMPY" + version + length + text.encode()
 
 
 def npz(**arrays: Array) -> bytes:
-    """The bytes of an ``.npz``."""
+    """Return the bytes of an ``.npz`` file."""
     buffer = io.BytesIO()
-    save: Callable[..., None] = np.savez_compressed  # numpy 2 types its keywords as options.
+    save: Callable[..., None] = np.savez_compressed  # The type hints of numpy 2 take array keywords for options.
     save(buffer, **arrays)
     return buffer.getvalue()
 
 
 def exr(path: Path, channels: dict[str, Array], **header: object) -> bytes:
-    """The bytes of a scan-line ``.exr``."""
+    """Return the bytes of a scan-line ``.exr`` file."""
     fields = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
     OpenEXR.File(fields, channels).write(str(path))
     return path.read_bytes()
 
 
 def chunk(kind: bytes, body: bytes) -> bytes:
-    """A PNG chunk."""
+    """Return the bytes of a PNG chunk."""
     return len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big")
 
 
 def png(units: Array, *, bits: int = 16, colour: int = 0, interlace: int = 0, idat: bytes | None = None) -> bytes:
-    """A PNG of unfiltered rows."""
+    """Return the bytes of a PNG of unfiltered rows; ``idat`` replaces the compressed rows."""
     rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in units)
     head = struct.pack(">2I5B", units.shape[1], units.shape[0], bits, colour, 0, 0, interlace)
     body = zlib.compress(rows) if idat is None else idat
@@ -123,10 +123,10 @@ GOOD = [META, FIRST, SECOND]
 
 
 def with_first(**changes: object) -> list[Record]:
-    """The good archive with other fields in its first view."""
+    """Return the records of ``GOOD`` with other fields in the entry of the first view."""
     return [META, replace(FIRST, **changes), SECOND]  # type: ignore[arg-type]
 
 
 def with_view(suffix: str, data: bytes) -> list[Record]:
-    """The good archive with other bytes for its first view."""
+    """Return the records of ``GOOD`` with an entry of another suffix and content for the first view."""
     return [META, Record(b"lattice/0000" + suffix.encode(), data), SECOND]

@@ -1,7 +1,6 @@
-"""A small scene for tests of the audit: the printed board and three bars, seen without Blender on any grid.
+"""Small synthetic scene for tests of the audit: the printed board and three bars, imaged without Blender.
 
-Depth comes from the ray caster, colour from looking the board's print up at the same points, over 2 x 2 rays a
-pixel.
+Depth is ray-cast; colour is sampled from the board texture at the same points with 2 x 2 rays per pixel.
 """
 
 from __future__ import annotations
@@ -15,15 +14,16 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView
 from dataset_builder.config.rigs import Camera, rig_cameras
 from dataset_builder.config.specs import RigSpec
-from dataset_builder.config.trajectories import aim_rig
+from dataset_builder.config.trajectories import look_at_with_rig
 from dataset_builder.scene.board_texture import board_texture
-from dataset_builder.scene.model import Bar, WorldMesh
+from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import EyeTruth, RayCaster
 from dataset_builder.scene.shapes.bar_mesh import plain_bar_mesh
 from dataset_builder.scene.shapes.bending import bent_line_m
+from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, transform
 from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
@@ -44,7 +44,7 @@ RAW = StereoCalibration(
     (-9.17e-4, 6.24e-3, 7.70e-4),
     (-0.12, 0.0, 0.0),
 )
-"""A real unit's lenses and rotation; the baseline made round."""
+"""Calibration of a real ZED with the baseline rounded to 0.12 m."""
 
 RIGS = {
     "ideal": RigSpec(WIDTH, HEIGHT),
@@ -55,7 +55,7 @@ RIGS = {
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Bars and the caster that knows them and the floor."""
+    """Bars and a ray caster of the bars and the floor."""
 
     steel: tuple[Bar, ...]
     caster: RayCaster
@@ -63,102 +63,106 @@ class Scene:
 
 @cache
 def scene() -> Scene:
-    """Two straight bars across each other, and a bent one, on the floor z = 0."""
-    bent = bent_line_m(np.array([[-0.08, -0.09, 0.012], [0.08, -0.09, 0.012], [0.08, -0.02, 0.012]]), 0.025)
-    lines = [
+    """Return a scene of two crossing straight bars and a bent one above the floor z = 0."""
+    bent_axis_m = bent_line_m(np.array([[-0.08, -0.09, 0.012], [0.08, -0.09, 0.012], [0.08, -0.02, 0.012]]), 0.025)
+    axes_m = [
         np.array([[-0.12, 0.0, 0.02], [0.12, 0.0, 0.02]]),
         np.array([[0.0, -0.05, 0.04], [0.0, 0.12, 0.04]]),
-        bent,
+        bent_axis_m,
     ]
     steel = tuple(
-        Bar(n, "bar", 0.010, tuple((float(x), float(y), float(z)) for x, y, z in line))
-        for n, line in enumerate(lines, start=1)
+        Bar(n, "bar", 0.010, tuple((float(x), float(y), float(z)) for x, y, z in axis_m))
+        for n, axis_m in enumerate(axes_m, start=1)
     )
-    meshes = [plain_bar_mesh(line, 0.010) for line in lines]
+    meshes = [plain_bar_mesh(axis_m, 0.010) for axis_m in axes_m]
     floor_m = np.array([[-9.0, -9.0, 0.0], [9.0, -9.0, 0.0], [9.0, 9.0, 0.0], [-9.0, 9.0, 0.0]])
     vertices = [*(mesh.vertices_m for mesh in meshes), floor_m]
     faces = [*(mesh.faces for mesh in meshes), np.array([[0, 1, 2], [0, 2, 3]])]
-    starts = np.cumsum([0, *(len(part) for part in vertices)])
+    vertex_offsets = np.cumsum([0, *(len(part) for part in vertices)])
     ids = np.repeat([1, 2, 3, 0], [len(part) for part in faces]).astype(np.uint16)
-    joined = np.concatenate([part + start for part, start in zip(faces, starts, strict=False)]).astype(np.int32)
-    return Scene(steel, RayCaster(WorldMesh(np.concatenate(vertices), joined, ids)))
+    all_faces = np.concatenate([part + start for part, start in zip(faces, vertex_offsets, strict=False)]).astype(
+        np.int32
+    )
+    return Scene(steel, RayCaster(WorldMesh(np.concatenate(vertices), all_faces, ids)))
 
 
 def config(board: BoardSpec | None = BOARD, kind: str = "pile", variants: tuple[str, ...] = ()) -> AuditedConfig:
-    """The scene's config, with as much of a manifest entry as checks read."""
+    """Return the config of the scene with those keys of a manifest entry that the checks read."""
     entry: dict[str, Any] = {"scene": {"assembly": {"kind": kind}, "appearance": {"variants": list(variants)}}}
     return AuditedConfig("scene", entry, scene().steel, board)
 
 
 @cache
 def view(rig: str, azimuth_deg: float = 20.0, distance_m: float = 0.35) -> AuditedView:
-    """A view from 50 degrees above the board."""
+    """Return a view from an elevation of 50 degrees."""
     azimuth, elevation = np.deg2rad(azimuth_deg), np.deg2rad(50.0)
     level = np.cos(elevation)
     towards = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
-    pose = aim_rig(TARGET_M + distance_m * towards, TARGET_M, 0.12)
-    eyes = {name: seen_by(camera) for name, camera in rig_cameras(RIGS[rig], pose).items()}
+    pose = look_at_with_rig(TARGET_M + distance_m * towards, TARGET_M, 0.12)
+    eyes = {name: render_eye(camera) for name, camera in rig_cameras(RIGS[rig], pose).items()}
     return AuditedView("scene/0000", eyes["left"], eyes["right"])
 
 
-def seen_by(camera: Camera) -> AuditedEye:
-    """What a camera sees of the scene: exact depth, and colour of 2 x 2 rays a pixel."""
+def render_eye(camera: Camera) -> EyeView:
+    """Return the view of a camera: exact depth, and colour averaged over 2 x 2 rays per pixel."""
     rays_cam = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
     truth = scene().caster.cast(rays_cam, camera.cam_from_world)
-    return AuditedEye(camera, _colour(camera), truth.depth_m, truth.mask, truth.bars, rays_cam)
+    return EyeView(camera, _colour(camera), truth.depth_m, truth.mask, truth.bars, rays_cam)
 
 
 def _colour(camera: Camera) -> UInt8[ndarray, "h w 3"]:
-    finer = camera.K.copy()
-    finer[:2] *= RAYS_ACROSS
-    finer[:2, 2] += (RAYS_ACROSS - 1) / 2
+    fine_K = camera.K.copy()
+    fine_K[:2] *= RAYS_ACROSS
+    fine_K[:2, 2] += (RAYS_ACROSS - 1) / 2
     width, height = RAYS_ACROSS * camera.width, RAYS_ACROSS * camera.height
-    rays_cam = pixel_rays(finer, width, height, camera.distortion)
+    rays_cam = pixel_rays(fine_K, width, height, camera.distortion)
     truth = scene().caster.cast(rays_cam, camera.cam_from_world)
-    levels = np.where(truth.mask, STEEL_LEVEL, _print_levels(rays_cam, truth, camera))
+    levels = np.where(truth.mask, STEEL_LEVEL, _board_levels(rays_cam, truth, camera))
     mean = levels.reshape(camera.height, RAYS_ACROSS, camera.width, RAYS_ACROSS).mean(axis=(1, 3))
     return np.repeat(np.round(mean).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def _print_levels(rays_cam: Float64[ndarray, "h w 3"], truth: EyeTruth, camera: Camera) -> ndarray:
+def _board_levels(rays_cam: Float64[ndarray, "h w 3"], truth: EyeTruth, camera: Camera) -> ndarray:
     points_m = transform(inverse_rigid(camera.cam_from_world), rays_cam * truth.depth_m[..., None])
     column = (points_m[..., 0] + BOARD.width_m / 2) * PX_PER_M - 0.5
     row = (BOARD.height_m / 2 - points_m[..., 1]) * PX_PER_M - 0.5
     at = (column.astype(np.float32), row.astype(np.float32))
     border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": FLOOR_LEVEL}
-    return np.asarray(cv2.remap(_printed(), *at, cv2.INTER_LINEAR, **border))
+    return np.asarray(cv2.remap(_board_texture(), *at, cv2.INTER_LINEAR, **border))
 
 
 @cache
-def _printed() -> UInt8[ndarray, "h w"]:
+def _board_texture() -> UInt8[ndarray, "h w"]:
     return board_texture(BOARD, PX_PER_M)
 
 
-def with_camera(eye: AuditedEye, **changes: Any) -> AuditedEye:
-    """The eye with a camera that says something else, and the rays that follow from it."""
+def with_camera(eye: EyeView, **changes: Any) -> EyeView:
+    """Return ``eye`` with changed camera parameters and the corresponding rays."""
     camera = replace(eye.camera, **changes)
     rays_cam = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
     return replace(eye, camera=camera, rays_cam=rays_cam)
 
 
-def with_depth(seen: AuditedView, factor: float) -> AuditedView:
-    """The view with the depth of both eyes times a factor."""
-    left, right = (replace(eye, depth_m=(eye.depth_m * np.float32(factor))) for eye in (seen.left, seen.right))
-    return AuditedView(seen.view_id, left, right)
+def with_depth(original: AuditedView, factor: float) -> AuditedView:
+    """Return the view with the depth of both cameras multiplied by ``factor``."""
+    left, right = (
+        replace(eye, depth_m=(eye.depth_m * np.float32(factor))) for eye in (original.left, original.right)
+    )
+    return AuditedView(original.view_id, left, right)
 
 
-def with_baseline(seen: AuditedView, more_m: float) -> AuditedView:
-    """The view with a right camera that says it stands further off."""
-    pose = seen.right.camera.cam_from_world.copy()
+def with_baseline(original: AuditedView, more_m: float) -> AuditedView:
+    """Return the view with the right camera displaced by ``more_m`` along the baseline."""
+    pose = original.right.camera.cam_from_world.copy()
     pose[0, 3] -= more_m
-    return AuditedView(seen.view_id, seen.left, with_camera(seen.right, cam_from_world=pose))
+    return AuditedView(original.view_id, original.left, with_camera(original.right, cam_from_world=pose))
 
 
-def with_K_shift(seen: AuditedView, eyes: tuple[str, ...], axis: int, px: float) -> AuditedView:
-    """The view with the principal points of some eyes elsewhere along u (0) or v (1)."""
-    changed = dict(seen.eyes)
+def with_K_shift(original: AuditedView, eyes: tuple[str, ...], axis: int, px: float) -> AuditedView:
+    """Return the view with the principal points of ``eyes`` shifted by ``px`` along u (axis 0) or v (axis 1)."""
+    changed = dict(original.eyes)
     for name in eyes:
         K = changed[name].camera.K.copy()
         K[axis, 2] += px
         changed[name] = with_camera(changed[name], K=K)
-    return AuditedView(seen.view_id, changed["left"], changed["right"])
+    return AuditedView(original.view_id, changed["left"], changed["right"])

@@ -1,4 +1,4 @@
-"""The audit passes a good folder, with figures, and names what is wrong with a bad one."""
+"""Audit of a dataset folder: a correct folder passes, and every defect is reported."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
 from dataset_builder.audit.files import array_problems, row_problems
 from dataset_builder.audit.run import VIEW_CHECKS
-from dataset_builder.build.bars_table import read_bars
-from rebar_depth_bench.data.ground_truth import CACHE_FOLDER
+from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.scoring.ground_truth import CACHE_FOLDER
 
 Row = dict[str, Any]
 
@@ -36,44 +36,48 @@ def copy(tiny_root: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def row(tiny_root: Path) -> Row:
-    found: Row = rdb.load(tiny_root, "lattice")[4]
-    return found
+    loaded: Row = rdb.load(tiny_root, "lattice")[4]
+    return loaded
 
 
-@pytest.mark.render
-def test_a_good_folder_passes_every_check_with_figures(tiny_root: Path) -> None:
+@pytest.mark.usefixtures("blender")
+def test_correct_dataset_passes_with_measured_values(tiny_root: Path) -> None:
     command = [sys.executable, "-m", "dataset_builder", "audit", str(tiny_root), "--depth-views", "2"]
-    finished = subprocess.run(command, capture_output=True, text=True, check=False, env={"COLUMNS": "160"})
-    assert finished.returncode == 0, finished.stdout + finished.stderr
-    assert "FAILED" not in finished.stdout
-    assert finished.stdout.count(" ok ") == 2 + 2 * (3 + len(VIEW_CHECKS))
-    assert "2 views: median 0.0" in finished.stdout  # micrometres against Cycles
+    process = subprocess.run(command, capture_output=True, text=True, check=False, env={"COLUMNS": "160"})
+    assert process.returncode == 0, process.stdout + process.stderr
+    assert "FAILED" not in process.stdout
+    assert process.stdout.count(" ok ") == 2 + 2 * (3 + len(VIEW_CHECKS))
+    assert "2 views: median 0.0" in process.stdout  # micrometre agreement with Cycles
 
 
-def failed(root: Path) -> dict[str, tuple[str, ...]]:
+def failed_checks(root: Path) -> dict[str, tuple[str, ...]]:
     return {check.name: check.problems for check in audit(root, depth_views=0).failures}
 
 
-def test_a_changed_a_missing_and_a_foreign_file_are_named(copy: Path) -> None:
+def test_changed_missing_and_extra_files_are_reported(copy: Path) -> None:
     mesh = copy / "meshes" / "lattice.ply"
     mesh.write_bytes(mesh.read_bytes()[:-1] + b"\x7f")
     (copy / "bars.parquet").unlink()
     (copy / "lattice" / "extra.txt").write_text("")
-    problems = failed(copy)["files against the manifest"]
+    problems = failed_checks(copy)["files against the manifest"]
     assert len(problems) == 3
     assert any(problem.startswith("meshes/lattice.ply: SHA-256 is") for problem in problems)
     assert "bars.parquet: is missing" in problems
     assert "lattice/extra.txt: is not in the manifest" in problems
 
 
-def test_a_wrong_digest_is_named(copy: Path) -> None:
+@pytest.mark.slow
+def test_wrong_ground_truth_digest_is_reported(copy: Path) -> None:
     manifest = json.loads((copy / "manifest.json").read_text())
     manifest["ground_truth"]["digest"] = "sha256:00"
     (copy / "manifest.json").write_text(json.dumps(manifest))
-    assert "the ground-truth digest is sha256:00, expected sha256:" in failed(copy)["digests of the manifest"][0]
+    assert (
+        "the ground-truth digest is sha256:00, expected sha256:"
+        in failed_checks(copy)["digests of the manifest"][0]
+    )
 
 
-def changed(row: Row, **cells: Any) -> Row:
+def with_cells(row: Row, **cells: Any) -> Row:
     return {**row, **cells}
 
 
@@ -91,12 +95,12 @@ def changed(row: Row, **cells: Any) -> Row:
         (lambda row: {"right_distortion": row["right_distortion"] + np.inf}, "right_distortion is not (5,)"),
     ],
 )
-def test_arrays_that_cannot_be_judged_are_named(
+def test_malformed_arrays_are_reported(
     tiny_root: Path, row: Row, damage: Callable[[Row], Row], words: str
 ) -> None:
     rig = open_folder(tiny_root).config("lattice")["rig"]
     assert list(array_problems(row, rig)) == []
-    problems = list(array_problems(changed(row, **damage(row)), rig))
+    problems = list(array_problems(with_cells(row, **damage(row)), rig))
     assert any(words in problem for problem in problems), problems
 
 
@@ -117,30 +121,32 @@ def test_arrays_that_cannot_be_judged_are_named(
         (lambda _: {"view_id": "lattice/0001"}, "the row's view_id is lattice/0001"),
     ],
 )
-def test_every_broken_invariant_is_named(
+def test_broken_row_invariants_are_reported(
     tiny_root: Path, row: Row, damage: Callable[[Row], Row], words: str
 ) -> None:
     record = open_folder(tiny_root).views("lattice")[4]
     bar_ids = {bar.bar_id for bar in read_bars(tiny_root / "bars.parquet")["lattice"]}
     assert list(row_problems(row, record, bar_ids)) == []
-    problems = list(row_problems(changed(row, **damage(row)), record, bar_ids))
+    problems = list(row_problems(with_cells(row, **damage(row)), record, bar_ids))
     assert any(words in problem for problem in problems), problems
 
 
-def test_a_manifest_of_other_cameras_is_noticed(copy: Path) -> None:
-    """The rows stay as they are; the manifest claims a longer baseline and another dome."""
+@pytest.mark.slow
+def test_manifest_with_other_cameras_is_reported(copy: Path) -> None:
+    """Audit unchanged rows against a manifest with a longer baseline and another ring radius."""
     manifest = json.loads((copy / "manifest.json").read_text())
     manifest["configs"]["lattice"]["rig"]["baseline_m"] = 0.121
     manifest["configs"]["lattice-orbit"]["protocol"]["radius_m"] = 0.326
     (copy / "manifest.json").write_text(json.dumps(manifest))
-    found = failed(copy)
-    assert set(found) == {"lattice: cameras", "lattice-orbit: cameras"}
-    assert any("baseline_m is 0.12, expected 0.121" in problem for problem in found["lattice: cameras"])
-    assert all("cam_from_world is" in problem for problem in found["lattice-orbit: cameras"])
+    failures = failed_checks(copy)
+    assert set(failures) == {"lattice: cameras", "lattice-orbit: cameras"}
+    assert any("baseline_m is 0.12, expected 0.121" in problem for problem in failures["lattice: cameras"])
+    assert all("cam_from_world is" in problem for problem in failures["lattice-orbit: cameras"])
 
 
-def test_a_swapped_row_is_noticed(copy: Path) -> None:
-    """Two views change places in a shard, with a manifest that is otherwise in order."""
+@pytest.mark.slow
+def test_swapped_rows_are_reported(copy: Path) -> None:
+    """Swap two views in a shard while the rest of the manifest stays consistent."""
     shard = next(copy.glob("lattice/*00000-of*.parquet"))
     table = pq.read_table(shard)
     order = [1, 0, *range(2, table.num_rows)]
@@ -149,11 +155,11 @@ def test_a_swapped_row_is_noticed(copy: Path) -> None:
     name = shard.relative_to(copy).as_posix()
     manifest["files"][name] = hashlib.sha256(shard.read_bytes()).hexdigest()
     (copy / "manifest.json").write_text(json.dumps(manifest))
-    problems = failed(copy)["lattice: rows"]
+    problems = failed_checks(copy)["lattice: rows"]
     assert any("the row's view_id is" in problem for problem in problems)
 
 
-def test_records_are_compared_whole(tiny_root: Path, row: Row) -> None:
+def test_all_fields_of_view_record_are_compared(tiny_root: Path, row: Row) -> None:
     folder = open_folder(tiny_root)
     record = replace(folder.views("lattice")[4], scored_px=1)
     problems = list(row_problems(row, record, set(range(1, 76))))

@@ -1,4 +1,4 @@
-"""Markers that OpenCV finds in pictures against the cameras that are said to have taken them."""
+"""Audit of markers: positions detected by OpenCV compared with projections by the stored cameras."""
 
 from __future__ import annotations
 
@@ -8,112 +8,116 @@ import numpy as np
 import pytest
 
 from dataset_builder.audit.markers import (
-    FoundMarkers,
-    corner_figures,
-    found_markers,
+    DetectedMarkers,
+    detect_markers,
+    detect_view_markers,
+    fit_inset,
     inset_directions,
-    least_width_px,
     marker_verdict,
+    min_width_px,
     projected_corners_px,
-    view_markers,
 )
 from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView
 from rebar_depth_bench.geometry.aruco_board import marker_corners_m
 from tests.builder.audit.audit_scene import BOARD, RIGS, config, view, with_baseline, with_K_shift
 
-GRID = pytest.mark.parametrize("rig", RIGS)
+EVERY_GRID = pytest.mark.parametrize("rig", RIGS)
 
 
 def verdict(*views: AuditedView, of: AuditedConfig | None = None) -> Check:
     audited = of or config()
-    return marker_verdict(audited, [view_markers(audited, seen) for seen in views])
+    return marker_verdict(audited, [detect_view_markers(audited, audited_view) for audited_view in views])
 
 
-@GRID
-def test_markers_of_good_pictures_are_where_the_cameras_say(rig: str) -> None:
-    found = [found_markers(eye, BOARD) for eye in view(rig).eyes.values()]
-    assert all(len(eye.found_px) == eye.expected >= 2 for eye in found)
-    inset_px, rms_px, place_px = corner_figures(found)
-    assert abs(inset_px) < 0.3  # no tone curve in these pictures
-    assert rms_px < 0.3
-    assert place_px < 0.15
+@pytest.mark.slow
+@EVERY_GRID
+def test_detected_markers_match_projections(rig: str) -> None:
+    detections = [detect_markers(eye, BOARD) for eye in view(rig).eyes.values()]
+    assert all(len(eye.detected_px) == eye.expected >= 2 for eye in detections)
+    inset_px, corner_rms_px, centre_rms_px = fit_inset(detections)
+    assert abs(inset_px) < 0.3  # These images have no tone curve.
+    assert corner_rms_px < 0.3
+    assert centre_rms_px < 0.15
     assert verdict(view(rig)).passed
 
 
-@GRID
+@EVERY_GRID
 @pytest.mark.parametrize("axis", [0, 1])
-def test_both_principal_points_half_a_pixel_off_are_noticed(rig: str, axis: int) -> None:
+def test_half_pixel_shift_of_both_K_is_reported(rig: str, axis: int) -> None:
     check = verdict(with_K_shift(view(rig), ("left", "right"), axis, 0.5))
     assert any("found markers lie" in problem for problem in check.problems), check
 
 
-@GRID
-def test_one_principal_point_half_a_pixel_off_is_noticed(rig: str) -> None:
+@EVERY_GRID
+def test_half_pixel_shift_of_right_K_is_reported(rig: str) -> None:
     assert not verdict(with_K_shift(view(rig), ("right",), 0, 0.5)).passed
 
 
-def test_a_baseline_that_is_off_is_noticed() -> None:
+def test_baseline_error_of_2_mm_is_reported() -> None:
     assert not verdict(with_baseline(view("ideal"), 0.002)).passed
 
 
-def test_forgotten_distortion_is_noticed() -> None:
-    seen = view("raw")
-    left = replace(seen.left, camera=replace(seen.left.camera, distortion=np.zeros(5)))
-    check = verdict(replace(seen, left=left))
+def test_missing_distortion_is_reported() -> None:
+    original = view("raw")
+    left = replace(original.left, camera=replace(original.left.camera, distortion=np.zeros(5)))
+    check = verdict(replace(original, left=left))
     assert any("markers" in problem for problem in check.problems), check
 
 
-def without_markers(eye: AuditedEye) -> AuditedEye:
+def without_markers(eye: EyeView) -> EyeView:
     return replace(eye, rgb=np.full_like(eye.rgb, 128))
 
 
-def test_markers_that_are_not_found_are_counted() -> None:
-    seen = view("ideal")
-    bare = AuditedView("x", without_markers(seen.left), without_markers(seen.right))
-    check = verdict(bare)
+def test_undetected_markers_are_reported() -> None:
+    original = view("ideal")
+    blank_view = AuditedView("x", without_markers(original.left), without_markers(original.right))
+    check = verdict(blank_view)
     assert any(problem.startswith("0 of ") for problem in check.problems)
-    assert verdict(bare, of=config(variants=("spotlight",))).passed  # hard light may hide them
-    assert not verdict(bare, of=config(variants=("clutter",))).passed
+    assert verdict(
+        blank_view, of=config(variants=("spotlight",))
+    ).passed  # Hard light may make markers undetectable.
+    assert not verdict(blank_view, of=config(variants=("clutter",))).passed
 
 
-def test_markers_behind_things_are_not_asked_for() -> None:
+def test_occluded_markers_are_not_expected() -> None:
     eye = view("ideal").left
-    asked = found_markers(eye, BOARD).expected
-    hidden = found_markers(replace(eye, depth_m=eye.depth_m * np.float32(0.9)), BOARD)
-    assert asked >= 2
-    assert (hidden.expected, len(hidden.found_px)) == (0, 0)
-    steel = found_markers(replace(eye, mask=np.ones_like(eye.mask)), BOARD)
+    num_expected = detect_markers(eye, BOARD).expected
+    hidden = detect_markers(replace(eye, depth_m=eye.depth_m * np.float32(0.9)), BOARD)
+    assert num_expected >= 2
+    assert (hidden.expected, len(hidden.detected_px)) == (0, 0)
+    steel = detect_markers(replace(eye, mask=np.ones_like(eye.mask)), BOARD)
     assert steel.expected == 0
 
 
-def test_without_large_markers_or_a_board_nothing_is_asked() -> None:
+@pytest.mark.slow
+def test_check_is_skipped_without_large_markers_or_board() -> None:
     far = view("ideal", distance_m=1.6)
-    assert verdict(far).found.startswith("none large enough")
-    assert verdict(far, of=config(board=None)).found == "no board in this scene"
+    assert verdict(far).measured.startswith("none large enough")
+    assert verdict(far, of=config(board=None)).measured == "no board in this scene"
 
 
-def test_an_inset_is_told_and_taken_off() -> None:
+def test_inset_is_estimated_and_removed() -> None:
     square = np.array([[[0.0, 0.0], [40.0, 0.0], [40.0, 40.0], [0.0, 40.0]]])
     assert inset_directions(square)[0].tolist() == [[1, 1], [-1, 1], [-1, -1], [1, -1]]
     assert inset_directions(square[:, ::-1])[0].tolist() == [[1, -1], [-1, -1], [-1, 1], [1, 1]]
-    found = square + 0.6 * inset_directions(square) + np.array([0.1, 0.0])
-    figures = corner_figures([FoundMarkers(1, found, square, np.zeros((1, 4, 3)))])
-    assert figures == pytest.approx((0.6, 0.1, 0.1))
-    assert corner_figures([FoundMarkers(1, np.zeros((0, 4, 2)), np.zeros((0, 4, 2)), np.zeros((0, 4, 3)))]) == (
+    detected_px = square + 0.6 * inset_directions(square) + np.array([0.1, 0.0])
+    inset_and_residuals = fit_inset([DetectedMarkers(1, detected_px, square, np.zeros((1, 4, 3)))])
+    assert inset_and_residuals == pytest.approx((0.6, 0.1, 0.1))
+    assert fit_inset([DetectedMarkers(1, np.zeros((0, 4, 2)), np.zeros((0, 4, 2)), np.zeros((0, 4, 3)))]) == (
         0,
         0,
         0,
     )
 
 
-def test_the_least_width_of_a_slanted_marker_is_its_height() -> None:
+def test_minimum_width_of_slanted_marker_is_its_height() -> None:
     slanted = np.array([[0.0, 0.0], [100.0, 0.0], [110.0, 20.0], [10.0, 20.0]])
-    assert least_width_px(slanted) == pytest.approx(20.0)
+    assert min_width_px(slanted) == pytest.approx(20.0)
 
 
-def test_markers_behind_the_camera_are_no_number() -> None:
+def test_markers_behind_camera_project_to_nan() -> None:
     camera = view("ideal").left.camera
     turned = replace(camera, cam_from_world=np.diag([1.0, -1.0, -1.0, 1.0]) @ camera.cam_from_world)
     assert all(np.isnan(quad).all() for quad in projected_corners_px(turned, marker_corners_m(BOARD)).values())
-    assert found_markers(replace(view("ideal").left, camera=turned), BOARD).expected == 0
+    assert detect_markers(replace(view("ideal").left, camera=turned), BOARD).expected == 0

@@ -1,7 +1,7 @@
-"""The Blender scene: what Cycles renders is what the evaluated mesh says, byte for byte every time.
+"""Blender scene: agreement of Cycles' depth with the evaluated mesh, and byte-identical repeated renders.
 
-Blender runs in a process of its own, ``python -m tests.builder.blender.test_blender_scene FOLDER``, which renders
-tiny pictures of a small lattice into FOLDER; the tests look at what it left there.
+Blender runs in a separate process, ``python -m tests.builder.blender.test_blender_scene FOLDER``, which renders
+small images of a small lattice into FOLDER; the tests check the results.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from numpy import ndarray
 
 from dataset_builder.config.rigs import Camera
 from dataset_builder.config.specs import ColourSpec, LatticeSpec, SceneSpec
-from dataset_builder.config.trajectories import aim_rig
+from dataset_builder.config.trajectories import look_at_with_rig
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.cameras import ideal_K, look_at, pixel_rays, project, transform
-from tests.builder.blender.probe import run_probe
-
-pytestmark = pytest.mark.render
+from tests.builder.blender.probe import RunProbe
 
 SCENE = SceneSpec("small", LatticeSpec(pitch_m=0.05), BoardSpec(), seed=3)
-BARS = 12
+NUM_BARS = 12
 TARGET_M = np.array([0.0, 0.0, 0.05])
 
-LOW = Camera(ideal_K(128, 72), np.zeros(5), aim_rig(np.array([0.20, -0.24, 0.15]), TARGET_M, 0.12), 128, 72)
-ODD = Camera(
+LATTICE_CAMERA = Camera(
+    ideal_K(128, 72), np.zeros(5), look_at_with_rig(np.array([0.20, -0.24, 0.15]), TARGET_M, 0.12), 128, 72
+)
+ANISOTROPIC_CAMERA = Camera(
     np.array([[70.0, 0.0, 40.3], [0.0, 83.0, 61.7], [0.0, 0.0, 1.0]]),
     np.zeros(5),
     look_at(np.array([-0.3, -0.2, 0.3]), TARGET_M),
     110,
     90,
 )
-ABOVE = Camera(
+TOP_CAMERA = Camera(
     np.array([[360.0, 0.0, 239.5], [0.0, 360.0, 179.5], [0.0, 0.0, 1.0]]),
     np.zeros(5),
     look_at(np.array([0.0, 0.0, 0.44]), np.zeros(3), np.array([0.0, 1.0, 0.0])),
@@ -52,7 +52,7 @@ ABOVE = Camera(
 
 
 def probe(folder: Path) -> None:
-    """Run inside Blender's process: render, read back, and write everything down."""
+    """Render, read back and write all results to ``folder`` (runs in the Blender process)."""
     from dataset_builder.blender.camera import place_camera
     from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
     from dataset_builder.blender.render import configure_colour, render_colour, render_depth
@@ -60,32 +60,34 @@ def probe(folder: Path) -> None:
 
     facts: dict[str, Any] = {}
     build_scene(lattice_assembly(SCENE.assembly), SCENE)  # type: ignore[arg-type]
-    facts["refusal"] = _message_of(lambda: render_colour(LOW, seed=1, scratch_dir=folder))
-    facts["skew"] = _message_of(lambda: place_camera(replace(LOW, K=LOW.K + np.eye(3, k=1))))
+    facts["refusal"] = _error_message(lambda: render_colour(LATTICE_CAMERA, seed=1, scratch_dir=folder))
+    facts["skew"] = _error_message(
+        lambda: place_camera(replace(LATTICE_CAMERA, K=LATTICE_CAMERA.K + np.eye(3, k=1)))
+    )
     mesh = evaluated_world_mesh()
-    arrays: dict[str, ndarray] = {"depth_first": render_depth(ODD, scratch_dir=folder)}
+    arrays: dict[str, ndarray] = {"depth_first": render_depth(ANISOTROPIC_CAMERA, scratch_dir=folder)}
     configure_colour(ColourSpec(samples=2), threads=1)
-    arrays["colour"] = render_colour(LOW, seed=1, scratch_dir=folder)
-    arrays["depth_low"] = render_depth(LOW, scratch_dir=folder)
-    arrays["colour_after_depth"] = render_colour(LOW, seed=1, scratch_dir=folder)
-    arrays["other_seed"] = render_colour(LOW, seed=2, scratch_dir=folder)
+    arrays["colour"] = render_colour(LATTICE_CAMERA, seed=1, scratch_dir=folder)
+    arrays["depth_low"] = render_depth(LATTICE_CAMERA, scratch_dir=folder)
+    arrays["colour_after_depth"] = render_colour(LATTICE_CAMERA, seed=1, scratch_dir=folder)
+    arrays["other_seed"] = render_colour(LATTICE_CAMERA, seed=2, scratch_dir=folder)
     facts["left_over"] = sorted(path.name for path in folder.iterdir())
     build_scene(lattice_assembly(SCENE.assembly), SCENE)  # type: ignore[arg-type]
-    again = evaluated_world_mesh()
+    repeated_mesh = evaluated_world_mesh()
     configure_colour(ColourSpec(samples=2), threads=2)
-    arrays["colour_two_threads"] = render_colour(LOW, seed=1, scratch_dir=folder)
-    arrays["above"] = render_colour(ABOVE, seed=1, scratch_dir=folder)
-    facts["deviation"] = place_camera(LOW)
-    facts["mesh_repeats"] = _same_mesh(mesh, again)
+    arrays["colour_two_threads"] = render_colour(LATTICE_CAMERA, seed=1, scratch_dir=folder)
+    arrays["above"] = render_colour(TOP_CAMERA, seed=1, scratch_dir=folder)
+    facts["deviation"] = place_camera(LATTICE_CAMERA)
+    facts["mesh_repeats"] = _same_mesh(mesh, repeated_mesh)
     facts["objects"] = _steel_objects()
-    _hide_and_move()
+    _modify_bars()
     _save_mesh(folder / "mesh.npz", mesh)
     _save_mesh(folder / "changed.npz", evaluated_world_mesh())
     np.savez(folder / "arrays.npz", **arrays)
     (folder / "facts.json").write_text(json.dumps(facts))
 
 
-def _message_of(action: Any) -> str:
+def _error_message(action: Any) -> str:
     try:
         action()
     except Exception as error:
@@ -95,7 +97,7 @@ def _message_of(action: Any) -> str:
 
 def _same_mesh(a: WorldMesh, b: WorldMesh) -> bool:
     pairs = [(a.vertices_m, b.vertices_m), (a.faces, b.faces), (a.face_bar_id, b.face_bar_id)]
-    return all(one.tobytes() == other.tobytes() for one, other in pairs)
+    return all(x.tobytes() == y.tobytes() for x, y in pairs)
 
 
 def _steel_objects() -> list[dict[str, Any]]:
@@ -105,8 +107,8 @@ def _steel_objects() -> list[dict[str, Any]]:
     return [{"bar_id": item["bar_id"], "rust": item["rust_amount"], "mesh": item.data.name} for item in steel]
 
 
-def _hide_and_move() -> None:
-    """Hide bar 1 from render, turn and move bar 2, thicken bar 3 by a modifier."""
+def _modify_bars() -> None:
+    """Hide bar 1 from renders, rotate and move bar 2, thicken bar 3 with a modifier."""
     import bpy
 
     by_id = {item.get("bar_id"): item for item in bpy.data.objects}
@@ -122,7 +124,7 @@ def _save_mesh(path: Path, mesh: WorldMesh) -> None:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, run_probe: RunProbe) -> Path:
     return run_probe("tests.builder.blender.test_blender_scene", tmp_path_factory.mktemp("blender"))
 
 
@@ -147,99 +149,101 @@ def steel_vertices_m(mesh: WorldMesh, bar_id: int) -> Float64[ndarray, "n 3"]:
 
 
 @pytest.mark.parametrize("other", ["colour_after_depth", "colour_two_threads"])
-def test_colour_repeats_byte_for_byte(arrays: dict[str, ndarray], other: str) -> None:
+def test_repeated_colour_render_is_byte_identical(arrays: dict[str, ndarray], other: str) -> None:
     assert arrays["colour"].shape == (72, 128, 3)
     assert arrays["colour"].dtype == np.uint8
     assert arrays["colour"].tobytes() == arrays[other].tobytes()
 
 
-def test_seed_moves_the_noise_alone(arrays: dict[str, ndarray]) -> None:
+def test_seed_changes_only_noise(arrays: dict[str, ndarray]) -> None:
     difference = np.abs(arrays["colour"].astype(int) - arrays["other_seed"])
     assert difference.max() > 0
     assert np.median(difference) <= 3
 
 
-def test_exposure_is_sound(arrays: dict[str, ndarray]) -> None:
+def test_exposure_is_neither_dark_nor_clipped(arrays: dict[str, ndarray]) -> None:
     assert 90 < arrays["colour"].mean() < 190
     assert (arrays["colour"].min(axis=2) >= 250).mean() < 0.001
     assert arrays["colour"].min() < 60
 
 
-@pytest.mark.parametrize(("name", "camera"), [("depth_low", LOW), ("depth_first", ODD)])
-def test_cycles_sees_the_evaluated_mesh(
+@pytest.mark.parametrize(("name", "camera"), [("depth_low", LATTICE_CAMERA), ("depth_first", ANISOTROPIC_CAMERA)])
+def test_cycles_depth_equals_evaluated_mesh(
     arrays: dict[str, ndarray], mesh: WorldMesh, name: str, camera: Camera
 ) -> None:
     rays_cam = pixel_rays(camera.K, camera.width, camera.height)
     truth = RayCaster(mesh).cast(rays_cam, camera.cam_from_world)
     assert truth.mask.mean() > 0.01
     assert arrays[name].dtype == np.float32
-    off_m = np.abs(arrays[name].astype(np.float64) - truth.depth_m)
-    assert np.median(off_m) < 1e-6
-    assert (off_m > 1e-4).mean() < 1e-3
-    assert (off_m[truth.mask] > 1e-5).mean() < 5e-3
+    error_m = np.abs(arrays[name].astype(np.float64) - truth.depth_m)
+    assert np.median(error_m) < 1e-6
+    assert (error_m > 1e-4).mean() < 1e-3
+    assert (error_m[truth.mask] > 1e-5).mean() < 5e-3
 
 
-def test_steel_is_the_assembly(mesh: WorldMesh) -> None:
+def test_steel_mesh_equals_assembly(mesh: WorldMesh) -> None:
     assembly = lattice_assembly(LatticeSpec(pitch_m=0.05))
-    assert set(np.unique(mesh.face_bar_id)) == set(range(BARS + 1))
+    assert set(np.unique(mesh.face_bar_id)) == set(range(NUM_BARS + 1))
     for part in assembly.parts:
         assert (mesh.face_bar_id == part.bar_id).sum() == len(part.mesh.faces)
         np.testing.assert_allclose(steel_vertices_m(mesh, part.bar_id), part.mesh.vertices_m, atol=2e-8)
 
 
-def test_the_room_surrounds_the_board(mesh: WorldMesh) -> None:
-    room = mesh.vertices_m[np.unique(mesh.faces[mesh.face_bar_id == 0])]
-    assert (np.ptp(room, axis=0) > [3.0, 3.0, 1.5]).all()
-    corners = np.array([[sx * 0.21, sy * 0.1485, 0.0] for sx in (-1, 1) for sy in (-1, 1)])
-    nearest = np.linalg.norm(room[None] - corners[:, None], axis=2).min(axis=1)
-    assert nearest.max() < 1e-7
+def test_room_surrounds_aruco_board(mesh: WorldMesh) -> None:
+    room_m = mesh.vertices_m[np.unique(mesh.faces[mesh.face_bar_id == 0])]
+    assert (np.ptp(room_m, axis=0) > [3.0, 3.0, 1.5]).all()
+    corners_m = np.array([[sx * 0.21, sy * 0.1485, 0.0] for sx in (-1, 1) for sy in (-1, 1)])
+    nearest_m = np.linalg.norm(room_m[None] - corners_m[:, None], axis=2).min(axis=1)
+    assert nearest_m.max() < 1e-7
 
 
-def test_evaluated_mesh_repeats(facts: dict[str, Any]) -> None:
+def test_evaluated_mesh_is_deterministic(facts: dict[str, Any]) -> None:
     assert facts["mesh_repeats"]
 
 
-def test_evaluated_mesh_follows_what_is_done_to_objects(folder: Path, mesh: WorldMesh) -> None:
+def test_evaluated_mesh_reflects_object_changes(folder: Path, mesh: WorldMesh) -> None:
     changed = WorldMesh(**np.load(folder / "changed.npz"))
     assert 1 not in changed.face_bar_id
-    moved, before = steel_vertices_m(changed, 2), steel_vertices_m(mesh, 2)
-    assert moved[:, 0].mean() - before[:, 0].mean() == pytest.approx(1.0, abs=0.05)
-    # Turned by 0.3 rad about the vertical, a rod along x reaches sideways.
-    assert np.ptp(moved[:, 1]) > np.ptp(before[:, 1]) + 0.02
-    thick, thin = (np.ptp(steel_vertices_m(m, 3)[:, 1:], axis=0) for m in (changed, mesh))
-    assert (thick > thin + 0.005).all()
+    moved, original = steel_vertices_m(changed, 2), steel_vertices_m(mesh, 2)
+    assert moved[:, 0].mean() - original[:, 0].mean() == pytest.approx(1.0, abs=0.05)
+    # A rod along x that is rotated by 0.3 rad about the vertical has a larger extent in y.
+    assert np.ptp(moved[:, 1]) > np.ptp(original[:, 1]) + 0.02
+    thick_m, thin_m = (np.ptp(steel_vertices_m(world_mesh, 3)[:, 1:], axis=0) for world_mesh in (changed, mesh))
+    assert (thick_m > thin_m + 0.005).all()
     np.testing.assert_array_equal(steel_vertices_m(changed, 4), steel_vertices_m(mesh, 4))
 
 
-def test_bars_are_objects_that_share_meshes_and_differ_in_rust(facts: dict[str, Any]) -> None:
+def test_bar_objects_share_meshes_but_not_rust(facts: dict[str, Any]) -> None:
     objects = facts["objects"]
-    assert sorted(item["bar_id"] for item in objects) == list(range(1, BARS + 1))
+    assert sorted(item["bar_id"] for item in objects) == list(range(1, NUM_BARS + 1))
     assert len({item["mesh"] for item in objects}) == 6
-    assert len({item["rust"] for item in objects}) == BARS
+    assert len({item["rust"] for item in objects}) == NUM_BARS
 
 
-def test_markers_are_where_the_layout_says_and_not_mirrored(arrays: dict[str, ndarray]) -> None:
+def test_rendered_markers_match_layout(arrays: dict[str, ndarray]) -> None:
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(arrays["above"])
+    detections, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(arrays["above"])
     assert sorted(ids.ravel()) == list(range(6))
-    for marker_id, found in zip(ids.ravel(), corners, strict=True):
-        expected = project(ABOVE.K, transform(ABOVE.cam_from_world, marker_corners_m(BoardSpec())[int(marker_id)]))
-        # Two samples a pixel leave the detector a pixel or two; a mirrored or turned marker is 40 px off.
-        np.testing.assert_allclose(found[0], expected, atol=2.0)
+    for marker_id, detected in zip(ids.ravel(), detections, strict=True):
+        expected_px = project(
+            TOP_CAMERA.K, transform(TOP_CAMERA.cam_from_world, marker_corners_m(BoardSpec())[int(marker_id)])
+        )
+        # With two samples per pixel the detector is accurate to 1-2 px; a mirrored or rotated marker is 40 px off.
+        np.testing.assert_allclose(detected[0], expected_px, atol=2.0)
 
 
-def test_camera_stands_where_it_was_put(facts: dict[str, Any]) -> None:
+def test_blender_camera_has_requested_pose(facts: dict[str, Any]) -> None:
     assert facts["deviation"] < 1e-6
 
 
-def test_misuse_is_refused_in_words(facts: dict[str, Any]) -> None:
+def test_missing_colour_setup_and_skew_raise_errors(facts: dict[str, Any]) -> None:
     assert facts["refusal"].startswith("BuildError: the scene is not set up for colour")
     assert facts["skew"].startswith("ValueError: Blender's camera has no skew")
 
 
-def test_no_scratch_file_stays(facts: dict[str, Any]) -> None:
+def test_no_scratch_files_remain(facts: dict[str, Any]) -> None:
     assert facts["left_over"] == []
 
 

@@ -1,4 +1,4 @@
-"""The seven configs of the contract, users' own scenes and variants: built, audited, published."""
+"""Standard configs, user scenes and appearance variants: build, audit and publication."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from PIL import Image
 
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
-from dataset_builder.build.bars_table import read_bars
-from dataset_builder.build.contact_sheet import STRIP_PANEL_PX, TILE_PX
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
 from dataset_builder.config.specs import RigSpec, RingSpec
-from dataset_builder.config.trajectories import offsets_m
+from dataset_builder.config.trajectories import camera_offsets_m
+from dataset_builder.pipeline.contact_sheet import STRIP_PANEL_PX, TILE_PX
 from dataset_builder.scene.assemblies import check_fits, make_assembly
+from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.cameras import ideal_K
 from rebar_depth_bench.scoring.score import score
-from tests.conftest import TINY, run_build
+from tests.building import TINY, RunBuild
+from tests.requirements import Repetitions
 
 VIEWS = {"lattice": 504, "lattice-orbit": 100, "lattice-zed": 504, "lattice-zed-raw": 504, "lattice-12": 504}
 VIEWS |= {"pile": 504, "pier": 504}
@@ -31,12 +32,12 @@ GRID = ("--width", "240", "--height", "135", "--samples", "1")
 
 
 @pytest.fixture(scope="module")
-def full_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """All configs, one view each, by the one command that a maintainer gives."""
+def full_root(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) -> Path:
+    """Return the root of a dataset of all configs, one view each, built by a single command."""
     root = tmp_path_factory.mktemp("full") / "dataset"
-    finished = run_build("--out", root, "--views", "1", *GRID)
-    assert finished.returncode == 0, finished.stderr
-    assert f"built: {', '.join(VIEWS)}" in finished.stdout
+    process = run_build("--out", root, "--views", "1", *GRID)
+    assert process.returncode == 0, process.stderr
+    assert f"built: {', '.join(VIEWS)}" in process.stdout
     return root
 
 
@@ -46,13 +47,16 @@ def manifest(full_root: Path) -> dict[str, Any]:
     return loaded
 
 
-def test_the_registry_is_the_contracts() -> None:
-    assert {name: len(offsets_m(make().protocol)) for name, make in CONFIGS.items()} == VIEWS
-    distances = {
-        name: [float(np.linalg.norm(offset)) for offset in offsets_m(CONFIGS[name]().protocol)] for name in VIEWS
+def test_config_registry_matches_contract() -> None:
+    assert {name: len(camera_offsets_m(make().protocol)) for name, make in CONFIGS.items()} == VIEWS
+    distances_m = {
+        name: [float(np.linalg.norm(offset)) for offset in camera_offsets_m(CONFIGS[name]().protocol)]
+        for name in VIEWS
     }
     assert {
-        name: (round(min(far), 6), round(max(far), 6)) for name, far in distances.items() if len(far) == 504
+        name: (round(min(radii_m), 6), round(max(radii_m), 6))
+        for name, radii_m in distances_m.items()
+        if len(radii_m) == 504
     } == {
         **dict.fromkeys(("lattice", "lattice-zed", "lattice-zed-raw", "lattice-12"), (0.22, 0.43)),
         "pile": (0.50, 0.90),
@@ -60,18 +64,16 @@ def test_the_registry_is_the_contracts() -> None:
     }
 
 
-@pytest.mark.render
-def test_plain_datasets_reads_every_config(full_root: Path) -> None:
+def test_datasets_library_loads_every_config(full_root: Path) -> None:
     for name in VIEWS:
         [row] = datasets.load_dataset(str(full_root), name, split="test")
         assert row["view_id"] == f"{name}/{VIEWS[name] // 2:04d}"
         assert row["left_rgb"].size == (240, 135)
 
 
-@pytest.mark.render
 def test_every_config_has_its_scene_and_optics(full_root: Path) -> None:
     bars = read_bars(full_root / "bars.parquet")
-    assert {scene: len(found) for scene, found in bars.items()} == {
+    assert {scene: len(scene_bars) for scene, scene_bars in bars.items()} == {
         "lattice": 75,
         "lattice-12": 75,
         "pile": 6,
@@ -85,19 +87,18 @@ def test_every_config_has_its_scene_and_optics(full_root: Path) -> None:
         assert row["left_distortion"].any() == (name == "lattice-zed-raw")
     raw, rectified = rows["lattice-zed-raw"], rows["lattice-zed"]
     assert raw["baseline_m"] == rectified["baseline_m"] == pytest.approx(0.119978, abs=1e-9)
-    assert (rows["pier"]["left_depth"] == 0).any()  # the sky is no surface
+    assert (rows["pier"]["left_depth"] == 0).any()  # The sky has no depth.
     assert 5 < np.median(rows["pier"]["left_depth"][rows["pier"]["left_mask"]]) < 20
 
 
-@pytest.mark.render
-def test_the_audit_passes_on_all_of_them(full_root: Path) -> None:
-    report = audit(full_root, depth_views=1)
+def test_audit_passes_on_all_configs(full_root: Path, repetitions: Repetitions) -> None:
+    depth_views = repetitions(0, 1)
+    report = audit(full_root, depth_views=depth_views)
     assert [f"{check.name}: {check.problems}" for check in report.failures] == []
-    assert sum("depth against Cycles" in check.name for check in report.checks) == len(VIEWS)
+    assert sum("depth against Cycles" in check.name for check in report.checks) == depth_views * len(VIEWS)
 
 
-@pytest.mark.render
-def test_the_truth_scores_perfectly_on_every_config(full_root: Path, tmp_path: Path) -> None:
+def test_ground_truth_scores_zero_error_on_every_config(full_root: Path, tmp_path: Path) -> None:
     archive = tmp_path / "truth.zip"
     with rdb.SubmissionWriter(archive, method="truth") as writer:
         for name in VIEWS:
@@ -106,38 +107,36 @@ def test_the_truth_scores_perfectly_on_every_config(full_root: Path, tmp_path: P
     tables = score(archive, full_root).tables
     assert set(tables) == set(VIEWS)
     scored = [table for table in tables.values() if table.views_scored]
-    assert len(scored) >= len(VIEWS) - 1  # tiny, the pier may keep no interior pixel
+    assert len(scored) >= len(VIEWS) - 1  # At this size the pier may have no scored pixel.
     assert all(table.native is not None and table.native.abs_rel == 0.0 for table in scored)
 
 
-def picture_size(path: Path) -> tuple[int, int]:
-    with Image.open(path) as picture:
-        return picture.size
+def image_size(path: Path) -> tuple[int, int]:
+    with Image.open(path) as image:
+        return image.size
 
 
-@pytest.mark.render
-def test_pictures_show_every_view_and_every_scene(full_root: Path, manifest: dict[str, Any]) -> None:
-    sizes = {path.name: picture_size(path) for path in (full_root / "pictures").iterdir()}
+def test_contact_sheets_have_one_tile_per_view_and_scene(full_root: Path, manifest: dict[str, Any]) -> None:
+    sizes = {path.name: image_size(path) for path in (full_root / "pictures").iterdir()}
     assert sizes.pop("scenes.webp") == (3 * STRIP_PANEL_PX[0], STRIP_PANEL_PX[1])
     assert sizes == {f"{name}.webp": (TILE_PX[0], 2 * TILE_PX[1]) for name in VIEWS}
     card = (full_root / "README.md").read_text()
     assert all(entry["sheet"] in card for entry in manifest["configs"].values())
 
 
-@pytest.mark.render
-def test_a_users_scene_and_a_variant_stand_beside_the_standard_configs(tmp_path: Path) -> None:
+def test_user_scene_and_variant_are_added_to_dataset(tmp_path: Path, run_build: RunBuild) -> None:
     root = tmp_path / "dataset"
     assert run_build("--out", root, "--config", "lattice", "--views", "1", *TINY).returncode == 0
-    standard = (root / "manifest.json").read_text()
+    standard_manifest = (root / "manifest.json").read_text()
     for arguments in (
         ("--scene", "examples/beam.toml"),
         ("--config", "lattice", "--variant", "wet", "formwork"),
     ):
-        finished = run_build("--out", root, *arguments, "--views", "1", *TINY)
-        assert finished.returncode == 0, finished.stderr
+        process = run_build("--out", root, *arguments, "--views", "1", *TINY)
+        assert process.returncode == 0, process.stderr
     entries = json.loads((root / "manifest.json").read_text())["configs"]
     assert list(entries) == ["lattice", "beam", "lattice-wet-formwork"]
-    assert entries["lattice"] == json.loads(standard)["configs"]["lattice"]
+    assert entries["lattice"] == json.loads(standard_manifest)["configs"]["lattice"]
     assert entries["lattice-wet-formwork"]["scene"]["appearance"]["variants"] == ["wet", "formwork"]
     assert rdb.load(root, "beam")[0]["left_mask"].any()
     plain, other = (rdb.load(root, name)[0] for name in ("lattice", "lattice-wet-formwork"))
@@ -158,27 +157,27 @@ def test_a_users_scene_and_a_variant_stand_beside_the_standard_configs(tmp_path:
         (BuildRequest(configs=("pier", "latice")), "no config 'latice', expected one of lattice"),
     ],
 )
-def test_what_does_not_exist_is_refused_in_words(request_: BuildRequest, words: str) -> None:
+def test_invalid_build_request_is_rejected(request_: BuildRequest, words: str) -> None:
     with pytest.raises(InputError, match=words):
         request_.config_specs()
 
 
-def test_a_mesh_takes_the_place_of_rods_alone(tmp_path: Path) -> None:
+def test_mesh_option_is_rejected_for_other_scenes(tmp_path: Path, run_build: RunBuild) -> None:
     (tmp_path / "a.stl").write_bytes(b"")
-    refused = run_build("--out", tmp_path / "dataset", "--config", "pile", "--mesh", tmp_path / "a.stl")
-    assert refused.returncode == 2
-    assert "--mesh takes the place of the lattice's rods, but pile is no lattice" in refused.stderr
+    process = run_build("--out", tmp_path / "dataset", "--config", "pile", "--mesh", tmp_path / "a.stl")
+    assert process.returncode == 2
+    assert "--mesh takes the place of the lattice's rods, but pile is no lattice" in process.stderr
 
 
-def test_the_order_of_variants_makes_no_other_look() -> None:
-    one, other = (
+def test_variant_order_does_not_matter() -> None:
+    first, second = (
         BuildRequest(variants=names).config_specs() for names in (("wet", "formwork"), ("formwork", "wet"))
     )
-    assert one == other
-    assert one[0].name == "lattice-wet-formwork"
+    assert first == second
+    assert first[0].name == "lattice-wet-formwork"
 
 
-def test_the_screen_of_the_shadows_never_hangs_among_the_cameras() -> None:
+def test_shadow_screen_among_cameras_is_rejected() -> None:
     [spec] = BuildRequest(configs=("lattice",), variants=("shadows",)).config_specs()
     check_fits(make_assembly(spec.scene.assembly), spec)
     far = replace(spec, protocol=RingSpec(radius_m=0.6, elevation_deg=30.0, azimuths=4))

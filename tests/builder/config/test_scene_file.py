@@ -1,4 +1,4 @@
-"""Users' scenes as TOML: bars exactly as given, defaults as told."""
+"""User scenes as TOML: bar geometry, units and default cameras."""
 
 from __future__ import annotations
 
@@ -15,62 +15,57 @@ from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from dataset_builder.config.catalog import LATTICE_DOME
-from dataset_builder.config.scene_file import NEAREST_PER_REACH, scene_config
+from dataset_builder.config.scene_file import NEAREST_RADIUS_PER_REACH, scene_config
 from dataset_builder.config.scene_schema import read_scene_toml
 from dataset_builder.config.specs import CageFileSpec, DomeSpec, LatticeSpec, MeshFileSpec, RingSpec
-from dataset_builder.config.trajectories import offsets_m
+from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
-from dataset_builder.scene.assemblies.cage_assembly import MAX_RIBS, CageBar, cage_assembly
+from dataset_builder.scene.assemblies.cage_assembly import MAX_RIBS_PER_ROW, CageBar, cage_assembly
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.mesh_ply import write_mesh_ply
-from dataset_builder.scene.model import Assembly, Bar
+from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
+from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import InputError, MeshError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
+from tests.builder.config.scene_files import BAR, MM, write_scene
 
 EXAMPLES = Path("examples")
-BAR = "[[bar]]\ndiameter = 10\npoints = [[-100, 0, 50], [100, 0, 50]]\n"
-MM = 'unit = "mm"\n'
 
 
-def written(folder: Path, content: str | bytes, name: str = "my-beam.toml") -> Path:
-    path = folder / name
-    path.write_bytes(content.encode() if isinstance(content, str) else content)
-    return path
+def load_cage_text(folder: Path, content: str) -> Assembly:
+    return load_cage(cage_file_spec(write_scene(folder, content)))
 
 
-def cage(folder: Path, content: str) -> Assembly:
-    return load_cage(cage_file_spec(written(folder, content)))
+def sample_axis_m(bar: Bar, step_m: float = 5e-4) -> ndarray:
+    axis_m = np.array(bar.axis_m)
+    segments = pairwise(axis_m)
+    counts = np.ceil(np.linalg.norm(np.diff(axis_m, axis=0), axis=1) / step_m).astype(int) + 1
+    return np.concatenate([np.linspace(a, b, n) for (a, b), n in zip(segments, counts, strict=True)])
 
 
-def dense_m(bar: Bar, step_m: float = 5e-4) -> ndarray:
-    axis = np.array(bar.axis_m)
-    legs = pairwise(axis)
-    counts = np.ceil(np.linalg.norm(np.diff(axis, axis=0), axis=1) / step_m).astype(int) + 1
-    return np.concatenate([np.linspace(a, b, n) for (a, b), n in zip(legs, counts, strict=True)])
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["beam.toml", "column.ifc"])
-def test_the_examples_stand_on_the_board_and_no_two_bars_touch(name: str) -> None:
+def test_examples_are_above_board_without_touching_bars(name: str) -> None:
     config = scene_config(EXAMPLES / name)
     assembly = make_assembly(config.scene.assembly)
     vertices_m = np.concatenate([part.mesh.vertices_m for part in assembly.parts])
     assert 0 < vertices_m[:, 2].min() < 0.001
-    # Clear of the markers, which begin at x = 0.139 with their quiet zones.
+    # The quiet zones of the markers begin at x = 0.139 m.
     assert np.abs(vertices_m[:, 0]).max() < 0.139
     assert np.abs(vertices_m[:, 1]).max() < 0.07
-    lines = [dense_m(bar) for bar in assembly.bars]
+    lines = [sample_axis_m(bar) for bar in assembly.bars]
     trees = [cKDTree(line) for line in lines]
     radii_m = [outer_radius_m(bar.diameter_m) for bar in assembly.bars]
     for a, b in combinations(range(len(lines)), 2):
         assert trees[a].query(lines[b])[0].min() > radii_m[a] + radii_m[b] + 2e-4
     assert (config.name, config.scene.name) == (name.split(".")[0],) * 2
     assert (config.scene.environment, config.scene.board) == ("laboratory", BoardSpec(markers=6))
-    assert len(offsets_m(config.protocol)) == 504
+    assert len(camera_offsets_m(config.protocol)) == 504
 
 
-def test_bars_are_exactly_as_given(tmp_path: Path) -> None:
+def test_bars_have_specified_geometry(tmp_path: Path) -> None:
     content = (
         MM
         + """
@@ -92,12 +87,12 @@ bend_diameter = 100
 points = [[0, 200, 20], [300, 200, 20], [300, 400, 20]]
 """
     )
-    assembly = cage(tmp_path, content)
+    assembly = load_cage_text(tmp_path, content)
     first, second, third, fourth = assembly.bars
     assert first == Bar(2, "edge bar", 0.009, ((-0.1, 0.007, 0.0505), (0.1, 0.007, 0.0505)))
     assert second == Bar(1, "bar", 0.016, ((0.0, 0.0, 0.003), (0.0, 0.0, 0.3)))
     assert [bar.bar_id for bar in (third, fourth)] == [3, 4]
-    # A quarter circle round (300 - r, r), r = (7 x 20 + 20) / 2 = 80 mm: EN 1992-1-1, table 8.1N, above 16 mm.
+    # Quarter circle about (300 - r, r), r = (7 x 20 + 20) / 2 = 80 mm: EN 1992-1-1, table 8.1N, above 16 mm.
     arc = np.array(third.axis_m)[1:-1]
     np.testing.assert_allclose(np.hypot(arc[:, 0] - 0.22, arc[:, 2] - 0.1), 0.08, atol=1e-12)
     assert len(arc) == 16
@@ -105,7 +100,7 @@ points = [[0, 200, 20], [300, 200, 20], [300, 400, 20]]
     np.testing.assert_allclose(np.hypot(arc[:, 0] - 0.245, arc[:, 1] - 0.255), 0.055, atol=1e-12)
     assert [part.bar_id for part in assembly.parts] == [2, 1, 3, 4]
     assert [part.name for part in assembly.parts[:2]] == ["edge bar-002", "bar-001"]
-    # Plain: two rings of 24 corners and two middles. Ribbed: as high as the bar is long, to the end.
+    # Plain bar: two rings of 24 vertices and two end centres. The ribbed mesh has the full length of the bar.
     assert len(assembly.parts[0].mesh.vertices_m) == 50
     assert np.ptp(assembly.parts[1].mesh.vertices_m[:, 2]) == pytest.approx(0.297, abs=1e-12)
 
@@ -114,101 +109,104 @@ points = [[0, 200, 20], [300, 200, 20], [300, 400, 20]]
     unit=st.sampled_from([("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("in", 0.0254), ("ft", 0.3048)]),
     scale=st.floats(0.5, 2.0),
 )
-def test_units_only_scale(unit: tuple[str, float], scale: float) -> None:
+def test_unit_only_scales_geometry(unit: tuple[str, float], scale: float) -> None:
     name, metres = unit
-    one, two = 0.2 * scale / metres, 0.01 * scale / metres
-    bar = f"[[bar]]\ndiameter = {two!r}\npoints = [[0, 0, {two!r}], [{one!r}, 0, {two!r}]]\n"
-    [found] = read_scene_toml(f'unit = "{name}"\n{bar}'.encode(), "a").bars
-    assert found.diameter_m == pytest.approx(0.01 * scale, abs=1e-12)
-    assert found.corners_m[1] == pytest.approx((0.2 * scale, 0.0, 0.01 * scale), abs=1e-12)
+    length, diameter = 0.2 * scale / metres, 0.01 * scale / metres
+    bar = f"[[bar]]\ndiameter = {diameter!r}\npoints = [[0, 0, {diameter!r}], [{length!r}, 0, {diameter!r}]]\n"
+    [parsed_bar] = read_scene_toml(f'unit = "{name}"\n{bar}'.encode(), "a").bars
+    assert parsed_bar.diameter_m == pytest.approx(0.01 * scale, abs=1e-12)
+    assert parsed_bar.corners_m[1] == pytest.approx((0.2 * scale, 0.0, 0.01 * scale), abs=1e-12)
 
 
-def test_the_default_dome_is_the_lattices_and_grows_with_the_reach(tmp_path: Path) -> None:
-    small = scene_config(written(tmp_path, MM + BAR.replace("100", "20")))
+def test_default_dome_scales_with_steel_extent(tmp_path: Path) -> None:
+    small = scene_config(write_scene(tmp_path, MM + BAR.replace("100", "20")))
     assert small.protocol == LATTICE_DOME
-    config = scene_config(written(tmp_path, MM + BAR))
+    config = scene_config(write_scene(tmp_path, MM + BAR))
     assert isinstance(config.protocol, DomeSpec)
     reach_m = math.hypot(0.1, outer_radius_m(0.01))
-    assert min(config.protocol.radii_m) == pytest.approx(NEAREST_PER_REACH * reach_m, abs=0.002)
+    assert min(config.protocol.radii_m) == pytest.approx(NEAREST_RADIUS_PER_REACH * reach_m, abs=0.002)
     ratio = np.array(config.protocol.radii_m) / np.array(LATTICE_DOME.radii_m)
     np.testing.assert_allclose(ratio, ratio[0], atol=0.003)
     lattice = lattice_assembly(LatticeSpec())
     vertices_m = np.concatenate([part.mesh.vertices_m for part in lattice.parts])
     reach_m = float(np.linalg.norm(vertices_m - aim_point_m(lattice), axis=1).max())
-    assert min(LATTICE_DOME.radii_m) == pytest.approx(NEAREST_PER_REACH * reach_m, rel=0.08)
+    assert min(LATTICE_DOME.radii_m) == pytest.approx(NEAREST_RADIUS_PER_REACH * reach_m, rel=0.08)
 
 
 @settings(max_examples=15)
 @given(length=st.floats(3.0, 2500.0), across=st.floats(0.0, 2000.0))
-def test_the_default_dome_always_fits(
+def test_default_dome_fits_any_cage(
     length: float, across: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     points = f"[[0, 0, 40], [{length!r}, {across!r}, 40]]"
     content = f"{MM}[[bar]]\ndiameter = 10\nribs = false\npoints = {points}\n"
-    config = scene_config(written(tmp_path_factory.mktemp("dome"), content))
+    config = scene_config(write_scene(tmp_path_factory.mktemp("dome"), content))
     check_fits(make_assembly(config.scene.assembly), config)
-    assert len(offsets_m(config.protocol)) == 504
+    assert len(camera_offsets_m(config.protocol)) == 504
 
 
-def test_cameras_board_and_environment_as_asked(tmp_path: Path) -> None:
+def test_cameras_board_and_environment_are_applied(tmp_path: Path) -> None:
     head = 'name = "other"\nenvironment = "outdoors"\nboard = 12\n' + MM
     ring = '[cameras]\nkind = "ring"\nradius = 400\nelevation_deg = 35\nazimuths = 20\n'
-    config = scene_config(written(tmp_path, head + BAR + ring))
+    config = scene_config(write_scene(tmp_path, head + BAR + ring))
     assert (config.name, config.scene.name, config.scene.environment) == ("other", "other", "outdoors")
     assert (config.protocol, config.scene.board) == (RingSpec(0.4, 35.0, 20), BoardSpec(markers=12))
     in_cm = "[[bar]]\ndiameter = 1\npoints = [[-10, 0, 5], [10, 0, 5]]\n"
     dome = '[cameras]\nkind = "dome"\nradii = [30, 40.5]\nelevations_deg = [15, 45]\nazimuths = 5\n'
-    config = scene_config(written(tmp_path, 'unit = "cm"\nboard = false\n' + in_cm + dome))
+    config = scene_config(write_scene(tmp_path, 'unit = "cm"\nboard = false\n' + in_cm + dome))
     assert config.protocol == replace(LATTICE_DOME, radii_m=(0.3, 0.405), elevations_deg=(15.0, 45.0), azimuths=5)
     assert (config.scene.environment, config.scene.board) == ("laboratory", None)
 
 
-def test_a_large_cage_goes_outdoors_and_not_into_the_laboratory(tmp_path: Path) -> None:
+def test_large_cage_is_outdoors_and_rejected_in_laboratory(tmp_path: Path) -> None:
     content = MM + BAR.replace("100", "2000")
-    config = scene_config(written(tmp_path, content))
+    config = scene_config(write_scene(tmp_path, content))
     assert (config.scene.environment, config.scene.board) == ("outdoors", None)
     with pytest.raises(InputError, match=r"steel reaches 2 m from the laboratory's middle, expected 0\.45 m"):
-        scene_config(written(tmp_path, 'environment = "laboratory"\n' + content))
+        scene_config(write_scene(tmp_path, 'environment = "laboratory"\n' + content))
     far = '[cameras]\nkind = "ring"\nradius = 2000\nelevation_deg = 35\nazimuths = 4\n'
     with pytest.raises(
         InputError, match=r"too large for the dome that is fitted to it: cameras would stand 3\d\."
     ):
-        scene_config(written(tmp_path, MM + BAR.replace("100", "8000")))
+        scene_config(write_scene(tmp_path, MM + BAR.replace("100", "8000")))
     with pytest.raises(InputError, match=r"cameras stand 1.638 m from the laboratory's middle"):
-        scene_config(written(tmp_path, 'environment = "laboratory"\n' + MM + BAR + far))
+        scene_config(write_scene(tmp_path, 'environment = "laboratory"\n' + MM + BAR + far))
 
 
-def test_mesh_and_ifc_beside_the_file(tmp_path: Path) -> None:
+def test_mesh_and_ifc_paths_are_relative_to_scene_file(tmp_path: Path) -> None:
     (tmp_path / "parts").mkdir()
-    part = cage(tmp_path, MM + BAR).parts[0]
+    part = load_cage_text(tmp_path, MM + BAR).parts[0]
     faces = part.mesh.faces
     write_mesh_ply(tmp_path / "parts/a.ply", part.mesh.vertices_m * 1000, faces, np.full(len(faces), 4))
-    config = scene_config(written(tmp_path, MM + 'mesh = "parts/a.ply"\n'))
+    config = scene_config(write_scene(tmp_path, MM + 'mesh = "parts/a.ply"\n'))
     assert isinstance(config.scene.assembly, MeshFileSpec)
     assert make_assembly(config.scene.assembly).bars[0].diameter_m == pytest.approx(0.01, rel=0.01)
     (tmp_path / "parts/b.ifc").write_bytes((EXAMPLES / "column.ifc").read_bytes())
-    config = scene_config(written(tmp_path, 'ifc = "parts/b.ifc"\n'))
+    config = scene_config(write_scene(tmp_path, 'ifc = "parts/b.ifc"\n'))
     assert isinstance(config.scene.assembly, CageFileSpec)
     assert (config.name, len(make_assembly(config.scene.assembly).bars)) == ("my-beam", 13)
 
 
-def test_changed_content_is_refused(tmp_path: Path) -> None:
-    spec = cage_file_spec(written(tmp_path, MM + BAR))
-    assert cage_file_spec(written(tmp_path, MM + BAR)) == spec
-    written(tmp_path, MM + BAR + "# more\n")
+def test_changed_file_content_is_rejected(tmp_path: Path) -> None:
+    spec = cage_file_spec(write_scene(tmp_path, MM + BAR))
+    assert cage_file_spec(write_scene(tmp_path, MM + BAR)) == spec
+    write_scene(tmp_path, MM + BAR + "# more\n")
     with pytest.raises(MeshError, match=f"my-beam.toml: changed since it was chosen: .* {spec.sha256} expected"):
         load_cage(spec)
 
 
-def test_very_long_bars_are_plain_and_triangles_have_a_limit() -> None:
+@pytest.mark.slow
+def test_long_bars_are_plain_and_triangle_count_is_limited() -> None:
     def bar(number: int, length_m: float, points: int = 2) -> CageBar:
         axis_m = tuple((x, 0.02 * number, 0.1) for x in np.linspace(0, length_m, points).tolist())
         return CageBar(f"bar {number}", Bar(number, "bar", 0.01, axis_m))
 
-    longest = MAX_RIBS * 0.68 * 0.01
-    short, long = cage_assembly([bar(1, longest * 0.999), bar(2, longest * 1.001)], "a").parts
+    max_ribbed_length_m = MAX_RIBS_PER_ROW * 0.68 * 0.01
+    short, long = cage_assembly(
+        [bar(1, max_ribbed_length_m * 0.999), bar(2, max_ribbed_length_m * 1.001)], "a"
+    ).parts
     assert len(short.mesh.faces) > 100_000
-    assert len(long.mesh.faces) == 96  # 24 sides of two triangles, two lids of 24
+    assert len(long.mesh.faces) == 96  # 24 sides of two triangles, two end caps of 24
     many = cage_assembly([bar(number, 0.1) for number in range(1, 1000)], "a")
     assert {len(part.mesh.faces) for part in many.parts} == {96}
     few = cage_assembly([bar(number, 0.1) for number in range(1, 20)], "a")
@@ -217,12 +215,10 @@ def test_very_long_bars_are_plain_and_triangles_have_a_limit() -> None:
         cage_assembly([bar(number, 3.0, points=10_000) for number in range(1, 20)], "a")
 
 
-def test_straight_legs_beside_bends_keep_their_section(tmp_path: Path) -> None:
+def test_straight_segments_next_to_bends_keep_section(tmp_path: Path) -> None:
     content = MM + "[[bar]]\ndiameter = 10\nribs = false\npoints = [[0, 0, 9], [300, 0, 9], [300, 300, 9]]\n"
-    vertices_m = cage(tmp_path, content).parts[0].mesh.vertices_m
+    vertices_m = load_cage_text(tmp_path, content).parts[0].mesh.vertices_m
     straight = vertices_m[vertices_m[:, 0] < 0.2651]
     rings = np.unique(np.round(straight[:, 0], 9))
-    assert rings.tolist() == [
-        0.0,
-        0.265,
-    ]  # a diameter before the bend, which begins at 275 mm, and square to the leg
+    # One diameter before the bend, which begins at 275 mm, and perpendicular to the segment.
+    assert rings.tolist() == [0.0, 0.265]

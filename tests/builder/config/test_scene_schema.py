@@ -1,4 +1,4 @@
-"""Mistakes in users' scene files: each is told in words, all at once, and nothing is guessed."""
+"""Validation of users' scene files: all problems are reported at once, and no value is guessed."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 from dataset_builder.config.catalog import CONFIGS
 from dataset_builder.config.scene_file import scene_config
 from rebar_depth_bench.errors import InputError, MeshError
-from tests.builder.config.test_scene_file import BAR, MM, written
+from tests.builder.config.scene_files import BAR, MM, write_scene
 
-WRONG = [
+INVALID_SCENES = [
     ("", "unit is missing.*none of them given, expected exactly one of"),
     (BAR, r'unit is missing, expected "m", "cm", "mm", "in" or "ft"'),
     ('unit = "yard"\n' + BAR, "unit: got 'yard', expected"),
@@ -104,21 +104,21 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("content", "words"), WRONG)
-def test_a_wrong_file_is_told_in_words(tmp_path: Path, content: str, words: str) -> None:
+@pytest.mark.parametrize(("content", "words"), INVALID_SCENES)
+def test_invalid_scene_file_is_rejected(tmp_path: Path, content: str, words: str) -> None:
     with pytest.raises(InputError, match=f"(?s)^{tmp_path}/my-beam.toml: .*{words}"):
-        scene_config(written(tmp_path, content))
+        scene_config(write_scene(tmp_path, content))
 
 
-def test_all_problems_come_at_once(tmp_path: Path) -> None:
+def test_all_problems_are_reported_together(tmp_path: Path) -> None:
     content = "unit = 'mmm'\nfoo = 1\nboard = 7\n" + BAR.replace("= 10", "= -1") + "rips = true\n"
-    with pytest.raises(InputError) as refused:
-        scene_config(written(tmp_path, content))
-    head, *lines = str(refused.value).splitlines()
+    with pytest.raises(InputError) as raised:
+        scene_config(write_scene(tmp_path, content))
+    head, *lines = str(raised.value).splitlines()
     assert head == f"{tmp_path}/my-beam.toml: 5 problems"
     assert [line.split()[1] for line in lines] == ["'foo'", "unit:", "board:", "[[bar]]", "[[bar]]"]
     with pytest.raises(InputError, match=r"40 problems(.|\n)*and 20 more"):
-        scene_config(written(tmp_path, MM + "[[bar]]\n" * 20))
+        scene_config(write_scene(tmp_path, MM + "[[bar]]\n" * 20))
 
 
 @pytest.mark.parametrize(
@@ -140,30 +140,30 @@ def test_all_problems_come_at_once(tmp_path: Path) -> None:
         ("[[bar]]\ndiameter = 1\npoints = [[0, 0, 5], [0.5, 0, 5]]\n", "cage is 0.0005 m long, expected 0.001 to"),
     ],
 )
-def test_bars_that_cannot_be_are_told_in_words(tmp_path: Path, content: str, words: str) -> None:
+def test_impossible_bar_geometry_is_rejected(tmp_path: Path, content: str, words: str) -> None:
     with pytest.raises(MeshError, match=f"^{tmp_path}/my-beam.toml: .*{words}"):
-        scene_config(written(tmp_path, MM + content))
+        scene_config(write_scene(tmp_path, MM + content))
 
 
-def test_steel_below_the_board_and_cameras_within_it_are_refused(tmp_path: Path) -> None:
+def test_steel_below_board_or_around_cameras_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match=r"reaches down to z = -0\.0"):
-        scene_config(written(tmp_path, MM + BAR.replace("50]", "-50]")))
+        scene_config(write_scene(tmp_path, MM + BAR.replace("50]", "-50]")))
     near = '[cameras]\nkind = "ring"\nradius = 130\nelevation_deg = 35\nazimuths = 20\n'
     with pytest.raises(MeshError, match=r"reaches 0\.2\d* m from its middle, expected less than the 0\.13 m"):
-        scene_config(written(tmp_path, MM + BAR.replace("100", "200") + near))
+        scene_config(write_scene(tmp_path, MM + BAR.replace("100", "200") + near))
 
 
-def test_files_that_are_none(tmp_path: Path) -> None:
+def test_unreadable_or_misnamed_files_are_rejected(tmp_path: Path) -> None:
     for name, words in (("a.yaml", "kind '.yaml' are not read"), ("a.toml", "cannot be read: No such file")):
         with pytest.raises(InputError, match=words):
             scene_config(tmp_path / name)
     with pytest.raises(InputError, match="byte 0 is no UTF-8"):
-        scene_config(written(tmp_path, b"\xff\xfe"))
+        scene_config(write_scene(tmp_path, b"\xff\xfe"))
     with pytest.raises(InputError, match=r"would be named 'My Beam', expected a name of small letters.*rename"):
-        scene_config(written(tmp_path, MM + BAR, "My Beam.toml"))
+        scene_config(write_scene(tmp_path, MM + BAR, "My Beam.toml"))
     with pytest.raises(MeshError, match=r"gone.ifc: the cage file cannot be read"):
-        scene_config(written(tmp_path, 'ifc = "gone.ifc"'))
-    assert scene_config(written(tmp_path, "\ufeff" + (MM + BAR).replace("\n", "\r\n"))).name == "my-beam"
-    taken = next(iter(CONFIGS))
-    with pytest.raises(InputError, match=f"would be named '{taken}'"):
-        scene_config(written(tmp_path, MM + BAR, f"{taken}.toml"))
+        scene_config(write_scene(tmp_path, 'ifc = "gone.ifc"'))
+    assert scene_config(write_scene(tmp_path, "\ufeff" + (MM + BAR).replace("\n", "\r\n"))).name == "my-beam"
+    builtin_name = next(iter(CONFIGS))
+    with pytest.raises(InputError, match=f"would be named '{builtin_name}'"):
+        scene_config(write_scene(tmp_path, MM + BAR, f"{builtin_name}.toml"))

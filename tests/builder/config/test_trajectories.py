@@ -1,4 +1,4 @@
-"""Camera protocols: how many, where, aimed how, and everything in frame in both eyes."""
+"""Camera trajectories: number of views, distances, aim, and assembly in frame in both cameras."""
 
 from __future__ import annotations
 
@@ -14,7 +14,14 @@ from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assem
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.errors import MeshError
-from rebar_depth_bench.geometry.cameras import camera_centre, ideal_K, pixel_rays, project, right_of_rig, transform
+from rebar_depth_bench.geometry.cameras import (
+    camera_centre,
+    ideal_K,
+    pixel_rays,
+    project,
+    right_camera_pose,
+    transform,
+)
 
 
 @pytest.fixture(params=["lattice", "lattice-orbit"])
@@ -22,55 +29,60 @@ def config(request: pytest.FixtureRequest) -> ConfigSpec:
     return CONFIGS[request.param]()
 
 
-def test_the_papers_numbers_of_views_and_distances() -> None:
-    target = aim_point_m(make_assembly(CONFIGS["lattice"]().scene.assembly))
-    assert target.tolist() == [0.0, 0.0, 0.05]
+def test_view_counts_and_distances_match_paper() -> None:
+    target_m = aim_point_m(make_assembly(CONFIGS["lattice"]().scene.assembly))
+    assert target_m.tolist() == [0.0, 0.0, 0.05]
     dome = CONFIGS["lattice"]()
-    distances = [np.linalg.norm(camera_centre(pose) - target) for pose in poses(dome.protocol, target, dome.rig)]
-    assert len(distances) == 504
-    assert min(distances) == pytest.approx(0.22)
-    assert max(distances) == pytest.approx(0.43)
+    distances_m = [
+        np.linalg.norm(camera_centre(pose) - target_m) for pose in poses(dome.protocol, target_m, dome.rig)
+    ]
+    assert len(distances_m) == 504
+    assert min(distances_m) == pytest.approx(0.22)
+    assert max(distances_m) == pytest.approx(0.43)
     ring = CONFIGS["lattice-orbit"]()
-    centres = np.array([camera_centre(pose) for pose in poses(ring.protocol, target, ring.rig)])
-    assert len(centres) == 100
-    assert np.ptp(centres[:, 2]) < 1e-12
+    centres_m = np.array([camera_centre(pose) for pose in poses(ring.protocol, target_m, ring.rig)])
+    assert len(centres_m) == 100
+    assert np.ptp(centres_m[:, 2]) < 1e-12
 
 
-def test_no_two_views_are_the_same(config: ConfigSpec) -> None:
-    found = poses(config.protocol, np.array([0.0, 0.0, 0.05]), config.rig)
-    assert len({pose.round(9).tobytes() for pose in found}) == len(found)
+def test_all_poses_are_distinct(config: ConfigSpec) -> None:
+    cameras_from_world = poses(config.protocol, np.array([0.0, 0.0, 0.05]), config.rig)
+    assert len({pose.round(9).tobytes() for pose in cameras_from_world}) == len(cameras_from_world)
 
 
-def test_every_pose_has_the_whole_assembly_in_frame_in_both_eyes(config: ConfigSpec) -> None:
+def test_assembly_is_in_frame_of_both_cameras(config: ConfigSpec) -> None:
     assembly = make_assembly(config.scene.assembly)
     vertices = np.concatenate([part.mesh.vertices_m for part in assembly.parts])[::7]
     corners = np.array(np.meshgrid(*zip(vertices.min(0), vertices.max(0), strict=True))).reshape(3, -1).T
     K = ideal_K(config.rig.width, config.rig.height)
     for left in poses(config.protocol, aim_point_m(assembly), config.rig):
-        for pose in (left, right_of_rig(left, config.rig.baseline_m)):
-            in_camera = transform(pose, corners)
-            uv = project(K, in_camera)
-            assert (in_camera[:, 2] > 0).all()
+        for pose in (left, right_camera_pose(left, config.rig.baseline_m)):
+            corners_cam_m = transform(pose, corners)
+            uv = project(K, corners_cam_m)
+            assert (corners_cam_m[:, 2] > 0).all()
             assert (uv >= 0).all()
             assert (uv <= [config.rig.width - 1, config.rig.height - 1]).all()
 
 
-def test_the_rigs_middle_axis_passes_through_the_target(config: ConfigSpec) -> None:
+def test_rig_centre_axis_passes_through_target(config: ConfigSpec) -> None:
     target = np.array([0.0, 0.0, 0.05])
     for left in poses(config.protocol, target, config.rig)[::17]:
-        seen_left = transform(left, target)
-        seen_right = transform(right_of_rig(left, config.rig.baseline_m), target)
-        assert seen_left == pytest.approx([config.rig.baseline_m / 2, 0, seen_left[2]], abs=1e-9)
-        assert seen_right == pytest.approx([-config.rig.baseline_m / 2, 0, seen_left[2]], abs=1e-9)
+        target_in_left_m = transform(left, target)
+        target_in_right_m = transform(right_camera_pose(left, config.rig.baseline_m), target)
+        assert target_in_left_m == pytest.approx([config.rig.baseline_m / 2, 0, target_in_left_m[2]], abs=1e-9)
+        assert target_in_right_m == pytest.approx([-config.rig.baseline_m / 2, 0, target_in_left_m[2]], abs=1e-9)
 
 
-def test_steel_covers_as_much_of_the_frame_as_in_the_paper(config: ConfigSpec) -> None:
+@pytest.mark.slow
+def test_steel_pixel_share_matches_paper(config: ConfigSpec) -> None:
     assembly = make_assembly(config.scene.assembly)
     meshes = [part.mesh for part in assembly.parts]
-    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+    vertex_offsets = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
     steel = WorldMesh(
         np.concatenate([mesh.vertices_m for mesh in meshes]),
-        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]).astype(np.int32),
+        np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, vertex_offsets, strict=False)]).astype(
+            np.int32
+        ),
         np.ones(sum(len(mesh.faces) for mesh in meshes), np.uint16),
     )
     caster, rays = RayCaster(steel), pixel_rays(ideal_K(160, 90), 160, 90)
@@ -79,22 +91,22 @@ def test_steel_covers_as_much_of_the_frame_as_in_the_paper(config: ConfigSpec) -
     assert 0.045 <= share <= 0.072
 
 
-def test_cameras_stand_above_the_board_and_upright(config: ConfigSpec) -> None:
+def test_cameras_are_above_board_and_upright(config: ConfigSpec) -> None:
     for left in poses(config.protocol, np.array([0.0, 0.0, 0.05]), config.rig):
         assert camera_centre(left)[2] > 0.05
-        assert left[1, 2] < 0  # the camera's y points down
+        assert left[1, 2] < 0  # The camera's y axis points down.
 
 
-def test_subset_is_spread_evenly_and_whole_when_all_are_wanted() -> None:
+def test_subset_is_evenly_spread() -> None:
     assert subset(504, None) == list(range(504))
     assert subset(504, 504) == list(range(504))
     assert subset(504, 900) == list(range(504))
     assert subset(10, 1) == [5]
-    chosen = subset(504, 6)
-    assert chosen == [42, 126, 210, 294, 378, 462]
-    for wanted in range(1, 60):
-        indices = subset(504, wanted)
-        assert len(set(indices)) == wanted
+    indices_of_6 = subset(504, 6)
+    assert indices_of_6 == [42, 126, 210, 294, 378, 462]
+    for count in range(1, 60):
+        indices = subset(504, count)
+        assert len(set(indices)) == count
         gaps = np.diff(indices)
         assert not len(gaps) or np.ptp(gaps) <= 1
 
@@ -106,7 +118,7 @@ def test_subset_is_spread_evenly_and_whole_when_all_are_wanted() -> None:
         (1, -0.01, "reaches down to z = -0.00995 m, ribs and all, expected 0 or above"),
     ],
 )
-def test_an_assembly_that_does_not_fit_the_cameras_is_refused(scale: float, shift_m: float, words: str) -> None:
+def test_assembly_outside_camera_limits_is_rejected(scale: float, shift_m: float, words: str) -> None:
     config = CONFIGS["lattice"]()
     assembly = make_assembly(config.scene.assembly)
     check_fits(assembly, config)

@@ -1,4 +1,4 @@
-"""The raw export: every file read back with the tool it is for."""
+"""Raw export: every file format read back with the tool it is meant for."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from dataset_builder.build.bars_table import read_bars
 from dataset_builder.config.rigs import Camera
 from dataset_builder.export import export
 from dataset_builder.export.colmap import cameras_txt, images_txt, points_txt, quaternion_wxyz
@@ -24,53 +23,56 @@ from dataset_builder.export.images import depth_exr, depth_mm_png
 from dataset_builder.export.nerfstudio import transforms_json
 from dataset_builder.export.views import CameraView
 from rebar_depth_bench import load
+from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid, look_at, project, rigid, transform
 
 Rows = dict[str, dict[str, Any]]
-EYES = ("left", "right")
+CAMERA_NAMES = ("left", "right")
 
 
 @pytest.fixture(scope="module")
 def exported(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """All of the tiny dataset, exported."""
+    """Return an export of the whole tiny dataset."""
     return export(tiny_root, tmp_path_factory.mktemp("export") / "all").folder
 
 
 @pytest.fixture(scope="module")
 def rows(tiny_root: Path) -> Rows:
-    """The rows of the tiny ``lattice`` config by the number in their view id."""
+    """Return the rows of the tiny ``lattice`` config by the number in their view id."""
     return {row["view_id"][-4:]: row for row in load(tiny_root, "lattice")}
 
 
 @pytest.fixture(scope="module")
 def known_points_m(tiny_root: Path) -> np.ndarray:
-    """Points whose place in the world is known: the ends of the bars and the corners of the markers."""
+    """Return known world points, in metres: the ends of the bars and the corners of the markers."""
     ends = [point for bar in read_bars(tiny_root / "bars.parquet")["lattice"] for point in bar.axis_m]
     corners = [corner for four in marker_corners_m(BoardSpec(markers=6)).values() for corner in four]
     return np.array([*ends, *corners])
 
 
 def zed_views() -> list[CameraView]:
-    """A raw pair of a real first-generation ZED: two lenses, both distorted, the right one turned."""
+    """Return two raw views of a real first-generation ZED: both lenses distorted, the right camera rotated."""
     left_K = np.array([[701.88, 0, 641.285], [0, 701.70, 344.1835], [0, 0, 1]])
     right_K = np.array([[700.965, 0, 633.515], [0, 701.11, 359.3135], [0, 0, 1]])
     left = np.array([-0.175286, 0.0283094, 6.68e-5, -1.50e-4, 1e-10])
     right = np.array([-0.172795, 0.0265223, 1.64e-4, 1.02e-5, 0.0])
-    turn = rigid(cv2.Rodrigues(np.array([-9.17e-4, 6.24e-3, 7.70e-4]))[0], np.array([-0.119978, 0.0, 0.0]))
+    right_from_left = rigid(
+        cv2.Rodrigues(np.array([-9.17e-4, 6.24e-3, 7.70e-4]))[0], np.array([-0.119978, 0.0, 0.0])
+    )
     views = []
-    for number, eye_m in enumerate(([0.3, -0.2, 0.25], [-0.1, 0.35, 0.2])):
-        pose = look_at(np.array(eye_m), np.array([0.0, 0.0, 0.05]))
+    for number, centre_m in enumerate(([0.3, -0.2, 0.25], [-0.1, 0.35, 0.2])):
+        pose = look_at(np.array(centre_m), np.array([0.0, 0.0, 0.05]))
         cameras = {
             "left": Camera(left_K, left, cam_from_world=pose, width=1280, height=720),
-            "right": Camera(right_K, right, cam_from_world=turn @ pose, width=1280, height=720),
+            "right": Camera(right_K, right, cam_from_world=right_from_left @ pose, width=1280, height=720),
         }
         views.append(CameraView(f"lattice-zed-raw/{number:04d}", 0.119978, cameras))
     return views
 
 
-@pytest.mark.parametrize("eye", EYES)
-def test_pictures_read_back_equal(exported: Path, rows: Rows, eye: str) -> None:
+@pytest.mark.parametrize("eye", CAMERA_NAMES)
+def test_colour_bars_and_masks_round_trip(exported: Path, rows: Rows, eye: str) -> None:
     for number, row in rows.items():
         stem = f"{number}_{eye}"
         colour = cv2.imread(str(exported / f"lattice/images/{stem}.png"), cv2.IMREAD_UNCHANGED)
@@ -83,27 +85,27 @@ def test_pictures_read_back_equal(exported: Path, rows: Rows, eye: str) -> None:
             assert np.array_equal(np.asarray(mask), row[f"{eye}_mask"] * np.uint8(255))
 
 
-@pytest.mark.parametrize("eye", EYES)
-def test_depth_is_bit_exact_through_openexr_and_opencv(
+@pytest.mark.parametrize("eye", CAMERA_NAMES)
+def test_exr_depth_is_bit_exact_in_openexr_and_opencv(
     exported: Path, rows: Rows, eye: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("OPENCV_IO_ENABLE_OPENEXR", "1")  # read when OpenCV meets its first EXR file
+    monkeypatch.setenv("OPENCV_IO_ENABLE_OPENEXR", "1")  # OpenCV reads it at its first EXR file.
     for number, row in rows.items():
         path = str(exported / f"lattice/depth/{number}_{eye}.exr")
         (channel,) = OpenEXR.File(path, separate_channels=True).channels().values()
-        for found in (channel.pixels, cv2.imread(path, cv2.IMREAD_UNCHANGED)):
-            assert found.dtype == np.float32
-            assert found.tobytes() == row[f"{eye}_depth"].tobytes()
+        for depth_m in (channel.pixels, cv2.imread(path, cv2.IMREAD_UNCHANGED)):
+            assert depth_m.dtype == np.float32
+            assert depth_m.tobytes() == row[f"{eye}_depth"].tobytes()
 
 
-def test_any_float_survives_the_exr(tmp_path: Path) -> None:
-    bits = np.random.default_rng(0).integers(0, 0x7F800000, (45, 80), dtype=np.uint32)  # up to, not with, infinity
+def test_exr_preserves_all_positive_floats(tmp_path: Path) -> None:
+    bits = np.random.default_rng(0).integers(0, 0x7F800000, (45, 80), dtype=np.uint32)  # below infinity
     (tmp_path / "depth.exr").write_bytes(depth_exr(bits.view(np.float32)))
     (channel,) = OpenEXR.File(str(tmp_path / "depth.exr"), separate_channels=True).channels().values()
     assert np.array_equal(channel.pixels.view(np.uint32), bits)
 
 
-def test_millimetres_are_rounded_and_never_wrap(exported: Path, rows: Rows, tmp_path: Path) -> None:
+def test_depth_mm_is_rounded_without_overflow(exported: Path, rows: Rows, tmp_path: Path) -> None:
     number, row = next(iter(rows.items()))
     depth_mm = cv2.imread(str(exported / f"lattice/depth_mm/{number}_left.png"), cv2.IMREAD_UNCHANGED)
     assert depth_mm.dtype == np.uint16
@@ -114,12 +116,12 @@ def test_millimetres_are_rounded_and_never_wrap(exported: Path, rows: Rows, tmp_
     assert far.tolist() == [[0, 2, 65535, 0, 0]]
 
 
-def test_cameras_json_holds_the_rows_numbers_and_names_files_that_exist(exported: Path, rows: Rows) -> None:
-    described = json.loads((exported / "lattice/cameras.json").read_text())
-    assert len(described["cameras"]) == 2 * len(rows)
-    assert described["parameters"]["rig"]["width"] == 160
-    assert set(described["conventions"]) >= {"axes", "pixels", "depth", "cam_from_world"}
-    for camera in described["cameras"]:
+def test_cameras_json_matches_rows_and_files(exported: Path, rows: Rows) -> None:
+    cameras_json = json.loads((exported / "lattice/cameras.json").read_text())
+    assert len(cameras_json["cameras"]) == 2 * len(rows)
+    assert cameras_json["parameters"]["rig"]["width"] == 160
+    assert set(cameras_json["conventions"]) >= {"axes", "pixels", "depth", "cam_from_world"}
+    for camera in cameras_json["cameras"]:
         row, eye = rows[camera["view_id"][-4:]], camera["eye"]
         for name in ("K", "distortion", "cam_from_world"):
             assert np.array_equal(camera[name], row[f"{eye}_{name}"])
@@ -129,29 +131,27 @@ def test_cameras_json_holds_the_rows_numbers_and_names_files_that_exist(exported
             assert (exported / "lattice" / camera[picture]).is_file()
 
 
-def test_the_readme_states_units_and_licence(exported: Path) -> None:
+def test_readme_states_units_and_licence(exported: Path) -> None:
     text = (exported / "lattice-orbit/README.txt").read_text()
     for statement in ("config lattice-orbit: 2 stereo views", "Metres", "ROUNDED", "planar", "CC BY 4.0"):
         assert statement in text
 
 
-def test_pycolmap_reads_the_model_and_projects_as_our_cameras_do(
-    exported: Path, rows: Rows, known_points_m: np.ndarray
-) -> None:
+def test_pycolmap_projections_match_our_cameras(exported: Path, rows: Rows, known_points_m: np.ndarray) -> None:
     model = pycolmap.Reconstruction(exported / "lattice/sparse/0")
-    assert model.num_cameras() == 1  # both eyes of an ideal rig share it
+    assert model.num_cameras() == 1  # Both cameras of an ideal rig share their intrinsics.
     assert model.num_reg_images() == 2 * len(rows)
     for image in model.images.values():
         assert (exported / "lattice/images" / image.name).is_file()
         number, eye = image.name.removesuffix(".png").split("_")
         pose, K = rows[number][f"{eye}_cam_from_world"], rows[number][f"{eye}_K"]
         expected_px = project(K, transform(pose, known_points_m)) + 0.5
-        found_px = np.array([image.project_point(point) for point in known_points_m])
-        assert np.abs(found_px - expected_px).max() < 1e-6
+        colmap_px = np.array([image.project_point(point) for point in known_points_m])
+        assert np.abs(colmap_px - expected_px).max() < 1e-6
         assert np.abs(image.projection_center() - camera_centre(pose)).max() < 1e-12
 
 
-def test_the_points_lie_on_steel_in_every_picture(exported: Path) -> None:
+def test_colmap_points_project_onto_steel_masks(exported: Path) -> None:
     model = pycolmap.Reconstruction(exported / "lattice/sparse/0")
     points_m = np.array([point.xyz for point in model.points3D.values()])
     assert 5000 < len(points_m) < 12_000
@@ -162,10 +162,10 @@ def test_the_points_lie_on_steel_in_every_picture(exported: Path) -> None:
             mask = np.asarray(picture)
         inside = (column >= 0) & (row >= 0) & (column < mask.shape[1]) & (row < mask.shape[0])
         assert inside.mean() > 0.5
-        assert (mask[row[inside], column[inside]] == 255).mean() > 0.97  # bars' ends may miss their pixel's middle
+        assert (mask[row[inside], column[inside]] == 255).mean() > 0.97  # Bar ends may miss a pixel centre.
 
 
-def test_a_distorted_camera_is_full_opencv(tmp_path: Path, known_points_m: np.ndarray) -> None:
+def test_distorted_camera_is_full_opencv_in_colmap(tmp_path: Path, known_points_m: np.ndarray) -> None:
     views = zed_views()
     (tmp_path / "cameras.txt").write_text(cameras_txt(views))
     (tmp_path / "images.txt").write_text(images_txt(views))
@@ -177,13 +177,13 @@ def test_a_distorted_camera_is_full_opencv(tmp_path: Path, known_points_m: np.nd
     for view in views:
         for eye, camera in view.cameras.items():
             image = by_name[f"{view.stem(eye)}.png"]
-            turn, shift = cv2.Rodrigues(camera.cam_from_world[:3, :3])[0], camera.cam_from_world[:3, 3]
-            expected, _ = cv2.projectPoints(known_points_m, turn, shift, camera.K, camera.distortion)
-            found = np.array([image.project_point(point) for point in known_points_m])
-            assert np.abs(found - (expected[:, 0] + 0.5)).max() < 1e-6
+            rotation, translation = cv2.Rodrigues(camera.cam_from_world[:3, :3])[0], camera.cam_from_world[:3, 3]
+            expected_px, _ = cv2.projectPoints(known_points_m, rotation, translation, camera.K, camera.distortion)
+            colmap_px = np.array([image.project_point(point) for point in known_points_m])
+            assert np.abs(colmap_px - (expected_px[:, 0] + 0.5)).max() < 1e-6
 
 
-def test_colmap_takes_features_inside_the_exported_mask_alone(exported: Path, tmp_path: Path) -> None:
+def test_colmap_extracts_features_only_inside_mask(exported: Path, tmp_path: Path) -> None:
     name = sorted(path.name for path in (exported / "lattice/images").iterdir())[0]
     reader = pycolmap.ImageReaderOptions()
     reader.mask_path = exported / "lattice/masks"
@@ -206,7 +206,7 @@ QUATERNION_PART = st.one_of(st.sampled_from([0.0, 1.0, -1.0, 1e-9]), st.floats(-
 
 
 @given(st.tuples(*[QUATERNION_PART] * 4).filter(lambda q: np.linalg.norm(q) > 0.1))
-def test_quaternions_turn_as_their_matrix_does(q: tuple[float, ...]) -> None:
+def test_quaternion_represents_same_rotation_as_matrix(q: tuple[float, ...]) -> None:
     matrix = Rotation.from_quat(q).as_matrix()
     w, x, y, z = quaternion_wxyz(matrix)
     assert w >= 0
@@ -214,7 +214,7 @@ def test_quaternions_turn_as_their_matrix_does(q: tuple[float, ...]) -> None:
 
 
 def nerfstudio_points_m(meta: dict[str, Any], frame: dict[str, Any], depth_m: np.ndarray) -> np.ndarray:
-    """Un-project planar depth as nerfstudio casts its rays: pixel + 0.5, y up, looking along -z."""
+    """Return world points of planar depth by nerfstudio's convention: pixel + 0.5, y up, view along -z."""
     height, width = depth_m.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     intrinsics = {**meta, **frame}
@@ -225,7 +225,7 @@ def nerfstudio_points_m(meta: dict[str, Any], frame: dict[str, Any], depth_m: np
     return np.asarray((directions * depth_m[..., None]) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3])
 
 
-def test_depth_through_nerfstudios_rays_lands_on_the_board(exported: Path, rows: Rows) -> None:
+def test_depth_with_nerfstudio_cameras_is_on_board_plane(exported: Path, rows: Rows) -> None:
     folder, board = exported / "lattice", BoardSpec(markers=6)
     meta = json.loads((folder / "transforms.json").read_text())
     assert meta["camera_model"] == "OPENCV"
@@ -235,26 +235,28 @@ def test_depth_through_nerfstudios_rays_lands_on_the_board(exported: Path, rows:
         assert (folder / frame["mask_path"]).is_file()
         number, eye = Path(frame["file_path"]).stem.split("_")
         row = rows[number]
-        exact = nerfstudio_points_m(meta, frame, row[f"{eye}_depth"].astype(np.float64))
-        inner_m = np.array([board.width_m, board.height_m]) / 2 - 0.001  # without the sheet's sides
-        within = (np.abs(exact[..., :2]) < inner_m).all(axis=-1)
+        points_m = nerfstudio_points_m(meta, frame, row[f"{eye}_depth"].astype(np.float64))
+        inner_m = np.array([board.width_m, board.height_m]) / 2 - 0.001  # excluding the sides of the sheet
+        within = (np.abs(points_m[..., :2]) < inner_m).all(axis=-1)
         on_board = within & ~row[f"{eye}_mask"] & (row[f"{eye}_depth"] > 0)
         assert on_board.sum() > 100
-        assert np.abs(exact[on_board][:, 2]).max() < 1e-6
+        assert np.abs(points_m[on_board][:, 2]).max() < 1e-6
         depth_mm = cv2.imread(str(folder / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
-        rounded = nerfstudio_points_m(meta, frame, depth_mm * meta["depth_unit_scale_factor"])
-        assert np.abs(rounded[on_board][:, 2]).max() < 0.001
+        points_of_mm_depth_m = nerfstudio_points_m(meta, frame, depth_mm * meta["depth_unit_scale_factor"])
+        assert np.abs(points_of_mm_depth_m[on_board][:, 2]).max() < 0.001
 
 
-def test_nerfstudio_gets_intrinsics_frame_by_frame_where_the_eyes_differ() -> None:
+def test_nerfstudio_intrinsics_are_per_frame_if_different() -> None:
     views = zed_views()
     meta = json.loads(transforms_json(views))
     assert not {"fl_x", "k1", "w"} & set(meta)
-    for frame, (view, eye) in zip(meta["frames"], [(view, eye) for view in views for eye in EYES], strict=True):
+    for frame, (view, eye) in zip(
+        meta["frames"], [(view, eye) for view in views for eye in CAMERA_NAMES], strict=True
+    ):
         camera = view.cameras[eye]
         assert frame["file_path"] == f"images/{view.stem(eye)}.png"
         assert [frame[k] for k in ("k1", "k2", "p1", "p2", "k3")] == camera.distortion.tolist()
         assert (frame["cx"], frame["cy"]) == (camera.K[0, 2] + 0.5, camera.K[1, 2] + 0.5)
         assert (frame["fl_x"], frame["w"], frame["h"]) == (camera.K[0, 0], 1280, 720)
-        flip = np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])
-        assert flip == pytest.approx(inverse_rigid(camera.cam_from_world), abs=1e-12)
+        world_from_cam = np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])
+        assert world_from_cam == pytest.approx(inverse_rigid(camera.cam_from_world), abs=1e-12)

@@ -1,4 +1,4 @@
-"""Scanners as the bench runs them: offered, described, run over a rendered folder, scored."""
+"""LiDAR methods of the benchmark: entry points, descriptions, predictions and scores."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from rebar_depth_bench import load, score
 from rebar_depth_bench.methods import MultiViewMethod
 from rebar_depth_bench.methods.runner import predict
 
-GROUP = "rebar_depth_bench.methods"
+ENTRY_POINT_GROUP = "rebar_depth_bench.methods"
 NEAR_SPEC = replace(
     SURVEY,
     azimuth_step_rad=8 * SURVEY.azimuth_step_rad,
     elevation_step_rad=8 * SURVEY.elevation_step_rad,
     min_range_m=0.1,
 )
-NEAR = lidar_method("near", NEAR_SPEC, "one that measures close by, coarse as the tiny pictures are")
+NEAR_METHOD = lidar_method("near", NEAR_SPEC, "one that measures close by, coarse as the tiny pictures are")
 
 
 def predictions(archive: Path) -> dict[str, bytes]:
@@ -35,15 +35,15 @@ def predictions(archive: Path) -> dict[str, bytes]:
         return {name: source.read(name) for name in source.namelist() if name != "submission.json"}
 
 
-def test_the_package_offers_both_by_the_door_that_anyone_uses() -> None:
-    pyproject = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
-    offered = pyproject["project"]["entry-points"][GROUP]
+def test_both_methods_are_registered_as_entry_points() -> None:
+    pyproject = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())
+    entry_points = pyproject["project"]["entry-points"][ENTRY_POINT_GROUP]
     for method in (LIDAR_SURVEY, LIDAR_MOBILE):
-        assert EntryPoint(method.info.name, offered[method.info.name], GROUP).load() is method
+        assert EntryPoint(method.info.name, entry_points[method.info.name], ENTRY_POINT_GROUP).load() is method
 
 
 @pytest.mark.parametrize(("method", "nearest"), [(LIDAR_SURVEY, "0.6 m"), (LIDAR_MOBILE, "0.8 m")])
-def test_what_people_read_says_that_it_is_a_simulation(method: MultiViewMethod, nearest: str) -> None:
+def test_summary_states_simulation_and_minimum_range(method: MultiViewMethod, nearest: str) -> None:
     summary = method.info.summary
     assert "reads the scene's mesh: a simulation, no measurement of pictures" in summary
     assert "60 mm above the left camera, pose known exactly" in summary
@@ -52,13 +52,14 @@ def test_what_people_read_says_that_it_is_a_simulation(method: MultiViewMethod, 
 
 
 @pytest.mark.parametrize("spec", [SURVEY, MOBILE])
-def test_notes_are_plain_json_and_hold_every_figure(spec: object) -> None:
-    notes = spec.notes()  # type: ignore[attr-defined]
+def test_notes_are_json_with_every_scanner_field(spec: object) -> None:
+    notes = spec.to_dict()  # type: ignore[attr-defined]
     assert json.loads(json.dumps(notes)) == notes
     assert set(notes) == set(spec.__dataclass_fields__)  # type: ignore[attr-defined]
 
 
-def test_without_embreex_it_can_be_listed_and_says_what_to_install() -> None:
+@pytest.mark.slow
+def test_missing_embreex_names_pip_extra() -> None:
     code = """
 import sys
 sys.modules["embreex"] = None
@@ -70,15 +71,16 @@ try:
 except MethodError as error:
     print(error)
 """
-    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert finished.stdout.strip() == (
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert process.stdout.strip() == (
         "lidar-survey needs embreex to cast rays: pip install 'rebar-depth-bench[build]'"
     )
 
 
-def test_it_runs_over_a_rendered_folder_and_scores(tiny_root: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_lidar_predictions_of_rendered_dataset_score(tiny_root: Path, tmp_path: Path) -> None:
     archive = tmp_path / "near.zip"
-    notes = predict(NEAR, tiny_root, archive, configs=["lattice-orbit"])["lattice-orbit"].notes
+    notes = predict(NEAR_METHOD, tiny_root, archive, configs=["lattice-orbit"])["lattice-orbit"].notes
     assert notes["scanner"]["min_range_m"] == 0.1
     with zipfile.ZipFile(archive) as source:
         submission = json.loads(source.read("submission.json"))
@@ -89,12 +91,13 @@ def test_it_runs_over_a_rendered_folder_and_scores(tiny_root: Path, tmp_path: Pa
     assert table.native is not None
     assert table.native.abs_rel < 0.2
     assert table.scale_median == pytest.approx(1.0, abs=0.02)
-    again = tmp_path / "again.zip"
-    predict(NEAR, tiny_root, again, configs=["lattice-orbit"])
-    assert predictions(again) == predictions(archive)
+    repeated = tmp_path / "again.zip"
+    predict(NEAR_METHOD, tiny_root, repeated, configs=["lattice-orbit"])
+    assert predictions(repeated) == predictions(archive)
 
 
-def test_the_lattice_is_nearer_than_a_spinning_scanner_measures(tiny_root: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_lattice_is_below_minimum_range_of_mobile_lidar(tiny_root: Path, tmp_path: Path) -> None:
     archive = tmp_path / "mobile.zip"
     coarse = lidar_method("coarse", replace(MOBILE, rays_per_beam=2), "fewer rays, for the test")
     predict(coarse, tiny_root, archive, configs=["lattice-orbit"])
@@ -104,8 +107,9 @@ def test_the_lattice_is_nearer_than_a_spinning_scanner_measures(tiny_root: Path,
     assert not table.ranked
 
 
-def test_exact_beams_agree_with_the_ground_truth(tiny_root: Path, tmp_path: Path) -> None:
-    """Thin beams without noise from the camera's own place: what is left is the size of a cell."""
+@pytest.mark.slow
+def test_thin_noiseless_beams_match_ground_truth(tiny_root: Path, tmp_path: Path) -> None:
+    """Scan with thin noiseless beams from the camera centre: the remaining error is the size of a cell."""
     thin = replace(
         SURVEY,
         divergence_rad=0.0,
@@ -117,10 +121,10 @@ def test_exact_beams_agree_with_the_ground_truth(tiny_root: Path, tmp_path: Path
     )
     archive = tmp_path / "thin.zip"
     predict(lidar_method("thin", thin, "thin beams"), tiny_root, archive, configs=["lattice-orbit"])
-    answers = predictions(archive)
+    entries = predictions(archive)
     for row in load(tiny_root, "lattice-orbit", columns=["view_id", "left_depth"]):
-        found = np.load(io.BytesIO(answers[f"{row['view_id']}.npy"]))
-        surface = row["left_depth"] > 0
-        error = np.abs(found - row["left_depth"])[surface] / row["left_depth"][surface]
+        depth_m = np.load(io.BytesIO(entries[f"{row['view_id']}.npy"]))
+        has_surface = row["left_depth"] > 0
+        error = np.abs(depth_m - row["left_depth"])[has_surface] / row["left_depth"][has_surface]
         assert np.isfinite(error).mean() > 0.99
         assert np.nanmedian(error) < 1e-3

@@ -1,4 +1,4 @@
-"""Writes the small IFC models that tests read."""
+"""Writer of small IFC models for tests."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage_assembly import CageBar
 from dataset_builder.scene.assemblies.ifc.bars import ifc_bars
-from dataset_builder.scene.assemblies.ifc.model import ifcopenshell as package
+from dataset_builder.scene.assemblies.ifc.model import import_ifcopenshell as package
 
 ifcopenshell = package()
 Numbers = Sequence[float]
 
 
 class Ifc:
-    """A small IFC model as it is written; lengths in its own unit."""
+    """IFC model under construction; lengths are in the unit of the model."""
 
     def __init__(self, schema: str = "IFC4", prefix: str | None = "MILLI", unit: Any = None) -> None:
         self.file = ifcopenshell.file(schema=schema)
@@ -74,11 +74,11 @@ class Ifc:
         return ifc_bars(self.file.to_string().encode(), "a.ifc")
 
     def axis_m(self) -> ndarray:
-        [found] = self.bars()
-        return np.array(found.bar.axis_m)
+        [cage_bar] = self.bars()
+        return np.array(cage_bar.bar.axis_m)
 
 
-def extruded(ifc: Ifc, radius: float = 8.0, x: float = 0.0) -> Any:
+def extruded_circle(ifc: Ifc, radius: float = 8.0, x: float = 0.0) -> Any:
     circle = ifc.new(
         "IfcCircleProfileDef", "AREA", None, ifc.new("IfcAxis2Placement2D", ifc.point((x, 0))), radius
     )

@@ -1,4 +1,4 @@
-"""Bars of IFC models: where they stand, along which axes."""
+"""Bars of IFC models: placements, axes, diameters and roles."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
 from dataset_builder.scene.assemblies.ifc import tessellation
 from dataset_builder.scene.assemblies.ifc.bars import ifc_bars
 from dataset_builder.scene.assemblies.ifc.geometry import arc_through, axis_placement
-from dataset_builder.scene.model import Bar
-from tests.builder.scene.ifc_writer import Ifc, extruded, ifcopenshell
+from rebar_depth_bench.data.bars import Bar
+from tests.builder.scene.ifc_writer import Ifc, extruded_circle, ifcopenshell
 
 COLUMN = Path("examples/column.ifc")
 
 
-def test_the_column_is_the_same_cage_as_its_toml(tmp_path: Path) -> None:
+def test_example_column_equals_same_cage_in_toml(tmp_path: Path) -> None:
     script = runpy.run_path("examples/make_column_ifc.py")
     foot, head = script["FOOT"], script["HEAD"]
     lines = ['unit = "mm"']
@@ -36,30 +36,31 @@ def test_the_column_is_the_same_cage_as_its_toml(tmp_path: Path) -> None:
         corners = script["stirrup_corners"]() * ([1, 1, 1] if n % 2 == 0 else [-1, -1, 1]) + [0, 0, level]
         lines += ["[[bar]]", "role = 'stirrup'", "diameter = 5", f"points = {corners.tolist()}"]
     (tmp_path / "same.toml").write_text("\n".join(lines))
-    ours, theirs = (load_cage(cage_file_spec(path)) for path in (COLUMN, tmp_path / "same.toml"))
-    assert len(ours.bars) == 13
-    for a, b in zip(ours.bars, theirs.bars, strict=True):
+    from_ifc, from_toml = (load_cage(cage_file_spec(path)) for path in (COLUMN, tmp_path / "same.toml"))
+    assert len(from_ifc.bars) == 13
+    for a, b in zip(from_ifc.bars, from_toml.bars, strict=True):
         assert (a.bar_id, a.role, a.diameter_m) == (b.bar_id, b.role, b.diameter_m)
         np.testing.assert_allclose(a.axis_m, b.axis_m, rtol=0, atol=1e-9)
-    for one, other in zip(ours.parts, theirs.parts, strict=True):
-        np.testing.assert_array_equal(one.mesh.faces, other.mesh.faces)
-        np.testing.assert_allclose(one.mesh.vertices_m, other.mesh.vertices_m, rtol=0, atol=1e-7)
+    for ifc_part, toml_part in zip(from_ifc.parts, from_toml.parts, strict=True):
+        np.testing.assert_array_equal(ifc_part.mesh.faces, toml_part.mesh.faces)
+        np.testing.assert_allclose(ifc_part.mesh.vertices_m, toml_part.mesh.vertices_m, rtol=0, atol=1e-7)
 
 
-def test_the_column_is_written_anew_to_the_same_bytes(tmp_path: Path) -> None:
+def test_example_column_script_reproduces_file(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "examples/make_column_ifc.py", tmp_path / "a.ifc"], check=True)
     assert (tmp_path / "a.ifc").read_bytes() == COLUMN.read_bytes()
     assert COLUMN.stat().st_size < 40_000
 
 
-def test_the_column_as_the_geometry_kernel_sees_it() -> None:
-    """Every vertex of IfcOpenShell's own tessellation lies a radius from our axis."""
+@pytest.mark.slow
+def test_example_column_matches_ifcopenshell_geometry() -> None:
+    """Check that every vertex of IfcOpenShell's tessellation is one radius away from the axis."""
     content = COLUMN.read_bytes()
     model = ifcopenshell.file.from_string(content.decode())
     numbers = [bar.id() for bar in model.by_type("IfcReinforcingBar")]
-    chosen = [0, 8, 9]  # an upright bar, and stirrups as they are and turned
-    meshes = tessellation.meshes_of(content, "a", [numbers[k] for k in chosen])
-    bars = [ifc_bars(content, "a")[k].bar for k in chosen]
+    indices = [0, 8, 9]  # a vertical bar and stirrups in both orientations
+    meshes = tessellation.tessellate(content, "a", [numbers[k] for k in indices])
+    bars = [ifc_bars(content, "a")[k].bar for k in indices]
     for mesh, bar in zip(meshes, bars, strict=True):
         assert not isinstance(mesh, str)
         distance_m = distance_to_axis_m(mesh.vertices_m, bar)
@@ -69,11 +70,11 @@ def test_the_column_as_the_geometry_kernel_sees_it() -> None:
 
 def distance_to_axis_m(points_m: ndarray, bar: Bar) -> ndarray:
     axis = np.array(bar.axis_m)
-    nearest = np.full(len(points_m), np.inf)
+    nearest_m = np.full(len(points_m), np.inf)
     for a, b in pairwise(axis):
         share = np.clip((points_m - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
-        nearest = np.minimum(nearest, np.linalg.norm(points_m - a - share[:, None] * (b - a), axis=1))
-    return nearest
+        nearest_m = np.minimum(nearest_m, np.linalg.norm(points_m - a - share[:, None] * (b - a), axis=1))
+    return nearest_m
 
 
 @pytest.mark.parametrize(
@@ -86,45 +87,45 @@ def distance_to_axis_m(points_m: ndarray, bar: Bar) -> ndarray:
         ("MILLI", 25.4, 0.0254),
     ],
 )
-def test_placements_by_hand_in_every_unit(prefix: str | None, unit: float | None, metres: float) -> None:
+def test_nested_placements_in_every_unit(prefix: str | None, unit: float | None, metres: float) -> None:
     ifc = Ifc(prefix=prefix, unit=unit)
-    # The storey's x axis is the world's y, its z the world's x, so that its y is the world's z.
+    # The storey's x axis is the world's y, its z axis the world's x and therefore its y axis the world's z.
     storey = ifc.at((10, 20, 30), (1, 0, 0), (0, 1, 0))
-    # In it the bar is turned a quarter about z: its x is the storey's y, its y the storey's -x.
+    # The bar is rotated by 90 degrees about z: its x axis is the storey's y, its y axis the storey's -x.
     ifc.bar(
         ifc.disc(ifc.polyline((0, 0, 0), (5, 2, 1)), 0.25), at=ifc.at((1, 2, 3), None, (0, 1, 0), parent=storey)
     )
     # (5, 2, 1) -> storey (1 - 2, 2 + 5, 3 + 1) = (-1, 7, 4) -> world (10 + 4, 20 - 1, 30 + 7).
-    [found] = ifc.bars()
-    np.testing.assert_allclose(found.bar.axis_m, np.array([(13, 21, 32), (14, 19, 37)]) * metres, atol=1e-11)
-    assert found.bar.diameter_m == pytest.approx(0.5 * metres, abs=1e-12)
+    [cage_bar] = ifc.bars()
+    np.testing.assert_allclose(cage_bar.bar.axis_m, np.array([(13, 21, 32), (14, 19, 37)]) * metres, atol=1e-11)
+    assert cage_bar.bar.diameter_m == pytest.approx(0.5 * metres, abs=1e-12)
 
 
-def test_a_slanted_placement_makes_its_axes_square() -> None:
+def test_placement_axes_are_orthogonalised() -> None:
     ifc = Ifc()
     matrix = axis_placement(ifc.axes((1, 2, 3), (0, 0, 2), (3, 0, 4)))
     np.testing.assert_allclose(matrix, [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-15)
 
 
-def test_maps_by_hand() -> None:
+def test_nested_mapped_items() -> None:
     ifc = Ifc()
     disc = ifc.disc(ifc.polyline((0, 0, 0), (100, 0, 10)))
-    turned = ifc.new(
+    rotation = ifc.new(
         "IfcCartesianTransformationOperator3D",
         ifc.direction((0, 1, 0)), ifc.direction((-1, 0, 0)), ifc.point((5, 6, 7)), 2.0, ifc.direction((0, 0, 1)),
     )  # fmt: skip
-    inner = ifc.mapped(turned, ifc.axes((50, 0, 0)), disc)
-    plain = ifc.new("IfcCartesianTransformationOperator3D", LocalOrigin=ifc.point((0, 0, 1000)))
-    ifc.bar(ifc.mapped(plain, ifc.axes((0, 0, 0)), inner, disc))
+    inner = ifc.mapped(rotation, ifc.axes((50, 0, 0)), disc)
+    translation = ifc.new("IfcCartesianTransformationOperator3D", LocalOrigin=ifc.point((0, 0, 1000)))
+    ifc.bar(ifc.mapped(translation, ifc.axes((0, 0, 0)), inner, disc))
     first, second = ifc.bars()
-    # x + 50, then doubled and turned a quarter about z, then moved: (5 - 2 y, 6 + 2 (x + 50), 7 + 2 z + 1000).
+    # x + 50, scaled by 2, rotated by 90 degrees about z, translated: (5 - 2 y, 6 + 2 (x + 50), 7 + 2 z + 1000).
     np.testing.assert_allclose(np.array(first.bar.axis_m) * 1000, [(5, 106, 1007), (5, 306, 1027)], atol=1e-9)
     assert (first.bar.diameter_m, second.bar.diameter_m) == (0.032, 0.016)
     np.testing.assert_allclose(np.array(second.bar.axis_m) * 1000, [(0, 0, 1000), (100, 0, 1010)], atol=1e-9)
     assert (first.bar.bar_id, second.bar.bar_id) == (1, 2)
 
 
-def test_a_mirrored_map() -> None:
+def test_mirrored_mapped_item() -> None:
     ifc = Ifc()
     mirror = ifc.new("IfcCartesianTransformationOperator3D", None, ifc.direction((0, -1, 0)), ifc.point((0, 0, 0)))
     ifc.bar(ifc.mapped(mirror, ifc.axes((0, 0, 0)), ifc.disc(ifc.polyline((0, 0, 0), (100, 30, 10)))))
@@ -135,15 +136,13 @@ def test_a_mirrored_map() -> None:
     turn=st.floats(0.02, 6.2), middle=st.floats(0.1, 0.9), radius=st.floats(1.0, 500.0),
     seed=st.integers(0, 1000),
 )  # fmt: skip
-def test_an_arc_through_three_points_is_that_of_its_circle(
-    turn: float, middle: float, radius: float, seed: int
-) -> None:
+def test_arc_through_three_points_is_on_circle(turn: float, middle: float, radius: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    turned, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    basis, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     centre = rng.normal(size=3) * 100
 
     def on_circle(angle: float) -> ndarray:
-        return np.asarray(centre + radius * (math.cos(angle) * turned[0] + math.sin(angle) * turned[1]))
+        return np.asarray(centre + radius * (math.cos(angle) * basis[0] + math.sin(angle) * basis[1]))
 
     points = arc_through(on_circle(0.0), on_circle(middle * turn), on_circle(turn))
     assert len(points) == max(2, math.ceil(math.degrees(turn) / 6 - 1e-6) + 1)
@@ -151,12 +150,12 @@ def test_an_arc_through_three_points_is_that_of_its_circle(
     np.testing.assert_allclose(points, expected, atol=radius * 1e-6)
 
 
-def test_an_arc_of_three_points_on_a_line_is_the_line() -> None:
+def test_arc_of_collinear_points_is_line() -> None:
     points = np.array([(0.0, 0, 0), (1, 1, 0), (3, 3, 0)])
     np.testing.assert_array_equal(arc_through(*points), points)
 
 
-QUARTER = [
+QUARTER_CIRCLE_MM = [
     (0, 0, 0),
     (200, 0, 0),
     (200 + 40 * math.sin(math.pi / 4), 40 - 40 * math.cos(math.pi / 4), 0),
@@ -165,7 +164,7 @@ QUARTER = [
 
 
 def quarter_circle_axis(ifc: Ifc, arc: Any, same: bool) -> ndarray:
-    """The axis of a bar along a line, an arc and a line that is given backwards."""
+    """Return the axis of a bar made of a line, an arc and a reversed line, in metres."""
     line = ifc.new("IfcLine", ifc.point((0, 0, 0)), ifc.new("IfcVector", ifc.direction((2, 0, 0)), 10.0))
     first = ifc.new("IfcTrimmedCurve", line, [ifc.parameter(0.0)], [ifc.parameter(20.0)], True, "PARAMETER")
     curves = [(first, True), (arc, same), (ifc.polyline((240, 140, 0), (240, 40, 0)), False)]
@@ -175,21 +174,23 @@ def quarter_circle_axis(ifc: Ifc, arc: Any, same: bool) -> ndarray:
 
 
 @pytest.mark.parametrize("kind", ["parameters", "points", "both", "backwards", "sense", "indexed"])
-def test_every_way_to_write_the_same_bend(kind: str) -> None:
+def test_all_encodings_of_bend_give_same_axis(kind: str) -> None:
     ifc = Ifc()
     up = ifc.new("IfcCircle", ifc.axes((200, 40, 0), (0, 0, 1), (0, -1, 0)), 40.0)
     down = ifc.new("IfcCircle", ifc.axes((200, 40, 0), (0, 0, -1), (0, -1, 0)), 40.0)
     start, end = ifc.point((200, 0, 0)), ifc.point((240, 40, 0))
-    at = ifc.parameter
-    trimmed: dict[str, tuple[Any, ...]] = {
-        "parameters": (up, [at(0.0)], [at(90.0)], True, "PARAMETER"),
+    parameter = ifc.parameter
+    trimmed_curve_args: dict[str, tuple[Any, ...]] = {
+        "parameters": (up, [parameter(0.0)], [parameter(90.0)], True, "PARAMETER"),
         "points": (up, [start], [end], True, "CARTESIAN"),
-        "both": (up, [start, at(0.0)], [end, at(90.0)], True, "PARAMETER"),
-        "backwards": (down, [at(270.0)], [at(0.0)], True, "PARAMETER"),
+        "both": (up, [start, parameter(0.0)], [end, parameter(90.0)], True, "PARAMETER"),
+        "backwards": (down, [parameter(270.0)], [parameter(0.0)], True, "PARAMETER"),
         "sense": (up, [end], [start], False, "CARTESIAN"),
     }
     if kind == "indexed":
-        points = ifc.new("IfcCartesianPointList3D", [tuple(map(float, p)) for p in (*QUARTER, (240, 140, 0))])
+        points = ifc.new(
+            "IfcCartesianPointList3D", [tuple(map(float, p)) for p in (*QUARTER_CIRCLE_MM, (240, 140, 0))]
+        )
         segments = [
             ifc.new("IfcLineIndex", (1, 2)),
             ifc.new("IfcArcIndex", (2, 3, 4)),
@@ -198,14 +199,14 @@ def test_every_way_to_write_the_same_bend(kind: str) -> None:
         ifc.bar(ifc.disc(ifc.new("IfcIndexedPolyCurve", points, segments, False)))
         axis_mm = ifc.axis_m() * 1000
     else:
-        arc = ifc.new("IfcTrimmedCurve", *trimmed[kind])
+        arc = ifc.new("IfcTrimmedCurve", *trimmed_curve_args[kind])
         axis_mm = quarter_circle_axis(ifc, arc, same=kind not in ("backwards", "sense")) * 1000
     angles = np.linspace(0, math.pi / 2, 16)
     bend = [(200 + 40 * math.sin(a), 40 - 40 * math.cos(a), 0) for a in angles]
     np.testing.assert_allclose(axis_mm, [(0, 0, 0), *bend, (240, 140, 0)], atol=1e-9)
 
 
-def test_a_polygonal_disc_is_bent_at_its_corners() -> None:
+def test_polygonal_disk_solid_has_rounded_corners() -> None:
     ifc = Ifc()
     line = ifc.polyline((0, 0, 0), (240, 0, 0), (240, 140, 0))
     ifc.bar(ifc.new("IfcSweptDiskSolidPolygonal", line, 8.0, None, None, None, 40.0))
@@ -214,34 +215,37 @@ def test_a_polygonal_disc_is_bent_at_its_corners() -> None:
     np.testing.assert_allclose(np.hypot(axis_mm[1:-1, 0] - 200, axis_mm[1:-1, 1] - 40), 40, atol=1e-9)
 
 
-def test_roles_and_order() -> None:
+def test_bar_roles_and_order() -> None:
     ifc = Ifc()
-    wanted = [
+    expected = [
         ("main", {"PredefinedType": "MAIN"}),
         ("stirrup", {"PredefinedType": "LIGATURE", "Name": "x"}),
         ("Top layer", {"PredefinedType": "USERDEFINED", "ObjectType": " Top \n layer "}),
         ("Bügel 7", {"Name": "Bügel 7"}),
         ("bar", {}),
     ]
-    made = [
+    entities = [
         ifc.bar(ifc.disc(ifc.polyline((0, 100 * n, 0), (500, 100 * n, 0))), **attributes)
-        for n, (_, attributes) in enumerate(wanted)
+        for n, (_, attributes) in enumerate(expected)
     ]
     ifc.rooted(
         "IfcRelDefinesByType",
-        RelatedObjects=[made[-1]],
+        RelatedObjects=[entities[-1]],
         RelatingType=ifc.rooted("IfcReinforcingBarType", PredefinedType="SHEAR"),
     )
-    found = [bar.bar for bar in ifc.bars()]
-    assert [bar.role for bar in found] == [*(role for role, _ in wanted[:-1]), "shear"]
-    assert [bar.axis_m[0][1] for bar in found] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
-    assert [bar.bar_id for bar in found] == [1, 2, 3, 4, 5]
+    bars = [bar.bar for bar in ifc.bars()]
+    assert [bar.role for bar in bars] == [*(role for role, _ in expected[:-1]), "shear"]
+    assert [bar.axis_m[0][1] for bar in bars] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert [bar.bar_id for bar in bars] == [1, 2, 3, 4, 5]
 
 
-def test_other_solids_are_tessellated_and_estimated() -> None:
+@pytest.mark.slow
+def test_extruded_bars_are_tessellated_and_fitted() -> None:
     ifc = Ifc()
     ifc.bar(ifc.disc(ifc.polyline((0, 0, 0), (500, 0, 0))))
-    ifc.bar(extruded(ifc), extruded(ifc, 6.0, x=50.0), at=ifc.at((100, 200, 300), (1, 0, 0), (0, 0, 1)))
+    ifc.bar(
+        extruded_circle(ifc), extruded_circle(ifc, 6.0, x=50.0), at=ifc.at((100, 200, 300), (1, 0, 0), (0, 0, 1))
+    )
     swept, first, second = ifc.bars()
     assert (swept.bar.role, first.bar.role, second.bar.role) == ("bar", "imported", "imported")
     np.testing.assert_allclose(first.bar.axis_m, [(0.1, 0.2, 0.3), (0.6, 0.2, 0.3)], atol=1e-4)

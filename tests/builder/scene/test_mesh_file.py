@@ -1,4 +1,4 @@
-"""Users' mesh files as assemblies: which part is which bar, in whose frame and unit, and what is refused."""
+"""Import of users' mesh files: numbering of bars, axes, units and rejected files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ALONG_X = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
 
 
 def rod(diameter_m: float, y_m: float = 0.0) -> trimesh.Trimesh:
-    """A closed rod of 0.5 m along x."""
+    """Return a closed rod of 0.5 m along x."""
     body = trimesh.creation.cylinder(diameter_m / 2, 0.5, sections=64, transform=ALONG_X)
     body.apply_translation([0.25, y_m, 0.1])
     return body
@@ -33,19 +33,19 @@ def rod(diameter_m: float, y_m: float = 0.0) -> trimesh.Trimesh:
 RODS = tuple(rod(diameter_m, y_m) for diameter_m, y_m in ((0.016, 0.0), (0.010, 0.1), (0.020, 0.2)))
 
 
-def joined(bodies: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+def concatenate_meshes(bodies: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     arrays = trimesh.util.append_faces([body.vertices for body in bodies], [body.faces for body in bodies])
     return trimesh.Trimesh(*arrays, process=False)
 
 
-def scene(bodies: Sequence[trimesh.Trimesh], names: Sequence[str]) -> trimesh.Scene:
-    found = trimesh.Scene()
+def named_scene(bodies: Sequence[trimesh.Trimesh], names: Sequence[str]) -> trimesh.Scene:
+    combined = trimesh.Scene()
     for body, name in zip(bodies, names, strict=True):
-        found.add_geometry(body, node_name=name, geom_name=name)
-    return found
+        combined.add_geometry(body, node_name=name, geom_name=name)
+    return combined
 
 
-def obj(bodies: Sequence[trimesh.Trimesh], names: Sequence[str], per_metre: float = 1.0) -> bytes:
+def obj_bytes(bodies: Sequence[trimesh.Trimesh], names: Sequence[str], per_metre: float = 1.0) -> bytes:
     lines, start = ["mtllib missing.mtl"], 1
     for body, name in zip(bodies, names, strict=True):
         lines += [f"o {name}", *(f"v {x!r} {y!r} {z!r}" for x, y, z in (body.vertices * per_metre).tolist())]
@@ -54,7 +54,7 @@ def obj(bodies: Sequence[trimesh.Trimesh], names: Sequence[str], per_metre: floa
     return "\n".join(lines).encode()
 
 
-def loaded(folder: Path, name: str, content: bytes | str, unit: str | float = "m") -> Assembly:
+def load_content(folder: Path, name: str, content: bytes | str, unit: str | float = "m") -> Assembly:
     (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
     return load_assembly(mesh_file_spec(folder / name, unit))
 
@@ -63,32 +63,33 @@ def diameters_mm(assembly: Assembly) -> list[int]:
     return [round(bar.diameter_m * 1000) for bar in assembly.bars]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj", ".glb"])
-def test_a_lattice_comes_back_through_every_format(tmp_path: Path, suffix: str) -> None:
+def test_lattice_round_trips_through_every_format(tmp_path: Path, suffix: str) -> None:
     lattice = lattice_assembly(replace(LatticeSpec(), extent_m=0.040))
     meshes = [part.mesh for part in lattice.parts]
     bodies = [trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False) for mesh in meshes]
-    names = [f"rod {number}" for number in range(1, 13)]  # "rod 10" comes after "rod 9"
-    whole, path = joined(bodies), tmp_path / f"a{suffix}"
+    names = [f"rod {number}" for number in range(1, 13)]  # Natural order: "rod 10" after "rod 9".
+    whole, path = concatenate_meshes(bodies), tmp_path / f"a{suffix}"
     if suffix == ".ply":
         bar_id = np.repeat(range(1, 13), [len(body.faces) for body in bodies])
         write_mesh_ply(path, whole.vertices, whole.faces, bar_id)
     elif suffix == ".glb":
-        (y_up := scene(bodies, names)).apply_transform(
+        (y_up := named_scene(bodies, names)).apply_transform(
             trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
         )
         y_up.export(path)
     else:
-        path.write_bytes(obj(bodies, names) if suffix == ".obj" else trimesh.exchange.stl.export_stl(whole))
+        path.write_bytes(obj_bytes(bodies, names) if suffix == ".obj" else trimesh.exchange.stl.export_stl(whole))
 
-    back = load_assembly(mesh_file_spec(path, "m"))
+    imported = load_assembly(mesh_file_spec(path, "m"))
 
-    assert [bar.bar_id for bar in back.bars] == [part.bar_id for part in back.parts] == list(range(1, 13))
-    for bar, bar_in in zip(back.bars, lattice.bars, strict=True):
-        np.testing.assert_allclose(bar.axis_m, bar_in.axis_m, rtol=0, atol=1e-4)
+    assert [bar.bar_id for bar in imported.bars] == [part.bar_id for part in imported.parts] == list(range(1, 13))
+    for bar, original in zip(imported.bars, lattice.bars, strict=True):
+        np.testing.assert_allclose(bar.axis_m, original.axis_m, rtol=0, atol=1e-4)
         assert bar.role == "imported"
-        assert bar.diameter_m == pytest.approx(bar_in.diameter_m, rel=0.05)
-    for part, mesh in zip(back.parts, meshes, strict=True):
+        assert bar.diameter_m == pytest.approx(original.diameter_m, rel=0.05)
+    for part, mesh in zip(imported.parts, meshes, strict=True):
         assert (part.name, part.material) == (f"bar-{part.bar_id:03d}", "steel")
         assert (part.mesh.vertices_m.dtype, part.mesh.faces.dtype) == (np.float64, np.int32)
         corners = part.mesh.vertices_m[part.mesh.faces]
@@ -98,11 +99,11 @@ def test_a_lattice_comes_back_through_every_format(tmp_path: Path, suffix: str) 
             np.testing.assert_array_equal(part.mesh.faces, mesh.faces)
 
 
-def test_own_ply_keeps_ids_and_winding_and_leaves_the_board_out(tmp_path: Path) -> None:
+def test_dataset_ply_keeps_bar_ids_and_skips_board(tmp_path: Path) -> None:
     inside_out = RODS[1].copy()
     inside_out.invert()
     bodies = (RODS[0], trimesh.creation.box((2, 2, 0.01)), inside_out)
-    whole = joined(bodies)
+    whole = concatenate_meshes(bodies)
     bar_id = np.repeat([40_000, 0, 7], [len(body.faces) for body in bodies])
     write_mesh_ply(tmp_path / "a.ply", whole.vertices, whole.faces, bar_id)
     parts = load_assembly(mesh_file_spec(tmp_path / "a.ply", "m")).parts
@@ -115,11 +116,11 @@ def test_own_ply_keeps_ids_and_winding_and_leaves_the_board_out(tmp_path: Path) 
     with pytest.raises(MeshError, match="every face has bar_id 0"):
         load_assembly(mesh_file_spec(tmp_path / "a.ply", "m"))
     with pytest.raises(MeshError, match=f"^{tmp_path}/b.ply: truncated or damaged"):
-        loaded(tmp_path, "b.ply", (tmp_path / "a.ply").read_bytes()[:-1])
+        load_content(tmp_path, "b.ply", (tmp_path / "a.ply").read_bytes()[:-1])
 
 
-def test_one_soup_is_split_by_first_faces(tmp_path: Path) -> None:
-    """Faces of two rods alternate, and their vertices come the other way round."""
+def test_triangle_soup_is_split_in_order_of_first_face(tmp_path: Path) -> None:
+    """Split two rods whose faces alternate and whose vertices are stored in reverse order."""
     first, second = RODS[2], RODS[1]
     faces = np.stack([first.faces + len(second.vertices), second.faces], axis=1).reshape(-1, 3)
     soup = trimesh.Trimesh(np.concatenate([second.vertices, first.vertices]), faces, process=False)
@@ -130,52 +131,52 @@ def test_one_soup_is_split_by_first_faces(tmp_path: Path) -> None:
         "a.ply": trimesh.exchange.ply.export_ply(soup),
         "text.PLY": trimesh.exchange.ply.export_ply(soup, encoding="ascii"),
     }.items():
-        assembly = loaded(tmp_path, name, content)
+        assembly = load_content(tmp_path, name, content)
         assert diameters_mm(assembly) == [20, 10]
         assert [len(part.mesh.vertices_m) for part in assembly.parts] == [130, 130]
 
 
-def test_objects_are_numbered_by_name_whatever_their_order(tmp_path: Path) -> None:
+def test_objects_are_numbered_by_name(tmp_path: Path) -> None:
     names = ("bar10", "bar9", "bar1")
-    files = {"a.obj": obj(RODS, names), "a.glb": scene(RODS, names).export(file_type="glb")}
+    files = {"a.obj": obj_bytes(RODS, names), "a.glb": named_scene(RODS, names).export(file_type="glb")}
     for name, content in files.items():
-        assert diameters_mm(loaded(tmp_path, name, content)) == [20, 10, 16]
+        assert diameters_mm(load_content(tmp_path, name, content)) == [20, 10, 16]
 
 
-def test_an_object_of_two_pieces_is_one_bar(tmp_path: Path) -> None:
-    lines = obj((joined(RODS[:2]), RODS[2]), "ab").split(b"\n")
+def test_object_of_two_pieces_is_one_bar(tmp_path: Path) -> None:
+    lines = obj_bytes((concatenate_meshes(RODS[:2]), RODS[2]), "ab").split(b"\n")
     content = b"\n".join([*lines[:400], b"usemtl paint", b"g group", *lines[400:]])
-    assert [len(part.mesh.faces) for part in loaded(tmp_path, "a.obj", content).parts] == [512, 256]
+    assert [len(part.mesh.faces) for part in load_content(tmp_path, "a.obj", content).parts] == [512, 256]
     tree = json.loads(GLTF)
     tree["meshes"][0]["primitives"] += tree["meshes"].pop(1)["primitives"]
     tree["nodes"][1]["mesh"] = 1
     tree["nodes"].pop(2)
     tree["scenes"] = [{"nodes": [1, 0]}]
-    parts = loaded(tmp_path, "a.gltf", json.dumps(tree)).parts
+    parts = load_content(tmp_path, "a.gltf", json.dumps(tree)).parts
     assert [len(part.mesh.faces) for part in parts] == [512, 256]
 
 
-def test_gltf_is_turned_z_up_and_its_transforms_apply(tmp_path: Path) -> None:
+def test_gltf_is_converted_to_z_up_with_transforms(tmp_path: Path) -> None:
     plate = trimesh.Trimesh([[0, 0, 0], [2, 0, 0], [0, 2, 0.1]], [[0, 1, 2]], process=False)
-    found = trimesh.Scene()
-    turned = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 0, 1]) @ np.diag([1, 10, 100, 1])
-    turned[:3, 3] = 1, 2, 3
-    found.add_geometry(plate, node_name="a", transform=turned)
-    found.add_geometry(plate, node_name="b")
+    gltf_scene = trimesh.Scene()
+    transform_a = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 0, 1]) @ np.diag([1, 10, 100, 1])
+    transform_a[:3, 3] = 1, 2, 3
+    gltf_scene.add_geometry(plate, node_name="a", transform=transform_a)
+    gltf_scene.add_geometry(plate, node_name="b")
     first, second = (
-        part.mesh.vertices_m for part in loaded(tmp_path, "a.glb", found.export(file_type="glb")).parts
+        part.mesh.vertices_m for part in load_content(tmp_path, "a.glb", gltf_scene.export(file_type="glb")).parts
     )
     np.testing.assert_allclose(first, [[1.0, -3, 2], [1.0, -3, 4], [-19.0, -13, 2]], atol=1e-5)
     np.testing.assert_allclose(second, [[0.0, 0, 0], [2.0, 0, 0], [0, -0.1, 2]], atol=1e-7)
 
 
-def test_polygons_are_triangulated_and_closed_parts_turned_outward(tmp_path: Path) -> None:
+def test_polygons_are_triangulated_and_oriented_outward(tmp_path: Path) -> None:
     square = "v 0 0 0\nv .1 0 0\nv .1 .1 0\nv 0 .1 0\nf 1 2 \\\n3 4\n"
-    mesh = loaded(tmp_path, "a.obj", square).parts[0].mesh
+    mesh = load_content(tmp_path, "a.obj", square).parts[0].mesh
     assert trimesh.Trimesh(mesh.vertices_m, mesh.faces).area == pytest.approx(0.01)
     inside_out = RODS[0].copy()
     inside_out.invert()
-    for part in loaded(tmp_path, "b.obj", obj((inside_out, RODS[1]), "ab")).parts:
+    for part in load_content(tmp_path, "b.obj", obj_bytes((inside_out, RODS[1]), "ab")).parts:
         assert trimesh.Trimesh(part.mesh.vertices_m, part.mesh.faces).is_volume
 
 
@@ -183,16 +184,17 @@ def test_polygons_are_triangulated_and_closed_parts_turned_outward(tmp_path: Pat
     ("unit", "per_metre"),
     [("m", 1), ("cm", 100), ("mm", 1000), ("in", 1 / 0.0254), ("ft", 1 / 0.3048), (0.5, 2)],
 )
-def test_units(tmp_path: Path, unit: str | float, per_metre: float) -> None:
-    assembly = loaded(tmp_path, "a.obj", obj(RODS, "abc", per_metre), unit)
+def test_units_scale_vertices(tmp_path: Path, unit: str | float, per_metre: float) -> None:
+    assembly = load_content(tmp_path, "a.obj", obj_bytes(RODS, "abc", per_metre), unit)
     assert diameters_mm(assembly) == [16, 10, 20]
     np.testing.assert_allclose(assembly.parts[1].mesh.vertices_m, RODS[1].vertices, atol=1e-12)
 
 
-def test_estimates_of_an_open_tube_and_a_wedge(tmp_path: Path) -> None:
-    """Far from the origin; one end of the tube is open, and one side there is tessellated finely.
+def test_axis_and_diameter_of_open_tube_and_wedge(tmp_path: Path) -> None:
+    """Check the fitted axis and diameter of two bodies far from the origin.
 
-    The wedge's section is a 3-4-5 triangle: the middle of its surface lies beside that of its volume.
+    One end of the tube is open, and one side of it is finely tessellated. The section of the wedge is a 3-4-5
+    triangle: the centroid of its surface differs from that of its volume.
     """
     tube = rod(0.016)
     tube.update_faces(tube.face_normals[:, 0] < 0.5)
@@ -204,7 +206,7 @@ def test_estimates_of_an_open_tube_and_a_wedge(tmp_path: Path) -> None:
     wedge = trimesh.Trimesh(ends, faces)
     for body in (tube, wedge):
         body.apply_translation([300, -200, 500])
-    bars = loaded(tmp_path, "a.obj", obj((tube, wedge), "ab")).bars
+    bars = load_content(tmp_path, "a.obj", obj_bytes((tube, wedge), "ab")).bars
     np.testing.assert_allclose(bars[0].axis_m, [[300.0, -200, 500.1], [300.5, -200, 500.1]], rtol=0, atol=2e-6)
     middle = [-200 + 0.01, 500 + 0.04 / 3]
     np.testing.assert_allclose(bars[1].axis_m, [[300, *middle], [301, *middle]], rtol=0, atol=2e-5)
@@ -212,7 +214,7 @@ def test_estimates_of_an_open_tube_and_a_wedge(tmp_path: Path) -> None:
     assert bars[1].diameter_m == pytest.approx((4 * 0.0006 / np.pi) ** 0.5, rel=1e-3)
 
 
-def test_what_the_spec_refuses(tmp_path: Path) -> None:
+def test_invalid_mesh_paths_and_units_are_rejected(tmp_path: Path) -> None:
     path = tmp_path / "a.stl"
     with pytest.raises(MeshError, match="cannot be read: No such file"):
         mesh_file_spec(path, "m")
@@ -233,20 +235,21 @@ def test_what_the_spec_refuses(tmp_path: Path) -> None:
         load_assembly(spec)
 
 
-def test_too_many_bars(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_more_than_65535_parts_are_rejected(tmp_path: Path) -> None:
     corners = np.arange(65_536)[:, None, None] * [1e-4, 0, 0] + [[0, 0, 0], [5e-5, 0, 0], [0, 0.1, 0]]
     soup = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * 65_536).reshape(-1, 3), process=False)
     with pytest.raises(MeshError, match="65536 separate parts found, expected at most 65535 bars"):
-        loaded(tmp_path, "a.stl", trimesh.exchange.stl.export_stl(soup))
+        load_content(tmp_path, "a.stl", trimesh.exchange.stl.export_stl(soup))
 
 
-GLB = scene(RODS, "abc").export(file_type="glb")
-GLTF = trimesh.exchange.gltf.export_gltf(scene(RODS, "abc"), embed_buffers=True)["model.gltf"].decode()
+GLB = named_scene(RODS, "abc").export(file_type="glb")
+GLTF = trimesh.exchange.gltf.export_gltf(named_scene(RODS, "abc"), embed_buffers=True)["model.gltf"].decode()
 STL = trimesh.exchange.stl.export_stl_ascii(RODS[0])
 PLY = trimesh.exchange.ply.export_ply(RODS[0], encoding="ascii").decode()
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 UNREADABLE = "not a mesh file of its kind that can be read"
-HOSTILE: dict[str, tuple[str, bytes | str, str]] = {
+INVALID_FILES: dict[str, tuple[str, bytes | str, str]] = {
     "empty obj": (".obj", "", "no triangle found"),
     "points only": (".obj", TRIANGLE, "no triangle found"),
     "corner beyond": (".obj", TRIANGLE + "f 1 2 9", UNREADABLE),
@@ -275,33 +278,34 @@ HOSTILE: dict[str, tuple[str, bytes | str, str]] = {
 }
 
 
-@pytest.mark.parametrize(("suffix", "content", "words"), HOSTILE.values(), ids=HOSTILE)
-def test_hostile_files(tmp_path: Path, suffix: str, content: bytes | str, words: str) -> None:
+@pytest.mark.parametrize(("suffix", "content", "words"), INVALID_FILES.values(), ids=INVALID_FILES)
+def test_invalid_mesh_files_are_rejected(tmp_path: Path, suffix: str, content: bytes | str, words: str) -> None:
     (tmp_path / "b.bin").write_bytes(b"beside")
     with pytest.raises(MeshError, match=words) as caught:
-        loaded(tmp_path, "a" + suffix, content)
+        load_content(tmp_path, "a" + suffix, content)
     assert str(caught.value).startswith(f"{tmp_path / 'a'}{suffix}: ")
     assert "\n" not in str(caught.value)
 
 
-SAMPLES = {"a.obj": obj(RODS[:1], "a"), "a.glb": GLB, "a.gltf": GLTF.encode(), "b.stl": STL.encode()}
+SAMPLES = {"a.obj": obj_bytes(RODS[:1], "a"), "a.glb": GLB, "a.gltf": GLTF.encode(), "b.stl": STL.encode()}
 SAMPLES |= {"a.stl": trimesh.exchange.stl.export_stl(RODS[0]), "b.ply": PLY.encode()}
 SAMPLES |= {"a.ply": trimesh.exchange.ply.export_ply(RODS[0])}
 
 
+@pytest.mark.slow
 @settings(max_examples=150)
 @given(name=st.sampled_from(sorted(SAMPLES)), data=st.data())
-def test_any_damage_is_answered_in_words(
+def test_random_damage_raises_only_mesh_error(
     tmp_path_factory: pytest.TempPathFactory, name: str, data: st.DataObject
 ) -> None:
     content = bytearray(SAMPLES[name])
-    # Half of the damage falls on the first 400 bytes, where the headers are.
-    places = st.integers(0, len(content) - 1) | st.integers(0, 399)
-    for place, value in data.draw(st.lists(st.tuples(places, st.integers(0, 255)), min_size=1, max_size=4)):
-        content[place] = value
+    # Half of the damage is in the first 400 bytes, which hold the headers.
+    positions = st.integers(0, len(content) - 1) | st.integers(0, 399)
+    for position, value in data.draw(st.lists(st.tuples(positions, st.integers(0, 255)), min_size=1, max_size=4)):
+        content[position] = value
     folder = tmp_path_factory.mktemp("damaged")
     try:
-        assembly = loaded(folder, name, bytes(content[: data.draw(places | st.none())]))
+        assembly = load_content(folder, name, bytes(content[: data.draw(positions | st.none())]))
     except MeshError as error:
         assert str(error).startswith(str(folder / name))  # noqa: PT017
         return

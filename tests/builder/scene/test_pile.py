@@ -1,4 +1,4 @@
-"""The pile: six true stirrups in a heap that rests, and that no bar of runs through another or the board."""
+"""Pile assembly: six bent stirrups at rest that intersect neither each other nor the board."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from dataset_builder.scene.assemblies import pile as pile_module
 from dataset_builder.scene.assemblies.pile import (
     RIBS,
     SELF_GAP_M,
-    STATES,
+    STATES_DIR,
     hook_extension_m,
+    load_settled_poses,
     pile_assembly,
-    settled_poses,
     stirrup_centreline_m,
 )
 from dataset_builder.scene.model import Assembly
@@ -35,9 +35,9 @@ from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 
 SPEC = PileSpec()
 RADIUS_M = outer_radius_m(SPEC.diameter_m, RIBS)
-STORED = json.loads((STATES / "pile-0.json").read_text())
+STORED = json.loads((STATES_DIR / "pile-0.json").read_text())
 
-Line = Float64[ndarray, "n 3"]
+Polyline = Float64[ndarray, "n 3"]
 
 
 @pytest.fixture(scope="module")
@@ -46,14 +46,14 @@ def pile() -> Assembly:
 
 
 @pytest.fixture(scope="module")
-def lines_m(pile: Assembly) -> list[Line]:
+def lines_m(pile: Assembly) -> list[Polyline]:
     return [np.array(bar.axis_m) for bar in pile.bars]
 
 
-def segment_distances_m(a: Line, b: Line) -> Float64[ndarray, "n k"]:
-    """Return the exact distance of every segment of one line from every segment of another.
+def segment_distances_m(a: Polyline, b: Polyline) -> Float64[ndarray, "n k"]:
+    """Return the exact distance between every segment of one polyline and every segment of another.
 
-    Two segments are closest inside both (their common perpendicular) or at an end of one of them.
+    The minimum is on the common perpendicular inside both segments, or at an end of one of them.
     """
     a0, a1, b0, b1 = a[:-1, None], a[1:, None], b[None, :-1], b[None, 1:]
     u, v, w = a1 - a0, b1 - b0, a0 - b0
@@ -69,29 +69,29 @@ def segment_distances_m(a: Line, b: Line) -> Float64[ndarray, "n k"]:
 
 
 def point_distances_m(point: ndarray, start: ndarray, end: ndarray) -> Float64[ndarray, "n k"]:
-    leg = end - start
-    share = np.clip(((point - start) * leg).sum(-1) / (leg * leg).sum(-1), 0, 1)
-    return np.asarray(np.linalg.norm(point - start - share[..., None] * leg, axis=-1))
+    segment = end - start
+    fraction = np.clip(((point - start) * segment).sum(-1) / (segment * segment).sum(-1), 0, 1)
+    return np.asarray(np.linalg.norm(point - start - fraction[..., None] * segment, axis=-1))
 
 
-def directions(line: Line) -> Line:
+def directions(line: Polyline) -> Polyline:
     steps = np.diff(line, axis=0)
     return np.asarray(steps / np.linalg.norm(steps, axis=1, keepdims=True))
 
 
-def test_six_stirrups_in_order(pile: Assembly) -> None:
+def test_six_stirrups_are_numbered_in_order(pile: Assembly) -> None:
     assert [bar.bar_id for bar in pile.bars] == [part.bar_id for part in pile.parts] == [1, 2, 3, 4, 5, 6]
     assert {(bar.role, bar.diameter_m) for bar in pile.bars} == {("stirrup", 0.010)}
     assert {part.material for part in pile.parts} == {"steel"}
-    again = make_assembly(SPEC)
-    assert again.bars == pile.bars
+    repeated = make_assembly(SPEC)
+    assert repeated.bars == pile.bars
     assert all(
-        one.mesh.vertices_m.tobytes() == other.mesh.vertices_m.tobytes()
-        for one, other in zip(pile.parts, again.parts, strict=True)
+        part.mesh.vertices_m.tobytes() == repeated_part.mesh.vertices_m.tobytes()
+        for part, repeated_part in zip(pile.parts, repeated.parts, strict=True)
     )
 
 
-def test_every_stirrup_is_a_closed_solid_round_its_line(pile: Assembly, lines_m: list[Line]) -> None:
+def test_stirrup_meshes_are_closed_around_their_axes(pile: Assembly, lines_m: list[Polyline]) -> None:
     for part, line_m in zip(pile.parts, lines_m, strict=True):
         solid = trimesh.Trimesh(part.mesh.vertices_m, part.mesh.faces, process=False)
         assert solid.is_watertight
@@ -99,12 +99,12 @@ def test_every_stirrup_is_a_closed_solid_round_its_line(pile: Assembly, lines_m:
         assert len(part.mesh.faces) < 60_000
         length_m = np.linalg.norm(np.diff(line_m, axis=0), axis=1).sum()
         assert solid.volume == pytest.approx(np.pi / 4 * SPEC.diameter_m**2 * length_m, rel=0.01)
-        some = part.mesh.vertices_m[::97, None]
-        off_axis_m = point_distances_m(some, line_m[None, :-1], line_m[None, 1:]).min(axis=1)
+        sampled_m = part.mesh.vertices_m[::97, None]
+        off_axis_m = point_distances_m(sampled_m, line_m[None, :-1], line_m[None, 1:]).min(axis=1)
         assert off_axis_m.max() < RADIUS_M + 1e-9
 
 
-def test_no_bar_runs_through_another_or_the_board(lines_m: list[Line], pile: Assembly) -> None:
+def test_bars_touch_without_intersection(lines_m: list[Polyline], pile: Assembly) -> None:
     gaps_m = [segment_distances_m(a, b).min() - 2 * RADIUS_M for a, b in combinations(lines_m, 2)]
     assert min(gaps_m) > -1e-4
     assert min(gaps_m) < 1e-4, "a heap whose bars do not lie on each other"
@@ -113,12 +113,12 @@ def test_no_bar_runs_through_another_or_the_board(lines_m: list[Line], pile: Ass
     assert min(part.mesh.vertices_m[:, 2].min() for part in pile.parts) >= lowest_m
 
 
-def test_the_heap_is_no_neat_stack_and_leaves_markers_free(lines_m: list[Line], pile: Assembly) -> None:
+def test_pile_is_tilted_and_leaves_four_markers_free(lines_m: list[Polyline], pile: Assembly) -> None:
     vertices_m = np.concatenate([part.mesh.vertices_m for part in pile.parts])
     assert np.abs(vertices_m[:, :2]).max() <= 0.17
     assert vertices_m[:, 2].max() > 0.03
-    planes = [np.linalg.svd(line - line.mean(axis=0))[2][2] for line in lines_m]
-    assert np.rad2deg(np.arccos(min(abs(plane[2]) for plane in planes))) > 8.0
+    normals = [np.linalg.svd(line - line.mean(axis=0))[2][2] for line in lines_m]
+    assert np.rad2deg(np.arccos(min(abs(normal[2]) for normal in normals))) > 8.0
     covered = [
         ((vertices_m[:, :2] > corners[:, :2].min(axis=0)) & (vertices_m[:, :2] < corners[:, :2].max(axis=0)))
         .all(axis=1)
@@ -129,21 +129,21 @@ def test_the_heap_is_no_neat_stack_and_leaves_markers_free(lines_m: list[Line], 
 
 
 def developed_length_m(size_m: tuple[float, float], diameter_m: float) -> float:
-    """Return a bar's length by the bending schedule's sum: sides less corners, three quarter bends, two hooks."""
-    radius_m = 2.5 * diameter_m  # half of the mandrel of 4 d, and half the bar
+    """Return the bar length as in a bending schedule: sides minus corners, three 90-degree bends, two hooks."""
+    radius_m = 2.5 * diameter_m  # half the mandrel of 4 d plus half the bar
     sides_m = 2 * (size_m[0] - diameter_m) + 2 * (size_m[1] - diameter_m) - 8 * radius_m
-    turned_deg = 3 * 90 + 2 * 135
-    flat_m = sides_m + np.deg2rad(turned_deg) * radius_m + 2 * max(6 * diameter_m, 0.075)
-    turn_m = sides_m + 2 * np.pi * radius_m
+    total_bend_deg = 3 * 90 + 2 * 135
+    planar_length_m = sides_m + np.deg2rad(total_bend_deg) * radius_m + 2 * max(6 * diameter_m, 0.075)
+    loop_length_m = sides_m + 2 * np.pi * radius_m
     outer_m = 2 * outer_radius_m(diameter_m, RIBS) + SELF_GAP_M
-    return float(flat_m * np.hypot(1.0, outer_m / turn_m))
+    return float(planar_length_m * np.hypot(1.0, outer_m / loop_length_m))
 
 
-def resampled_m(line: Line) -> Line:
-    """Return points every 5 mm or so along a line."""
+def resample_polyline_m(line: Polyline) -> Polyline:
+    """Return points about every 5 mm along a polyline."""
     along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    at_m = np.linspace(0.0, along_m[-1], int(along_m[-1] / 0.005))
-    return np.stack([np.interp(at_m, along_m, column) for column in line.T], axis=1)
+    sample_m = np.linspace(0.0, along_m[-1], int(along_m[-1] / 0.005))
+    return np.stack([np.interp(sample_m, along_m, column) for column in line.T], axis=1)
 
 
 @settings(max_examples=30)
@@ -152,7 +152,7 @@ def resampled_m(line: Line) -> Line:
     st.floats(0.2, 0.6),
     st.floats(0.2, 0.6),
 )
-def test_any_stirrup_has_its_size_length_and_hooks(diameter_m: float, length_m: float, width_m: float) -> None:
+def test_stirrup_has_specified_size_length_and_hooks(diameter_m: float, length_m: float, width_m: float) -> None:
     size_m = (length_m, width_m)
     outer_m = outer_radius_m(diameter_m, RIBS)
     line = stirrup_centreline_m(size_m, diameter_m, outer_m)
@@ -164,7 +164,7 @@ def test_any_stirrup_has_its_size_length_and_hooks(diameter_m: float, length_m: 
     flat = directions(line * [1.0, 1.0, 0.0])
     heading_deg = np.rad2deg(np.unwrap(np.arctan2(flat[:, 1], flat[:, 0])))
     straight_deg = heading_deg[legs_m > 0.9 * hook_extension_m(diameter_m)]
-    # Tip, hook, three corners, hook, tip: all to the left.
+    # Tip, hook, three corners, hook, tip: all bends are to the left.
     np.testing.assert_allclose(np.diff(straight_deg), [135, 90, 90, 90, 135], atol=1e-6)
     assert [legs_m[0], legs_m[-1]] == pytest.approx([max(6 * diameter_m, 0.075)] * 2, rel=1e-3)
     middle = (line.min(axis=0) + line.max(axis=0)) / 2
@@ -173,17 +173,17 @@ def test_any_stirrup_has_its_size_length_and_hooks(diameter_m: float, length_m: 
 
 
 @pytest.mark.parametrize(("size_m", "diameter_m"), [(SPEC.size_m, SPEC.diameter_m), ((0.5, 0.4), 0.006)])
-def test_no_stirrup_runs_through_itself(size_m: tuple[float, float], diameter_m: float) -> None:
+def test_stirrup_does_not_intersect_itself(size_m: tuple[float, float], diameter_m: float) -> None:
     outer_m = outer_radius_m(diameter_m, RIBS)
     line = stirrup_centreline_m(size_m, diameter_m, outer_m)
-    fine = resampled_m(line)
-    number = np.arange(len(fine) - 1)
-    apart = np.abs(number[:, None] - number) > 16  # 80 mm along the bar, more than a bend
-    own_gap_m = segment_distances_m(fine, fine)[apart].min() - 2 * outer_m
+    fine = resample_polyline_m(line)
+    index = np.arange(len(fine) - 1)
+    not_adjacent = np.abs(index[:, None] - index) > 16  # 80 mm along the bar, which is longer than a bend
+    own_gap_m = segment_distances_m(fine, fine)[not_adjacent].min() - 2 * outer_m
     assert 0.5 * SELF_GAP_M < own_gap_m < 1.5 * SELF_GAP_M
 
 
-def test_bends_stay_close_to_their_arcs() -> None:
+def test_bend_chords_are_within_50_um_of_arc() -> None:
     line = stirrup_centreline_m(SPEC.size_m, SPEC.diameter_m, RADIUS_M)
     corner = (line.min(axis=0) + line.max(axis=0)) / 2 + [0.135 - 0.025, 0.095 - 0.025, 0.0]
     bend = line[(line[:, 0] >= corner[0] - 1e-9) & (line[:, 1] >= corner[1] - 1e-9)]
@@ -198,19 +198,19 @@ def test_bends_stay_close_to_their_arcs() -> None:
     ("size_m", "diameter_m"),
     [((0.12, 0.10), 0.010), ((0.03, 0.20), 0.010), ((0.28, 0.20), 0.0), ((float("nan"), 0.2), 0.010)],
 )
-def test_stirrups_that_cannot_be_are_refused(size_m: tuple[float, float], diameter_m: float) -> None:
+def test_invalid_stirrups_are_rejected(size_m: tuple[float, float], diameter_m: float) -> None:
     with pytest.raises(MeshError, match="no stirrup can be made"):
         pile_assembly(replace(SPEC, size_m=size_m, diameter_m=diameter_m))
 
 
 @pytest.mark.parametrize("name", ["pile-99", "", "../settled/pile-0", "pile-0.json", "*"])
-def test_unknown_states_are_named(name: str) -> None:
+def test_unknown_state_is_rejected(name: str) -> None:
     with pytest.raises(MeshError, match=r"no settled state .* expected one of pile-0"):
         pile_assembly(replace(SPEC, state=name))
 
 
 @pytest.mark.parametrize("change", [{"stirrups": 5}, {"size_m": (0.30, 0.20)}, {"diameter_m": 0.008}])
-def test_poses_of_other_stirrups_are_refused(change: dict[str, object]) -> None:
+def test_state_of_other_stirrups_is_rejected(change: dict[str, object]) -> None:
     with pytest.raises(MeshError, match=f"other stirrups.*{next(iter(change))}"):
         pile_assembly(replace(SPEC, **change))  # type: ignore[arg-type]
 
@@ -229,14 +229,14 @@ def test_poses_of_other_stirrups_are_refused(change: dict[str, object]) -> None:
         (lambda text: without_last(text), "5 poses"),
     ],
 )
-def test_spoilt_states_say_what_is_wrong(
+def test_damaged_state_files_are_rejected(
     spoil: object, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert callable(spoil)
-    (tmp_path / "pile-0.json").write_text(spoil((STATES / "pile-0.json").read_text()))
-    monkeypatch.setattr(pile_module, "STATES", tmp_path)
+    (tmp_path / "pile-0.json").write_text(spoil((STATES_DIR / "pile-0.json").read_text()))
+    monkeypatch.setattr(pile_module, "STATES_DIR", tmp_path)
     with pytest.raises(MeshError, match=rf"'pile-0'.*{reason}"):
-        settled_poses(SPEC)
+        load_settled_poses(SPEC)
 
 
 def with_pose(text: str, **values: object) -> str:
@@ -251,6 +251,6 @@ def without_last(text: str) -> str:
     return json.dumps(content)
 
 
-def test_a_state_never_changes_under_its_name() -> None:
-    digest = hashlib.sha256((STATES / "pile-0.json").read_bytes()).hexdigest()
+def test_stored_state_has_known_digest() -> None:
+    digest = hashlib.sha256((STATES_DIR / "pile-0.json").read_bytes()).hexdigest()
     assert digest == "e55162bfe0a5931671a22bbdb5d9640775eb7caeec72cc007b0984c9dcd86932"

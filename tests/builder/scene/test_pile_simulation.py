@@ -1,4 +1,4 @@
-"""The simulation behind the pile: it repeats, its heap rests, and what speaks against a heap is said."""
+"""Pile simulation: determinism, rest of the stored pile, and reported problems."""
 
 from __future__ import annotations
 
@@ -15,104 +15,124 @@ import numpy as np
 import pytest
 
 from dataset_builder.config.specs import PileSpec
-from dataset_builder.scene.assemblies.pile import STATES, Pose, placed_m, settled_poses, stirrup_line_m
+from dataset_builder.scene.assemblies.pile import (
+    STATES_DIR,
+    Pose,
+    load_settled_poses,
+    points_in_world_m,
+    spec_centreline_m,
+)
 from dataset_builder.scene.assemblies.pile_checks import DropSpec, drop_poses, free_markers
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'rebar-depth-bench[physics]'")
 
-from dataset_builder.scene.assemblies.pile_simulation import PHYSICS, Settled, dropped, faults, settled  # noqa: E402
+from dataset_builder.scene.assemblies.pile_simulation import (  # noqa: E402
+    PHYSICS,
+    SettledPile,
+    drop_pile,
+    find_problems,
+    simulate_drop,
+)
 
 SPEC = PileSpec()
-STORED = json.loads((STATES / "pile-0.json").read_text())
+STORED = json.loads((STATES_DIR / "pile-0.json").read_text())
 
 
-def moved_m(one: Sequence[Pose], other: Sequence[Pose]) -> float:
-    """Return how far any point of a stirrup's line is in another place, metres."""
-    line_m = stirrup_line_m(SPEC)
-    pairs = zip(one, other, strict=True)
-    return float(max(np.linalg.norm(placed_m(line_m, a) - placed_m(line_m, b), axis=1).max() for a, b in pairs))
+def max_displacement_m(poses: Sequence[Pose], other_poses: Sequence[Pose]) -> float:
+    """Return the largest displacement of any centreline point between two sets of poses, metres."""
+    line_m = spec_centreline_m(SPEC)
+    pairs = zip(poses, other_poses, strict=True)
+    return float(
+        max(
+            np.linalg.norm(points_in_world_m(line_m, a) - points_in_world_m(line_m, b), axis=1).max()
+            for a, b in pairs
+        )
+    )
 
 
 @pytest.fixture(scope="module")
-def resettled() -> Settled:
-    """The stored heap, let go once more for half a second."""
-    return settled(SPEC, settled_poses(SPEC), replace(PHYSICS, rest_for_s=0.5, limit_s=0.5))
+def resettled() -> SettledPile:
+    """Return the stored pile after another half second of simulation."""
+    return simulate_drop(SPEC, load_settled_poses(SPEC), replace(PHYSICS, rest_for_s=0.5, limit_s=0.5))
 
 
-def test_the_stored_heap_stays_where_it_is(resettled: Settled) -> None:
-    assert moved_m(resettled.poses, settled_poses(SPEC)) < 1e-6
+def test_stored_pile_is_at_rest(resettled: SettledPile) -> None:
+    assert max_displacement_m(resettled.poses, load_settled_poses(SPEC)) < 1e-6
     assert max(*resettled.speeds, *resettled.spins) < PHYSICS.rest_speed
-    assert faults(resettled, SPEC) == []
+    assert find_problems(resettled, SPEC) == []
 
 
-def test_a_heap_without_board_under_it_would_not_stay() -> None:
+def test_lifted_pile_falls() -> None:
     lifted = [
-        replace(pose, position_m=(*pose.position_m[:2], pose.position_m[2] + 0.02)) for pose in settled_poses(SPEC)
+        replace(pose, position_m=(*pose.position_m[:2], pose.position_m[2] + 0.02))
+        for pose in load_settled_poses(SPEC)
     ]
-    fallen = settled(SPEC, lifted, replace(PHYSICS, rest_for_s=0.5, limit_s=0.2))
-    assert moved_m(fallen.poses, lifted) > 0.01
+    fallen = simulate_drop(SPEC, lifted, replace(PHYSICS, rest_for_s=0.5, limit_s=0.2))
+    assert max_displacement_m(fallen.poses, lifted) > 0.01
 
 
-def test_the_same_seed_falls_the_same_way() -> None:
-    line_m = stirrup_line_m(SPEC)
-    two = replace(SPEC, stirrups=3)
-    short = replace(PHYSICS, limit_s=0.25)
+def test_drop_depends_only_on_seed() -> None:
+    line_m = spec_centreline_m(SPEC)
+    spec = replace(SPEC, stirrups=3)
+    physics = replace(PHYSICS, limit_s=0.25)
 
-    def fallen(seed: int) -> Settled:
-        return settled(two, drop_poses(DropSpec(), line_m, 3, np.random.default_rng(seed)), short)
+    def drop(seed: int) -> SettledPile:
+        return simulate_drop(spec, drop_poses(DropSpec(), line_m, 3, np.random.default_rng(seed)), physics)
 
-    assert fallen(7) == fallen(7)
-    assert moved_m(fallen(7).poses, fallen(8).poses) > 1e-3
+    assert drop(7) == drop(7)
+    assert max_displacement_m(drop(7).poses, drop(8).poses) > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     mujoco.__version__ != STORED["mujoco"] or platform.machine() != STORED["machine"],
     reason="another MuJoCo or processor gives other last digits, and a fall magnifies them",
 )
-def test_the_stored_heap_is_what_its_seed_makes() -> None:
-    heap = dropped(SPEC, STORED["seed"])
-    assert moved_m(heap.poses, settled_poses(SPEC)) < 1e-9
-    assert heap.gap_m == pytest.approx(STORED["least_gap_m"], abs=1e-9)
+def test_stored_pile_is_reproduced_from_seed() -> None:
+    pile = drop_pile(SPEC, STORED["seed"])
+    assert max_displacement_m(pile.poses, load_settled_poses(SPEC)) < 1e-9
+    assert pile.gap_m == pytest.approx(STORED["least_gap_m"], abs=1e-9)
 
 
-def test_faults_are_named(resettled: Settled) -> None:
+def test_problems_are_reported(resettled: SettledPile) -> None:
     level = Pose((0.0, 0.0, 0.02), (1.0, 0.0, 0.0, 0.0))
     far = replace(level, position_m=(0.04, 0.0, 0.02))
     calm = (0.0,) * 6
 
-    def against(**change: object) -> str:
-        return "; ".join(faults(replace(resettled, **change), SPEC))  # type: ignore[arg-type]
+    def problems_with(**change: object) -> str:
+        return "; ".join(find_problems(replace(resettled, **change), SPEC))  # type: ignore[arg-type]
 
-    assert "still moves at 2.0e-01" in against(speeds=(*calm[1:], 0.2))
-    assert "still moves at 3.0e-01" in against(spins=(*calm[1:], 0.3))
-    assert "overlaps by 1.1e-04 m" in against(gap_m=-1.1e-4)
-    assert "overlapped by 6.0e-03 m on the way" in against(deepest_m=6e-3)
-    assert "tilts by 0.0 degrees" in against(poses=(level,) * 6)
-    assert "reaches 0.200 m" in against(poses=(far,) * 6)
-    assert "leaves only the markers (0, 2, 4) free" in against(poses=(far,) * 6)
+    assert "still moves at 2.0e-01" in problems_with(speeds=(*calm[1:], 0.2))
+    assert "still moves at 3.0e-01" in problems_with(spins=(*calm[1:], 0.3))
+    assert "overlaps by 1.1e-04 m" in problems_with(gap_m=-1.1e-4)
+    assert "overlapped by 6.0e-03 m on the way" in problems_with(deepest_m=6e-3)
+    assert "tilts by 0.0 degrees" in problems_with(poses=(level,) * 6)
+    assert "reaches 0.200 m" in problems_with(poses=(far,) * 6)
+    assert "leaves only the markers (0, 2, 4) free" in problems_with(poses=(far,) * 6)
 
 
-def test_markers_are_free_until_steel_comes_near() -> None:
+def test_marker_is_free_unless_steel_is_near() -> None:
     board = BoardSpec()
-    every = (0, 1, 2, 3, 4, 5)
-    beside = np.array([[0.05, -0.1, 0.3], [0.05, 0.1, 0.3]])
-    assert free_markers([beside], 0.005, board) == every
+    all_markers = (0, 1, 2, 3, 4, 5)
+    line_m = np.array([[0.05, -0.1, 0.3], [0.05, 0.1, 0.3]])
+    assert free_markers([line_m], 0.005, board) == all_markers
     edge_m = 0.172 - 0.025 - 0.05 / 6 - 0.005
-    assert free_markers([beside * [0, 1, 1] + [edge_m - 1e-6, 0, 0]], 0.005, board) == every
-    assert free_markers([beside * [0, 1, 1] + [edge_m + 1e-6, 0, 0]], 0.005, board) == (0, 2, 4)
+    assert free_markers([line_m * [0, 1, 1] + [edge_m - 1e-6, 0, 0]], 0.005, board) == all_markers
+    assert free_markers([line_m * [0, 1, 1] + [edge_m + 1e-6, 0, 0]], 0.005, board) == (0, 2, 4)
 
 
-def test_stirrups_start_apart_whichever_way_they_tilt() -> None:
-    line_m = stirrup_line_m(SPEC)
+def test_initial_stirrups_are_vertically_separated() -> None:
+    line_m = spec_centreline_m(SPEC)
     for seed in range(50):
         starts = drop_poses(DropSpec(tilt_deg=10.0), line_m, 6, np.random.default_rng(seed))
-        levels = [placed_m(line_m, pose)[:, 2] for pose in starts]
-        assert levels[0].min() > 0.006
-        assert all(above.min() - below.max() > 0.011 for below, above in pairwise(levels))
+        heights_m = [points_in_world_m(line_m, pose)[:, 2] for pose in starts]
+        assert heights_m[0].min() > 0.006
+        assert all(above.min() - below.max() > 0.011 for below, above in pairwise(heights_m))
 
 
-def test_the_command_refuses_in_words(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_command_rejects_negative_seed(tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-m",
@@ -122,7 +142,7 @@ def test_the_command_refuses_in_words(tmp_path: Path) -> None:
         "--out",
         str(tmp_path / "x.json"),
     ]
-    refused = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert refused.returncode == 2
-    assert "Traceback" not in refused.stderr
+    process = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert process.returncode == 2
+    assert "Traceback" not in process.stderr
     assert not (tmp_path / "x.json").exists()

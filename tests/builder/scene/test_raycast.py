@@ -1,4 +1,4 @@
-"""The ray caster against geometry whose depth is known in closed form."""
+"""Ray caster compared with surfaces of analytically known depth."""
 
 from __future__ import annotations
 
@@ -12,36 +12,40 @@ from rebar_depth_bench.geometry.cameras import camera_centre, ideal_K, look_at, 
 WIDTH, HEIGHT = 160, 90
 
 
-def slab(z: float, half: float, bar_id: int) -> WorldMesh:
-    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
+def slab(z_m: float, half_m: float, bar_id: int) -> WorldMesh:
+    corners = np.array(
+        [[-half_m, -half_m, z_m], [half_m, -half_m, z_m], [half_m, half_m, z_m], [-half_m, half_m, z_m]]
+    )
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     return WorldMesh(corners, faces, np.full(2, bar_id, np.uint16))
 
 
-def joined(*meshes: WorldMesh) -> WorldMesh:
-    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+def concatenate_meshes(*meshes: WorldMesh) -> WorldMesh:
+    vertex_offsets = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
     return WorldMesh(
         np.concatenate([mesh.vertices_m for mesh in meshes]),
-        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]).astype(np.int32),
+        np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, vertex_offsets, strict=False)]).astype(
+            np.int32
+        ),
         np.concatenate([mesh.face_bar_id for mesh in meshes]),
     )
 
 
 @pytest.mark.parametrize("scale", [1.0, 40.0])
-def test_depth_of_a_tilted_plane_is_exact(scale: float) -> None:
-    eye = scale * np.array([0.21, -0.13, 0.31])
-    pose = look_at(eye, scale * np.array([0.01, 0.02, 0.0]))
+def test_depth_of_tilted_plane_is_exact(scale: float) -> None:
+    centre_m = scale * np.array([0.21, -0.13, 0.31])
+    pose = look_at(centre_m, scale * np.array([0.01, 0.02, 0.0]))
     rays = pixel_rays(ideal_K(WIDTH, HEIGHT), WIDTH, HEIGHT)
     truth = RayCaster(slab(0.0, scale * 100, 7)).cast(rays, pose)
     directions = rays @ pose[:3, :3]  # world directions with unit planar depth
-    expected = np.where(directions[..., 2] < 0, -eye[2] / directions[..., 2], 0.0)
+    expected_m = np.where(directions[..., 2] < 0, -centre_m[2] / directions[..., 2], 0.0)
     hit = truth.depth_m > 0
     assert hit.mean() > 0.9
-    assert truth.depth_m[hit] == pytest.approx(expected[hit].astype(np.float32), rel=1.2e-7)
+    assert truth.depth_m[hit] == pytest.approx(expected_m[hit].astype(np.float32), rel=1.2e-7)
 
 
-def test_nearest_surface_wins_and_the_rest_is_nothing() -> None:
-    mesh = joined(slab(0.0, 0.2, 0), slab(0.1, 0.05, 9))
+def test_nearest_surface_wins_and_background_is_zero() -> None:
+    mesh = concatenate_meshes(slab(0.0, 0.2, 0), slab(0.1, 0.05, 9))
     pose = look_at(np.array([0.0, -0.001, 0.5]), np.array([0.0, 0.0, 0.0]))
     truth = RayCaster(mesh).cast(pixel_rays(ideal_K(WIDTH, HEIGHT), WIDTH, HEIGHT), pose)
     centre = (HEIGHT // 2, WIDTH // 2)
@@ -53,7 +57,7 @@ def test_nearest_surface_wins_and_the_rest_is_nothing() -> None:
     assert np.array_equal(truth.mask, truth.bars > 0)
 
 
-def test_unprojected_depth_lies_on_the_surface() -> None:
+def test_unprojected_depth_is_on_surface() -> None:
     rng = np.random.default_rng(3)
     corners = rng.normal(0, 0.2, (60, 3, 3)) + np.array([0, 0, 0.2])
     mesh = WorldMesh(
@@ -70,5 +74,5 @@ def test_unprojected_depth_lies_on_the_surface() -> None:
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     off_plane_m = np.abs(np.einsum("ij,ij->i", points - triangles[:, 0], normals))
-    assert off_plane_m.max() < 1e-7  # what float32 storage of about 1 m leaves
+    assert off_plane_m.max() < 1e-7  # rounding error of float32 at about 1 m
     assert np.linalg.norm(camera_centre(pose)) > 1

@@ -1,4 +1,4 @@
-"""Which pictures are matched, which views help a view, and between which depths: against counts made by hand."""
+"""Selection of image pairs, neighbour views and depth ranges for multi-view methods."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import pytest
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.aruco_detection import Corners
 from rebar_depth_bench.geometry.cameras import ideal_K, look_at, project, transform
-from rebar_depth_bench.methods.multiview.dense import NEIGHBOURS, depth_range, neighbours
-from rebar_depth_bench.methods.multiview.images import plausible_pairs
-from rebar_depth_bench.methods.multiview.sfm import Structure
+from rebar_depth_bench.methods.multiview.dense import MAX_NEIGHBOURS, depth_range, select_neighbours
+from rebar_depth_bench.methods.multiview.images import select_pairs
+from rebar_depth_bench.methods.multiview.sfm import SparseReconstruction
 
 K = ideal_K(1280, 720)
 BOARD = BoardSpec()
@@ -23,58 +23,60 @@ RING = {
 }
 
 
-def corners(name: str) -> Corners:
+def project_markers(name: str) -> Corners:
     pose = RING[name]
     return {marker: project(K, transform(pose, quad)) for marker, quad in marker_corners_m(BOARD).items()}
 
 
-def turned_deg(one: str, other: str) -> float:
-    relative = RING[one][:3, :3] @ RING[other][:3, :3].T
+def rotation_between_deg(first: str, second: str) -> float:
+    relative = RING[first][:3, :3] @ RING[second][:3, :3].T
     return float(np.degrees(np.arccos((np.trace(relative) - 1) / 2)))
 
 
-def test_pictures_turned_far_against_each_other_are_not_matched() -> None:
-    pairs = plausible_pairs({name: corners(name) for name in RING}, BOARD, K)
+def test_images_over_60_degrees_apart_are_not_paired() -> None:
+    pairs = select_pairs({name: project_markers(name) for name in RING}, BOARD, K)
     names = sorted(RING)
-    wanted = {(a, b) for a in names for b in names if a < b and turned_deg(a, b) <= 60}
-    assert set(pairs) == wanted
-    assert 0 < len(wanted) < len(names) * (len(names) - 1) / 4
+    expected = {(a, b) for a in names for b in names if a < b and rotation_between_deg(a, b) <= 60}
+    assert set(pairs) == expected
+    assert 0 < len(expected) < len(names) * (len(names) - 1) / 4
 
 
-def test_a_picture_without_markers_is_matched_with_all() -> None:
-    seen = {name: corners(name) for name in RING}
-    blind = sorted(RING)[4]
-    seen[blind] = {}
-    pairs = plausible_pairs(seen, BOARD, K)
-    assert sum(blind in pair for pair in pairs) == len(RING) - 1
+def test_image_without_markers_is_paired_with_all() -> None:
+    corners_by_image = {name: project_markers(name) for name in RING}
+    without_markers = sorted(RING)[4]
+    corners_by_image[without_markers] = {}
+    pairs = select_pairs(corners_by_image, BOARD, K)
+    assert sum(without_markers in pair for pair in pairs) == len(RING) - 1
 
 
-def structure() -> Structure:
-    """Points in a small cube that every camera of the ring sees."""
+def make_reconstruction() -> SparseReconstruction:
+    """Return a reconstruction of points in a small cube that every camera of the ring sees."""
     points = np.random.default_rng(0).uniform(-0.05, 0.05, (50, 3))
-    return Structure(RING, points, {name: np.arange(50) for name in RING}, 0.5)
+    return SparseReconstruction(RING, points, {name: np.arange(50) for name in RING}, 0.5)
 
 
-def test_neighbours_are_the_views_beside_a_view_nearest_to_the_best_angle_first() -> None:
-    found = neighbours(structure())
+def test_neighbours_are_adjacent_views_best_angle_first() -> None:
+    neighbours = select_neighbours(make_reconstruction())
     names = sorted(RING)
-    for place, name in enumerate(names):
-        beside = {names[(place + step) % len(names)] for step in (-2, -1, 1, 2)}
-        assert set(found[name]) == beside
-        assert set(found[name][:2]) == {names[(place + step) % len(names)] for step in (-1, 1)}
-    assert len(found[names[0]]) == NEIGHBOURS
+    for index, name in enumerate(names):
+        adjacent = {names[(index + step) % len(names)] for step in (-2, -1, 1, 2)}
+        assert set(neighbours[name]) == adjacent
+        assert set(neighbours[name][:2]) == {names[(index + step) % len(names)] for step in (-1, 1)}
+    assert len(neighbours[names[0]]) == MAX_NEIGHBOURS
 
 
-def test_views_that_share_no_point_are_no_neighbours() -> None:
-    whole = structure()
+def test_views_without_shared_points_are_not_neighbours() -> None:
+    whole = make_reconstruction()
     name = sorted(RING)[0]
-    apart = Structure(RING, whole.points, {**whole.seen, name: np.array([], np.int64)}, 0.5)
-    assert neighbours(apart)[name] == ()
-    assert all(name not in near for near in neighbours(apart).values())
+    separated = SparseReconstruction(
+        RING, whole.points, {**whole.visible_points, name: np.array([], np.int64)}, 0.5
+    )
+    assert select_neighbours(separated)[name] == ()
+    assert all(name not in neighbours for neighbours in select_neighbours(separated).values())
 
 
-def test_the_range_of_depths_holds_the_points_with_a_margin() -> None:
-    whole = structure()
+def test_depth_range_covers_points_with_margin() -> None:
+    whole = make_reconstruction()
     name = sorted(RING)[3]
     depths = whole.depths(name)
     assert depths == pytest.approx([float((RING[name] @ [*point, 1.0])[2]) for point in whole.points])

@@ -1,4 +1,4 @@
-"""Multi-view methods from rendered pictures to an archive: cameras, scale and depth against the exact truth."""
+"""Multi-view methods on rendered images: cameras, scale and depth against ground truth."""
 
 from __future__ import annotations
 
@@ -19,16 +19,14 @@ from rebar_depth_bench.methods import METHODS, ConfigViews, MultiViewMethod
 from rebar_depth_bench.methods.multiview import dense
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.progress import silent
-from tests.conftest import run_build
-
-pytestmark = pytest.mark.render
+from tests.building import RunBuild
 
 ORBIT = ("--config", "lattice-orbit", "--views", "24", "--width", "512", "--height", "288", "--samples", "1")
 
 
 @pytest.fixture(scope="module")
-def orbit_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Views of the lattice 15 degrees apart, small and grainy, but real."""
+def orbit_root(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) -> Path:
+    """Render views of the lattice 15 degrees apart, at low resolution and one sample per pixel."""
     root = tmp_path_factory.mktemp("orbit") / "dataset"
     finished = run_build("--out", root, *ORBIT)
     assert finished.returncode == 0, finished.stderr
@@ -37,7 +35,7 @@ def orbit_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def work(orbit_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a run that was stopped at the fifth view leaves: ``sweep-aruco.zip`` is not there yet."""
+    """Return the folder of a run that was interrupted at the fifth view, before ``sweep-aruco.zip`` exists."""
     folder = tmp_path_factory.mktemp("sweep")
 
     def stop(what: str, done: int, _: int) -> None:
@@ -45,7 +43,7 @@ def work(orbit_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        predict(multi_view("sweep-aruco"), orbit_root, folder / "sweep-aruco.zip", progress=stop)
+        predict(multi_view_method("sweep-aruco"), orbit_root, folder / "sweep-aruco.zip", progress=stop)
     assert not (folder / "sweep-aruco.zip").exists()
     shutil.copytree(folder / ".sweep-aruco.zip.views" / "lattice-orbit.work", folder / "kept")
     return folder
@@ -53,40 +51,40 @@ def work(orbit_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def archive(work: Path, orbit_root: Path) -> Path:
-    """The same run taken up again; what would find cameras or sweep once more fails."""
+    """Resume the run and return its archive; reconstructing cameras or sweeping again would fail."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pycolmap, "extract_features", None)
-        patch.setattr(dense, "sweep", None)
-        predict(multi_view("sweep-aruco"), orbit_root, work / "sweep-aruco.zip")
+        patch.setattr(dense, "sweep_depth", None)
+        predict(multi_view_method("sweep-aruco"), orbit_root, work / "sweep-aruco.zip")
     assert not (work / ".sweep-aruco.zip.views").exists()
     return work / "sweep-aruco.zip"
 
 
-def multi_view(name: str) -> MultiViewMethod:
-    found = METHODS[name]
-    assert isinstance(found, MultiViewMethod)
-    return found
+def multi_view_method(name: str) -> MultiViewMethod:
+    method = METHODS[name]
+    assert isinstance(method, MultiViewMethod)
+    return method
 
 
-def metadata(archive: Path) -> dict[str, Any]:
+def read_metadata(archive: Path) -> dict[str, Any]:
     with zipfile.ZipFile(archive) as source:
-        found: dict[str, Any] = json.loads(source.read("submission.json"))
-    return found
+        content: dict[str, Any] = json.loads(source.read("submission.json"))
+    return content
 
 
-def test_cameras_and_scale_are_the_true_ones_and_said_so(archive: Path) -> None:
-    told = metadata(archive)["notes"]["lattice-orbit"]
-    assert told["views_registered"] == told["views"] == 24
-    assert abs(told["scale_error_percent"]) < 1
-    assert told["markers"] == [0, 1, 2, 3, 4, 5]
-    assert told["marker_rms_mm"] < 2
-    assert told["centre_error_mm"]["median"] < 8
-    assert told["rotation_error_deg"]["median"] < 1
-    assert told["cameras_compared"] == "in the board's frame"
-    assert metadata(archive)["runtime"]["preparing"]["lattice-orbit"] > 0
+def test_notes_report_accurate_cameras_and_scale(archive: Path) -> None:
+    notes = read_metadata(archive)["notes"]["lattice-orbit"]
+    assert notes["views_registered"] == notes["views"] == 24
+    assert abs(notes["scale_error_percent"]) < 1
+    assert notes["markers"] == [0, 1, 2, 3, 4, 5]
+    assert notes["marker_rms_mm"] < 2
+    assert notes["centre_error_mm"]["median"] < 8
+    assert notes["rotation_error_deg"]["median"] < 1
+    assert notes["cameras_compared"] == "in the board's frame"
+    assert read_metadata(archive)["runtime"]["preparing"]["lattice-orbit"] > 0
 
 
-def test_the_depth_is_metric_where_there_is_an_answer(archive: Path, orbit_root: Path) -> None:
+def test_swept_depth_is_metric(archive: Path, orbit_root: Path) -> None:
     table = score(archive, orbit_root).tables["lattice-orbit"]
     assert table.coverage is not None
     assert table.coverage > 0.4
@@ -95,50 +93,52 @@ def test_the_depth_is_metric_where_there_is_an_answer(archive: Path, orbit_root:
     assert table.scale_median == pytest.approx(1, abs=0.03)
 
 
-def test_anchored_to_the_truth_it_comes_to_about_the_same_scale(work: Path, orbit_root: Path) -> None:
+def test_anchored_scale_agrees_with_board_scale(work: Path, orbit_root: Path) -> None:
     views = ConfigViews(open_folder(orbit_root), "lattice-orbit")
     by_board, by_truth = (
-        multi_view(name).prepare(views, work / "kept", silent) for name in ("sweep-aruco", "sweep-anchored")
+        multi_view_method(name).prepare(views, work / "kept", silent) for name in ("sweep-aruco", "sweep-anchored")
     )
     assert by_truth.notes["scale_m"] == pytest.approx(by_board.notes["scale_m"], rel=0.02)
     assert "not metric" in by_truth.notes["scale_from"]
     assert by_truth.notes["views_anchored_with"] == 24
     row = {"view_id": views.view_ids[0]}
-    both = by_board.predict(row), by_truth.predict(row)
+    depths_m = by_board.predict(row), by_truth.predict(row)
     factor = by_truth.notes["scale_m"] / by_board.notes["scale_m"]
-    assert np.allclose(both[0] * factor, both[1], rtol=1e-5, equal_nan=True)
+    assert np.allclose(depths_m[0] * factor, depths_m[1], rtol=1e-5, equal_nan=True)
 
 
-def test_the_board_plane_is_the_board_where_the_board_is_seen(orbit_root: Path) -> None:
+def test_board_plane_matches_visible_board(orbit_root: Path) -> None:
     views = ConfigViews(open_folder(orbit_root), "lattice-orbit")
-    run = multi_view("board-plane").prepare(views, orbit_root, silent).predict
-    off_m = []
+    predictor = multi_view_method("board-plane").prepare(views, orbit_root, silent).predict
+    errors_m = []
     for row in load(orbit_root, "lattice-orbit").select(range(4)):
-        found_m = run(row)
-        z = row["left_depth"]
-        height, width = z.shape
+        predicted_m = predictor(row)
+        truth_m = row["left_depth"]
+        height, width = truth_m.shape
         rows, columns = np.indices((height, width))
         K, pose = row["left_K"], row["left_cam_from_world"]
-        rays = np.stack([(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones_like(z)], axis=-1)
-        points = (rays * z[..., None] - pose[:3, 3]) @ pose[:3, :3]
+        rays = np.stack(
+            [(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones_like(truth_m)], axis=-1
+        )
+        points = (rays * truth_m[..., None] - pose[:3, 3]) @ pose[:3, :3]
         on_board = (np.abs(points) < [0.2, 0.14, 1e-4]).all(axis=-1)
         assert on_board.mean() > 0.1
-        off_m.append(np.median(np.abs(found_m - z)[on_board]))
+        errors_m.append(np.median(np.abs(predicted_m - truth_m)[on_board]))
         steel = row["left_mask"]
-        assert (found_m >= z - 0.005)[steel].all(), "what stands on the board is nearer than the board"
-    assert max(off_m) < 0.01, "one marker alone tells little of the far side"
-    assert min(off_m) < 0.002
+        assert (predicted_m >= truth_m - 0.005)[steel].all(), "what stands on the board is nearer than the board"
+    assert max(errors_m) < 0.01, "one marker alone tells little of the far side"
+    assert min(errors_m) < 0.002
 
 
 @pytest.mark.parametrize("name", ["sweep-aruco", "board-plane"])
-def test_a_scene_without_a_board_is_refused_before_any_work(name: str, tiny_root: Path, tmp_path: Path) -> None:
-    root = without_board(tiny_root, tmp_path)
+def test_scene_without_board_raises_before_work(name: str, tiny_root: Path, tmp_path: Path) -> None:
+    root = copy_without_board(tiny_root, tmp_path)
     with pytest.raises(MethodError, match=r"lattice: the scene has no ArUco board.*--config lattice pile"):
         predict(METHODS[name], root, tmp_path / "out.zip")
     assert [path.name for path in tmp_path.iterdir()] == ["dataset"]
 
 
-def without_board(root: Path, folder: Path) -> Path:
+def copy_without_board(root: Path, folder: Path) -> Path:
     copy = folder / "dataset"
     copy.mkdir()
     for path in root.iterdir():
@@ -153,7 +153,7 @@ def without_board(root: Path, folder: Path) -> Path:
 
 @pytest.mark.skipif(pycolmap.has_cuda, reason="this pycolmap has CUDA: PatchMatch would run")
 @pytest.mark.parametrize("name", ["colmap-aruco", "colmap-anchored"])
-def test_patch_match_without_cuda_says_what_to_install(name: str, tiny_root: Path, tmp_path: Path) -> None:
+def test_patch_match_without_cuda_names_package(name: str, tiny_root: Path, tmp_path: Path) -> None:
     with pytest.raises(MethodError, match=r"needs CUDA.*pip install pycolmap-cuda12.*use sweep-aruco"):
         predict(METHODS[name], tiny_root, tmp_path / "out.zip")
-    assert METHODS[name].info.unexercised
+    assert METHODS[name].info.untested_note

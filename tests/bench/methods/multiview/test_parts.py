@@ -1,4 +1,4 @@
-"""Parts of the multi-view methods that need no rendering: COLMAP's depth maps, distorted grids, noise."""
+"""Multi-view helpers that need no rendering: COLMAP depth maps, distorted grids and failed matching."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from hypothesis import strategies as st
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
-from rebar_depth_bench.methods.multiview.images import pinhole_grid, pinhole_picture
+from rebar_depth_bench.methods.multiview.images import pinhole_grid, pinhole_image
 from rebar_depth_bench.methods.multiview.patch_match import read_depth_map
-from rebar_depth_bench.methods.multiview.sfm import find_structure
+from rebar_depth_bench.methods.multiview.sfm import reconstruct_sparse
 
 ZED_DISTORTION = np.array([-0.175286, 0.0283094, 6.68e-5, -1.50e-4, 0.0])
 WIDTH, HEIGHT = 320, 180
 
 
-def written(path: Path, header: str, values: Any) -> Path:
+def write_depth_map(path: Path, header: str, values: Any) -> Path:
     path.write_bytes(header.encode() + np.asarray(values, "<f4").tobytes())
     return path
 
 
-def test_a_depth_map_of_colmap_is_read_row_by_row(tmp_path: Path) -> None:
-    depth = np.arange(-1, 11, dtype=np.float32).reshape(3, 4)
-    found = read_depth_map(written(tmp_path / "a.bin", "4&3&1&", depth))
-    assert found.dtype == np.float32
-    assert np.isnan(found[0, :2]).all(), "0 and below is no depth"
-    assert np.array_equal(found.ravel()[2:], np.arange(1, 11))
+def test_colmap_depth_map_is_read_row_by_row(tmp_path: Path) -> None:
+    written_m = np.arange(-1, 11, dtype=np.float32).reshape(3, 4)
+    read_m = read_depth_map(write_depth_map(tmp_path / "a.bin", "4&3&1&", written_m))
+    assert read_m.dtype == np.float32
+    assert np.isnan(read_m[0, :2]).all(), "0 and below is no depth"
+    assert np.array_equal(read_m.ravel()[2:], np.arange(1, 11))
 
 
 @pytest.mark.parametrize("header", ["4&3&2&", "4&2&1&", "4x3", "", "9999999&9999999&1&"])
-def test_any_other_file_is_refused(header: str, tmp_path: Path) -> None:
+def test_invalid_colmap_depth_map_raises(header: str, tmp_path: Path) -> None:
     with pytest.raises(MethodError, match=r"is no depth map of COLMAP: .* expected WIDTH&HEIGHT&1&"):
-        read_depth_map(written(tmp_path / "a.bin", header, np.zeros(12)))
+        read_depth_map(write_depth_map(tmp_path / "a.bin", header, np.zeros(12)))
 
 
 def camera_row() -> dict[str, Any]:
@@ -46,41 +46,42 @@ def camera_row() -> dict[str, Any]:
     return {"left_rgb": rgb, "left_K": K, "left_distortion": ZED_DISTORTION}
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(st.tuples(*[st.floats(-0.3, 0.3)] * 2), st.floats(0.2, 15.0))
-def test_depth_of_a_plane_comes_back_to_a_distorted_grid(slant: tuple[float, float], distance_m: float) -> None:
-    """A plane n . x = d has depth d / n . ray on either grid; a pixel takes the canvas pixel next to its ray."""
+def test_plane_depth_is_resampled_to_distorted_grid(slant: tuple[float, float], distance_m: float) -> None:
+    """A plane n . x = d has depth d / (n . ray) on either grid; a pixel takes the nearest canvas pixel."""
     row = camera_row()
     grid = pinhole_grid(row, WIDTH, HEIGHT)
     normal = np.array([*slant, 1.0])
-    on_canvas = distance_m / (pixel_rays(grid.K, grid.width, grid.height) @ normal)
-    back = grid.depth_on_left_grid(on_canvas.astype(np.float32))
+    canvas_depth_m = distance_m / (pixel_rays(grid.K, grid.width, grid.height) @ normal)
+    depth_m = grid.depth_on_left_grid(canvas_depth_m.astype(np.float32))
     expected = distance_m / (pixel_rays(row["left_K"], WIDTH, HEIGHT, ZED_DISTORTION) @ normal)
-    assert back.shape == (HEIGHT, WIDTH)
-    assert np.abs(back / expected - 1).max() < 0.005, "half a pixel of slant"
+    assert depth_m.shape == (HEIGHT, WIDTH)
+    assert np.abs(depth_m / expected - 1).max() < 0.005, "half a pixel of slant"
 
 
-def test_without_distortion_nothing_is_touched() -> None:
+def test_undistorted_image_and_depth_are_unchanged() -> None:
     row = {**camera_row(), "left_distortion": np.zeros(5)}
     grid = pinhole_grid(row, WIDTH, HEIGHT)
-    assert pinhole_picture(row, grid) is row["left_rgb"]
+    assert pinhole_image(row, grid) is row["left_rgb"]
     depth = np.ones((HEIGHT, WIDTH), np.float32)
     assert grid.depth_on_left_grid(depth) is depth
 
 
-def test_a_distorted_picture_becomes_the_pinholes() -> None:
-    """Straight lines of a pinhole are straight on the canvas: a picture drawn by rays comes back as drawn."""
+def test_distorted_image_is_resampled_to_pinhole() -> None:
+    """An image drawn as a function of the viewing rays is the same function of the pinhole camera's rays."""
     row = camera_row()
     rays = pixel_rays(row["left_K"], WIDTH, HEIGHT, ZED_DISTORTION)
     row["left_rgb"] = np.repeat((127 + 120 * np.sin(9 * rays[..., :1])).astype(np.uint8), 3, axis=2)
     grid = pinhole_grid(row, WIDTH, HEIGHT)
-    found = pinhole_picture(row, grid).astype(float)
+    image = pinhole_image(row, grid).astype(float)
     expected = 127 + 120 * np.sin(9 * pixel_rays(grid.K, grid.width, grid.height)[..., :1])
     middle = (slice(15, -15), slice(25, -25))
-    assert np.abs(found - expected)[middle].max() < 6
+    assert np.abs(image - expected)[middle].max() < 6
 
 
-def test_pictures_that_show_nothing_in_common_are_refused_in_words(tmp_path: Path) -> None:
+def test_unrelated_images_raise(tmp_path: Path) -> None:
     images = tmp_path / "images"
     images.mkdir()
     names = [f"{k}.png" for k in range(3)]
@@ -88,5 +89,5 @@ def test_pictures_that_show_nothing_in_common_are_refused_in_words(tmp_path: Pat
         noise = np.random.default_rng(k).integers(0, 256, (90, 160, 3)).astype(np.uint8)
         cv2.imwrite(str(images / name), noise)
     with pytest.raises(MethodError, match="no two of 3 pictures that belong together"):
-        find_structure(images, names, ideal_K(160, 90), tmp_path)
+        reconstruct_sparse(images, names, ideal_K(160, 90), tmp_path)
     assert not (tmp_path / "model").exists()

@@ -1,4 +1,4 @@
-"""The similarity that lays a reconstruction on metres."""
+"""Similarity transform fitted to corresponding points."""
 
 from __future__ import annotations
 
@@ -8,24 +8,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rebar_depth_bench.methods.multiview.pose_errors import rotation_deg, similarity
+from rebar_depth_bench.methods.multiview.pose_errors import fit_similarity, rotation_angle_deg
 
 ANGLE = st.floats(-3.0, 3.0)
-TURN = st.tuples(ANGLE, ANGLE, ANGLE)
+ROTATION_VECTOR = st.tuples(ANGLE, ANGLE, ANGLE)
 
 
-@given(TURN, st.floats(0.01, 100.0), st.booleans())
-def test_the_similarity_is_found_on_a_ring_and_on_a_dome(
-    turn: tuple[float, float, float], scale: float, flat: bool
-) -> None:
+@given(ROTATION_VECTOR, st.floats(0.01, 100.0), st.booleans())
+def test_fit_similarity_on_ring_and_dome(turn: tuple[float, float, float], scale: float, flat: bool) -> None:
     azimuth = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     height = np.full(24, 0.2) if flat else 0.2 + 0.1 * np.sin(3 * azimuth)
     source = np.stack([0.3 * np.cos(azimuth), 0.3 * np.sin(azimuth), height], axis=-1)
     rotation = Rotation.from_rotvec(turn).as_matrix()
     target = scale * source @ rotation.T + [1.0, -2.0, 3.0]
-    found = similarity(source, target)
-    assert found.scale == pytest.approx(scale, rel=1e-9)
-    assert np.linalg.det(found.rotation) == pytest.approx(1)
-    assert rotation_deg(found.rotation @ rotation.T) < 1e-6
-    assert found.translation == pytest.approx([1.0, -2.0, 3.0], abs=1e-7 * max(scale, 1))
-    assert found.points(source) == pytest.approx(target, abs=1e-7 * max(scale, 1))
+    fit = fit_similarity(source, target)
+    assert fit.scale == pytest.approx(scale, rel=1e-9)
+    assert np.linalg.det(fit.rotation) == pytest.approx(1)
+    assert rotation_angle_deg(fit.rotation @ rotation.T) < 1e-6
+    assert fit.translation == pytest.approx([1.0, -2.0, 3.0], abs=1e-7 * max(scale, 1))
+    assert fit.apply(source) == pytest.approx(target, abs=1e-7 * max(scale, 1))

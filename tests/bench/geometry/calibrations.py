@@ -1,0 +1,70 @@
+"""Contents of stereo calibration files in both formats, and a helper that writes and reads them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rebar_depth_bench.geometry.calibration import read_calibration
+from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration
+
+SHIPPED_CALIBRATION = Path(__file__).parents[3] / "dataset_builder" / "config" / "calibrations" / "zed-hd720.conf"
+
+
+CONF = """\
+[LEFT_CAM_HD]
+fx=700.5
+fy=701.5
+cx=640.25
+cy=350.75
+k1=-0.17
+k2=0.03
+p1=0.001
+p2=-0.002
+k3=0.0001
+
+[RIGHT_CAM_HD]
+fx=702.5
+fy=703.5
+cx=633.25
+cy=359.75
+k1=-0.16
+k2=0.02
+p1=0.003
+p2=-0.004
+k3=0.0002
+
+[STEREO]
+Baseline=120.5
+TY=0.25
+TZ=-0.75
+CV_HD=0.006
+RX_HD=-0.001
+RZ_HD=0.0007
+"""
+
+
+TOML = """\
+width = 1280
+height = 720
+[left]
+fx = 700.5
+fy = 701.5
+cx = 640.25
+cy = 350.75
+distortion = [-0.17, 0.03, 0.001, -0.002, 0.0001]
+[right]
+K = [[702.5, 0, 633.25], [0, 703.5, 359.75], [0, 0, 1]]
+distortion = [-0.16, 0.02, 0.003, -0.004, 0.0002]
+[stereo]
+rotation = [-0.001, 0.006, 0.0007]
+translation_m = [-0.1205, -0.00025, 0.00075]
+"""
+
+
+def write_and_read(
+    folder: Path, text: str | bytes, name: str = "SN1.conf", grid: tuple[int, int] = (1280, 720)
+) -> StereoCalibration:
+    """Write ``text`` to ``folder / name`` and read it as a calibration for ``grid`` (width, height)."""
+    path = folder / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_calibration(path, *grid)

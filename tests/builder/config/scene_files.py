@@ -1,0 +1,16 @@
+"""Scene file fragments and a writer of scene files for tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+BAR = "[[bar]]\ndiameter = 10\npoints = [[-100, 0, 50], [100, 0, 50]]\n"
+
+
+MM = 'unit = "mm"\n'
+
+
+def write_scene(folder: Path, content: str | bytes, name: str = "my-beam.toml") -> Path:
+    path = folder / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path

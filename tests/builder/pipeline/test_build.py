@@ -1,0 +1,236 @@
+"""``rebar-build`` end to end: interruption, resumption, changed parameters and byte-identical output."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from functools import partial
+from pathlib import Path
+
+import datasets
+import numpy as np
+import pytest
+
+import rebar_depth_bench as rdb
+from dataset_builder.pipeline.plan import BUILD_FOLDER
+from rebar_depth_bench.data.bars import read_bars
+from rebar_depth_bench.data.manifest import open_folder
+from tests.building import (
+    TINY,
+    TINY_VIEWS,
+    RunBuild,
+    StartBuild,
+    contents,
+    progressed_or_ended,
+    render_processes_of,
+    staged_rows,
+    wait_until,
+)
+from tests.requirements import Repetitions
+
+LATTICE = ("--config", "lattice", "--views", str(TINY_VIEWS), *TINY)
+
+
+@pytest.fixture(scope="module")
+def lattice_only(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) -> Path:
+    root = tmp_path_factory.mktemp("whole") / "dataset"
+    process = run_build("--out", root, *LATTICE)
+    assert process.returncode == 0, process.stderr
+    return root
+
+
+def test_killed_builds_resume_to_same_bytes(
+    lattice_only: Path, tmp_path: Path, run_build: RunBuild, start_build: StartBuild, repetitions: Repetitions
+) -> None:
+    root = tmp_path / "dataset"
+    rng = np.random.default_rng(11)
+    for kill in range(repetitions(1, 6)):
+        build = start_build(root, *LATTICE)
+        staged_before = staged_rows(root)
+        wait_until(partial(progressed_or_ended, root, staged_before, build))
+        time.sleep(float(rng.uniform(0, 0.4)))
+        if kill % 2:
+            os.kill(build.pid, signal.SIGKILL)
+        else:
+            os.killpg(build.pid, signal.SIGKILL)
+        build.communicate()
+    process = run_build("--out", root, *LATTICE)
+    assert process.returncode == 0, process.stderr
+    assert contents(root) == contents(lattice_only)
+    assert not (root / BUILD_FOLDER).exists()
+
+
+def test_killed_build_leaves_no_render_process(tmp_path: Path, start_build: StartBuild) -> None:
+    build = start_build(tmp_path / "dataset", *LATTICE)
+    wait_until(lambda: render_processes_of(build.pid))
+    process_dirs = [Path(f"/proc/{pid}") for pid in render_processes_of(build.pid)]
+    assert all(process_dir.exists() for process_dir in process_dirs)
+    os.kill(build.pid, signal.SIGKILL)
+    build.communicate()
+    wait_until(lambda: not any(process_dir.exists() for process_dir in process_dirs), timeout_s=120)
+    assert not any(process_dir.exists() for process_dir in process_dirs)
+
+
+def test_worker_count_does_not_change_bytes(lattice_only: Path, tmp_path: Path, run_build: RunBuild) -> None:
+    root = tmp_path / "dataset"
+    process = run_build("--out", root, *LATTICE, "--workers", "2")
+    assert process.returncode == 0, process.stderr
+    assert contents(root) == contents(lattice_only)
+
+
+def test_second_build_is_up_to_date(lattice_only: Path, run_build: RunBuild) -> None:
+    before = contents(lattice_only)
+    mtimes_ns = {path: path.stat().st_mtime_ns for path in lattice_only.rglob("*.parquet")}
+    process = run_build("--out", lattice_only, *LATTICE)
+    assert "up to date: lattice" in process.stdout
+    assert contents(lattice_only) == before
+    assert mtimes_ns == {path: path.stat().st_mtime_ns for path in lattice_only.rglob("*.parquet")}
+
+
+def test_render_process_is_retried_once_then_reported(tmp_path: Path, start_build: StartBuild) -> None:
+    root = tmp_path / "dataset"
+    build = start_build(root, *LATTICE)
+    killed: set[int] = set()
+    while len(killed) < 2:
+        wait_until(lambda: set(render_processes_of(build.pid)) - killed)
+        for pid in set(render_processes_of(build.pid)) - killed:
+            os.kill(pid, signal.SIGKILL)
+            killed.add(pid)
+    _, stderr = build.communicate(timeout=120)
+    assert build.returncode == 1
+    message = stderr.decode()
+    assert "render process for lattice views 28 to 420 died 2 times, last by signal SIGKILL" in message
+    assert "Traceback" not in message
+
+
+def test_build_survives_single_render_crash(lattice_only: Path, tmp_path: Path, start_build: StartBuild) -> None:
+    root = tmp_path / "dataset"
+    build = start_build(root, *LATTICE)
+    wait_until(lambda: staged_rows(root) >= 1)
+    os.kill(render_processes_of(build.pid)[0], signal.SIGKILL)
+    _, stderr = build.communicate(timeout=300)
+    assert build.returncode == 0, stderr.decode()
+    assert contents(root) == contents(lattice_only)
+
+
+def test_rebuild_with_other_size_invalidates_cache(tmp_path: Path, run_build: RunBuild) -> None:
+    root = tmp_path / "dataset"
+    small = ("--config", "lattice", "--views", "2", "--samples", "1")
+    assert run_build("--out", root, *small, "--width", "96", "--height", "54").returncode == 0
+    first = datasets.load_dataset(str(root), "lattice", split="test")
+    assert first[0]["left_rgb"].size == (96, 54)
+    old_shards = set(root.glob("lattice/*.parquet"))
+    assert run_build("--out", root, *small, "--width", "64", "--height", "36").returncode == 0
+    second = datasets.load_dataset(str(root), "lattice", split="test")
+    assert second[0]["left_rgb"].size == (64, 36)
+    assert rdb.load(root, "lattice")[1]["left_depth"].shape == (36, 64)
+    assert not old_shards & set(root.glob("lattice/*.parquet"))
+
+
+def test_mesh_import_of_lattice_reproduces_ground_truth(
+    tiny_root: Path, tmp_path: Path, run_build: RunBuild
+) -> None:
+    mesh = tiny_root / "meshes" / "lattice.ply"
+    process = run_build("--out", tmp_path / "again", *LATTICE, "--mesh", mesh, "--mesh-unit", "m")
+    assert process.returncode == 0, process.stderr
+    original, imported = open_folder(tiny_root), open_folder(tmp_path / "again")
+    assert original.config("lattice")["ground_truth_digest"] == imported.config("lattice")["ground_truth_digest"]
+    assert imported.config("lattice")["scene"]["assembly"]["path"] == "lattice.ply"
+    bars = (read_bars(root / "bars.parquet")["lattice"] for root in (tiny_root, tmp_path / "again"))
+    for bar, imported_bar in zip(*bars, strict=True):
+        assert imported_bar.bar_id == bar.bar_id
+        assert imported_bar.diameter_m == pytest.approx(bar.diameter_m, rel=0.01)
+        assert np.array(imported_bar.axis_m) == pytest.approx(np.array(bar.axis_m), abs=1e-4)
+
+
+def test_concurrent_build_is_rejected(tmp_path: Path, run_build: RunBuild, start_build: StartBuild) -> None:
+    root = tmp_path / "dataset"
+    build = start_build(root, *LATTICE)
+    try:
+        wait_until(lambda: render_processes_of(build.pid))
+        process = run_build("--out", root, *LATTICE)
+        assert process.returncode == 2
+        assert "another rebar-build is at work there" in process.stderr
+    finally:
+        os.killpg(build.pid, signal.SIGKILL)
+        build.communicate()
+
+
+def test_config_with_other_scene_parameters_is_rejected(tiny_root: Path, run_build: RunBuild) -> None:
+    process = run_build("--out", tiny_root, *LATTICE, "--seed", "5")
+    assert process.returncode == 2
+    assert "config lattice-orbit was built on scene 'lattice' with other parameters" in process.stderr
+
+
+def test_manifest_and_card_describe_dataset(lattice_only: Path) -> None:
+    manifest = json.loads((lattice_only / "manifest.json").read_text())
+    files = contents(lattice_only)
+    del files["manifest.json"]
+    assert manifest["files"] == files
+    scene = manifest["configs"]["lattice"]["scene"]
+    assert scene["assembly"]["diameters_m"] == [0.007, 0.004]
+    assert manifest["configs"]["lattice"]["generator"]["bpy"].startswith("4.5")
+    assert (
+        "| `lattice` | lattice | 9 of 504 | 160 x 90 | 1 | 0.22-0.43 m |"
+        in (lattice_only / "README.md").read_text()
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--config", "latice"), "no config 'latice', expected one of lattice"),
+        (("--views", "0"), "--views is 0, expected 1 to"),
+        (("--width", "2", "--samples", "0"), "--width is 2, expected 16 to 8192; --samples is 0"),
+        (("--workers", "0"), "--workers is 0, expected 1 or more"),
+        (("--mesh", "nothing.stl"), "nothing.stl"),
+        (("--mesh", __file__), "mesh files of kind '.py' are not read, expected"),
+    ],
+)
+def test_invalid_options_exit_2_and_write_nothing(
+    tmp_path: Path, arguments: tuple[str, ...], words: str, run_build: RunBuild
+) -> None:
+    root = tmp_path / "dataset"
+    process = run_build("--out", root, *arguments)
+    assert process.returncode == 2
+    assert words in process.stderr
+    assert "Traceback" not in process.stderr
+    assert not root.exists()
+
+
+@pytest.mark.parametrize("marker", ["notes.txt", ".build/state", "manifest.json", ".rebar-build/state"])
+def test_foreign_folder_is_rejected_and_unchanged(tmp_path: Path, marker: str, run_build: RunBuild) -> None:
+    foreign = [marker, "meshes/mine.ply", "lattice/test-0-of-1.parquet", ".draft.tmp"]
+    for name in foreign:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("mine")
+    process = run_build("--out", tmp_path, *LATTICE)
+    assert process.returncode == 2
+    assert "Traceback" not in process.stderr
+    assert sorted(
+        path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()
+    ) == sorted(foreign)
+
+
+def test_leftovers_of_kill_after_publishing_are_repaired(lattice_only: Path, run_build: RunBuild) -> None:
+    """Remove the staging folder of a published config and restore files that contradict the manifest."""
+    before = contents(lattice_only)
+    key = json.loads((lattice_only / "manifest.json").read_text())["configs"]["lattice"]["key"]
+    for name in (key[:16], "0123456789abcdef"):
+        (lattice_only / BUILD_FOLDER / f"lattice-{name}" / "rows").mkdir(parents=True)
+    assert "up to date" in run_build("--out", lattice_only, *LATTICE).stdout
+    assert not (lattice_only / BUILD_FOLDER).exists()
+    for name in ("README.md", "bars.parquet"):
+        (lattice_only / name).unlink()
+        assert "up to date" in run_build("--out", lattice_only, *LATTICE).stdout
+        assert contents(lattice_only) == before
+
+
+def test_damaged_shard_is_rebuilt(lattice_only: Path, run_build: RunBuild) -> None:
+    before = contents(lattice_only)
+    shard = next(lattice_only.glob("lattice/*-00001-of-*.parquet"))
+    shard.write_bytes(shard.read_bytes()[:-1] + b"!")
+    assert "built: lattice" in run_build("--out", lattice_only, *LATTICE).stdout
+    assert contents(lattice_only) == before

@@ -1,0 +1,46 @@
+"""System packages that some tests need, by the list of ``make`` and CI, and the type of ``repetitions``."""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+Repetitions = Callable[[int, int], int]
+"""Type of the fixture ``repetitions``: ``repetitions(few, many)``."""
+
+PACKAGES = Path(__file__).parents[1] / "scripts" / "system-packages.txt"
+
+
+def probes(use: str) -> dict[str, str]:
+    """Return the probes of one use (``blender``, ``browser``, ``uploads``) and the Debian package of each."""
+    rows = [line.split() for line in PACKAGES.read_text().splitlines() if not line.startswith("#")]
+    return {probe: package for kind, probe, package in rows if kind == use}
+
+
+def chromium_path() -> str | None:
+    """Return the path of the system's Chromium or Chrome."""
+    return shutil.which("chromium") or shutil.which("google-chrome")
+
+
+def is_present(probe: str) -> bool:
+    """Return whether a library or program of the list is on this machine."""
+    if ".so." in probe:
+        return ctypes.util.find_library(probe.removeprefix("lib").split(".so.")[0]) is not None
+    return chromium_path() is not None if probe == "chromium" else shutil.which(probe) is not None
+
+
+def require(use: str) -> None:
+    """Skip the test unless the packages of ``use`` are installed; fail instead where ``CI`` is true."""
+    # Fonts change only how pages look, and other distributions keep them elsewhere.
+    programs = {probe: package for probe, package in probes(use).items() if not probe.startswith("/")}
+    missing = [package for probe, package in programs.items() if not is_present(probe)]
+    if missing:
+        reason = f"missing system packages; on Debian: apt-get install {' '.join(missing)}"
+        if os.environ.get("CI") == "true":
+            pytest.fail(reason)
+        pytest.skip(reason)

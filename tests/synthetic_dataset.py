@@ -1,0 +1,125 @@
+"""Synthetic dataset folder and submissions, computed without rendering for code that does not depend on images."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from dataset_builder.pipeline.shards import Eye, View, encode_view
+from rebar_depth_bench import SubmissionWriter
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, ViewRecord
+from rebar_depth_bench.scoring.protocol import PROTOCOL
+
+HEIGHT, WIDTH = 90, 160
+BASELINE_M = 0.12
+_BAR_PERIOD_PX, _BAR_WIDTH_PX = 16, 6
+
+
+def write_dataset(root: Path, configs: Sequence[str], views: int) -> None:
+    """Write a dataset folder for ``load`` and ``score``; each config has ``views`` views of vertical bars."""
+    records = {config: _write_config(root / config, config, views) for config in configs}
+    config_yaml = "".join(
+        f"- config_name: {name}\n  data_files:\n  - split: test\n    path: {name}/test.parquet\n"
+        for name in configs
+    )
+    (root / "README.md").write_text(f"---\nconfigs:\n{config_yaml}---\n")
+    entries = {config: _config_entry(config, config_records) for config, config_records in records.items()}
+    digest = _digest([entry["ground_truth_digest"] for entry in entries.values()])
+    manifest = {
+        "format": MANIFEST_FORMAT,
+        "version": "0.0.0",
+        "protocol": PROTOCOL,
+        "ground_truth": {"digest": digest},
+        "configs": entries,
+        "files": {},
+    }
+    (root / MANIFEST_FILE).write_text(json.dumps(manifest))
+
+
+def write_archive(path: Path, configs: Sequence[str], views: int, method: str, seed: int) -> None:
+    """Write a submission with a prediction for every view: ground-truth depth with 2 % Gaussian noise, float32."""
+    rng = np.random.default_rng(seed)
+    with SubmissionWriter(path, method) as writer:
+        for config in configs:
+            for index in range(views):
+                noise = 1 + 0.02 * rng.standard_normal((HEIGHT, WIDTH))
+                writer.add(_view_id(config, index), (_depth_m(index) * noise).astype(np.float32))
+
+
+def _write_config(folder: Path, config: str, views: int) -> list[ViewRecord]:
+    folder.mkdir(parents=True)
+    encoded = [encode_view(_view(config, index)) for index in range(views)]
+    pq.write_table(pa.concat_tables([table for table, _ in encoded]), folder / "test.parquet", row_group_size=1)
+    return [record for _, record in encoded]
+
+
+def _config_entry(config: str, records: Sequence[ViewRecord]) -> dict[str, object]:
+    digest = _digest([record.left for record in records])
+    return {
+        "scene": {"name": config},
+        "rig": {"height": HEIGHT, "width": WIDTH},
+        "views": [asdict(record) for record in records],
+        "ground_truth_digest": digest,
+        "key": "",
+        "shards": [f"{config}/test.parquet"],
+        "mesh": "",
+    }
+
+
+def _digest(parts: Sequence[object]) -> str:
+    return f"sha256:{hashlib.sha256(' '.join(map(str, parts)).encode()).hexdigest()}"
+
+
+def _view_id(config: str, index: int) -> str:
+    return f"{config}/{index:04d}"
+
+
+def _view(config: str, index: int) -> View:
+    eye = _eye(index)
+    return View(_view_id(config, index), eye, eye, BASELINE_M)
+
+
+def _eye(index: int) -> Eye:
+    mask = np.broadcast_to(_is_bar(), (HEIGHT, WIDTH))
+    return Eye(
+        rgb=np.full((HEIGHT, WIDTH, 3), 128, dtype=np.uint8),
+        depth_m=_depth_m(index),
+        mask=mask,
+        bars=mask.astype(np.uint16),
+        K=np.array([[100.0, 0.0, (WIDTH - 1) / 2], [0.0, 100.0, (HEIGHT - 1) / 2], [0.0, 0.0, 1.0]]),
+        distortion=np.zeros(5),
+        cam_from_world=np.eye(4),
+    )
+
+
+def _is_bar() -> np.ndarray:
+    return np.arange(WIDTH) % _BAR_PERIOD_PX < _BAR_WIDTH_PX
+
+
+def _depth_m(index: int) -> np.ndarray:
+    """Return the planar depth of a view, metres, float32, ``HEIGHT`` x ``WIDTH``.
+
+    The bars lean away from the camera and stand 10 mm farther away in each view; the wall behind them is at 1.5 m.
+    """
+    bars_m = 0.3 + 0.01 * index + 0.001 * np.arange(HEIGHT)[:, None]
+    return np.where(_is_bar()[None, :], bars_m, 1.5).astype(np.float32)
+
+
+_ERROR_METRICS = ("abs_rel", "rmse_cm", "mae_cm")
+
+
+def scale_errors(part: Any, factor: float, name: str = "") -> Any:
+    """Return part of a result (as JSON data) with all errors and their intervals multiplied by ``factor``."""
+    if isinstance(part, dict):
+        return {key: scale_errors(value, factor, key) for key, value in part.items()}
+    if isinstance(part, list):
+        return [scale_errors(value, factor, name) for value in part]
+    return part * factor if name in _ERROR_METRICS and isinstance(part, float) else part
