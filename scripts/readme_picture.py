@@ -1,4 +1,4 @@
-"""Makes the README's picture from a dataset folder: colour, depth and bar ids of one view.
+"""README picture: colour, depth and bar ids of one view of a dataset folder, side by side.
 
 python scripts/readme_picture.py ROOT docs/lattice.webp
 """
@@ -11,18 +11,18 @@ import numpy as np
 from PIL import Image
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, positions
+from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, colour_indices
 
 PANEL = (640, 360)
 VIEW = 0
 
 
 def main(root: str, target: str) -> None:
-    """Write the picture."""
+    """Write the picture of the dataset folder ``root`` to the WebP file ``target``."""
     row = rdb.load(root, "lattice", columns=["left_rgb", "left_depth", "left_bars"])[VIEW]
     steel = row["left_bars"] > 0
     near_m, far_m = row["left_depth"][steel].min(), row["left_depth"][steel].max()
-    depth = DEPTH_COLOURS[positions(-row["left_depth"], -far_m, -near_m)]
+    depth = DEPTH_COLOURS[colour_indices(-row["left_depth"], -far_m, -near_m)]
     hues = np.random.default_rng(1).integers(70, 240, (np.iinfo(np.uint16).max + 1, 3)).astype(np.uint8)
     bars = np.where(steel[..., None], hues[row["left_bars"]], np.uint8(24))
     panels = [
