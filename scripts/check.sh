@@ -13,7 +13,7 @@ shift 2
 report=$(mktemp)
 { "$bin/mypy" && "$bin/lint-imports" --no-logo; } >"$report" 2>&1 &
 static=$!
-trap 'kill "$static" 2>/dev/null; rm -f "$report"' EXIT
+trap 'kill "$static" 2>/dev/null || true; rm -f "$report"' EXIT
 
 status=0
 # A file's tests stay together, so that the servers and renders of a module are started once.

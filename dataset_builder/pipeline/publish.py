@@ -30,6 +30,13 @@ from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.version import software_version
 
+MESHES = "meshes"
+CARD = "README.md"
+PICTURES = "pictures"
+STRIP = f"{PICTURES}/scenes.webp"
+"""Strip with one view of each kind of assembly."""
+_SHARDS = "*/test-*-of-*.parquet"
+_DIGEST_CHARACTERS = 12
 LOCK = "lock"
 
 
@@ -49,15 +56,6 @@ def build_lock(folder: Path) -> Iterator[None]:
         except BlockingIOError:
             raise InputError(f"{folder.parent}: another rebar-build is at work there") from None
         yield
-
-
-MESHES = "meshes"
-CARD = "README.md"
-PICTURES = "pictures"
-STRIP = f"{PICTURES}/scenes.webp"
-"""Strip with one view of each kind of assembly."""
-_SHARDS = "*/test-*-of-*.parquet"
-_DIGEST_CHARACTERS = 12
 
 
 def is_published(out: Path, plan: ConfigPlan) -> bool:

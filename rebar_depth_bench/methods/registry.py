@@ -156,10 +156,8 @@ def _import_file(path: Path) -> ModuleType:
         raise MethodError(f"{path}: is no Python file")
     module = importlib.util.module_from_spec(spec)
     sys.path.insert(0, str(path.resolve().parent))  # Allows imports of files beside it, as for a script.
-    writes_bytecode, sys.dont_write_bytecode = (
-        sys.dont_write_bytecode,
-        True,
-    )  # No __pycache__ beside the user's files.
+    writes_bytecode = sys.dont_write_bytecode
+    sys.dont_write_bytecode = True  # No __pycache__ appears beside the user's files.
     try:
         spec.loader.exec_module(module)
     except Exception as error:
