@@ -147,6 +147,7 @@ def outcomes(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[
     return dict(zip(CASES, json.loads(process.stdout), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_invalid_settings_exit_2_with_message(
     name: str, outcomes: dict[str, tuple[int | str | None, str]]

@@ -160,6 +160,7 @@ def test_methods_lists_licences() -> None:
     assert "Apache-2.0" in listed
 
 
+@pytest.mark.slow
 def test_closed_stdout_pipe_gives_no_traceback(archives: dict[str, Path], tiny_root: Path) -> None:
     command = f"{sys.executable} -m rebar_depth_bench score {archives['constant']} --data {tiny_root} | head -n 1"
     finished = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)

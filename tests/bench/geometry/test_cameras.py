@@ -120,6 +120,7 @@ def test_undistort_equals_opencv_where_it_converges() -> None:
     assert ours == pytest.approx(expected[:, 0], abs=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distortion", LENSES)
 def test_distorted_rays_project_to_their_pixel_centres(distortion: np.ndarray) -> None:
     rays = pixel_rays(RAW_K, 1280, 720, distortion)[::45, ::64]

@@ -31,6 +31,8 @@ from rebar_depth_bench.methods.huggingface.model import hf_method
 from tests.bench.methods.predictors import load_predictor
 from tests.bench.methods.tiny_depth_models import LAST_LAYER, MODELS, save_checkpoint
 
+pytestmark = pytest.mark.slow  # torch and transformers take seconds to import
+
 H, W = 90, 160
 FX = 87.5
 SIGMOID_2 = 1 / (1 + np.exp(-2.0))
@@ -51,7 +53,6 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {kind: save_checkpoint(root / kind, kind) for kind in MODELS}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", MODELS)
 def test_families_predict_deterministically_on_left_grid(folders: dict[str, Path], kind: str) -> None:
     method = find_method(f"hf:{folders[kind]}")
@@ -68,7 +69,6 @@ def test_families_predict_deterministically_on_left_grid(folders: dict[str, Path
     assert str(folders[kind]) not in json.dumps(vars(method.info))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "bias", "changes", "expected"),
     [
@@ -192,7 +192,6 @@ def test_other_weights_give_different_method_info(tmp_path: Path) -> None:
     assert infos[1] == infos[2]
 
 
-@pytest.mark.slow
 def test_predict_command_runs_hf_folder(
     tmp_path: Path, tiny_root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

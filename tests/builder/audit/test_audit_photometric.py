@@ -44,6 +44,7 @@ def test_correct_images_fit_within_0_05_px(rig: str) -> None:
     assert verdict(config(), [view(rig)]).passed
 
 
+@pytest.mark.slow
 @EVERY_GRID
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_small_errors_are_reported_on_every_grid(rig: str, damage: str) -> None:
