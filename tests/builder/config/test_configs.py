@@ -92,10 +92,11 @@ def test_every_config_has_its_scene_and_optics(full_root: Path) -> None:
 
 
 def test_audit_passes_on_all_configs(full_root: Path, repetitions: Repetitions) -> None:
-    depth_views = repetitions(0, 1)
-    report = audit(full_root, depth_views=depth_views)
+    report = audit(
+        full_root, depth_views=repetitions(0, 1)
+    )  # Cycles renders the depth of the sample data in any tier
     assert [f"{check.name}: {check.problems}" for check in report.failures] == []
-    assert sum("depth against Cycles" in check.name for check in report.checks) == depth_views * len(VIEWS)
+    assert sum("depth against Cycles" in check.name for check in report.checks) == len(VIEWS)
 
 
 def test_ground_truth_scores_zero_error_on_every_config(full_root: Path, tmp_path: Path) -> None:
