@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from datasets import DatasetInfo, SplitDict, SplitInfo
-from datasets.info import DatasetInfosDict
 from huggingface_hub import DatasetCardData
 
 from cards.templates import render
 from rebar_depth_bench.data.dataset import COLUMN_DESCRIPTIONS, column_kind, features
+
+if TYPE_CHECKING:
+    from datasets import DatasetInfo
 
 SPLIT = "test"
 _OPTICS_TEXTS = {
@@ -60,6 +61,8 @@ def _type_name(feature: Any) -> str:
 
 def _card_metadata(manifest: Mapping[str, Any]) -> DatasetCardData:
     configs: Mapping[str, Mapping[str, Any]] = manifest["configs"]
+    from datasets.info import DatasetInfosDict
+
     views = sum(len(entry["views"]) for entry in configs.values())
     card = DatasetCardData(
         license="cc-by-4.0",
@@ -78,6 +81,8 @@ def _card_metadata(manifest: Mapping[str, Any]) -> DatasetCardData:
 
 
 def _dataset_info(name: str, entry: Mapping[str, Any], version: str) -> DatasetInfo:
+    from datasets import DatasetInfo, SplitDict, SplitInfo
+
     size = entry["bytes"]
     split = SplitInfo(SPLIT, num_examples=len(entry["views"]), num_bytes=size)
     return DatasetInfo(

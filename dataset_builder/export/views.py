@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from datasets.exceptions import DatasetGenerationError, DatasetsError
 
 from dataset_builder.config.rigs import Camera
 from rebar_depth_bench.data.dataset import EYES, decode_row, load_undecoded
@@ -83,6 +82,8 @@ def stored_views(folder: DatasetFolder, config: str, wanted: Collection[str]) ->
 
 def _rows(folder: DatasetFolder, config: str) -> Iterator[Mapping[str, Any]]:
     """Yield the undecoded rows of a config. Raises ``DatasetError`` if the shards cannot be read."""
+    from datasets.exceptions import DatasetGenerationError, DatasetsError
+
     rows = iter(load_undecoded(folder.root, config, streaming=True, columns=_COLUMNS))
     while True:
         try:

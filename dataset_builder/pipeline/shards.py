@@ -9,7 +9,7 @@ depend on the number of workers or attempts.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,28 @@ from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
-from rebar_depth_bench.data.dataset import features
+from rebar_depth_bench.data.dataset import COLUMNS, column_kind, features
 from rebar_depth_bench.data.digests import eye_digest
 from rebar_depth_bench.data.manifest import ViewRecord
 from rebar_depth_bench.reporting.colormap import depth_preview
 from rebar_depth_bench.scoring.protocol import scored_pixels
 
 VIEWS_PER_SHARD = 8
+_IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+_ARROW_TYPES: Mapping[str, pa.DataType] = {
+    "view_id": pa.string(),
+    **dict.fromkeys(("rgb", "mask", "bars", "preview"), _IMAGE),
+    "depth": pa.binary(),
+    "K": pa.list_(pa.list_(pa.float64(), 3), 3),
+    "distortion": pa.list_(pa.float64(), 5),
+    "cam_from_world": pa.list_(pa.list_(pa.float64(), 4), 4),
+    "baseline_m": pa.float64(),
+}
+ROW_SCHEMA = pa.schema([(name, _ARROW_TYPES[column_kind(name)]) for name in COLUMNS])
+"""Arrow schema of ``features``, without its metadata.
+
+Blender processes use it because ``datasets`` takes a second to import.
+"""
 _RECORD_KEY = b"rebar_view_record"
 _PARQUET = {"compression": "none", "use_dictionary": False, "write_statistics": False}
 """Parquet writer options: no compression, since the cells contain compressed images."""
@@ -65,7 +80,7 @@ def split_into_shards(indices: Sequence[int]) -> list[tuple[int, ...]]:
 
 def stage_row(path: Path, row: pa.Table, record: ViewRecord) -> None:
     """Write the row of one view, with its record in the metadata, atomically."""
-    metadata = {**(row.schema.metadata or {}), _RECORD_KEY: json.dumps(asdict(record)).encode()}
+    metadata = {_RECORD_KEY: json.dumps(asdict(record)).encode()}
     with atomic_replace(path) as temporary:
         pq.write_table(row.replace_schema_metadata(metadata), temporary, **_PARQUET)
 
@@ -77,12 +92,10 @@ def read_staged_record(path: Path) -> ViewRecord:
 
 def pack_shard(rows: Sequence[Path], target: Path) -> None:
     """Write the staged ``rows`` as one Parquet shard with one row group per view, to keep streaming cheap."""
-    first = pq.read_table(rows[0])
-    metadata = {key: value for key, value in first.schema.metadata.items() if key != _RECORD_KEY}
-    schema = first.schema.with_metadata(metadata)
+    schema = features().arrow_schema
     with atomic_replace(target) as temporary, pq.ParquetWriter(temporary, schema, **_PARQUET) as writer:
         for path in rows:
-            writer.write_table(pq.read_table(path).replace_schema_metadata(metadata))
+            writer.write_table(pq.read_table(path).replace_schema_metadata(schema.metadata))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,13 +126,12 @@ class View:
 
 
 def encode_view(view: View) -> tuple[pa.Table, ViewRecord]:
-    """Return a view as a one-row table in the schema of the dataset, and its record for the manifest."""
+    """Return a view as a one-row table of ``ROW_SCHEMA``, and its record for the manifest."""
     cells: dict[str, Any] = {"view_id": view.view_id, "baseline_m": view.baseline_m}
     for name, eye in (("left", view.left), ("right", view.right)):
         cells |= {f"{name}_{kind}": cell for kind, cell in _eye_cells(eye).items()}
     cells["left_preview"] = _image_cell(codecs.encode_palette(*depth_preview(view.left.depth_m)))
-    schema = features().arrow_schema
-    return pa.Table.from_pylist([cells], schema=schema), _view_record(view)
+    return pa.Table.from_pylist([cells], schema=ROW_SCHEMA), _view_record(view)
 
 
 def _eye_cells(eye: Eye) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def _run_sandbox(task: ScoringTask, settings: Settings, should_continue: Callabl
         with suppress(BrokenPipeError):
             process.stdin.write(task.to_json())
             process.stdin.close()
-        while not _has_ended(process, step_s):
+        while not _has_ended(process, min(step_s, max(0.0, deadline - time.monotonic()))):
             if time.monotonic() >= deadline:
                 return Outcome(
                     reason=f"scoring took longer than the {settings.score_time:g} s this service allows"

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
-
-import datasets
 
 from rebar_depth_bench.cli import check, compare, demo, methods, predict, score, submit, table
 from rebar_depth_bench.console import check_outputs, replace_renamed_options, run_command
@@ -48,7 +47,7 @@ _STUDY_SUMMARY = "the studies of the paper, on your own archives"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-bench`` and return its exit code."""
     options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
-    datasets.disable_progress_bars()
+    os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")  # ``datasets`` reads it at import.
     return run_command(lambda: _run(options), interrupted=getattr(options, "interrupted", "interrupted"))
 
 

@@ -1,7 +1,8 @@
 """Dataset rows: columns and features, loading through ``datasets``, and decoding to NumPy.
 
 ``load`` returns a config as a ``datasets`` object whose rows decode to NumPy arrays; ``ConfigViews`` gives access
-to all views of a config for methods that need more than one view at a time.
+to all views of a config for methods that need more than one view at a time. ``datasets`` takes a second to import,
+which commands that read only cached ground truth do not need, so functions import it on use.
 """
 
 from __future__ import annotations
@@ -9,24 +10,28 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
-import datasets
 import numpy as np
 import pyarrow as pa
-from datasets import Dataset, Features, Image, IterableDataset, List, Value
-from datasets.exceptions import DatasetGenerationError, DatasetsError
 
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
+if TYPE_CHECKING:
+    from datasets import Dataset, Features, IterableDataset
+
 EYES = ("left", "right")
-
-
-def _matrix(rows: int, columns: int) -> List:
-    return List(List(Value("float64"), length=columns), length=rows)
+COLUMNS = (
+    "view_id",
+    *(f"{eye}_{kind}" for kind in ("rgb", "depth", "mask", "bars") for eye in EYES),
+    "left_preview",
+    *(f"{eye}_{kind}" for kind in ("K", "distortion", "cam_from_world") for eye in EYES),
+    "baseline_m",
+)
+"""Names of the columns, in order."""
 
 
 def features(*, decode_images: bool = True) -> Features:
@@ -34,16 +39,19 @@ def features(*, decode_images: bool = True) -> Features:
 
     With ``decode_images=False`` image columns are left as encoded bytes.
     """
-    image = Image(decode=decode_images)
-    columns: dict[str, object] = {"view_id": Value("string")}
-    for kind, feature in (("rgb", image), ("depth", Value("binary")), ("mask", image), ("bars", image)):
-        columns |= {f"{eye}_{kind}": feature for eye in EYES}
-    columns["left_preview"] = image
-    columns |= {f"{eye}_K": _matrix(3, 3) for eye in EYES}
-    columns |= {f"{eye}_distortion": List(Value("float64"), length=5) for eye in EYES}
-    columns |= {f"{eye}_cam_from_world": _matrix(4, 4) for eye in EYES}
-    columns["baseline_m"] = Value("float64")
-    return Features(columns)
+    from datasets import Features, Image, List, Value
+
+    image, number = Image(decode=decode_images), Value("float64")
+    by_kind = {
+        "view_id": Value("string"),
+        **dict.fromkeys(("rgb", "mask", "bars", "preview"), image),
+        "depth": Value("binary"),
+        "K": List(List(number, length=3), length=3),
+        "distortion": List(number, length=5),
+        "cam_from_world": List(List(number, length=4), length=4),
+        "baseline_m": number,
+    }
+    return Features({name: by_kind[column_kind(name)] for name in COLUMNS})
 
 
 COLUMN_DESCRIPTIONS: dict[str, str] = {
@@ -117,6 +125,8 @@ def load(
 
     Raises ``DatasetError`` for a folder, config or column that does not exist.
     """
+    from datasets import IterableDataset
+
     undecoded = load_undecoded(root, config, streaming=streaming, columns=columns)
     if isinstance(undecoded, IterableDataset):
         return undecoded.map(decode_row)
@@ -130,6 +140,9 @@ def load_undecoded(
 
     Raises ``DatasetError`` as ``load`` does.
     """
+    import datasets
+    from datasets.exceptions import DatasetGenerationError, DatasetsError
+
     open_folder(root).config(config)
     selected_columns = _validated_columns(columns)
     try:
@@ -138,8 +151,8 @@ def load_undecoded(
         raise DatasetError(f"{root}: config {config} cannot be loaded: {error}") from error
     selected = loaded.select_columns(list(selected_columns))
     for name in selected_columns:
-        if isinstance(selected.features[name], Image):
-            selected = selected.cast_column(name, Image(decode=False))  # This changes only the decoding.
+        if isinstance(selected.features[name], datasets.Image):
+            selected = selected.cast_column(name, datasets.Image(decode=False))  # This changes only the decoding.
     return selected
 
 
@@ -148,6 +161,8 @@ def iterate_rows(root: str | Path, config: str, columns: Sequence[str]) -> Itera
 
     Raises ``DatasetError`` if the config cannot be loaded or a shard is damaged.
     """
+    from datasets.exceptions import DatasetsError
+
     rows = iter(load(root, config, streaming=True, columns=columns))
     while True:
         try:
@@ -178,12 +193,11 @@ def _identity(cell: Any) -> Any:
 
 
 def _validated_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
-    known = tuple(features())
     if columns is None:
-        return known
-    unknown = [name for name in columns if name not in known]
+        return COLUMNS
+    unknown = [name for name in columns if name not in COLUMNS]
     if unknown:
-        raise DatasetError(f"no column {', '.join(map(repr, unknown))}, expected some of {', '.join(known)}")
+        raise DatasetError(f"no column {', '.join(map(repr, unknown))}, expected some of {', '.join(COLUMNS)}")
     return tuple(columns)
 
 

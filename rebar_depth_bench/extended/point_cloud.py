@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
-from scipy.spatial import cKDTree
 
 from rebar_depth_bench.extended.measures import Measure, Samples, subsample
 from rebar_depth_bench.extended.steel_truth import SteelTruth
@@ -121,6 +120,8 @@ def _nearest_m(
 
 def _build_tree(points_m: Float64[ndarray, "m 3"]) -> Any:
     """Return a k-d tree that is fast to build: it serves a single batch of queries."""
+    from scipy.spatial import cKDTree  # Half a second to import, which reports and cards do not need.
+
     return cKDTree(points_m, balanced_tree=False, compact_nodes=False)
 
 

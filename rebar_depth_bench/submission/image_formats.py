@@ -14,7 +14,6 @@ from collections.abc import Iterator, Mapping
 from itertools import pairwise
 
 import numpy as np
-import OpenEXR
 from PIL import Image
 
 from rebar_depth_bench.errors import EntryError, escape_text, format_shape
@@ -45,6 +44,8 @@ def decode_exr(name: str, data: memoryview, shape: tuple[int, int], depth_scale:
     """
     del depth_scale
     _check_exr_header(name, data, shape)
+    import OpenEXR  # A tenth of a second, which archives of other formats do not need.
+
     try:
         image = OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0)
         (channel,) = image.channels().values()

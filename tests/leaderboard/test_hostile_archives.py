@@ -1,4 +1,4 @@
-"""Thousands of hostile archives: readable rejections, no files written elsewhere and no memory growth."""
+"""Hundreds of hostile archives: readable rejections, no files written elsewhere and no memory growth."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CLIENTS = 4
 NUM_WARM_UP = 60
 """Number of archives after which one-time allocations of the server are done."""
 MAX_GROWTH_BYTES = 24 << 20
-"""Bound on memory growth: a fifth of the bodies in the nightly tier, and a weak one with 200 archives."""
+"""Bound on memory growth: a fifth of the bodies of the 1,000 archives."""
 SEED = 20261122
 REPOSITORY = Path(__file__).parents[2]
 
@@ -221,8 +221,13 @@ def test_no_file_is_written_elsewhere_and_no_pickle_runs(attack: AttackResult, t
     assert marker.exists()
 
 
-def test_memory_and_open_files_do_not_grow(attack: AttackResult) -> None:
+def test_open_files_do_not_grow(attack: AttackResult) -> None:
+    before, after = attack.footprints
+    assert after.files <= before.files + CLIENTS, attack.footprints
+
+
+@pytest.mark.nightly  # With few archives, one-time allocations outweigh what each archive could leave behind.
+def test_memory_does_not_grow(attack: AttackResult) -> None:
     before, after = attack.footprints
     assert after.server_bytes - before.server_bytes < MAX_GROWTH_BYTES, attack.footprints
     assert after.children_bytes - before.children_bytes < MAX_GROWTH_BYTES, attack.footprints
-    assert after.files <= before.files + CLIENTS, attack.footprints

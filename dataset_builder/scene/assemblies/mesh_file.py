@@ -11,9 +11,9 @@ import hashlib
 import math
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from jaxtyping import Float64
 from numpy import ndarray
 
@@ -23,6 +23,9 @@ from dataset_builder.scene.assemblies.mesh_import import SUFFIXES, read_parts
 from dataset_builder.scene.model import ESTIMATED_ROLE, STEEL, Assembly, Mesh, Part, axis_of
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import MeshError
+
+if TYPE_CHECKING:
+    import trimesh
 
 _MIN_RELATIVE_VOLUME = 1e-9
 """Least volume of a solid, relative to its surface area to the power 3/2.
@@ -41,6 +44,8 @@ def estimate_bar(bar_id: int, mesh: Mesh) -> Bar:
 
     Raises ``ValueError`` if every triangle has zero area.
     """
+    import trimesh
+
     # Coordinates relative to a point near the mesh, since a far origin would cost digits by cancellation.
     origin = mesh.vertices_m.mean(axis=0)
     body = trimesh.Trimesh(mesh.vertices_m - origin, mesh.faces)

@@ -13,6 +13,9 @@
 STL, PLY and OBJ coordinates are used unchanged and should be z up. glTF is y up by its specification and is
 rotated: (x, y, z) becomes (x, -z, y). Except in the dataset's own PLY, a closed part that is wound inside out
 is reversed.
+
+trimesh takes more than half a second to import, which builds of the standard scenes do not need, so functions
+import it on use.
 """
 
 from __future__ import annotations
@@ -26,9 +29,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import shorten
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from jaxtyping import Integer
 from numpy import ndarray
 from numpy.typing import ArrayLike
@@ -37,6 +40,9 @@ from dataset_builder.config.specs import MeshFileSpec
 from dataset_builder.scene.mesh_ply import has_mesh_ply_header, parse_mesh_ply
 from dataset_builder.scene.model import MAX_BARS, NOT_STEEL, Mesh
 from rebar_depth_bench.errors import DatasetError, MeshError
+
+if TYPE_CHECKING:
+    import trimesh
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 """Supported suffixes of mesh files, in lower case."""
@@ -102,6 +108,8 @@ def _read_objects(content: bytes, spec: MeshFileSpec) -> list[Mesh]:
     pattern, problem = _UNSUPPORTED_CONTENT[suffix]
     if re.search(pattern, content):
         raise MeshError(f"{spec.path}: {problem}")
+    import trimesh
+
     scene = trimesh.load_scene(
         io.BytesIO(content),
         file_type=suffix[1:],
@@ -125,6 +133,8 @@ def _read_objects(content: bytes, spec: MeshFileSpec) -> list[Mesh]:
 
 def _stl_triangles(content: bytes) -> tuple[ndarray, ndarray]:
     """Return the corners (n, 3) of all solids, in order, and faces (n / 3, 3) of consecutive corners."""
+    import trimesh
+
     # load_scene repairs files with several solids, which would drop corners that are not finite.
     loaded = trimesh.exchange.stl.load_stl(io.BytesIO(content))
     solids = loaded["geometry"].values() if "geometry" in loaded else [loaded]
@@ -168,6 +178,8 @@ def _mesh_in_metres(vertices: ArrayLike, faces: ArrayLike, spec: MeshFileSpec) -
 
 def connected_components(mesh: Mesh) -> list[Mesh]:
     """Return the connected components, ordered by their first faces; faces and vertices keep their order."""
+    import trimesh
+
     edges = trimesh.geometry.faces_to_edges(mesh.faces)
     vertex_label = trimesh.graph.connected_component_labels(edges, len(mesh.vertices_m))
     groups = _indices_by_label(vertex_label[mesh.faces[:, 0]])
@@ -176,12 +188,16 @@ def connected_components(mesh: Mesh) -> list[Mesh]:
 
 def _merged_close_vertices(mesh: Mesh) -> Mesh:
     """Return the mesh with vertices closer than 10 nm merged."""
+    import trimesh
+
     body = trimesh.Trimesh(mesh.vertices_m, mesh.faces)
     return Mesh(np.array(body.vertices), np.array(body.faces, np.int32))
 
 
 def _indices_by_label(label: Integer[ndarray, " n"]) -> list[Integer[ndarray, " k"]]:
     """Return the ascending indices at which each label occurs, ordered by label."""
+    import trimesh
+
     return [np.sort(group) for group in trimesh.grouping.group(label) if len(group)]
 
 
@@ -194,6 +210,8 @@ def _submesh(mesh: Mesh, faces_kept: Integer[ndarray, " k"]) -> Mesh:
 
 def _oriented_outward(mesh: Mesh) -> Mesh:
     """Return the mesh with close vertices merged, reversed if it is closed and wound inside out."""
+    import trimesh
+
     body = trimesh.Trimesh(mesh.vertices_m, mesh.faces)
     if body.is_watertight and body.is_winding_consistent and body.volume < 0:
         body.invert()
