@@ -27,7 +27,7 @@ from dataset_builder.audit.stereo_consistency import epipolar_verdict, view_epip
 from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView, RayCache, view_from_row
 from dataset_builder.config.trajectories import subset
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
-from rebar_depth_bench.data.dataset import features, iterate_rows
+from rebar_depth_bench.data.dataset import COLUMNS, iterate_rows
 from rebar_depth_bench.data.manifest import DatasetFolder, ViewRecord, open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
@@ -89,7 +89,7 @@ def _config_checks(
     aim_m, aim_problems = checked_aim_point_m(entry, root / entry["mesh"])
     expected = expected_views(name, entry, aim_m)
     accumulator = _AuditAccumulator(config, folder.views(name), expected, depth_views)
-    for row in iterate_rows(root, name, [column for column in features() if column not in _NOT_AUDITED]):
+    for row in iterate_rows(root, name, [column for column in COLUMNS if column not in _NOT_AUDITED]):
         accumulator.add(row)
         progress(f"audit of {name}", accumulator.rows, len(entry["views"]))
     yield accumulator.rows_check()

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from dataset_builder.config.rigs import Camera
-from rebar_depth_bench.data.dataset import EYES, decode_row, load_undecoded
+from rebar_depth_bench.data.dataset import EYES, decode_row, iterate_undecoded
 from rebar_depth_bench.data.digests import eye_digest
 from rebar_depth_bench.data.manifest import DatasetFolder, ViewRecord
 from rebar_depth_bench.errors import DatasetError
@@ -69,7 +68,7 @@ def stored_views(folder: DatasetFolder, config: str, wanted: Collection[str]) ->
     records = {record.view_id: record for record in folder.views(config)}
     missing = set(wanted)
     grid = folder.grid(config)
-    for row in _rows(folder, config):
+    for row in iterate_undecoded(folder.root, config, _COLUMNS):
         view_id = row["view_id"]
         if view_id not in records:
             raise DatasetError(f"{folder.root}: view {view_id} is not in the manifest")
@@ -78,21 +77,6 @@ def stored_views(folder: DatasetFolder, config: str, wanted: Collection[str]) ->
             yield StoredView(_camera_view(row, grid), records[view_id], row)
     if missing:
         raise DatasetError(f"{folder.root}: {config} lacks {len(missing)} views, among them {min(missing)}")
-
-
-def _rows(folder: DatasetFolder, config: str) -> Iterator[Mapping[str, Any]]:
-    """Yield the undecoded rows of a config. Raises ``DatasetError`` if the shards cannot be read."""
-    from datasets.exceptions import DatasetGenerationError, DatasetsError
-
-    rows = iter(load_undecoded(folder.root, config, streaming=True, columns=_COLUMNS))
-    while True:
-        try:
-            row: Mapping[str, Any] = next(rows)
-        except StopIteration:
-            return
-        except (OSError, pa.ArrowException, DatasetsError, DatasetGenerationError) as error:
-            raise DatasetError(f"{folder.root}: config {config} cannot be read: {error}") from error
-        yield row
 
 
 def _camera_view(row: Mapping[str, Any], grid: tuple[int, int]) -> CameraView:

@@ -25,7 +25,7 @@ from dataset_builder.pipeline.publish import (
     repair_metadata,
 )
 from dataset_builder.pipeline.work_units import accept_result, remaining_units
-from dataset_builder.scene.assemblies import check_fits, make_assembly
+from dataset_builder.scene.assemblies import check_fits
 from rebar_depth_bench.progress import Progress, silent
 
 
@@ -59,7 +59,7 @@ def build(
     check_request(request)
     plans = plan_request(request, out)
     for plan in plans:  # Report an unusable mesh file before anything is written.
-        check_fits(make_assembly(plan.spec.scene.assembly), plan.spec)
+        check_fits(plan.assembly, plan.spec)
     check_folder(out)
     with build_lock(out / BUILD_FOLDER):
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.specs import ConfigSpec
 from dataset_builder.config.trajectories import camera_offsets_m, subset
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging
+from dataset_builder.scene.assemblies import make_assembly
+from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.data.digests import parameters_digest
 from rebar_depth_bench.version import software_version
 
@@ -41,6 +44,11 @@ class ConfigPlan:
     def all_stagings(self) -> list[Path]:
         """Return all staging folders of this config, including those of abandoned builds with other parameters."""
         return list(self.staging.root.parent.glob(f"{self.spec.name}-{'[0-9a-f]' * _KEY_CHARACTERS}"))
+
+    @cached_property
+    def assembly(self) -> Assembly:
+        """Bars and meshes of the config, made on first access. Raises what ``make_assembly`` raises."""
+        return make_assembly(self.spec.scene.assembly)
 
     @property
     def parameters(self) -> dict[str, Any]:

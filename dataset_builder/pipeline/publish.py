@@ -21,7 +21,7 @@ from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.pipeline.contact_sheet import write_contact_sheet, write_scenes_strip
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, generator_versions
 from dataset_builder.pipeline.shards import pack_shard, read_staged_record, split_into_shards
-from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from dataset_builder.scene.assemblies import aim_point_m
 from rebar_depth_bench.atomic_io import TEMPORARY_PATTERN, exclusive_lock, write_bytes, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest, views_digest
@@ -127,7 +127,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
     entry = {
         **plan.parameters,
         "key": plan.key,
-        "aim_point_m": aim_point_m(make_assembly(plan.spec.scene.assembly)).tolist(),
+        "aim_point_m": aim_point_m(plan.assembly).tolist(),
         "protocol_views": len(camera_offsets_m(plan.spec.protocol)),
         "generator": generator_versions(),
         "mesh": mesh,
@@ -143,7 +143,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
 def _write_bars(out: Path, plan: ConfigPlan) -> None:
     path, scene = out / BARS_FILE, plan.spec.scene
     published = read_bars(path) if path.is_file() else {}
-    write_bars(path, {**published, scene.name: make_assembly(scene.assembly).bars})
+    write_bars(path, {**published, scene.name: plan.assembly.bars})
 
 
 def _sheet_name(plan: ConfigPlan) -> str:

@@ -9,7 +9,7 @@ depend on the number of workers or attempts.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,28 +22,13 @@ from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
-from rebar_depth_bench.data.dataset import COLUMNS, column_kind, features
+from rebar_depth_bench.data.dataset import ROW_SCHEMA, features
 from rebar_depth_bench.data.digests import eye_digest
 from rebar_depth_bench.data.manifest import ViewRecord
 from rebar_depth_bench.reporting.colormap import depth_preview
 from rebar_depth_bench.scoring.protocol import scored_pixels
 
 VIEWS_PER_SHARD = 8
-_IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-_ARROW_TYPES: Mapping[str, pa.DataType] = {
-    "view_id": pa.string(),
-    **dict.fromkeys(("rgb", "mask", "bars", "preview"), _IMAGE),
-    "depth": pa.binary(),
-    "K": pa.list_(pa.list_(pa.float64(), 3), 3),
-    "distortion": pa.list_(pa.float64(), 5),
-    "cam_from_world": pa.list_(pa.list_(pa.float64(), 4), 4),
-    "baseline_m": pa.float64(),
-}
-ROW_SCHEMA = pa.schema([(name, _ARROW_TYPES[column_kind(name)]) for name in COLUMNS])
-"""Arrow schema of ``features``, without its metadata.
-
-Blender processes use it because ``datasets`` takes a second to import.
-"""
 _RECORD_KEY = b"rebar_view_record"
 _PARQUET = {"compression": "none", "use_dictionary": False, "write_statistics": False}
 """Parquet writer options: no compression, since the cells contain compressed images."""

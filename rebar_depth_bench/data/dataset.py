@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
@@ -75,6 +76,19 @@ def column_kind(name: str) -> str:
     eye, _, kind = name.partition("_")
     return kind if eye in EYES else name
 
+
+_IMAGE_CELL = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+_ARROW_TYPES: Mapping[str, pa.DataType] = {
+    "view_id": pa.string(),
+    **dict.fromkeys(("rgb", "mask", "bars", "preview"), _IMAGE_CELL),
+    "depth": pa.binary(),
+    "K": pa.list_(pa.list_(pa.float64(), 3), 3),
+    "distortion": pa.list_(pa.float64(), 5),
+    "cam_from_world": pa.list_(pa.list_(pa.float64(), 4), 4),
+    "baseline_m": pa.float64(),
+}
+ROW_SCHEMA = pa.schema([(name, _ARROW_TYPES[column_kind(name)]) for name in COLUMNS])
+"""Arrow schema of ``features``, without its metadata."""
 
 SPLIT = "test"
 """Split that is loaded."""
@@ -157,25 +171,53 @@ def load_undecoded(
 
 
 def iterate_rows(root: str | Path, config: str, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield the decoded rows of a config by streaming, without a cache.
+    """Yield the decoded rows of a config, one at a time, without a cache.
 
     Raises ``DatasetError`` if the config cannot be loaded or a shard is damaged.
     """
-    from datasets.exceptions import DatasetsError
-
-    rows = iter(load(root, config, streaming=True, columns=columns))
-    while True:
+    for row in iterate_undecoded(root, config, columns):
         try:
-            row = next(rows)
-        except StopIteration:
-            return
-        except (OSError, pa.ArrowException, DatasetsError) as error:
+            decoded = decode_row(row)
+        except (OSError, TypeError, ValueError) as error:
             raise DatasetError(f"{root}: config {config} cannot be read: {error}") from error
-        yield row
+        yield decoded
+
+
+def iterate_undecoded(root: str | Path, config: str, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a config with encoded images and depth, one at a time, to be decoded by ``decode_row``.
+
+    The shards of a local folder are read with pyarrow: ``datasets`` takes a second to import, and imports torch,
+    which takes several, to stream. Hub repositories are streamed. Raises ``DatasetError`` as ``iterate_rows``.
+    """
+    folder = open_folder(root)
+    folder.config(config)
+    if folder.local is None:
+        return _streamed_rows(root, config, columns)
+    return _shard_rows(folder, config, _validated_columns(columns))
+
+
+def _shard_rows(folder: DatasetFolder, config: str, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    schema = pa.schema([ROW_SCHEMA.field(name) for name in columns])
+    try:
+        for name in folder.config(config)["shards"]:
+            with pq.ParquetFile(folder.file(name)) as shard:
+                for batch in shard.iter_batches(batch_size=1, columns=schema.names):
+                    yield from batch.select(schema.names).cast(schema).to_pylist()
+    except (KeyError, OSError, pa.ArrowException) as error:
+        raise DatasetError(f"{folder.root}: config {config} cannot be read: {error}") from error
+
+
+def _streamed_rows(root: str | Path, config: str, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    from datasets.exceptions import DatasetGenerationError, DatasetsError
+
+    try:
+        yield from load_undecoded(root, config, streaming=True, columns=columns)
+    except (OSError, pa.ArrowException, DatasetsError, DatasetGenerationError) as error:
+        raise DatasetError(f"{root}: config {config} cannot be read: {error}") from error
 
 
 def decode_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Decode the cells of a row of ``load_undecoded``."""
+    """Decode the cells of a row of ``load_undecoded`` or ``iterate_undecoded``."""
     return {name: _decoder(name)(cell) for name, cell in row.items()}
 
 

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import atomic_replace, write_text
-from rebar_depth_bench.data.dataset import decode_row, load_undecoded
+from rebar_depth_bench.data.dataset import decode_row, iterate_undecoded
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import InputError, MethodError, RebarDepthError
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
@@ -226,7 +226,7 @@ def _remaining_rows(
 ) -> Iterator[dict[str, Any]]:
     """Yield the decoded rows of the views that are not in ``done``; the others are not decoded."""
     columns = ("view_id", *method.info.columns)
-    for row in load_undecoded(folder.root, config, streaming=True, columns=columns):
+    for row in iterate_undecoded(folder.root, config, columns):
         if row["view_id"] not in done:
             yield decode_row(row)
 

@@ -1,4 +1,4 @@
-"""Rendering of the dataset in ``tests/data/tiny``: ``python -m tests.data.render`` replaces it."""
+"""Rendering of the sample data in ``tests/data``: ``python -m tests.data.render`` replaces it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ import shutil
 import tempfile
 from pathlib import Path
 
+import pyarrow.parquet as pq
+
 from tests.building import TINY, TINY_VIEWS, run_build
+from tests.data import orbit
 
 FOLDER = Path(__file__).parent / "tiny"
 
@@ -19,8 +22,18 @@ def render(root: Path) -> None:
         assert finished.returncode == 0, finished.stderr
 
 
+def render_orbit(root: Path) -> dict[str, bytes]:
+    """Render the views of the orbit into the folder ``root`` and return the left images by file name."""
+    size = ("--width", str(orbit.REQUEST.width), "--height", str(orbit.REQUEST.height))
+    options = ("--views", str(orbit.REQUEST.views), *size, "--samples", str(orbit.REQUEST.samples))
+    finished = run_build("--out", root, "--config", *orbit.REQUEST.configs, *options)
+    assert finished.returncode == 0, finished.stderr
+    rows = pq.read_table(root / "lattice-orbit", columns=["view_id", "left_rgb"]).to_pylist()
+    return {f"{row['view_id'].rpartition('/')[2]}.webp": row["left_rgb"]["bytes"] for row in rows}
+
+
 def main() -> None:
-    """Render the dataset, pack its mesh, and put it in the place of the one in the tree."""
+    """Render the sample data, pack the mesh of the tiny dataset, and replace both folders in the tree."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "dataset"
         render(root)
@@ -29,6 +42,10 @@ def main() -> None:
             mesh.unlink()
         shutil.rmtree(FOLDER, ignore_errors=True)
         shutil.copytree(root, FOLDER)
+        shutil.rmtree(orbit.IMAGES, ignore_errors=True)
+        orbit.IMAGES.mkdir()
+        for name, content in render_orbit(Path(folder) / "orbit").items():
+            (orbit.IMAGES / name).write_bytes(content)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from typing import Any
 from markupsafe import Markup
 
 from rebar_depth_bench.atomic_io import write_text
-from rebar_depth_bench.data.dataset import decode_row, load_undecoded
+from rebar_depth_bench.data.dataset import decode_row, iterate_undecoded
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
@@ -195,7 +195,7 @@ def iter_view_panels(
     for config, views in chosen.items():
         scores = {view.view_id: view for view in views}
         if scores:
-            for row in load_undecoded(root, config, streaming=True, columns=_COLUMNS):
+            for row in iterate_undecoded(root, config, _COLUMNS):
                 if row["view_id"] in scores:
                     yield _panels(scores[row["view_id"]], decode_row(row), submission)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -124,9 +125,9 @@ def test_contact_sheets_have_one_tile_per_view_and_scene(full_root: Path, manife
     assert all(entry["sheet"] in card for entry in manifest["configs"].values())
 
 
-def test_user_scene_and_variant_are_added_to_dataset(tmp_path: Path, run_build: RunBuild) -> None:
+def test_user_scene_and_variant_are_added_to_dataset(tiny_root: Path, tmp_path: Path, run_build: RunBuild) -> None:
     root = tmp_path / "dataset"
-    assert run_build("--out", root, "--config", "lattice", "--views", "1", *TINY).returncode == 0
+    shutil.copytree(tiny_root, root)
     standard_manifest = (root / "manifest.json").read_text()
     for arguments in (
         ("--scene", "examples/beam.toml"),
@@ -135,11 +136,13 @@ def test_user_scene_and_variant_are_added_to_dataset(tmp_path: Path, run_build: 
         process = run_build("--out", root, *arguments, "--views", "1", *TINY)
         assert process.returncode == 0, process.stderr
     entries = json.loads((root / "manifest.json").read_text())["configs"]
-    assert list(entries) == ["lattice", "beam", "lattice-wet-formwork"]
+    assert list(entries) == ["lattice", "lattice-orbit", "beam", "lattice-wet-formwork"]
     assert entries["lattice"] == json.loads(standard_manifest)["configs"]["lattice"]
     assert entries["lattice-wet-formwork"]["scene"]["appearance"]["variants"] == ["wet", "formwork"]
     assert rdb.load(root, "beam")[0]["left_mask"].any()
-    plain, other = (rdb.load(root, name)[0] for name in ("lattice", "lattice-wet-formwork"))
+    other = rdb.load(root, "lattice-wet-formwork")[0]
+    index = other["view_id"].rpartition("/")[2]
+    (plain,) = (row for row in rdb.load(root, "lattice") if row["view_id"] == f"lattice/{index}")
     assert np.array_equal(plain["left_cam_from_world"], other["left_cam_from_world"])
     assert not np.array_equal(plain["left_rgb"], other["left_rgb"])
     assert audit(root, depth_views=0).failures == ()

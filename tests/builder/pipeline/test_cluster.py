@@ -25,8 +25,8 @@ from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
 from rebar_depth_bench.errors import InputError
 from tests.building import TINY, RunBuild, StartBuild, contents, render_processes_of, staged_rows, wait_until
 
-VIEWS = 17
-"""Number of views: two shards of eight and one of one, that is three work units."""
+VIEWS = 9
+"""Number of views: a shard of eight and one of one, that is two work units."""
 LATTICE = ("--config", "lattice", "--views", str(VIEWS), *TINY)
 
 
@@ -90,7 +90,7 @@ def running_cluster(folder: Path) -> Iterator[Cluster]:
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     with running_cluster(tmp_path_factory.mktemp("cluster")) as started:
-        for _ in range(3):
+        for _ in range(2):
             started.start_worker()
         yield started
 
@@ -111,7 +111,7 @@ def test_cluster_build_equals_local_build(
     assert process.returncode == 0, process.stderr
     assert contents(root) == contents(local_root)
     assert not (root / BUILD_FOLDER).exists()
-    assert "lattice: 4 of 17" in process.stderr, "no progress within a unit"
+    assert "lattice: 4 of 9" in process.stderr, "no progress within a unit"
 
 
 def write_two_bars(path: Path) -> None:

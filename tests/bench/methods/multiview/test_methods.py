@@ -19,17 +19,14 @@ from rebar_depth_bench.methods import METHODS, ConfigViews, MultiViewMethod
 from rebar_depth_bench.methods.multiview import dense
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.progress import silent
-from tests.building import RunBuild
-
-ORBIT = ("--config", "lattice-orbit", "--views", "24", "--width", "512", "--height", "288", "--samples", "1")
+from tests.data.orbit import write_orbit
 
 
 @pytest.fixture(scope="module")
-def orbit_root(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) -> Path:
-    """Render views of the lattice 15 degrees apart, at low resolution and one sample per pixel."""
+def orbit_root(tmp_path_factory: pytest.TempPathFactory, tiny_root: Path) -> Path:
+    """Return a dataset of 24 views of the lattice, 15 degrees apart, with stored images."""
     root = tmp_path_factory.mktemp("orbit") / "dataset"
-    finished = run_build("--out", root, *ORBIT)
-    assert finished.returncode == 0, finished.stderr
+    write_orbit(root, tiny_root / "meshes" / "lattice.ply")
     return root
 
 

@@ -1,0 +1,73 @@
+"""Dataset of 24 views of the lattice, 15 degrees apart, with the left images rendered beforehand.
+
+The images are in ``tests/data/orbit``, 512 x 288 at one sample per pixel, rendered by ``make sample-data``. Depth,
+masks and bar ids are cast anew against the mesh of the tiny dataset, which shows the same scene. Right images are
+black: multi-view methods do not read them.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dataset_builder.config.catalog import BuildRequest, view_id
+from dataset_builder.config.rigs import rig_cameras
+from dataset_builder.config.trajectories import poses
+from dataset_builder.pipeline.build import build
+from dataset_builder.pipeline.local_renderer import OnViewDone
+from dataset_builder.pipeline.shards import Eye, Staging, View, encode_view, stage_row
+from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
+from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from dataset_builder.scene.mesh_ply import read_mesh_ply
+from dataset_builder.scene.model import WorldMesh
+from dataset_builder.scene.raycast import RayCaster
+from rebar_depth_bench.data.codecs import decode_rgb
+from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.geometry.cameras import pixel_rays
+
+IMAGES = Path(__file__).parent / "orbit"
+REQUEST = BuildRequest(configs=("lattice-orbit",), views=24, width=512, height=288, samples=1)
+
+
+@dataclass(frozen=True)
+class StoredImages:
+    """Renderer that takes the left images from ``IMAGES`` and casts the ground truth against ``mesh``."""
+
+    mesh: Path
+
+    def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
+        """Stage the views of the unit."""
+        staging.row(0).parent.mkdir(parents=True, exist_ok=True)
+        staging.mesh.write_bytes(self.mesh.read_bytes())
+        caster = RayCaster(WorldMesh(*read_mesh_ply(self.mesh)))
+        config = unit.config
+        left_poses = poses(config.protocol, aim_point_m(make_assembly(config.scene.assembly)), config.rig)
+        for index in unit.indices:
+            eyes = {}
+            for name, camera in rig_cameras(config.rig, left_poses[index]).items():
+                rays_cam = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
+                truth = caster.cast(rays_cam, camera.cam_from_world)
+                shape = (camera.height, camera.width, 3)
+                rgb = decode_rgb(_image(index).read_bytes()) if name == "left" else np.zeros(shape, np.uint8)
+                pose = camera.cam_from_world
+                eyes[name] = Eye(rgb, truth.depth_m, truth.mask, truth.bars, camera.K, camera.distortion, pose)
+            row, record = encode_view(
+                View(view_id(config.name, index), eyes["left"], eyes["right"], config.rig.baseline_m)
+            )
+            stage_row(staging.row(index), row, record)
+            on_view_done(index)
+        finished: Future[UnitResult] = Future()
+        finished.set_result(UnitResult("stored images", {}, file_sha256(staging.mesh)))
+        return finished
+
+
+def write_orbit(root: Path, mesh: Path) -> None:
+    """Write the dataset folder ``root``; ``mesh`` is the PLY file of the lattice."""
+    build(REQUEST, root, cluster=StoredImages(mesh))
+
+
+def _image(index: int) -> Path:
+    return IMAGES / f"{index:04d}.webp"
