@@ -2,7 +2,7 @@
 
 import sys
 
-from leaderboard.cli import main
+if __name__ == "__main__":  # The processes that check archives import this module again, but need no command.
+    from leaderboard.cli import main
 
-if __name__ == "__main__":
     sys.exit(main())

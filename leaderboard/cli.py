@@ -139,7 +139,3 @@ def _add_setting(command: argparse.ArgumentParser, name: str) -> None:
         metavar=name.upper(),
         help=f"{field.description}{default_text}".replace("%", "%%"),
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -14,6 +14,8 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER
 TINY = ("--width", "160", "--height", "90", "--samples", "1")
 TINY_VIEWS = 9
 """One more than a shard holds."""
+TWO_BARS = Path(__file__).parent / "data" / "two-bars.toml"
+"""Cage that renders in a third of the time of the lattice."""
 
 RunBuild = Callable[..., subprocess.CompletedProcess[str]]
 StartBuild = Callable[..., subprocess.Popen[bytes]]

@@ -42,6 +42,8 @@ FIXTURE_MARKERS = {
     "chromium_program": "browser",
 }
 """Markers by the fixtures that start something heavy; a test has them through whichever fixtures it requests."""
+SHARED_SERVERS = {"board", "waiting"}
+"""Fixtures that start a server for several test modules."""
 TIERS = {
     "quick": {*FIXTURE_MARKERS.values(), "slow", "nightly"},
     "test": {"nightly"},
@@ -59,6 +61,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="quick: no Blender, server, database, cluster or browser, and nothing slow; "
         "test: all but long stress tests (default); nightly: everything, with full repetitions",
     )
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Group tests for ``--dist loadgroup``: one process runs all tests of a group and makes their fixtures once."""
+    is_shared = SHARED_SERVERS & set(getattr(item, "fixturenames", ())) and item.path.name != "test_api.py"
+    item.add_marker(pytest.mark.xdist_group("shared servers" if is_shared else str(item.path)))
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -132,7 +132,7 @@ class Service:
             self.postgres.start()
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.nightly)])
 def service(
     request: pytest.FixtureRequest,
     tiny_root: Path,

@@ -223,7 +223,8 @@ def test_no_file_is_written_elsewhere_and_no_pickle_runs(attack: AttackResult, t
 
 def test_open_files_do_not_grow(attack: AttackResult) -> None:
     before, after = attack.footprints
-    assert after.files <= before.files + CLIENTS, attack.footprints
+    # Connections of the clients, and the pipes and files of the scorers; a leak would have one for each archive.
+    assert after.files <= before.files + 4 * CLIENTS, attack.footprints
 
 
 @pytest.mark.nightly  # With few archives, one-time allocations outweigh what each archive could leave behind.

@@ -20,6 +20,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from tests.building import (
     TINY,
     TINY_VIEWS,
+    TWO_BARS,
     RunBuild,
     StartBuild,
     contents,
@@ -30,24 +31,24 @@ from tests.building import (
 )
 from tests.requirements import Repetitions
 
-LATTICE = ("--config", "lattice", "--views", str(TINY_VIEWS), *TINY)
+SMALL = ("--scene", str(TWO_BARS), "--views", str(TINY_VIEWS), *TINY)
 
 
 @pytest.fixture(scope="module")
-def lattice_only(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) -> Path:
+def small_root(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) -> Path:
     root = tmp_path_factory.mktemp("whole") / "dataset"
-    process = run_build("--out", root, *LATTICE)
+    process = run_build("--out", root, *SMALL)
     assert process.returncode == 0, process.stderr
     return root
 
 
 def test_killed_builds_resume_to_same_bytes(
-    lattice_only: Path, tmp_path: Path, run_build: RunBuild, start_build: StartBuild, repetitions: Repetitions
+    small_root: Path, tmp_path: Path, run_build: RunBuild, start_build: StartBuild, repetitions: Repetitions
 ) -> None:
     root = tmp_path / "dataset"
     rng = np.random.default_rng(11)
     for kill in range(repetitions(1, 6)):
-        build = start_build(root, *LATTICE)
+        build = start_build(root, *SMALL)
         staged_before = staged_rows(root)
         wait_until(partial(progressed_or_ended, root, staged_before, build))
         time.sleep(float(rng.uniform(0, 0.4)))
@@ -56,14 +57,14 @@ def test_killed_builds_resume_to_same_bytes(
         else:
             os.killpg(build.pid, signal.SIGKILL)
         build.communicate()
-    process = run_build("--out", root, *LATTICE)
+    process = run_build("--out", root, *SMALL)
     assert process.returncode == 0, process.stderr
-    assert contents(root) == contents(lattice_only)
+    assert contents(root) == contents(small_root)
     assert not (root / BUILD_FOLDER).exists()
 
 
 def test_killed_build_leaves_no_render_process(tmp_path: Path, start_build: StartBuild) -> None:
-    build = start_build(tmp_path / "dataset", *LATTICE)
+    build = start_build(tmp_path / "dataset", *SMALL)
     wait_until(lambda: render_processes_of(build.pid))
     process_dirs = [Path(f"/proc/{pid}") for pid in render_processes_of(build.pid)]
     assert all(process_dir.exists() for process_dir in process_dirs)
@@ -73,25 +74,25 @@ def test_killed_build_leaves_no_render_process(tmp_path: Path, start_build: Star
     assert not any(process_dir.exists() for process_dir in process_dirs)
 
 
-def test_worker_count_does_not_change_bytes(lattice_only: Path, tmp_path: Path, run_build: RunBuild) -> None:
+def test_worker_count_does_not_change_bytes(small_root: Path, tmp_path: Path, run_build: RunBuild) -> None:
     root = tmp_path / "dataset"
-    process = run_build("--out", root, *LATTICE, "--workers", "2")
+    process = run_build("--out", root, *SMALL, "--workers", "2")
     assert process.returncode == 0, process.stderr
-    assert contents(root) == contents(lattice_only)
+    assert contents(root) == contents(small_root)
 
 
-def test_second_build_is_up_to_date(lattice_only: Path, run_build: RunBuild) -> None:
-    before = contents(lattice_only)
-    mtimes_ns = {path: path.stat().st_mtime_ns for path in lattice_only.rglob("*.parquet")}
-    process = run_build("--out", lattice_only, *LATTICE)
-    assert "up to date: lattice" in process.stdout
-    assert contents(lattice_only) == before
-    assert mtimes_ns == {path: path.stat().st_mtime_ns for path in lattice_only.rglob("*.parquet")}
+def test_second_build_is_up_to_date(small_root: Path, run_build: RunBuild) -> None:
+    before = contents(small_root)
+    mtimes_ns = {path: path.stat().st_mtime_ns for path in small_root.rglob("*.parquet")}
+    process = run_build("--out", small_root, *SMALL)
+    assert "up to date: two-bars" in process.stdout
+    assert contents(small_root) == before
+    assert mtimes_ns == {path: path.stat().st_mtime_ns for path in small_root.rglob("*.parquet")}
 
 
 def test_render_process_is_retried_once_then_reported(tmp_path: Path, start_build: StartBuild) -> None:
     root = tmp_path / "dataset"
-    build = start_build(root, *LATTICE)
+    build = start_build(root, *SMALL)
     killed: set[int] = set()
     while len(killed) < 2:
         wait_until(lambda: set(render_processes_of(build.pid)) - killed)
@@ -101,32 +102,32 @@ def test_render_process_is_retried_once_then_reported(tmp_path: Path, start_buil
     _, stderr = build.communicate(timeout=120)
     assert build.returncode == 1
     message = stderr.decode()
-    assert "render process for lattice views 28 to 420 died 2 times, last by signal SIGKILL" in message
+    assert "render process for two-bars views 28 to 420 died 2 times, last by signal SIGKILL" in message
     assert "Traceback" not in message
 
 
-def test_build_survives_single_render_crash(lattice_only: Path, tmp_path: Path, start_build: StartBuild) -> None:
+def test_build_survives_single_render_crash(small_root: Path, tmp_path: Path, start_build: StartBuild) -> None:
     root = tmp_path / "dataset"
-    build = start_build(root, *LATTICE)
+    build = start_build(root, *SMALL)
     wait_until(lambda: staged_rows(root) >= 1)
     os.kill(render_processes_of(build.pid)[0], signal.SIGKILL)
     _, stderr = build.communicate(timeout=300)
     assert build.returncode == 0, stderr.decode()
-    assert contents(root) == contents(lattice_only)
+    assert contents(root) == contents(small_root)
 
 
 def test_rebuild_with_other_size_invalidates_cache(tmp_path: Path, run_build: RunBuild) -> None:
     root = tmp_path / "dataset"
-    small = ("--config", "lattice", "--views", "2", "--samples", "1")
+    small = ("--scene", str(TWO_BARS), "--views", "2", "--samples", "1")
     assert run_build("--out", root, *small, "--width", "96", "--height", "54").returncode == 0
-    first = datasets.load_dataset(str(root), "lattice", split="test")
+    first = datasets.load_dataset(str(root), "two-bars", split="test")
     assert first[0]["left_rgb"].size == (96, 54)
-    old_shards = set(root.glob("lattice/*.parquet"))
+    old_shards = set(root.glob("two-bars/*.parquet"))
     assert run_build("--out", root, *small, "--width", "64", "--height", "36").returncode == 0
-    second = datasets.load_dataset(str(root), "lattice", split="test")
+    second = datasets.load_dataset(str(root), "two-bars", split="test")
     assert second[0]["left_rgb"].size == (64, 36)
-    assert rdb.load(root, "lattice")[1]["left_depth"].shape == (36, 64)
-    assert not old_shards & set(root.glob("lattice/*.parquet"))
+    assert rdb.load(root, "two-bars")[1]["left_depth"].shape == (36, 64)
+    assert not old_shards & set(root.glob("two-bars/*.parquet"))
 
 
 def test_mesh_import_of_lattice_reproduces_ground_truth(
@@ -149,10 +150,10 @@ def test_mesh_import_of_lattice_reproduces_ground_truth(
 
 def test_concurrent_build_is_rejected(tmp_path: Path, run_build: RunBuild, start_build: StartBuild) -> None:
     root = tmp_path / "dataset"
-    build = start_build(root, *LATTICE)
+    build = start_build(root, *SMALL)
     try:
         wait_until(lambda: render_processes_of(build.pid))
-        process = run_build("--out", root, *LATTICE)
+        process = run_build("--out", root, *SMALL)
         assert process.returncode == 2
         assert "another rebar-build is at work there" in process.stderr
     finally:
@@ -161,22 +162,21 @@ def test_concurrent_build_is_rejected(tmp_path: Path, run_build: RunBuild, start
 
 
 def test_config_with_other_scene_parameters_is_rejected(tiny_root: Path, run_build: RunBuild) -> None:
-    process = run_build("--out", tiny_root, *LATTICE, "--seed", "5")
+    process = run_build("--out", tiny_root, "--config", "lattice", *TINY, "--seed", "5")
     assert process.returncode == 2
     assert "config lattice-orbit was built on scene 'lattice' with other parameters" in process.stderr
 
 
-def test_manifest_and_card_describe_dataset(lattice_only: Path) -> None:
-    manifest = json.loads((lattice_only / "manifest.json").read_text())
-    files = contents(lattice_only)
+def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
+    manifest = json.loads((tiny_root / "manifest.json").read_text())
+    files = contents(tiny_root)
     del files["manifest.json"]
     assert manifest["files"] == files
     scene = manifest["configs"]["lattice"]["scene"]
     assert scene["assembly"]["diameters_m"] == [0.007, 0.004]
     assert manifest["configs"]["lattice"]["generator"]["bpy"].startswith("4.5")
     assert (
-        "| `lattice` | lattice | 9 of 504 | 160 x 90 | 1 | 0.22-0.43 m |"
-        in (lattice_only / "README.md").read_text()
+        "| `lattice` | lattice | 9 of 504 | 160 x 90 | 1 | 0.22-0.43 m |" in (tiny_root / "README.md").read_text()
     )
 
 
@@ -208,7 +208,7 @@ def test_foreign_folder_is_rejected_and_unchanged(tmp_path: Path, marker: str, r
     for name in foreign:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("mine")
-    process = run_build("--out", tmp_path, *LATTICE)
+    process = run_build("--out", tmp_path, *SMALL)
     assert process.returncode == 2
     assert "Traceback" not in process.stderr
     assert sorted(
@@ -216,23 +216,23 @@ def test_foreign_folder_is_rejected_and_unchanged(tmp_path: Path, marker: str, r
     ) == sorted(foreign)
 
 
-def test_leftovers_of_kill_after_publishing_are_repaired(lattice_only: Path, run_build: RunBuild) -> None:
+def test_leftovers_of_kill_after_publishing_are_repaired(small_root: Path, run_build: RunBuild) -> None:
     """Remove the staging folder of a published config and restore files that contradict the manifest."""
-    before = contents(lattice_only)
-    key = json.loads((lattice_only / "manifest.json").read_text())["configs"]["lattice"]["key"]
+    before = contents(small_root)
+    key = json.loads((small_root / "manifest.json").read_text())["configs"]["two-bars"]["key"]
     for name in (key[:16], "0123456789abcdef"):
-        (lattice_only / BUILD_FOLDER / f"lattice-{name}" / "rows").mkdir(parents=True)
-    assert "up to date" in run_build("--out", lattice_only, *LATTICE).stdout
-    assert not (lattice_only / BUILD_FOLDER).exists()
+        (small_root / BUILD_FOLDER / f"two-bars-{name}" / "rows").mkdir(parents=True)
+    assert "up to date" in run_build("--out", small_root, *SMALL).stdout
+    assert not (small_root / BUILD_FOLDER).exists()
     for name in ("README.md", "bars.parquet"):
-        (lattice_only / name).unlink()
-        assert "up to date" in run_build("--out", lattice_only, *LATTICE).stdout
-        assert contents(lattice_only) == before
+        (small_root / name).unlink()
+        assert "up to date" in run_build("--out", small_root, *SMALL).stdout
+        assert contents(small_root) == before
 
 
-def test_damaged_shard_is_rebuilt(lattice_only: Path, run_build: RunBuild) -> None:
-    before = contents(lattice_only)
-    shard = next(lattice_only.glob("lattice/*-00001-of-*.parquet"))
+def test_damaged_shard_is_rebuilt(small_root: Path, run_build: RunBuild) -> None:
+    before = contents(small_root)
+    shard = next(small_root.glob("two-bars/*-00001-of-*.parquet"))
     shard.write_bytes(shard.read_bytes()[:-1] + b"!")
-    assert "built: lattice" in run_build("--out", lattice_only, *LATTICE).stdout
-    assert contents(lattice_only) == before
+    assert "built: two-bars" in run_build("--out", small_root, *SMALL).stdout
+    assert contents(small_root) == before

@@ -23,11 +23,20 @@ from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import remaining_units
 from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
 from rebar_depth_bench.errors import InputError
-from tests.building import TINY, RunBuild, StartBuild, contents, render_processes_of, staged_rows, wait_until
+from tests.building import (
+    TINY,
+    TWO_BARS,
+    RunBuild,
+    StartBuild,
+    contents,
+    render_processes_of,
+    staged_rows,
+    wait_until,
+)
 
 VIEWS = 9
 """Number of views: a shard of eight and one of one, that is two work units."""
-LATTICE = ("--config", "lattice", "--views", str(VIEWS), *TINY)
+SMALL = ("--scene", str(TWO_BARS), "--views", str(VIEWS), *TINY)
 
 
 @dataclass
@@ -98,7 +107,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 @pytest.fixture(scope="module")
 def local_root(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) -> Path:
     root = tmp_path_factory.mktemp("local") / "dataset"
-    process = run_build("--out", root, *LATTICE, "--workers", "2")
+    process = run_build("--out", root, *SMALL, "--workers", "2")
     assert process.returncode == 0, process.stderr
     return root
 
@@ -107,11 +116,11 @@ def test_cluster_build_equals_local_build(
     cluster: Cluster, local_root: Path, tmp_path: Path, run_build: RunBuild
 ) -> None:
     root = tmp_path / "dataset"
-    process = run_build("--out", root, *LATTICE, "--cluster", cluster.address)
+    process = run_build("--out", root, *SMALL, "--cluster", cluster.address)
     assert process.returncode == 0, process.stderr
     assert contents(root) == contents(local_root)
     assert not (root / BUILD_FOLDER).exists()
-    assert "lattice: 4 of 9" in process.stderr, "no progress within a unit"
+    assert "two-bars: 4 of 9" in process.stderr, "no progress within a unit"
 
 
 def write_two_bars(path: Path) -> None:
@@ -138,7 +147,7 @@ def test_interrupted_build_resumes_and_dead_worker_is_replaced(
     cluster: Cluster, local_root: Path, tmp_path: Path, start_build: StartBuild
 ) -> None:
     root = tmp_path / "dataset"
-    build = start_build(root, *LATTICE, "--cluster", cluster.address)
+    build = start_build(root, *SMALL, "--cluster", cluster.address)
     wait_until(lambda: staged_rows(root) or build.poll() is not None)
     build.send_signal(signal.SIGINT)
     _, stderr = build.communicate(timeout=300)
@@ -149,7 +158,7 @@ def test_interrupted_build_resumes_and_dead_worker_is_replaced(
     assert 0 < staged_before < VIEWS
     wait_until(lambda: not render_pids(cluster), timeout_s=300)  # Cancelled units end at their next view.
 
-    build = start_build(root, *LATTICE, "--cluster", cluster.address)
+    build = start_build(root, *SMALL, "--cluster", cluster.address)
     wait_until(lambda: render_pids(cluster) or build.poll() is not None)
     victim = next(worker for worker in cluster.workers if render_processes_of(worker.pid))
     orphans = [Path(f"/proc/{pid}") for pid in render_processes_of(victim.pid)]
@@ -159,7 +168,7 @@ def test_interrupted_build_resumes_and_dead_worker_is_replaced(
     _, stderr = build.communicate(timeout=300)
     cluster.start_worker()
     assert build.returncode == 0, stderr.decode()
-    assert f"lattice: {staged_before} of {VIEWS}" in stderr.decode()
+    assert f"two-bars: {staged_before} of {VIEWS}" in stderr.decode()
     assert contents(root) == contents(local_root)
     wait_until(lambda: not any(process_dir.exists() for process_dir in orphans), timeout_s=120)
 
@@ -171,7 +180,7 @@ def render_pids(cluster: Cluster) -> list[int]:
 def test_unit_that_crashes_blender_twice_fails_build(
     cluster: Cluster, tmp_path: Path, start_build: StartBuild
 ) -> None:
-    build = start_build(tmp_path / "dataset", *LATTICE, "--cluster", cluster.address)
+    build = start_build(tmp_path / "dataset", *SMALL, "--cluster", cluster.address)
     deadline = time.monotonic() + 900
     while build.poll() is None:
         assert time.monotonic() < deadline, "waited too long"
@@ -183,7 +192,7 @@ def test_unit_that_crashes_blender_twice_fails_build(
     message = stderr.decode()
     assert build.returncode == 1
     assert "error: worker tcp://127.0.0.1:" in message
-    assert "the render process for lattice views" in message
+    assert "the render process for two-bars views" in message
     assert "died 2 times, last by signal SIGKILL" in message
     assert "Traceback" not in message
 
@@ -216,7 +225,7 @@ def test_worker_with_other_software_is_rejected(tmp_path: Path, run_build: RunBu
     (dist_info / "METADATA").write_text("Metadata-Version: 2.1\nName: embreex\nVersion: 0.0.1\n")
     with running_cluster(tmp_path) as started:
         started.start_worker(PYTHONPATH=os.pathsep.join([str(dist_info.parent), os.environ.get("PYTHONPATH", "")]))
-        process = run_build("--out", tmp_path / "dataset", *LATTICE, "--cluster", started.address)
+        process = run_build("--out", tmp_path / "dataset", *SMALL, "--cluster", started.address)
     assert process.returncode == 2, process.stderr
     assert "has other software than the machine that builds: embreex 0.0.1, expected 4" in process.stderr
     assert not (tmp_path / "dataset").exists()
@@ -230,7 +239,7 @@ def test_unusable_cluster_is_rejected_and_nothing_written(tmp_path: Path, start_
             idle.address: f"--cluster {idle.address}: has no workers after 10 s",
         }
         builds = {
-            address: start_build(tmp_path / "dataset", *LATTICE, "--cluster", address)
+            address: start_build(tmp_path / "dataset", *SMALL, "--cluster", address)
             for address in expected_messages
         }
         stderr_by_address = {
