@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import settings
+from xdist.scheduler import LoadFileScheduling
 
 # Before anything of ours is imported: libraries read these once.
 _CACHES = tempfile.TemporaryDirectory(prefix="rebar-test-caches-")
@@ -42,8 +43,8 @@ FIXTURE_MARKERS = {
     "chromium_program": "browser",
 }
 """Markers by the fixtures that start something heavy; a test has them through whichever fixtures it requests."""
-SHARED_SERVERS = {"board", "waiting"}
-"""Fixtures that start a server for several test modules."""
+SHARED_SERVER_FILES = {f"tests/leaderboard/test_{name}.py" for name in ("browser", "client", "pages")}
+"""Files whose tests use the servers of the fixtures ``board`` and ``waiting``."""
 TIERS = {
     "quick": {*FIXTURE_MARKERS.values(), "slow", "nightly"},
     "test": {"nightly"},
@@ -63,10 +64,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
-def pytest_itemcollected(item: pytest.Item) -> None:
-    """Group tests for ``--dist loadgroup``: one process runs all tests of a group and makes their fixtures once."""
-    is_shared = SHARED_SERVERS & set(getattr(item, "fixturenames", ())) and item.path.name != "test_api.py"
-    item.add_marker(pytest.mark.xdist_group("shared servers" if is_shared else str(item.path)))
+class SharedServerScheduling(LoadFileScheduling):  # type: ignore[misc]  # It has no types.
+    """Schedule whole files, and all files that share servers, to one process, which makes their fixtures once."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = str(super()._split_scope(nodeid))
+        return "shared servers" if file in SHARED_SERVER_FILES else file
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> SharedServerScheduling:
+    """Return the scheduler of ``pytest --numprocesses``."""
+    return SharedServerScheduling(config, log)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
