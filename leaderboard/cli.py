@@ -64,7 +64,7 @@ def _run(options: argparse.Namespace) -> None:
     elif options.command == "score":
         from leaderboard.scoring.__main__ import run_worker
 
-        run_worker(settings)
+        run_worker(settings, migrate=True)
     elif options.command == "token":
         database = Database(settings.database_url)
         database.migrate()

@@ -18,6 +18,8 @@ from xdist.scheduler import LoadFileScheduling
 # Before anything of ours is imported: libraries read these once.
 _CACHES = tempfile.TemporaryDirectory(prefix="rebar-test-caches-")
 os.environ.update(HF_HOME=_CACHES.name, XDG_CACHE_HOME=_CACHES.name, HF_HUB_OFFLINE="1")
+# Several processes share the cores, and threads that wait for each other take processor time.
+os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
 
 from rebar_depth_bench import SubmissionWriter, load  # noqa: E402
 from tests import building, requirements  # noqa: E402

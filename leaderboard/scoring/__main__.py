@@ -29,15 +29,17 @@ _LOG = structlog.get_logger("scorer")
 
 
 def main() -> int:
-    """Run a worker until it is stopped. The command-line argument is the id of the parent process."""
+    """Run a worker until it is stopped. The command-line argument is the id of the parent process, a server."""
     die_with_parent(int(sys.argv[1]))
     set_up_logs()
     settings = Settings.model_validate_json(sys.stdin.read())
-    return run_command(lambda: run_worker(settings))
+    return run_command(lambda: run_worker(settings, migrate=False))
 
 
-def run_worker(settings: Settings) -> None:
+def run_worker(settings: Settings, *, migrate: bool) -> None:
     """Score queued submissions, on this machine or on a dask cluster, until SIGTERM or SIGINT.
+
+    ``migrate`` upgrades the schema first, which the server has done for its own workers.
 
     Raises ``InputError`` if the SQLite database does not exist.
     """
@@ -49,7 +51,8 @@ def run_worker(settings: Settings) -> None:
     if path is not None and not path.is_file():
         raise InputError(f"{url}: there is no database, expected that of a server")
     with work_dir(settings.spool) as spool, closing(Database(url)) as database:
-        database.migrate()
+        if migrate:
+            database.migrate()
         _LOG.info("waiting for submissions", database=without_password(url), version=software_version())
         process_queue(database, settings, _make_backend(settings, spool), stop)
 

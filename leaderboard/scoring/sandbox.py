@@ -13,10 +13,17 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from leaderboard.scoring.process_limits import limit_process
+from leaderboard.scoring.task import (
+    ERROR_MAPS_DIR,
+    NO_MEMORY,
+    PROBLEM_FILE,
+    RESULT_FILE,
+    UNAVAILABLE_FILE,
+    ScoringTask,
+)
 from leaderboard.storage.archive_store import ArchiveNotFoundError, ArchiveStore
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError, RebarDepthError, SubmissionError, problem_summary
@@ -39,32 +46,6 @@ def render_error_maps(archive: str, data: str, result: Result, count: int) -> It
     with open_submission(archive, open_folder(data).expected_views()) as submission:
         for panels in iter_view_panels(worst, data, submission):
             yield panels.view_id, error_webp(panels)
-
-
-RESULT_FILE, PROBLEM_FILE, UNAVAILABLE_FILE, ERROR_MAPS_DIR = "result.json", "problem.txt", "away.txt", "pictures"
-NO_MEMORY = "needs more memory than this service allows"
-
-
-@dataclass(frozen=True)
-class ScoringTask:
-    """Input of the scoring process.
-
-    ``archives`` is the URL of the archive storage, ``data`` the dataset, ``out`` the output folder, ``memory`` the
-    limit in bytes, ``error_maps`` the number of views per config, ``parent`` the id of the waiting process.
-    """
-
-    archives: str
-    submission_id: str
-    data: str
-    dataset_digest: str
-    out: str
-    memory: int
-    error_maps: int
-    parent: int
-
-    def to_json(self) -> bytes:
-        """Return the task as JSON for the standard input of the process."""
-        return json.dumps(asdict(self)).encode()
 
 
 def main() -> int:

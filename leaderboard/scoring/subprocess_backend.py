@@ -15,7 +15,7 @@ from pathlib import Path
 import structlog
 
 from leaderboard.db.jobs import Job, Outcome
-from leaderboard.scoring.sandbox import ERROR_MAPS_DIR, PROBLEM_FILE, RESULT_FILE, UNAVAILABLE_FILE, ScoringTask
+from leaderboard.scoring.task import ERROR_MAPS_DIR, PROBLEM_FILE, RESULT_FILE, UNAVAILABLE_FILE, ScoringTask
 from leaderboard.scoring.worker import POLL_INTERVAL_S, RENEWALS_PER_LEASE, BackendUnavailableError, ScoringBackend
 from leaderboard.settings import Settings
 
