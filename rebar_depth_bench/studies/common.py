@@ -9,10 +9,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -29,13 +29,16 @@ from rebar_depth_bench.errors import InputError, SubmissionError
 from rebar_depth_bench.parallel import ordered_map
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.reporting.html.study_page import PageTable, StudyPage, render_study
-from rebar_depth_bench.reporting.tables import csv_text, print_unwrapped
+from rebar_depth_bench.reporting.tables import frame_csv, print_unwrapped
 from rebar_depth_bench.scoring.ground_truth import ViewTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
 from rebar_depth_bench.scoring.rounding import rounded
 from rebar_depth_bench.submission import SubmissionReader, config_of, open_submission
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 def add_output_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,17 +49,16 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def write_outputs(
-    options: argparse.Namespace, content: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], page: StudyPage
+    options: argparse.Namespace, content: Mapping[str, Any], frame: DataFrame, page: StudyPage
 ) -> None:
     """Write the requested files, then print the tables and notes of the page to standard output.
 
-    ``content`` is the JSON object. ``rows`` are the rows of the CSV, all with the same keys, which are the header;
-    an empty sequence writes an empty file. Numbers are rounded as in the JSON.
+    ``content`` is the JSON object and ``frame`` has the rows of the CSV; an empty frame writes an empty file.
     """
     if options.json:
         write_bytes(options.json, json_bytes(content))
     if options.csv:
-        write_text(options.csv, csv_text([*rows[:1], *(_round_numbers(list(row.values())) for row in rows)]))
+        write_text(options.csv, frame_csv(frame))
     if options.html:
         write_text(options.html, render_study(page))
     print_page(page, Console())

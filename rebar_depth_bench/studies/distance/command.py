@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
             bins_per_decade=options.bins_per_decade,
             progress=bars.update,
         )
-    write_outputs(options, output.to_json(study), output.to_csv_rows(study), output.to_page(study))
+    write_outputs(options, output.to_json(study), output.to_pandas(study), output.to_page(study))
 
 
 def run_distance_study(

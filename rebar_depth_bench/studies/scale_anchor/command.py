@@ -90,7 +90,7 @@ def run(options: argparse.Namespace) -> None:
             seed=options.seed,
             progress=bars.update,
         )
-    write_outputs(options, output.to_json(study), output.to_csv_rows(study), output.to_page(study))
+    write_outputs(options, output.to_json(study), output.to_pandas(study), output.to_page(study))
 
 
 def run_anchor_study(
