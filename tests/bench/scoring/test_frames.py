@@ -19,6 +19,17 @@ from rebar_depth_bench.scoring.result import VIEW_METRICS, Result
 from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredicted_view
 
 
+class TagCollector(HTMLParser):
+    """Parser that keeps the names of the start tags."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+
+
 @pytest.fixture
 def two_configs() -> Result:
     return result(
@@ -92,9 +103,7 @@ def test_repr_fits_a_screen() -> None:
 
 def test_notebook_shows_escaped_table(two_configs: Result) -> None:
     html = result(*two_configs.views, method=HOSTILE)._repr_html_()
-    tags: list[str] = []
-    parser = HTMLParser()
-    parser.handle_starttag = lambda tag, _: tags.append(tag)  # type: ignore[method-assign]
+    parser = TagCollector()
     parser.feed(html)
-    assert tags.count("tr") == 3
-    assert set(tags) <= {"p", "b", "table", "thead", "tbody", "tr", "th", "td"}
+    assert parser.tags.count("tr") == 3
+    assert set(parser.tags) <= {"p", "b", "table", "thead", "tbody", "tr", "th", "td"}
