@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rebar_depth_bench.data.bars import bars
     from rebar_depth_bench.data.dataset import load
     from rebar_depth_bench.data.torch_loader import torch_loader
     from rebar_depth_bench.errors import DatasetError, InputError, MethodError, RebarDepthError, SubmissionError
@@ -23,12 +24,14 @@ __all__ = [
     "SubmissionWriter",
     "Table",
     "ViewScore",
+    "bars",
     "load",
     "score",
     "torch_loader",
 ]
 
 _MODULE_BY_NAME = {
+    "bars": "data.bars",
     "load": "data.dataset",
     "score": "scoring.score",
     "torch_loader": "data.torch_loader",

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -84,6 +85,10 @@ def run_command(command: Callable[[], None], interrupted: str = "interrupted") -
 
 OUTPUT_OPTIONS = ("out", "json", "csv", "html", "latex", "extended_csv")
 """Names (argparse dest) of the options that are output paths."""
+INPUT_FILE_OPTIONS = ("archive", "archives", "first", "others", "method", "token_file")
+"""Names of the options that are files to read; a method may be ``FILE.py:NAME`` or ``FILE.toml``."""
+INPUT_FOLDER_OPTIONS = ("data", "predictions", "kitti", "methods", "reference")
+"""Names of the options that are folders to read, or files or Hub repositories in their place."""
 
 
 def add_archive(parser: argparse.ArgumentParser) -> None:
@@ -129,22 +134,23 @@ def replace_renamed_options(arguments: Sequence[str] | None, renamed: Mapping[st
 def check_outputs(options: Mapping[str, object]) -> None:
     """Check the output paths of a command's ``options``.
 
-    Outputs are the options in ``OUTPUT_OPTIONS``; inputs are all other strings and lists of strings. Raises
-    ``InputError`` if an output would overwrite an input, another output or a file of the dataset, is a folder, or
-    lies in a folder that cannot be written.
+    Outputs are the options in ``OUTPUT_OPTIONS``, inputs those in ``INPUT_FILE_OPTIONS`` and
+    ``INPUT_FOLDER_OPTIONS``. Raises ``InputError`` if an output would overwrite an input, another output or a file
+    of an input folder, is a folder, or lies in a folder that cannot be written.
     """
     outputs = {name: value for name in OUTPUT_OPTIONS if isinstance(value := options.get(name), Path)}
-    input_values = [value for name, value in options.items() if name not in outputs]
-    inputs = [Path(string) for value in input_values for string in _strings(value)]
+    folders = [path for name in INPUT_FOLDER_OPTIONS for path in _paths(options.get(name))]
+    files = [path for name in INPUT_FILE_OPTIONS for path in _paths(options.get(name))]
     seen: dict[Path, str] = {}
     for name, output in outputs.items():
         option, target = f"--{name.replace('_', '-')}", output.resolve()
         if target in seen:
             raise InputError(f"{option} and {seen[target]} both name {output}, expected a file each")
         seen[target] = option
-        for path in inputs:
+        for path in (*files, *folders):
             if path.exists() and target == path.resolve():
                 raise InputError(f"{option} names {output}, which is read: it would be overwritten")
+        for path in folders:
             if path.is_dir() and name != "out" and path.resolve() in target.parents:
                 raise InputError(
                     f"{option} names {output}, which is inside {path}: expected a place outside the data"
@@ -163,7 +169,7 @@ def _check_writable(option: str, output: Path, target: Path) -> None:
         raise InputError(f"{option} names {output}, but {ancestor} cannot be written to")
 
 
-def _strings(value: object) -> Iterable[str]:
-    if isinstance(value, str):
-        return [value]
-    return [item for item in value if isinstance(item, str)] if isinstance(value, list) else []
+def _paths(value: object) -> list[Path]:
+    """Return the paths of an option: one, several or none; ``FILE.py:NAME`` is a path and the name of a method."""
+    values = value if isinstance(value, list) else [] if value is None else [value]
+    return [Path(re.sub(r"(\.py):\w+$", r"\1", str(item))) for item in values]

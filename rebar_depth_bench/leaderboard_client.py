@@ -13,8 +13,6 @@ from rebar_depth_bench.progress import Progress, silent
 
 POLL_INTERVAL_S = 2.0
 """Time between two status requests, seconds."""
-NO_SUBMISSION_DETAIL = "no such submission"
-"""``detail`` of the service's 404 response for an unknown submission id."""
 MAX_FAILED_POLLS = 30
 """Number of consecutive failed status requests that ``LeaderboardClient.wait`` tolerates."""
 UPLOAD_TIMEOUT_S = 3600.0
@@ -50,24 +48,29 @@ class LeaderboardClient:
         an exhausted quota, an archive that is too large or a file that cannot be read, and ``ServiceError`` if
         the service cannot be reached.
         """
-        self._check_token()
+        max_bytes = self.token()["max_upload_bytes"]
         try:
             total = archive.stat().st_size
+            if total > max_bytes:
+                raise InputError(f"{archive}: has {total} bytes, expected at most {max_bytes}")
             with archive.open("rb") as stream:
                 upload = _ProgressReader(stream.read, lambda done: progress("uploading", done, total))
-                response = self._call("POST", "", files={"archive": (archive.name, upload, "application/zip")})
+                response = self._call(
+                    "POST", "submissions", files={"archive": (archive.name, upload, "application/zip")}
+                )
         except OSError as error:
             raise InputError(f"{archive}: cannot be read: {error.strerror or error}") from None
         if response.status_code == 422:
             content = _json_object(response)
             raise SubmissionError(str(archive), content.get("problems", [content.get("detail", "refused")]))
-        return self._submission_from(response, 202)
+        return self._checked(response, 202, "id")
 
-    def _check_token(self) -> None:
-        """Verify URL and token before uploading, by requesting a submission that does not exist."""
-        response = self._call("GET", "/none")
-        if response.status_code != 404 or _json_object(response).get("detail") != NO_SUBMISSION_DETAIL:
-            self._submission_from(response, 404)
+    def token(self) -> dict[str, Any]:
+        """Return the token's ``name``, ``quota``, ``quota_left`` and the limits of the service.
+
+        Raises ``InputError`` for an unknown token or a wrong URL, ``ServiceError`` if the service does not answer.
+        """
+        return self._checked(self._call("GET", "token"), 200, "max_upload_bytes")
 
     def wait(self, submission_id: str, progress: Progress = silent) -> dict[str, Any]:
         """Poll until the submission is scored or failed, and return it.
@@ -78,10 +81,10 @@ class LeaderboardClient:
         failed_polls = 0
         while True:
             try:
-                response = self._call("GET", f"/{submission_id}")
+                response = self._call("GET", f"submissions/{submission_id}")
                 if response.status_code == 429:
                     raise ServiceError(f"{self._url}: {_json_object(response).get('detail', 'too many requests')}")
-                submission = self._submission_from(response, 200)
+                submission = self._checked(response, 200, "id")
                 failed_polls = 0
             except ServiceError:
                 failed_polls += 1
@@ -99,7 +102,7 @@ class LeaderboardClient:
 
         Raises ``ServiceError`` if the response status is not 200.
         """
-        response = self._call("GET", f"/{submission_id}/result.json")
+        response = self._call("GET", f"submissions/{submission_id}/result.json")
         if response.status_code != 200:
             raise ServiceError(f"{self._url}: answered {response.status_code} for the result, expected 200")
         content: bytes = response.content
@@ -107,15 +110,16 @@ class LeaderboardClient:
 
     def _call(self, method: str, path: str, **content: Any) -> Any:
         try:
-            return self._client.request(method, f"{self._url}/api/v1/submissions{path}", **content)
+            return self._client.request(method, f"{self._url}/api/v1/{path}", **content)
         except (self._http.InvalidURL, self._http.UnsupportedProtocol) as error:
             raise InputError(f"{self._url!r}: no address, expected http://HOST:PORT: {error}") from None
         except self._http.HTTPError as error:
             raise ServiceError(f"{self._url}: no answer: {error or type(error).__name__}") from None
 
-    def _submission_from(self, response: Any, status: int) -> dict[str, Any]:
+    def _checked(self, response: Any, status: int, key: str) -> dict[str, Any]:
+        """Return the JSON object of a response with ``status`` that has ``key``; raise its error otherwise."""
         content = _json_object(response)
-        if response.status_code == status and "id" in content:
+        if response.status_code == status and key in content:
             return content
         detail = content.get("detail", f"answered {response.status_code}, expected {status}")
         error_type = InputError if 400 <= response.status_code < 500 else ServiceError

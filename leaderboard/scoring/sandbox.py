@@ -29,11 +29,13 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError, RebarDepthError, SubmissionError, problem_summary
 from rebar_depth_bench.reporting.html.page import iter_view_panels
 from rebar_depth_bench.reporting.html.view_images import error_webp
+from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.result import Result, sort_key_worst_first
-from rebar_depth_bench.submission import config_of, open_submission
+from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.submission import config_of
 
 
-def render_error_maps(archive: str, data: str, result: Result, count: int) -> Iterator[tuple[str, bytes]]:
+def render_error_maps(evaluation: Evaluation, result: Result, count: int) -> Iterator[tuple[str, bytes]]:
     """Yield (view id, WebP bytes) of the native error maps of the ``count`` worst views of each config."""
     worst = {
         config: sorted(
@@ -43,9 +45,8 @@ def render_error_maps(archive: str, data: str, result: Result, count: int) -> It
         )[:count]
         for config in result.tables
     }
-    with open_submission(archive, open_folder(data).expected_views()) as submission:
-        for panels in iter_view_panels(worst, data, submission):
-            yield panels.view_id, error_webp(panels)
+    for panels in iter_view_panels(worst, evaluation):
+        yield panels.view_id, error_webp(panels)
 
 
 def main() -> int:
@@ -68,17 +69,17 @@ def main() -> int:
 
 
 def _score(archive: str, task: ScoringTask) -> None:
-    from rebar_depth_bench import score
-
     digest = open_folder(task.data).digest
-    if digest != task.dataset_digest:
+    if digest != task.dataset_digest:  # Checked first: on another dataset, the archive could seem invalid.
         raise DatasetError(f"{task.data}: the digest is {digest}, expected {task.dataset_digest}")
-    result = score(archive, task.data)
-    if task.error_maps:
-        (Path(task.out) / ERROR_MAPS_DIR).mkdir()
-        for number, (view_id, webp) in enumerate(render_error_maps(archive, task.data, result, task.error_maps)):
-            (Path(task.out) / ERROR_MAPS_DIR / f"{number:04d}.webp").write_bytes(webp)
-            (Path(task.out) / ERROR_MAPS_DIR / f"{number:04d}.txt").write_text(view_id)
+    with open_evaluation(archive, task.data) as evaluation:
+        result = score_evaluation(evaluation)
+        if task.error_maps:
+            folder = Path(task.out) / ERROR_MAPS_DIR
+            folder.mkdir()
+            for number, (view_id, webp) in enumerate(render_error_maps(evaluation, result, task.error_maps)):
+                (folder / f"{number:04d}.webp").write_bytes(webp)
+                (folder / f"{number:04d}.txt").write_text(view_id)
     (Path(task.out) / RESULT_FILE).write_bytes(result.to_json())
 
 

@@ -46,7 +46,7 @@ async def accept_upload(
     ``UploadRejectedError``.
     """
     settings = service.settings
-    if await to_thread.run_sync(_quota_used, service, token) >= settings.quota:
+    if await to_thread.run_sync(quota_used, service, token) >= settings.quota:
         raise _quota_exceeded(settings.quota)
     if int(headers.get("content-length", 0)) > settings.max_upload + MAX_OVERHEAD_BYTES:
         raise UploadRejectedError(413, too_large_message(settings.max_upload))
@@ -101,7 +101,8 @@ def _problem_count(problems: tuple[str, ...]) -> str:
     return f"the archive is refused: {len(problems)} problem{'' if len(problems) == 1 else 's'}"
 
 
-def _quota_used(service: Service, token: TokenModel) -> int:
+def quota_used(service: Service, token: TokenModel) -> int:
+    """Return the number of submissions that the token has made today (UTC)."""
     with service.database.read() as session:
         return submissions.count_submissions_today(session, token.id)
 

@@ -13,7 +13,7 @@ from leaderboard.db.engine import DATABASE_UNAVAILABLE
 from leaderboard.service import Service
 from leaderboard.uploads.accept import UploadRejectedError
 from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES
-from leaderboard.web.api import health, leaderboard, submissions
+from leaderboard.web.api import health, leaderboard, submissions, token
 from leaderboard.web.api.schemas import DATABASE_UNAVAILABLE_MESSAGE
 from leaderboard.web.cache import new_cache_state
 from leaderboard.web.middleware import DrainRequestBodyMiddleware, RequestMiddleware
@@ -47,7 +47,7 @@ def make_app(service: Service) -> FastAPI:
         writes=settings.write_rate_limit,
         metrics=service.metrics,
     )
-    for router in (submissions, leaderboard, health, routes, submit, static):
+    for router in (submissions, leaderboard, token, health, routes, submit, static):
         app.include_router(router.router)
     app.add_middleware(DrainRequestBodyMiddleware, max_bytes=settings.max_upload + MAX_OVERHEAD_BYTES)
     app.add_exception_handler(HTTPException, _handle_http_exception)

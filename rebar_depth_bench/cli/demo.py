@@ -21,7 +21,8 @@ from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.tables import print_table
-from rebar_depth_bench.scoring.score import score
+from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.score import score_evaluation
 
 DEMO_FOLDER = "demo-output"
 DEMO_VIEWS = 6
@@ -46,10 +47,11 @@ def run_demo(out: Path, views: int) -> None:
         _print_step(f"predicting with {name}: {method.info.summary}")
         with ProgressBars() as bars:
             predict(method, data, archive, configs=[DEMO_CONFIG], progress=bars.update)
-            result = score(archive, data, progress=bars.update)
+            with open_evaluation(archive, data) as evaluation:
+                result = score_evaluation(evaluation, progress=bars.update)
+                reports.append(out / f"{name}.html")
+                write_report(result, evaluation, reports[-1])
         write_bytes(out / f"{name}.json", result.to_json())
-        reports.append(out / f"{name}.html")
-        write_report(result, archive, data, reports[-1])
         print_table(result, Console())
     print("open in a browser:")
     for report in reports:

@@ -15,7 +15,8 @@ from rebar_depth_bench.reporting.extended_tables import extended_csv, print_exte
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.html.view_browser import VIEWS_SHOWN
 from rebar_depth_bench.reporting.tables import print_table, result_csv
-from rebar_depth_bench.scoring.score import score
+from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.score import score_evaluation
 
 SUMMARY = "score a submission archive: native beside scaled"
 
@@ -47,21 +48,20 @@ def run(options: argparse.Namespace) -> None:
     """Score an archive, write the requested files and print the tables."""
     if options.html_views < 0:
         raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
-    with ProgressBars() as bars:
-        result = score(options.archive, options.data, workers=options.workers, progress=bars.update)
-        if options.extended or options.extended_csv:
-            extended = score_extended(
-                result, options.archive, options.data, workers=options.workers, progress=bars.update
-            )
-            result = replace(result, extended=extended)
+    with open_evaluation(options.archive, options.data) as evaluation:
+        with ProgressBars() as bars:
+            result = score_evaluation(evaluation, workers=options.workers, progress=bars.update)
+            if options.extended or options.extended_csv:
+                extended = score_extended(result, evaluation, workers=options.workers, progress=bars.update)
+                result = replace(result, extended=extended)
+        if options.html:
+            write_report(result, evaluation, options.html, views_shown=options.html_views)
     if options.json:
         write_bytes(options.json, result.to_json())
     if options.csv:
         write_text(options.csv, result_csv(result))
     if options.extended_csv:
         write_text(options.extended_csv, extended_csv(result))
-    if options.html:
-        write_report(result, options.archive, options.data, options.html, views_shown=options.html_views)
     print_table(result, Console())
     if result.extended is not None:
         print_extended(result.extended, Console())

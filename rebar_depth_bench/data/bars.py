@@ -5,14 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from rebar_depth_bench.atomic_io import atomic_replace
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 BARS_FILE = "bars.parquet"
 BARS_SCHEMA = pa.schema(
@@ -39,6 +45,11 @@ class Bar:
     diameter_m: float
     axis_m: tuple[tuple[float, float, float], ...]
 
+    @property
+    def length_m(self) -> float:
+        """Length of the centreline, metres."""
+        return sum(math.dist(start, end) for start, end in pairwise(self.axis_m))
+
 
 def read_bars(path: Path) -> dict[str, tuple[Bar, ...]]:
     """Read a ``bars.parquet`` and return the bars of each scene, keyed by scene name, in the order of the file.
@@ -57,6 +68,22 @@ def read_bars(path: Path) -> dict[str, tuple[Bar, ...]]:
             raise DatasetError(f"{path}: scene {row['scene']!r} has bar {bar.bar_id} twice, expected each id once")
         bars[bar.bar_id] = bar
     return {scene: tuple(bars.values()) for scene, bars in scenes.items()}
+
+
+def bars(root: str | Path) -> DataFrame:
+    """Return the bars of every scene of a dataset folder or Hub repository as a frame, one row per bar.
+
+    Columns: ``scene``, ``bar_id``, ``role``, ``diameter_m``, ``length_m`` (of the centreline) and ``axis_m``, a
+    float64 array of shape (n, 3), world frame. Raises ``DatasetError`` as ``open_folder`` and ``read_bars``.
+    """
+    import pandas as pd  # Half a second to import, which reading bars for scoring does not need.
+
+    rows = [
+        (scene, bar.bar_id, bar.role, bar.diameter_m, bar.length_m, np.array(bar.axis_m))
+        for scene, scene_bars in read_bars(open_folder(root).file(BARS_FILE)).items()
+        for bar in scene_bars
+    ]
+    return pd.DataFrame(rows, columns=["scene", "bar_id", "role", "diameter_m", "length_m", "axis_m"])
 
 
 def write_bars(path: Path, scenes: Mapping[str, tuple[Bar, ...]]) -> None:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended import alignment, boundary, depth_layers, full_mask, point_cloud, profiles
 from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, load_steel_truth
 from rebar_depth_bench.extended.inspection import evaluate as inspection
@@ -30,9 +27,10 @@ from rebar_depth_bench.extended.result import (
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.parallel import ordered_map
 from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 from rebar_depth_bench.scoring.result import Result, protocol_indices
-from rebar_depth_bench.submission import SubmissionReader, open_submission
+from rebar_depth_bench.submission import SubmissionReader
 
 ONCE, NATIVE, SCALED = "once", "native", "scaled"
 """Alignments of a prediction (keys of the result's JSON).
@@ -121,34 +119,31 @@ def measures_by_alignment() -> dict[str, tuple[Measure, ...]]:
 
 def score_extended(
     result: Result,
-    archive: str | os.PathLike[str],
-    root: str | Path,
+    evaluation: Evaluation,
     *,
     workers: int | None = None,
     progress: Progress = silent,
 ) -> ExtendedResult:
-    """Return the extended measures of the submission archive that ``result`` was computed from.
+    """Return the extended measures of the submission that ``result`` was computed from.
 
     Raises ``DatasetError`` if the dataset folder lacks its bars or contradicts its manifest.
     """
-    folder = open_folder(root)
     scales = {view.view_id: view.scale for view in result.views}
     measures = measures_by_alignment()
     tables: dict[str, ExtendedTable] = {}
     views: list[ViewNumbers] = []
-    with open_submission(archive, folder.expected_views()) as submission:
-        for config in result.tables:
-            steel = load_steel_truth(folder, config, progress)
-            work = partial(_view, submission, steel, scales)
-            outcomes = ordered_map(work, range(len(steel)), workers)
-            config_views = []
-            for done, view in enumerate(outcomes, start=1):
-                config_views.append(view)
-                progress(f"extended measures of {config}", done, len(steel))
-            tables[config] = tabulate_extended(
-                config_views, protocol_indices([view.view_id for view in config_views]), measures
-            )
-            views += [view_numbers(view, measures) for view in config_views]
+    for config in result.tables:
+        steel = load_steel_truth(evaluation.folder, config, progress)
+        work = partial(_view, evaluation.submission, steel, scales)
+        outcomes = ordered_map(work, range(len(steel)), workers)
+        config_views = []
+        for done, view in enumerate(outcomes, start=1):
+            config_views.append(view)
+            progress(f"extended measures of {config}", done, len(steel))
+        tables[config] = tabulate_extended(
+            config_views, protocol_indices([view.view_id for view in config_views]), measures
+        )
+        views += [view_numbers(view, measures) for view in config_views]
     return ExtendedResult(measures, tables, views)
 
 

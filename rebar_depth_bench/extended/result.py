@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -13,7 +13,11 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample
+from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,17 @@ class ExtendedResult:
             "tables": {name: _table_dict(table) for name, table in self.tables.items()},
             "views": [_view_dict(view) for view in self.views],
         }
+
+    def to_pandas(self) -> DataFrame:
+        """Return one row per config, alignment and measure: value, 95 % interval and number of samples."""
+        return make_frame([_estimate_row(*item) for item in self.estimates()])
+
+    def estimates(self) -> Iterator[tuple[str, str, Measure, MeasureEstimate]]:
+        """Yield config, alignment, measure and estimate, in order."""
+        for config, table in self.tables.items():
+            for alignment, measures in self.measures.items():
+                for measure in measures:
+                    yield config, alignment, measure, table.numbers[alignment][measure.name]
 
 
 def view_numbers(view: ExtendedView, measures: Mapping[str, Sequence[Measure]]) -> ViewNumbers:
@@ -172,6 +187,22 @@ def _table_dict(table: ExtendedTable) -> dict[str, Any]:
         for alignment, alignment_estimates in table.numbers.items()
     }
     return {"views": table.views, **numbers}
+
+
+def _estimate_row(config: str, alignment: str, measure: Measure, estimate: MeasureEstimate) -> dict[str, Any]:
+    """Return the row of an estimate in the frame."""
+    low, high = rounded_interval(estimate.interval) or (None, None)
+    return {
+        "config": config,
+        "alignment": alignment,
+        "measure": measure.name,
+        "unit": measure.unit,
+        "statistic": measure.statistic,
+        "value": estimate.value,
+        "low": low,
+        "high": high,
+        "samples": estimate.samples,
+    }
 
 
 def _estimate_dict(entry: MeasureEstimate) -> dict[str, Any]:

@@ -18,9 +18,10 @@ from rich.text import Text
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.published import load_published, paper_scene, published_rows
-from rebar_depth_bench.reporting.tables import csv_text
+from rebar_depth_bench.reporting.tables import frame_csv
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_VIEWS
 from rebar_depth_bench.scoring.comparison import Comparison, Difference
+from rebar_depth_bench.scoring.frames import differences_frame
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.result import SCALE_MEDIAN, Result, Table
 from rebar_depth_bench.version import software_version
@@ -66,20 +67,7 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
 
 def comparison_csv(comparisons: list[Comparison]) -> str:
     r"""Return comparisons as tidy CSV: one row per pair, config and number, with provenance, ``\n`` line ends."""
-    provenance_heads = ("protocol", "dataset_digest", "software_version", "first_sha256", "other_sha256")
-    number_heads = ("views", "first", "other", "difference", "low", "high", "verdict")
-    lines = [["first_method", "other_method", "config", "number", *number_heads, *provenance_heads]]
-    for comparison in comparisons:
-        content = comparison.to_dict()
-        first, other = content["submissions"]
-        for config, rows in content["configs"].items():
-            for row in rows:
-                cells = [first["method"], other["method"], config, row["name"]]
-                cells += [row[key] for key in ("views", "first", "other", "difference")]
-                cells += [*(row["ci95"] or (None, None)), row["verdict"]]
-                cells += [content["protocol"], content["dataset"]["digest"], content["software"]["version"]]
-                lines.append([*cells, first["sha256"], other["sha256"]])
-    return csv_text(lines)
+    return frame_csv(differences_frame([comparison.to_dict() for comparison in comparisons]))
 
 
 def _provenance(comparison: Comparison) -> str:

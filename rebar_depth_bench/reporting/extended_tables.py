@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 from rich import box
 from rich.console import Console
@@ -18,10 +17,9 @@ from rebar_depth_bench.extended.inspection.measures import MISS_MM
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.tables import csv_text
+from rebar_depth_bench.reporting.tables import frame_csv
 from rebar_depth_bench.scoring.bootstrap import Interval
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
 
 UNDEFINED = "not told"
 """Text of an undefined capability: 5 % or more of the bars were not found, so that p95 is the error of a miss."""
@@ -61,7 +59,7 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
                     Padding(measure_heading(measure), (0, 0, 0, 2)), *map(Text, texts if wide else texts[::2])
                 )
         console.print(grid)
-    numbers = [(measure, estimate) for _, _, measure, estimate in _iter_estimates(extended)]
+    numbers = [(measure, estimate) for _, _, measure, estimate in extended.estimates()]
     if any(is_miss(estimate, measure) for measure, estimate in numbers):
         console.print(Text(f"{MISSED}: the error of what was not found, {MISS_MM:g} mm in CSV and JSON."))
     if any(estimate.value is None and estimate.samples for _, estimate in numbers):
@@ -117,24 +115,14 @@ def format_value(value: float | None, measure: Measure, digits: int = 4) -> str:
 
 def extended_csv(result: Result) -> str:
     r"""Return the extended tables as tidy CSV: one row per config, alignment and measure, ``\n`` line ends."""
-    head = ["method", "config", "alignment", "measure", "unit", "statistic", "value", "low", "high", "samples"]
-    provenance_heads = ["protocol", "dataset_digest", "submission_sha256", "software_version"]
-    rows: list[list[Any]] = [head + provenance_heads]
-    if result.extended is not None:
-        provenance = [EXTENDED_PROTOCOL, result.dataset_digest, result.submission_sha256, result.software_version]
-        for config, alignment, measure, estimate in _iter_estimates(result.extended):
-            identity = [result.method, config, alignment, measure.name, measure.unit, measure.statistic]
-            ends = rounded_interval(estimate.interval) or (None, None)
-            numbers = [rounded(estimate.value), *ends, estimate.samples]
-            rows.append([*identity, *numbers, *provenance])
-    return csv_text(rows)
-
-
-def _iter_estimates(extended: ExtendedResult) -> Iterator[tuple[str, str, Measure, MeasureEstimate]]:
-    for config, table in extended.tables.items():
-        for alignment, measures in extended.measures.items():
-            for measure in measures:
-                yield config, alignment, measure, table.numbers[alignment][measure.name]
+    if result.extended is None:
+        raise ValueError("the result has no extended measures")
+    frame = result.extended.to_pandas()
+    frame.insert(0, "method", result.method)
+    frame["protocol"] = EXTENDED_PROTOCOL
+    for name in ("dataset_digest", "submission_sha256", "software_version"):
+        frame[name] = getattr(result, name)
+    return frame_csv(frame)
 
 
 def _interval_text(ends: Interval | None, measure: Measure) -> str:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console
@@ -18,9 +18,12 @@ from rich.text import Text
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.scoring.metrics import METRIC_NAMES
+from rebar_depth_bench.scoring.frames import tables_frame
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.result import Result, Table
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _UNBOUNDED = 10_000
 _FORMULA_STARTS = ("=", "+", "-", "@")
@@ -63,11 +66,8 @@ def result_csv(result: Result) -> str:
 
 def results_csv(results: Sequence[Result]) -> str:
     """Return the tables of several results as one CSV, in the format of ``result_csv``."""
-    rows = [_csv_header()]
-    for result in results:
-        content = result.to_dict()
-        rows += [_csv_row(content, name, table) for name, table in content["tables"].items()]
-    return csv_text(rows)
+    frame = tables_frame([result.to_dict() for result in results])
+    return frame_csv(frame[[name for name in frame if not name.endswith(("_low", "_high"))]])
 
 
 def _headline(result: Result) -> str:
@@ -180,43 +180,12 @@ def _width(table: RichTable, console: Console) -> int:
     return Measurement.get(console, console.options.update(max_width=_UNBOUNDED), table).maximum
 
 
-def _csv_header() -> list[str]:
-    return [
-        *("protocol", "method", "config", *number_columns()),
-        *("dataset_digest", "dataset_version", "submission_sha256", "software_version"),
-    ]
-
-
-def _csv_row(content: dict[str, Any], name: str, table: dict[str, Any]) -> list[Any]:
-    """Return one config's cells in the order of the header, from the objects of the result's JSON."""
-    return [
-        *(content["protocol"], content["submission"]["method"], name),
-        *number_values(table),
-        *(content["dataset"]["digest"], content["dataset"]["version"]),
-        *(content["submission"]["sha256"], content["software"]["version"]),
-    ]
-
-
-def number_columns() -> list[str]:
-    """Return the CSV column names of a config's numbers."""
-    return [
-        *("views", "views_scored", "coverage", "ranked"),
-        *(f"native_{name}" for name in METRIC_NAMES),
-        *(f"scaled_{name}" for name in METRIC_NAMES),
-        "scale_median",
-        *(f"within_{t}mm" for t in WITHIN_MM),
-    ]
-
-
-def number_values(table: Mapping[str, Any]) -> list[Any]:
-    """Return a config's numbers in the order of ``number_columns``, from its table in the result's JSON."""
-    return [
-        *(table[key] for key in ("views", "views_scored", "coverage", "ranked")),
-        *table["native"].values(),
-        *table["scaled"].values(),
-        table["scale_median"],
-        *table["within_mm"].values(),
-    ]
+def frame_csv(frame: DataFrame) -> str:
+    r"""Return a frame as CSV with ``\n`` line ends; undefined numbers are empty."""
+    if frame.columns.empty:
+        return ""
+    cells = frame.astype(object).where(frame.notna(), None)
+    return csv_text([list(frame.columns), *cells.itertuples(index=False, name=None)])
 
 
 def csv_text(rows: Iterable[Iterable[str | float | bool | None]]) -> str:

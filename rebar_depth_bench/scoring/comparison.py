@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.bootstrap import Interval, interval, resample
+from rebar_depth_bench.scoring.frames import differences_frame
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
 from rebar_depth_bench.scoring.result import (
@@ -26,6 +27,9 @@ from rebar_depth_bench.scoring.result import (
 )
 from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
 from rebar_depth_bench.submission import config_of
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 Verdict = Literal["better", "worse", "equal", "undecided", "not ranked", ""]
 
@@ -61,6 +65,10 @@ class Comparison:
 
     provenance: Provenance
     configs: Mapping[str, Sequence[Difference]]
+
+    def to_pandas(self) -> DataFrame:
+        """Return one row per config and metric: values, difference with its 95 % interval, and provenance."""
+        return differences_frame([self.to_dict()])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as a JSON-compatible object."""

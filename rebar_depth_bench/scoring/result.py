@@ -7,25 +7,35 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample
+from rebar_depth_bench.scoring.frames import tables_frame, views_frame
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from rebar_depth_bench.extended.result import ExtendedResult
 
 SCALE_MEDIAN = "scale_median"
 """Key of the median over views of the scale factor in ``VIEW_METRICS``."""
 
 _VIEW_INDEX = re.compile("[0-9]{4}")
+_MAX_CONFIGS_SHOWN = 10
+_NOTEBOOK_COLUMNS = (
+    *("config", "views", "views_scored", "coverage", "ranked"),
+    *("native_abs_rel", "native_rmse_cm", "scaled_abs_rel", "scaled_rmse_cm", "scale_median"),
+)
 
 
 @dataclass(frozen=True)
@@ -80,7 +90,7 @@ class Table:
     intervals: Mapping[str, Interval | None] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """Result of scoring one submission, with the digests and versions of its inputs."""
 
@@ -105,6 +115,37 @@ class Result:
             "views": [_view_dict(view) for view in self.views],
             **extended,
         }
+
+    def to_pandas(self, rows: Literal["tables", "views", "extended"] = "tables") -> DataFrame:
+        """Return the numbers of the JSON as a frame.
+
+        ``"tables"`` has one row per config, with the 95 % interval of each metric in the columns
+        ``<metric>_low`` and ``<metric>_high``; ``"views"`` has one row per view; ``"extended"`` has one row per
+        config, alignment and extended measure. Raises ``ValueError`` for other rows, and for ``"extended"`` if the
+        result has no extended measures.
+        """
+        if rows == "tables":
+            return tables_frame([self.to_dict()])
+        if rows == "views":
+            return views_frame(self.to_dict())
+        if rows == "extended" and self.extended is not None:
+            return self.extended.to_pandas()
+        raise ValueError(f"rows is {rows!r}, expected 'tables', 'views', or 'extended' for a result that has them")
+
+    def __repr__(self) -> str:
+        """Return the method, the numbers of the first ten configs, and the number of views."""
+        shown = [f"  {printable(name)}: {_describe_table(table)}" for name, table in self.tables.items()]
+        omitted = [f"  ... and {len(shown) - _MAX_CONFIGS_SHOWN} more"] if len(shown) > _MAX_CONFIGS_SHOWN else []
+        head = f"<Result of {printable(self.method)}: {len(shown)} configs, {len(self.views)} views"
+        return "\n".join([head, *shown[:_MAX_CONFIGS_SHOWN], *omitted]) + ">"
+
+    def _repr_html_(self) -> str:
+        """Return the method, its provenance and the tables for notebooks."""
+        frame = self.to_pandas()[[*_NOTEBOOK_COLUMNS]]
+        frame["config"] = frame["config"].map(printable)
+        provenance = f"protocol {PROTOCOL}, dataset {self.dataset_version} ({self.dataset_digest[:19]})"
+        head = f"<p><b>{escape(printable(self.method))}</b>, {escape(printable(provenance))}</p>"
+        return head + str(frame.to_html(index=False, na_rep="–", float_format="{:.4g}".format, border=0))
 
     def to_json(self) -> bytes:
         """Return the result as UTF-8 JSON; the same archive and dataset give the same bytes on every machine."""
@@ -196,6 +237,13 @@ def _mean_metrics(metrics: Sequence[DepthMetrics]) -> DepthMetrics | None:
 
 def _is_finite(metrics: DepthMetrics | None) -> bool:
     return metrics is not None and all(math.isfinite(value) for value in vars(metrics).values())
+
+
+def _describe_table(table: Table) -> str:
+    if table.native is None or table.scaled is None:
+        return "no predictions"
+    note = "" if table.ranked else ", not ranked"
+    return f"AbsRel {table.native.abs_rel:.4g} native, {table.scaled.abs_rel:.4g} scaled{note}"
 
 
 def _metrics_dict(metrics: DepthMetrics | None) -> dict[str, float | None]:

@@ -12,15 +12,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.parallel import ordered_map
 from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.ground_truth import ConfigTruth, ViewTruth, config_truth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, median, median_scale, metrics_at_scales
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Result, ViewScore, tabulate
-from rebar_depth_bench.submission import EntryError, SubmissionReader, config_of, open_submission
+from rebar_depth_bench.submission import EntryError, SubmissionReader
 from rebar_depth_bench.version import software_version
 
 
@@ -39,20 +39,20 @@ def score(
     Raises ``SubmissionError`` with all problems if any part of the archive is invalid, and ``DatasetError`` if the
     dataset folder is invalid.
     """
-    folder = open_folder(root)
-    with (
-        open_submission(archive, folder.expected_views()) as submission,
-        ThreadPoolExecutor(1) as pool,
-    ):
-        if submission.meta is None or submission.structure_problems:
-            raise SubmissionError(str(archive), list(submission.problems()))
-        sha256 = pool.submit(submission.sha256)
-        scores = _score_all(submission, folder, workers, progress)
+    with open_evaluation(archive, root) as evaluation:
+        return score_evaluation(evaluation, workers=workers, progress=progress)
+
+
+def score_evaluation(evaluation: Evaluation, *, workers: int | None = None, progress: Progress = silent) -> Result:
+    """Score an open submission as ``score`` does. Raises ``SubmissionError`` if an entry is invalid."""
+    with ThreadPoolExecutor(1) as pool:
+        sha256 = pool.submit(evaluation.submission.sha256)
+        scores = _score_all(evaluation, workers, progress)
         return Result(
-            method=submission.meta.method,
+            method=evaluation.method,
             submission_sha256=sha256.result(),
-            dataset_digest=folder.digest,
-            dataset_version=folder.version,
+            dataset_digest=evaluation.folder.digest,
+            dataset_version=evaluation.folder.version,
             software_version=software_version(),
             tables={config: tabulate(views) for config, views in scores.items()},
             views=[view for views in scores.values() for view in views],
@@ -83,22 +83,19 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
     )
 
 
-def _score_all(
-    submission: SubmissionReader, folder: DatasetFolder, workers: int | None, progress: Progress
-) -> dict[str, list[ViewScore]]:
+def _score_all(evaluation: Evaluation, workers: int | None, progress: Progress) -> dict[str, list[ViewScore]]:
     """Return the scores of every view of the archive by config. Raises ``SubmissionError`` with all problems."""
-    present = {config_of(view_id) for view_id in submission.view_ids}
+    submission = evaluation.submission
     unread = set(submission.view_ids)
     problems: list[str] = []
     scores: dict[str, list[ViewScore]] = {}
-    for config in folder.configs:
-        if config in present:
-            truths = config_truth(folder, config, progress)
-            outcomes = ordered_map(partial(_score_or_problem, submission, truths), range(len(truths)), workers)
-            scored = list(_report_progress(outcomes, f"scoring {config}", len(truths), progress))
-            scores[config] = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
-            problems += [outcome for outcome in scored if isinstance(outcome, str)]
-            unread.difference_update(truths.view_ids)
+    for config in evaluation.configs:
+        truths = config_truth(evaluation.folder, config, progress)
+        outcomes = ordered_map(partial(_score_or_problem, submission, truths), range(len(truths)), workers)
+        scored = list(_report_progress(outcomes, f"scoring {config}", len(truths), progress))
+        scores[config] = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
+        problems += [outcome for outcome in scored if isinstance(outcome, str)]
+        unread.difference_update(truths.view_ids)
     problems += _unscored_view_problems(submission, unread)
     if problems:
         raise SubmissionError(str(submission.path), problems)

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -24,18 +22,19 @@ from rich.text import Text
 
 from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.console import add_output_file
-from rebar_depth_bench.data.manifest import DatasetFolder
-from rebar_depth_bench.errors import InputError, SubmissionError
+from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.parallel import ordered_map
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.reporting.html.study_page import PageTable, StudyPage, render_study
-from rebar_depth_bench.reporting.tables import csv_text, print_unwrapped
+from rebar_depth_bench.reporting.tables import frame_csv, print_unwrapped
+from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.ground_truth import ViewTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
-from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
 from rebar_depth_bench.scoring.rounding import rounded
-from rebar_depth_bench.submission import SubmissionReader, config_of, open_submission
+from rebar_depth_bench.submission import SubmissionReader
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 def add_output_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,17 +45,16 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def write_outputs(
-    options: argparse.Namespace, content: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], page: StudyPage
+    options: argparse.Namespace, content: Mapping[str, Any], frame: DataFrame, page: StudyPage
 ) -> None:
     """Write the requested files, then print the tables and notes of the page to standard output.
 
-    ``content`` is the JSON object. ``rows`` are the rows of the CSV, all with the same keys, which are the header;
-    an empty sequence writes an empty file. Numbers are rounded as in the JSON.
+    ``content`` is the JSON object and ``frame`` has the rows of the CSV; an empty frame writes an empty file.
     """
     if options.json:
         write_bytes(options.json, json_bytes(content))
     if options.csv:
-        write_text(options.csv, csv_text([*rows[:1], *(_round_numbers(list(row.values())) for row in rows)]))
+        write_text(options.csv, frame_csv(frame))
     if options.html:
         write_text(options.html, render_study(page))
     print_page(page, Console())
@@ -120,47 +118,19 @@ class ViewPairs:
     z_m: Float64[ndarray, " n"]
 
 
-@contextmanager
-def open_valid_submission(
-    archive: str | os.PathLike[str], folder: DatasetFolder, progress: Progress = silent
-) -> Iterator[SubmissionReader]:
-    """Open a submission, check every entry and yield its reader.
-
-    Raises ``SubmissionError`` with all problems if the submission is invalid.
-    """
-    with open_submission(archive, folder.expected_views()) as submission:
-        problems = list(submission.problems(progress))
-        if problems:
-            raise SubmissionError(str(archive), problems)
-        yield submission
-
-
-def archive_provenance(submission: SubmissionReader, folder: DatasetFolder) -> Provenance:
-    """Return the provenance of a study of one valid submission against a dataset folder."""
-    method = submission.meta.method if submission.meta else ""
-    archives = (ArchiveIdentity(method, submission.sha256()),)
-    return Provenance(PROTOCOL, folder.digest, folder.version, archives)
-
-
-def submission_configs(submission: SubmissionReader, folder: DatasetFolder) -> list[str]:
-    """Return the configs that a submission contains, in the order of the dataset folder."""
-    present = {config_of(view_id) for view_id in submission.view_ids}
-    return [config for config in folder.configs if config in present]
-
-
-def select_config(submission: SubmissionReader, folder: DatasetFolder, wanted: str | None) -> str:
+def select_config(evaluation: Evaluation, wanted: str | None) -> str:
     """Return the config to study: ``wanted``, or the only config of the submission if ``wanted`` is None.
 
     Raises ``InputError`` if the submission does not contain ``wanted``, or if ``wanted`` is None and the
     submission does not contain exactly one config.
     """
-    present = submission_configs(submission, folder)
+    present, path = evaluation.configs, evaluation.submission.path
     if wanted is None and len(present) == 1:
         return present[0]
     if wanted is None:
-        raise InputError(f"{submission.path}: holds {', '.join(present)}, expected --config with one of them")
+        raise InputError(f"{path}: holds {', '.join(present)}, expected --config with one of them")
     if wanted not in present:
-        raise InputError(f"{submission.path}: has no config {wanted!r}, expected one of {', '.join(present)}")
+        raise InputError(f"{path}: has no config {wanted!r}, expected one of {', '.join(present)}")
     return wanted
 
 

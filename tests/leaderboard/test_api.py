@@ -195,6 +195,18 @@ def test_quota_holds_for_concurrent_uploads_and_deletions(private_server: Server
     assert accepted[0] not in stored_ids
 
 
+def test_token_states_quota_and_limits(private_server: Server, small_archive: Path) -> None:
+    assert call(private_server, "GET", "/api/v1/token").status_code == 401
+    token = private_server.token("curious about limits")
+    before = call(private_server, "GET", "/api/v1/token", token).json()
+    private_server.submit_accepted(small_archive, token)
+    after = call(private_server, "GET", "/api/v1/token", token).json()
+    assert (before["name"], before["quota"], before["quota_left"]) == ("curious about limits", QUOTA, QUOTA)
+    assert after == before | {"quota_left": QUOTA - 1}
+    assert before["write_rate_limit"] == "1000/minute"
+    assert before["max_upload_bytes"] > 0
+
+
 def test_private_submission_is_visible_to_owner_only(private_server: Server, write_archive: WriteArchive) -> None:
     token, other_token = private_server.token("shy"), private_server.token("curious")
     submission_id = private_server.submit_accepted(write_archive("hidden", 1.1), token)

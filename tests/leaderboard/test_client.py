@@ -136,7 +136,7 @@ def test_too_large_archive_is_reported(strict_server: Server, tmp_path: Path) ->
     large.write_bytes(bytes(2_200_000))
     with (
         LeaderboardClient(strict_server.url, strict_server.token("bob")) as leaderboard,
-        pytest.raises(InputError, match="larger than 2000000"),
+        pytest.raises(InputError, match="expected at most 2000000"),
     ):
         leaderboard.submit(large)
 

@@ -21,7 +21,8 @@ from leaderboard.web.api.schemas import (
     row_schema,
 )
 from leaderboard.web.cache import NO_STORE, REVALIDATE, RenderedBody, cached_public_body, conditional_response
-from rebar_depth_bench.reporting.tables import csv_text, number_columns, number_values
+from rebar_depth_bench.reporting.tables import csv_text
+from rebar_depth_bench.scoring.frames import TABLE_COLUMNS, table_values
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 
@@ -30,9 +31,9 @@ def entries_to_csv(rows: Sequence[LeaderboardEntry]) -> str:
 
     Undefined numbers are empty cells.
     """
-    header = ["rank", "id", "method", "submitter", "config", *number_columns()]
+    header = ["rank", "id", "method", "submitter", "config", *TABLE_COLUMNS]
     cells = (
-        [row.rank, row.submission_id, row.method, row.submitter, row.config, *number_values(row.table)]
+        [row.rank, row.submission_id, row.method, row.submitter, row.config, *table_values(row.table)]
         for row in rows
     )
     return csv_text([header, *cells])

@@ -72,6 +72,17 @@ class Submission(BaseModel):
     result: dict[str, Any] | None = None
 
 
+class Token(BaseModel):
+    """Name of a token, its quota and the limits of the service."""
+
+    name: str = Field(description="the submitter's name, as the board shows it")
+    quota: int = Field(description="accepted submissions per day (UTC)")
+    quota_left: int
+    max_upload_bytes: int
+    read_rate_limit: str = Field(examples=["600/minute"])
+    write_rate_limit: str = Field(examples=["60/minute"])
+
+
 class Publication(BaseModel):
     """Visibility of a submission's rows on the leaderboard."""
 

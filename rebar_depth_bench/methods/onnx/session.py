@@ -5,6 +5,7 @@ This is the only module that imports onnxruntime.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,8 +77,11 @@ def open_session(path: Path, input_spec: InputSpec, output_spec: OutputSpec) -> 
         raise MethodError(
             f"an ONNX model needs onnxruntime ({error}): pip install 'rebar-depth-bench[onnx]'"
         ) from None
+    onnxruntime.set_default_logger_severity(_LOG_ERRORS_ONLY)
     options = onnxruntime.SessionOptions()
     options.log_severity_level = _LOG_ERRORS_ONLY
+    # Without a number, it pins threads to processors and prints an error for each that the process may not use.
+    options.intra_op_num_threads = len(os.sched_getaffinity(0))
     available = onnxruntime.get_available_providers()
     try:
         session = onnxruntime.InferenceSession(

@@ -8,7 +8,6 @@ views to show and loads their images.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,6 @@ from markupsafe import Markup
 
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.data.dataset import decode_row, iterate_undecoded
-from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import score_charts
@@ -36,9 +34,10 @@ from rebar_depth_bench.reporting.html.view_browser import (
 )
 from rebar_depth_bench.reporting.html.view_images import ViewPanels, colour_bar_uri
 from rebar_depth_bench.reporting.published import load_published
+from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.result import Result, ViewScore, sort_key_worst_first
-from rebar_depth_bench.submission import SubmissionReader, config_of, open_submission
+from rebar_depth_bench.submission import SubmissionReader, config_of
 
 WORST_SHOWN = 10
 """Number of views of a config that are listed openly; the full list is collapsed."""
@@ -165,15 +164,8 @@ def _config_views(name: str, views: Sequence[ViewScore]) -> ConfigViewTables:
 _COLUMNS = ("view_id", "left_rgb", "left_depth", "left_mask")
 
 
-def write_report(
-    result: Result,
-    archive: str | os.PathLike[str],
-    root: str | Path,
-    target: Path,
-    *,
-    views_shown: int = VIEWS_SHOWN,
-) -> None:
-    """Write the HTML report of ``result``, the scores of the submission ``archive`` on the dataset ``root``.
+def write_report(result: Result, evaluation: Evaluation, target: Path, *, views_shown: int = VIEWS_SHOWN) -> None:
+    """Write the HTML report of ``result``, the scores of the submission of ``evaluation``.
 
     Up to ``views_shown`` views of each config are shown with images: the worst by native AbsRel, then evenly
     spaced down to the best. Raises ``InputError`` if ``views_shown`` is negative.
@@ -182,22 +174,17 @@ def write_report(
         config: views_to_show([view for view in result.views if config_of(view.view_id) == config], views_shown)
         for config in result.tables
     }
-    folder = open_folder(root)
-    with open_submission(archive, folder.expected_views()) as submission:
-        page = render_report(result, iter_view_panels(chosen, root, submission))
-    write_text(target, page)
+    write_text(target, render_report(result, iter_view_panels(chosen, evaluation)))
 
 
-def iter_view_panels(
-    chosen: Mapping[str, list[ViewScore]], root: str | Path, submission: SubmissionReader
-) -> Iterator[ViewPanels]:
+def iter_view_panels(chosen: Mapping[str, list[ViewScore]], evaluation: Evaluation) -> Iterator[ViewPanels]:
     """Yield the arrays of the chosen views (by config), one view at a time; other rows are not decoded."""
     for config, views in chosen.items():
         scores = {view.view_id: view for view in views}
         if scores:
-            for row in iterate_undecoded(root, config, _COLUMNS):
+            for row in iterate_undecoded(evaluation.folder.root, config, _COLUMNS):
                 if row["view_id"] in scores:
-                    yield _panels(scores[row["view_id"]], decode_row(row), submission)
+                    yield _panels(scores[row["view_id"]], decode_row(row), evaluation.submission)
 
 
 def _panels(score: ViewScore, row: Mapping[str, Any], submission: SubmissionReader) -> ViewPanels:

@@ -8,14 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rebar_depth_bench.console import ProgressBars, add_archive, add_data
-from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.ground_truth import config_truth
-from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
 from rebar_depth_bench.scoring.result import Result, protocol_indices
-from rebar_depth_bench.scoring.score import score
+from rebar_depth_bench.scoring.score import score_evaluation
 from rebar_depth_bench.studies.common import add_output_arguments, write_outputs
 from rebar_depth_bench.studies.distance import output
 from rebar_depth_bench.studies.distance.study import (
@@ -59,7 +58,7 @@ def run(options: argparse.Namespace) -> None:
             bins_per_decade=options.bins_per_decade,
             progress=bars.update,
         )
-    write_outputs(options, output.to_json(study), output.to_csv_rows(study), output.to_page(study))
+    write_outputs(options, output.to_json(study), output.to_pandas(study), output.to_page(study))
 
 
 def run_distance_study(
@@ -80,10 +79,11 @@ def run_distance_study(
     """
     if not 1 <= bins_per_decade <= 100:
         raise InputError(f"--bins-per-decade is {bins_per_decade}, expected 1 to 100")
-    folder = open_folder(root)
-    result = score(archive, root, progress=progress)
-    names = _select_configs(archive, result, configs)
-    points = {name: _distance_points(result, folder, name) for name in names}
+    with open_evaluation(archive, root) as evaluation:
+        result = score_evaluation(evaluation, progress=progress)
+        names = _select_configs(archive, result, configs)
+        points = {name: _distance_points(result, evaluation.folder, name) for name in names}
+        provenance = evaluation.provenance()
     empty = [name for name, views in points.items() if not views]
     if empty:
         raise InputError(f"{archive}: {', '.join(empty)} has no view with a scored pixel, expected one or more")
@@ -91,12 +91,7 @@ def run_distance_study(
     if len(points) > 1:
         slopes.append(fit_scale_slope(ALL_CONFIGS, points))
     return DistanceStudy(
-        provenance=Provenance(
-            PROTOCOL,
-            result.dataset_digest,
-            result.dataset_version,
-            (ArchiveIdentity(result.method, result.submission_sha256),),
-        ),
+        provenance=provenance,
         bins_per_decade=bins_per_decade,
         points=tuple(point for views in points.values() for point in views),
         bins=tuple(bin_ for views in points.values() for bin_ in bin_views(views, bins_per_decade)),

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.lines import HEIGHT, LEFT, RIGHT, TOP, ChartText, Series, chart, log_axis
 from rebar_depth_bench.reporting.html.study_page import PageFigure, PageTable, StudyPage
 from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS
+from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.studies.distance.study import (
     ALL_CONFIGS,
     DistanceBin,
@@ -19,6 +20,9 @@ from rebar_depth_bench.studies.distance.study import (
     IntervalEstimate,
     ScaleSlope,
 )
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 def to_json(study: DistanceStudy) -> dict[str, Any]:
@@ -33,27 +37,29 @@ def to_json(study: DistanceStudy) -> dict[str, Any]:
     }
 
 
-def to_csv_rows(study: DistanceStudy) -> list[dict[str, Any]]:
-    """Return the rows of the CSV: one per config and bin, with the provenance in columns."""
+def to_pandas(study: DistanceStudy) -> DataFrame:
+    """Return the rows of the CSV as a frame: one per config and bin, with the provenance in columns."""
     provenance = study.provenance
-    return [
-        {
-            "study": "distance",
-            "protocol": provenance.protocol,
-            "method": provenance.archives[0].method,
-            **{
-                name: getattr(bin_, name)
-                for name in ("config", "low_m", "high_m", "distance_m", "views", "views_scored")
-            },
-            **_estimate_cells("scale_median", bin_.scale),
-            "scale_min": bin_.scale_range[0] if bin_.scale_range else None,
-            "scale_max": bin_.scale_range[1] if bin_.scale_range else None,
-            **_estimate_cells("native_abs_rel", bin_.native_abs_rel),
-            **_estimate_cells("scaled_abs_rel", bin_.scaled_abs_rel),
-            **provenance.csv_cells(),
-        }
-        for bin_ in study.bins
-    ]
+    return make_frame(
+        [
+            {
+                "study": "distance",
+                "protocol": provenance.protocol,
+                "method": provenance.archives[0].method,
+                **{
+                    name: getattr(bin_, name)
+                    for name in ("config", "low_m", "high_m", "distance_m", "views", "views_scored")
+                },
+                **_estimate_cells("scale_median", bin_.scale),
+                "scale_min": bin_.scale_range[0] if bin_.scale_range else None,
+                "scale_max": bin_.scale_range[1] if bin_.scale_range else None,
+                **_estimate_cells("native_abs_rel", bin_.native_abs_rel),
+                **_estimate_cells("scaled_abs_rel", bin_.scaled_abs_rel),
+                **provenance.csv_cells(),
+            }
+            for bin_ in study.bins
+        ]
+    )
 
 
 def to_page(study: DistanceStudy) -> StudyPage:

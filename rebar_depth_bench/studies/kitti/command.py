@@ -34,7 +34,7 @@ from rebar_depth_bench.studies.kitti.ground_truth import (
     read_truth,
 )
 from rebar_depth_bench.studies.kitti.metrics import CROPS, ImageScore, KittiImage, eigen_test_images, score_image
-from rebar_depth_bench.studies.kitti.output import to_csv_rows, to_page
+from rebar_depth_bench.studies.kitti.output import to_page, to_pandas
 from rebar_depth_bench.studies.kitti.result import KittiProtocol, KittiResult, tabulate_images
 from rebar_depth_bench.submission import EntryError
 from rebar_depth_bench.submission.formats import FORMATS
@@ -97,7 +97,7 @@ def run(options: argparse.Namespace) -> None:
         result = run_kitti_study(
             options.predictions, options.kitti, protocol, workers=options.workers, progress=bars.update
         )
-    write_outputs(options, result.to_dict(), to_csv_rows(result), to_page(result))
+    write_outputs(options, result.to_dict(), to_pandas(result), to_page(result))
 
 
 def run_kitti_study(

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.study_page import PageTable, StudyPage
 from rebar_depth_bench.reporting.published import load_published
+from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE
 from rebar_depth_bench.studies.kitti.ground_truth import EXPECTED_IMAGES
 from rebar_depth_bench.studies.kitti.metrics import METRIC_NAMES, KittiMetrics
 from rebar_depth_bench.studies.kitti.result import SCALE_NAME, KittiResult
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _METRIC_HEADS = (
     ("method", ""),
@@ -44,29 +48,31 @@ def to_page(result: KittiResult) -> StudyPage:
     )
 
 
-def to_csv_rows(result: KittiResult) -> list[dict[str, Any]]:
-    """Return the rows of the CSV: one for the native and one for the scaled alignment."""
+def to_pandas(result: KittiResult) -> DataFrame:
+    """Return the rows of the CSV as a frame: one for the native and one for the scaled alignment."""
     protocol, provenance, table = result.protocol, result.provenance.to_dict(), result.table
     alignments = (("native", table.native), ("scaled", table.scaled))
-    return [
-        {
-            "protocol": provenance["protocol"],
-            "method": result.method,
-            "alignment": alignment,
-            **vars(protocol),
-            "images": table.images,
-            "images_scored": table.images_scored,
-            "coverage": table.coverage,
-            "complete": table.complete,
-            "published_set": result.is_published_set,
-            **{name: getattr(metrics, name, None) for name in METRIC_NAMES},
-            SCALE_NAME: table.scale_median,
-            "ground_truth_digest": result.provenance.dataset_digest,
-            "submission_sha256": result.provenance.archives[0].sha256,
-            "software_version": provenance["software"]["version"],
-        }
-        for alignment, metrics in alignments
-    ]
+    return make_frame(
+        [
+            {
+                "protocol": provenance["protocol"],
+                "method": result.method,
+                "alignment": alignment,
+                **vars(protocol),
+                "images": table.images,
+                "images_scored": table.images_scored,
+                "coverage": table.coverage,
+                "complete": table.complete,
+                "published_set": result.is_published_set,
+                **{name: getattr(metrics, name, None) for name in METRIC_NAMES},
+                SCALE_NAME: table.scale_median,
+                "ground_truth_digest": result.provenance.dataset_digest,
+                "submission_sha256": result.provenance.archives[0].sha256,
+                "software_version": provenance["software"]["version"],
+            }
+            for alignment, metrics in alignments
+        ]
+    )
 
 
 def _lead(result: KittiResult) -> str:

@@ -24,7 +24,7 @@ from rebar_depth_bench.scoring.result import mean, tabulate
 from rebar_depth_bench.studies.common import add_output_arguments, write_outputs
 from rebar_depth_bench.studies.depth_source import DepthSource, open_depths
 from rebar_depth_bench.studies.pseudo_reference.capture import CAPTURE_LAYOUT, Capture, is_capture, open_capture
-from rebar_depth_bench.studies.pseudo_reference.output import to_csv_rows, to_page
+from rebar_depth_bench.studies.pseudo_reference.output import to_page, to_pandas
 from rebar_depth_bench.studies.pseudo_reference.result import (
     AgreementRow,
     DepthReference,
@@ -121,7 +121,7 @@ def run(options: argparse.Namespace) -> None:
             workers=options.workers,
             progress=bars.update,
         )
-    write_outputs(options, result.to_dict(), to_csv_rows(result), to_page(result))
+    write_outputs(options, result.to_dict(), to_pandas(result), to_page(result))
 
 
 def run_pseudo_reference_study(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.study_page import PageTable, StudyPage
 from rebar_depth_bench.reporting.published import PublishedNumbers, load_published
+from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.studies.pseudo_reference.result import (
     ALIGNMENTS,
@@ -16,6 +17,9 @@ from rebar_depth_bench.studies.pseudo_reference.result import (
     MethodRow,
     PseudoReferenceResult,
 )
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _SCORE_HEADS = (
     ("method", ""),
@@ -59,9 +63,9 @@ def to_page(result: PseudoReferenceResult) -> StudyPage:
     )
 
 
-def to_csv_rows(result: PseudoReferenceResult) -> list[dict[str, Any]]:
-    """Return the rows of the CSV: one per method and reference, with the provenance in columns."""
-    return [_csv_row(result, row) for row in result.rows]
+def to_pandas(result: PseudoReferenceResult) -> DataFrame:
+    """Return the rows of the CSV as a frame: one per method and reference, with the provenance in columns."""
+    return make_frame([_csv_row(result, row) for row in result.rows])
 
 
 def _lead(result: PseudoReferenceResult) -> str:

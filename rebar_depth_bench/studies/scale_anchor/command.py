@@ -12,15 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from rebar_depth_bench.console import ProgressBars, add_data
-from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.ground_truth import config_truth
 from rebar_depth_bench.studies.common import (
     add_output_arguments,
-    archive_provenance,
     map_views,
-    open_valid_submission,
     select_config,
     write_outputs,
 )
@@ -90,7 +88,7 @@ def run(options: argparse.Namespace) -> None:
             seed=options.seed,
             progress=bars.update,
         )
-    write_outputs(options, output.to_json(study), output.to_csv_rows(study), output.to_page(study))
+    write_outputs(options, output.to_json(study), output.to_pandas(study), output.to_page(study))
 
 
 def run_anchor_study(
@@ -115,10 +113,11 @@ def run_anchor_study(
     ``SubmissionError`` with all problems if the archive is invalid; ``DatasetError`` for the dataset folder.
     """
     _check_arguments(given_scale, counts, draws, seed)
-    folder = open_folder(root)
-    with open_valid_submission(archive, folder, progress) as submission:
-        name = select_config(submission, folder, config)
-        truths = config_truth(folder, name, progress)
+    with open_evaluation(archive, root) as evaluation:
+        evaluation.check_entries(progress)
+        submission = evaluation.submission
+        name = select_config(evaluation, config)
+        truths = config_truth(evaluation.folder, name, progress)
         view_ratios = map_views(submission, truths, len(truths), view_ratio, f"ratios of {name}", progress)
         ratios = np.array([view.ratio for view in view_ratios if view.ratio is not None])
         usable_counts = [k for k in sorted(set(counts)) if k <= len(ratios)]
@@ -134,7 +133,7 @@ def run_anchor_study(
         errors = mean_errors(
             map_views(submission, predicted, len(ratios), compute_errors, f"errors of {name}", progress)
         )
-        provenance = archive_provenance(submission, folder)
+        provenance = evaluation.provenance()
     given, all_views, *rest = map(ScaledArchive, scales.tolist(), errors.abs_rel.tolist(), errors.rmse_cm.tolist())
     per_k = tuple(tuple(rest[start : start + draws]) for start in range(0, len(rest), draws))
     return AnchorStudy(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
@@ -21,8 +21,12 @@ from rebar_depth_bench.reporting.charts.lines import (
     log_axis,
 )
 from rebar_depth_bench.reporting.html.study_page import PageFigure, PageTable, StudyPage
+from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE
 from rebar_depth_bench.studies.scale_anchor.study import AnchorRow, AnchorStudy, Spread
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _SPREAD_FIELDS = ("scale", "deviation_percent", "abs_rel_change", "rmse_cm_change")
 
@@ -47,29 +51,31 @@ def to_json(study: AnchorStudy) -> dict[str, Any]:
     }
 
 
-def to_csv_rows(study: AnchorStudy) -> list[dict[str, Any]]:
-    """Return the rows of the CSV: one per k, with the provenance in columns."""
+def to_pandas(study: AnchorStudy) -> DataFrame:
+    """Return the rows of the CSV as a frame: one per k, with the provenance in columns."""
     provenance = study.provenance
-    return [
-        {
-            "study": "anchor",
-            "protocol": provenance.protocol,
-            "method": provenance.archives[0].method,
-            "config": study.config,
-            "k": row.k,
-            "draws": len(draws),
-            "given_scale": study.given.scale,
-            "given_abs_rel": study.given.abs_rel,
-            "given_rmse_cm": study.given.rmse_cm,
-            **{
-                f"{name}_{key}": value
-                for name in _SPREAD_FIELDS
-                for key, value in asdict(getattr(row, name)).items()
-            },
-            **provenance.csv_cells(),
-        }
-        for row, draws in zip(study.rows, study.draws, strict=True)
-    ]
+    return make_frame(
+        [
+            {
+                "study": "anchor",
+                "protocol": provenance.protocol,
+                "method": provenance.archives[0].method,
+                "config": study.config,
+                "k": row.k,
+                "draws": len(draws),
+                "given_scale": study.given.scale,
+                "given_abs_rel": study.given.abs_rel,
+                "given_rmse_cm": study.given.rmse_cm,
+                **{
+                    f"{name}_{key}": value
+                    for name in _SPREAD_FIELDS
+                    for key, value in asdict(getattr(row, name)).items()
+                },
+                **provenance.csv_cells(),
+            }
+            for row, draws in zip(study.rows, study.draws, strict=True)
+        ]
+    )
 
 
 def to_page(study: AnchorStudy) -> StudyPage:

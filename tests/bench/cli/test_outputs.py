@@ -53,6 +53,25 @@ def test_unwritable_output_raises_input_error(
         check_outputs({name: Path(value) for name, value in options.items()})
 
 
+def test_method_file_and_prediction_folder_are_inputs(tmp_path: Path) -> None:
+    method, predictions = tmp_path / "mine.py", tmp_path / "predictions"
+    method.touch()
+    predictions.mkdir()
+    with pytest.raises(InputError, match="which is read"):
+        check_outputs({"method": f"{method}:METHOD", "out": method})
+    with pytest.raises(InputError, match="inside"):
+        check_outputs({"kitti": predictions, "csv": predictions / "t.csv"})
+
+
+def test_folder_named_like_config_or_method_is_no_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("lattice", "sgbm"):
+        Path(name).mkdir()
+    check_outputs(
+        {"config": ["lattice"], "method": "sgbm", "csv": Path("lattice/t.csv"), "out": Path("sgbm/a.zip")}
+    )
+
+
 def test_new_files_in_new_folders_are_accepted(tmp_path: Path) -> None:
     check_outputs({"json": tmp_path / "a" / "b.json", "csv": tmp_path / "c.csv", "data": str(tmp_path / "data")})
 

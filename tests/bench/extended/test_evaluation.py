@@ -29,13 +29,16 @@ from rebar_depth_bench.extended.ground_truth import dilate_mask, load_steel_trut
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import print_extended
+from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.score import score_evaluation
 
 Depths = dict[str, np.ndarray]
 Archive = Callable[..., Path]
 
 
 def extended(archive: Path, root: Path, workers: int = 2) -> ExtendedResult:
-    return score_extended(score(archive, root), archive, root, workers=workers)
+    with open_evaluation(archive, root) as evaluation:
+        return score_extended(score_evaluation(evaluation), evaluation, workers=workers)
 
 
 def values(result: ExtendedResult, alignment: str) -> dict[str, float]:
@@ -168,8 +171,11 @@ def test_folder_without_bars_raises_dataset_error(
     for item in tiny_root.iterdir():
         if item.name != "bars.parquet":
             (tmp_path / item.name).symlink_to(item)
-    with pytest.raises(DatasetError, match=r"has no bars\.parquet, expected a folder finished by rebar-build"):
-        score_extended(result, archive, tmp_path)
+    with (
+        open_evaluation(archive, tmp_path) as evaluation,
+        pytest.raises(DatasetError, match=r"has no bars\.parquet, expected a folder finished by rebar-build"),
+    ):
+        score_extended(result, evaluation)
 
 
 @pytest.mark.slow

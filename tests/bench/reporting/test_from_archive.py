@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rebar_depth_bench import score
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.reporting.html.page import write_report
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.result import sort_key_worst_first
+from rebar_depth_bench.scoring.score import score_evaluation
 
 
 def test_report_embeds_requested_views_worst_first(
@@ -22,14 +23,15 @@ def test_report_embeds_requested_views_worst_first(
     archive = archive_of(
         {view: depth_m * factor for (view, depth_m), factor in zip(tiny_truth.items(), factors, strict=True)}
     )
-    result = score(archive, tiny_root)
-    worst_first = [view.view_id for view in sorted(result.views, key=sort_key_worst_first, reverse=True)]
-    page = tmp_path / "page.html"
-    write_report(result, archive, tiny_root, page, views_shown=3)
-    text = page.read_text(encoding="utf-8")
-    assert re.findall(r"<h3>(lattice/\d+)</h3>", text) == [*worst_first[:2], worst_first[-1]]
-    assert f"3 of {len(tiny_truth)} views of <b>lattice</b>" in text
-    write_report(result, archive, tiny_root, page, views_shown=0)
-    assert "<article" not in page.read_text(encoding="utf-8")
-    with pytest.raises(InputError, match="views to show: -1"):
-        write_report(result, archive, tiny_root, page, views_shown=-1)
+    with open_evaluation(archive, tiny_root) as evaluation:
+        result = score_evaluation(evaluation)
+        worst_first = [view.view_id for view in sorted(result.views, key=sort_key_worst_first, reverse=True)]
+        page = tmp_path / "page.html"
+        write_report(result, evaluation, page, views_shown=3)
+        text = page.read_text(encoding="utf-8")
+        assert re.findall(r"<h3>(lattice/\d+)</h3>", text) == [*worst_first[:2], worst_first[-1]]
+        assert f"3 of {len(tiny_truth)} views of <b>lattice</b>" in text
+        write_report(result, evaluation, page, views_shown=0)
+        assert "<article" not in page.read_text(encoding="utf-8")
+        with pytest.raises(InputError, match="views to show: -1"):
+            write_report(result, evaluation, page, views_shown=-1)

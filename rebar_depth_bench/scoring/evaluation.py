@@ -1,0 +1,60 @@
+"""Open submission and dataset folder, shared by scoring, extended measures, studies and reports."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.errors import SubmissionError
+from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
+from rebar_depth_bench.submission import SubmissionReader, config_of, open_submission
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Submission whose structure is valid, and the dataset folder it is evaluated against."""
+
+    folder: DatasetFolder
+    submission: SubmissionReader
+
+    @property
+    def method(self) -> str:
+        """Name of the method."""
+        return self.submission.meta.method if self.submission.meta else ""
+
+    @property
+    def configs(self) -> tuple[str, ...]:
+        """Names of the configs that the submission contains, in the order of the folder."""
+        present = {config_of(view_id) for view_id in self.submission.view_ids}
+        return tuple(config for config in self.folder.configs if config in present)
+
+    def check_entries(self, progress: Progress = silent) -> None:
+        """Decode every entry. Raises ``SubmissionError`` with all problems."""
+        problems = list(self.submission.problems(progress))
+        if problems:
+            raise SubmissionError(str(self.submission.path), problems)
+
+    def provenance(self) -> Provenance:
+        """Return the provenance of a study of the submission."""
+        archives = (ArchiveIdentity(self.method, self.submission.sha256()),)
+        return Provenance(PROTOCOL, self.folder.digest, self.folder.version, archives)
+
+
+@contextmanager
+def open_evaluation(archive: str | os.PathLike[str], root: str | Path) -> Iterator[Evaluation]:
+    """Open an archive and a dataset folder or Hub repository, and close the archive when the block ends.
+
+    Raises ``SubmissionError`` with all problems, also those of single entries, if the structure of the archive is
+    invalid, and ``DatasetError`` if the dataset folder is.
+    """
+    folder = open_folder(root)
+    with open_submission(archive, folder.expected_views()) as submission:
+        if submission.meta is None or submission.structure_problems:
+            raise SubmissionError(str(archive), list(submission.problems()))
+        yield Evaluation(folder, submission)

@@ -1,0 +1,109 @@
+"""Results and bars as pandas data frames, and how a notebook shows a result."""
+
+from __future__ import annotations
+
+import math
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import rebar_depth_bench as rdb
+from rebar_depth_bench.data.bars import read_bars
+from rebar_depth_bench.reporting.tables import frame_csv
+from rebar_depth_bench.scoring.comparison import compare
+from rebar_depth_bench.scoring.frames import make_frame
+from rebar_depth_bench.scoring.result import VIEW_METRICS, Result
+from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredicted_view
+
+
+class TagCollector(HTMLParser):
+    """Parser that keeps the names of the start tags."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+
+
+@pytest.fixture
+def two_configs() -> Result:
+    return result(
+        *(scored_view(f"lattice/{index:04d}") for index in range(12)),
+        scored_view("pier/0000"),
+        unpredicted_view("pier/0001"),
+    )
+
+
+def test_tables_have_numbers_and_intervals_of_json(two_configs: Result) -> None:
+    frame = two_configs.to_pandas().set_index("config")
+    document = two_configs.to_dict()
+    assert list(frame.index) == list(document["tables"])
+    assert frame.dtypes[["views", "ranked", "native_abs_rel"]].tolist() == [np.int64, np.bool_, np.float64]
+    for config, table in document["tables"].items():
+        assert frame.loc[config, "native_abs_rel"] == table["native"]["abs_rel"]
+        assert frame.loc[config, "within_10mm"] == table["within_mm"]["10"]
+    low, high = document["tables"]["lattice"]["ci95"]["native"]["abs_rel"]
+    assert frame.loc["lattice", ["native_abs_rel_low", "native_abs_rel_high"]].tolist() == [low, high]
+    assert math.isnan(frame.loc["pier", "native_abs_rel_low"]), "two views have no interval"
+    assert sum(name.endswith("_low") for name in frame) == len(VIEW_METRICS)
+
+
+def test_views_have_one_row_each(two_configs: Result) -> None:
+    frame = two_configs.to_pandas("views")
+    assert frame["view_id"].tolist() == [view.view_id for view in two_configs.views]
+    assert frame.groupby("config")["native_abs_rel"].count().to_dict() == {"lattice": 12, "pier": 1}
+    assert frame["scored_px"].dtype == np.int64
+
+
+def test_unknown_or_missing_rows_raise_value_error(two_configs: Result) -> None:
+    for rows in ("bars", "extended"):
+        with pytest.raises(ValueError, match="expected 'tables', 'views'"):
+            two_configs.to_pandas(rows)  # type: ignore[arg-type]
+
+
+def test_comparison_has_one_row_per_metric(two_configs: Result) -> None:
+    comparison = compare(two_configs, two_configs)
+    frame = comparison.to_pandas()
+    assert frame["number"].tolist() == [*VIEW_METRICS, *VIEW_METRICS]
+    assert set(frame["verdict"]) <= {"equal", "not ranked", "undecided", ""}
+
+
+def test_integers_with_missing_values_stay_integers() -> None:
+    frame = make_frame([{"count": 3, "text": "a"}, {"count": None, "text": None}])
+    assert isinstance(frame["count"].dtype, pd.Int64Dtype)
+    assert frame_csv(frame) == "count,text\n3,a\n,\n"
+    assert frame_csv(make_frame([])) == ""
+
+
+def test_bars_of_a_dataset_folder(tiny_root: Path) -> None:
+    frame = rdb.bars(tiny_root)
+    bars = read_bars(tiny_root / "bars.parquet")["lattice"]
+    assert (len(frame), set(frame["scene"])) == (len(bars), {"lattice"})
+    assert frame["bar_id"].tolist() == [bar.bar_id for bar in bars]
+    first = frame.iloc[0]
+    assert np.array_equal(first["axis_m"], np.array(bars[0].axis_m))
+    assert first["length_m"] == pytest.approx(
+        float(np.linalg.norm(np.diff(first["axis_m"], axis=0), axis=1).sum())
+    )
+
+
+def test_repr_fits_a_screen() -> None:
+    shown = repr(result(*(scored_view(f"config-{config}/0000") for config in range(30)), method="a\nb"))
+    assert len(shown.splitlines()) <= 12
+    assert max(map(len, shown.splitlines())) <= 100
+    assert "30 configs, 30 views" in shown
+    assert "a\N{REPLACEMENT CHARACTER}b" in shown
+    assert "... and 20 more" in shown
+
+
+def test_notebook_shows_escaped_table(two_configs: Result) -> None:
+    html = result(*two_configs.views, method=HOSTILE)._repr_html_()
+    parser = TagCollector()
+    parser.feed(html)
+    assert parser.tags.count("tr") == 3
+    assert set(parser.tags) <= {"p", "b", "table", "thead", "tbody", "tr", "th", "td"}
