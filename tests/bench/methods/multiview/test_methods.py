@@ -21,6 +21,8 @@ from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.progress import silent
 from tests.data.orbit import write_orbit
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def orbit_root(tmp_path_factory: pytest.TempPathFactory, tiny_root: Path) -> Path:
