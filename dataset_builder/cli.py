@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-build``; return its exit status."""
     options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
     command = {"audit": _audit, "export": _export}.get(options.command, _build)
-    return run_command(lambda: command(options), interrupted="interrupted; run the same command again to go on")
+    return run_command(lambda: command(options), interrupted="interrupted; run the same command again to continue")
 
 
 def _check_extra() -> None:
@@ -53,11 +53,11 @@ def _build(options: argparse.Namespace) -> None:
     from dataset_builder.pipeline.build import build
 
     if options.out is None:
-        raise InputError("--out ROOT is missing: the dataset folder to build")
+        raise InputError("--out ROOT is missing, expected the dataset folder to build")
     if options.cluster is not None and options.workers is not None:
         raise InputError(
-            f"--workers {options.workers} stands beside --cluster {options.cluster}, expected one of them: "
-            "on a cluster its workers decide how many views are rendered at once"
+            f"--workers {options.workers} is combined with --cluster {options.cluster}, expected only one of "
+            "them: on a cluster, the number of its workers determines how many views are rendered at once"
         )
     workers = 1 if options.workers is None else options.workers
     if workers < 1:
@@ -147,33 +147,46 @@ def argument_parser() -> argparse.ArgumentParser:
     """Return the argument parser of ``rebar-build``."""
     parser = argparse.ArgumentParser(
         prog="rebar-build",
-        description="Render a dataset folder of stereo views with exact depth, or continue one.",
+        description="Render a dataset folder of stereo views with exact depth, or resume an interrupted build.",
     )
     parser.add_argument("--version", action="version", version=software_version())
-    parser.add_argument("--out", type=Path, metavar="ROOT", help="the dataset folder to build or continue")
+    parser.add_argument("--out", type=Path, metavar="ROOT", help="dataset folder to build or resume")
     parser.add_argument(
         "--config",
         nargs="+",
         action="extend",
         metavar="NAME",
-        help=f"which configs: {', '.join(CONFIGS)} (all these by default), or {', '.join(SWEEPS)}",
+        help=f"configs to build: {', '.join(CONFIGS)} (default: all of these), or {', '.join(SWEEPS)}",
     )
-    parser.add_argument("--views", type=int, metavar="N", help="N views spread evenly over each full protocol")
-    parser.add_argument("--width", type=int, default=BuildRequest.width, help="pixels (default: %(default)s)")
-    parser.add_argument("--height", type=int, default=BuildRequest.height, help="pixels (default: %(default)s)")
+    parser.add_argument(
+        "--views",
+        type=int,
+        metavar="N",
+        help="number of views per config, evenly spaced over the full protocol (default: all)",
+    )
+    parser.add_argument(
+        "--width", type=int, default=BuildRequest.width, help="image width in pixels (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--height", type=int, default=BuildRequest.height, help="image height in pixels (default: %(default)s)"
+    )
     parser.add_argument(
         "--samples",
         type=int,
         default=BuildRequest.samples,
         help="Cycles samples per pixel (default: %(default)s)",
     )
-    parser.add_argument("--workers", type=int, metavar="N", help="render processes at once (default: 1)")
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="number of parallel render processes (default: 1)"
+    )
     parser.add_argument(
         "--cluster",
         metavar="ADDRESS",
-        help="render on the workers of the dask scheduler at this address, such as tcp://host:8786",
+        help="address of a dask scheduler whose workers render the views, such as tcp://host:8786",
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of surfaces and noise (default: %(default)s)")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="random seed of surfaces and noise (default: %(default)s)"
+    )
     parser.add_argument(
         "--mesh", metavar="FILE", help="STL, PLY, OBJ or glTF file that replaces the lattice's rods"
     )
@@ -188,14 +201,14 @@ def argument_parser() -> argparse.ArgumentParser:
         nargs="+",
         action="extend",
         metavar="FILE",
-        help="build your own cage too: a TOML file, or an IFC model; alone unless --config names others",
+        help="scene files to build: TOML or IFC; only these are built unless --config is given",
     )
     parser.add_argument(
         "--variant",
         nargs="+",
         action="extend",
         metavar="NAME",
-        help=f"another look, told in the config's name: {', '.join(VARIANTS)}",
+        help=f"appearance variants, appended to the config name: {', '.join(VARIANTS)}",
     )
     _add_commands(parser)
     return parser
@@ -204,20 +217,27 @@ def argument_parser() -> argparse.ArgumentParser:
 def _add_commands(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="command", metavar="{audit,export}")
     checking = commands.add_parser("audit", help="check a dataset folder and its ground truth")
-    checking.add_argument("root", metavar="ROOT", help="the dataset folder")
+    checking.add_argument("root", metavar="ROOT", help="dataset folder")
     checking.add_argument(
         "--depth-views",
         type=int,
         default=4,
         metavar="N",
-        help="views per config whose depth is compared with Cycles' own (default: %(default)s)",
+        help="number of views per config whose depth is compared with Cycles' depth pass (default: %(default)s)",
     )
-    exporting = commands.add_parser("export", help="write a dataset folder as PNG, OpenEXR, COLMAP and nerfstudio")
-    exporting.add_argument("root", metavar="ROOT", help="the dataset folder")
+    exporting = commands.add_parser(
+        "export", help="export a dataset folder as PNG, OpenEXR, COLMAP and nerfstudio files"
+    )
+    exporting.add_argument("root", metavar="ROOT", help="dataset folder")
     exporting.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="a new folder, or one to go on with"
+        "--out", type=Path, required=True, metavar="DIR", help="output folder: new, or an earlier export to resume"
     )
     exporting.add_argument(
-        "--config", nargs="+", action="extend", metavar="NAME", help="which configs (default: all)"
+        "--config", nargs="+", action="extend", metavar="NAME", help="configs to export (default: all)"
     )
-    exporting.add_argument("--views", type=int, metavar="N", help="N views spread evenly over those of the folder")
+    exporting.add_argument(
+        "--views",
+        type=int,
+        metavar="N",
+        help="number of views per config, evenly spaced over the views of the folder (default: all)",
+    )

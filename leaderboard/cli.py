@@ -70,7 +70,7 @@ def _run(options: argparse.Namespace) -> None:
         database.migrate()
         make_token = replace_token if options.replace else create_token
         print(make_token(database, options.name))
-        print("It is shown this once; only its hash is kept.", file=sys.stderr)
+        print("The token is not shown again; only its hash is stored.", file=sys.stderr)
     elif options.command == "remove":
         _remove(settings, options.id)
     else:
@@ -94,40 +94,41 @@ def _make_state_dir(folder: Path) -> None:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: files cannot be kept there: {error.strerror}") from None
+        raise InputError(f"{folder}: cannot create the state folder: {error.strerror}") from None
 
 
 def argument_parser() -> argparse.ArgumentParser:
     """Return the argument parser with all commands."""
     parser = argparse.ArgumentParser(
         "rebar-leaderboard",
-        description="A leaderboard that scores archives exactly as rebar-bench does.",
-        epilog="Every setting may also be given as REBAR_LEADERBOARD_NAME in the environment, or as name = value "
-        "in a TOML file (--settings); the command line wins over the file, the file over the environment.",
+        description="Leaderboard server that scores prediction archives exactly as rebar-bench does.",
+        epilog="Each setting can also be given as the environment variable REBAR_LEADERBOARD_NAME or as "
+        "name = value in a TOML file (--settings). The command line takes precedence over the file, and the file "
+        "over the environment.",
     )
     parser.add_argument("--version", action="version", version=software_version())
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, help_text in _COMMAND_HELP.items():
         command = commands.add_parser(name, help=help_text, description=help_text)
-        command.add_argument("--settings", type=Path, metavar="FILE", help="a TOML file of settings")
+        command.add_argument("--settings", type=Path, metavar="FILE", help="TOML file with settings")
         for setting in COMMAND_SETTINGS[name]:
             _add_setting(command, setting)
         if name == "token":
-            command.add_argument("name", metavar="NAME", help="whose it is; shown on the board")
-            command.add_argument("--replace", action="store_true", help="void the token that NAME has")
+            command.add_argument("name", metavar="NAME", help="name of the submitter, shown on the leaderboard")
+            command.add_argument("--replace", action="store_true", help="revoke the existing token of NAME")
         if name == "remove":
-            command.add_argument("id", metavar="ID", help="the submission, as its address has it")
+            command.add_argument("id", metavar="ID", help="id of the submission, the last part of its URL")
         if name == "backup":
-            command.add_argument("target", type=Path, metavar="FOLDER", help="a folder to write the backup into")
+            command.add_argument("target", type=Path, metavar="FOLDER", help="folder to write the backup to")
     return parser
 
 
 _COMMAND_HELP = {
-    "serve": "serve the board, and score what is uploaded",
-    "score": "score what is uploaded to a server that shares the database and the archives",
-    "token": "make a token for a submitter and print it",
-    "remove": "delete a submission, whoever made it, with its archive and results",
-    "backup": "copy database and archives into a folder while the service runs",
+    "serve": "run the web server and its local scoring workers",
+    "score": "run a scoring worker for a server that uses the same database and archive storage",
+    "token": "create a token for a submitter and print it",
+    "remove": "delete a submission of any owner, with its archive and results",
+    "backup": "copy the database and the archives to a folder while the service is running",
 }
 
 

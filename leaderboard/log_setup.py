@@ -44,4 +44,4 @@ def set_up_logs() -> None:
 def _log_uncaught_exception(
     error_type: type[BaseException], error: BaseException, traceback: TracebackType | None
 ) -> None:
-    structlog.get_logger("process").critical("ended by an error", exc_info=(error_type, error, traceback))
+    structlog.get_logger("process").critical("uncaught exception", exc_info=(error_type, error, traceback))

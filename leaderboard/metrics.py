@@ -18,14 +18,19 @@ class ServiceMetrics:
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         self.requests = Counter(
-            "rebar_requests_total", "Requests answered", ["method", "route", "status"], registry=self.registry
+            "rebar_requests_total",
+            "Number of HTTP requests",
+            ["method", "route", "status"],
+            registry=self.registry,
         )
         self.request_seconds = Histogram(
-            "rebar_request_seconds", "Time to answer", ["method", "route"], registry=self.registry
+            "rebar_request_seconds", "Duration of HTTP requests", ["method", "route"], registry=self.registry
         )
-        self._submissions = Gauge("rebar_submissions", "Submissions by status", ["status"], registry=self.registry)
+        self._submissions = Gauge(
+            "rebar_submissions", "Number of submissions by status", ["status"], registry=self.registry
+        )
         self._oldest = Gauge(
-            "rebar_oldest_queued_seconds", "How long the oldest queued submission waits", registry=self.registry
+            "rebar_oldest_queued_seconds", "Waiting time of the oldest queued submission", registry=self.registry
         )
 
     def update_queue_gauges(self, database: Database) -> None:

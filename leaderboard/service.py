@@ -66,8 +66,8 @@ def _check_dataset_unchanged(folder: DatasetFolder, database: Database, rescore:
     stale = jobs.count_stale_submissions(database, folder.digest)
     if stale and not rescore:
         raise InputError(
-            f"{folder.root}: {stale} submissions of this board are of another dataset, expected the same "
-            f"(this one is {folder.digest}); to score them against this one: --rescore true"
+            f"{folder.root}: the dataset digest is {folder.digest}, but {stale} submissions of this leaderboard "
+            "belong to another dataset; use --rescore true to score them against this one"
         )
     jobs.requeue_stale_submissions(database, folder.digest)
 
@@ -82,9 +82,9 @@ def remove_orphan_archives(database: Database, archives: ArchiveStore) -> None:
         rows = session.execute(select(SubmissionModel.id, SubmissionModel.status)).all()
     orphans = archives.ids() - {submission_id for submission_id, status in rows if status != DELETED}
     if orphans and not rows:
-        _LOG.warning("nothing cleared", reason="the database has no submissions", archives=len(orphans))
+        _LOG.warning("orphan cleanup skipped", reason="the database has no submissions", archives=len(orphans))
         return
     for submission_id in orphans:
         if archives.age_s(submission_id, now) > ORPHAN_AGE_S:
             archives.delete(submission_id)
-            _LOG.info("cleared", archive=submission_id[:6])
+            _LOG.info("orphaned archive deleted", archive=submission_id[:6])

@@ -40,34 +40,37 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix=ENVIRONMENT_PREFIX, extra="forbid", frozen=True)
 
-    data: str = Field(description="the dataset: a folder, or a Hub repository id")
-    state_dir: Path = Field(Path("leaderboard-state"), description="folder for all that the service keeps")
-    db: str = Field("", description="database URL; default: SQLite in the state folder")
-    archives: str = Field("", description="where archives are kept, any fsspec URL; default: the state folder")
-    host: str = Field("127.0.0.1", description="address to listen on")
-    port: int = Field(8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
-    title: str = Field("Rebar depth leaderboard", description="the page's title")
-    default_visibility: Literal["owner", "always"] = Field(
-        "always", description="always: every submission is on the board at once; owner: once its owner says so"
+    data: str = Field(description="dataset folder or Hub repository id")
+    state_dir: Path = Field(
+        Path("leaderboard-state"), description="folder for the database, archives and temporary files"
     )
-    quota: int = Field(10, ge=0, description="accepted submissions a token may make in a day (UTC)")
-    max_upload: ByteSize = Field(ByteSize(8 * GIB), gt=0, description="largest archive")
+    db: str = Field("", description="database URL; default: SQLite in the state folder")
+    archives: str = Field("", description="folder or fsspec URL for archives; default: in the state folder")
+    host: str = Field("127.0.0.1", description="address to listen on")
+    port: int = Field(8000, ge=0, le=65535, description="port to listen on; 0 selects a free port")
+    title: str = Field("Rebar depth leaderboard", description="title shown on the pages")
+    default_visibility: Literal["owner", "always"] = Field(
+        "always",
+        description="always: every scored submission is public; owner: only after its owner publishes it",
+    )
+    quota: int = Field(10, ge=0, description="accepted submissions per token and day (UTC)")
+    max_upload: ByteSize = Field(ByteSize(8 * GIB), gt=0, description="maximum size of an archive")
     error_maps: int = Field(
         0,
         ge=0,
         le=100,
-        description="worst views of a config shown as error maps, which tell the truth to whoever predicted",
+        description="worst views per config shown as error maps; these let a submitter compute the ground truth",
     )
-    rescore: bool = Field(False, description="score again, against this dataset, what was submitted for another")
-    workers: int = Field(1, ge=0, le=64, description="scoring processes that `serve` starts itself")
-    dask_scheduler: str = Field("", description="address of a dask scheduler whose workers score")
-    score_time: float = Field(3600.0, gt=0, description="longest that scoring an archive may take")
-    score_memory: ByteSize = Field(
-        ByteSize(4 * GIB), gt=0, description="most memory that scoring an archive may take"
+    rescore: bool = Field(False, description="score submissions for another dataset again, against this one")
+    workers: int = Field(1, ge=0, le=64, description="number of scoring processes that `serve` starts")
+    dask_scheduler: str = Field("", description="address of a dask scheduler whose workers score the archives")
+    score_time: float = Field(3600.0, gt=0, description="time limit for scoring an archive")
+    score_memory: ByteSize = Field(ByteSize(4 * GIB), gt=0, description="memory limit for scoring an archive")
+    lease_seconds: float = Field(
+        20.0, gt=0, description="time without a heartbeat from a worker after which its job is reassigned"
     )
-    lease_seconds: float = Field(20.0, gt=0, description="a scorer that is silent for so long has lost its job")
-    read_rate_limit: str = Field("600/minute", description="requests an address may make")
-    write_rate_limit: str = Field("60/minute", description="uploads and changes an address may make")
+    read_rate_limit: str = Field("600/minute", description="read requests per client address")
+    write_rate_limit: str = Field("60/minute", description="uploads and changes per client address")
 
     @field_validator("db")
     @classmethod

@@ -93,7 +93,7 @@ INPUT_FOLDER_OPTIONS = ("data", "predictions", "kitti", "methods", "reference")
 
 def add_archive(parser: argparse.ArgumentParser) -> None:
     """Add the positional argument ``archive``."""
-    parser.add_argument("archive", metavar="ARCHIVE", help="the submission's zip")
+    parser.add_argument("archive", metavar="ARCHIVE", help="submission archive (zip)")
 
 
 def add_data(parser: argparse.ArgumentParser) -> None:
@@ -103,7 +103,7 @@ def add_data(parser: argparse.ArgumentParser) -> None:
 
 def add_workers(parser: argparse.ArgumentParser) -> None:
     """Add the option ``--workers``."""
-    parser.add_argument("--workers", type=int, metavar="N", help="threads (default: one a core)")
+    parser.add_argument("--workers", type=int, metavar="N", help="number of threads (default: one per core)")
 
 
 def add_output_file(parser: argparse.ArgumentParser, option: str, summary: str) -> None:
@@ -145,15 +145,15 @@ def check_outputs(options: Mapping[str, object]) -> None:
     for name, output in outputs.items():
         option, target = f"--{name.replace('_', '-')}", output.resolve()
         if target in seen:
-            raise InputError(f"{option} and {seen[target]} both name {output}, expected a file each")
+            raise InputError(f"{option} and {seen[target]} both name {output}, expected different files")
         seen[target] = option
         for path in (*files, *folders):
             if path.exists() and target == path.resolve():
-                raise InputError(f"{option} names {output}, which is read: it would be overwritten")
+                raise InputError(f"{option} names {output}, which is an input and would be overwritten")
         for path in folders:
             if path.is_dir() and name != "out" and path.resolve() in target.parents:
                 raise InputError(
-                    f"{option} names {output}, which is inside {path}: expected a place outside the data"
+                    f"{option} names {output}, which is inside {path}: expected a path outside the input"
                 )
         if name != "out" or not target.is_dir():
             _check_writable(option, output, target)

@@ -62,7 +62,7 @@ class LeaderboardClient:
             raise InputError(f"{archive}: cannot be read: {error.strerror or error}") from None
         if response.status_code == 422:
             content = _json_object(response)
-            raise SubmissionError(str(archive), content.get("problems", [content.get("detail", "refused")]))
+            raise SubmissionError(str(archive), content.get("problems", [content.get("detail", "rejected")]))
         return self._checked(response, 202, "id")
 
     def token(self) -> dict[str, Any]:
@@ -90,7 +90,7 @@ class LeaderboardClient:
                 failed_polls += 1
                 if failed_polls > MAX_FAILED_POLLS:
                     raise
-                submission = {"status": "no answer, asking again"}
+                submission = {"status": "no response, retrying"}
             if submission["status"] in ("scored", "failed"):
                 progress(submission["status"], 1, 1)
                 return submission
@@ -104,7 +104,9 @@ class LeaderboardClient:
         """
         response = self._call("GET", f"submissions/{submission_id}/result.json")
         if response.status_code != 200:
-            raise ServiceError(f"{self._url}: answered {response.status_code} for the result, expected 200")
+            raise ServiceError(
+                f"{self._url}: the response status for the result is {response.status_code}, expected 200"
+            )
         content: bytes = response.content
         return content
 
@@ -112,16 +114,16 @@ class LeaderboardClient:
         try:
             return self._client.request(method, f"{self._url}/api/v1/{path}", **content)
         except (self._http.InvalidURL, self._http.UnsupportedProtocol) as error:
-            raise InputError(f"{self._url!r}: no address, expected http://HOST:PORT: {error}") from None
+            raise InputError(f"{self._url!r}: is not a valid URL, expected http://HOST:PORT: {error}") from None
         except self._http.HTTPError as error:
-            raise ServiceError(f"{self._url}: no answer: {error or type(error).__name__}") from None
+            raise ServiceError(f"{self._url}: no response: {error or type(error).__name__}") from None
 
     def _checked(self, response: Any, status: int, key: str) -> dict[str, Any]:
         """Return the JSON object of a response with ``status`` that has ``key``; raise its error otherwise."""
         content = _json_object(response)
         if response.status_code == status and key in content:
             return content
-        detail = content.get("detail", f"answered {response.status_code}, expected {status}")
+        detail = content.get("detail", f"the response status is {response.status_code}, expected {status}")
         error_type = InputError if 400 <= response.status_code < 500 else ServiceError
         raise error_type(f"{self._url}: {detail}")
 
@@ -156,6 +158,8 @@ def _httpx() -> ModuleType:
     try:
         import httpx2
     except ImportError as error:
-        raise InputError(f"submitting needs httpx2 ({error}): pip install 'rebar-depth-bench[submit]'") from None
+        raise InputError(
+            f"submitting requires httpx2 ({error}): pip install 'rebar-depth-bench[submit]'"
+        ) from None
     module: ModuleType = httpx2
     return module

@@ -96,7 +96,7 @@ def finite(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
         raise ValueError
     if abs(value) > _MAX_MAGNITUDE:
-        raise ValueError(f"got a number beyond {_MAX_MAGNITUDE:g}")
+        raise ValueError(f"got a number with a magnitude above {_MAX_MAGNITUDE:g}")
     return float(value)
 
 

@@ -74,8 +74,8 @@ def _spec_from_manifest(
         return make_spec(entry[key])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DatasetError(
-            f"manifest: the {key} of config {config} is {entry.get(key)!r}, expected one this version writes: "
-            f"{type(error).__name__}: {error}"
+            f"manifest: the {key} of config {config} is {entry.get(key)!r}, expected a value that this "
+            f"version writes: {type(error).__name__}: {error}"
         ) from None
 
 
@@ -129,7 +129,7 @@ def mesh_aim_point_m(mesh: Path) -> Float64[ndarray, " 3"]:
     vertices_m, faces, face_bar_id = read_mesh_ply(mesh)
     steel = vertices_m[np.unique(faces[face_bar_id != NOT_STEEL])]
     if not len(steel):
-        raise DatasetError(f"{mesh}: holds no steel, expected the bars of its scene")
+        raise DatasetError(f"{mesh}: contains no steel, expected the bars of its scene")
     return aim_point_m(Assembly((), (Part("steel", Mesh(steel, faces[:0]), 1, "steel"),)))
 
 
@@ -144,7 +144,9 @@ def checked_aim_point_m(entry: Mapping[str, Any], mesh: Path) -> tuple[Float64[n
         return middle_m, ()
     aim_m = np.asarray(entry["aim_point_m"], dtype=np.float64)
     if aim_m.shape != (3,) or not np.abs(aim_m - middle_m).max() <= _AIM_TOLERANCE_M:
-        return middle_m, (f"aim_point_m is {entry['aim_point_m']}, the steel's middle is {middle_m.tolist()}",)
+        return middle_m, (
+            f"aim_point_m is {entry['aim_point_m']}, expected {middle_m.tolist()}, the centre of the steel",
+        )
     return aim_m, ()
 
 
@@ -161,7 +163,7 @@ def expected_views(config: str, entry: Mapping[str, Any], aim_m: Float64[ndarray
             for index in subset(len(left_poses), len(entry["views"]))
         ]
     except ValueError as error:
-        raise DatasetError(f"manifest: the rig of config {config} gives no cameras: {error}") from None
+        raise DatasetError(f"manifest: the rig of config {config} is invalid: {error}") from None
 
 
 def view_list_problems(entry: Mapping[str, Any], views: Sequence[ExpectedView]) -> Iterator[str]:
@@ -173,12 +175,13 @@ def view_list_problems(entry: Mapping[str, Any], views: Sequence[ExpectedView]) 
             (pair for pair in zip(listed_ids, expected_ids, strict=False) if pair[0] != pair[1]), None
         )
         detail = (
-            f": the first that differs is {first_mismatch[0]}, expected {first_mismatch[1]}"
+            f": the first difference is {first_mismatch[0]}, expected {first_mismatch[1]}"
             if first_mismatch
             else ""
         )
         yield (
-            f"the manifest names {len(listed_ids)} views, its protocol gives {len(expected_ids)} of these{detail}"
+            f"the manifest lists {len(listed_ids)} views, expected the {len(expected_ids)} views of its protocol"
+            f"{detail}"
         )
 
 
@@ -192,7 +195,7 @@ def camera_problems(row: Mapping[str, Any], expected: ExpectedView) -> Iterator[
                 float(np.abs(value - expected_value).max()) if value.shape == expected_value.shape else np.inf
             )
             if not deviation <= CAMERA_TOLERANCE:
-                yield f"{eye}_{kind} is {deviation:.1e} off that of the protocol and the rig"
+                yield f"{eye}_{kind} differs by {deviation:.1e} from the value given by the protocol and the rig"
         if row[f"{eye}_depth"].shape != (camera.height, camera.width):
             yield f"{eye} grid is {row[f'{eye}_depth'].shape}, expected {(camera.height, camera.width)}"
     yield from _rig_problems(row, expected.baseline_m)
@@ -204,12 +207,12 @@ def _rig_problems(row: Mapping[str, Any], baseline_m: float) -> Iterator[str]:
     left_m, right_m = (camera_centre(row[f"{eye}_cam_from_world"]) for eye in EYES)
     centre_distance_m = float(np.linalg.norm(right_m - left_m))
     if not abs(centre_distance_m - row["baseline_m"]) <= 1e-9:
-        yield f"the eyes stand {centre_distance_m:.9f} m apart, baseline_m is {row['baseline_m']}"
+        yield f"the camera centres are {centre_distance_m:.9f} m apart, expected baseline_m = {row['baseline_m']}"
     for eye in EYES:
         rotation = row[f"{eye}_cam_from_world"][:3, :3]
         deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         if not deviation <= CAMERA_TOLERANCE or not np.linalg.det(rotation) > 0:
-            yield f"{eye}_cam_from_world is no rigid pose (off by {deviation:.1e})"
+            yield f"{eye}_cam_from_world is not a rigid pose (deviation {deviation:.1e})"
 
 
 MAX_PROJECTION_ERROR_PX = 1e-6
@@ -249,9 +252,9 @@ def projection_error_px(eye: EyeView) -> float:
 def projection_verdict(config: AuditedConfig, errors_px: Sequence[float]) -> Check:
     """Return the check of the largest reprojection error of the measured views."""
     worst_px = max(errors_px, default=0.0)
-    problem = f"a pixel's point lands {worst_px:.2e} px from it in cv2.projectPoints"
+    problem = f"cv2.projectPoints projects a pixel's 3-D point {worst_px:.2e} px away from the pixel"
     return Check(
-        f"{config.name}: points through OpenCV's lens model",
+        f"{config.name}: reprojection with OpenCV's lens model",
         f"{len(errors_px)} views: at most {worst_px:.1e} px",
         f"{MAX_PROJECTION_ERROR_PX:g} px",
         () if worst_px <= MAX_PROJECTION_ERROR_PX else (problem,),

@@ -59,11 +59,11 @@ def cycles_difference_m(
 
 def cycles_verdict(config: str, difference_and_depth_m: ndarray[Any, Any], views: int) -> Check:
     """Return the check of the depth differences of ``views`` views; it passes if no views were requested."""
-    name = f"{config}: depth against Cycles"
+    name = f"{config}: depth compared with Cycles"
     if not views:
-        return Check(name, "skipped", "none asked for")
+        return Check(name, "skipped", "no views requested")
     if not len(difference_and_depth_m):
-        return Check(name, f"{views} views: no steel", "left out")
+        return Check(name, f"{views} views: no steel", "skipped")
     difference_m, depth_m = difference_and_depth_m.T
     median_m, share = (
         float(np.median(difference_m)),
@@ -72,11 +72,11 @@ def cycles_verdict(config: str, difference_and_depth_m: ndarray[Any, Any], views
     bound_m = MAX_CYCLES_MEDIAN_RATIO * float(np.median(depth_m))
     measured = (
         f"{views} views: median {median_m * 1e6:.3f} um, 99.9 % {np.quantile(difference_m, 0.999) * 1e6:.2f} um, "
-        f"{share:.4%} over 1 mm a metre"
+        f"{share:.4%} over 1 mm/m"
     )
     return Check(
         name,
         measured,
-        f"median {bound_m * 1e6:.3g} um, {MAX_CYCLES_OUTLIER_SHARE:.1%} over 1 mm a metre",
+        f"median {bound_m * 1e6:.3g} um, {MAX_CYCLES_OUTLIER_SHARE:.1%} over 1 mm/m",
         () if median_m <= bound_m and share <= MAX_CYCLES_OUTLIER_SHARE else (measured,),
     )

@@ -23,8 +23,10 @@ def check_files(folder: DatasetFolder, root: Path) -> Check:
     unlisted = sorted(_existing_files(root) - set(listed) - {MANIFEST_FILE})
     problems += [f"{name}: is not in the manifest" for name in unlisted]
     if (root / BUILD_FOLDER).exists():
-        problems.append(f"{BUILD_FOLDER}: an unfinished build stands there; run rebar-build again or remove it")
-    return Check("files against the manifest", f"{len(listed)} files", "every SHA-256 equal", tuple(problems))
+        problems.append(
+            f"{BUILD_FOLDER}: the folder contains an unfinished build; run rebar-build again or remove it"
+        )
+    return Check("files against the manifest", f"{len(listed)} files", "all SHA-256 equal", tuple(problems))
 
 
 def check_digests(folder: DatasetFolder) -> Check:
@@ -76,11 +78,11 @@ def array_problems(row: Mapping[str, Any], rig: Mapping[str, Any]) -> Iterator[s
                 yield f"{eye} {kind} is {array.dtype} {array.shape}, expected {dtype} {expected}"
         depth_m = row[f"{eye}_depth"]
         if not np.isfinite(depth_m).all() or (depth_m < 0).any():
-            yield f"{eye} depth has values that are not finite or below 0"
+            yield f"{eye} depth has non-finite or negative values"
         for kind, shape in _MATRICES.items():
             matrix = row[f"{eye}_{kind}"]
             if matrix.shape != shape or not np.isfinite(matrix).all():
-                yield f"{eye}_{kind} is not {shape} of finite numbers"
+                yield f"{eye}_{kind} is not an array of finite numbers of shape {shape}"
 
 
 def row_problems(row: Mapping[str, Any], record: ViewRecord, bar_ids: set[int]) -> Iterator[str]:
@@ -104,11 +106,11 @@ def _ground_truth_problems(row: Mapping[str, Any], eye: str, bar_ids: set[int]) 
 
 def _record_problems(row: Mapping[str, Any], record: ViewRecord) -> Iterator[str]:
     if row["view_id"] != record.view_id:
-        yield f"the row's view_id is {row['view_id']}"
+        yield f"the row's view_id is {row['view_id']}, expected {record.view_id}"
     for eye, expected in (("left", record.left), ("right", record.right)):
         kinds = ("depth", "mask", "bars", "K", "distortion", "cam_from_world")
         if eye_digest(*(row[f"{eye}_{kind}"] for kind in kinds)) != expected:
-            yield f"{eye} ground truth has another digest than the manifest's"
+            yield f"{eye} ground-truth digest differs from the manifest's"
     scored = len(scored_pixels(row["left_mask"], row["left_depth"]))
     if (np.count_nonzero(row["left_mask"]), scored) != (record.steel_px, record.scored_px):
         yield "steel and scored pixel counts differ from the manifest's"

@@ -119,11 +119,11 @@ def polyline_distance_m(
 
 def axis_verdict(config: AuditedConfig, ratios: Sequence[float]) -> Check:
     """Return the check of the largest axis distance of all views; bars with estimated axes are left out."""
-    name, largest = f"{config.name}: steel on its bar's axis", max(ratios, default=0.0)
+    name, largest = f"{config.name}: steel distance from the bar axis", max(ratios, default=0.0)
     measured = f"at most {largest:.3f} radii"
     if not config.bars_with_known_axis:
-        return Check(name, "the axes are estimates", "left out")
-    problem = f"a steel pixel lies {largest:.3f} nominal radii from its bar's axis"
+        return Check(name, "the bar axes are estimated", "skipped")
+    problem = f"a steel pixel is {largest:.3f} nominal radii away from its bar's axis"
     return Check(name, measured, f"{MAX_AXIS_RATIO} radii", (problem,) if largest > MAX_AXIS_RATIO else ())
 
 
@@ -174,27 +174,27 @@ def board_verdict(config: AuditedConfig, errors: Sequence[BoardError]) -> Check:
     """
     name = f"{config.name}: board at z = 0"
     if config.board is None:
-        return Check(name, "no board in this scene", "left out")
+        return Check(name, "no board in this scene", "skipped")
     all_views = merged_board_errors(errors)
     if not all_views.pixels:
-        return Check(name, "no view sees the board", "left out")
+        return Check(name, "no view sees the board", "skipped")
     bound = f"{MAX_BOARD_ERROR_M * 1e6:g} um"
     if not config.has_props:
         measured = f"at most {all_views.off_m * 1e6:.3f} um"
         return Check(name, measured, bound, tuple(_plane_problems(all_views.off_m)))
     share = all_views.off_plane / all_views.pixels
-    measured = f"at most {all_views.near_m * 1e6:.3f} um, {share:.1%} hidden by things on the board"
+    measured = f"at most {all_views.near_m * 1e6:.3f} um, {share:.1%} occluded by objects on the board"
     problems = [*_plane_problems(max(all_views.near_m, all_views.below_m))]
     if share > _MAX_OCCLUDED_SHARE:
         problems.append(
-            f"{share:.1%} of the board's pixels lie above it, expected under {_MAX_OCCLUDED_SHARE:.0%}"
+            f"{share:.1%} of the board's pixels are occluded, expected less than {_MAX_OCCLUDED_SHARE:.0%}"
         )
     return Check(name, measured, bound, tuple(problems))
 
 
 def _plane_problems(off_m: float) -> Iterator[str]:
     if off_m > MAX_BOARD_ERROR_M:
-        yield f"a board pixel lies {off_m * 1e6:.3f} um from z = 0"
+        yield f"a board pixel is {off_m * 1e6:.3f} um away from z = 0"
 
 
 def _points_by_bar(

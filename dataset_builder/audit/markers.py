@@ -198,30 +198,32 @@ def marker_verdict(config: AuditedConfig, views: Sequence[ViewMarkers]) -> Check
     """Return the check of corners, detected share and poses of all views together."""
     name = f"{config.name}: ArUco markers"
     if config.board is None:
-        return Check(name, "no board in this scene", "left out")
+        return Check(name, "no board in this scene", "skipped")
     cameras_and_eyes = [pair for view in views for pair in view.eyes]
     eyes = [eye for _, eye in cameras_and_eyes]
     expected, detected = sum(eye.expected for eye in eyes), sum(len(eye.detected_px) for eye in eyes)
     if not expected:
-        return Check(name, f"none large enough: {MIN_MARKER_WIDTH_PX:g} px, whole and clear", "left out")
+        return Check(name, f"no unoccluded marker of {MIN_MARKER_WIDTH_PX:g} px or more", "skipped")
     min_share = 0.0 if config.has_lighting_variant else MIN_DETECTED_SHARE
     missing = (
-        () if detected >= min_share * expected else (f"{detected} of {expected} clear, large markers are found",)
+        ()
+        if detected >= min_share * expected
+        else (f"{detected} of {expected} unoccluded, large markers are detected",)
     )
     inset_px, corner_rms_px, centre_rms_px = fit_inset(eyes)
     errors = _nominal_pose_errors(cameras_and_eyes, inset_px)
     off_mm, off_deg = np.median(errors, axis=0).tolist() if len(errors) else (0.0, 0.0)
     poses = (
-        f"{len(errors)} poses back to {off_mm:.2f} mm a metre, {off_deg:.3f} deg"
+        f"{len(errors)} poses recovered within {off_mm:.2f} mm/m, {off_deg:.3f} deg"
         if len(errors)
-        else "no pose asked for"
+        else "no pose estimated"
     )
     return Check(
         name,
-        f"{detected} of {expected} found, markers {centre_rms_px:.2f} px and corners {corner_rms_px:.2f} px off "
-        f"after an inset of {inset_px:+.2f} px; {poses}",
-        f"{min_share:.0%} found, {MAX_CENTRE_RMS_PX} and {MAX_CORNER_RMS_PX} px, inset {MAX_INSET_PX:g} px; "
-        f"median {MAX_POSE_MM_PER_M:g} mm a metre, {MAX_POSE_DEG:g} deg",
+        f"{detected} of {expected} detected; RMS error {centre_rms_px:.2f} px (markers), "
+        f"{corner_rms_px:.2f} px (corners) after an inset of {inset_px:+.2f} px; {poses}",
+        f"{min_share:.0%} detected; {MAX_CENTRE_RMS_PX} and {MAX_CORNER_RMS_PX} px, inset {MAX_INSET_PX:g} px; "
+        f"median {MAX_POSE_MM_PER_M:g} mm/m, {MAX_POSE_DEG:g} deg",
         (*missing, *_marker_problems(inset_px, corner_rms_px, centre_rms_px, off_mm, off_deg)),
     )
 
@@ -264,10 +266,10 @@ def _marker_problems(
     inset_px: float, corner_rms_px: float, centre_rms_px: float, off_mm: float, off_deg: float
 ) -> Iterator[str]:
     if not centre_rms_px <= MAX_CENTRE_RMS_PX:
-        yield f"found markers lie {centre_rms_px:.2f} px (RMS) from where the cameras put them"
+        yield f"detected markers are {centre_rms_px:.2f} px (RMS) away from their projected positions"
     if not corner_rms_px <= MAX_CORNER_RMS_PX:
-        yield f"found corners lie {corner_rms_px:.2f} px (RMS) from where the cameras put them"
+        yield f"detected corners are {corner_rms_px:.2f} px (RMS) away from their projected positions"
     if not abs(inset_px) <= MAX_INSET_PX:
-        yield f"found corners lie {inset_px:+.2f} px inside the printed markers"
+        yield f"detected corners are {inset_px:+.2f} px inside the printed markers"
     if not (off_mm <= MAX_POSE_MM_PER_M and off_deg <= MAX_POSE_DEG):
-        yield f"solvePnP on found markers lands {off_mm:.2f} mm a metre, {off_deg:.3f} degrees from the poses"
+        yield f"poses from solvePnP differ from the stored poses by {off_mm:.2f} mm/m and {off_deg:.3f} degrees"

@@ -130,10 +130,10 @@ def best_shift_px(cost: Float64[ndarray, " n"]) -> float:
 
 def photometric_verdict(config: AuditedConfig, fits: Sequence[PhotometricFit]) -> Check:
     """Return the check of the best shift of all views together, and of each view alone."""
-    name = f"{config.name}: right colour in left through depth"
+    name = f"{config.name}: right image warped to the left by depth"
     pixels = sum(fit.pixels for fit in fits)
     if pixels < _MIN_PIXELS:
-        return Check(name, f"only {pixels} pixels with texture that both eyes see", "left out")
+        return Check(name, f"only {pixels} textured pixels visible to both eyes", "skipped")
     u_px, v_px = (best_shift_px(row) for row in np.sum([fit.cost for fit in fits], axis=0))
     judged = [fit for fit in fits if fit.pixels >= _MIN_VIEW_PIXELS]
     worst_px = max((abs(best_shift_px(row)) for fit in judged for row in fit.cost), default=0.0)
@@ -141,11 +141,14 @@ def photometric_verdict(config: AuditedConfig, fits: Sequence[PhotometricFit]) -
     bound_px = MAX_SHIFT_PX + SHIFT_NOISE_PX / pixels**0.5
     if not max(abs(u_px), abs(v_px)) <= bound_px:
         problems.append(
-            f"the right pictures fit best {u_px:+.2f}, {v_px:+.2f} px beside where ground truth puts them"
+            f"the right images match best at an offset of {u_px:+.2f}, {v_px:+.2f} px from the ground-truth "
+            "position"
         )
     if not worst_px <= MAX_VIEW_SHIFT_PX:
-        problems.append(f"the pictures of one view fit best {worst_px:.2f} px beside where ground truth puts them")
-    surfaces = ("steady surfaces", "close steel")
+        problems.append(
+            f"the images of one view match best at an offset of {worst_px:.2f} px from the ground-truth position"
+        )
+    surfaces = ("view-independent surfaces", "close-range steel")
     surface_texts = [
         f"{surface} {_nanmedian([fit.off_levels[n] for fit in fits]):.1f} levels, correlation "
         f"{_nanmedian([fit.correlation[n] for fit in fits]):.2f}"

@@ -71,7 +71,7 @@ def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent
         raise InputError(f"--depth-views is {depth_views}, expected 0 or more")
     folder = open_folder(root)
     if folder.local is None:
-        raise DatasetError(f"{root}: is not a folder on this machine, expected one to audit")
+        raise DatasetError(f"{root}: is not a local folder, expected a dataset folder on this machine")
     files = check_files(folder, folder.local)
     checks = [files, check_digests(folder)]
     if files.passed:  # Rows of damaged files cannot be checked.
@@ -152,7 +152,7 @@ class _AuditAccumulator:
         problems = list(self._problems)
         if self.rows != len(self._records):
             problems.append(
-                f"{self._config.name} has {self.rows} rows, the manifest names {len(self._records)} views"
+                f"{self._config.name} has {self.rows} rows, expected the manifest's {len(self._records)} views"
             )
         return Check(f"{self._config.name}: rows", f"{self.rows} views", "all invariants", tuple(problems))
 

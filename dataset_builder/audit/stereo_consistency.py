@@ -108,15 +108,15 @@ def epipolar_counts(view: AuditedView, steel: Iterable[Bar]) -> EpipolarCounts:
 
 def epipolar_verdict(config: AuditedConfig, views: Sequence[EpipolarCounts]) -> Check:
     """Return the check of the share of contradicted pixels of all views."""
-    name = f"{config.name}: left in right through depth"
+    name = f"{config.name}: left steel projected into the right eye"
     seen, hidden, contradicted = (
         sum(getattr(counts, kind) for counts in views) for kind in ("seen", "hidden", "contradicted")
     )
     inside = seen + hidden + contradicted
     if not inside:
-        return Check(name, "no bar of two pixels or more", "left out")
+        return Check(name, "no bar is two pixels wide or more", "skipped")
     share = contradicted / inside
-    problem = f"{contradicted} of {inside} steel pixels should be seen by the right eye and are not"
+    problem = f"{contradicted} of {inside} steel pixels should be visible to the right eye but are not"
     return Check(
         name,
         f"{seen / inside:.1%} seen, {hidden / inside:.1%} hidden, {share:.4%} contradicted",

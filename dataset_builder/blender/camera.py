@@ -65,7 +65,7 @@ def _compiled_shader() -> str:
         source_file, oso_file = Path(scratch, SHADER), Path(scratch, "camera.oso")
         source_file.write_text(source, encoding="utf-8")
         if not _cycles.osl_compile(str(source_file), str(oso_file)):
-            raise BuildError(f"Blender cannot compile its camera shader {SHADER}; its log has the reason")
+            raise BuildError(f"Blender cannot compile its camera shader {SHADER}; see its log for the reason")
         return oso_file.read_text(encoding="utf-8")
 
 
@@ -92,7 +92,7 @@ def place_camera(camera: Camera) -> float:
     pixel aspect.
     """
     if camera.K[0, 1] != 0.0 or camera.K[1, 0] != 0.0:
-        raise ValueError(f"Blender's camera has no skew, K has:\n{camera.K}")
+        raise ValueError(f"Blender cameras cannot have skew, but K is:\n{camera.K}")
     blender_camera = _scene_camera()
     distorted = camera.distortion.any()
     _set_resolution(camera.width, camera.height, aspect=1.0 if distorted else camera.K[1, 1] / camera.K[0, 0])
@@ -107,7 +107,7 @@ def place_camera(camera: Camera) -> float:
     deviation = float(np.abs(blender_cam_from_world() - camera.cam_from_world).max())
     if deviation > MAX_POSE_DEVIATION:
         raise BuildError(
-            f"Blender holds a camera pose {deviation:.2e} off the one asked for:\n{camera.cam_from_world}"
+            f"Blender's camera pose differs by {deviation:.2e} from the requested pose:\n{camera.cam_from_world}"
         )
     return deviation
 
@@ -133,7 +133,7 @@ def _set_resolution(width: int, height: int, aspect: float) -> None:
     Raises ``ValueError`` if the aspect is outside Blender's range.
     """
     if not 1 / 200 <= aspect <= 200:
-        raise ValueError(f"fy / fx is {aspect}, Blender's pixel aspect reaches from 1/200 to 200")
+        raise ValueError(f"fy / fx is {aspect}, expected 1/200 to 200 (Blender's range of pixel aspects)")
     render = bpy.context.scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
     render.pixel_aspect_x = max(aspect, 1.0)

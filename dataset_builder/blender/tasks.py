@@ -140,8 +140,8 @@ def _stage_mesh(mesh: WorldMesh, path: Path, expected_sha256: str | None) -> Non
     actual = file_sha256(own_path)
     if expected not in (None, actual):
         raise BuildError(
-            f"{own_path}: the scene's mesh has sha256 {actual}, expected {expected}, which other views of the "
-            "config were cast against"
+            f"{own_path}: the scene's mesh has sha256 {actual}, expected {expected} as for the "
+            "config's other views"
         )
     own_path.replace(path)
 

@@ -133,7 +133,7 @@ class BuildRequest:
         duplicates = sorted({name for name in names if names.count(name) > 1})
         if duplicates:
             raise InputError(
-                f"more than one config would be named {', '.join(duplicates)}: give a scene another name"
+                f"more than one config is named {', '.join(duplicates)}, expected unique names: rename the scene"
             )
         return specs
 
@@ -161,7 +161,7 @@ class BuildRequest:
         if self.mesh is None:
             return spec.scene.assembly
         if not isinstance(spec.scene.assembly, LatticeSpec):
-            raise InputError(f"--mesh takes the place of the lattice's rods, but {spec.name} is no lattice")
+            raise InputError(f"--mesh replaces the rods of a lattice, but config {spec.name} is not a lattice")
         return self.mesh
 
 

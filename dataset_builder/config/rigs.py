@@ -74,7 +74,7 @@ def rig_cameras(rig: RigSpec, cam_from_world: Float64[ndarray, "4 4"]) -> dict[s
 
 def _ideal_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
     if rig.calibration is not None:
-        raise ValueError("a rig with a calibration is seen on grid 'raw' or 'rectified', not 'ideal'")
+        raise ValueError("the grid of a rig with a calibration is 'ideal', expected 'raw' or 'rectified'")
     return _pinholes(rig, ideal_K(rig.width, rig.height), left)
 
 
@@ -106,10 +106,10 @@ def _pinholes(rig: RigSpec, K: Float64[ndarray, "3 3"], left: Pose) -> dict[str,
 
 def _scaled_calibration(rig: RigSpec) -> StereoCalibration:
     if rig.calibration is None:
-        raise ValueError(f"a rig on grid {rig.grid!r} needs a calibration")
+        raise ValueError(f"a rig with grid {rig.grid!r} requires a calibration")
     baseline_m = calibrated_baseline_m(rig.calibration)
     if not isclose(rig.baseline_m, baseline_m, rel_tol=1e-12):
-        raise ValueError(f"the rig's baseline_m is {rig.baseline_m}, its calibration's {baseline_m}")
+        raise ValueError(f"the rig's baseline_m is {rig.baseline_m}, expected {baseline_m} as in its calibration")
     return scale_calibration(rig.calibration, rig.width, rig.height)
 
 

@@ -69,17 +69,17 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     misfit = _laboratory_misfit(assembly, camera_radius_m)
     environment = scene_toml.environment or ("outdoors" if misfit else "laboratory")
     if environment == "laboratory" and misfit:
-        raise InputError(f'{path}: {misfit}: stand it at the origin, or choose environment = "outdoors"')
+        raise InputError(f'{path}: {misfit}: place the cage at the origin, or set environment = "outdoors"')
     if camera_radius_m > OUTDOORS_CAMERA_RADIUS_M and scene_toml.trajectory is None:
         raise InputError(
-            f"{path}: the cage is too large for the dome that is fitted to it: cameras would stand "
-            f"{camera_radius_m:.4g} m from the world's origin, at most {OUTDOORS_CAMERA_RADIUS_M} m is clear; "
-            "is the unit right, does the cage stand at the origin? Else give [cameras] in a TOML file"
+            f"{path}: the cage is too large for the default camera dome: cameras would be "
+            f"{camera_radius_m:.4g} m from the world's origin, expected at most {OUTDOORS_CAMERA_RADIUS_M} m. "
+            "Check the unit and the position of the cage, or define [cameras] in a TOML file"
         )
     if camera_radius_m > OUTDOORS_CAMERA_RADIUS_M:
         raise InputError(
-            f"{path}: cameras stand {camera_radius_m:.4g} m from the world's origin, expected at most "
-            f"{OUTDOORS_CAMERA_RADIUS_M} m: is the unit right, and does the cage stand at the origin?"
+            f"{path}: cameras are {camera_radius_m:.4g} m from the world's origin, expected at most "
+            f"{OUTDOORS_CAMERA_RADIUS_M} m: is the unit right, and is the cage at the origin?"
         )
     check_fits(assembly, config)
     markers = _DEFAULT_MARKERS[environment] if scene_toml.board is None else scene_toml.board
@@ -104,7 +104,7 @@ def _read_scene(path: Path) -> SceneToml:
     if suffix == ".ifc":
         return replace(_ALL_DEFAULTS, ifc=path.name)
     if suffix != ".toml":
-        raise InputError(f"{path}: scenes of kind {suffix!r} are not read, expected .toml or .ifc")
+        raise InputError(f"{path}: unsupported scene file type {suffix!r}, expected .toml or .ifc")
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -120,7 +120,7 @@ def _check_name(name: str, path: Path) -> None:
     except ValueError:
         raise InputError(
             f"{path}: the scene would be named {name!r}, expected {name_type.expected}: rename the file, "
-            "or give a name in a TOML file"
+            "or set its name in a TOML file"
         ) from None
 
 
@@ -141,12 +141,12 @@ def _laboratory_misfit(assembly: Assembly, camera_radius_m: float) -> str | None
     steel_radius_m = float(np.linalg.norm(assembly.vertices_m[:, :2], axis=1).max())
     if steel_radius_m > LABORATORY_STEEL_RADIUS_M:
         return (
-            f"the steel reaches {steel_radius_m:.4g} m from the laboratory's middle, "
-            f"expected {LABORATORY_STEEL_RADIUS_M} m"
+            f"the steel extends {steel_radius_m:.4g} m from the laboratory's centre, "
+            f"expected at most {LABORATORY_STEEL_RADIUS_M} m"
         )
     if camera_radius_m > LABORATORY_CAMERA_RADIUS_M:
         return (
-            f"cameras stand {camera_radius_m:.4g} m from the laboratory's middle, "
-            f"expected {LABORATORY_CAMERA_RADIUS_M} m"
+            f"cameras are {camera_radius_m:.4g} m from the laboratory's centre, "
+            f"expected at most {LABORATORY_CAMERA_RADIUS_M} m"
         )
     return None

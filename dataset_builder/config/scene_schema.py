@@ -136,9 +136,9 @@ class SceneToml:
 
 def scene_name_type(reserved: Collection[str]) -> FieldType[str]:
     """Return the field type of scene names: none of ``reserved``, not ending in the name of a variant."""
-    expected = "a name of small letters, digits and hyphens that starts with a letter or digit"
+    expected = "a name of lower-case letters, digits and hyphens that starts with a letter or digit"
     if reserved:
-        expected += f", is none of {', '.join(reserved)} and ends in no variant's name"
+        expected += f", is not one of {', '.join(reserved)} and does not end in a variant's name"
     return string_matching(
         expected, lambda name: bool(_NAME.fullmatch(name)) and name not in reserved and not _is_variant(name)
     )
@@ -164,7 +164,7 @@ def read_scene_toml(content: bytes, where: str, reserved: Collection[str] = ()) 
     source_keys = [key for key in SOURCES if key in table.values]
     if len(source_keys) != 1:
         given_keys = " and ".join(source_keys) or "none of them"
-        problems.append(f"{given_keys} given, expected exactly one of [[bar]] tables, mesh and ifc")
+        problems.append(f"found {given_keys}, expected exactly one of [[bar]] tables, mesh and ifc")
     environment = table.optional("environment", one_of(*ENVIRONMENTS))
     board = table.optional("board", FieldType("6, 12 or false", _marker_count))
     cameras = table.optional("cameras", TABLE)
@@ -179,7 +179,7 @@ def _parse_toml(content: bytes, where: str) -> dict[str, Any]:
     try:
         return tomllib.loads(content.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
-        raise InputError(f"{where}: byte {error.start} is no UTF-8 text, expected a TOML file") from error
+        raise InputError(f"{where}: not UTF-8: byte {error.start} is invalid, expected a TOML file") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: not a TOML file: {error}") from error
 
@@ -237,11 +237,11 @@ def _read_trajectory(table: TableReader, unit_m: float) -> DomeSpec | RingSpec |
 def _check_cameras(table: TableReader, nearest_m: float, views: int) -> None:
     if nearest_m < RigSpec.baseline_m:
         table.problems.append(
-            f"{table.where[:-1]}: the nearest stand {nearest_m:.4g} m from the aim point, expected at least the "
-            f"rig's baseline, {RigSpec.baseline_m} m: is the unit right?"
+            f"{table.where[:-1]}: the nearest cameras are {nearest_m:.4g} m from the aim point, expected at least "
+            f"the rig's baseline, {RigSpec.baseline_m} m: is the unit right?"
         )
     if views > MAX_VIEWS:
-        table.problems.append(f"{table.where[:-1]}: {views} views asked for, expected at most {MAX_VIEWS}")
+        table.problems.append(f"{table.where[:-1]}: {views} views requested, expected at most {MAX_VIEWS}")
 
 
 _ROLE = string_matching(
@@ -269,7 +269,8 @@ def _read_bars(tables: tuple[Mapping[str, Any], ...], unit_m: float, problems: l
         bar_id = row["id"]
         if bar_id in number_of_id:
             problems.append(
-                f"[[bar]] {bar_number}: id {bar_id} is that of [[bar]] {number_of_id[bar_id]}, expected another"
+                f"[[bar]] {bar_number}: id {bar_id} is already used by [[bar]] {number_of_id[bar_id]}, "
+                "expected a unique id"
             )
         elif bar_id is not None:
             number_of_id[bar_id] = bar_number

@@ -67,7 +67,8 @@ class PinnedFile:
         actual_sha256 = hashlib.sha256(content).hexdigest()
         if actual_sha256 != self.sha256:
             raise MeshError(
-                f"{self.path}: changed since it was chosen: sha256 {actual_sha256} found, {self.sha256} expected"
+                f"{self.path}: the file has changed since it was selected: its sha256 is {actual_sha256}, "
+                f"expected {self.sha256}"
             )
         return content
 

@@ -90,7 +90,7 @@ def _select_view_ids(folder: DatasetFolder, config: str, views: int | None) -> l
     """
     view_ids = [record.view_id for record in folder.views(config)]
     if not _FOLDER_NAME.fullmatch(config):
-        raise DatasetError(f"{folder.root}: the name of config {config!r} cannot be a folder's name")
+        raise DatasetError(f"{folder.root}: the name of config {config!r} is not a valid folder name")
     if views is not None and views < 1:
         raise InputError(f"--views is {views}, expected 1 or more")
     return [view_ids[index] for index in subset(len(view_ids), views)]

@@ -43,12 +43,12 @@ def export_target(to: Path, folder: DatasetFolder, wanted: Mapping[str, Sequence
     try:
         to.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{to}: cannot be made: {error.strerror}") from None
+        raise InputError(f"{to}: cannot be created: {error.strerror}") from None
     with ExitStack() as stack:
         try:
             stack.enter_context(exclusive_lock(to))  # Locking the folder itself leaves no file behind.
         except BlockingIOError:
-            raise InputError(f"{to}: another export is at work there") from None
+            raise InputError(f"{to}: another export is using this folder") from None
         exported = _merged_configs(to, folder, wanted)
         for temporary in to.rglob(TEMPORARY_PATTERN):
             temporary.unlink()
@@ -64,12 +64,12 @@ def _check_target(to: Path, folder: DatasetFolder) -> None:
         raise InputError(f"{to}: is a file, expected a folder")
     root = Path(folder.root).resolve()
     if to.resolve().is_relative_to(root):
-        raise InputError(f"{to}: lies in the dataset folder {folder.root}, expected a folder outside of it")
+        raise InputError(f"{to}: is inside the dataset folder {folder.root}, expected a folder outside it")
     if to.is_dir() and not (to / MARKER).is_file():
         foreign = sorted(path.name for path in to.iterdir() if not path.match(_PARTIAL_MARKER))
         if foreign:
             raise InputError(
-                f"{to}: is not empty (it holds {foreign[0]}) and has no {MARKER}, "
+                f"{to}: is not empty (it contains {foreign[0]}) and has no {MARKER}, "
                 "expected a new or an empty folder"
             )
 
@@ -100,13 +100,13 @@ def _read_marker(path: Path, folder: DatasetFolder) -> dict[str, _ExportedConfig
             for name, entry in marker["configs"].items()
         }
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: cannot be read as the record of an export: {error!r}") from None
+        raise InputError(f"{path}: is not a readable export record: {error!r}") from None
     if format_name != FORMAT:
         raise InputError(f"{path}: format is {format_name!r}, expected {FORMAT!r}")
     if dataset != folder.digest:
         raise InputError(
-            f"{path.parent}: holds an export of dataset {dataset}, but {folder.root} is {folder.digest}; "
-            "choose another folder"
+            f"{path.parent}: contains an export of dataset {dataset}, expected {folder.digest} "
+            f"as in {folder.root}; choose another folder"
         )
     return exported
 
@@ -115,12 +115,12 @@ def _check_same_build(to: Path, name: str, earlier: _ExportedConfig, wanted: _Ex
     """Raise ``InputError`` if a config was exported from another build or has unselected views."""
     if earlier.key != wanted.key:
         raise InputError(
-            f"{to}: holds config {name} of another build (key {earlier.key[:16]}, now {wanted.key[:16]}): "
-            "the same ground truth under other pictures; choose another folder"
+            f"{to}: contains config {name} of another build (key {earlier.key[:16]}, now {wanted.key[:16]}): "
+            "the ground truth is the same, but the images may differ; choose another folder"
         )
     dropped = set(earlier.views) - set(wanted.views)
     if dropped:
         raise InputError(
-            f"{to}: holds {len(earlier.views)} views of {name}, {len(dropped)} of which are not among the "
-            f"{len(wanted.views)} asked for, such as {min(dropped)}; ask for more views or choose another folder"
+            f"{to}: contains {len(earlier.views)} views of {name}, {len(dropped)} of which are not among the "
+            f"{len(wanted.views)} requested, such as {min(dropped)}; request more views or choose another folder"
         )

@@ -49,13 +49,13 @@ class StoredView:
         try:
             decoded = decode_row(self.row)
         except (OSError, ValueError) as error:
-            raise DatasetError(f"view {self.record.view_id}: a picture cannot be decoded: {error}") from error
+            raise DatasetError(f"view {self.record.view_id}: an image cannot be decoded: {error}") from error
         for eye, expected in (("left", self.record.left), ("right", self.record.right)):
             digest = eye_digest(*(decoded[f"{eye}_{kind}"] for kind in _TRUTH_KINDS))
             if digest != expected:
                 raise DatasetError(
                     f"view {self.record.view_id}: the {eye} ground truth has digest {digest[:16]}, "
-                    f"the manifest says {expected[:16]}"
+                    f"expected {expected[:16]} as in the manifest"
                 )
         return decoded
 

@@ -39,7 +39,7 @@ def lidar_method(name: str, spec: ScannerSpec, what: str) -> MultiViewMethod:
 
     def check(_: ConfigViews) -> None:
         if find_spec("embreex") is None:
-            raise MethodError(f"{name} needs embreex to cast rays: pip install 'rebar-depth-bench[build]'")
+            raise MethodError(f"{name} requires embreex for ray casting: pip install 'rebar-depth-bench[build]'")
 
     def prepare(views: ConfigViews, _: Path, progress: Progress) -> Prepared:
         from dataset_builder.scene.raycast import RayCaster

@@ -87,7 +87,7 @@ class ScannerSpec:
             "elevation limits are not two angles from -90 to 90 degrees": not (
                 -math.pi / 2 <= lowest <= highest <= math.pi / 2
             ),
-            "the beam's width is below 0": not (self.divergence_rad >= 0 and self.exit_diameter_m >= 0),
+            "the beam width is below 0": not (self.divergence_rad >= 0 and self.exit_diameter_m >= 0),
             "rays_per_beam is not 1 or an even number": self.rays_per_beam != 1
             and (self.rays_per_beam < 2 or self.rays_per_beam % 2 == 1),
             "range_resolution_m is below 0": not self.range_resolution_m >= 0,
@@ -96,9 +96,8 @@ class ScannerSpec:
             "noise is below 0": not (self.noise_m >= 0 and self.noise_per_m >= 0),
         }
         if any(violations.values()):
-            raise ValueError(
-                f"no scanner: {'; '.join(message for message, violated in violations.items() if violated)}: {self}"
-            )
+            problems = "; ".join(message for message, violated in violations.items() if violated)
+            raise ValueError(f"invalid scanner: {problems}: {self}")
 
     @property
     def divergence_sigma_rad(self) -> float:

@@ -110,7 +110,7 @@ class BlenderProcesses:
     def _start(self, log: Path) -> subprocess.Popen[bytes]:
         with self._lock:
             if self._closed:
-                raise RenderProcessError("the build is ending, no further render process is started")
+                raise RenderProcessError("the build is ending; no further render process is started")
             process = subprocess.Popen(
                 [sys.executable, "-m", "dataset_builder.blender", str(log)],
                 stdin=subprocess.PIPE,
@@ -152,7 +152,8 @@ def _dispatch_event(event: Event, on_event: Callable[[Event], None]) -> None:
 def _failure_message(label: str, status: int, attempts: int, log: Path) -> str:
     reason = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
     tail = log.read_text(errors="replace").splitlines()[-_LOG_TAIL_LINES:] if log.is_file() else []
-    log_excerpt = "\n".join(f"  | {line}" for line in tail) or "  | (it printed nothing)"
+    log_excerpt = "\n".join(f"  | {line}" for line in tail) or "  | (no output)"
     return (
-        f"the render process for {label} died {attempts} times, last by {reason}; the end of {log}:\n{log_excerpt}"
+        f"the render process for {label} died {attempts} times, the last time with {reason}; "
+        f"end of {log}:\n{log_excerpt}"
     )

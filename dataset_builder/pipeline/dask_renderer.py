@@ -94,12 +94,13 @@ def _translate_dask_errors(renderer: ClusterRenderer, address: str) -> Iterator[
         yield
     except KilledWorker as error:
         raise RenderProcessError(
-            f"{_task_label(renderer, error.task)}: {error.allowed_failures + 1} workers died while they rendered "
-            f"it, the last at {error.last_worker.address}; their own logs say why"
+            f"{_task_label(renderer, error.task)}: {error.allowed_failures + 1} workers died while rendering "
+            f"it, the last at {error.last_worker.address}; see the logs of these workers for the reason"
         ) from None
     except CancelledError:
         raise BuildError(
-            f"the dask scheduler at {address} was lost; run the same command again to go on when it is up"
+            f"the dask scheduler at {address} was lost; run the same command again to continue "
+            "when the scheduler is running"
         ) from None
 
 
@@ -124,12 +125,14 @@ def _connect(address: str) -> distributed.Client:
     try:
         get_address_host_port(address)  # A client that fails on an invalid address does not close cleanly.
     except ValueError as error:
-        raise InputError(f"--cluster {address}: is no address ({_first_line(error)}), {expected}") from None
+        raise InputError(
+            f"--cluster {address}: is not a valid address ({_first_line(error)}), {expected}"
+        ) from None
     try:
         return distributed.Client(address, timeout=_CONNECT_S, set_as_default=False, name="rebar-build")
     except (OSError, ImportError) as error:
         raise InputError(
-            f"--cluster {address}: no dask scheduler answers there ({_first_line(error)}), {expected}"
+            f"--cluster {address}: no dask scheduler responds at this address ({_first_line(error)}), {expected}"
         ) from None
 
 
@@ -139,7 +142,7 @@ def _check_workers(client: distributed.Client, address: str) -> None:
         client.wait_for_workers(1, timeout=_CONNECT_S)
     except TimeoutError:
         raise InputError(
-            f"--cluster {address}: has no workers after {_CONNECT_S} s, expected one or more: "
+            f"--cluster {address}: the scheduler has no workers after {_CONNECT_S} s, expected at least one: "
             f"on each machine that renders, run: dask worker {address} --nthreads 1"
         ) from None
     expected_versions = generator_versions()
@@ -210,7 +213,7 @@ def _make_progress_reporter(worker: Any) -> OnViewDone:
     def report_view(index: int) -> None:
         task = worker.state.tasks.get(key)
         if task is None or task.state == "cancelled":
-            raise BuildError("the build that asked for this unit has ended")
+            raise BuildError("the build that requested this unit has ended")
         worker.log_event(key, index)
 
     return report_view

@@ -49,12 +49,12 @@ def build_lock(folder: Path) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder.parent}: cannot be made or written to: {error.strerror}") from None
+        raise InputError(f"{folder.parent}: cannot be created or written to: {error.strerror}") from None
     with ExitStack() as stack:
         try:
             stack.enter_context(exclusive_lock(folder / LOCK))
         except BlockingIOError:
-            raise InputError(f"{folder.parent}: another rebar-build is at work there") from None
+            raise InputError(f"{folder.parent}: another rebar-build process is using this folder") from None
         yield
 
 
@@ -88,7 +88,9 @@ def check_folder(out: Path) -> None:
     if (out / MANIFEST_FILE).is_file():
         read_manifest(out / MANIFEST_FILE)
     elif out.is_dir() and any(out.iterdir()) and not (out / BUILD_FOLDER / LOCK).is_file():
-        raise InputError(f"{out}: is not empty and holds no {MANIFEST_FILE}, expected a new or a dataset folder")
+        raise InputError(
+            f"{out}: is not empty and has no {MANIFEST_FILE}, expected a new folder or a dataset folder"
+        )
 
 
 def check_retained_files(out: Path, plans: Sequence[ConfigPlan]) -> None:
@@ -98,7 +100,7 @@ def check_retained_files(out: Path, plans: Sequence[ConfigPlan]) -> None:
         missing_files = [file for file in (*entry["shards"], entry["mesh"]) if not (out / file).is_file()]
         if missing_files and name not in planned:
             raise InputError(
-                f"{out}: {missing_files[0]} of config {name} is missing; build it again too: --config {name}"
+                f"{out}: {missing_files[0]} of config {name} is missing; rebuild this config too: --config {name}"
             )
 
 
@@ -111,8 +113,8 @@ def check_shared_scenes(out: Path, plans: Sequence[ConfigPlan]) -> None:
             same_name = entry["scene"]["name"] == scene["name"]
             if name not in planned and same_name and entry["scene"] != json.loads(json.dumps(scene)):
                 raise InputError(
-                    f"{out}: config {name} was built on scene {scene['name']!r} with other parameters; "
-                    f"build it again too (--config {name} {plan.spec.name}) or choose another folder"
+                    f"{out}: config {name} was built with other parameters of scene {scene['name']!r}; "
+                    f"rebuild it too (--config {name} {plan.spec.name}) or choose another folder"
                 )
 
 

@@ -95,7 +95,7 @@ def check_software_versions(expected: Mapping[str, str], worker: str, actual: Ma
     ]
     if different:
         raise InputError(
-            f"worker {worker} has other software than the machine that builds: {'; '.join(different)}"
+            f"worker {worker} has other software versions than the building machine: {'; '.join(different)}"
         )
 
 
@@ -120,7 +120,7 @@ def accept_result(unit: WorkUnit, result: UnitResult, staging: Staging) -> None:
     known_mesh_sha256 = _known_mesh_sha256(staging)
     problems = [*_mesh_problems(unit, result, staging, known_mesh_sha256), *_row_problems(unit, result, staging)]
     if problems:
-        raise BuildError(f"{unit.label}, rendered by {result.worker}: refused: {'; '.join(problems)}")
+        raise BuildError(f"{unit.label}, rendered by {result.worker}: rejected: {'; '.join(problems)}")
     if known_mesh_sha256 is None or not _mesh_digest_path(staging).is_file():
         write_text(_mesh_digest_path(staging), result.mesh_sha256)
     if result.mesh is not None:
@@ -134,11 +134,11 @@ def _mesh_problems(
 ) -> Iterator[str]:
     if known_mesh_sha256 not in (None, result.mesh_sha256):
         yield (
-            f"its mesh has sha256 {result.mesh_sha256}, "
-            f"the config's other views were cast against {known_mesh_sha256}"
+            f"its mesh has sha256 {result.mesh_sha256}, expected "
+            f"{known_mesh_sha256} as for the config's other views"
         )
     if result.mesh is not None and _sha256(result.mesh) != result.mesh_sha256:
-        yield f"the mesh arrived as sha256 {_sha256(result.mesh)}, expected {result.mesh_sha256}"
+        yield f"the received mesh has sha256 {_sha256(result.mesh)}, expected {result.mesh_sha256}"
     if unit.with_mesh and result.mesh is None and not staging.mesh.is_file():
         yield "the mesh is missing"
 
@@ -150,9 +150,9 @@ def _row_problems(unit: WorkUnit, result: UnitResult, staging: Staging) -> Itera
             yield f"view {index} is missing"
     for row in result.rows:
         if row.index not in unit.indices:
-            yield f"view {row.index} was not asked for"
+            yield f"view {row.index} was not requested"
         if _sha256(row.content) != row.sha256:
-            yield f"view {row.index} arrived as sha256 {_sha256(row.content)}, expected {row.sha256}"
+            yield f"view {row.index} was received with sha256 {_sha256(row.content)}, expected {row.sha256}"
 
 
 def _known_mesh_sha256(staging: Staging) -> str | None:

@@ -44,14 +44,15 @@ def _whole_pixels(pixels: float, spec: BoardSpec, px_per_m: float) -> int:
     """Return ``pixels`` rounded; raise ``ValueError`` if it is not a whole number (to 1e-6)."""
     if abs(pixels - round(pixels)) > 1e-6:
         raise ValueError(
-            f"at {px_per_m} px/m an edge of the board {spec} falls {pixels:.4f} pixels in, on no pixel edge"
+            f"at {px_per_m} px/m an edge of the board {spec} is at {pixels:.4f} pixels, "
+            "expected a whole number of pixels"
         )
     return round(pixels)
 
 
 def _dictionary(spec: BoardSpec) -> cv2.aruco.Dictionary:
     if not spec.dictionary.startswith("DICT_4X4_"):
-        raise ValueError(f"the board knows 4 x 4 dictionaries, not {spec.dictionary}")
+        raise ValueError(f"dictionary is {spec.dictionary}, expected a 4 x 4 dictionary")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
 
 

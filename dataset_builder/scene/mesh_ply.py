@@ -140,7 +140,7 @@ def _check_rows(vertices: Float64[ndarray, "v 3"], rows: ndarray, where: str) ->
     if len(outside):
         row = outside[0]
         raise DatasetError(
-            f"{where}: face {row} names vertices {index[row].tolist()}, expected 0 to {len(vertices) - 1}"
+            f"{where}: face {row} refers to vertices {index[row].tolist()}, expected 0 to {len(vertices) - 1}"
         )
     not_finite = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if len(not_finite):
@@ -160,7 +160,7 @@ def _check_arrays(vertices_m: ndarray, faces: ndarray, face_bar_id: ndarray) -> 
         raise ValueError("a vertex is not finite: expected metres")
     if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices_m)):
         raise ValueError(
-            f"faces name vertices {faces.min()} to {faces.max()}: expected 0 to {len(vertices_m) - 1}"
+            f"faces refer to vertices {faces.min()} to {faces.max()}: expected 0 to {len(vertices_m) - 1}"
         )
     if face_bar_id.size and not (face_bar_id.min() >= 0 and face_bar_id.max() <= np.iinfo(np.uint16).max):
         raise ValueError(f"bar ids {face_bar_id.min()} to {face_bar_id.max()}: expected 0 to 65535")

@@ -70,7 +70,7 @@ class RayCaster:
         depth_m = np.zeros(len(face))
         depth_m[hit] = self._plane_depth_m(centre_m, directions[hit], face[hit])
         if not (np.isfinite(depth_m) & (depth_m >= 0)).all():
-            raise BuildError("a ray meets the plane of the face it hit nowhere or behind the camera")
+            raise BuildError("a ray does not intersect the plane of the face it hit in front of the camera")
         bars = np.zeros(len(face), np.uint16)
         bars[hit] = self._face_bar_id[face[hit]]
         shape = (height, width)

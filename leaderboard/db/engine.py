@@ -36,7 +36,7 @@ class Database:
         try:
             self._engine = _engine(url)
         except (ArgumentError, NoSuchModuleError, ImportError, OSError) as error:
-            raise InputError(f"{without_password(url)}: no database's URL: {error}") from None
+            raise InputError(f"{without_password(url)}: invalid database URL: {error}") from None
         self._write_engine = self._engine.execution_options(**{_IMMEDIATE: True})
 
     @contextmanager
@@ -75,7 +75,7 @@ class Database:
         except (*DATABASE_UNAVAILABLE, DatabaseError) as error:
             url = self._engine.url.render_as_string(hide_password=True)
             reason = " ".join(str(getattr(error, "orig", error)).split())
-            raise InputError(f"{url}: the database does not answer: {reason}") from None
+            raise InputError(f"{url}: the database is unavailable: {reason}") from None
 
     def close(self) -> None:
         """Close all connections."""

@@ -67,7 +67,7 @@ def claim(database: Database, scorer: str, lease_s: float) -> str | None:
                 record.lease_until, record.attempts = now + lease_s, record.attempts + 1
                 return record.id
             record.status, record.finished_at = FAILED, now
-            record.reason = f"scoring was begun {record.attempts} times and never came to an end"
+            record.reason = f"scoring was started {record.attempts} times but never finished"
 
 
 def renew(database: Database, submission_id: str, scorer: str, lease_s: float) -> bool:

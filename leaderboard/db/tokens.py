@@ -23,13 +23,13 @@ def create_token(database: Database, name: str) -> str:
     Raises ``InputError`` if the name is taken, blank, longer than ``MAX_NAME`` characters or not printable.
     """
     if not name.strip() or len(name) > MAX_NAME or not name.isprintable():
-        raise InputError(f"a token's name is {name!r}, expected 1 to {MAX_NAME} printable characters")
+        raise InputError(f"the token name is {name!r}, expected 1 to {MAX_NAME} printable characters")
     token = PREFIX + secrets.token_urlsafe(32)
     try:
         with database.write() as session:
             session.add(TokenModel(name=name, sha256=digest(token), created_at=time.time()))
     except IntegrityError:
-        raise InputError(f"there is a token for {name!r} already, expected another name, or --replace") from None
+        raise InputError(f"a token for {name!r} already exists, expected another name or --replace") from None
     return token
 
 
@@ -39,7 +39,7 @@ def replace_token(database: Database, name: str) -> str:
     with database.write() as session:
         record = session.scalar(select(TokenModel).where(TokenModel.name == name))
         if record is None:
-            raise InputError(f"there is no token for {name!r}, expected the name of one")
+            raise InputError(f"there is no token for {name!r}, expected the name of an existing token")
         record.sha256 = digest(token)
     return token
 

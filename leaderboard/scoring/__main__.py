@@ -25,7 +25,7 @@ from rebar_depth_bench.console import run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
 
-_LOG = structlog.get_logger("scorer")
+_LOG = structlog.get_logger("worker")
 
 
 def main() -> int:
@@ -49,7 +49,7 @@ def run_worker(settings: Settings, *, migrate: bool) -> None:
     url = settings.database_url
     path = sqlite_path(url)
     if path is not None and not path.is_file():
-        raise InputError(f"{url}: there is no database, expected that of a server")
+        raise InputError(f"{url}: the database does not exist, expected the database of a server")
     with work_dir(settings.spool) as spool, closing(Database(url)) as database:
         if migrate:
             database.migrate()

@@ -49,7 +49,7 @@ def check_dask() -> None:
         import distributed  # noqa: F401
     except ImportError as error:
         raise InputError(
-            f"a cluster needs dask ({error}): pip install 'rebar-depth-bench[server,cluster]'"
+            f"scoring on a cluster requires dask ({error}): pip install 'rebar-depth-bench[server,cluster]'"
         ) from None
 
 

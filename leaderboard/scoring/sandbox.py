@@ -58,7 +58,7 @@ def main() -> int:
         with ArchiveStore(task.archives).local_copy(task.submission_id, out) as archive:
             _score(str(archive), task)
     except ArchiveNotFoundError:
-        (out / PROBLEM_FILE).write_text("the archive is no longer there")
+        (out / PROBLEM_FILE).write_text("the archive is no longer in the archive storage")
     except SubmissionError as error:  # Without the path of the archive on this machine.
         (out / PROBLEM_FILE).write_text(problem_summary(error.problems))
     except MemoryError:

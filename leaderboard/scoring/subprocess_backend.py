@@ -20,7 +20,7 @@ from leaderboard.scoring.worker import POLL_INTERVAL_S, RENEWALS_PER_LEASE, Back
 from leaderboard.settings import Settings
 
 OUTPUT_FILE = "complaints.txt"
-_LOG = structlog.get_logger("scorer")
+_LOG = structlog.get_logger("worker")
 
 
 def make_subprocess_backend(settings: Settings, spool: Path) -> ScoringBackend:
@@ -59,9 +59,7 @@ def _run_sandbox(task: ScoringTask, settings: Settings, should_continue: Callabl
             process.stdin.close()
         while not _has_ended(process, min(step_s, max(0.0, deadline - time.monotonic()))):
             if time.monotonic() >= deadline:
-                return Outcome(
-                    reason=f"scoring took longer than the {settings.score_time:g} s this service allows"
-                )
+                return Outcome(reason=f"scoring took longer than the limit of {settings.score_time:g} s")
             if not should_continue():
                 return None
     finally:
@@ -87,5 +85,7 @@ def _read_outcome(out: Path, status: int) -> Outcome | None:
         raise BackendUnavailableError((out / UNAVAILABLE_FILE).read_text())
     if status in (-signal.SIGKILL, -signal.SIGTERM):
         return None  # Killed from outside, not caused by the archive: try again.
-    _LOG.error("scoring crashed", status=status, said=(out / OUTPUT_FILE).read_text(errors="replace")[-2000:])
-    return Outcome(reason=f"scoring ended with status {status} and said nothing")
+    _LOG.error(
+        "scoring process crashed", status=status, said=(out / OUTPUT_FILE).read_text(errors="replace")[-2000:]
+    )
+    return Outcome(reason=f"the scoring process exited with status {status} without a result")

@@ -16,7 +16,7 @@ from leaderboard.settings import Settings
 CHECK_INTERVAL_S = 0.5
 RESTART_DELAY_S = 2.0
 STOP_TIMEOUT_S = 15.0
-_LOG = structlog.get_logger("crew")
+_LOG = structlog.get_logger("supervisor")
 
 
 class WorkerSupervisor:
@@ -25,7 +25,7 @@ class WorkerSupervisor:
     def __init__(self, settings: Settings, count: int) -> None:
         self._settings, self._count = settings, count
         self._stopping = threading.Event()
-        self._watcher = threading.Thread(target=self._watch, name="crew", daemon=True)
+        self._watcher = threading.Thread(target=self._watch, name="supervisor", daemon=True)
 
     def __enter__(self) -> Self:
         self._watcher.start()
@@ -42,7 +42,7 @@ class WorkerSupervisor:
         while True:
             for index, worker in enumerate(workers):
                 if worker is not None and worker.poll() is not None:
-                    _LOG.warning("scorer died", status=worker.returncode)
+                    _LOG.warning("worker exited unexpectedly; restarting", status=worker.returncode)
                     self._stopping.wait(RESTART_DELAY_S)
                 if (worker is None or worker.returncode is not None) and not self._stopping.is_set():
                     workers[index] = self._start()
@@ -63,7 +63,7 @@ class WorkerSupervisor:
         try:
             worker = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
         except OSError as error:  # Out of memory or processes: try again later.
-            _LOG.warning("scorer not started", error=str(error))
+            _LOG.warning("worker not started; retrying", error=str(error))
             return None
         assert worker.stdin is not None
         try:

@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 
 RESULT_FILE, PROBLEM_FILE, UNAVAILABLE_FILE, ERROR_MAPS_DIR = "result.json", "problem.txt", "away.txt", "pictures"
-NO_MEMORY = "needs more memory than this service allows"
+NO_MEMORY = "scoring needed more memory than this service allows"
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from leaderboard.settings import Settings
 POLL_INTERVAL_S = 1.0
 RETRY_INTERVAL_S = 1.0
 RENEWALS_PER_LEASE = 4
-_LOG = structlog.get_logger("scorer")
+_LOG = structlog.get_logger("worker")
 
 T = TypeVar("T")
 ScoringBackend = Callable[[Job, Callable[[], bool]], Outcome | None]
@@ -67,22 +67,24 @@ def _score_submission(
     record = _retry_until_available(lambda: submissions.find(database, submission_id), stop)
     if record is None:  # Deleted after it was leased.
         return
-    log.info("scoring")
+    log.info("scoring started")
     wait_s, outcome = 0.0, None
     try:
         job = Job(submission_id, record.dataset_digest)
         outcome = score(job, _make_heartbeat(database, submission_id, name, settings.lease_seconds, stop))
     except BackendUnavailableError as error:
-        log.warning("nobody to score", reason=str(error))
+        log.warning("scoring backend unavailable; job requeued", reason=str(error))
         wait_s = settings.lease_seconds
     if outcome is not None:
         is_stored = _retry_until_available(lambda: jobs.finish(database, submission_id, name, outcome), stop)
-        log.info("ended" if is_stored else "lost", reason=outcome.reason)
+        log.info("scoring finished" if is_stored else "lease lost; outcome discarded", reason=outcome.reason)
     elif wait_s or stop.is_set():
         _retry_until_available(lambda: jobs.release(database, submission_id, name, wait_s), stop)
-        log.info("given back")
+        log.info("job requeued")
     else:
-        log.warning("died", lease_s=settings.lease_seconds)  # Leased again once the lease expires.
+        log.warning(
+            "scoring ended without an outcome; job requeued when the lease expires", lease_s=settings.lease_seconds
+        )
 
 
 def _retry_until_available(step: Callable[[], T], stop: threading.Event) -> T | None:
@@ -91,7 +93,7 @@ def _retry_until_available(step: Callable[[], T], stop: threading.Event) -> T | 
         try:
             return step()
         except DATABASE_UNAVAILABLE as error:
-            _LOG.warning("database away", error=type(error).__name__)
+            _LOG.warning("database unavailable", error=type(error).__name__)
             if stop.wait(RETRY_INTERVAL_S):
                 return None
 

@@ -36,7 +36,7 @@ class ArchiveStore:
             files, self._root = fsspec.core.url_to_fs(url)
             files.makedirs(self._root, exist_ok=True)
         except Exception as error:  # Each filesystem raises its own exception types.
-            raise InputError(f"{without_password(url)}: archives cannot be kept there: {error}") from None
+            raise InputError(f"{without_password(url)}: cannot access the archive storage: {error}") from None
         self._is_local = isinstance(files, LocalFileSystem)
 
     @contextmanager
@@ -88,7 +88,7 @@ class ArchiveStore:
             if not path.is_file():
                 if path.parent.is_dir():
                     raise ArchiveNotFoundError(submission_id)
-                raise OSError(f"{path.parent}: there is no such folder")
+                raise OSError(f"{path.parent}: the folder does not exist")
             yield path
             return
         fetched = scratch / f"{submission_id}.zip"

@@ -31,15 +31,15 @@ def back_up(settings: Settings, target: Path) -> Path:
     """
     source = sqlite_path(settings.database_url)
     if source is None:
-        raise InputError("the database is PostgreSQL: copy it with pg_dump, and the archives as files")
+        raise InputError("the database is PostgreSQL, expected SQLite; use pg_dump and copy the archives as files")
     if target.resolve() in (source.parent.resolve(), settings.state_dir.resolve()):
-        raise InputError(f"{target}: the service itself uses this folder, expected another")
+        raise InputError(f"{target}: is in use by the service, expected another folder")
     if not source.is_file():
-        raise InputError(f"{source}: there is no database, expected that of a service")
+        raise InputError(f"{source}: the database does not exist, expected the database of a leaderboard")
     archive_dir = target / ARCHIVES
     try:
         if target.is_dir() and any(target.iterdir()) and not (target / DATABASE).is_file():
-            raise InputError(f"{target}: holds other things, expected a new folder or an earlier backup")
+            raise InputError(f"{target}: contains other files, expected a new folder or an earlier backup")
         target.mkdir(mode=0o700, parents=True, exist_ok=True)
         archive_dir.mkdir(exist_ok=True)
         _copy_database(source, target / DATABASE)

@@ -13,7 +13,7 @@ import structlog
 from rebar_depth_bench.atomic_io import exclusive_lock
 from rebar_depth_bench.errors import InputError
 
-_LOG = structlog.get_logger("spool")
+_LOG = structlog.get_logger("work_dirs")
 _STARTUP_LOCK = "entrance.lock"
 _LOCK_MODE = 0o600
 
@@ -35,7 +35,7 @@ def work_dir(root: Path) -> Iterator[Path]:
                 folder.mkdir()
                 stack.enter_context(exclusive_lock(_lock_path(folder), wait=True, mode=_LOCK_MODE))
         except OSError as error:
-            raise InputError(f"{root}: files cannot be kept there: {error.strerror}") from None
+            raise InputError(f"{root}: cannot create a work folder: {error.strerror}") from None
         try:
             yield folder
         finally:
@@ -46,7 +46,7 @@ def _remove_abandoned(root: Path) -> None:
     for folder in [path for path in root.iterdir() if path.is_dir()]:
         with suppress(BlockingIOError), exclusive_lock(_lock_path(folder), mode=_LOCK_MODE):
             _remove(folder)
-            _LOG.info("cleared", spool=folder.name)
+            _LOG.info("abandoned work folder deleted", spool=folder.name)
 
 
 def _remove(folder: Path) -> None:

@@ -20,9 +20,9 @@ from leaderboard.uploads.multipart import (
 )
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, RebarDepthError
 
-UNAVAILABLE_MESSAGE = "the service cannot check or keep archives now; try again later"
+UNAVAILABLE_MESSAGE = "the service cannot validate or store archives at the moment; try again later"
 """Detail of the 503 response if the dataset is unreadable, the disk full or the archive storage unavailable."""
-_LOG = structlog.get_logger("intake")
+_LOG = structlog.get_logger("uploads")
 
 
 class UploadRejectedError(Exception):
@@ -59,14 +59,14 @@ async def accept_upload(
     except UploadError as error:
         raise UploadRejectedError(error.status, error.detail) from None
     except (OSError, RebarDepthError) as error:
-        _LOG.error("cannot take uploads", error=str(error))
+        _LOG.error("upload failed: service unavailable", error=str(error))
         raise UploadRejectedError(503, UNAVAILABLE_MESSAGE) from None
 
 
 async def _validate_and_store(service: Service, token: TokenModel, received: ReceivedArchive) -> SubmissionModel:
     verdict = await service.checker.check(received.path)
     if isinstance(verdict, tuple):
-        _LOG.info("refused", token=token.name, problems=len(verdict))
+        _LOG.info("upload rejected", token=token.name, problems=len(verdict))
         raise UploadRejectedError(422, _problem_count(verdict), truncate_problems(verdict))
     submission_id = submissions.new_id()
     upload = Upload(verdict, received.sha256, received.size, service.folder.digest)
@@ -86,7 +86,7 @@ async def _validate_and_store(service: Service, token: TokenModel, received: Rec
         record = await to_thread.run_sync(store)
     except QuotaExceededError:
         raise _quota_exceeded(service.settings.quota) from None
-    _LOG.info("accepted", token=token.name, submission=submission_id[:6], bytes=received.size)
+    _LOG.info("upload accepted", token=token.name, submission=submission_id[:6], bytes=received.size)
     return record
 
 
@@ -98,7 +98,7 @@ def truncate_problems(problems: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _problem_count(problems: tuple[str, ...]) -> str:
-    return f"the archive is refused: {len(problems)} problem{'' if len(problems) == 1 else 's'}"
+    return f"the archive is invalid: {len(problems)} problem{'' if len(problems) == 1 else 's'}"
 
 
 def quota_used(service: Service, token: TokenModel) -> int:
@@ -109,5 +109,5 @@ def quota_used(service: Service, token: TokenModel) -> int:
 
 def _quota_exceeded(quota: int) -> UploadRejectedError:
     return UploadRejectedError(
-        429, f"this token has made its {quota} submissions of today (UTC); refused archives were not counted"
+        429, f"the quota of {quota} submissions per day (UTC) is used up; rejected archives do not count"
     )

@@ -162,12 +162,12 @@ async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, 
             size += await to_thread.run_sync(flush)
         if not parts.complete or not parts.archives:
             raise UploadError(
-                422, f"the body ends early or has no field {ARCHIVE_FIELD!r}, expected one with the zip in it"
+                422, f"the body is incomplete or has no field {ARCHIVE_FIELD!r}, expected a zip file in this field"
             )
         return ReceivedArchive(path, sha256.hexdigest(), size)
     except FormParserError as error:
         path.unlink(missing_ok=True)
-        raise UploadError(422, f"the body is no multipart/form-data: {error}") from None
+        raise UploadError(422, f"the body is not valid multipart/form-data: {error}") from None
     except BaseException:
         path.unlink(missing_ok=True)
         raise
@@ -198,7 +198,7 @@ async def read_leading_field(
             ):
                 break
     except FormParserError as error:
-        raise UploadError(422, f"the body is no multipart/form-data: {error}") from None
+        raise UploadError(422, f"the body is not valid multipart/form-data: {error}") from None
     is_complete = first.ended and first.name == name.encode() and len(first.text) <= MAX_FIELD_BYTES
     return (first.text.decode(errors="replace") if is_complete else ""), _replay(chunks, stream)
 
@@ -215,13 +215,15 @@ def boundary_of(content_type: str) -> bytes:
     kind, options = parse_options_header(content_type)
     boundary = options.get(b"boundary")
     if kind != b"multipart/form-data" or not boundary:
-        raise UploadError(422, f"the body is {content_type or 'nothing'!r}, expected multipart/form-data")
+        raise UploadError(
+            422, f"the content type is {content_type!r}, expected multipart/form-data with a boundary"
+        )
     return boundary
 
 
 def too_large_message(max_bytes: int) -> str:
     """Return the message that rejects an archive of more than ``max_bytes`` bytes."""
-    return f"the archive is larger than {max_bytes} bytes, the most this service takes"
+    return f"the archive is larger than {max_bytes} bytes, the limit of this service"
 
 
 def _check_parts(parts: _ArchivePart, overhead_bytes: int) -> None:
@@ -229,5 +231,5 @@ def _check_parts(parts: _ArchivePart, overhead_bytes: int) -> None:
         raise UploadError(422, f"the body has the field {ARCHIVE_FIELD!r} twice, expected once")
     if overhead_bytes > MAX_OVERHEAD_BYTES:  # including preamble and epilogue
         raise UploadError(
-            422, f"the body has more than {MAX_OVERHEAD_BYTES} bytes beside the field {ARCHIVE_FIELD!r}"
+            422, f"the body has more than {MAX_OVERHEAD_BYTES} bytes outside the field {ARCHIVE_FIELD!r}"
         )

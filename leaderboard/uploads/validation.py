@@ -17,8 +17,8 @@ from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.submission import SubmissionMeta, open_submission
 
 POOL_PROCESSES = 2
-CRASHED = "the archive cannot be read: reading it ends the reader, which a sound archive does not do"
-NO_MEMORY = "the archive cannot be read in the memory that this service allows"
+CRASHED = "the archive cannot be read: the process that reads it crashed"
+NO_MEMORY = "the archive cannot be read: this needs more memory than this service allows"
 
 Verdict = SubmissionMeta | tuple[str, ...]
 """The content of ``submission.json`` if the archive is valid, otherwise all problems."""

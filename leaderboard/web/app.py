@@ -22,10 +22,11 @@ from leaderboard.web.pages.rendering import error_response, make_templates
 from rebar_depth_bench.version import software_version
 
 _LOG = structlog.get_logger("http")
-DESCRIPTION = """Takes prediction archives and scores them exactly as `rebar-bench score` does.
+DESCRIPTION = """Accepts prediction archives and scores them exactly as `rebar-bench score` does.
 
-Upload with a bearer token; the archive is checked before it is accepted, and a refused one costs no quota. A
-submission's id cannot be guessed and opens it to whoever has it, also while its rows are not on the board."""
+Uploads require a bearer token. An archive is validated before it is accepted; a rejected archive does not count
+against the quota. The id of a submission is random. Anyone who knows the id can read the submission, even if its
+rows are not on the leaderboard."""
 
 
 def make_app(service: Service) -> FastAPI:
@@ -88,7 +89,7 @@ async def _handle_validation_error(request: Request, error: Exception) -> Respon
 
 
 async def _handle_database_unavailable(request: Request, error: Exception) -> Response:
-    _LOG.warning("database away", error=" ".join(str(getattr(error, "orig", error)).split()))
+    _LOG.warning("database unavailable", error=" ".join(str(getattr(error, "orig", error)).split()))
     return error_response(request, 503, DATABASE_UNAVAILABLE_MESSAGE, {"Retry-After": "10"})
 
 

@@ -63,4 +63,4 @@ def _listen(settings: Settings) -> socket.socket:
         return socket.create_server((settings.host, settings.port), family=family, backlog=512)
     except (OSError, UnicodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{settings.host}:{settings.port}: cannot listen there: {reason}") from None
+        raise InputError(f"{settings.host}:{settings.port}: cannot listen on this address: {reason}") from None

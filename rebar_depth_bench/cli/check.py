@@ -9,7 +9,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.submission import check_archive
 
-SUMMARY = "say everything that is wrong with an archive"
+SUMMARY = "list all problems of a submission archive"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -53,7 +53,7 @@ def run_demo(out: Path, views: int) -> None:
                 write_report(result, evaluation, reports[-1])
         write_bytes(out / f"{name}.json", result.to_json())
         print_table(result, Console())
-    print("open in a browser:")
+    print("open the reports in a browser:")
     for report in reports:
         print(f"  {report.resolve()}")
 
@@ -65,7 +65,7 @@ def _build_dataset(data: Path, views: int) -> None:
     command += ["--samples", str(DEMO_SAMPLES)]
     finished = subprocess.run([sys.executable, *command], stdout=sys.stderr, check=False)
     if finished.returncode == EXIT_INPUT:
-        raise InputError("the demo's set cannot be built, for the reason above")
+        raise InputError("the demo dataset cannot be built, see the error above")
     if finished.returncode:
         raise BuildError(f"rebar-build ended with exit status {finished.returncode}, expected 0")
 
@@ -74,13 +74,13 @@ def _print_step(step: str) -> None:
     print(step, file=sys.stderr, flush=True)
 
 
-SUMMARY = "render a small lattice set, predict, score and report"
+SUMMARY = "render a small lattice dataset, predict, score and report"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument(
-        "--out", type=Path, default=Path(DEMO_FOLDER), help="folder to work in (default: %(default)s)"
+        "--out", type=Path, default=Path(DEMO_FOLDER), help="working folder (default: %(default)s)"
     )
     parser.add_argument(
         "--views", type=int, default=DEMO_VIEWS, help="stereo views to render (default: %(default)s)"

@@ -41,7 +41,7 @@ COMMANDS: Mapping[str, Command] = {
 RENAMED_OPTIONS = {"--given-scale": "--baseline-scale", "--k": "--num-anchor-views"}
 """Old option strings that are still accepted, and their new names."""
 
-_STUDY_SUMMARY = "the studies of the paper, on your own archives"
+_STUDY_SUMMARY = "run a study of the paper on your own archives"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,8 +12,8 @@ from rich.text import Text
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, all_methods
 
-SUMMARY = "list the methods that come with the bench"
-_ALL_VIEWS_NOTE = "sees all views of a config before it answers for any"
+SUMMARY = "list the available methods"
+_ALL_VIEWS_NOTE = "reads all views of a config before it predicts any"
 _NEEDS_COLUMN_WIDTH = len("cam_from_world,")
 
 
@@ -26,7 +26,7 @@ def run(_: argparse.Namespace) -> None:
     """Print a table of the methods: summary, required columns, source, licence and untested parts."""
     table = Table(title="Methods", show_lines=True, expand=True)
     table.add_column("method", no_wrap=True)
-    table.add_column("what it does", overflow="fold", ratio=3)
+    table.add_column("description", overflow="fold", ratio=3)
     table.add_column("needs", overflow="fold", width=_NEEDS_COLUMN_WIDTH)
     table.add_column("source, licence", overflow="fold", ratio=2)
     for name, method in all_methods().items():
@@ -42,7 +42,7 @@ def run(_: argparse.Namespace) -> None:
             f"{info.source}\nlicence: {info.licence}",
         )
     Console().print(table)
-    Console().print("† is told some of the truth: its numbers stand for no instrument")
+    Console().print("† uses ground truth; results are not comparable to a real method")
 
 
 def _summary_and_notes(method: AnyMethod) -> Text:

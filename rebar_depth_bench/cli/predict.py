@@ -11,22 +11,28 @@ from rebar_depth_bench.methods import METHODS, find_method
 from rebar_depth_bench.methods.registry import FROM_FOLDER
 from rebar_depth_bench.methods.runner import predict
 
-SUMMARY = "run a method over a dataset into an archive"
+SUMMARY = "run a method on a dataset and write a submission archive"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     names = (
-        f"{', '.join(METHODS)}, an installed package's, or one from elsewhere: my_model.py:METHOD, my_model.toml "
-        "(an ONNX model), hf:ORG/NAME (a checkpoint of transformers), NAME:FOLDER (own weights of "
-        f"{', '.join(FROM_FOLDER)})"
+        f"{', '.join(METHODS)}, the name of a method of an installed package, my_model.py:METHOD (a Python file), "
+        "my_model.toml (an ONNX model), hf:ORG/NAME (a transformers checkpoint) or NAME:FOLDER (a folder with "
+        f"weights for {', '.join(FROM_FOLDER)})"
     )
-    parser.set_defaults(interrupted="interrupted; the same command goes on where it was")
+    parser.set_defaults(interrupted="interrupted; run the same command again to resume")
     parser.add_argument("method", metavar="METHOD", help=names)
     add_data(parser)
-    parser.add_argument("--out", required=True, type=Path, metavar="ARCHIVE", help="the zip to write")
     parser.add_argument(
-        "--config", nargs="+", action="extend", metavar="NAME", help="which configs (default: all of the folder)"
+        "--out", required=True, type=Path, metavar="ARCHIVE", help="submission archive (zip) to write"
+    )
+    parser.add_argument(
+        "--config",
+        nargs="+",
+        action="extend",
+        metavar="NAME",
+        help="configs to predict (default: all in the folder)",
     )
 
 

@@ -18,7 +18,7 @@ from rebar_depth_bench.reporting.tables import print_table, result_csv
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.score import score_evaluation
 
-SUMMARY = "score a submission archive: native beside scaled"
+SUMMARY = "score a submission archive, native and scaled"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,15 +32,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=VIEWS_SHOWN,
         metavar="N",
-        help="views of each config in pictures (default: %(default)s)",
+        help="views per config shown as images (default: %(default)s)",
     )
     add_output_file(parser, "--csv", "write the tables as CSV")
     parser.add_argument(
         "--extended",
         action="store_true",
-        help="also boundary, point clouds, layers, inspection bar by bar, other alignments",
+        help="also compute boundary, point cloud, layer, per-bar inspection and alignment measures",
     )
-    add_output_file(parser, "--extended-csv", "write these as CSV (implies --extended)")
+    add_output_file(parser, "--extended-csv", "write the extended measures as CSV (implies --extended)")
     add_workers(parser)
 
 

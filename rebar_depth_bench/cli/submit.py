@@ -17,7 +17,7 @@ from rebar_depth_bench.leaderboard_client import LeaderboardClient
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.result_io import read_result
 
-SUMMARY = "upload an archive to a leaderboard, wait, print its table"
+SUMMARY = "upload an archive to a leaderboard, wait for its score and print the table"
 TOKEN_VARIABLE = "REBAR_LEADERBOARD_TOKEN"
 """Environment variable that holds the token."""
 
@@ -25,21 +25,23 @@ TOKEN_VARIABLE = "REBAR_LEADERBOARD_TOKEN"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     add_archive(parser)
-    parser.add_argument("--url", required=True, help="the leaderboard's address")
+    parser.add_argument("--url", required=True, help="URL of the leaderboard")
     parser.add_argument(
         "--token-file",
         type=Path,
         metavar="FILE",
-        help=f"a file with the token (default: {TOKEN_VARIABLE}, or it is asked for)",
+        help=f"file with the token (default: the environment variable {TOKEN_VARIABLE}, or a prompt)",
     )
-    parser.add_argument("--no-wait", action="store_true", help="do not wait until it is scored")
+    parser.add_argument("--no-wait", action="store_true", help="do not wait until the submission is scored")
     add_output_file(parser, "--json", "write the result as JSON")
 
 
 def run(options: argparse.Namespace) -> None:
     """Upload an archive, wait until it is scored and print its table."""
     if options.no_wait and options.json:
-        raise InputError("--no-wait and --json: there is no result yet, expected one of the two")
+        raise InputError(
+            "--no-wait and --json are both given, expected at most one: without waiting there is no result"
+        )
     with LeaderboardClient(options.url, _read_token(options.token_file)) as leaderboard, ProgressBars() as bars:
         accepted = leaderboard.submit(Path(options.archive), bars.update)
         print(accepted["url"], file=sys.stderr, flush=True)
@@ -49,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
         try:
             submission = leaderboard.wait(accepted["id"], bars.update)
         except KeyboardInterrupt:
-            print("it is accepted and goes on without you; its address is above", file=sys.stderr)
+            print("the submission is accepted and will be scored; its URL is printed above", file=sys.stderr)
             raise
         if submission["status"] == "failed":
             raise InputError(f"{options.archive}: scoring failed: {submission['reason']}")

@@ -13,17 +13,19 @@ from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import results_csv
 from rebar_depth_bench.scoring.score import score
 
-SUMMARY = "several submissions in the layout of the paper's Table I, with the paper's rows beside"
+SUMMARY = "print several submissions and the paper's rows in the layout of its Table I"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    parser.add_argument("archives", metavar="ARCHIVE", nargs="+", help="the submissions' zips, a row each")
+    parser.add_argument(
+        "archives", metavar="ARCHIVE", nargs="+", help="submission archives (zip), one table row per archive"
+    )
     add_data(parser)
     add_output_file(parser, "--latex", "write the table as LaTeX (booktabs)")
     add_output_file(parser, "--csv", "write all tables as CSV")
-    parser.add_argument("--intervals", action="store_true", help="put the 95 %% intervals into the LaTeX table")
-    parser.add_argument("--no-published", action="store_true", help="leave the paper's own rows out")
+    parser.add_argument("--intervals", action="store_true", help="include the 95 %% intervals in the LaTeX table")
+    parser.add_argument("--no-published", action="store_true", help="omit the paper's own rows")
     add_workers(parser)
 
 

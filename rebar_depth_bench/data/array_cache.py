@@ -68,8 +68,8 @@ class ArrayCache:
             arrays[name] = np.frombuffer(self.sources[name].read_at(start * size, (end - start) * size), dtype)
         if _checksum(arrays.values()) != self.checksums[index]:
             raise DatasetError(
-                f"{self.path}: the cached values of {self.view_ids[index]} are damaged; delete this folder, it is "
-                "filled again"
+                f"{self.path}: the cached values of {self.view_ids[index]} are damaged; delete this folder, it "
+                "will be filled again"
             )
         return ViewArrays(self.view_ids[index], arrays, self.metadata[index])
 
@@ -122,7 +122,7 @@ def _read(path: Path, dtypes: Mapping[str, type]) -> ArrayCache:
     index = json.loads((path / _INDEX_FILE).read_text())
     view_ids, starts, checksums, metadata = (tuple(index[key]) for key in _KEYS)
     if not len(starts) - 1 == len(view_ids) == len(checksums) == len(metadata):
-        raise ValueError(f"{path}: the outline contradicts itself")
+        raise ValueError(f"{path}: the outline is inconsistent")
     sources = {name: FileSource(path / name) for name in dtypes}
     for name, dtype in dtypes.items():
         size_bytes, expected_bytes = sources[name].size, starts[-1] * np.dtype(dtype).itemsize

@@ -108,9 +108,9 @@ def _bar_from_row(path: Path, row: Mapping[str, Any]) -> Bar:
     where = f"{path}: bar {row['bar_id']} of scene {row['scene']!r}"
     empty = [name for name in BARS_SCHEMA.names if row[name] is None]
     if empty or any(point is None for point in row["axis"]):
-        raise DatasetError(f"{where} has no {', '.join(empty) or 'whole axis'}")
+        raise DatasetError(f"{where} has no {', '.join(empty) or 'complete axis'}")
     if row["bar_id"] < 1:
-        raise DatasetError(f"{where}: bar_id is {row['bar_id']}, expected 1 or more (0 is no steel)")
+        raise DatasetError(f"{where}: bar_id is {row['bar_id']}, expected 1 or more (0 means no steel)")
     if not 0 < row["diameter_m"] < math.inf:
         raise DatasetError(f"{where}: diameter_m is {row['diameter_m']}, expected a positive length")
     axis_m = tuple((x, y, z) for x, y, z in row["axis"])

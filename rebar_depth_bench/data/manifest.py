@@ -134,7 +134,9 @@ def _check_configs(path: Path, configs: object) -> None:
         if missing:
             raise DatasetError(f"{path}: config {name} lacks {', '.join(missing)}")
         if any(not isinstance(view, dict) or set(view) != _VIEW_KEYS for view in entry["views"]):
-            raise DatasetError(f"{path}: a view of config {name} has not exactly {', '.join(sorted(_VIEW_KEYS))}")
+            raise DatasetError(
+                f"{path}: a view of config {name} does not have exactly the keys {', '.join(sorted(_VIEW_KEYS))}"
+            )
 
 
 def _manifest_path(root: str) -> Path:
@@ -148,11 +150,11 @@ def _local_path(root: str, name: str) -> Path:
     if Path(root).is_dir():
         path = Path(root) / name
         if not path.is_file():
-            raise DatasetError(f"{root}: has no {name}, expected a folder finished by rebar-build")
+            raise DatasetError(f"{root}: has no {name}, expected a complete dataset folder written by rebar-build")
         return path
     try:
         return Path(hf_hub_download(root, name, repo_type="dataset"))
     except (EntryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError) as error:
         raise DatasetError(
-            f"{root}: no such folder, and as a Hub repository its {name} cannot be had: {error}"
+            f"{root}: not a local folder, and its {name} cannot be downloaded from the Hub: {error}"
         ) from None

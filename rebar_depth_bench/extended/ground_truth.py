@@ -82,7 +82,7 @@ def load_steel_truth(folder: DatasetFolder, config: str, progress: Progress = si
     scene = folder.config(config)["scene"]["name"]
     bars = read_bars(bars_path).get(scene)
     if bars is None:
-        raise DatasetError(f"{bars_path}: has no bars of scene {scene!r}, which {config} shows")
+        raise DatasetError(f"{bars_path}: has no bars for scene {scene!r} of config {config}")
     cage = cage_truth(bars)
     diameter_m = np.full(max((bar.bar_id for bar in bars), default=0) + 1, np.nan)
     diameter_m[[bar.bar_id for bar in bars]] = [bar.diameter_m for bar in bars]

@@ -64,7 +64,7 @@ def _marker_centres_m(spec: BoardSpec) -> list[tuple[float, float]]:
         inner_m = _floor_to_millimetre(x_m / 2)
         edge_row = [-x_m, -inner_m, 0.0, inner_m, x_m]
     else:
-        raise ValueError(f"a board has 6 or 12 markers, not {spec.markers}")
+        raise ValueError(f"markers is {spec.markers}, expected 6 or 12")
     rows = {y_m: edge_row, 0.0: [-x_m, x_m], -y_m: edge_row}
     centres = [(x, y) for y, row in rows.items() for x in row]
     _check_quiet_zones(centres, spec)

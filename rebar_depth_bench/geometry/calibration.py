@@ -53,7 +53,7 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
     """
     path = Path(path)
     if path.suffix.lower() not in PARSERS:
-        raise CalibrationError(str(path), [f"its name ends on {path.suffix!r}, expected {' or '.join(PARSERS)}"])
+        raise CalibrationError(str(path), [f"the file suffix is {path.suffix!r}, expected {' or '.join(PARSERS)}"])
     problems: list[str] = []
     calibration = PARSERS[path.suffix.lower()](_read_text(path), width, height, problems)
     if calibration is not None and not problems:
@@ -68,21 +68,25 @@ def _read_text(path: Path) -> str:
         with path.open("rb") as file:
             content = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
-        raise CalibrationError(str(path), [f"it cannot be read: {error.strerror}"]) from error
+        raise CalibrationError(str(path), [f"the file cannot be read: {error.strerror}"]) from error
     if len(content) > MAX_FILE_BYTES:
-        raise CalibrationError(str(path), [f"it is larger than {MAX_FILE_BYTES} bytes, expected a calibration"])
+        raise CalibrationError(
+            str(path), [f"the file is larger than {MAX_FILE_BYTES} bytes, expected a calibration file"]
+        )
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise CalibrationError(str(path), [f"it is no UTF-8 text: byte {error.start} is none of it"]) from error
+        raise CalibrationError(str(path), [f"the file is not UTF-8: byte {error.start} is invalid"]) from error
 
 
 def _check_rig(calibration: StereoCalibration, problems: list[str]) -> None:
     x_m, y_m, z_m = calibration.translation_m
     if max(abs(y_m), abs(z_m)) > abs(x_m) / 2:
-        problems.append(f"the right eye stands {(-x_m, -y_m, -z_m)} m from the left, expected mostly along x")
+        problems.append(
+            f"the right camera is at {(-x_m, -y_m, -z_m)} m from the left one, expected an offset mostly along x"
+        )
     for eye, lens in (("left", calibration.left), ("right", calibration.right)):
         try:
             check_invertible(lens, calibration.width, calibration.height)
         except ValueError as error:
-            problems.append(f"the {eye} lens reaches no ray at the rim of its picture: {error}")
+            problems.append(f"the {eye} distortion cannot be inverted at the image border: {error}")

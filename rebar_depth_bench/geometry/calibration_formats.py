@@ -125,12 +125,12 @@ def _read_sections(text: str, problems: list[str]) -> Sections:
     try:
         parser.read_string(text, "the file")
     except configparser.Error as error:
-        problems.append(f"it is no INI file: {' '.join(error.message.split())}")
+        problems.append(f"the file is not an INI file: {' '.join(error.message.split())}")
         return {}
     upper_sections: dict[str, Mapping[str, str]] = {}
     for name in parser.sections():
         if name.strip().upper() in upper_sections:
-            problems.append(f"section [{name}] stands there twice")
+            problems.append(f"section [{name}] occurs twice")
         upper_sections[name.strip().upper()] = dict(parser.items(name))
     return upper_sections
 
@@ -147,7 +147,9 @@ def _nearest_suffix(sections: Sections, width: int, height: int, problems: list[
         if not problems:
             found = ", ".join(f"[{name}]" for name in sections) or "no section"
             expected = ", ".join(f"[LEFT_CAM_{suffix}]" for suffix in STEREOLABS_GRIDS)
-            problems.append(f"it has {found}, expected one of {expected}, its [RIGHT_CAM_...] and [STEREO]")
+            problems.append(
+                f"the file has {found}, expected one of {expected} with its [RIGHT_CAM_...] and [STEREO]"
+            )
         return None
 
     def distance(suffix: str) -> tuple[float, float]:
@@ -216,7 +218,7 @@ def parse_toml(text: str, width: int, height: int, problems: list[str]) -> Stere
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        problems.append(f"it is no TOML file: {error}")
+        problems.append(f"the file is not a TOML file: {error}")
         return None
     _check_keys(document, "the file", ("width", "height", "left", "right", "stereo"), problems)
     grid = _side(document, "width", width, problems), _side(document, "height", height, problems)
@@ -304,7 +306,7 @@ def _rotation_rad(stereo: Mapping[str, Any], problems: list[str]) -> tuple[float
     if len(problems) > before:
         return unknown
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        problems.append(f"{where} is {raw!r}, expected a rotation: rows of length 1 at right angles, no mirror")
+        problems.append(f"{where} is {raw!r}, expected a rotation matrix (orthonormal, determinant 1)")
         return unknown
     cosine = (float(np.trace(rotation)) - 1.0) / 2
     parse_number(math.acos(max(-1.0, min(1.0, cosine))), f"{where}'s angle", ANGLE_RANGE_RAD, problems)
@@ -314,7 +316,7 @@ def _rotation_rad(stereo: Mapping[str, Any], problems: list[str]) -> tuple[float
 
 def _translation_m(stereo: Mapping[str, Any], problems: list[str]) -> tuple[float, float, float]:
     if ("translation_m" in stereo) == ("baseline_m" in stereo):
-        problems.append("[stereo] has both or none of translation_m and baseline_m, expected one of them")
+        problems.append("[stereo] has both or neither of translation_m and baseline_m, expected exactly one")
         return (math.nan,) * 3
     if "baseline_m" in stereo:
         return -parse_number(stereo["baseline_m"], "[stereo] baseline_m", BASELINE_RANGE_M, problems), 0.0, 0.0

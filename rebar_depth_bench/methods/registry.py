@@ -98,8 +98,8 @@ def find_method(name: str) -> AnyMethod:
         return _load_entry_point(entries[name])
     known = ", ".join((*METHODS, *entries))
     raise MethodError(
-        f"no method {name!r}, expected one of {known}, or a file's like my_model.py:METHOD or "
-        f"my_model.toml, or hf:ORG/NAME, or a folder for one of {', '.join(FROM_FOLDER)}: NAME:FOLDER"
+        f"unknown method {name!r}, expected one of {known}, or my_model.py:METHOD, my_model.toml, hf:ORG/NAME, "
+        f"or NAME:FOLDER for one of {', '.join(FROM_FOLDER)}"
     )
 
 
@@ -150,10 +150,10 @@ def _with_file_digest(path: Path, method: AnyMethod) -> AnyMethod:
 def _import_file(path: Path) -> ModuleType:
     """Import a Python file as a module. Raises ``MethodError`` if it is missing or cannot be imported."""
     if not path.is_file():
-        raise MethodError(f"{path}: no such file, expected a Python file that holds a method")
+        raise MethodError(f"{path}: no such file, expected a Python file that defines a method")
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:
-        raise MethodError(f"{path}: is no Python file")
+        raise MethodError(f"{path}: is not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.path.insert(0, str(path.resolve().parent))  # Allows imports of files beside it, as for a script.
     writes_bytecode = sys.dont_write_bytecode

@@ -143,7 +143,7 @@ def predict(
     loaded = _load_method(method) if isinstance(method, Method) else None
     views = PredictedViews.open(target.with_name(f".{target.name}.views"), key)
     if len(views):
-        print(f"going on: {len(views)} views are in {views.path}; delete it to start over", file=sys.stderr)
+        print(f"resuming: {len(views)} views are in {views.path}; delete it to start over", file=sys.stderr)
     for name in names:
         done = [view.view_id for view in folder.views(name) if view.view_id in views]
         if len(done) == totals[name]:
@@ -196,7 +196,7 @@ def _check_notes(method: AnyMethod, config: ConfigViews, prepared: Prepared) -> 
             json.dumps({key: value}, allow_nan=False)
         except (TypeError, ValueError) as error:
             raise MethodError(
-                f"{method.info.name}: {config.config}: the note {key!r} is no plain JSON value: {error}"
+                f"{method.info.name}: {config.config}: the note {key!r} is not a plain JSON value: {error}"
             ) from None
 
 

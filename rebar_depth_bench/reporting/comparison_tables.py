@@ -58,7 +58,7 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
         Text(
             "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
             f"({BLOCK_VIEWS} steps of the protocol); none with fewer than {MIN_VIEWS} views. B is called better "
-            "or worse where the interval leaves out zero. Of many comparisons one in twenty does so by chance. "
+            "or worse if the interval excludes zero, which happens by chance in about one of twenty comparisons. "
             "Errors of a submission that is not ranked (coverage below 95 %, or a view without prediction) are "
             "not judged."
         )

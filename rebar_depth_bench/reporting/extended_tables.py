@@ -21,7 +21,7 @@ from rebar_depth_bench.reporting.tables import frame_csv
 from rebar_depth_bench.scoring.bootstrap import Interval
 from rebar_depth_bench.scoring.result import Result
 
-UNDEFINED = "not told"
+UNDEFINED = "n/a"
 """Text of an undefined capability: 5 % or more of the bars were not found, so that p95 is the error of a miss."""
 
 MISSED = "missed"
@@ -61,14 +61,17 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
         console.print(grid)
     numbers = [(measure, estimate) for _, _, measure, estimate in extended.estimates()]
     if any(is_miss(estimate, measure) for measure, estimate in numbers):
-        console.print(Text(f"{MISSED}: the error of what was not found, {MISS_MM:g} mm in CSV and JSON."))
+        console.print(Text(f"{MISSED}: not found, recorded as {MISS_MM:g} mm in CSV and JSON."))
     if any(estimate.value is None and estimate.samples for _, estimate in numbers):
-        console.print(Text(f"{UNDEFINED}: 5 % or more were not found."))
+        console.print(Text(f"{UNDEFINED}: 5 % or more were not found, so the capability is undefined."))
     if not wide:
         console.print(
-            Text(f"Intervals: in CSV, JSON and the report, and here from {_MIN_WIDTH_WITH_INTERVALS} columns on.")
+            Text(
+                "Intervals: in CSV, JSON and the report, and in terminals with at least "
+                f"{_MIN_WIDTH_WITH_INTERVALS} columns."
+            )
         )
-    note = "One number in the first column: no scale changes it, or it brings its own alignment."
+    note = "A single number in the first column is independent of scale or uses its own alignment."
     console.print(Text(f"{note} Definitions: cards/BENCHMARK.md."))
 
 

@@ -97,7 +97,7 @@ def print_unwrapped(console: Console, table: RichTable) -> None:
 def _print_notes(result: Result, console: Console) -> None:
     console.print()
     _print_line(
-        console, "Means over views; s: median over views. z: truth, p: prediction. ↓ ↑: which way is better."
+        console, "Means over views; s: median over views. z: truth, p: prediction. ↓ lower, ↑ higher is better."
     )
     for name, table in result.tables.items():
         reasons = formatting.unranked_reasons(table)

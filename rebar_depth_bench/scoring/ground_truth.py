@@ -149,6 +149,6 @@ def _verify_digest(row: dict[str, ndarray], record: ViewRecord | None, root: str
     if digest != record.left or len(pixels) != record.scored_px:
         raise DatasetError(
             f"{root}: view {record.view_id}: ground truth has digest {digest[:16]} and {len(pixels)} "
-            f"scored pixels, the manifest says {record.left[:16]} and {record.scored_px}"
+            f"scored pixels, the manifest has {record.left[:16]} and {record.scored_px}"
         )
     return pixels

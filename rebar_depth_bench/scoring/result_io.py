@@ -32,7 +32,7 @@ def read_result(data: bytes, where: str) -> Result:
             views=[_read_view(view) for view in document["views"]],
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{where}: is no result of rebar-bench: {type(error).__name__}: {error}") from None
+        raise InputError(f"{where}: is not a rebar-bench result: {type(error).__name__}: {error}") from None
 
 
 def read_table(table: Mapping[str, Any]) -> Table:

@@ -143,7 +143,7 @@ def _missing_problems(candidates: Mapping[str, Sequence[int]], expected: Expecte
         ]
     missing = (view for view in sorted(expected) if config_of(view) in configs and view not in candidates)
     return problems + [
-        f"{view}: missing, expected one of {_SUFFIXES}, since other views of {config_of(view)} are there"
+        f"{view}: missing, expected one of {_SUFFIXES}, because other views of {config_of(view)} are included"
         for view in missing
     ]
 

@@ -127,7 +127,7 @@ def _parse_attributes(head: bytes) -> Mapping[str, bytes]:
         if length < 0 or offset + length > len(head):
             raise ValueError(f"attribute {name} declares {length} bytes")
         if name in attributes:
-            raise ValueError(f"attribute {name} stands twice")
+            raise ValueError(f"attribute {name} occurs twice")
         attributes[name] = head[offset : offset + length]
         offset += length
 
@@ -148,7 +148,7 @@ def _read_name(data: bytes, start: int) -> tuple[str, int]:
     """Return the NUL-terminated name at byte ``start`` and the offset after it. Raises ``ValueError``."""
     end = data.find(b"\0", start, start + _MAX_NAME_BYTES + 1)
     if end < 0:
-        raise ValueError(f"no end of the name at byte {start}")
+        raise ValueError(f"the name at byte {start} is not terminated")
     return data[start:end].decode("utf-8", "backslashreplace"), end + 1
 
 
@@ -207,7 +207,7 @@ def _read_chunks(name: str, data: memoryview) -> Iterator[tuple[bytes, memoryvie
         kind, content = bytes(data[offset + 4 : offset + 8]), data[offset + 8 : end - 4]
         if zlib.crc32(data[offset + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
             raise EntryError(
-                f"{name}: the PNG chunk at byte {offset} is corrupt: its checksum is not the one stored"
+                f"{name}: the PNG chunk at byte {offset} is corrupt: its checksum does not match the stored one"
             )
         yield kind, content
         offset = end
@@ -224,7 +224,7 @@ def _check_png_header(
         or len(content) != _IHDR.size
         or sum(chunk_kind == b"IHDR" for chunk_kind, _ in chunks) != 1
     ):
-        raise EntryError(f"{name}: the PNG does not start with its one header chunk, expected IHDR")
+        raise EntryError(f"{name}: the PNG does not start with its header chunk, expected exactly one IHDR")
     header = _IHDR.unpack(content)
     width, height, bits, colour, compression, filtering, interlace = header
     if (bits, colour) != (16, 0):
@@ -234,7 +234,7 @@ def _check_png_header(
         raise EntryError(f"{name}: the image is {height} x {width}, expected {format_shape(shape)} (H x W)")
     if compression or filtering or interlace > 1:
         actual = f"compression {compression}, filter {filtering}, interlace {interlace}"
-        raise EntryError(f"{name}: the PNG header says {actual}, expected 0, 0 and 0 or 1")
+        raise EntryError(f"{name}: the PNG header declares {actual}, expected 0, 0 and 0 or 1")
     return header
 
 
@@ -260,7 +260,9 @@ def _inflate_rows(name: str, chunks: list[tuple[bytes, memoryview]], expected: i
         raise EntryError(f"{name}: the PNG image data is corrupt ({error})") from error
     if len(rows) != expected or not inflater.eof:
         actual = f"more than {expected}" if len(rows) > expected else f"{len(rows)}"
-        raise EntryError(f"{name}: the PNG image data inflates to {actual} bytes, expected {expected}, whole")
+        raise EntryError(
+            f"{name}: the PNG image data inflates to {actual} bytes, expected {expected} and a complete stream"
+        )
     return rows
 
 

@@ -120,7 +120,7 @@ def description_problems(description: object) -> list[str]:
     """Return the problems of a description: any text without NUL, which PostgreSQL cannot store."""
     problems = type_problems("description", description, str)
     has_nul = isinstance(description, str) and "\0" in description
-    return [*problems, *(["description has a NUL character, expected text without one"] if has_nul else [])]
+    return [*problems, *(["description contains a NUL character, expected text without NUL"] if has_nul else [])]
 
 
 def url_problems(url: object) -> list[str]:

@@ -106,7 +106,7 @@ class SubmissionReader:
     def _suffix(self, view_id: str) -> str:
         checked = self._inspection.views.get(view_id)
         if checked is None:
-            raise EntryError(f"{view_id}: no sound entry was found, expected one of {', '.join(FORMATS)}")
+            raise EntryError(f"{view_id}: no valid entry was found, expected one of {', '.join(FORMATS)}")
         return PurePosixPath(checked.entry.name).suffix
 
     def _decode(self, view_id: str, scale: float) -> Depth:
@@ -191,5 +191,5 @@ def _scale_problems(meta: SubmissionMeta | None, views: Mapping[str, CheckedEntr
         return []
     return [
         f"{METADATA_NAME}: depth_scale is missing, expected metres per PNG unit, "
-        f"since {len(images)} entries are PNG (first {images[0]})"
+        f"because {len(images)} entries are PNG (first {images[0]})"
     ]

@@ -104,7 +104,7 @@ class SubmissionWriter:
 
     def __enter__(self) -> Self:
         if not self.path.parent.is_dir():
-            raise InputError(f"{self.path.parent}: no such folder, expected one to write the archive into")
+            raise InputError(f"{self.path.parent}: no such folder, expected an existing folder for the archive")
         if self.path.is_dir():
             raise InputError(f"{self.path}: the path is a directory, expected a file name for the archive")
         with ExitStack() as stack:
@@ -156,7 +156,9 @@ def _as_depth(view_id: str, depth: object) -> Depth:
     try:
         array = np.asarray(depth)
     except Exception as error:  # The object's own conversion may raise anything, e.g. for a tensor on a GPU.
-        raise InputError(f"{view_id}: depth cannot become a numpy array ({escape_text(str(error))})") from error
+        raise InputError(
+            f"{view_id}: depth cannot be converted to a numpy array ({escape_text(str(error))})"
+        ) from error
     if array.dtype.kind != "f":
         raise InputError(f"{view_id}: depth has dtype {array.dtype}, expected floats in metres")
     if array.ndim != 2 or 0 in array.shape:

@@ -191,13 +191,15 @@ def _parse_end_record(source: ByteSource, position: int, record: bytes) -> _EndR
     if zip64 is not None:
         position, expected = zip64
         if any(a not in (b, limit) for a, b, limit in zip(fields, expected, full, strict=True)):
-            raise DirectoryError(f"the zip end record says {fields}, expected the zip64 end record's {expected}")
+            raise DirectoryError(
+                f"the zip end record declares {fields}, expected the zip64 end record's {expected}"
+            )
         fields = expected
     disk, start_disk, here, count, size, offset = fields
     if disk or start_disk or here != count:
         raise DirectoryError(
             f"the zip is part of a multi-disk set (disk {disk}, {here} of {count} entries), "
-            "expected one whole file"
+            "expected a single complete file"
         )
     return _EndRecord(position, count, size, offset)
 
@@ -212,14 +214,14 @@ def _find_zip64_end_record(source: ByteSource, position: int) -> tuple[int, tupl
     if magic != b"PK\x06\x07":
         return None
     if disk or disks > 1:
-        raise DirectoryError(f"the zip is part of a multi-disk set of {disks}, expected one whole file")
+        raise DirectoryError(f"the zip is part of a multi-disk set of {disks}, expected a single complete file")
     if record_offset + _ZIP64_END_RECORD.size > locator_offset:
         raise DirectoryError(
             f"the zip64 end record is declared at byte {record_offset}, expected it before byte {locator_offset}"
         )
     magic, length, _, _, *fields = _ZIP64_END_RECORD.unpack(source.read_at(record_offset, _ZIP64_END_RECORD.size))
     if magic != b"PK\x06\x06" or record_offset + 12 + length != locator_offset:
-        raise DirectoryError(f"no whole zip64 end record was found at byte {record_offset}, expected one")
+        raise DirectoryError(f"no complete zip64 end record was found at byte {record_offset}, expected one")
     return record_offset, tuple(fields)
 
 
@@ -247,7 +249,7 @@ def _parse_record(data: bytes, start: int, index: int) -> tuple[ZipEntry, int]:
     name_end = start + _DIRECTORY_RECORD.size + name_length
     extra_end = name_end + extra_length
     if extra_end + comment_length > len(data):
-        raise DirectoryError(f"the zip directory record of entry {index} runs past the directory's end")
+        raise DirectoryError(f"the zip directory record of entry {index} extends past the directory's end")
     raw_name = data[start + _DIRECTORY_RECORD.size : name_end]
     name = raw_name.decode("utf-8" if flags & _UTF8_NAME else "cp437", errors="backslashreplace")
     size, compressed, offset = _apply_zip64_sizes((size, compressed, offset), data[name_end:extra_end], index)

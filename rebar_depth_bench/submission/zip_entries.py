@@ -99,7 +99,7 @@ def _type_problems(entry: ZipEntry) -> list[str]:
             f"the compression method is {entry.method}, expected {STORED} (stored) or {DEFLATED} (deflated)"
         )
     if entry.disk:
-        problems.append(f"the entry is on disk {entry.disk} of a multi-disk set, expected one whole file")
+        problems.append(f"the entry is on disk {entry.disk} of a multi-disk set, expected a single complete file")
     return problems
 
 
@@ -180,7 +180,7 @@ def read_data(source: ByteSource, checked: CheckedEntry) -> memoryview:
     try:
         data = source.read_at(checked.data_offset, entry.compressed_size)
     except EOFError as error:
-        raise EntryError(f"{name}: the archive was shortened while it was read: {error}") from error
+        raise EntryError(f"{name}: the archive was truncated while it was read: {error}") from error
     if entry.method == DEFLATED:
         data = _inflate(name, data, entry.size)
     # zlib-ng's CRC-32 is six times as fast as zlib's, whose time exceeds the rest of reading a view.

@@ -185,7 +185,7 @@ def test_quota_holds_for_concurrent_uploads_and_deletions(private_server: Server
     assert call(private_server, "DELETE", f"{API}/{accepted[0]}", token).status_code == 204
     rejected = private_server.submit(small_archive, token)
     assert rejected.status_code == 429
-    assert rejected.json()["detail"].startswith(f"this token has made its {QUOTA} submissions of today")
+    assert rejected.json()["detail"].startswith(f"the quota of {QUOTA} submissions per day (UTC) is used up")
     assert private_server.submit(small_archive, other_token).status_code == 202
     assert {private_server.wait_until_ended(submission_id)["status"] for submission_id in accepted[1:]} == {
         "scored"
@@ -241,7 +241,10 @@ def test_private_submission_is_visible_to_owner_only(private_server: Server, wri
 def test_always_public_submission_cannot_be_hidden(board: SharedServer) -> None:
     path = f"{API}/{board.ids['good']}"
     response = call(board.server, "PATCH", path, board.token, json={"public": False})
-    assert (response.status_code, response.json()["detail"]) == (403, "every submission is public here")
+    assert (response.status_code, response.json()["detail"]) == (
+        403,
+        "every submission of this leaderboard is public",
+    )
     assert call(board.server, "GET", path).json()["public"] is True
 
 

@@ -61,7 +61,7 @@ def test_upload_is_scored_and_shown_on_leaderboard(
         expect(page.get_by_role("heading", level=1)).to_have_text("from the browser")
         expect(page.locator("#state")).to_contain_text("Scored", timeout=SCORED_MS)
         expect(page.get_by_role("heading", name="Every view")).to_be_visible()
-        page.get_by_role("link", name="Board", exact=True).click()
+        page.get_by_role("link", name="Leaderboard", exact=True).click()
         page.get_by_role("link", name="from the browser").first.click()
         expect(page.get_by_role("link", name="result.json")).to_be_visible()
 
@@ -74,7 +74,7 @@ def test_rejected_upload_shows_problems(
     broken.write_bytes(b"PK no zip at all")
     with new_page(chromium, script=script) as page:
         page.goto(f"{board.url}/how-to-submit")
-        for token, words in (("rdb_wrong", "the token is unknown"), (board.token, "the archive is refused")):
+        for token, words in (("rdb_wrong", "the token is unknown"), (board.token, "the archive is invalid")):
             page.get_by_label("Token", exact=True).fill(token)
             page.get_by_label("Archive", exact=True).set_input_files(broken)
             page.get_by_role("button", name="Upload and check").click()

@@ -203,9 +203,9 @@ def test_private_rows_of_token_are_not_cached(apps: list[FastAPI], database: Dat
         assert b"secret method" not in get_response(apps[0], address)[2]
     status, headers, page = get_response(apps[0], f"/submissions/{submission_id}")
     assert (status, headers["cache-control"]) == (200, "no-store")
-    assert b"Not on the board" in page
+    assert b"Not on the leaderboard" in page
     submissions.publish(database, submission_id, True)
-    assert b"Not on the board" not in get_response(apps[0], f"/submissions/{submission_id}")[2]
+    assert b"Not on the leaderboard" not in get_response(apps[0], f"/submissions/{submission_id}")[2]
     submissions.remove(database, submission_id)
     assert get_response(apps[0], f"/submissions/{submission_id}")[0] == 404
 

@@ -98,7 +98,7 @@ class Service:
     def times_ended(self) -> Counter[str]:
         """Return how often each submission, by the prefix of its id, was finished by any scorer."""
         events = [json.loads(line) for log in self.logs for line in log if line.startswith("{")]
-        return Counter(event["submission"] for event in events if event["event"] == "ended")
+        return Counter(event["submission"] for event in events if event["event"] == "scoring finished")
 
     def url(self) -> str:
         return "http://127.0.0.1:9" if self.server is None else self.server.url
@@ -173,7 +173,9 @@ def test_accepted_submissions_are_scored_once(
     for submission_id in uploads.accepted:
         submission = service.server.wait_until_ended(submission_id, 300)
         if submission["status"] == "failed":
-            assert submission["reason"].startswith(f"scoring was begun {MAX_ATTEMPTS} times"), submission["reason"]
+            assert submission["reason"].startswith(f"scoring was started {MAX_ATTEMPTS} times"), submission[
+                "reason"
+            ]
             failed.append(submission_id)
             continue
         expected = expected or submission["result"]

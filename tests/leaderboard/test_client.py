@@ -125,10 +125,10 @@ def test_scoring_failure_and_exceeded_quota_are_reported(
     small = write_archive("small", configs=("lattice-orbit",))
     failed = run("submit", small, "--url", strict_server.url, token=token)
     assert failed.returncode == 2
-    assert "scoring failed: scoring took longer than the 0.01 s this service allows" in failed.stderr
+    assert "scoring failed: scoring took longer than the limit of 0.01 s" in failed.stderr
     over_quota = run("submit", small, "--url", strict_server.url, token=token)
     assert over_quota.returncode == 2
-    assert "this token has made its 1 submissions of today (UTC)" in over_quota.stderr
+    assert "the quota of 1 submissions per day (UTC) is used up" in over_quota.stderr
 
 
 def test_too_large_archive_is_reported(strict_server: Server, tmp_path: Path) -> None:
@@ -149,12 +149,12 @@ def test_client_library_raises_errors_of_command(board: SharedServer, tmp_path: 
         with pytest.raises(SubmissionError) as raised:
             leaderboard.submit(tmp_path / "broken.zip")
         assert raised.value.problems
-        with pytest.raises(ServiceError, match="answered 404"):
+        with pytest.raises(ServiceError, match="status for the result is 404"):
             leaderboard.result("nope")
         scored = json.loads(leaderboard.result(board.ids["good"]))
         assert scored["submission"]["method"] == "good"
     with (
         LeaderboardClient("http://127.0.0.1:9", "x") as unreachable,
-        pytest.raises(ServiceError, match="no answer"),
+        pytest.raises(ServiceError, match="no response"),
     ):
         unreachable.result("x")

@@ -19,6 +19,9 @@ from tests.leaderboard.dask_cluster import Cluster, NewCluster
 from tests.leaderboard.serving import RunServer, Server
 from tests.leaderboard.watching import SCORING, processes_below, submission_row, wait_until
 
+UNAVAILABLE = "scoring backend unavailable; job requeued"
+"""Log event of a worker that cannot reach the dask scheduler."""
+
 
 @pytest.fixture
 def cluster(tmp_path: Path, new_cluster: NewCluster) -> Iterator[Cluster]:
@@ -55,8 +58,8 @@ def test_late_scheduler_costs_no_attempt(
     with running_server(Path(data), relative_state, **settings) as server:
         token = server.token("alice")
         submission = server.submit_accepted(small_archive, token)
-        wait_until(lambda: is_logged(server, "nobody to score"), "the scheduler is missed")
-        wait_until(lambda: is_logged(server, "given back"), "the job is given back")
+        wait_until(lambda: is_logged(server, UNAVAILABLE), "the scheduler is unavailable")
+        wait_until(lambda: is_logged(server, "job requeued"), "the job is requeued")
         cluster.start_scheduler()
         worker = cluster.start_worker()
         wait_until(lambda: processes_below(worker.pid, SCORING), "the worker scores")
@@ -85,7 +88,7 @@ def test_killed_worker_or_scheduler_loses_no_submission(
         wait_until(lambda: processes_below(worker.pid, SCORING), "the second worker scores")
         scheduler.kill()
         scheduler.wait()
-        wait_until(lambda: is_logged(server, "nobody to score"), "the scheduler is missed")
+        wait_until(lambda: is_logged(server, UNAVAILABLE), "the scheduler is unavailable")
         worker.kill()
         worker.wait()
         cluster.start_scheduler()

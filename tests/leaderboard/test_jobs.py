@@ -111,9 +111,7 @@ def test_job_fails_after_max_attempts_and_next_is_claimed(database: Database, al
     [good] = queue(database, alice, 1)
     assert [jobs.claim(database, "s", LEASE_S) for _ in range(2)] == [good, None]
     assert get_submission(database, bad).status == "failed"
-    assert (
-        get_submission(database, bad).reason == f"scoring was begun {MAX_ATTEMPTS} times and never came to an end"
-    )
+    assert get_submission(database, bad).reason == f"scoring was started {MAX_ATTEMPTS} times but never finished"
 
 
 def test_job_of_dead_scorer_is_queued_last(database: Database, alice: TokenModel) -> None:

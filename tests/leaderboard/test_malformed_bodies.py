@@ -94,8 +94,8 @@ def _leaves_nothing(upload_server: UploadServer) -> Iterator[None]:
         ("multipart/form-data; boundary=", "expected multipart/form-data"),
         ('multipart/form-data; boundary=""', "expected multipart/form-data"),
         ("multipart/form-data; boundary*=utf-8''XX", "expected multipart/form-data"),
-        ("multipart/form-data; boundary=" + "X" * 10_000, "no multipart/form-data"),
-        ("multipart/form-data; boundary=YY", "no multipart/form-data"),
+        ("multipart/form-data; boundary=" + "X" * 10_000, "not valid multipart/form-data"),
+        ("multipart/form-data; boundary=YY", "not valid multipart/form-data"),
         ("multipart/mixed; boundary=XX", "expected multipart/form-data"),
         ("application/zip", "expected multipart/form-data"),
         ("\xff\xfe", "expected multipart/form-data"),
@@ -209,12 +209,12 @@ def test_wrong_content_length_is_rejected(upload_server: UploadServer) -> None:
 def test_body_size_is_limited_everywhere(upload_server: UploadServer, where: str) -> None:
     start = multipart_part(upload_server.sound)[:-2]
     body, status, words = {
-        "after the end": (start + b"\r\n" + END + b"y" * 10_000_000, 422, "more than 65536 bytes beside"),
+        "after the end": (start + b"\r\n" + END + b"y" * 10_000_000, 422, "more than 65536 bytes outside"),
         "in the archive": (start + b"y" * 10_000_000, 413, f"larger than {MAX_UPLOAD_BYTES} bytes"),
         "in other fields": (
             multipart_part(b"", DISPOSITION_WITH_NAME.format("note")) * 100_000,
             422,
-            "more than 65536 bytes beside",
+            "more than 65536 bytes outside",
         ),
     }[where]
     pieces = [body[offset : offset + 60_000] for offset in range(0, len(body), 60_000)]

@@ -167,7 +167,7 @@ def test_backup_into_foreign_folder_is_rejected(tmp_path: Path) -> None:
     (other / "precious.txt").write_text("mine")
     process = run_command("backup", other, "--state-dir", state)
     assert process.returncode == 2
-    assert "holds other things, expected a new folder or an earlier backup" in process.stderr
+    assert "contains other files, expected a new folder or an earlier backup" in process.stderr
     assert [path.name for path in other.iterdir()] == ["precious.txt"]
 
 
@@ -260,7 +260,7 @@ def test_token_is_printed_once_and_stored_as_hash(tmp_path: Path) -> None:
     assert token not in first.stderr
     second = run_command("token", "alice", "--state-dir", tmp_path)
     assert (second.returncode, second.stdout) == (2, "")
-    assert second.stderr.startswith("error: there is a token for 'alice' already")
+    assert second.stderr.startswith("error: a token for 'alice' already exists")
     stored = contents(tmp_path)
     assert hashlib.sha256(token.encode()).hexdigest().encode() in stored
     for part in (token, token.removeprefix("rdb_")):

@@ -194,7 +194,7 @@ def test_other_or_too_long_first_field_is_empty(parts: list[tuple[str, bytes]]) 
 def test_non_multipart_body_is_rejected() -> None:
     with pytest.raises(UploadError, match="expected multipart/form-data"):
         first_field(b"{}", 10, "application/json")
-    with pytest.raises(UploadError, match="no multipart/form-data"):
+    with pytest.raises(UploadError, match="not valid multipart/form-data"):
         first_field(b"hello", 10)
 
 

@@ -144,19 +144,19 @@ def test_page_of_queued_submission(waiting: SharedServer) -> None:
     response, parsed = page(waiting.page("later"))
     assert re.search(r"number 2 of \d in the queue", parsed.text)
     assert re.search(r"number 1 of \d in the queue", page(waiting.page("next"))[1].text)
-    assert "Not on the board" in parsed.text
+    assert "Not on the leaderboard" in parsed.text
     assert '<noscript><meta http-equiv="refresh" content="5"></noscript>' in response.text
     assert response.headers["cache-control"] == "no-store"
 
 
 def test_page_of_failed_submission_shows_reason(waiting: SharedServer) -> None:
     _, parsed = page(waiting.page("failed"))
-    assert "scoring took longer than the 0.01 s this service allows" in parsed.text
+    assert "scoring took longer than the limit of 0.01 s" in parsed.text
 
 
 def test_private_submission_is_not_on_leaderboard_page(waiting: SharedServer) -> None:
     response, parsed = page(f"{waiting.url}/")
-    assert "No submission of lattice is on the board yet." in parsed.text
+    assert "No submission of lattice is on the leaderboard yet." in parsed.text
     assert waiting.ids["scored"] not in response.text
     assert "rank" not in page(waiting.page("scored"))[1].text.split("Submitted by")[0].replace("not ranked", "")
     error_map = re.search(r'src="([^"]+error-maps[^"]+)"', get(waiting.page("scored")).text)
@@ -220,7 +220,7 @@ def test_form_rejects_uploads_like_api(waiting: SharedServer, write_archive: Wri
         (post_form(waiting, archive, "x" * 5000), 401, "no token"),
         (post_form(waiting, invalid, waiting.token), 422, "lattice/<b>0000.npy"),
         (post_form(waiting, None, waiting.token), 422, "has no field 'archive'"),
-        (post_form(waiting, large, waiting.token), 413, "the most this service takes"),
+        (post_form(waiting, large, waiting.token), 413, "the limit of this service"),
     ]
     for response, status, words in cases:
         assert response.status_code == status, response.text

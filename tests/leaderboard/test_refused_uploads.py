@@ -58,11 +58,9 @@ class RejectingServer:
             "too large": RejectedUpload(413, too_large, self.fresh, large),
             "too large, chunked": RejectedUpload(413, too_large, self.fresh, large, True),
             "no quota": RejectedUpload(
-                429, "this token has made its 1 submissions of today (UTC)", self.spent, small
+                429, "the quota of 1 submissions per day (UTC) is used up", self.spent, small
             ),
-            "no quota, large": RejectedUpload(
-                429, "this token has made its 1 submissions", self.spent, large, True
-            ),
+            "no quota, large": RejectedUpload(429, "the quota of 1 submissions per day", self.spent, large, True),
         }
 
 

@@ -47,7 +47,7 @@ def test_other_dataset_is_rejected_without_rescore_option(tmp_path: Path, runnin
     ]
     process = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=60, check=False)
     assert process.returncode == 2
-    assert "2 submissions of this board are of another dataset" in process.stderr
+    assert "2 submissions of this leaderboard belong to another dataset" in process.stderr
     assert "--rescore true" in process.stderr
     assert "Traceback" not in process.stderr
     with running_server(second, state, db=db, rescore=True, workers=0) as server:
@@ -74,7 +74,7 @@ def test_scorer_with_other_dataset_releases_job(
     with running_server(first, state, workers=0) as server:
         submission_id = server.submit_accepted(archive, server.token("alice"))
         with running_scorer(second, state) as log:
-            wait_until(lambda: any("given back" in line for line in log), "the job is given back")
+            wait_until(lambda: any('"event": "job requeued"' in line for line in log), "the job is requeued")
         assert any("expected sha256:" in line for line in log)
         assert (
             submission_row(state, submission_id)["status"],

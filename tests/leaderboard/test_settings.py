@@ -74,33 +74,41 @@ CASES = {
     "another database": Case("db: expected sqlite", f"--db mysql://u:{PASSWORD}@h/x"),
     "database in memory": Case("db: expected sqlite", "--db sqlite://"),
     "database's port": Case("db: expected sqlite", f"--db postgresql://u:{PASSWORD}@h:port/x"),
-    "database away": Case("does not answer", f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x"),
-    "database away, token": Case(
-        "not answer", f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x", "token me --state-dir HERE/state"
+    "database unavailable": Case("database is unavailable", f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x"),
+    "database unavailable, token": Case(
+        "database is unavailable",
+        f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x",
+        "token me --state-dir HERE/state",
     ),
-    "database away, score": Case(
-        "not answer", f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x", "score --data DATA --state-dir HERE/state"
+    "database unavailable, score": Case(
+        "database is unavailable",
+        f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x",
+        "score --data DATA --state-dir HERE/state",
     ),
-    "state is a file": Case("files cannot be kept there", "--state-dir HERE/type"),
-    "port taken": Case("cannot listen there: Address already in use", "--port TAKEN"),
-    "not our address": Case("cannot listen there", "--host 192.0.2.1"),
-    "no address at all": Case("cannot listen there", f"--host {'x' * 70}"),
+    "state is a file": Case("cannot create the state folder", "--state-dir HERE/type"),
+    "port taken": Case("cannot listen on this address: Address already in use", "--port TAKEN"),
+    "not our address": Case("cannot listen on this address", "--host 192.0.2.1"),
+    "no address at all": Case("cannot listen on this address", f"--host {'x' * 70}"),
     "unknown protocol": Case("Protocol not known: nope", f"--archives nope://u:{PASSWORD}@h/x"),
-    "archives away": Case("cannot be kept there", f"--archives ftp://u:{PASSWORD}@127.0.0.1:1/x"),
-    "archives in a file": Case("cannot be kept there", "--archives HERE/type/x"),
+    "archive storage unavailable": Case(
+        "cannot access the archive storage", f"--archives ftp://u:{PASSWORD}@127.0.0.1:1/x"
+    ),
+    "archives in a file": Case("cannot access the archive storage", "--archives HERE/type/x"),
     "backup of PostgreSQL": Case(
         "pg_dump", f"--db postgresql://u:{PASSWORD}@h/x", "backup HERE/b --state-dir HERE/state"
     ),
-    "backup of nothing": Case("there is no database", "--state-dir HERE", "backup HERE/b"),
-    "backup into the state": Case("the service itself uses", "--state-dir HERE", "backup HERE/none/.."),
-    "backup into the database": Case("itself uses", "--db sqlite:///HERE/x/b.sqlite", "backup HERE/x"),
+    "backup of nothing": Case("database does not exist", "--state-dir HERE", "backup HERE/b"),
+    "backup into the state": Case("is in use by the service", "--state-dir HERE", "backup HERE/none/.."),
+    "backup into the database": Case(
+        "is in use by the service", "--db sqlite:///HERE/x/b.sqlite", "backup HERE/x"
+    ),
 }
 
 _RUNNER = """
 import contextlib, io, json, os, signal, sys, traceback
 from leaderboard.storage.archive_store import ArchiveStore
 from leaderboard.cli import main
-signal.signal(signal.SIGALRM, lambda *_: sys.exit("it was not refused and runs on"))
+signal.signal(signal.SIGALRM, lambda *_: sys.exit("the command did not fail within 30 s"))
 answers = []
 for arguments, environment in json.load(sys.stdin):
     said, clean = io.StringIO(), dict(os.environ)

@@ -56,28 +56,28 @@ def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
     """Check that an assembly stays above the board and clear of the config's cameras.
 
     Raises ``MeshError`` if it reaches more than 1 mm below z = 0 or as far as the nearest camera, and
-    ``InputError`` if the screen of the variant ``shadows`` would hang among the cameras.
+    ``InputError`` if the screen of the variant ``shadows`` would be among the cameras.
     """
     vertices_m = assembly.vertices_m
     lowest = min(assembly.parts, key=lambda part: float(part.mesh.vertices_m[:, 2].min()))
     lowest_m = float(lowest.mesh.vertices_m[:, 2].min())
     if lowest_m < -_BOARD_TOLERANCE_M:
         raise MeshError(
-            f"{config.name}: {lowest.name} reaches down to z = {lowest_m:.4g} m, ribs and all, expected 0 or "
-            "above, where the board or the ground is"
+            f"{config.name}: {lowest.name} extends down to z = {lowest_m:.4g} m, including its ribs, expected 0 "
+            "or above (the board or the ground is at z = 0)"
         )
     reach_m = float(np.linalg.norm(vertices_m - aim_point_m(assembly), axis=1).max())
     nearest_m = min(float(np.linalg.norm(offset)) for offset in camera_offsets_m(config.protocol))
     if reach_m >= nearest_m:
         raise MeshError(
-            f"the assembly reaches {reach_m:.4g} m from its middle, expected less than the {nearest_m:.4g} m "
-            f"at which the cameras of {config.name} stand: is the unit right?"
+            f"the assembly extends {reach_m:.4g} m from its centre, expected less than {nearest_m:.4g} m, "
+            f"the distance of the nearest camera of {config.name}: is the unit right?"
         )
     _check_shadow_screen(vertices_m, config)
 
 
 def _check_shadow_screen(vertices_m: Float64[ndarray, "n 3"], config: ConfigSpec) -> None:
-    """Raise ``InputError`` if the screen of the variant ``shadows`` would hang among the cameras."""
+    """Raise ``InputError`` if the screen of the variant ``shadows`` would be among the cameras."""
     if SHADOWS not in config.scene.appearance.variants:
         return
     farthest_m = max(float(np.linalg.norm(offset)) for offset in camera_offsets_m(config.protocol))
@@ -85,8 +85,8 @@ def _check_shadow_screen(vertices_m: Float64[ndarray, "n 3"], config: ConfigSpec
     screen_m = SCREEN_DISTANCE * float(np.linalg.norm(np.ptp(vertices_m, axis=0))) / 2
     if right_eye_m >= screen_m:
         raise InputError(
-            f"the screen of the variant {SHADOWS!r} would hang {screen_m:.4g} m from the steel, expected it "
-            f"beyond the cameras of {config.name}, which stand up to {right_eye_m:.4g} m from it"
+            f"the screen of the variant {SHADOWS!r} would be among the cameras: {screen_m:.4g} m from the steel, "
+            f"expected more than {right_eye_m:.4g} m, the distance of the farthest camera of {config.name}"
         )
 
 

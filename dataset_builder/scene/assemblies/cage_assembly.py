@@ -109,11 +109,11 @@ def _bar_problems(bar: CageBar) -> list[str]:
         )
     points_m = axis_m if bar.mesh is None else np.concatenate([axis_m, bar.mesh.vertices_m])
     if not np.isfinite(points_m).all():
-        problems.append(f"{bar.label}: a coordinate is not finite, expected numbers")
+        problems.append(f"{bar.label}: a coordinate is not finite, expected finite numbers")
     elif np.abs(points_m).max() > MAX_EXTENT_M:
         problems.append(
-            f"{bar.label}: reaches {np.abs(points_m).max():.6g} m from the world's origin, expected at most "
-            f"{MAX_EXTENT_M:g} m: is the unit right, and does the cage stand at the origin?"
+            f"{bar.label}: extends {np.abs(points_m).max():.6g} m from the world's origin, expected at most "
+            f"{MAX_EXTENT_M:g} m: is the unit right, and is the cage at the origin?"
         )
     return problems
 
@@ -141,7 +141,7 @@ def _duplicate_axis_problems(bars: Sequence[CageBar]) -> list[str]:
         ]
         key = min(tuple(points), tuple(reversed(points)))
         if key in first_label:
-            problems.append(f"{bar.label}: lies in the very place of {first_label[key]}, expected one bar there")
+            problems.append(f"{bar.label}: has the same axis as {first_label[key]}, expected distinct axes")
         first_label.setdefault(key, bar.label)
     return problems
 

@@ -51,7 +51,7 @@ def _toml_bars(content: bytes, where: str) -> list[CageBar]:
         try:
             cage_bars.append(_bent_bar(bar))
         except ValueError as error:
-            problems.append(f"{_label(bar)}: {error}, expected a path with room for its bends")
+            problems.append(f"{_label(bar)}: {error}, expected a path that is long enough for its bends")
     raise_problems(problems, where)
     return cage_bars
 
@@ -79,7 +79,7 @@ def _read_content(path: str | os.PathLike[str]) -> bytes:
     """Return a cage file's bytes; raise ``MeshError`` if its suffix is unknown or it cannot be read."""
     if _lower_suffix(path) not in _READERS:
         raise MeshError(
-            f"{path}: cages of kind {_lower_suffix(path)!r} are not read, expected {', '.join(_READERS)}"
+            f"{path}: unsupported cage file type {_lower_suffix(path)!r}, expected {', '.join(_READERS)}"
         )
     try:
         return Path(path).read_bytes()

@@ -65,13 +65,13 @@ def _check_spec(spec: LatticeSpec) -> None:
     if min(spec.extent_m, spec.pitch_m, *spec.diameters_m) <= 0:
         raise ValueError(f"extent, pitch and diameters must be positive: {spec}")
     if not np.isclose(_rods_per_axis(spec) * spec.pitch_m, spec.extent_m, rtol=1e-9):
-        raise ValueError(f"extent_m {spec.extent_m} is no whole number of pitch_m {spec.pitch_m}")
+        raise ValueError(f"extent_m is {spec.extent_m}, expected a multiple of pitch_m, {spec.pitch_m}")
     # Between two layers of one family lies one layer of each other family, which needs a gap to both.
     needed_m = 2 * _layer_offset_m(spec)
     if spec.pitch_m < needed_m:
         raise ValueError(
             f"pitch_m {spec.pitch_m} is too small for crossing rods of {max(spec.diameters_m)} m:"
-            f" {needed_m:.5f} m or more keeps them {CLEAR_GAP_M} m apart"
+            f" {needed_m:.5f} m or more is needed for a gap of {CLEAR_GAP_M} m"
         )
 
 

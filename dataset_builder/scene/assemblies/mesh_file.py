@@ -115,7 +115,9 @@ def _estimated_bar(bar_id: int, mesh: Mesh, where: str) -> Bar:
     try:
         return estimate_bar(bar_id, mesh)
     except ValueError as error:
-        raise MeshError(f"{where}: bar {bar_id} ({len(mesh.faces)} triangles) is no surface: {error}") from error
+        raise MeshError(
+            f"{where}: bar {bar_id} ({len(mesh.faces)} triangles) is not a valid surface: {error}"
+        ) from error
 
 
 def _check_unit(unit_m: float, where: str) -> None:
@@ -128,7 +130,7 @@ def _read_content(path: str | os.PathLike[str]) -> bytes:
     """Return a mesh file's bytes; raise ``MeshError`` if its suffix is unknown or it cannot be read."""
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
-        raise MeshError(f"{path}: mesh files of kind {suffix!r} are not read, expected {', '.join(SUFFIXES)}")
+        raise MeshError(f"{path}: unsupported mesh file type {suffix!r}, expected {', '.join(SUFFIXES)}")
     try:
         return Path(path).read_bytes()
     except OSError as error:

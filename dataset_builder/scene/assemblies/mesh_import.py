@@ -53,16 +53,19 @@ MAX_EXTENT_M = 100.0
 
 _UNSUPPORTED_GLTF = (
     rb'"sparse"\s*:|EXT_mesh_gpu_instancing|KHR_mesh_quantization|KHR_draco_mesh_compression|EXT_meshopt',
-    "it has sparse, instanced, quantised or compressed meshes, expected plain ones",
+    "the file has sparse, instanced, quantised or compressed meshes, expected plain meshes",
 )
 _UNSUPPORTED_CONTENT = {
     ".glb": _UNSUPPORTED_GLTF,
     ".gltf": _UNSUPPORTED_GLTF,
-    ".obj": (rb"(?m)^f[ \t][^\n#]*-", "it has relative (negative) vertex indices, expected absolute ones"),
+    ".obj": (
+        rb"(?m)^f[ \t][^\n#]*-",
+        "the file has relative (negative) vertex indices, expected absolute indices",
+    ),
     ".ply": (
         rb"(?m)\Aply\r?\n(?:(?!end_header)[^\n]*\n)*property \w+ bar_id\s*$",
-        "it has bar_id, but not this dataset's own PLY layout: without that property, connected components "
-        "are numbered",
+        "the file has the property bar_id, but not this dataset's PLY layout; without bar_id, connected "
+        "components are numbered as bars",
     ),
 }
 """Content that trimesh would misread silently, by suffix: a search pattern and the text of the error."""
@@ -168,7 +171,7 @@ def _mesh_in_metres(vertices: ArrayLike, faces: ArrayLike, spec: MeshFileSpec) -
         raise MeshError(f"{spec.path}: a vertex is {non_finite[0].tolist()}, expected finite coordinates")
     if corners.size and not (corners.min() >= 0 and corners.max() < len(points)):
         raise MeshError(
-            f"{spec.path}: triangles name vertices {corners.min()} to {corners.max()}, expected 0 to "
+            f"{spec.path}: triangles refer to vertices {corners.min()} to {corners.max()}, expected 0 to "
             f"{len(points) - 1}"
         )
     if Path(spec.path).suffix.lower() in {".glb", ".gltf"}:
@@ -227,7 +230,7 @@ def _check_extent(meshes: Iterable[Mesh], spec: MeshFileSpec) -> None:
     if not MIN_EXTENT_M < extent < MAX_EXTENT_M:
         raise MeshError(
             f"{spec.path}: the assembly is {extent:.6g} m long, expected {MIN_EXTENT_M:g} to "
-            f"{MAX_EXTENT_M:g} m: is the unit right? One file unit was taken as {spec.unit_m:g} m"
+            f"{MAX_EXTENT_M:g} m: is the unit right? One file unit was read as {spec.unit_m:g} m"
         )
 
 
@@ -235,7 +238,7 @@ class _NoSiblingFiles(dict[str, bytes]):
     """A trimesh resolver that refuses files beside the mesh file, since ``spec.sha256`` does not cover them."""
 
     def __missing__(self, name: str) -> bytes:
-        raise FileNotFoundError(f"{name!r} would be looked for beside it: save all in one .glb")
+        raise FileNotFoundError(f"the file refers to {name!r}, expected a single self-contained file such as .glb")
 
 
 @contextmanager
@@ -253,4 +256,4 @@ def _loader_errors_as_mesh_errors(where: str) -> Iterator[None]:
         raise MeshError(str(error)) from error
     except Exception as error:
         reason = shorten(f"{type(error).__name__}: {error}", 200)
-        raise MeshError(f"{where}: not a mesh file of its kind that can be read ({reason})") from error
+        raise MeshError(f"{where}: not a readable mesh file of its type ({reason})") from error

@@ -119,7 +119,10 @@ def tie_row(tie_number: int, intervals: int) -> int:
 def check_stock_length(role: str, length_m: float) -> None:
     """Raise ``ValueError`` if a bar is longer than the longest stock bar."""
     if length_m > STOCK_LENGTH_M:
-        raise ValueError(f"a {role} of this pier is {length_m:.2f} m long, stock bars end at {STOCK_LENGTH_M} m")
+        raise ValueError(
+            f"a {role} of this pier is {length_m:.2f} m long, expected at most {STOCK_LENGTH_M} m "
+            "(the longest stock bar)"
+        )
 
 
 def _check_spec_values(spec: PierSpec) -> None:
@@ -131,7 +134,7 @@ def _check_spec_values(spec: PierSpec) -> None:
     if spec.tie_diameter_m > spec.hoop_diameter_m:
         raise ValueError(
             f"ties of {spec.tie_diameter_m} m are thicker than hoops of {spec.hoop_diameter_m} m, "
-            "expected no thicker: their hooks would stand out of the cage"
+            "expected at most the same diameter: their hooks would protrude from the cage"
         )
 
 
@@ -153,7 +156,7 @@ def _check_hooks(spacing_m: float, vertical_m: float, bar_type: BentBarType) -> 
     needed_m = reach_m + CLEAR_GAP_M + vertical_m
     if spacing_m < needed_m:
         raise ValueError(
-            f"verticals stand {spacing_m:.4f} m apart, the hooks of {bar_type.diameter_m} m bars need "
+            f"verticals are {spacing_m:.4f} m apart, but the hooks of {bar_type.diameter_m} m bars need "
             f"{needed_m:.4f} m"
         )
 
@@ -186,7 +189,7 @@ def _level_layers_m(spec: PierSpec, hoop: BentBarType, tie: BentBarType) -> tupl
     if pitch_m < stack_m + CLEAR_GAP_M:
         raise ValueError(
             f"{spec.levels} levels in {spec.height_m} m are {pitch_m:.4f} m apart, "
-            f"two half hoops and a tie above each other take {stack_m + CLEAR_GAP_M:.4f} m"
+            f"but two half hoops and a tie above each other need {stack_m + CLEAR_GAP_M:.4f} m"
         )
     lowest_m = (pitch_m - stack_m) / 2 + hoop.outer_radius_m
     heights = lowest_m + pitch_m * np.arange(spec.levels)[:, None] + above_first

@@ -150,7 +150,7 @@ def spec_centreline_m(spec: PileSpec) -> Float64[ndarray, "n 3"]:
     try:
         return stirrup_centreline_m(spec.size_m, spec.diameter_m, outer_radius_m(spec.diameter_m, RIBS))
     except ValueError as error:
-        raise MeshError(f"no stirrup can be made of {spec}: {error}") from None
+        raise MeshError(f"no valid stirrup for {spec}: {error}") from None
 
 
 def points_in_world_m(points_m: Float64[ndarray, "n 3"], pose: Pose) -> Float64[ndarray, "n 3"]:
@@ -197,7 +197,7 @@ def _check_stored_stirrups(spec: PileSpec, stored: Mapping[str, Any]) -> None:
     ]
     if differing:
         raise MeshError(
-            f"settled state {spec.state!r} is of other stirrups than asked for: {'; '.join(differing)}"
+            f"settled state {spec.state!r} does not match the requested stirrups: {'; '.join(differing)}"
         )
 
 
@@ -209,5 +209,5 @@ def _parse_pose(number: int, stored: Mapping[str, Any]) -> Pose:
     if len(quaternion) != 4 or not abs(float(np.linalg.norm(quaternion)) - 1) < UNIT_TOLERANCE:
         raise ValueError(f"stirrup {number} has the quaternion {quaternion}, expected four numbers of norm 1")
     if not np.isfinite([x, y, z]).all():
-        raise ValueError(f"stirrup {number} lies at {(x, y, z)}, expected finite metres")
+        raise ValueError(f"stirrup {number} is at {(x, y, z)}, expected finite metres")
     return Pose((x, y, z), quaternion)

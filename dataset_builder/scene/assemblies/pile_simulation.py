@@ -161,7 +161,7 @@ def first_good_seed(pile: PileSpec, first_seed: int, tries: int = 500) -> tuple[
         print(f"seed {seed}: {'; '.join(problems) or 'good'}", file=sys.stderr, flush=True)
         if not problems:
             return seed, settled_pile
-    raise BuildError(f"none of the seeds {first_seed} to {first_seed + tries - 1} makes a good heap of {pile}")
+    raise BuildError(f"none of the seeds {first_seed} to {first_seed + tries - 1} gives a valid pile of {pile}")
 
 
 def pile_state(pile: PileSpec, seed: int, settled_pile: SettledPile) -> dict[str, Any]:
@@ -262,7 +262,7 @@ def _format_numbers(values: Sequence[float] | Float64[ndarray, " n"]) -> str:
 def _seed_argument(text: str) -> int:
     """Return a seed from the command line; raise ``ArgumentTypeError`` unless it is a whole number from 0 on."""
     if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text} is no seed, expected a whole number from 0 on")
+        raise argparse.ArgumentTypeError(f"{text} is not a valid seed, expected a whole number of 0 or more")
     return int(text)
 
 
@@ -271,8 +271,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="python -m dataset_builder.scene.assemblies.pile_simulation", description=__doc__.split("\n")[0]
     )
-    parser.add_argument("--seed", type=_seed_argument, default=0, help="the first seed to try")
-    parser.add_argument("--out", type=Path, required=True, help="the state, a JSON file")
+    parser.add_argument("--seed", type=_seed_argument, default=0, help="first seed to try")
+    parser.add_argument("--out", type=Path, required=True, help="output file of the settled state (JSON)")
     arguments = parser.parse_args()
 
     def settle_and_write() -> None:

@@ -38,9 +38,9 @@ class RibPattern:
 
     def __post_init__(self) -> None:
         if not 0 < self.spacing <= 0.7:
-            raise ValueError(f"rib spacing is {self.spacing} d, ASTM A615 allows up to 0.7 d")
+            raise ValueError(f"rib spacing is {self.spacing} d, expected at most 0.7 d (ASTM A615)")
         if not 45 <= self.angle_deg <= 90:
-            raise ValueError(f"rib angle is {self.angle_deg} degrees to the axis, ASTM A615 asks for 45 or more")
+            raise ValueError(f"rib angle is {self.angle_deg} degrees to the axis, expected 45 or more (ASTM A615)")
 
 
 def ribbed_bar_mesh(
@@ -55,7 +55,7 @@ def ribbed_bar_mesh(
     ribs = RibPattern() if ribs is None else ribs
     axis = _Axis.from_points(np.asarray(centreline_m, dtype=np.float64))
     if diameter_m <= 0:
-        raise ValueError(f"diameter_m is {diameter_m}, a bar needs a positive one")
+        raise ValueError(f"diameter_m is {diameter_m}, expected a positive length")
     theta = _ring_angles(ribs)
     ring_position = _ring_positions(axis.length_m / diameter_m, ribs)
     radius_m = diameter_m * (_core_ratio(ribs) + _rib_height(ring_position[:, None], theta, ribs))
@@ -74,7 +74,7 @@ def plain_bar_mesh(centreline_m: Float64[ndarray, "n 3"], diameter_m: float, seg
     """
     axis = _Axis.from_points(np.asarray(centreline_m, dtype=np.float64))
     if diameter_m <= 0:
-        raise ValueError(f"diameter_m is {diameter_m}, a bar needs a positive one")
+        raise ValueError(f"diameter_m is {diameter_m}, expected a positive length")
     theta = np.arange(segments) * 2 * np.pi / segments
     radius_m = plain_outer_radius_m(diameter_m, segments)
     s_m = np.repeat(axis.arc_m[:, None], segments, axis=1)

@@ -43,7 +43,7 @@ def bent_line_m(
     if len(too_short):
         leg = int(too_short[0])
         raise ValueError(
-            f"leg {leg + 1} is {lengths[leg]:.4f} m long, its bends of radius {radius_m:.4f} m take "
+            f"leg {leg + 1} is {lengths[leg]:.4f} m long, but its bends of radius {radius_m:.4f} m need "
             f"{tangent_length_m[leg] + tangent_length_m[leg + 1]:.4f} m"
         )
     pieces = [corners[:1]]
@@ -65,7 +65,7 @@ def _turn_angle(before: Float64[ndarray, " 3"], after: Float64[ndarray, " 3"]) -
     """Return the change of direction at a corner, radians; raise ``ValueError`` above 179 degrees."""
     turn_rad = float(np.arctan2(np.linalg.norm(np.cross(before, after)), before @ after))
     if turn_rad > np.deg2rad(179.0):
-        raise ValueError("the path turns straight back on itself at a corner; give the turn two corners")
+        raise ValueError("the path turns straight back on itself at a corner; use two corners for the turn")
     return turn_rad
 
 

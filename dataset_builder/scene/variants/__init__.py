@@ -61,7 +61,7 @@ def check_variants(names: Iterable[str]) -> None:
     problems = [f"no appearance variant {name!r}, expected one of {', '.join(VARIANTS)}" for name in unknown]
     repeated = [name for name in dict.fromkeys(requested) if requested.count(name) > 1]
     problems += [
-        f"appearance variant {name!r} is named {requested.count(name)} times, expected once" for name in repeated
+        f"appearance variant {name!r} is given {requested.count(name)} times, expected once" for name in repeated
     ]
     for slot in EXCLUSIVE_SLOTS:
         conflicting = variants_of_slot(dict.fromkeys(requested), slot)

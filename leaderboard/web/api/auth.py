@@ -11,7 +11,7 @@ from leaderboard.db.models import TokenModel
 from leaderboard.db.tokens import find_token
 from leaderboard.service import Service
 
-_BEARER = HTTPBearer(auto_error=False, description="A token made by `rebar-leaderboard token NAME`.")
+_BEARER = HTTPBearer(auto_error=False, description="A token created by `rebar-leaderboard token NAME`.")
 _Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_BEARER)]
 
 

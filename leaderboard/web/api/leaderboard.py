@@ -42,7 +42,7 @@ def entries_to_csv(rows: Sequence[LeaderboardEntry]) -> str:
 router = APIRouter(prefix="/api/v1", tags=["leaderboard"], responses=COMMON_RESPONSES)
 
 CSV = "text/csv; charset=utf-8"
-ConfigName = Annotated[str, Query(max_length=100, description="the config's name", examples=["lattice"])]
+ConfigName = Annotated[str, Query(max_length=100, description="name of the config", examples=["lattice"])]
 _ERROR_RESPONSES: Responses = {
     **UNKNOWN_TOKEN_RESPONSE,
     404: {"model": Problem, "description": "the dataset has no such config"},
@@ -90,7 +90,7 @@ async def _leaderboard_response(
     service = service_of(request)
     if config not in service.folder.configs:
         known = ", ".join(service.folder.configs)
-        raise HTTPException(404, f"no config {config!r}, expected one of {known}")
+        raise HTTPException(404, f"the dataset has no config {config!r}, expected one of {known}")
     if token is not None:
         content = await to_thread.run_sync(lambda: serialise(leaderboard_entries(service.database, config, token)))
         return Response(content, media_type=media_type, headers={"Cache-Control": NO_STORE})

@@ -25,12 +25,12 @@ class Problem(BaseModel):
 
 
 class Problems(BaseModel):
-    """Problems of a rejected upload. The quota is not charged."""
+    """Problems of a rejected upload, which does not count against the quota."""
 
     model_config = ConfigDict(
         json_schema_extra={
             "example": {
-                "detail": "the archive is refused: 1 problem",
+                "detail": "the archive is invalid: 1 problem",
                 "problems": ["lattice/0042.npy: missing, expected all 504 views of the config"],
             }
         }
@@ -62,12 +62,12 @@ class Submission(BaseModel):
 
     id: str
     status: Literal["queued", "scoring", "scored", "failed"]
-    url: str = Field(description="its page; whoever knows the address may read it")
+    url: str = Field(description="URL of its page, which anyone who knows the URL can read")
     method: str
-    public: bool = Field(description="whether its rows are on the board")
+    public: bool = Field(description="whether its rows are shown on the leaderboard")
     created_at: datetime
     finished_at: datetime | None
-    reason: str | None = Field(description="why it failed")
+    reason: str | None = Field(description="reason of the failure; null if it has not failed")
     archive_sha256: str
     result: dict[str, Any] | None = None
 
@@ -75,7 +75,7 @@ class Submission(BaseModel):
 class Token(BaseModel):
     """Name of a token, its quota and the limits of the service."""
 
-    name: str = Field(description="the submitter's name, as the board shows it")
+    name: str = Field(description="name of the submitter, shown on the leaderboard")
     quota: int = Field(description="accepted submissions per day (UTC)")
     quota_left: int
     max_upload_bytes: int
@@ -94,7 +94,7 @@ class Publication(BaseModel):
 class LeaderboardRow(BaseModel):
     """Leaderboard row; ``table`` is the table of the config in the result JSON."""
 
-    rank: int | None = Field(description="by native AbsRel; null where the protocol does not rank the row")
+    rank: int | None = Field(description="rank by native AbsRel; null if the row is not ranked")
     id: str
     method: str
     submitter: str
@@ -152,12 +152,12 @@ def _utc_datetime(seconds: float) -> datetime:
 Responses = dict[int | str, dict[str, Any]]
 """OpenAPI ``responses`` by status, as FastAPI expects them."""
 
-DATABASE_UNAVAILABLE_MESSAGE = "the database does not answer; try again in a while"
+DATABASE_UNAVAILABLE_MESSAGE = "the database is unavailable; try again later"
 DATABASE_UNAVAILABLE_RESPONSE: Responses = {503: {"model": Problem, "description": DATABASE_UNAVAILABLE_MESSAGE}}
 COMMON_RESPONSES: Responses = {
     429: {"model": Problem, "description": "too many requests"},
     **DATABASE_UNAVAILABLE_RESPONSE,
 }
 MALFORMED_RESPONSE: Responses = {422: {"model": Problems, "description": "the request is malformed"}}
-UNKNOWN_TOKEN_RESPONSE: Responses = {401: {"model": Problem, "description": "an unknown token"}}
-MISSING_TOKEN_RESPONSE: Responses = {401: {"model": Problem, "description": "no token, or an unknown one"}}
+UNKNOWN_TOKEN_RESPONSE: Responses = {401: {"model": Problem, "description": "the token is unknown"}}
+MISSING_TOKEN_RESPONSE: Responses = {401: {"model": Problem, "description": "the token is missing or unknown"}}

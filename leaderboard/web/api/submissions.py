@@ -51,8 +51,8 @@ _UPLOAD_REQUEST_BODY = {
 _ERROR_RESPONSES: Responses = {
     **MISSING_TOKEN_RESPONSE,
     413: {"model": Problem, "description": "the archive is too large"},
-    422: {"model": Problems, "description": "the archive is refused; the quota is not charged"},
-    429: {"model": Problem, "description": "too many requests, or the quota of the day is spent"},
+    422: {"model": Problems, "description": "the archive is invalid; it does not count against the quota"},
+    429: {"model": Problem, "description": "too many requests, or the daily quota is used up"},
 }
 _NOT_FOUND_RESPONSES: Responses = {
     404: {"model": Problem, "description": "no such submission"},
@@ -60,16 +60,16 @@ _NOT_FOUND_RESPONSES: Responses = {
 }
 _OWNER_ERROR_RESPONSES: Responses = {
     **MISSING_TOKEN_RESPONSE,
-    403: {"model": Problem, "description": "another's submission"},
+    403: {"model": Problem, "description": "you are not the owner of this submission"},
     **_NOT_FOUND_RESPONSES,
 }
 _ACCEPTED_RESPONSE: Responses = {
     202: {
-        "description": "accepted: file and row are on disk",
-        "headers": {"Location": {"description": "where to ask what became of it", "schema": {"type": "string"}}},
+        "description": "accepted; the archive and its database row are stored on disk",
+        "headers": {"Location": {"description": "URL path of the submission", "schema": {"type": "string"}}},
     }
 }
-_UNREADABLE_RESPONSE: Responses = {400: {"model": Problem, "description": "the body is no UTF-8"}}
+_UNREADABLE_RESPONSE: Responses = {400: {"model": Problem, "description": "the body is not valid UTF-8"}}
 
 
 @router.post(
@@ -115,7 +115,7 @@ def publish(
     """Publish a submission's rows on the leaderboard, or withdraw them; only the owner may do this."""
     record = get_own_submission(service, submission_id, token)
     if service.settings.default_visibility == "always" and not change.public:
-        raise HTTPException(403, "every submission is public here")
+        raise HTTPException(403, "every submission of this leaderboard is public")
     submissions.publish(service.database, submission_id, change.public)
     record.public = change.public
     return submission_schema(record, page_url(request, record))
@@ -144,7 +144,7 @@ def get_own_submission(service: Service, submission_id: str, token: TokenModel) 
     """Return the row of a submission. Raises status 404 if it does not exist, 403 if another token owns it."""
     record = get_submission(service, submission_id)
     if record.token_id != token.id:
-        raise HTTPException(403, "another's submission")
+        raise HTTPException(403, "you are not the owner of this submission")
     return record
 
 

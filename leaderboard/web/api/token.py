@@ -13,7 +13,7 @@ router = APIRouter(prefix="/api/v1", tags=["token"], responses=COMMON_RESPONSES)
 
 @router.get("/token", responses=MISSING_TOKEN_RESPONSE)
 def token(service: ServiceDep, token: RequiredToken) -> Token:
-    """Return whose the token is, how many submissions it has left today (UTC), and the limits of the service."""
+    """Return the name of a token, its quota and what remains of it today (UTC), and the service limits."""
     settings = service.settings
     return Token(
         name=token.name,

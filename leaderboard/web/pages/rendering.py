@@ -132,7 +132,7 @@ def format_size(count: int) -> str:
     return f"{count} bytes"
 
 
-_TITLES = {404: "There is no such page", 405: "That cannot be done here", 422: "The address is malformed"}
+_TITLES = {404: "Page not found", 405: "Method not allowed", 422: "Invalid request"}
 
 
 def error_response(
@@ -150,7 +150,7 @@ def error_response(
 
 
 def _error_page(request: Request, status: int, detail: str, headers: Mapping[str, str] | None) -> Response:
-    title = _TITLES.get(status, "That did not work")
+    title = _TITLES.get(status, "Request failed")
     message = "" if detail in ("Not Found", "Method Not Allowed") else clean_text(detail)
     context = {"title": title, "detail": message}
     return render(request, "refusal.html.j2", status_code=status, cache=NO_STORE, headers=headers, **context)

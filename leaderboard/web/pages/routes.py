@@ -98,7 +98,7 @@ def error_map(submission_id: SubmissionId, config: _PathPart, number: _PathPart,
     record = get_submission(service, submission_id)
     webp = error_map_webp(service.database, submission_id, f"{config}/{number}")
     if webp is None:
-        raise HTTPException(404, "no error map of this view is kept")
+        raise HTTPException(404, "there is no error map of this view")
     return Response(webp, media_type="image/webp", headers={"Cache-Control": _cache_control(record.public)})
 
 

@@ -73,7 +73,7 @@ async def _accept_form_upload(service: Service, body: AsyncIterator[bytes], requ
     except UploadError as error:
         raise UploadRejectedError(error.status, error.detail) from None
     if not text.strip():
-        raise UploadRejectedError(401, "no token, expected the one that the operator gave you")
+        raise UploadRejectedError(401, "no token, expected the token that you received from the operator")
     token = await to_thread.run_sync(find_token, service.database, text.strip())
     if token is None:
         raise UploadRejectedError(401, "the token is unknown")

@@ -58,8 +58,8 @@ def find_checkpoint(name_or_path: str) -> Checkpoint:
         return Checkpoint(folder.resolve().name, folder, None, _weights_digest(folder), config)
     if not _REPOSITORY.fullmatch(name_or_path):
         raise MethodError(
-            f"{name_or_path}: no such folder, and no name of a model on the Hub, expected a folder with {CONFIG} "
-            "or ORG/NAME"
+            f"{name_or_path}: is neither a folder nor the name of a model on the Hub, expected a folder with "
+            f"{CONFIG} or ORG/NAME"
         )
     folder = snapshot(name_or_path, CONFIG, _local_copy_hint(name_or_path))
     return Checkpoint(
@@ -105,7 +105,7 @@ def _read_json_object(path: Path) -> dict[str, Any]:
         value = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise MethodError(
-            f"{path.parent}: no {path.name}, expected a checkpoint's folder as save_pretrained writes it"
+            f"{path.parent}: no {path.name}, expected a checkpoint folder as written by save_pretrained"
         ) from None
     except (OSError, ValueError) as error:
         raise MethodError(f"{path}: cannot be read: {error}") from None

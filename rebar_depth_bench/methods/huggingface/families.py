@@ -71,7 +71,7 @@ FAMILIES: Mapping[str, ModelFamily] = {
 
 _UNSUPPORTED: Mapping[str, str] = {
     "chmv2": "it estimates the height of trees, not depth",
-    "prompt_depth_anything": "it completes measured depth, which a single picture does not bring",
+    "prompt_depth_anything": "it completes measured depth, which a single image does not have",
 }
 
 

@@ -151,7 +151,7 @@ DEPTH_PRO = Method(
         uses_intrinsics=True,
         source=f"transformers, {DEPTH_PRO_CHECKPOINT}",
         licence="Apple's own; it comes with the weights",
-        untested_note="never run with its real weights where this was written: they were not to be had",
+        untested_note="not tested with the real weights: they were not available",
     ),
     lambda: load_predictor(find_checkpoint(DEPTH_PRO_CHECKPOINT)),
 )

@@ -43,7 +43,7 @@ INFO = MethodInfo(
     uses_intrinsics=True,
     source=f"depth-anything-3, {REPOSITORY}",
     licence="Apache-2.0",
-    untested_note="tried with its real code and a small random network only: its weights were not to be had",
+    untested_note="tested only with its real code and a small random network: its weights were not available",
 )
 
 
@@ -61,7 +61,7 @@ def load_predictor(folder: Path) -> Predictor:
     def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         rgb, grid = row["left_rgb"], row["left_rgb"].shape[:2]
         with (
-            translate_errors(NAME, torch, "fails on a picture"),
+            translate_errors(NAME, torch, "inference failed"),
             torch.random.fork_rng(range(torch.cuda.device_count())),
         ):
             torch.manual_seed(SEED)
@@ -95,8 +95,8 @@ def check_preset(folder: Path) -> None:
         raise MethodError(f"{folder / CONFIG}: cannot be read as a JSON object: {error}") from None
     if preset != PRESET:
         raise MethodError(
-            f"{NAME}:{folder}: config.json names model {preset!r}, expected {PRESET!r}: only its output becomes "
-            "metres by the focal length"
+            f"{NAME}:{folder}: config.json names model {preset!r}, expected {PRESET!r}: only its output can be "
+            "converted to metres with the focal length"
         )
 
 

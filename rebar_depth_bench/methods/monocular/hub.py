@@ -18,7 +18,7 @@ from rebar_depth_bench.errors import MethodError, exception_summary
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.monocular.third_party import check_folder, with_weights_digest
 
-HUB_ACCESS = "a connection, HF_TOKEN for a model that is not public"
+HUB_ACCESS = "a network connection (and HF_TOKEN if the model is not public)"
 """Requirements for downloads from the Hub, for error messages."""
 
 
@@ -75,19 +75,19 @@ def announce_download(name: str, what: str, url: str, local_hint: str) -> None:
 
     if constants.HF_HUB_OFFLINE:
         raise MethodError(
-            f"{name}: {what} not on this machine, and HF_HUB_OFFLINE is set: unset it, or fetch them elsewhere "
-            f"and name their folder: {local_hint}"
+            f"{name}: {what} must be downloaded, but HF_HUB_OFFLINE is set: unset it, or download the files on "
+            f"another machine and pass their folder: {local_hint}"
         )
-    print(f"{name}: fetching {what} from {url}", file=sys.stderr, flush=True)
+    print(f"{name}: downloading {what} from {url}", file=sys.stderr, flush=True)
 
 
 def download_error(
-    name: str, url: str, error: Exception, local_hint: str, access: str = "a connection"
+    name: str, url: str, error: Exception, local_hint: str, access: str = "a network connection"
 ) -> MethodError:
     """Return the error of a failed download; ``access`` describes the requirements."""
     return MethodError(
-        f"{name}: cannot be fetched from {url}: {exception_summary(error)}; expected {access}, or a local copy: "
-        f"{local_hint}"
+        f"{name}: cannot be downloaded from {url}: {exception_summary(error)}; expected {access}, or a local "
+        f"copy: {local_hint}"
     )
 
 

@@ -57,9 +57,7 @@ INFO = MethodInfo(
     uses_intrinsics=True,
     source=f"github.com/YvanYin/Metric3D, {HUB_ENTRY_POINT}",
     licence="BSD-2-Clause",
-    untested_note=(
-        "never run with the real network where this was written: its code and weights were not to be had"
-    ),
+    untested_note="not tested with the real network: its code and weights were not available",
 )
 
 
@@ -73,7 +71,7 @@ def metric3d_method(folder: Path) -> Method:
     checkpoint = next((path for path in candidates if path.is_file()), None)
     if checkpoint is None:
         raise MethodError(
-            f"{NAME}:{folder}: no {CHECKPOINT_FILE} in it or in its weight/, expected that of {WEIGHTS_URL}"
+            f"{NAME}:{folder}: no {CHECKPOINT_FILE} in it or in its weight/, expected the file from {WEIGHTS_URL}"
         )
     return Method(
         with_weights_digest(INFO, folder.resolve().name, [checkpoint]), lambda: load_predictor(folder, checkpoint)
@@ -95,7 +93,7 @@ def load_predictor(folder: Path, checkpoint: Path) -> Predictor:
     def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         grid = row["left_rgb"].shape[:2]
         letterbox = fit_letterbox(grid, INPUT_SIZE_PX)
-        with translate_errors(NAME, torch, "fails on a picture"), torch.inference_mode():
+        with translate_errors(NAME, torch, "inference failed"), torch.inference_mode():
             raw_output = model.inference(
                 {"input": network_input(row["left_rgb"], letterbox).to(torch_device(torch))}
             )[0]
@@ -145,8 +143,10 @@ def cached_metric3d_method() -> Method:
     folder, checkpoint = cache / CACHE_FOLDER, cache / "checkpoints" / CHECKPOINT_FILE
     if not (folder / HUBCONF).is_file():
         source = "https://github.com/YvanYin/Metric3D"
-        announce_download(NAME, "its code, which is then run,", source, LOCAL_COPY_HINT)
-        with translate_errors(NAME, torch, f"its code of {source} cannot be fetched or run; {LOCAL_COPY_HINT}"):
+        announce_download(NAME, "its code, which is then executed,", source, LOCAL_COPY_HINT)
+        with translate_errors(
+            NAME, torch, f"its code from {source} cannot be downloaded or run; {LOCAL_COPY_HINT}"
+        ):
             torch.hub.load(REPOSITORY, HUB_ENTRY_POINT, pretrain=False, trust_repo=True)
     if not checkpoint.is_file():
         announce_download(NAME, "the weights", WEIGHTS_URL, LOCAL_COPY_HINT)

@@ -71,9 +71,9 @@ def translate_errors(method: str, torch: Any, doing: str) -> Iterator[None]:
     except Exception as error:  # Third-party code may raise anything.
         message = " ".join(f"{type(error).__name__}: {error}".split())[:MAX_ERROR_CHARACTERS]
         if not torch.cuda.is_available() and ("cuda" in message.lower() or "nvidia" in message.lower()):
-            message = f"its own code asks for a CUDA GPU, and torch sees none here ({message})"
+            message = f"its code requires a CUDA GPU, and torch finds none ({message})"
         if isinstance(error, ImportError):
-            message = f"{message}; install what its repository's requirements name"
+            message = f"{message}; install the requirements listed in its repository"
         raise MethodError(f"{method}: {doing}: {message}") from error
 
 
@@ -100,9 +100,9 @@ def check_weights_loaded(method: str, torch: Any, network: Any, loaded_names: It
     loaded_ids = {parameter_ids[name] for name in names if name in parameter_ids}
     missing = [name for name in sizes if parameter_ids[name] not in loaded_ids]
     fraction = 1 - sum(sizes[name] for name in missing) / max(sum(sizes.values()), 1)
-    message = f"{method}: the weights fill {fraction:.2%} of the network, lacking {len(missing)} tensors"
+    message = f"{method}: the weights cover {fraction:.2%} of the network, {len(missing)} tensors are missing"
     if missing and fraction < MIN_LOADED_FRACTION:
-        raise MethodError(f"{message}, first {missing[0]}, expected those of this network")
+        raise MethodError(f"{message}, first {missing[0]}, expected the weights of this network")
     if missing:
         print(f"{message}: {', '.join(missing)}", file=sys.stderr, flush=True)
     return network.to(torch_device(torch)).eval()

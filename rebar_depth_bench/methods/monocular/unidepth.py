@@ -38,9 +38,7 @@ INFO = MethodInfo(
     uses_intrinsics=False,
     source=f"github.com/lpiccinelli-eth/UniDepth, {REPOSITORY}",
     licence="CC BY-NC 4.0",
-    untested_note=(
-        "never run with the real network where this was written: its code and weights were not to be had"
-    ),
+    untested_note="not tested with the real network: its code and weights were not available",
 )
 
 
@@ -57,12 +55,12 @@ def load_predictor(folder: Path) -> Predictor:
 
     def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         planes = torch.from_numpy(row["left_rgb"].transpose(2, 0, 1).copy())
-        with translate_errors(NAME, torch, "fails on a picture"), torch.inference_mode():
+        with translate_errors(NAME, torch, "inference failed"), torch.inference_mode():
             raw_output = model.infer(planes)["depth"]
             depth_m = np.asarray(raw_output.float().cpu().numpy())
         if depth_m.shape != (1, 1, *row["left_rgb"].shape[:2]):
             raise MethodError(
-                f"{NAME}: the network returned depth of shape {depth_m.shape}, expected 1 x 1 and the picture's "
+                f"{NAME}: the network returned depth of shape {depth_m.shape}, expected 1 x 1 and the image's "
                 f"{row['left_rgb'].shape[:2]}"
             )
         return positive_or_nan(depth_m[0, 0])

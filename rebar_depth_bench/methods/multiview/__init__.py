@@ -23,7 +23,7 @@ _SCALE_SUMMARIES = {
     "aruco": "metres from the ArUco board",
     "anchored": "median-anchored to ground truth, no metric result",
 }
-_UNTESTED_NOTES = {"colmap": "PatchMatch never ran where this was written: there is no CUDA", "sweep": ""}
+_UNTESTED_NOTES = {"colmap": "PatchMatch is not tested: no CUDA GPU was available", "sweep": ""}
 
 
 def _import_pipeline() -> ModuleType:

@@ -108,7 +108,7 @@ def write_left_images(views: ConfigViews, folder: Path) -> LeftImages:
             camera, grid = row_camera, pinhole_grid(row, width, height)
         if not all(np.array_equal(a, b) for a, b in zip(camera, row_camera, strict=True)):
             raise MethodError(
-                f"{row['view_id']}: another K or distortion than the view before, expected one camera"
+                f"{row['view_id']}: K or distortion differs from the previous view, expected one camera"
             )
         name = names[row["view_id"]] = row["view_id"].rpartition("/")[2] + ".png"
         rgb = pinhole_image(row, grid)
@@ -117,7 +117,7 @@ def write_left_images(views: ConfigViews, folder: Path) -> LeftImages:
         markers[name] = detected_corners_px(rgb, views.board.dictionary) if views.board else {}
         poses[name] = row["left_cam_from_world"]
     if grid is None:
-        raise MethodError(f"{views.config}: no view, expected three or more")
+        raise MethodError(f"{views.config}: has no views, expected three or more")
     return LeftImages(folder, names, grid, markers, poses)
 
 

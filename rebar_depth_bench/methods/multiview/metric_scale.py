@@ -72,8 +72,8 @@ def fit_board(
             corners[marker] = np.array(marker_corners)
     if len(corners) < MIN_MARKERS:
         raise MethodError(
-            f"of the board's {len(layout)} markers {len(corners)} can be triangulated (each of their corners in "
-            f"{MIN_VIEWS} registered views and more), expected at least {MIN_MARKERS}"
+            f"{len(corners)} of the board's {len(layout)} markers can be triangulated (every corner is seen in "
+            f"at least {MIN_VIEWS} registered views), expected at least {MIN_MARKERS}"
         )
     source = np.concatenate(list(corners.values()))
     target = np.concatenate([layout[marker] for marker in corners])
@@ -180,8 +180,8 @@ def _require_board(views: ConfigViews) -> None:
     """Raise ``MethodError`` if the config's scene has no board."""
     if views.board is None:
         raise MethodError(
-            f"{views.config}: the scene has no ArUco board to take metres from; name configs that have one "
-            "(--config lattice pile), or take a method whose name ends in -anchored"
+            f"{views.config}: the scene has no ArUco board to determine the scale; select configs with one "
+            "(--config lattice pile), or use a method whose name ends in -anchored"
         )
 
 
@@ -221,7 +221,9 @@ def _scale_from_ground_truth(
         if scored.any():
             ratios.append(float(np.median(row["left_depth"][scored].astype(np.float64) / estimated[scored])))
     if not ratios:
-        raise MethodError(f"{views.config}: no registered view has depth on steel to anchor with")
+        raise MethodError(
+            f"{views.config}: no registered view has depth on steel, expected at least one to determine the scale"
+        )
     scale_m = float(np.median(ratios))
     notes = {
         "scale_from": "the median of ground truth over depth found: not metric by itself",

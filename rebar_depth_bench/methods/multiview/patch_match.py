@@ -24,8 +24,8 @@ def require_cuda() -> None:
     """Raise ``MethodError`` if COLMAP was built without CUDA."""
     if not pycolmap.has_cuda:
         raise MethodError(
-            "COLMAP's PatchMatch stereo needs CUDA, which this pycolmap was built without: on a machine with an "
-            "NVIDIA GPU, pip install pycolmap-cuda12 in its place; on a CPU use sweep-aruco or sweep-anchored"
+            "COLMAP's PatchMatch stereo needs CUDA, but this pycolmap was built without it: on a machine with an "
+            "NVIDIA GPU, pip install pycolmap-cuda12 instead; on a CPU use sweep-aruco or sweep-anchored"
         )
 
 
@@ -59,8 +59,8 @@ def read_depth_map(path: Path) -> Float32[ndarray, "h w"]:
     body = data[header.end() :] if header else b""
     if channels != 1 or len(body) != 4 * width * height:
         raise MethodError(
-            f"{path}: is no depth map of COLMAP: {len(data)} bytes that start with {data[:_HEADER_BYTES]!r}, "
-            "expected WIDTH&HEIGHT&1& and as many float32"
+            f"{path}: is not a COLMAP depth map: {len(data)} bytes that start with {data[:_HEADER_BYTES]!r}, "
+            "expected WIDTH&HEIGHT&1& and WIDTH x HEIGHT float32 values"
         )
     depth = np.frombuffer(body, "<f4").reshape(height, width)
     return np.where(depth > 0, depth, np.float32(np.nan))

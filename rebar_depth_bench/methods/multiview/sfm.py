@@ -67,7 +67,7 @@ def reconstruct_sparse(
     reconstruction = _from_pycolmap(pycolmap.Reconstruction(model))
     if len(reconstruction.cam_from_sfm) < MIN_REGISTERED_VIEWS:
         raise MethodError(
-            f"COLMAP registers {len(reconstruction.cam_from_sfm)} of {len(names)} pictures, expected at least "
+            f"COLMAP registered {len(reconstruction.cam_from_sfm)} of {len(names)} images, expected at least "
             f"{MIN_REGISTERED_VIEWS}"
         )
     return reconstruction
@@ -102,7 +102,7 @@ def _run_colmap(
     models = pycolmap.incremental_mapping(database, images, models_folder, options=_mapping_options())
     progress(stages, 3, 3)
     if not models:
-        raise MethodError(f"COLMAP finds no two of {len(names)} pictures that belong together")
+        raise MethodError(f"COLMAP found no matching pair among {len(names)} images")
     partial_model = work / "model.part"
     shutil.rmtree(partial_model, ignore_errors=True)
     partial_model.mkdir()

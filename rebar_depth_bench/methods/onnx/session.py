@@ -57,7 +57,9 @@ class OnnxSession:
         shape = tuple(np.shape(output))
         name = f"{self.where}: output {self.output_name!r}"
         if len(shape) < 2 or set(shape[:-2]) - {1} or not np.size(output):
-            raise MethodError(f"{name} has the shape {shape}, expected H x W, with any ones before")
+            raise MethodError(
+                f"{name} has the shape {shape}, expected H x W, with optional leading dimensions of 1"
+            )
         if self.at_input_size and shape[-2:] != tensor.shape[-2:]:
             expected = " x ".join(map(str, tensor.shape[-2:]))
             raise MethodError(
@@ -103,7 +105,7 @@ def _input_problems(inputs: Sequence[Any], spec: InputSpec) -> list[str]:
     """Return problems of the model's inputs: exactly one, floating point, of the expected shape."""
     if len(inputs) != 1:
         names = ", ".join(repr(entry.name) for entry in inputs) or "none"
-        return [f"the model takes {len(inputs)} inputs ({names}), expected one: the picture"]
+        return [f"the model takes {len(inputs)} inputs ({names}), expected one: the image"]
     [image_input] = inputs
     problems = []
     if image_input.type not in _FLOAT_DTYPES:
@@ -131,7 +133,7 @@ def _shape_problems(shape: Sequence[int | str | None], spec: InputSpec) -> list[
         problems.append(f"has the shape {shape_text}, expected 1 x 3 x H x W{hint}")
     for name, side, configured_side in zip(("height", "width"), sides, configured, strict=True):
         if not problems and _is_fixed(side) and side != configured_side:
-            got = "an open one (longest_side)" if configured_side is None else str(configured_side)
+            got = "a variable size (longest_side)" if configured_side is None else str(configured_side)
             problems.append(f"has the shape {shape_text}: got {got}, expected [input] {name} = {side}")
     return problems
 

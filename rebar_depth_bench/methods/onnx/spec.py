@@ -165,13 +165,13 @@ def _parse_toml(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise MethodError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if len(content) > MAX_TOML_BYTES:
-        raise MethodError(f"{path}: is larger than {MAX_TOML_BYTES} bytes, expected a short TOML file")
+        raise MethodError(f"{path}: is larger than {MAX_TOML_BYTES} bytes, expected a smaller TOML file")
     try:
         return tomllib.loads(content.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
-        raise MethodError(f"{path}: byte {error.start} is no UTF-8 text, expected a TOML file") from None
+        raise MethodError(f"{path}: byte {error.start} is not UTF-8 text, expected a TOML file") from None
     except (ValueError, RecursionError) as error:
-        raise MethodError(f"{path}: is no TOML file: {error}") from None
+        raise MethodError(f"{path}: is not a valid TOML file: {error}") from None
 
 
 def _read_table(reader: TableReader, name: str) -> TableReader:
@@ -263,6 +263,6 @@ def _read_focal_canonical_px(reader: TableReader, meaning: str) -> float:
         return reader.required(key, number(1, 100_000), math.nan)
     if key in reader.values:
         reader.problems.append(
-            f'{reader.where}{key}: got one with meaning "{meaning}", expected none: it is not used'
+            f'{reader.where}{key}: got a value, expected none: meaning "{meaning}" does not use it'
         )
     return math.nan

@@ -41,8 +41,8 @@ CODE_FILE, SETTINGS_FILE, CHECKPOINT_FILE = "core/foundation_stereo.py", "cfg.ya
 WEIGHTS_FOLDER = Path("pretrained_models", "23-51-11")
 SIDE_MULTIPLE_PX, ITERATIONS = 32, 32
 INSTALL_HINT = (
-    "git clone https://github.com/NVlabs/FoundationStereo, put the folder 23-51-11 that its readme links (Google "
-    f"Drive) into FoundationStereo/{WEIGHTS_FOLDER.parent}, install its requirements, and name it: "
+    "git clone https://github.com/NVlabs/FoundationStereo, put the folder 23-51-11 linked in its readme (Google "
+    f"Drive) into FoundationStereo/{WEIGHTS_FOLDER.parent}, install its requirements, and pass the clone as "
     f"{NAME}:FoundationStereo"
 )
 INFO = MethodInfo(
@@ -52,9 +52,7 @@ INFO = MethodInfo(
     uses_intrinsics=True,
     source="github.com/NVlabs/FoundationStereo, 23-51-11",
     licence="NVIDIA, research purposes only",
-    untested_note=(
-        "never run with the real network where this was written: its code and weights were not to be had"
-    ),
+    untested_note="not tested with the real network: its code and weights were not available",
 )
 
 
@@ -103,7 +101,7 @@ def load_predictor(installation: Installation) -> Predictor:
     import_package("cv2", NAME, "pip install 'rebar-depth-bench[methods]'")
     yaml = import_package("yaml", NAME, "pip install pyyaml")
     if downloads := _possible_downloads(torch):
-        print(f"{NAME}: its code may fetch {' and '.join(downloads)}", file=sys.stderr, flush=True)
+        print(f"{NAME}: its code may download {' and '.join(downloads)}", file=sys.stderr, flush=True)
     with (
         translate_errors(NAME, torch, f"{installation.weights} cannot be loaded"),
         on_sys_path(installation.clone),
@@ -123,7 +121,7 @@ def load_predictor(installation: Installation) -> Predictor:
         margins = margins_to_multiple((left.shape[0], left.shape[1]), SIDE_MULTIPLE_PX)
         cuda = torch.cuda.is_available()
         with (
-            translate_errors(NAME, torch, "fails on a pair"),
+            translate_errors(NAME, torch, "inference failed"),
             torch.inference_mode(),
             torch.autocast("cuda", enabled=cuda),
         ):
@@ -145,11 +143,11 @@ def _possible_downloads(torch: Any) -> list[str]:
     downloads = []
     if not any(Path(torch.hub.get_dir()).glob("facebookresearch_dinov2_*")):
         downloads.append(
-            "DINOv2's code (https://github.com/facebookresearch/dinov2, whatever HF_HUB_OFFLINE says), which is "
-            "then run,"
+            "DINOv2's code (https://github.com/facebookresearch/dinov2, even if HF_HUB_OFFLINE is set), which is "
+            "then executed,"
         )
     if not any(Path(constants.HF_HUB_CACHE).glob("models--timm--edgenext_small*")):
-        downloads.append("timm's edgenext_small (the Hub)")
+        downloads.append("timm's edgenext_small (from the Hub)")
     return downloads
 
 
@@ -168,23 +166,26 @@ def _find_installation(folder: Path) -> Installation:
     clone = next((candidate for candidate in (start, *start.parents) if (candidate / CODE_FILE).is_file()), None)
     if not folder.is_dir() or clone is None:
         raise MethodError(
-            f"{NAME}:{folder}: no clone of FoundationStereo with {CODE_FILE}, expected: {INSTALL_HINT}"
+            f"{NAME}:{folder}: no clone of FoundationStereo with {CODE_FILE}; to install it: {INSTALL_HINT}"
         )
     for name in (CHECKPOINT_FILE, SETTINGS_FILE):
         if not (weights / name).is_file():
-            raise MethodError(f"{NAME}:{folder}: no {name} in {weights}, expected: {INSTALL_HINT}")
+            raise MethodError(f"{NAME}:{folder}: no {name} in {weights}; to install it: {INSTALL_HINT}")
     return Installation(clone, weights)
 
 
 def _check_module_origin(code: Any, clone: Path) -> None:
     """Raise ``MethodError`` if ``core`` was imported from another package of the same name."""
     if not Path(code.__file__).resolve().is_relative_to(clone.resolve()):
-        raise MethodError(f"{NAME}: core is imported from {code.__file__} already, expected it from {clone}")
+        raise MethodError(f"{NAME}: core is already imported from {code.__file__}, expected it from {clone}")
 
 
 def _raise_without_folder() -> Predictor:
     """Raise ``MethodError`` with install instructions; the weights cannot be downloaded automatically."""
-    raise MethodError(f"{NAME}: its weights lie on Google Drive and cannot be fetched from here: {INSTALL_HINT}")
+    raise MethodError(
+        f"{NAME}: its weights are on Google Drive and cannot be downloaded automatically; to install it: "
+        f"{INSTALL_HINT}"
+    )
 
 
 FOUNDATION_STEREO = Method(

@@ -126,8 +126,8 @@ def _format_signed(value: float, decimals: int) -> str:
 
 _ALIGNMENT_NOTES: Mapping[str, str] = {NATIVE: "no alignment", SCALED: "oracle median scale per view"}
 _ONCE_NOTES: Mapping[str, str] = {
-    "alignment": "own alignment, named in the row",
-    "boundary": "no scale changes it",
+    "alignment": "own alignment, see the row",
+    "boundary": "independent of scale",
 }
 _AXIS_TITLES: Mapping[str, tuple[str, str]] = {
     "m": ("distance", "m"),
@@ -230,7 +230,7 @@ def _extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
         main_inspection=_measure_table(
             table, inspection.title, inspection, [by_name[key] for key in MAIN_INSPECTION_MEASURES]
         ),
-        other_inspection=_measure_table(table, "Inspection: spread, median, found bars alone", inspection, other),
+        other_inspection=_measure_table(table, "Inspection: spread, median, found bars only", inspection, other),
         tolerances=[_tolerance_row(table, *line) for line in _all_tolerances()],
         families=[family for family in [*folded, _profile_table(table)] if family.rows],
     )
@@ -261,12 +261,12 @@ def _measure_table(
 
 def _miss_note(rows: Iterable[MeasureRow]) -> str:
     has_miss = any(cell.text == MISSED for row in rows for cell in row.cells)
-    return f"{MISSED}: {MISS_MM:g} mm, which stands for what was not found." if has_miss else ""
+    return f"{MISSED}: not found, counted as {MISS_MM:g} mm." if has_miss else ""
 
 
 def _profile_table(table: ExtendedTable) -> ExtendedMeasureTable:
     family = MEASURE_FAMILIES["profile"]
-    return _measure_table(table, f"{family.title}: the numbers", family, family.measures)
+    return _measure_table(table, f"{family.title}: values", family, family.measures)
 
 
 def _cloud_table(table: ExtendedTable, family: MeasureFamily) -> ExtendedMeasureTable:

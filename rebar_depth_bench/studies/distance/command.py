@@ -25,7 +25,7 @@ from rebar_depth_bench.studies.distance.study import (
     fit_scale_slope,
 )
 
-SUMMARY = "the scale that predictions need, and their error, over distance"
+SUMMARY = "scale factor and error of predictions over distance"
 
 DEFAULT_BINS_PER_DECADE = 10
 """Distance bins per factor of ten, evenly spaced in the logarithm."""
@@ -36,14 +36,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_archive(parser)
     add_data(parser)
     parser.add_argument(
-        "--config", nargs="+", action="extend", metavar="NAME", help="which configs (default: all of the archive)"
+        "--config",
+        nargs="+",
+        action="extend",
+        metavar="NAME",
+        help="configs to evaluate (default: all in the archive)",
     )
     parser.add_argument(
         "--bins-per-decade",
         type=int,
         default=DEFAULT_BINS_PER_DECADE,
         metavar="N",
-        help="bins of distance from 1 m to 10 m, evenly in log (default: %(default)s)",
+        help="number of distance bins from 1 m to 10 m, equal in log distance (default: %(default)s)",
     )
     add_output_arguments(parser)
 

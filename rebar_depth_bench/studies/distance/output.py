@@ -80,16 +80,16 @@ def _slope_sentence(slope: ScaleSlope) -> str:
     value, interval = slope.slope.value, slope.slope.interval
     name = "All configs together" if slope.config == ALL_CONFIGS else printable(slope.config)
     if value is None:
-        return f"{name}: no slope, for its views with a prediction are too few or all about as far."
+        return f"{name}: no slope: too few views have a prediction, or their distances are too similar."
     verb = "falls" if value < 0 else "grows"
     power = f"s {verb} as distance to the power {formatting.number(value, 3)}"
     if interval is None:
-        return f"{name}: {power}, from too few views for an interval."
+        return f"{name}: {power}; there are too few views for an interval."
     interval_text = f"(95 % interval {formatting.interval_text(interval, 3)})"
     if interval[0] <= 0 <= interval[1]:
-        return f"{name}: {power} {interval_text}, so one scale may serve all distances."
+        return f"{name}: {power} {interval_text}, which is consistent with one scale for all distances."
     return (
-        f"{name}: {power} {interval_text}: twice the distance, {formatting.number(2**value, 3)} times the scale."
+        f"{name}: {power} {interval_text}: doubling the distance multiplies s by {formatting.number(2**value, 3)}."
     )
 
 
@@ -109,7 +109,7 @@ def _reversal_sentence(slope: ScaleSlope, bins: Sequence[DistanceBin]) -> list[s
     if (near[1] < 1) == (far[1] < 1):
         return []
     return [
-        f"The correction reverses: the median s is {formatting.scale_cell(near[1])} "
+        f"The correction changes direction: the median s is {formatting.scale_cell(near[1])} "
         f"at {_format_metres(near[0])} m and {formatting.scale_cell(far[1])} at {_format_metres(far[0])} m."
     ]
 
@@ -140,10 +140,10 @@ def _scale_figure(study: DistanceStudy) -> PageFigure:
     scales = [1.0, *(scale for points in view_points.values() for _, scale in points)]
     svg = chart(series, log_axis(distances_m, LEFT, RIGHT), log_axis(scales, HEIGHT, TOP), labels, reference=1.0)
     caption = (
-        "Dots: views; discs: medians of bins with 95 % intervals. The dashed line is s = 1, metric as it stands: "
-        "below it the prediction is too far, above it too near. A level line is one scale for all distances."
+        "Dots: views; discs: medians of bins with 95 % intervals. The dashed line is s = 1 (no correction): below "
+        "it the prediction is too far, above it too near. A horizontal line means one scale for all distances."
     )
-    return PageFigure(svg, "Scale s = median(z) / median(p) over distance, both in log.", caption)
+    return PageFigure(svg, "Scale s = median(z) / median(p) over distance, both axes logarithmic.", caption)
 
 
 def _error_figure(study: DistanceStudy) -> PageFigure:
@@ -171,7 +171,7 @@ def _error_figure(study: DistanceStudy) -> PageFigure:
         "Discs: native, no alignment; rings and dashed lines: scaled, an oracle s per view. Means of bins with "
         "95 % intervals."
     )
-    return PageFigure(svg, "AbsRel over distance, both in log.", caption)
+    return PageFigure(svg, "AbsRel over distance, both axes logarithmic.", caption)
 
 
 def _bin_points(bins: Sequence[DistanceBin], name: str) -> list[tuple[float, float]]:
@@ -186,7 +186,7 @@ def _error_bars(bins: Sequence[DistanceBin], name: str) -> list[tuple[float, flo
 
 def _slope_table(slopes: Sequence[ScaleSlope]) -> PageTable:
     return PageTable(
-        caption="Slope of log s over log distance, least squares over views: 0 says that one scale serves all.",
+        caption="Slope of log s over log distance, least squares over views: 0 means one scale for all distances.",
         heads=(
             ("Config", ""),
             ("Views", "with s"),
@@ -218,7 +218,7 @@ def _bin_table(bins: Sequence[DistanceBin]) -> PageTable:
             ("Views", "scored/all"),
             ("s", "median"),
             ("s", "95 % interval"),
-            ("s", "least to most"),
+            ("s", "minimum to maximum"),
             ("AbsRel ↓", "native"),
             ("AbsRel ↓", "95 % interval"),
             ("AbsRel ↓", "scaled"),
@@ -245,14 +245,16 @@ def _bin_table(bins: Sequence[DistanceBin]) -> PageTable:
 def _notes(study: DistanceStudy) -> list[str]:
     notes = [
         "Distance of a view: the median true depth of its scored pixels. z: truth, p: prediction.",
-        "Intervals resample blocks of neighbouring views: how far a number would move with other views of the "
-        f"same scenes. {formatting.DASH}: undefined, or no interval from fewer than {MIN_VIEWS} views.",
+        "Intervals: bootstrap over blocks of neighbouring views; they hold for other views of the same scenes, "
+        f"not for other scenes. {formatting.DASH}: undefined, or no interval from fewer than {MIN_VIEWS} views.",
     ]
     without = sum(point.score.scale is None for point in study.points)
     if without:
-        notes.append(f"{without} of {len(study.points)} views have no prediction: they have neither s nor error.")
+        notes.append(
+            f"{without} of {len(study.points)} views have no prediction, and therefore neither s nor an error."
+        )
     if len(study.slopes) > 1:
-        notes.append("The slope of all configs mixes distance with what else differs between their scenes.")
+        notes.append("The slope over all configs also depends on other differences between their scenes.")
     return notes
 
 

@@ -41,7 +41,7 @@ from rebar_depth_bench.submission.formats import FORMATS
 from rebar_depth_bench.submission.zip_directory import DirectoryError, FileSource, read_directory
 
 PROTOCOL = "rebar-kitti-eigen-1"
-SUMMARY = "check a method on KITTI's Eigen split against what is published"
+SUMMARY = "compare a method on KITTI's Eigen split with published numbers"
 DEFAULT_CAP_M = 80.0
 """Default depth cap, metres."""
 _SUFFIXES = ", ".join(FORMATS)
@@ -65,16 +65,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the study's arguments."""
     parser.description = (
         f"{SUMMARY}. Predictions: <drive>_<frame>_<side>.npy|npz|exr|png in a folder (16-bit PNG: metres x 256), "
-        "or an archive in the submission format with the views kitti/<drive>_<frame>_<side>; each exactly as "
-        "large as its ground truth, never resized."
+        "or an archive in the submission format with the views kitti/<drive>_<frame>_<side>. Each map must "
+        "have the size of its ground truth; maps are not resized."
     )
-    parser.add_argument("--predictions", required=True, metavar="DIR_OR_ZIP", help="one depth map an image")
+    parser.add_argument("--predictions", required=True, metavar="DIR_OR_ZIP", help="one depth map per image")
     parser.add_argument("--kitti", required=True, type=Path, metavar="ROOT", help="KITTI's raw data or depth maps")
     parser.add_argument(
         "--ground-truth",
         required=True,
         choices=get_args(GroundTruthKind),
-        help="one laser scan, or several (652 images)",
+        help="raw: one laser scan; improved: several scans (652 images)",
     )
     parser.add_argument("--crop", choices=tuple(CROPS), default="garg", help="default: %(default)s")
     parser.add_argument(
@@ -130,7 +130,9 @@ def run_kitti_study(
             raise SubmissionError(str(predictions), problems)
         scores = [outcome.score for outcome in outcomes if outcome.score is not None]
         if not scores:
-            raise InputError(f"{root}: no image has ground truth inside the crop {protocol.crop}, expected some")
+            raise InputError(
+                f"{root}: no image has ground truth inside the crop {protocol.crop}, expected at least one"
+            )
         archive = ArchiveIdentity(source.method, source.sha256())
     version = f"KITTI Eigen test, {protocol.ground_truth}"
     digest = "sha256:" + hashlib.sha256("".join(outcome.digest for outcome in outcomes).encode()).hexdigest()

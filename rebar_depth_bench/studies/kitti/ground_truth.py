@@ -146,7 +146,7 @@ def find_truth(
             truths.append(TruthFile(image, path, (cameras[key].height, cameras[key].width), cameras[key]))
     if not truths:
         example = _raw_path(Path(), images[0]) if kind == "raw" else _improved_path(Path(), images[0])
-        raise DatasetError(f"{root}: has the {kind} ground truth of no image, expected files such as {example}")
+        raise DatasetError(f"{root}: has no {kind} ground truth, expected files such as {example}")
     return truths, missing
 
 
@@ -222,7 +222,7 @@ def _png_shape(path: Path) -> tuple[int, int]:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from None
     width, height = struct.unpack(">2I", head[16:24]) if len(head) == 24 and head[12:16] == b"IHDR" else (0, 0)
     if not (0 < width <= _MAX_SIDE_PX and 0 < height <= _MAX_SIDE_PX):
-        raise DatasetError(f"{path}: says {height} x {width} pixels, expected a PNG of 1 to {_MAX_SIDE_PX} each")
+        raise DatasetError(f"{path}: is {height} x {width} pixels, expected a PNG of 1 to {_MAX_SIDE_PX} each")
     return height, width
 
 
@@ -233,7 +233,7 @@ def _read_limited(path: Path, limit: int) -> bytes:
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from None
     if len(data) > limit:
-        raise DatasetError(f"{path}: is larger than {limit} bytes, expected a file of KITTI")
+        raise DatasetError(f"{path}: is larger than {limit} bytes, expected a KITTI file")
     return data
 
 

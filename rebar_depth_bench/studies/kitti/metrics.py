@@ -184,6 +184,6 @@ def read_split(text: str) -> tuple[KittiImage, ...]:
             raise RebarDepthError(f"{SPLIT_FILE}: line {number} is {line!r}, expected <date>/<drive> <frame> l|r")
         image = KittiImage(*match.groups())
         if image in images:
-            raise RebarDepthError(f"{SPLIT_FILE}: line {number}: {image.name} stands twice")
+            raise RebarDepthError(f"{SPLIT_FILE}: line {number}: {image.name} is listed twice")
         images.add(image)
     return tuple(sorted(images))

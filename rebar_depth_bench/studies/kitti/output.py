@@ -38,7 +38,7 @@ def to_page(result: KittiResult) -> StudyPage:
         study="kitti",
         title=(
             f"KITTI Eigen split, {truth} ground truth, {result.table.images} images, crop {protocol.crop}, "
-            f"cap {protocol.cap_m:g} m: native (no alignment) beside scaled (oracle median scale per image)"
+            f"cap {protocol.cap_m:g} m: native (no alignment) and scaled (oracle median scale per image)"
         ),
         lead=_lead(result),
         stamps=result.provenance.lines(),
@@ -77,11 +77,13 @@ def to_pandas(result: KittiResult) -> DataFrame:
 
 def _lead(result: KittiResult) -> str:
     caveat = (
-        "" if result.is_published_set and result.table.complete else ", which does not hold here (see the notes)"
+        ""
+        if result.is_published_set and result.table.complete
+        else "; these conditions are not met here (see the notes)"
     )
     return (
-        "A check of an implementation: a method scored here should come close to what its authors publish, on the "
-        f"same images, crop and cap{caveat}."
+        "Check of an implementation: the numbers of a method should be close to those that its authors publish "
+        f"for the same images, crop and cap{caveat}."
     )
 
 
@@ -102,7 +104,7 @@ def _interval_table(result: KittiResult) -> PageTable:
         intervals.append(result.table.intervals.get(SCALE_NAME) if alignment == "scaled" else None)
         return [formatting.interval_text(interval, 4) for interval in intervals]
 
-    caption = "Their 95 % intervals: block bootstrap over images, in order of drive and frame"
+    caption = "95 % intervals of the means: block bootstrap over images, ordered by drive and frame"
     return PageTable(
         caption, _METRIC_HEADS, [[alignment, *cells(alignment)] for alignment in ("native", "scaled")]
     )
@@ -125,16 +127,16 @@ def _notes(result: KittiResult) -> list[str]:
     protocol, table = result.protocol, result.table
     expected = EXPECTED_IMAGES[protocol.ground_truth]
     notes = [
-        "z: ground truth, p: prediction. Means over images of each image's numbers; s = median(z)/median(p) of "
+        "z: ground truth, p: prediction. Numbers are means over images; s = median(z)/median(p) of "
         f"each image. Pixels count inside the crop with 0.001 m < z < {protocol.cap_m:g} m; "
-        "p is clamped to these ends after the alignment, as public evaluators do.",
+        "p is clamped to this range after the alignment, as in public evaluators.",
         f"{result.images_with_truth} images of the list have {protocol.ground_truth} ground truth here, "
         f"{expected} in the published set.{_missing_sentence(result)}",
     ]
     if protocol.ground_truth == "raw":
         meaning = {
             "camera": "A laser point's depth is planar z in the camera. Monodepth and its successors score "
-            "against the point's x in the scanner's frame, about 0.27 m more: --lidar-depth velodyne does so.",
+            "against the point's x in the scanner's frame, about 0.27 m more; use --lidar-depth velodyne for it.",
             "velodyne": "A laser point's depth is its x in the scanner's frame, as in Monodepth and its "
             "successors: about 0.27 m more than planar z in the camera.",
         }
@@ -142,11 +144,11 @@ def _notes(result: KittiResult) -> list[str]:
     if table.images < result.images_with_truth:
         notes.append(
             f"{result.images_with_truth - table.images} images have no ground truth inside the crop "
-            "and are left out."
+            "and are not scored."
         )
     if not table.complete:
         notes.append(
-            f"Not to be compared: predictions cover {formatting.coverage_percent(table.coverage)} % of the pixels "
+            f"Not comparable: predictions cover {formatting.coverage_percent(table.coverage)} % of the pixels "
             f"and {table.images_scored} of {table.images} images; expected at least "
             f"{MIN_RANKED_COVERAGE * 100:.0f} % and all images."
         )
@@ -158,7 +160,7 @@ def _missing_sentence(result: KittiResult) -> str:
         return ""
     names = ", ".join(result.missing[:_MAX_NAMES_SHOWN])
     more = len(result.missing) - _MAX_NAMES_SHOWN
-    return f" Without: {names}{f' and {more} more (all in the JSON)' if more > 0 else ''}."
+    return f" Missing: {names}{f' and {more} more (all in the JSON)' if more > 0 else ''}."
 
 
 def _metric_cells(metrics: KittiMetrics | None) -> list[str]:

@@ -91,7 +91,7 @@ def open_capture(path: str | os.PathLike[str]) -> Capture:
             if size != (width, height) and all(size)
         ]
     if problems or not left:
-        empty = [] if problems else ["left/ holds no picture"]
+        empty = [] if problems else ["left/ has no images"]
         raise InputError(f"{root}: {problem_summary([*problems, *empty])}\nexpected a capture: {CAPTURE_LAYOUT}")
     view_ids = tuple(f"{name}/{stem}" for stem in sorted(left))
     return Capture(root, view_ids, height, width, _read_calibration(root, width, height))
@@ -107,7 +107,7 @@ def _image_files(folder: Path, problems: list[str]) -> dict[str, Path]:
         if file.suffix.lower() not in _IMAGE_SUFFIXES or not file.is_file():
             continue
         if file.stem in files:
-            problems.append(f"{folder.name}/{file.name}: the name stands twice, expected one picture a view")
+            problems.append(f"{folder.name}/{file.name}: the name occurs twice, expected one image per view")
         if not _NAME.fullmatch(file.stem):
             problems.append(f"{folder.name}/{file.name}: expected a name of letters, digits, . _ -")
         files[file.stem] = file
@@ -120,7 +120,7 @@ def _image_size(file: Path, problems: list[str]) -> tuple[int, int]:
         with Image.open(file) as image:
             return image.size
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        problems.append(f"{file.parent.name}/{file.name}: is no readable picture ({type(error).__name__})")
+        problems.append(f"{file.parent.name}/{file.name}: is not a readable image ({type(error).__name__})")
         return 0, 0
 
 
@@ -134,7 +134,7 @@ def _read_calibration(root: Path, width: int, height: int) -> StereoCalibration:
     ratio = calibration.left.fx / calibration.left.fy
     if abs(ratio - 1) > _SQUARE_PIXEL_TOLERANCE:
         raise InputError(
-            f"{paths[0]}: at the pictures' {width} x {height} pixels fx is {ratio:.3f} times fy, expected 1: "
-            "the calibration belongs to pictures of another shape"
+            f"{paths[0]}: at the image size {width} x {height} fx is {ratio:.3f} times fy, expected 1: "
+            "the calibration belongs to images of another aspect ratio"
         )
     return calibration

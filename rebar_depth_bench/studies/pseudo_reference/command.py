@@ -80,9 +80,9 @@ class _StudyData:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the study's arguments."""
     parser.description = (
-        f"{SUMMARY}. A real capture is a folder with {CAPTURE_LAYOUT}; its view ids are <folder>/<name>. A folder "
-        "of depth files may name them by <name> alone, and hold a submission.json with method and, for 16-bit "
-        "PNG, depth_scale."
+        f"{SUMMARY}. A real capture is a folder with {CAPTURE_LAYOUT}; its view ids are <folder>/<name>. Depth "
+        "files in a folder may be named by <name> alone; the folder may contain a submission.json with method "
+        "and, for 16-bit PNG, depth_scale."
     )
     maps = "archive in the submission format, or a folder of <view_id>.npy|npz|exr|png"
     parser.add_argument("methods", nargs="+", metavar="METHOD", help=f"the methods' depth: {maps}")
@@ -94,16 +94,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"the pseudo-references, usually two: {maps}",
     )
     parser.add_argument("--data", required=True, metavar="ROOT", help="dataset folder, Hub repository or capture")
+    parser.add_argument("--config", metavar="NAME", help="config of a dataset folder (default: its only one)")
     parser.add_argument(
-        "--config", metavar="NAME", help="which config of a dataset folder (default: its only one)"
+        "--near",
+        type=float,
+        default=DEFAULT_NEAR_M,
+        metavar="M",
+        help="smallest depth scored, m (default: %(default)s)",
     )
     parser.add_argument(
-        "--near", type=float, default=DEFAULT_NEAR_M, metavar="M", help="evaluation range (default: %(default)s)"
+        "--far",
+        type=float,
+        default=DEFAULT_FAR_M,
+        metavar="M",
+        help="largest depth scored, m (default: %(default)s)",
     )
     parser.add_argument(
-        "--far", type=float, default=DEFAULT_FAR_M, metavar="M", help="evaluation range (default: %(default)s)"
+        "--no-exact", action="store_true", help="do not compare with the exact depth of a dataset folder"
     )
-    parser.add_argument("--no-exact", action="store_true", help="leave a dataset folder's exact depth out")
     add_workers(parser)
     add_output_arguments(parser)
 
@@ -211,7 +219,9 @@ def _label_sources(sources: Sequence[DepthSource], views: ExpectedViews) -> dict
     methods = [source.method for source in sources]
     for source in sources:
         if not any(view_id in views for view_id in source.view_ids):
-            raise InputError(f"{source.path}: has no view of this data, expected some such as {next(iter(views))}")
+            raise InputError(
+                f"{source.path}: has none of the views of this data, expected views such as {next(iter(views))}"
+            )
         label = source.method
         if methods.count(label) > 1 or label.startswith(EXACT_LABEL):
             label = f"{source.method} ({source.path.name})"
@@ -244,7 +254,7 @@ def _check_references_have_depth(references: Sequence[DepthReference], depth_ran
     if empty:
         raise InputError(
             f"{', '.join(map(printable, empty))}: no pixel of any view is {depth_range.describe()}, "
-            "expected some to score against"
+            "expected at least one to score against"
         )
 
 

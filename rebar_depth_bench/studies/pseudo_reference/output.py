@@ -46,7 +46,7 @@ def to_page(result: PseudoReferenceResult) -> StudyPage:
         study="pseudo-reference",
         title=(
             f"Full frame against {_describe_references(result)}, {printable(result.data)}: "
-            "native (no alignment) beside scaled (oracle median scale per view), "
+            "native (no alignment) and scaled (oracle median scale per view), "
             f"depths of {result.depth_range.describe()}"
         ),
         lead=_lead(result),
@@ -83,7 +83,7 @@ def _lead(result: PseudoReferenceResult) -> str:
         )
     ]
     share = f"{result.references[0].frame_share * 100:.1f} % of the frame"
-    return printable("; ".join([f"Held against {first} ({share})", *changes]) + ".", limit=2000)
+    return printable("; ".join([f"Relative to {first} ({share})", *changes]) + ".", limit=2000)
 
 
 def _describe_references(result: PseudoReferenceResult) -> str:
@@ -141,7 +141,7 @@ def _ranking_table(result: PseudoReferenceResult) -> PageTable:
         ("by AbsRel_s", "best first"),
         ("tau", ""),
     )
-    caption = f"Ranking; Kendall's tau against that under {printable(result.references[0].name)}"
+    caption = f"Ranking, with Kendall's tau relative to the ranking under {printable(result.references[0].name)}"
     return PageTable(caption, heads, [cells(reference.name) for reference in result.references])
 
 
@@ -155,7 +155,7 @@ def _reference_table(result: PseudoReferenceResult) -> PageTable:
         ]
         for reference in result.references
     ]
-    return PageTable("The references: depth in range, mean over all views", heads, rows)
+    return PageTable("Coverage of the references: depth in range, mean over all views", heads, rows)
 
 
 def _agreement_table(result: PseudoReferenceResult) -> PageTable:
@@ -176,7 +176,9 @@ def _agreement_table(result: PseudoReferenceResult) -> PageTable:
         ("views", ""),
     )
     return PageTable(
-        "How the references differ where both have depth", heads, [cells(row) for row in result.agreements]
+        "Differences between the references where both have depth",
+        heads,
+        [cells(row) for row in result.agreements],
     )
 
 
@@ -196,19 +198,19 @@ def _published_tables(published: PublishedNumbers) -> list[PageTable]:
 def _notes(result: PseudoReferenceResult) -> list[str]:
     first = printable(result.references[0].name)
     notes = [
-        "z: the reference, p: the prediction. Scored are pixels of the whole frame where both are finite, > 0 and "
+        "z: the reference, p: the prediction. Pixels of the whole frame are scored if both are finite, > 0 and "
         f"within {result.depth_range.describe()}. Means over views; s: median over views of median(z)/median(p).",
         f"Ratio: AbsRel here over AbsRel against {first}. Intervals: block bootstrap over views.",
-        "A prediction that is missing or out of range lowers the coverage and no error: a method that "
-        "covers less than 95 % of a reference's pixels, or nothing in a view, is shown and not ranked.",
+        "A prediction that is missing or out of range lowers the coverage but does not change the errors. A "
+        "method that covers less than 95 % of a reference's pixels, or none in a view, is shown but not ranked.",
     ]
     if any(reference.exact for reference in result.references):
         notes.append(
-            "Exact depth where a pseudo-reference has depth tells two effects apart: from there to the pseudo-"
-            "reference only the depth changes, from there to the exact depth only the pixels."
+            "Exact depth where a pseudo-reference has depth separates two effects: compared with the pseudo-"
+            "reference, only the depth differs; compared with the exact depth, only the pixels differ."
         )
     else:
-        notes.append("No exact depth is known here: the references are estimates, and so is every number above.")
+        notes.append("No exact depth is available: the references are estimates, and so is every number above.")
     for row in result.rows:
         reasons = formatting.unranked_reasons(row.table)
         if reasons:

@@ -33,7 +33,7 @@ from rebar_depth_bench.studies.scale_anchor.study import (
     view_ratio,
 )
 
-SUMMARY = "how many views of known depth give a whole archive its scale"
+SUMMARY = "scale a whole archive from k views of known depth"
 
 DEFAULT_DRAWS = 24
 """Draws for each k."""
@@ -44,16 +44,16 @@ MAX_DRAWS = 1000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the study's arguments."""
-    parser.add_argument("archive", metavar="ARCHIVE", help="a submission's zip, metric or up to scale")
+    parser.add_argument("archive", metavar="ARCHIVE", help="submission archive (zip), metric or up to scale")
     add_data(parser)
-    parser.add_argument("--config", metavar="NAME", help="which config (default: the archive's only one)")
+    parser.add_argument("--config", metavar="NAME", help="config to evaluate (default: the archive's only one)")
     parser.add_argument(
         "--baseline-scale",
         dest="given_scale",
         type=float,
         default=1.0,
         metavar="S",
-        help="what changes are told against: the archive times S (default: 1, as it stands)",
+        help="baseline of all changes: the archive multiplied by S (default: 1)",
     )
     parser.add_argument(
         "--num-anchor-views",
@@ -157,7 +157,7 @@ def _check_arguments(given_scale: float, counts: Sequence[int], draws: int, seed
         problems.append(f"--baseline-scale is {given_scale:g}, expected a finite number above 0")
     problems += [f"--num-anchor-views has {k}, expected 1 or more" for k in counts if k < 1]
     if not counts:
-        problems.append("--num-anchor-views names no number of views, expected one or more")
+        problems.append("--num-anchor-views has no number of views, expected one or more")
     if not 1 <= draws <= MAX_DRAWS:
         problems.append(f"--draws is {draws}, expected 1 to {MAX_DRAWS}")
     if not 0 <= seed < 2**31:

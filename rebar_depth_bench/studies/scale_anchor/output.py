@@ -97,9 +97,9 @@ def _lead(study: AnchorStudy) -> str:
     least, most = (formatting.counted(row.k, "view") for row in (first, study.rows[-1]))
     return (
         f"Each draw takes {first.k} to {most} of known depth, and the median over them "
-        "of r = median(z / p) multiplies every view of the archive alike. "
+        "of r = median(z / p) multiplies every view of the archive. "
         f"With {least} the scale is {_format_signed(first.deviation_percent.mean, 2)} % off the "
-        f"given {study.given.scale:g} in the mean of {len(study.draws[0])} draws "
+        f"given {study.given.scale:g} in the mean over {len(study.draws[0])} draws "
         f"(from {_format_signed(first.deviation_percent.low, 2)} to "
         f"{_format_signed(first.deviation_percent.high, 2)} %), "
         f"and AbsRel changes by {_format_signed(first.abs_rel_change.mean, 5)} "
@@ -120,7 +120,7 @@ def _change_figure(study: AnchorStudy) -> PageFigure:
         ),
     )
     caption = (
-        "against the given scale, the dashed line: below it the anchored archive is better. Line: mean of "
+        "relative to the given scale (dashed line). Below it the anchored archive is better. Line: mean of "
         f"{len(study.draws[0])} draws; band: from the smallest to the largest draw."
     )
     return PageFigure(svg, "Change of AbsRel", caption)
@@ -141,7 +141,7 @@ def _scale_figure(study: AnchorStudy) -> PageFigure:
     return PageFigure(
         svg,
         "Deviation of the scale",
-        "from the given one, the dashed line. Line: mean of the draws; band: their range.",
+        "from the given one (dashed line). Line: mean of the draws; band: their range.",
     )
 
 
@@ -162,7 +162,7 @@ def _spread_chart(study: AnchorStudy, spreads: list[tuple[int, Spread]], labels:
 def _table(study: AnchorStudy) -> PageTable:
     return PageTable(
         caption=(
-            "The archive times one scale from k known-depth views, against the archive times "
+            "The archive multiplied by one scale from k known-depth views, relative to the archive multiplied by "
             f"{study.given.scale:g}: mean ± standard deviation over {len(study.draws[0])} draws, and the range."
         ),
         heads=(
@@ -200,22 +200,22 @@ def _notes(study: AnchorStudy) -> list[str]:
         f"Scale of all {study.views - len(study.views_without_prediction)} views, their median r: "
         f"{formatting.number(all_views.scale, 5)}, AbsRel {formatting.number(all_views.abs_rel, 4)}, RMSE "
         f"{formatting.number(all_views.rmse_cm, 2)} cm.",
-        "Means over views on the scored pixels that have a prediction; z: truth, p: prediction. The anchors' "
-        "truth is exact and free of noise: a tape or a marker on a site is not.",
+        "Means over views on the scored pixels that have a prediction; z: truth, p: prediction. The known "
+        "depth is exact and free of noise, unlike measurements with a tape or marker on a site.",
     ]
     if study.views_without_prediction:
         notes.append(
             f"{len(study.views_without_prediction)} of {study.views} views have no prediction: "
-            "neither drawn nor scored."
+            "they are neither drawn nor scored."
         )
     if study.coverage < MIN_RANKED_COVERAGE:
         notes.append(
-            f"Coverage {formatting.coverage_percent(study.coverage)} %: what is missing has no error here."
+            f"Coverage {formatting.coverage_percent(study.coverage)} %: missing predictions have no error here."
         )
     if study.skipped_counts:
         skipped = ", ".join(map(str, study.skipped_counts))
         notes.append(
-            f"Left out: k = {skipped}, more than the "
+            f"Skipped: k = {skipped}, more than the "
             f"{study.views - len(study.views_without_prediction)} views to draw from."
         )
     return notes

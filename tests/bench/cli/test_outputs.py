@@ -28,7 +28,7 @@ def test_output_that_is_an_input_is_rejected(tmp_path: Path, capsys: pytest.Capt
     for command in commands:
         assert main(command) == 2, command
         stderr = capsys.readouterr().err
-        assert "which is read" in stderr or "inside" in stderr
+        assert "which is an input" in stderr or "inside" in stderr
     assert archive.read_bytes() == b"precious"
     assert (data / "manifest.json").read_text() == "precious"
 
@@ -36,7 +36,7 @@ def test_output_that_is_an_input_is_rejected(tmp_path: Path, capsys: pytest.Capt
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"json": "x", "html": "./x"}, r"--html and --json both name x, expected a file each"),
+        ({"json": "x", "html": "./x"}, r"--html and --json both name x, expected different files"),
         ({"json": "."}, r"--json names \., which is a folder"),
         (
             {"extended_csv": "file/x.csv"},
@@ -57,7 +57,7 @@ def test_method_file_and_prediction_folder_are_inputs(tmp_path: Path) -> None:
     method, predictions = tmp_path / "mine.py", tmp_path / "predictions"
     method.touch()
     predictions.mkdir()
-    with pytest.raises(InputError, match="which is read"):
+    with pytest.raises(InputError, match="which is an input"):
         check_outputs({"method": f"{method}:METHOD", "out": method})
     with pytest.raises(InputError, match="inside"):
         check_outputs({"kitti": predictions, "csv": predictions / "t.csv"})

@@ -101,14 +101,18 @@ def test_load_errors_name_expected_values(tiny_root: Path, tmp_path: Path) -> No
         rdb.load(tiny_root, "lattise")
     with pytest.raises(rdb.DatasetError, match=r"no column 'depth', expected some of view_id, left_rgb"):
         rdb.load(tiny_root, "lattice", columns=["depth"])
-    with pytest.raises(rdb.DatasetError, match=r"has no manifest.json, expected a folder finished by rebar-build"):
+    with pytest.raises(
+        rdb.DatasetError, match=r"has no manifest.json, expected a complete dataset folder written by rebar-build"
+    ):
         rdb.load(tmp_path, "lattice")
     with pytest.raises(rdb.DatasetError, match="no such folder"):
         rdb.load(tmp_path / "missing", "lattice")
 
 
 def test_unavailable_hub_repository_raises_dataset_error() -> None:
-    with pytest.raises(rdb.DatasetError, match=r"as a Hub repository its manifest\.json cannot be had"):
+    with pytest.raises(
+        rdb.DatasetError, match=r"not a local folder, and its manifest\.json cannot be downloaded from the Hub"
+    ):
         rdb.load("nobody/nothing-here", "lattice")
 
 
@@ -149,7 +153,7 @@ def test_damaged_shard_raises_dataset_error(tiny_root: Path, tmp_path: Path, dam
         (lambda manifest: manifest["configs"]["lattice"].pop("views"), "config lattice lacks views"),
         (
             lambda manifest: manifest["configs"]["lattice"]["views"][0].pop("left"),
-            "a view of config lattice has not",
+            "a view of config lattice does not have exactly the keys",
         ),
     ],
 )

@@ -173,7 +173,9 @@ def test_folder_without_bars_raises_dataset_error(
             (tmp_path / item.name).symlink_to(item)
     with (
         open_evaluation(archive, tmp_path) as evaluation,
-        pytest.raises(DatasetError, match=r"has no bars\.parquet, expected a folder finished by rebar-build"),
+        pytest.raises(
+            DatasetError, match=r"has no bars\.parquet, expected a complete dataset folder written by rebar-build"
+        ),
     ):
         score_extended(result, evaluation)
 

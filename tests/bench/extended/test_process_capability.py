@@ -197,11 +197,11 @@ def test_terminal_prints_defined_and_undefined_capability() -> None:
     line = next(line for line in text.splitlines() if "bar spacing: 10 mm / p95" in line)
     value = numbers["capability_gb50204_spacing"].value
     assert f"{value:.4g}" in line
-    assert "not told" not in text
+    assert "n/a" not in text
     missed = terminal_text(extended_of([{"spacing_judged_mm": np.full(9, MISS_MM)} for _ in range(VIEWS)]))
     line = next(line for line in missed.splitlines() if "bar spacing: 10 mm / p95" in line)
-    assert line.count("not told") == 2
-    assert "not told: 5 % or more were not found." in missed
+    assert line.count("n/a") == 2
+    assert "n/a: 5 % or more were not found, so the capability is undefined." in missed
 
 
 @pytest.mark.parametrize("width", [80, 100])

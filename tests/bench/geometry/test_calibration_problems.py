@@ -30,30 +30,34 @@ INVALID_CONF = [
     ("fx=700.5", "fx=1e999", r"\[LEFT_CAM_HD\] fx is '1e999', expected"),
     ("fx=700.5", "fx=-700.5", r"\[LEFT_CAM_HD\] fx is '-700.5', expected"),
     ("fx=700.5\n", "", r"section \[LEFT_CAM_HD\] has no fx, expected a number"),
-    ("fx=700.5", "fx=700.5\nFX=700", r"no INI file: .*FX.* already exists"),
+    ("fx=700.5", "fx=700.5\nFX=700", r"not an INI file: .*FX.* already exists"),
     ("k1=-0.16", "k1=%(k2)s", r"\[RIGHT_CAM_HD\] k1 is '%\(k2\)s', expected a number from -1000"),
     ("k1=-0.17\n", "", r"\[LEFT_CAM_HD\] has no k1"),
     ("cx=640.25", "cx=1290", r"\[LEFT_CAM_HD\] cx is '1290', expected a number from -0.5 to 1279.5 pixels"),
     ("cy=359.75", "cy=-1", r"\[RIGHT_CAM_HD\] cy is '-1', expected a number from -0.5 to 719.5"),
     ("[RIGHT_CAM_HD]", "[RIGHT_CAM_VGA]", r"section \[RIGHT_CAM_HD\] is missing"),
     ("[STEREO]", "[MONO]", r"section \[STEREO\] is missing"),
-    ("[STEREO]", "[LEFT_CAM_HD]", r"no INI file: .*section 'LEFT_CAM_HD' already exists"),
-    ("[STEREO]", "[left_cam_hd]", r"section \[left_cam_hd\] stands there twice"),
+    ("[STEREO]", "[LEFT_CAM_HD]", r"not an INI file: .*section 'LEFT_CAM_HD' already exists"),
+    ("[STEREO]", "[left_cam_hd]", r"section \[left_cam_hd\] occurs twice"),
     ("Baseline=120.5", "Baseline=0.1205", r"\[STEREO\] BASELINE is '0.1205', expected .* 1 to 10000 millimetres"),
     ("Baseline=120.5", "Baseline=-120.5", r"\[STEREO\] BASELINE is '-120.5', expected"),
     ("Baseline=120.5\n", "", r"\[STEREO\] has no BASELINE_HD and no BASELINE, expected"),
     ("CV_HD=0.006", "CV_VGA=0.006", r"\[STEREO\] has no CV_HD and no CV, expected .* -0.5 to 0.5 radians"),
     ("RX_HD=-0.001", "RX_HD=-5", r"\[STEREO\] RX_HD is '-5', expected"),
     ("TY=0.25", "TY=1e6", r"\[STEREO\] TY is '1e6', expected .* millimetres"),
-    ("[LEFT_CAM_HD]\n", "", r"no INI file: File contains no section headers"),
-    ("fx=700.5", "fx 700.5 ", r"no INI file: .*parsing errors"),
+    ("[LEFT_CAM_HD]\n", "", r"not an INI file: File contains no section headers"),
+    ("fx=700.5", "fx 700.5 ", r"not an INI file: .*parsing errors"),
     (
         "TY=0.25",
         "TY=-100",
-        r"right eye stands \(0.1205, -0.1, -0.00075\) m from the left, expected mostly along x",
+        r"right camera is at \(0.1205, -0.1, -0.00075\) m from the left one, expected an offset mostly along x",
     ),
-    ("k1=-0.17", "k1=-0.9", r"the left lens reaches no ray .*cannot be inverted at \d+ of \d+ points.*folds back"),
-    ("k2=0.02", "k2=-30", r"the right lens reaches no ray"),
+    (
+        "k1=-0.17",
+        "k1=-0.9",
+        r"the left distortion cannot be inverted .*cannot be inverted at \d+ of \d+ points.*folds back",
+    ),
+    ("k2=0.02", "k2=-30", r"the right distortion cannot be inverted"),
 ]
 
 
@@ -66,11 +70,11 @@ def test_invalid_conf_is_rejected(tmp_path: Path, old: str, new: str, words: str
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"", "it has no section, expected one of"),
-        (b"\x00" * 100, "no INI file"),
-        (b"\xff\xfe[\x00L\x00", "no UTF-8 text"),
-        (b"[STEREO]\nBaseline=120\n", r"it has \[STEREO\], expected one of \[LEFT_CAM_2K\]"),
-        (b"[DEFAULT]\nfx=1\n", r"it has \[DEFAULT\], expected"),
+        (b"", "the file has no section, expected one of"),
+        (b"\x00" * 100, "not an INI file"),
+        (b"\xff\xfe[\x00L\x00", "not UTF-8"),
+        (b"[STEREO]\nBaseline=120\n", r"the file has \[STEREO\], expected one of \[LEFT_CAM_2K\]"),
+        (b"[DEFAULT]\nfx=1\n", r"the file has \[DEFAULT\], expected"),
         (b"; " + b"x" * 1_000_001, "larger than 1000000 bytes"),
     ],
 )
@@ -84,7 +88,7 @@ def test_unreadable_path_raises_calibration_error(tmp_path: Path) -> None:
     (tmp_path / "folder.conf").mkdir()
     with pytest.raises(CalibrationError, match="cannot be read: Is a directory"):
         read_calibration(tmp_path / "folder.conf", 1280, 720)
-    with pytest.raises(CalibrationError, match=r"its name ends on '.yaml', expected .conf or .toml"):
+    with pytest.raises(CalibrationError, match=r"the file suffix is '.yaml', expected .conf or .toml"):
         read_calibration(tmp_path / "a.yaml", 1280, 720)
 
 
@@ -117,7 +121,11 @@ INVALID_TOML = [
     ("K = [[702.5,", "fx = 7\nK = [[702.5,", r"\[right\] has K and also fx"),
     ("rotation = [-0.001,", "rotation = [-3.1,", r"\[stereo\] rotation\[0\] is -3.1, expected .*radians"),
     ("rotation = [-0.001,", "rotation = [1, -0.001,", r"\[stereo\] rotation is .*, expected 3 numbers"),
-    ("[-0.001, 0.006, 0.0007]", "[[1, 0, 0], [0, 1, 0], [0, 0, -1]]", r"expected a rotation: .* no mirror"),
+    (
+        "[-0.001, 0.006, 0.0007]",
+        "[[1, 0, 0], [0, 1, 0], [0, 0, -1]]",
+        r"expected a rotation matrix .*determinant 1",
+    ),
     ("[-0.001, 0.006, 0.0007]", "[[1, 0, 0], [0, 1, 0], [0.1, 0, 1]]", r"expected a rotation"),
     (
         "[-0.001, 0.006, 0.0007]",
@@ -125,10 +133,14 @@ INVALID_TOML = [
         r"rotation's angle is 3\.14.*, expected .*radians",
     ),
     ("rotation = ", "roration = ", r"\[stereo\] rotation is missing"),
-    ("translation_m = ", "baseline_m = 0.12\ntranslation_m = ", r"both or none of translation_m and baseline_m"),
+    (
+        "translation_m = ",
+        "baseline_m = 0.12\ntranslation_m = ",
+        r"both or neither of translation_m and baseline_m",
+    ),
     ("[-0.1205, -0.00025", "[0.1205, -0.00025", r"translation_m\[0\], with its sign changed, is -0.1205"),
     ("[-0.1205, -0.00025", "[-120.5, -0.00025", r"translation_m\[0\] is -120.5, expected .* metres"),
-    ("fx = 700.5", "fx = = 700.5", r"no TOML file: .*line 4"),
+    ("fx = 700.5", "fx = = 700.5", r"not a TOML file: .*line 4"),
 ]
 
 

@@ -85,9 +85,7 @@ def test_cached_weights_commit_is_reported_and_used(name: str, hub_cache: Path) 
 def test_weights_missing_from_cache_raise_on_load(hub_cache: Path) -> None:
     (add_to_hub_cache("unidepth", hub_cache, COMMITS[0]) / "model.safetensors").unlink()
     method = find_method("unidepth")
-    with pytest.raises(
-        MethodError, match=r"unidepth-v2-vitl14: model.safetensors not on this machine, and HF_HUB"
-    ):
+    with pytest.raises(MethodError, match=r"unidepth-v2-vitl14: model.safetensors must be downloaded, but HF_HUB"):
         load_predictor(method)
 
 
@@ -112,7 +110,7 @@ def test_metric3d_reports_digests_of_torch_cache(
     np.testing.assert_allclose(
         load_predictor(first)(select_columns("metric3d", stereo_row())), 200 * 0.5 * 87.5 * 6.65 / 1000, rtol=3e-3
     )
-    assert "fetching" not in capsys.readouterr().err
+    assert "downloading" not in capsys.readouterr().err
     (torch_cache / "yvanyin_metric3d_main" / "mono").mkdir()
     (torch_cache / "yvanyin_metric3d_main" / "mono" / "model.py").write_text("")
     second = find_method("metric3d")
@@ -140,7 +138,7 @@ def test_methods_listing_needs_no_network(
 def test_predict_help_names_weight_folders(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["predict", "--help"])
-    assert "NAME:FOLDER (own weights of depth-anything-3," in " ".join(capsys.readouterr().out.split())
+    assert "NAME:FOLDER (a folder with weights for depth-anything-3," in " ".join(capsys.readouterr().out.split())
 
 
 def test_foundation_stereo_announces_only_uncached_downloads(
@@ -150,8 +148,8 @@ def test_foundation_stereo_announces_only_uncached_downloads(
     method = find_method(f"foundation-stereo:{stand_ins.stereo_clone(tmp_path / 'clone')}")
     load_predictor(method)
     stderr = capsys.readouterr().err
-    assert "DINOv2's code (https://github.com/facebookresearch/dinov2, whatever HF_HUB_OFFLINE says)" in stderr
-    assert "and timm's edgenext_small (the Hub)\n" in stderr
+    assert "DINOv2's code (https://github.com/facebookresearch/dinov2, even if HF_HUB_OFFLINE is set)" in stderr
+    assert "and timm's edgenext_small (from the Hub)\n" in stderr
     (hub_cache / "models--timm--edgenext_small.usi_in1k").mkdir(parents=True)
     load_predictor(method)
     stderr = capsys.readouterr().err
@@ -159,4 +157,4 @@ def test_foundation_stereo_announces_only_uncached_downloads(
     assert "edgenext" not in stderr
     (tmp_path / "torch" / "hub" / "facebookresearch_dinov2_main").mkdir(parents=True)
     load_predictor(method)
-    assert "fetch" not in capsys.readouterr().err
+    assert "download" not in capsys.readouterr().err

@@ -84,33 +84,34 @@ def test_checkpoint_is_fetched_once_then_read_from_cache(
     megabytes = sum(
         (model / name).stat().st_size for name in ("config.json", "preprocessor_config.json", "model.safetensors")
     )
-    assert f"org/model: fetching config.json from {endpoint}\n" in first.stderr
+    assert f"org/model: downloading config.json from {endpoint}\n" in first.stderr
     assert (
-        f"org/model: fetching the weights from {endpoint}\norg/model: {megabytes / 1e6:.1f} MB\n" in first.stderr
+        f"org/model: downloading the weights from {endpoint}\norg/model: {megabytes / 1e6:.1f} MB\n"
+        in first.stderr
     )
     assert any("model.safetensors" in request for request in requests)
     assert not any("pytorch_model.bin" in request for request in requests), "one kind of weights is enough"
     del requests[:]
     second = run_method("hf:org/model", tmp_path, endpoint, offline="1")
     assert (second.returncode, second.stdout) == (0, first.stdout)
-    assert "fetching" not in second.stderr
+    assert "downloading" not in second.stderr
     third = run_method("hf:org/model", tmp_path, endpoint, offline="0")
     assert (third.returncode, third.stdout) == (0, first.stdout)
-    assert "fetching" not in third.stderr
+    assert "downloading" not in third.stderr
     assert requests == [], "what is in the cache is not asked for"
     [weights] = tmp_path.glob("hub/models--*/snapshots/*/model.safetensors")
     weights.unlink()
     finished = run_method("hf:org/model", tmp_path, endpoint, offline="1")
     assert finished.returncode == 2
-    assert "org/model: the weights not on this machine, and HF_HUB_OFFLINE is set" in finished.stderr
+    assert "org/model: the weights must be downloaded, but HF_HUB_OFFLINE is set" in finished.stderr
 
 
 @pytest.mark.slow
 def test_offline_without_cache_exits_with_status_2(tmp_path: Path) -> None:
     finished = run_method("depth-pro", tmp_path, "http://127.0.0.1:9", offline="1")
     assert finished.returncode == 2
-    assert finished.stderr.startswith("error: apple/DepthPro-hf: config.json not on this machine, and HF_HUB_OFF")
-    assert "name their folder: hf:FOLDER (hf download apple/DepthPro-hf --local-dir FOLDER)\n" in finished.stderr
+    assert finished.stderr.startswith("error: apple/DepthPro-hf: config.json must be downloaded, but HF_HUB_OFF")
+    assert "pass their folder: hf:FOLDER (hf download apple/DepthPro-hf --local-dir FOLDER)\n" in finished.stderr
     assert "Traceback" not in finished.stderr
 
 
@@ -120,6 +121,6 @@ def test_model_missing_on_hub_exits_with_status_2(name: str, hub: tuple[str, lis
     endpoint, _ = hub
     finished = run_method(name, tmp_path, endpoint, offline="0")
     assert finished.returncode == 2
-    assert f"cannot be fetched from {endpoint}: RepositoryNotFoundError" in finished.stderr
-    assert "expected a connection, HF_TOKEN for a model that is not public, or a local copy: hf" in finished.stderr
+    assert f"cannot be downloaded from {endpoint}: RepositoryNotFoundError" in finished.stderr
+    assert "(and HF_TOKEN if the model is not public), or a local copy: hf" in finished.stderr
     assert "Traceback" not in finished.stderr

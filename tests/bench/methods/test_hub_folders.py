@@ -80,10 +80,10 @@ def test_weights_are_fetched_once_then_read_from_cache(hub: tuple[str, list[str]
     first = run_method("org/model", tmp_path / "home", endpoint, offline="0")
     assert (first.returncode, first.stdout) == (0, EXPECTED_OUTPUT), first.stderr
     before, _, after = first.stderr.partition("loading\n")
-    assert before == f"org/model: fetching config.json from {endpoint}\n", (
+    assert before == f"org/model: downloading config.json from {endpoint}\n", (
         "what the commit is known by, and no more"
     )
-    assert after == f"org/model: fetching model.safetensors from {endpoint}\n"
+    assert after == f"org/model: downloading model.safetensors from {endpoint}\n"
     assert all(request.endswith("/config.json") for request in requests if "main" in request)
     weights = {request for request in requests if "model.safetensors" in request}
     assert f"GET /org/model/resolve/{COMMIT}/model.safetensors" in weights
@@ -92,13 +92,13 @@ def test_weights_are_fetched_once_then_read_from_cache(hub: tuple[str, list[str]
     del requests[:]
     second = run_method("org/model", tmp_path / "home", endpoint, offline="1")
     assert (second.returncode, second.stdout) == (0, EXPECTED_OUTPUT), second.stderr
-    assert "fetching" not in second.stderr
+    assert "downloading" not in second.stderr
     assert requests == []
     [weights_file] = tmp_path.glob("home/hub/models--*/snapshots/*/model.safetensors")
     weights_file.unlink()
     third = run_method("org/model", tmp_path / "home", endpoint, offline="1")
     assert third.returncode == 2
-    assert "error: org/model: model.safetensors not on this machine, and HF_HUB_OFFLINE is set" in third.stderr
+    assert "error: org/model: model.safetensors must be downloaded, but HF_HUB_OFFLINE is set" in third.stderr
     assert "their folder: unidepth:FOLDER (hf download org/model --local-dir FOLDER)\n" in third.stderr
 
 
@@ -107,7 +107,7 @@ def test_model_missing_on_hub_exits_with_status_2(hub: tuple[str, list[str]], tm
     endpoint, _ = hub
     finished = run_method("org/other", tmp_path / "home", endpoint, offline="0")
     assert finished.returncode == 2
-    assert f"org/other: cannot be fetched from {endpoint}: RepositoryNotFoundError" in finished.stderr
+    assert f"org/other: cannot be downloaded from {endpoint}: RepositoryNotFoundError" in finished.stderr
     assert "or a local copy: unidepth:FOLDER" in finished.stderr
     assert "Traceback" not in finished.stderr
     [weights] = tmp_path.glob("model/model.safetensors")

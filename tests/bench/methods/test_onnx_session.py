@@ -70,7 +70,7 @@ MISMATCHES: dict[str, Mismatch] = {
         {"nodes": [CHANNEL_MEAN], "input_shape": (1, 3, 4, 6)},
         "longest_side = 6\nresize = 'stretch'\nrange = 1",
         DEPTH_OUTPUT,
-        "got an open one (longest_side), expected [input] height = 4",
+        "got a variable size (longest_side), expected [input] height = 4",
     ),
     "whole numbers in": (
         {"nodes": [helper.make_node("Neg", ["x"], ["y"])]}
@@ -107,7 +107,7 @@ MISMATCHES: dict[str, Mismatch] = {
         {"nodes": [helper.make_node("Neg", ["x"], ["y"])]},
         PLAIN_INPUT,
         DEPTH_OUTPUT,
-        "output 'y' has the shape (1, 3, 4, 6), expected H x W, with any ones before",
+        "output 'y' has the shape (1, 3, 4, 6), expected H x W, with optional leading dimensions of 1",
     ),
     "one number out": (
         {"nodes": [helper.make_node("ReduceMean", ["x"], ["y"], keepdims=0)]},

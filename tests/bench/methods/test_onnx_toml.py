@@ -54,9 +54,13 @@ INVALID_EDITS = [
     ("range = 255", "range = 255\nlayout = 'NHWC'", "[input] 'layout' is not a known key, expected only width"),
     ("'depth'", "'disparity'", '[output] meaning: got \'disparity\', expected "depth", "inverse-depth", "canon'),
     ("'depth'", "'canonical-depth'", "[output] focal_canonical_px is missing, expected a number from 1 to 100000"),
-    ("'depth'", "'depth'\nfocal_canonical_px = 1000", 'meaning "depth", expected none: it is not used'),
+    ("'depth'", "'depth'\nfocal_canonical_px = 1000", 'expected none: meaning "depth" does not use it'),
     ("'depth'", "'depth'\nscale = 0", "[output] scale: got 0, expected a number above 0"),
-    ("'depth'", "'depth'\nscale = inf", "[output] scale: got a number beyond 1e+09, expected a number above 0"),
+    (
+        "'depth'",
+        "'depth'\nscale = inf",
+        "[output] scale: got a number with a magnitude above 1e+09, expected a number above 0",
+    ),
     ("'depth'", "'depth'\nscale = '1'", "[output] scale: got '1', expected a number above 0"),
     ("'depth'", "'depth'\nmin_m = 3\nmax_m = 2", "[output] min_m: got 3, expected less than max_m, 2"),
     ("'depth'", "'depth'\nname = 'y'\nindex = 0", "[output] has name and index, expected one of them"),
@@ -64,9 +68,9 @@ INVALID_EDITS = [
     ("'depth'", "'depth'\nat_input_size = 1", "[output] at_input_size: got 1, expected true or false"),
     ("'depth'", "'depth'\nresize = 'area'", '[output] resize: got \'area\', expected "nearest" or "bilinear"'),
     ("range = 255", f"range = {'9' * 4000}", "[input] range: got 9999"),
-    ("range = 255", f"range = {'9' * 5000}", "is no TOML file"),
-    ("range = 255", f"range = {'[' * 5000}", "is no TOML file"),
-    ("range = 255", "range = 255\nrange = 1", "is no TOML file: Cannot overwrite a value"),
+    ("range = 255", f"range = {'9' * 5000}", "is not a valid TOML file"),
+    ("range = 255", f"range = {'[' * 5000}", "is not a valid TOML file"),
+    ("range = 255", "range = 255\nrange = 1", "is not a valid TOML file: Cannot overwrite a value"),
 ]
 
 
@@ -111,9 +115,9 @@ def test_example_in_docstring_is_valid(tmp_path: Path) -> None:
     ("content", "words"),
     [
         (None, "no such file, expected a TOML file that describes an ONNX model"),
-        (b"\xff\xfe", "byte 0 is no UTF-8 text"),
+        (b"\xff\xfe", "byte 0 is not UTF-8 text"),
         (b"#" * (1 << 21), "is larger than 1048576 bytes"),
-        (b"\x00", "is no TOML file"),
+        (b"\x00", "is not a valid TOML file"),
     ],
 )
 def test_unreadable_file_raises_with_reason(content: bytes | None, words: str, tmp_path: Path) -> None:

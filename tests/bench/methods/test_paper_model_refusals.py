@@ -46,7 +46,7 @@ def test_missing_package_names_install_command(
 @pytest.mark.parametrize("name", FROM_FOLDER)
 def test_weights_of_other_network_raise(name: str, tmp_path: Path) -> None:
     with pytest.raises(
-        MethodError, match=r"weights fill 0.00% of the network, lacking 1 tensors, first gain|Missing"
+        MethodError, match=r"weights cover 0.00% of the network, 1 tensors are missing, first gain|Missing"
     ):
         find_stand_in(name, tmp_path, other=1.0).load()
 
@@ -55,7 +55,7 @@ def test_weights_of_other_network_raise(name: str, tmp_path: Path) -> None:
     ("name", "spoil", "words"),
     [
         ("metric3d", "hubconf.py", "no hubconf.py in it"),
-        ("metric3d", "metric_depth_vit_small_800k.pth", "expected that of https://huggingface.co/JUGGHM/Metric3D"),
+        ("metric3d", "metric_depth_vit_small_800k.pth", "expected the file from https://huggingface.co/JUGGHM/"),
         (
             "unidepth",
             "model.safetensors",
@@ -99,7 +99,7 @@ def test_cuda_only_code_raises_without_gpu(tmp_path: Path) -> None:
     code = (folder / "hubconf.py").read_text()
     (folder / "hubconf.py").write_text(code.replace("print(", 'torch.linspace(0, 1, 2, device="cuda"); print('))
     predictor = load_predictor(f"metric3d:{folder}")
-    with pytest.raises(MethodError, match=r"metric3d: .* asks for a CUDA GPU, and torch sees none here"):
+    with pytest.raises(MethodError, match=r"metric3d: .* requires a CUDA GPU, and torch finds none"):
         predictor(select_columns("metric3d", stereo_row()))
 
 
@@ -110,7 +110,7 @@ def test_missing_import_of_model_code_is_named(name: str, code: str, tmp_path: P
     folder = BUILDERS[name](tmp_path / "theirs")
     text = (folder / code).read_text()
     (folder / code).write_text(text.replace("import torch", "import torch, no_such_mmcv", 1))
-    with pytest.raises(MethodError, match=r"No module named 'no_such_mmcv'; install what its repository's req"):
+    with pytest.raises(MethodError, match=r"No module named 'no_such_mmcv'; install the requirements listed"):
         load_predictor(f"{name}:{folder}")
 
 
@@ -143,16 +143,16 @@ def test_foreign_core_package_raises(tmp_path: Path, site: Path) -> None:
     (site / "core").mkdir()
     (site / "core" / "foundation_stereo.py").write_text("FoundationStereo = None\n")
     importlib.import_module("core.foundation_stereo")
-    with pytest.raises(MethodError, match=r"core is imported from .* already, expected it from"):
+    with pytest.raises(MethodError, match=r"core is already imported from .*, expected it from"):
         find_stand_in("foundation-stereo", tmp_path).load()
 
 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("unidepth", "not on this machine, and HF_HUB_OFFLINE is set: .* name their folder: unidepth:FOLDER"),
+        ("unidepth", "must be downloaded, but HF_HUB_OFFLINE is set: .* pass their folder: unidepth:FOLDER"),
         ("depth-anything-3", "depth-anything/DA3METRIC-LARGE: .* HF_HUB_OFFLINE .*: depth-anything-3:FOLDER"),
-        ("metric3d", "metric3d: its code, which is then run, not on this machine, and HF_HUB_OFFLINE is set"),
+        ("metric3d", "metric3d: its code, which is then executed, must be downloaded, but HF_HUB_"),
         (
             "foundation-stereo",
             "Google Drive .*: git clone https://github.com/NVlabs/FoundationStereo, put the folder",

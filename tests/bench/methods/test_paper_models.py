@@ -219,7 +219,7 @@ def test_weights_folder_inside_clone_is_accepted(tmp_path: Path) -> None:
     method = find_method(f"foundation-stereo:{small}")
     assert method.info.name == "foundation-stereo:11-33-40"
     assert np.isfinite(load_predictor(method)(select_columns("foundation-stereo", stereo_row()))).any()
-    with pytest.raises(MethodError, match=r"no model_best_bp2.pth in .*23-51-11, expected: git clone"):
+    with pytest.raises(MethodError, match=r"no model_best_bp2.pth in .*23-51-11; to install it: git clone"):
         find_method(f"foundation-stereo:{clone}")
 
 
@@ -234,7 +234,7 @@ def test_methods_list_marks_untested_and_multi_view(
         assert f"({METHODS[name].info.untested_note})" in listed
         assert METHODS[name].info.licence in listed
     multi_view_methods = [method for method in own_methods().values() if isinstance(method, MultiViewMethod)]
-    assert listed.count("(sees all views of a config before it answers for any)") == len(multi_view_methods) > 0
+    assert listed.count("(reads all views of a config before it predicts any)") == len(multi_view_methods) > 0
     assert "both rgb, both" in listed
     assert "left_depth" in listed
     assert "right_rgb" not in listed

@@ -139,7 +139,7 @@ def orbit_view_ids(root: Path) -> list[str]:
     [
         (
             "magic",
-            "no method 'magic', expected one of sgbm, sgbm-filled, ",
+            "unknown method 'magic', expected one of sgbm, sgbm-filled, ",
         ),
         ("nowhere.py:METHOD", "nowhere.py: no such file"),
         ("OWN:NOTHING", "is str, expected a rebar_depth_bench.methods.Method"),
@@ -348,7 +348,7 @@ def test_notes_that_are_not_json_raise(tiny_root: Path, tmp_path: Path) -> None:
     with_bad_notes = replace(
         method, prepare=lambda *args: replace(method.prepare(*args), notes={"bad": float("nan")})
     )
-    with pytest.raises(MethodError, match="whole: lattice: the note 'bad' is no plain JSON value"):
+    with pytest.raises(MethodError, match="whole: lattice: the note 'bad' is not a plain JSON value"):
         predict(with_bad_notes, tiny_root, tmp_path / "whole.zip")
     assert log[-1].startswith("prepare")
 

@@ -36,12 +36,12 @@ def test_missing_token_is_reported_and_shared_weights_count_once(capsys: pytest.
     assert not check_weights_loaded("m", torch, make_network(), ["tied.weight", "token", "head.unknown"]).training
     assert capsys.readouterr().err == ""
     check_weights_loaded("m", torch, make_network(), ["tied.weight"])
-    assert capsys.readouterr().err == "m: the weights fill 99.60% of the network, lacking 1 tensors: token\n"
+    assert capsys.readouterr().err == "m: the weights cover 99.60% of the network, 1 tensors are missing: token\n"
 
 
 def test_missing_body_weights_raise() -> None:
     with pytest.raises(
-        MethodError, match=r"m: the weights fill 0.40% .* lacking 1 tensors, first body.weight, exp"
+        MethodError, match=r"m: the weights cover 0.40% .* 1 tensors are missing, first body.weight, exp"
     ):
         check_weights_loaded("m", torch, make_network(), ["token"])
 

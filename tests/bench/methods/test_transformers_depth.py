@@ -243,13 +243,13 @@ def drop_tensor(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (delete_file("config.json"), "no config.json, expected a checkpoint's folder"),
+        (delete_file("config.json"), "no config.json, expected a checkpoint folder"),
         (break_config, "config.json: cannot be read"),
         (
             set_unsupported_type,
             "model_type is 'bert', expected one of depth_anything, depth_pro, dpt, glpn, zoedepth",
         ),
-        (set_depth_completion_type, "(it completes measured depth, which a single picture does not bring)"),
+        (set_depth_completion_type, "(it completes measured depth, which a single image does not have)"),
         (delete_file("preprocessor_config.json"), "no preprocessor_config.json"),
         (delete_file("model.safetensors"), "no weights, expected *.safetensors or *.bin beside config.json"),
         (truncate_weights, "cannot be loaded: SafetensorError"),
@@ -275,7 +275,7 @@ def test_missing_package_names_extra_to_install(
 
 @pytest.mark.parametrize("name", ["no/such/folder", "./nowhere", "word", "~/nowhere", "", "a/b:c"])
 def test_invalid_hf_name_raises(name: str) -> None:
-    with pytest.raises(MethodError, match="no such folder, and no name of a model on the Hub"):
+    with pytest.raises(MethodError, match="is neither a folder nor the name of a model on the Hub"):
         find_method(f"hf:{name}")
 
 

@@ -152,7 +152,7 @@ def test_inspection_table_is_open_with_native_and_scaled(rendered: str, lattice:
 def test_missed_bars_are_shown_as_missed_not_as_length(rendered: str) -> None:
     layer = table_row_cells(rendered, "lattice: Inspection, bar by bar", "layer distance: p95 error mm\xa0↓")
     assert layer == ["missed", "50.00 50.00 – 50.00", "24"]
-    assert "missed: 100 mm, which stands for what was not found." in Page(rendered).text
+    assert "missed: not found, counted as 100 mm." in Page(rendered).text
 
 
 def test_tolerance_rows_have_pass_rate_capability_source(rendered: str, lattice: ExtendedResult) -> None:
@@ -166,9 +166,9 @@ def test_tolerance_rows_have_pass_rate_capability_source(rendered: str, lattice:
         assert estimate.value == pytest.approx(expected, rel=0.02)
         assert estimate.interval is not None
         assert cell == f"{estimate.value:.2f} {estimate.interval[0]:.2f} – {estimate.interval[1]:.2f}"
-    assert table_row_cells(rendered, label, "GB 50204 distance of layers")[3:] == ["not told", "0.10 0.10 – 0.10"]
+    assert table_row_cells(rendered, label, "GB 50204 distance of layers")[3:] == ["n/a", "0.10 0.10 – 0.10"]
     text = Page(rendered).text
-    assert "not told: 5 % or more were not found" in text
+    assert "n/a: 5 % or more were not found" in text
     assert all(profile.source in text for profile in PROFILES)
     assert "ACI" not in extended_section_html(rendered)
 
@@ -179,7 +179,7 @@ def test_every_heading_states_its_alignment(rendered: str) -> None:
     asides = {
         "native": "no alignment",
         "scaled": "oracle median scale per view",
-        "once": r"own alignment, named in the row|no scale changes it",
+        "once": r"own alignment, see the row|independent of scale",
     }
     assert {kind for kind, _ in heads} == set(asides)
     for kind, content in heads:
@@ -280,7 +280,7 @@ def test_capability_is_formatted_as_ratio() -> None:
             MeasureEstimate(None, None, 0),
         )
     ]
-    assert texts == ["2.50", "∞", "not told", "–"]
+    assert texts == ["2.50", "∞", "n/a", "–"]
 
 
 def test_definitions_differing_only_in_step_are_merged() -> None:

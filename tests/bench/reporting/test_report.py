@@ -134,7 +134,7 @@ def test_overflow_and_zero_errors_render() -> None:
     shown = result(overflowed_view("pier/0000"), perfect, exact)
     text = Page(render_report(shown, [panels(factor=1e30), panels(factor=math.nan)])).text
     assert "is not ranked: a number overflowed." in text
-    assert "nothing to compare: no prediction on scored pixels" in text
+    assert "no prediction on scored pixels" in text
     assert "off the scale" in text
 
 

@@ -79,7 +79,7 @@ def test_views_without_prediction_are_excluded(noisy: Depths, tiny_root: Path, a
     assert study.skipped_counts == (9, 50)
     notes = " ".join(to_page(study).notes)
     assert "1 of 9 views have no prediction: neither drawn nor scored." in notes
-    assert "Left out: k = 9, 50, more than the 8 views to draw from." in notes
+    assert "Skipped: k = 9, 50, more than the 8 views to draw from." in notes
     nothing = archive_of({view: -depth_m for view, depth_m in noisy.items()}, "nothing.zip")
     with pytest.raises(InputError, match="0 of 9 views of lattice have a prediction, expected at least 2"):
         run_anchor_study(nothing, tiny_root, counts=(2, 3))

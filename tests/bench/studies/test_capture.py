@@ -85,11 +85,11 @@ def delete_all_images(root: Path) -> None:
     [
         (delete_right_image, r"left/000001.png: has no right/000001"),
         (resize_right_image, r"right/000001.png: is 32 x 18, expected 64 x 36"),
-        (corrupt_left_image, r"left/000001.png: is no readable picture"),
+        (corrupt_left_image, r"left/000001.png: is not a readable image"),
         (rename_with_space, r"left/view one.png: expected a name of letters"),
-        (duplicate_name, r"left/000001.png: the name stands twice"),
+        (duplicate_name, r"left/000001.png: the name occurs twice"),
         (rename_right_folder, r"right/: no such folder"),
-        (delete_all_images, r"left/ holds no picture"),
+        (delete_all_images, r"left/ has no images"),
     ],
 )
 def test_invalid_capture_raises_with_expected_layout(
@@ -109,9 +109,7 @@ def test_folder_name_invalid_in_view_id_raises(tmp_path: Path) -> None:
 
 def test_unsuitable_calibration_raises(tmp_path: Path) -> None:
     square = write_capture(tmp_path / "square", views=1, size=(64, 64))
-    with pytest.raises(
-        InputError, match=r"fx is 0\.563 times fy, expected 1: the calibration belongs to pictures"
-    ):
+    with pytest.raises(InputError, match=r"fx is 0\.563 times fy, expected 1: the calibration belongs to images"):
         open_capture(square)
     without = write_capture(tmp_path / "without", views=1)
     (without / "calibration.conf").unlink()

@@ -36,7 +36,7 @@ def test_known_power_law_is_recovered(tiny_truth: Depths, tiny_root: Path, archi
     assert slope.slope.value is not None
     assert slope.slope.interval is not None
     assert 0.5 < slope.slope.interval[0] < slope.slope.value < slope.slope.interval[1] < 0.7
-    assert "twice the distance" in to_page(study).lead
+    assert "doubling the distance" in to_page(study).lead
 
 
 def test_constant_scale_has_zero_slope(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
@@ -46,7 +46,7 @@ def test_constant_scale_has_zero_slope(tiny_truth: Depths, tiny_root: Path, arch
     [slope] = study.slopes
     assert slope.slope.interval is not None
     assert slope.slope.interval[0] < 0 < slope.slope.interval[1]
-    assert "one scale may serve all distances" in to_page(study).lead
+    assert "consistent with one scale for all distances" in to_page(study).lead
 
 
 def test_points_have_scores_and_true_distances_of_views(

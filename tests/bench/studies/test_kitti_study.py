@@ -150,7 +150,7 @@ def test_command_writes_files_and_states_conventions(
     arguments = ("--predictions", folder, "--kitti", root, "--ground-truth", "raw", "--crop", "eigen")
     assert run_study(study_module, *arguments, *output_options) == 0
     out = capsys.readouterr().out
-    title = f"raw LiDAR ground truth, {COUNT} images, crop eigen, cap 80 m: native (no alignment) beside scaled"
+    title = f"raw LiDAR ground truth, {COUNT} images, crop eigen, cap 80 m: native (no alignment) and scaled"
     assert title in " ".join(out.split())
     assert "0.0926" in out
     assert f"{COUNT} images of the list have raw ground truth here, 697 in the published set" in " ".join(
@@ -217,7 +217,7 @@ def test_all_bad_predictions_are_listed(root: Path, truths: Depths, tmp_path: Pa
         (("--cap", "0"), "the cap is 0.0 m, expected a finite number above 0.001"),
         (("--cap", "nan"), "the cap is nan m"),
         (("--workers", "0"), "workers is 0, expected 1 or more"),
-        (("--ground-truth", "improved"), "has the improved ground truth of no image"),
+        (("--ground-truth", "improved"), "has no improved ground truth"),
         (("--predictions", "short"), "2011_09_26_drive_0002_sync_0000000003_l: no file, expected one of .npy"),
         (("--predictions", "empty"), "no depth file of any view was found"),
     ],

@@ -39,7 +39,7 @@ def test_split_is_the_published_eigen_split() -> None:
     [
         ("2011_09_26/2011_09_28_drive_0002_sync 0000000069 l", "line 1 is '2011_09_26/2011_09_28"),
         ("2011_09_26/2011_09_26_drive_0002_sync 69 l", "expected <date>/<drive> <frame>"),
-        ("2011_09_26/2011_09_26_drive_0002_sync 0000000069 l\n" * 2, "line 2: .* stands twice"),
+        ("2011_09_26/2011_09_26_drive_0002_sync 0000000069 l\n" * 2, "line 2: .* is listed twice"),
     ],
 )
 def test_bad_split_list_names_line(text: str, words: str) -> None:
@@ -185,7 +185,7 @@ def test_depth_map_that_is_not_png_raises(tmp_path: Path) -> None:
     path = kitti.improved_path(tmp_path, images[0])
     path.parent.mkdir(parents=True)
     path.write_bytes(b"no picture")
-    with pytest.raises(DatasetError, match=r"\.png: says 0 x 0 pixels, expected a PNG"):
+    with pytest.raises(DatasetError, match=r"\.png: is 0 x 0 pixels, expected a PNG"):
         find_truth(tmp_path, images, "improved")
 
 
@@ -200,7 +200,7 @@ def test_truncated_depth_map_raises(tmp_path: Path) -> None:
 
 def test_folder_without_ground_truth_names_expected_file(tmp_path: Path) -> None:
     images = kitti.first_images(1)
-    with pytest.raises(DatasetError, match=r"raw ground truth of no image.*velodyne_points/data/0000000000\.bin"):
+    with pytest.raises(DatasetError, match=r"has no raw ground truth.*velodyne_points/data/0000000000\.bin"):
         find_truth(tmp_path, images, "raw")
     with pytest.raises(DatasetError, match="no such folder"):
         find_truth(tmp_path / "nowhere", images, "improved")

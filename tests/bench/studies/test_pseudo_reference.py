@@ -228,9 +228,9 @@ def test_command_writes_json_csv_and_html(lab: Path, tmp_path: Path, capsys: pyt
     arguments = (lab / "mono", lab / "other", "--reference", lab / "stereo", lab / "colmap", "--data", lab / "zed")
     assert run_study(study_module, *arguments, *output_options) == 0
     out = " ".join(capsys.readouterr().out.split())
-    assert "native (no alignment) beside scaled (oracle median scale per view), depths of 0.1 to 20 m" in out
+    assert "native (no alignment) and scaled (oracle median scale per view), depths of 0.1 to 20 m" in out
     assert "baseline 119.98 mm" in out
-    assert "No exact depth is known here" in out
+    assert "No exact depth is available" in out
     assert "0.62" in out  # Published in Table II.
     content = json.loads(files["json"].read_text())
     assert content["protocol"] == "rebar-pseudo-reference-1"

@@ -181,7 +181,7 @@ def test_enclosing_folder_is_one_problem(check: Check) -> None:
 
 def test_missing_views_and_metadata_are_reported(check: Check) -> None:
     (problem,) = check([META, FIRST])
-    assert problem.startswith("lattice/0001: missing, expected one of .npy, .npz, .exr, .png, since other views")
+    assert problem.startswith("lattice/0001: missing, expected one of .npy, .npz, .exr, .png, because other views")
     assert check([FIRST, SECOND]) == ['submission.json: missing, expected {"method": "name"}']
     (problem,) = check([META])
     assert problem.startswith("no view was found, expected <view_id>")
@@ -225,7 +225,10 @@ def test_error_shows_20_problems_and_count_of_the_rest(tmp_path: Path) -> None:
         (build(GOOD) + b"x", "the zip has no end record"),
         (build(GOOD, count=2), "the zip directory holds 2 entries"),
         (build(GOOD, count=4), "the zip directory holds 3 entries"),
-        (build(GOOD, disk=1), "part of a multi-disk set (disk 1, 3 of 3 entries), expected one whole file"),
+        (
+            build(GOOD, disk=1),
+            "part of a multi-disk set (disk 1, 3 of 3 entries), expected a single complete file",
+        ),
         (build(GOOD, count=60_000), "declares 60000 entries in"),
     ],
 )
@@ -252,7 +255,7 @@ def test_reader_in_threads_and_after_closing(tmp_path: Path) -> None:
         assert reader.meta is not None
         for array in pool.map(reader.read, reader.view_ids * 50):
             np.testing.assert_array_equal(array, DEPTH)
-        with pytest.raises(EntryError, match="pile/0000: no sound entry was found"):
+        with pytest.raises(EntryError, match="pile/0000: no valid entry was found"):
             reader.read("pile/0000")
     with pytest.raises(ValueError, match="is closed"):
         reader.read("lattice/0000")
@@ -290,7 +293,7 @@ def test_file_truncated_while_open_raises_entry_error(tmp_path: Path) -> None:
     path.write_bytes(build(GOOD))
     with open_submission(path, EXPECTED) as reader:
         os.truncate(path, 100)
-        with pytest.raises(EntryError, match=f"{ENTRY}: the archive was shortened while it was read"):
+        with pytest.raises(EntryError, match=f"{ENTRY}: the archive was truncated while it was read"):
             reader.read("lattice/0000")
 
 

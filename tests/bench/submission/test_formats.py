@@ -194,14 +194,14 @@ IEND = chunk(b"IEND", b"")
         (GOOD_PNG[:50] + b"\xff" + GOOD_PNG[51:], "the PNG chunk at byte 33 is corrupt"),
         (
             png(UNITS, idat=zlib.compress(ROWS[:-9])),
-            "the PNG image data inflates to 18 bytes, expected 27, whole",
+            "the PNG image data inflates to 18 bytes, expected 27 and a complete stream",
         ),
-        (png(UNITS, idat=zlib.compress(ROWS)[:-4]), "inflates to 27 bytes, expected 27, whole"),
+        (png(UNITS, idat=zlib.compress(ROWS)[:-4]), "inflates to 27 bytes, expected 27 and a complete stream"),
         (png(UNITS, idat=zlib.compress(bytes(10**6))), "inflates to more than 27 bytes, expected 27"),
         (png(UNITS, idat=b"nonsense"), "the PNG image data is corrupt"),
         (png(UNITS, idat=zlib.compress(b"\x07" + ROWS[1:])), "the PNG data is corrupt"),
         (GOOD_PNG[:33] + IEND, "the PNG has 0 image chunks, expected one run of IDAT"),
-        (GOOD_PNG[:8] + GOOD_PNG[33:], "the PNG does not start with its one header chunk"),
+        (GOOD_PNG[:8] + GOOD_PNG[33:], "the PNG does not start with its header chunk"),
         (b"GIF89a..", "the bytes start with b'GIF89a..', expected a PNG file"),
     ],
 )

@@ -38,7 +38,10 @@ def test_optional_and_unknown_keys_are_accepted() -> None:
         ('{"method": "a\\u0000b"}', r"method is 'a\x00b', expected"),
         ('{"method": "' + "m" * 201 + '"}', "method has 201 characters, expected"),
         ('{"method": "m", "description": 3}', "description is a number, expected text"),
-        ('{"method": "m", "description": "a\\u0000b"}', "description has a NUL character, expected text without"),
+        (
+            '{"method": "m", "description": "a\\u0000b"}',
+            "description contains a NUL character, expected text without",
+        ),
         ('{"method": "m", "url": "javascript:alert(1)"}', "url is javascript:alert(1), expected an address"),
         ('{"method": "m", "url": "http://[::1"}', "url is http://[::1, expected"),
         ('{"method": "m", "url": true}', "url is true or false, expected text"),
@@ -78,5 +81,5 @@ def test_png_without_depth_scale_is_one_problem(check: Check) -> None:
     views = [Record(f"lattice/000{index}.png".encode(), png(units)) for index in range(2)]
     assert check([Record(b"submission.json", b'{"method": "m"}'), *views]) == [
         "submission.json: depth_scale is missing, expected metres per PNG unit, "
-        "since 2 entries are PNG (first lattice/0000.png)"
+        "because 2 entries are PNG (first lattice/0000.png)"
     ]

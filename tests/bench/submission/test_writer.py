@@ -150,8 +150,8 @@ def test_add_accepts_array_interface_and_lists(tmp_path: Path) -> None:
         ("lattice/0001", np.ones(SHAPE, bool), "dtype bool, expected floats"),
         ("lattice/0001", np.ones(SHAPE, complex), "dtype complex128, expected floats"),
         ("lattice/0001", np.zeros(SHAPE).view(np.ma.MaskedArray), "masked array, expected NaN"),
-        ("lattice/0001", GpuTensor(), "cannot become a numpy array .*cuda:0"),
-        ("lattice/0001", [[1.0], [1.0, 2.0]], "cannot become a numpy array"),
+        ("lattice/0001", GpuTensor(), "cannot be converted to a numpy array .*cuda:0"),
+        ("lattice/0001", [[1.0], [1.0, 2.0]], "cannot be converted to a numpy array"),
     ],
 )
 def test_add_rejects_invalid_view_id_and_depth(tmp_path: Path, view_id: str, depth: object, words: str) -> None:

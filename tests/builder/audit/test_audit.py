@@ -89,10 +89,16 @@ def with_cells(row: Row, **cells: Any) -> Row:
             lambda row: {"right_rgb": row["right_rgb"][:-1]},
             "right rgb is uint8 (89, 160, 3), expected uint8 (90, 160, 3)",
         ),
-        (lambda row: {"left_depth": -row["left_depth"]}, "below 0"),
-        (lambda row: {"right_depth": row["right_depth"] + np.float32(np.nan)}, "right depth has values"),
-        (lambda row: {"left_K": row["left_K"][:2]}, "left_K is not (3, 3) of finite numbers"),
-        (lambda row: {"right_distortion": row["right_distortion"] + np.inf}, "right_distortion is not (5,)"),
+        (lambda row: {"left_depth": -row["left_depth"]}, "left depth has non-finite or negative values"),
+        (
+            lambda row: {"right_depth": row["right_depth"] + np.float32(np.nan)},
+            "right depth has non-finite or negative values",
+        ),
+        (lambda row: {"left_K": row["left_K"][:2]}, "left_K is not an array of finite numbers of shape (3, 3)"),
+        (
+            lambda row: {"right_distortion": row["right_distortion"] + np.inf},
+            "right_distortion is not an array of finite numbers of shape (5,)",
+        ),
     ],
 )
 def test_malformed_arrays_are_reported(
@@ -115,9 +121,9 @@ def test_malformed_arrays_are_reported(
         (lambda row: {"right_bars": np.where(row["right_mask"], 999, 0).astype(np.uint16)}, "bar ids [999]"),
         (
             lambda row: {"left_depth": np.nextafter(row["left_depth"], np.float32(9))},
-            "left ground truth has another",
+            "left ground-truth digest differs",
         ),
-        (lambda row: {"right_K": row["right_K"] + 1e-9}, "right ground truth has another"),
+        (lambda row: {"right_K": row["right_K"] + 1e-9}, "right ground-truth digest differs"),
         (lambda _: {"view_id": "lattice/0001"}, "the row's view_id is lattice/0001"),
     ],
 )

@@ -70,7 +70,7 @@ def test_damaged_rig_is_rejected(entry: dict[str, Any]) -> None:
 def test_rig_with_unknown_grid_is_rejected() -> None:
     rig = asdict(replace(RIGS["raw"], grid="fish"))
     entry = manifest_entry(rig=rig, protocol=asdict(RING), views=[{"view_id": "c/0000"}])
-    with pytest.raises(DatasetError, match=r"the rig of config c gives no cameras: .*fish"):
+    with pytest.raises(DatasetError, match=r"the rig of config c is invalid: .*fish"):
         expected_views("c", entry, AIM_M)
 
 
@@ -106,18 +106,21 @@ def shifted_pose(pose: np.ndarray, shift_m: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (lambda row: {"left_K": row["left_K"] + 1e-9}, "left_K is 1.0e-09 off"),
-        (lambda row: {"right_distortion": row["right_distortion"] + 1e-9}, "right_distortion is 1.0e-09 off"),
+        (lambda row: {"left_K": row["left_K"] + 1e-9}, "left_K differs by 1.0e-09"),
+        (lambda row: {"right_distortion": row["right_distortion"] + 1e-9}, "right_distortion differs by 1.0e-09"),
         (
             lambda row: {"left_cam_from_world": shifted_pose(row["left_cam_from_world"], 1e-9)},
-            "left_cam_from_world is",
+            "left_cam_from_world differs",
         ),
         (
             lambda row: {"right_cam_from_world": shifted_pose(row["right_cam_from_world"], 1e-6)},
-            "the eyes stand 0.1",
+            "the camera centres are 0.1",
         ),
-        (lambda row: {"left_cam_from_world": 1.001 * row["left_cam_from_world"]}, "no rigid pose"),
-        (lambda row: {"left_cam_from_world": row["left_cam_from_world"] * [[-1], [1], [1], [1]]}, "no rigid pose"),
+        (lambda row: {"left_cam_from_world": 1.001 * row["left_cam_from_world"]}, "not a rigid pose"),
+        (
+            lambda row: {"left_cam_from_world": row["left_cam_from_world"] * [[-1], [1], [1], [1]]},
+            "not a rigid pose",
+        ),
         (lambda _: {"baseline_m": 0.12001}, "baseline_m is 0.12001, expected 0.12"),
         (lambda row: {"left_depth": row["left_depth"][1:]}, "left grid is"),
     ],
@@ -137,7 +140,7 @@ def test_displaced_right_camera_is_reported() -> None:
     row["right_cam_from_world"] = right_camera_pose(pose, 0.122)
     problems = list(camera_problems(row, ExpectedView("c/0000", cameras, 0.12)))
     assert [problem.partition(" is ")[0] for problem in problems[:1]] == ["right_cam_from_world"]
-    assert any("the eyes stand 0.122" in problem for problem in problems)
+    assert any("the camera centres are 0.122" in problem for problem in problems)
 
 
 @pytest.mark.slow
@@ -159,7 +162,7 @@ def test_wrong_view_indices_are_reported() -> None:
     entry = manifest_entry(rig=asdict(RIGS["ideal"]), protocol=asdict(RING), views=views)
     problems = list(view_list_problems(entry, expected_views("c", entry, AIM_M)))
     assert len(problems) == 1
-    assert problems[0].endswith("the first that differs is c/0002, expected c/0004")
+    assert problems[0].endswith("the first difference is c/0002, expected c/0004")
     repeated_entry = manifest_entry(rig=asdict(RIGS["ideal"]), protocol=asdict(RING), views=[*views * 4])
     assert len(list(view_list_problems(repeated_entry, expected_views("c", repeated_entry, AIM_M)))) == 1
 
@@ -175,11 +178,11 @@ def test_aim_point_is_centre_of_steel_only(tmp_path: Path) -> None:
     for wrong in ([0.2, 0.2, 0.11], [0.2, 0.2], [0.2, 0.2, float("nan")]):
         aim_m, problems = checked_aim_point_m({"aim_point_m": wrong}, mesh)
         assert aim_m.tolist() == [0.2, 0.2, 0.1]
-        assert "the steel's middle is [0.2, 0.2, 0.1]" in problems[0]
+        assert "expected [0.2, 0.2, 0.1], the centre of the steel" in problems[0]
 
 
 def test_mesh_without_steel_is_rejected(tmp_path: Path) -> None:
     mesh = tmp_path / "m.ply"
     write_mesh_ply(mesh, np.eye(3), np.array([[0, 1, 2]]), np.array([0]))
-    with pytest.raises(DatasetError, match="holds no steel"):
+    with pytest.raises(DatasetError, match="contains no steel"):
         mesh_aim_point_m(mesh)

@@ -46,7 +46,7 @@ def test_detected_markers_match_projections(rig: str) -> None:
 @pytest.mark.parametrize("axis", [0, 1])
 def test_half_pixel_shift_of_both_K_is_reported(rig: str, axis: int) -> None:
     check = verdict(with_K_shift(view(rig), ("left", "right"), axis, 0.5))
-    assert any("found markers lie" in problem for problem in check.problems), check
+    assert any("detected markers are" in problem for problem in check.problems), check
 
 
 @EVERY_GRID
@@ -93,7 +93,7 @@ def test_occluded_markers_are_not_expected() -> None:
 @pytest.mark.slow
 def test_check_is_skipped_without_large_markers_or_board() -> None:
     far = view("ideal", distance_m=1.6)
-    assert verdict(far).measured.startswith("none large enough")
+    assert verdict(far).measured.startswith("no unoccluded marker")
     assert verdict(far, of=config(board=None)).measured == "no board in this scene"
 
 

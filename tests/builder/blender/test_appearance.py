@@ -104,7 +104,7 @@ def test_variants_have_description_and_slot() -> None:
         (("fog",), "no appearance variant 'fog', expected one of dusk, spotlight"),
         (("dusk", "shadows"), "dusk, shadows all set the light"),
         (("rusted", "clutter", "wet"), "rusted, wet all set the steel"),
-        (("clutter", "clutter"), "'clutter' is named 2 times"),
+        (("clutter", "clutter"), "'clutter' is given 2 times"),
         (("Dusk", ""), "no appearance variant ''"),
     ],
 )

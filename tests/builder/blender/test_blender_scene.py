@@ -240,7 +240,7 @@ def test_blender_camera_has_requested_pose(facts: dict[str, Any]) -> None:
 
 def test_missing_colour_setup_and_skew_raise_errors(facts: dict[str, Any]) -> None:
     assert facts["refusal"].startswith("BuildError: the scene is not set up for colour")
-    assert facts["skew"].startswith("ValueError: Blender's camera has no skew")
+    assert facts["skew"].startswith("ValueError: Blender cameras cannot have skew")
 
 
 def test_no_scratch_files_remain(facts: dict[str, Any]) -> None:

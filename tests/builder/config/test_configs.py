@@ -96,7 +96,7 @@ def test_audit_passes_on_all_configs(full_root: Path, repetitions: Repetitions) 
     # The comparison with Cycles runs on the sample data in test_audit.py, and on all configs in the nightly tier.
     report = audit(full_root, depth_views=repetitions(0, 1))
     assert [f"{check.name}: {check.problems}" for check in report.failures] == []
-    assert sum("depth against Cycles" in check.name for check in report.checks) == len(VIEWS)
+    assert sum("depth compared with Cycles" in check.name for check in report.checks) == len(VIEWS)
 
 
 def test_ground_truth_scores_zero_error_on_every_config(full_root: Path, tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_user_scene_and_variant_are_added_to_dataset(tiny_root: Path, tmp_path: 
         (BuildRequest(variants=("wet", "rusted")), "wet, rusted all set the steel, expected one of them"),
         (
             BuildRequest(configs=(), scenes=(CONFIGS["pile"](), CONFIGS["pile"]())),
-            "more than one config would be named pile",
+            "more than one config is named pile",
         ),
         (BuildRequest(configs=("pier", "latice")), "no config 'latice', expected one of lattice"),
     ],
@@ -169,7 +169,7 @@ def test_mesh_option_is_rejected_for_other_scenes(tmp_path: Path, run_build: Run
     (tmp_path / "a.stl").write_bytes(b"")
     process = run_build("--out", tmp_path / "dataset", "--config", "pile", "--mesh", tmp_path / "a.stl")
     assert process.returncode == 2
-    assert "--mesh takes the place of the lattice's rods, but pile is no lattice" in process.stderr
+    assert "--mesh replaces the rods of a lattice, but config pile is not a lattice" in process.stderr
 
 
 def test_variant_order_does_not_matter() -> None:
@@ -184,7 +184,7 @@ def test_shadow_screen_among_cameras_is_rejected() -> None:
     [spec] = BuildRequest(configs=("lattice",), variants=("shadows",)).config_specs()
     check_fits(make_assembly(spec.scene.assembly), spec)
     far = replace(spec, protocol=RingSpec(radius_m=0.6, elevation_deg=30.0, azimuths=4))
-    with pytest.raises(InputError, match=r"would hang 0\.5"):
+    with pytest.raises(InputError, match=r"would be among the cameras: 0\.5"):
         check_fits(make_assembly(far.scene.assembly), far)
 
 

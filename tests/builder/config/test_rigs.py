@@ -161,9 +161,9 @@ def test_sign_of_baseline_does_not_change_rectification() -> None:
     ("rig", "words"),
     [
         (replace(zed_rig(), grid="warped"), "no grid 'warped', expected one of ideal, raw, rectified"),
-        (replace(zed_rig(), grid="ideal"), "is seen on grid 'raw' or 'rectified'"),
-        (RigSpec(grid="raw"), "grid 'raw' needs a calibration"),
-        (replace(zed_rig(), baseline_m=0.12), "baseline_m is 0.12, its calibration's 0.119978"),
+        (replace(zed_rig(), grid="ideal"), "is 'ideal', expected 'raw' or 'rectified'"),
+        (RigSpec(grid="raw"), "grid 'raw' requires a calibration"),
+        (replace(zed_rig(), baseline_m=0.12), "baseline_m is 0.12, expected 0.119978 as in its calibration"),
     ],
 )
 def test_inconsistent_rig_is_rejected(rig: RigSpec, words: str) -> None:

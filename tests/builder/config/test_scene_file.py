@@ -162,14 +162,14 @@ def test_large_cage_is_outdoors_and_rejected_in_laboratory(tmp_path: Path) -> No
     content = MM + BAR.replace("100", "2000")
     config = scene_config(write_scene(tmp_path, content))
     assert (config.scene.environment, config.scene.board) == ("outdoors", None)
-    with pytest.raises(InputError, match=r"steel reaches 2 m from the laboratory's middle, expected 0\.45 m"):
+    with pytest.raises(
+        InputError, match=r"steel extends 2 m from the laboratory's centre, expected at most 0\.45 m"
+    ):
         scene_config(write_scene(tmp_path, 'environment = "laboratory"\n' + content))
     far = '[cameras]\nkind = "ring"\nradius = 2000\nelevation_deg = 35\nazimuths = 4\n'
-    with pytest.raises(
-        InputError, match=r"too large for the dome that is fitted to it: cameras would stand 3\d\."
-    ):
+    with pytest.raises(InputError, match=r"too large for the default camera dome: cameras would be 3\d\."):
         scene_config(write_scene(tmp_path, MM + BAR.replace("100", "8000")))
-    with pytest.raises(InputError, match=r"cameras stand 1.638 m from the laboratory's middle"):
+    with pytest.raises(InputError, match=r"cameras are 1.638 m from the laboratory's centre"):
         scene_config(write_scene(tmp_path, 'environment = "laboratory"\n' + MM + BAR + far))
 
 
@@ -191,7 +191,9 @@ def test_changed_file_content_is_rejected(tmp_path: Path) -> None:
     spec = cage_file_spec(write_scene(tmp_path, MM + BAR))
     assert cage_file_spec(write_scene(tmp_path, MM + BAR)) == spec
     write_scene(tmp_path, MM + BAR + "# more\n")
-    with pytest.raises(MeshError, match=f"my-beam.toml: changed since it was chosen: .* {spec.sha256} expected"):
+    with pytest.raises(
+        MeshError, match=f"my-beam.toml: the file has changed since it was selected: .* expected {spec.sha256}"
+    ):
         load_cage(spec)
 
 

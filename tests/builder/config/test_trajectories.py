@@ -115,7 +115,7 @@ def test_subset_is_evenly_spread() -> None:
     ("scale", "shift_m", "words"),
     [
         (1000, 0.0, "is the unit right"),
-        (1, -0.01, "reaches down to z = -0.00995 m, ribs and all, expected 0 or above"),
+        (1, -0.01, "extends down to z = -0.00995 m, including its ribs, expected 0 or above"),
     ],
 )
 def test_assembly_outside_camera_limits_is_rejected(scale: float, shift_m: float, words: str) -> None:

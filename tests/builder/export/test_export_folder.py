@@ -107,12 +107,12 @@ def write_edited_record(exported: Path, to: Path, change: Callable[[dict[str, An
 
 def test_foreign_folder_is_rejected_and_unchanged(tiny_root: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(InputError, match=r"not empty \(it holds thesis.tex\) and has no export.json"):
+    with pytest.raises(InputError, match=r"not empty \(it contains thesis.tex\) and has no export.json"):
         export(tiny_root, tmp_path)
     assert content(tmp_path) == {"thesis.tex": b"years of work"}
     with pytest.raises(InputError, match="is a file, expected a folder"):
         export(tiny_root, tmp_path / "thesis.tex")
-    with pytest.raises(InputError, match="lies in the dataset folder"):
+    with pytest.raises(InputError, match="is inside the dataset folder"):
         export(tiny_root, tiny_root / "raw")
     assert not (tiny_root / "raw").exists()
 
@@ -135,12 +135,12 @@ def test_export_of_other_dataset_is_rejected(tiny_root: Path, exported: Path, tm
     other_dataset = write_edited_record(
         exported, tmp_path / "other", lambda marker: marker.update(dataset="sha256:00")
     )
-    with pytest.raises(InputError, match=r"holds an export of dataset sha256:00, but .* is sha256:"):
+    with pytest.raises(InputError, match=r"contains an export of dataset sha256:00, expected sha256:.* as in"):
         export(tiny_root, other_dataset)
     other_build = write_edited_record(
         exported, tmp_path / "b", lambda marker: marker["configs"]["lattice-orbit"].update(key="0" * 64)
     )
-    with pytest.raises(InputError, match="holds config lattice-orbit of another build"):
+    with pytest.raises(InputError, match="contains config lattice-orbit of another build"):
         export(tiny_root, other_build)
     other_format = write_edited_record(
         exported, tmp_path / "future", lambda marker: marker.update(format="rebar-depth-export-9")
@@ -157,13 +157,13 @@ def test_export_of_other_dataset_is_rejected(tiny_root: Path, exported: Path, tm
 def test_damaged_record_is_rejected(tiny_root: Path, exported: Path, tmp_path: Path, text: str) -> None:
     digest = json.loads((exported / MARKER).read_text())["dataset"]
     (tmp_path / MARKER).write_text(text.replace("DIGEST", digest))
-    with pytest.raises(InputError, match="cannot be read as the record of an export"):
+    with pytest.raises(InputError, match="is not a readable export record"):
         export(tiny_root, tmp_path)
 
 
 def test_fewer_views_than_exported_is_rejected(tiny_root: Path, exported: Path) -> None:
     with pytest.raises(
-        InputError, match="holds 2 views of lattice-orbit, 1 of which are not among the 1 asked for"
+        InputError, match="contains 2 views of lattice-orbit, 1 of which are not among the 1 requested"
     ):
         export(tiny_root, exported, SMALL_CONFIG, views=1)
 
@@ -182,7 +182,7 @@ def test_invalid_configs_roots_and_view_counts_are_rejected(tiny_root: Path, tmp
 
 def test_concurrent_export_to_same_folder_is_rejected(tiny_root: Path, tmp_path: Path) -> None:
     def second(*_: object) -> None:
-        with pytest.raises(InputError, match="another export is at work there"):
+        with pytest.raises(InputError, match="another export is using this folder"):
             export(tiny_root, tmp_path / "x", SMALL_CONFIG)
 
     assert export(tiny_root, tmp_path / "x", SMALL_CONFIG, views=1, progress=second).configs[0].written
@@ -197,7 +197,7 @@ def test_data_contradicting_manifest_is_not_exported(tiny_root: Path, tmp_path: 
         export(root, tmp_path / "x", SMALL_CONFIG)
     manifest["configs"]["../../x"] = manifest["configs"]["lattice"]
     (root / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(DatasetError, match="cannot be a folder's name"):
+    with pytest.raises(DatasetError, match="is not a valid folder name"):
         export(root, tmp_path / "y", ["../../x"])
     (root / "bars.parquet").write_bytes(b"no parquet")
     with pytest.raises(DatasetError, match=r"bars.parquet: cannot be read"):

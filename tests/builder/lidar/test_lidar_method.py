@@ -73,7 +73,7 @@ except MethodError as error:
 """
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert process.stdout.strip() == (
-        "lidar-survey needs embreex to cast rays: pip install 'rebar-depth-bench[build]'"
+        "lidar-survey requires embreex for ray casting: pip install 'rebar-depth-bench[build]'"
     )
 
 

@@ -102,7 +102,7 @@ def test_render_process_is_retried_once_then_reported(tmp_path: Path, start_buil
     _, stderr = build.communicate(timeout=120)
     assert build.returncode == 1
     message = stderr.decode()
-    assert "render process for two-bars views 28 to 420 died 2 times, last by signal SIGKILL" in message
+    assert "render process for two-bars views 28 to 420 died 2 times, the last time with signal SIGKILL" in message
     assert "Traceback" not in message
 
 
@@ -155,7 +155,7 @@ def test_concurrent_build_is_rejected(tmp_path: Path, run_build: RunBuild, start
         wait_until(lambda: render_processes_of(build.pid))
         process = run_build("--out", root, *SMALL)
         assert process.returncode == 2
-        assert "another rebar-build is at work there" in process.stderr
+        assert "another rebar-build process is using this folder" in process.stderr
     finally:
         os.killpg(build.pid, signal.SIGKILL)
         build.communicate()
@@ -164,7 +164,7 @@ def test_concurrent_build_is_rejected(tmp_path: Path, run_build: RunBuild, start
 def test_config_with_other_scene_parameters_is_rejected(tiny_root: Path, run_build: RunBuild) -> None:
     process = run_build("--out", tiny_root, "--config", "lattice", *TINY, "--seed", "5")
     assert process.returncode == 2
-    assert "config lattice-orbit was built on scene 'lattice' with other parameters" in process.stderr
+    assert "config lattice-orbit was built with other parameters of scene 'lattice'" in process.stderr
 
 
 def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
@@ -188,7 +188,7 @@ def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
         (("--width", "2", "--samples", "0"), "--width is 2, expected 16 to 8192; --samples is 0"),
         (("--workers", "0"), "--workers is 0, expected 1 or more"),
         (("--mesh", "nothing.stl"), "nothing.stl"),
-        (("--mesh", __file__), "mesh files of kind '.py' are not read, expected"),
+        (("--mesh", __file__), "unsupported mesh file type '.py', expected"),
     ],
 )
 def test_invalid_options_exit_2_and_write_nothing(

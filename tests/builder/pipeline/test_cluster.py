@@ -152,7 +152,7 @@ def test_interrupted_build_resumes_and_dead_worker_is_replaced(
     build.send_signal(signal.SIGINT)
     _, stderr = build.communicate(timeout=300)
     assert build.returncode == 1, stderr.decode()
-    assert "run the same command again to go on" in stderr.decode()
+    assert "run the same command again to continue" in stderr.decode()
     assert "Traceback" not in stderr.decode()
     staged_before = staged_rows(root)
     assert 0 < staged_before < VIEWS
@@ -193,7 +193,7 @@ def test_unit_that_crashes_blender_twice_fails_build(
     assert build.returncode == 1
     assert "error: worker tcp://127.0.0.1:" in message
     assert "the render process for two-bars views" in message
-    assert "died 2 times, last by signal SIGKILL" in message
+    assert "died 2 times, the last time with signal SIGKILL" in message
     assert "Traceback" not in message
 
 
@@ -227,16 +227,16 @@ def test_worker_with_other_software_is_rejected(tmp_path: Path, run_build: RunBu
         started.start_worker(PYTHONPATH=os.pathsep.join([str(dist_info.parent), os.environ.get("PYTHONPATH", "")]))
         process = run_build("--out", tmp_path / "dataset", *SMALL, "--cluster", started.address)
     assert process.returncode == 2, process.stderr
-    assert "has other software than the machine that builds: embreex 0.0.1, expected 4" in process.stderr
+    assert "has other software versions than the building machine: embreex 0.0.1, expected 4" in process.stderr
     assert not (tmp_path / "dataset").exists()
 
 
 def test_unusable_cluster_is_rejected_and_nothing_written(tmp_path: Path, start_build: StartBuild) -> None:
     with running_cluster(tmp_path) as idle:
         expected_messages = {
-            "tcp://127.0.0.1:1": "--cluster tcp://127.0.0.1:1: no dask scheduler answers there",
-            "nonsense": "--cluster nonsense: is no address (missing port number in address 'nonsense')",
-            idle.address: f"--cluster {idle.address}: has no workers after 10 s",
+            "tcp://127.0.0.1:1": "--cluster tcp://127.0.0.1:1: no dask scheduler responds at this address",
+            "nonsense": "--cluster nonsense: is not a valid address (missing port number in address 'nonsense')",
+            idle.address: f"--cluster {idle.address}: the scheduler has no workers after 10 s",
         }
         builds = {
             address: start_build(tmp_path / "dataset", *SMALL, "--cluster", address)
@@ -255,7 +255,7 @@ def test_unusable_cluster_is_rejected_and_nothing_written(tmp_path: Path, start_
 def test_workers_with_cluster_is_rejected(tmp_path: Path, run_build: RunBuild) -> None:
     process = run_build("--out", tmp_path / "dataset", "--cluster", "tcp://127.0.0.1:1", "--workers", "2")
     assert process.returncode == 2
-    assert "--workers 2 stands beside --cluster tcp://127.0.0.1:1, expected one of them" in process.stderr
+    assert "--workers 2 is combined with --cluster tcp://127.0.0.1:1, expected only one of them" in process.stderr
 
 
 def run_cli(prepare: str, *arguments: str) -> subprocess.CompletedProcess[str]:

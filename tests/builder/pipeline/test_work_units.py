@@ -116,13 +116,13 @@ def with_extra_row(result: UnitResult) -> UnitResult:
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (with_damaged_row, "view 14 arrived as sha256"),
-        (with_empty_row, f"arrived as sha256 {sha256(b'')}, expected"),
-        (with_damaged_mesh, "the mesh arrived as sha256"),
-        (with_other_mesh, f"its mesh has sha256 {sha256(b'another')}, the config's other views were cast against"),
+        (with_damaged_row, "view 14 was received with sha256"),
+        (with_empty_row, f"was received with sha256 {sha256(b'')}, expected"),
+        (with_damaged_mesh, "the received mesh has sha256"),
+        (with_other_mesh, f"its mesh has sha256 {sha256(b'another')}, expected"),
         (with_missing_row, "view 14 is missing"),
         (with_missing_mesh, "the mesh is missing"),
-        (with_extra_row, "view 3 was not asked for"),
+        (with_extra_row, "view 3 was not requested"),
     ],
 )
 def test_result_that_does_not_match_unit_is_rejected(
@@ -135,7 +135,7 @@ def test_result_that_does_not_match_unit_is_rejected(
         accept_result(first, spoil(make_result(first)), plan.staging)
     message = str(raised.value)
     assert (
-        f"lattice views {first.indices[0]} to {first.indices[-1]}, rendered by tcp://far:1: refused: " in message
+        f"lattice views {first.indices[0]} to {first.indices[-1]}, rendered by tcp://far:1: rejected: " in message
     )
     assert words in message
     assert staged_files(plan) == before

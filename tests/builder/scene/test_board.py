@@ -108,5 +108,5 @@ def test_invalid_boards_are_rejected(change: dict[str, int], reason: str) -> Non
 
 
 def test_resolution_off_pixel_edges_is_rejected() -> None:
-    with pytest.raises(ValueError, match="no pixel edge"):
+    with pytest.raises(ValueError, match="a whole number of pixels"):
         board_texture(BoardSpec(), 6001.0)

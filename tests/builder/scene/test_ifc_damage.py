@@ -31,7 +31,7 @@ def test_bar_without_readable_shape_is_named() -> None:
     ifc = Ifc()
     bar = ifc.rooted("IfcReinforcingBar")
     assert_rejected(
-        ifc.file.to_string(), f"{bar.GlobalId.replace('$', '[$]')} .* no shape that can be read: .*tessellated"
+        ifc.file.to_string(), f"{bar.GlobalId.replace('$', '[$]')} .* no readable shape: .*tessellation"
     )
 
 
@@ -43,9 +43,9 @@ def test_slow_or_crashing_tessellation_is_reported(monkeypatch: pytest.MonkeyPat
     slow = "import time; time.sleep(60)"
     code = f"import signal, runpy; signal.alarm(1); {slow}"
     monkeypatch.setattr(tessellation, "COMMAND", (sys.executable, "-c", code))
-    assert_rejected(ifc.file.to_string(), "IfcReinforcingBar .* tessellated: took over 60 s")
+    assert_rejected(ifc.file.to_string(), "IfcReinforcingBar .* tessellation: took more than 60 s")
     monkeypatch.setattr(tessellation, "COMMAND", (sys.executable, "-c", "import os; os.abort()"))
-    assert_rejected(ifc.file.to_string(), "IfcReinforcingBar .* tessellated: brought the geometry kernel down")
+    assert_rejected(ifc.file.to_string(), "IfcReinforcingBar .* tessellation: the geometry kernel crashed")
 
 
 @pytest.mark.slow
@@ -62,7 +62,7 @@ def test_exponential_maps_and_placement_cycles_are_rejected() -> None:
         _swept_shapes(ifc.bar(item), 0.001, 1.0)
     placement = ifc.at((0, 0, 0))
     placement.PlacementRelTo = placement
-    with pytest.raises(ValueError, match="goes round in a circle"):
+    with pytest.raises(ValueError, match="is circular"):
         _swept_shapes(ifc.bar(ifc.disc(ifc.polyline((0, 0, 0), (500, 0, 0))), at=placement), 0.001, 1.0)
 
 
@@ -78,12 +78,12 @@ def column_with(old: str, new: str) -> str:
         ("", "does not begin with ISO-10303-21"),
         ("solid cage", "does not begin with ISO-10303-21"),
         (COLUMN.read_text()[:5000], "does not end with END-ISO-10303-21.*truncated"),
-        (column_with("'IFC4'", "'IFC9'"), "not an IFC file that can be read"),
+        (column_with("'IFC4'", "'IFC9'"), "not a readable IFC file"),
         (column_with("IFCLOCALPLACEMENT(", "IFCLOCALPLAZEMENT("), "1 of its instances cannot be read, first #11"),
-        (column_with("#31=", "#9031="), "1 instances are referred to and not there, first #31"),
+        (column_with("#31=", "#9031="), "1 referenced instances are not defined, first #31"),
         (column_with("#31=", "#30="), "#30 is defined twice"),
-        (COLUMN.read_text().replace("IFCREINFORCINGBAR", "IFCBEAM"), "holds no IfcReinforcingBar"),
-        (column_with(".LENGTHUNIT.,.MILLI.,.METRE.", ".AREAUNIT.,.MILLI.,.SQUARE_METRE."), "no length unit"),
+        (COLUMN.read_text().replace("IFCREINFORCINGBAR", "IFCBEAM"), "contains no IfcReinforcingBar"),
+        (column_with(".LENGTHUNIT.,.MILLI.,.METRE.", ".AREAUNIT.,.MILLI.,.SQUARE_METRE."), "no known length unit"),
     ],
 )  # fmt: skip
 def test_damaged_files_are_rejected(content: str, words: str) -> None:
@@ -93,7 +93,7 @@ def test_damaged_files_are_rejected(content: str, words: str) -> None:
 def test_implausible_dimensions_are_rejected(tmp_path: Path) -> None:
     for old, new, words in [
         (".MILLI.", ".KILO.", "IfcReinforcingBar .* diameter is 8000 m, expected .* is the unit right"),
-        ("(-46.,-46.,0.1)", "(-46.,-46.,1.E9)", "bar 1, .* reaches 1e.06 m from the world's origin"),
+        ("(-46.,-46.,0.1)", "(-46.,-46.,1.E9)", "bar 1, .* extends 1e.06 m from the world's origin"),
         ("(-46.,-46.,0.1)", "(-46.,0.,0.1)", "bar"),
     ]:
         (tmp_path / "a.ifc").write_text(column_with(old, new))

@@ -108,7 +108,7 @@ def test_other_extent_and_pitch() -> None:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"pitch_m": 0.015}, "whole number"),
+        ({"pitch_m": 0.015}, "multiple of pitch_m"),
         ({"pitch_m": 0.0125}, "too small"),
         ({"diameters_m": (0.010, 0.004)}, "too small"),
         ({"extent_m": -0.1}, "positive"),

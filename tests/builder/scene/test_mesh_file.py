@@ -224,14 +224,18 @@ def test_invalid_mesh_paths_and_units_are_rejected(tmp_path: Path) -> None:
     for unit_m in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(MeshError, match="expected a positive length"):
             mesh_file_spec(path, unit_m)
-    with pytest.raises(MeshError, match=r"kind '.step' are not read, expected .glb, .gltf, .obj, .ply, .stl"):
+    with pytest.raises(
+        MeshError, match=r"unsupported mesh file type '.step', expected .glb, .gltf, .obj, .ply, .stl"
+    ):
         mesh_file_spec(tmp_path / "a.step", "m")
     for unit_m in (1000, 1e-6, 1e200):
         with pytest.raises(MeshError, match="is the unit right"):
             load_assembly(mesh_file_spec(path, unit_m))
     spec = mesh_file_spec(path, "m")
     path.write_bytes(trimesh.exchange.stl.export_stl(RODS[1]))
-    with pytest.raises(MeshError, match=f"changed since it was chosen: sha256 .* {spec.sha256} expected"):
+    with pytest.raises(
+        MeshError, match=f"changed since it was selected: its sha256 is .*, expected {spec.sha256}"
+    ):
         load_assembly(spec)
 
 
@@ -248,7 +252,7 @@ GLTF = trimesh.exchange.gltf.export_gltf(named_scene(RODS, "abc"), embed_buffers
 STL = trimesh.exchange.stl.export_stl_ascii(RODS[0])
 PLY = trimesh.exchange.ply.export_ply(RODS[0], encoding="ascii").decode()
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
-UNREADABLE = "not a mesh file of its kind that can be read"
+UNREADABLE = "not a readable mesh file of its type"
 INVALID_FILES: dict[str, tuple[str, bytes | str, str]] = {
     "empty obj": (".obj", "", "no triangle found"),
     "points only": (".obj", TRIANGLE, "no triangle found"),
@@ -256,7 +260,11 @@ INVALID_FILES: dict[str, tuple[str, bytes | str, str]] = {
     "relative corner": (".obj", TRIANGLE + "f -3 -2 -1", "negative"),
     "no number": (".obj", TRIANGLE + "f 1 2 x", UNREADABLE),
     "nan": (".obj", TRIANGLE + "v nan 0 0\nf 1 2 4", "a vertex is .nan, 0.0, 0.0., expected finite"),
-    "no area": (".obj", TRIANGLE + "f 1 2 2", "bar 1 .1 triangles. is no surface: every triangle has zero area"),
+    "no area": (
+        ".obj",
+        TRIANGLE + "f 1 2 2",
+        "bar 1 .1 triangles. is not a valid surface: every triangle has zero area",
+    ),
     "empty stl": (".stl", "", "no triangle found"),
     "cut binary stl": (".stl", trimesh.exchange.stl.export_stl(RODS[0])[:-1], "no triangle found"),
     "cut text stl": (".stl", STL[:-80], "no triangle found"),
@@ -265,8 +273,12 @@ INVALID_FILES: dict[str, tuple[str, bytes | str, str]] = {
     "empty ply": (".ply", "", UNREADABLE),
     "half a ply header": (".ply", PLY[:60], UNREADABLE),
     "ply without y": (".ply", PLY.replace("float y", "float w"), UNREADABLE),
-    "ply corner beyond": (".ply", PLY.replace("\n3 ", "\n3 999", 1), "triangles name vertices 0 to 999"),
-    "foreign bar_id": (".ply", PLY.replace("end_h", "property int bar_id\nend_h"), "it has bar_id, but not"),
+    "ply corner beyond": (".ply", PLY.replace("\n3 ", "\n3 999", 1), "triangles refer to vertices 0 to 999"),
+    "foreign bar_id": (
+        ".ply",
+        PLY.replace("end_h", "property int bar_id\nend_h"),
+        "the file has the property bar_id, but not",
+    ),
     "empty glb": (".glb", "", UNREADABLE),
     "cut glb": (".glb", GLB[:-4], UNREADABLE),
     "glb with a wild accessor": (".glb", GLB.replace(b'"count":130', b'"count":999', 1), UNREADABLE),
@@ -274,7 +286,7 @@ INVALID_FILES: dict[str, tuple[str, bytes | str, str]] = {
     "no gltf": (".gltf", "{}", "no triangle found"),
     "gltf 1": (".gltf", '{"asset": {"version": "1.0"}}', UNREADABLE),
     "sparse gltf": (".gltf", GLTF.replace('"count"', '"sparse":{},"count"', 1), "sparse, instanced"),
-    "outside buffer": (".gltf", GLTF.replace('"data:', '"b.bin","x":"', 1), "'b.bin' would be looked for"),
+    "outside buffer": (".gltf", GLTF.replace('"data:', '"b.bin","x":"', 1), "the file refers to 'b.bin'"),
 }
 
 

@@ -138,7 +138,7 @@ def test_quads_bad_indices_and_nan_are_rejected(tmp_path: Path) -> None:
         parse_mesh_ply(quad, "x.ply")
     for corner in (-1, 50):
         index = np.array([0, 1, corner], "<i4").tobytes()
-        with pytest.raises(DatasetError, match=rf"face 2 names vertices \[0, 1, {corner}\], expected 0 to 49"):
+        with pytest.raises(DatasetError, match=rf"face 2 refers to vertices \[0, 1, {corner}\], expected 0 to 49"):
             parse_mesh_ply(content[: faces_offset + 31] + index + content[faces_offset + 43 :], "x.ply")
     nan = np.array(np.nan, "<f8").tobytes()
     with pytest.raises(DatasetError, match=r"vertex 49 is \[.*nan\], expected finite metres"):
@@ -181,8 +181,8 @@ def test_invalid_mesh_is_not_written(tmp_path: Path) -> None:
     for bad, words in (
         ((vertices[:, :2], faces, bar_id), r"vertices \(50, 2\)"),
         ((vertices, faces, bar_id[1:]), r"bar ids \(79,\): expected one for each of the 80 faces"),
-        ((vertices, faces + 1, bar_id), "faces name vertices 1 to 50: expected 0 to 49"),
-        ((vertices, faces - 1, bar_id), "faces name vertices -1 to"),
+        ((vertices, faces + 1, bar_id), "faces refer to vertices 1 to 50: expected 0 to 49"),
+        ((vertices, faces - 1, bar_id), "faces refer to vertices -1 to"),
         ((vertices, faces, np.full(80, 65536)), "bar ids 65536 to 65536: expected 0 to 65535"),
         ((vertices, faces.astype(float), bar_id), "faces float64"),
         ((infinite, faces, bar_id), "not finite"),

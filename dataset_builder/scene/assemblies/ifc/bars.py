@@ -62,7 +62,7 @@ def ifc_bars(content: bytes, where: str) -> list[CageBar]:
     objects = sorted(model.by_type("IfcReinforcingBar"), key=lambda entity: int(entity.id()))
     if not objects:
         raise MeshError(
-            f"{where}: holds no IfcReinforcingBar{_unread_reinforcement_note(model)}, expected at least one"
+            f"{where}: contains no IfcReinforcingBar{_unread_reinforcement_note(model)}, expected at least one"
         )
     unit_m, angle_rad = length_unit_m(model, where), angle_unit_rad(model)
     shapes: dict[int, list[_BarGeometry]] = {}
@@ -84,7 +84,7 @@ def ifc_bars(content: bytes, where: str) -> list[CageBar]:
 def _unread_reinforcement_note(model: Model) -> str:
     """Return a note for the error message on reinforcement of classes that are not read, or an empty string."""
     unread_classes = [name for name in ("IfcReinforcingMesh", "IfcTendon") if model.by_type(name)]
-    return f" ({' and '.join(unread_classes)} are not read)" if unread_classes else ""
+    return f" ({' and '.join(unread_classes)} are not supported)" if unread_classes else ""
 
 
 def _swept_shapes(entity: Entity, unit_m: float, angle_rad: float) -> list[_BarGeometry]:
@@ -134,7 +134,7 @@ def _swept_solids(items: list[Entity]) -> Iterator[tuple[Entity, Float64[ndarray
             yield item, matrix, scale
         else:
             raise ValueError(f"the body is a {item.is_a()}")
-    raise ValueError(f"the body has more than {_MAX_BODY_ITEMS} items, or maps that go round in a circle")
+    raise ValueError(f"the body has more than {_MAX_BODY_ITEMS} items, or circular maps")
 
 
 def _tessellated_shapes(
@@ -152,8 +152,8 @@ def _tessellated_shapes(
     for entity, mesh in zip(objects, tessellate(content, where, ids), strict=False):
         if isinstance(mesh, str):
             raise MeshError(
-                f"{where}: {_label(entity)} has no shape that can be read: {reasons[entity.id()]}; "
-                f"tessellated: {mesh}; expected an IfcSweptDiskSolid along lines and arcs, or another solid"
+                f"{where}: {_label(entity)} has no readable shape: {reasons[entity.id()]}; "
+                f"tessellation: {mesh}; expected an IfcSweptDiskSolid along lines and arcs, or another solid"
             )
         surfaces[entity.id()] = [_BarGeometry(entity, mesh=part) for part in connected_components(mesh)]
     return surfaces
@@ -166,7 +166,7 @@ def _cage_bar(bar_id: int, shape: _BarGeometry, where: str) -> CageBar:
         try:
             return CageBar(label, estimate_bar(bar_id, shape.mesh), mesh=shape.mesh)
         except ValueError as error:
-            raise MeshError(f"{where}: {label}: is no solid ({error}), expected a bar") from error
+            raise MeshError(f"{where}: {label}: is not a solid ({error}), expected a bar") from error
     assert shape.axis_m is not None
     return CageBar(label, Bar(bar_id, _role(shape.entity), shape.diameter_m, axis_of(shape.axis_m)))
 

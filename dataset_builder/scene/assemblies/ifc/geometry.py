@@ -79,7 +79,7 @@ def _indexed_curve_points(curve: Any, _angle_rad: float) -> Float64[ndarray, "n 
     for segment in curve.Segments or ():
         index = np.array(segment.wrappedValue) - 1
         if index.min() < 0 or index.max() >= len(points):
-            raise ValueError("a segment names a point that is not there")
+            raise ValueError("a segment refers to a point that does not exist")
         corners = points[index]
         pieces.append(arc_through(*corners) if segment.is_a("IfcArcIndex") else corners)
     return _join_segments(pieces) if pieces else points
@@ -91,7 +91,7 @@ def _composite_curve_points(curve: Any, angle_rad: float) -> Float64[ndarray, "n
         if not segment.is_a("IfcCompositeCurveSegment"):
             raise ValueError(f"a segment is a {segment.is_a()}, expected an IfcCompositeCurveSegment")
         if segment.ParentCurve.is_a("IfcCompositeCurve"):
-            raise ValueError("a composite curve is made of composite curves")
+            raise ValueError("a composite curve contains composite curves")
         points = _sample_curve(segment.ParentCurve, angle_rad)
         pieces.append(points if segment.SameSense else points[::-1])
     return _join_segments(pieces)
@@ -184,7 +184,7 @@ def _join_segments(pieces: list[Float64[ndarray, "n 3"]]) -> Float64[ndarray, "k
     extent = float(np.ptp(line, axis=0).max())
     for before, after in pairwise(pieces):
         if np.linalg.norm(after[0] - before[-1]) > _JOIN_TOLERANCE * extent:
-            raise ValueError("the segments of a curve do not join")
+            raise ValueError("the segments of a curve are not connected")
     return np.asarray(line)
 
 
@@ -194,7 +194,7 @@ def _drop_repeated_points(points: Float64[ndarray, "n 3"]) -> Float64[ndarray, "
     Raises ``ValueError`` if fewer than two points remain or a point is not finite.
     """
     if len(points) < 2 or not np.isfinite(points).all():
-        raise ValueError("a curve has no two points, or one that is not finite")
+        raise ValueError("a curve has fewer than two points, or a point that is not finite")
     distinct = without_repeats(points, 1e-6 * np.ptp(points, axis=0).max())
     if len(distinct) < 2:
         raise ValueError("a curve has no length")
@@ -209,7 +209,7 @@ def placement_matrix(placement: Any, depth: int = 0) -> Float64[ndarray, "4 4"]:
     if placement is None:
         return np.eye(4)
     if depth > MAX_PLACEMENT_DEPTH or not placement.is_a("IfcLocalPlacement"):
-        raise ValueError(f"the placement is a {placement.is_a()} or goes round in a circle")
+        raise ValueError(f"the placement is a {placement.is_a()} or is circular")
     parent = placement_matrix(placement.PlacementRelTo, depth + 1)
     return np.asarray(parent @ axis_placement(placement.RelativePlacement))
 

@@ -43,11 +43,11 @@ def open_model(content: bytes, where: str) -> Model:
         raise
     except Exception as error:
         reason = shorten(str(error), 200) or type(error).__name__
-        raise MeshError(f"{where}: not an IFC file that can be read ({reason})") from error
+        raise MeshError(f"{where}: not a readable IFC file ({reason})") from error
     unread = sorted(defined_ids - read_ids)
     if unread:
         raise MeshError(
-            f"{where}: {len(unread)} of its instances cannot be read, first #{unread[0]}, expected a whole "
+            f"{where}: {len(unread)} of its instances cannot be read, first #{unread[0]}, expected a complete "
             f"{schema} file"
         )
     return model
@@ -84,9 +84,7 @@ def length_unit_m(model: Model, where: str) -> float:
     """Return the project's length unit in metres; raise ``MeshError`` if the file does not define a known one."""
     metres = _project_unit(model, "LENGTHUNIT", "METRE")
     if metres is None:
-        raise MeshError(
-            f"{where}: the project has no length unit that is known, expected metres, feet or the like"
-        )
+        raise MeshError(f"{where}: the project has no known length unit, expected for example metres or feet")
     return metres
 
 
@@ -124,18 +122,18 @@ def _check_text(text: str, where: str) -> set[int]:
         raise MeshError(f"{where}: does not begin with ISO-10303-21, expected an IFC file in STEP format")
     if not re.search(r"END-ISO-10303-21\s*;\s*\Z", text):
         raise MeshError(
-            f"{where}: does not end with END-ISO-10303-21, expected a whole IFC file: is it truncated?"
+            f"{where}: does not end with END-ISO-10303-21, expected a complete IFC file: is it truncated?"
         )
     bare = _STRING_OR_COMMENT.sub("''", text)
     instances = [int(number) for number in _INSTANCE.findall(bare)]
     defined = set(instances)
     if len(defined) < len(instances):
         duplicate = next(number for number, times in Counter(instances).items() if times > 1)
-        raise MeshError(f"{where}: instance #{duplicate} is defined twice, expected each once")
+        raise MeshError(f"{where}: instance #{duplicate} is defined twice, expected once")
     undefined = sorted({int(number) for number in _REFERENCE.findall(bare)} - defined)
     if undefined:
         raise MeshError(
-            f"{where}: {len(undefined)} instances are referred to and not there, first #{undefined[0]}, "
-            "expected a whole file"
+            f"{where}: {len(undefined)} referenced instances are not defined, first #{undefined[0]}, "
+            "expected a complete file"
         )
     return defined

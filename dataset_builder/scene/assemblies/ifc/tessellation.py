@@ -37,7 +37,7 @@ def tessellate(content: bytes, where: str, ids: list[int]) -> list[Mesh | str]:
         status = finished.returncode
         slow = status == -signal.SIGALRM
         results.append(
-            f"took over {SECONDS_PER_SHAPE} s" if slow else f"brought the geometry kernel down (status {status})"
+            f"took more than {SECONDS_PER_SHAPE} s" if slow else f"the geometry kernel crashed (status {status})"
         )
     return results
 
@@ -69,7 +69,7 @@ def _tessellate_instance(model: object, number: int) -> Mesh | str:
     try:
         [(vertices, faces)] = world_meshes(model, [number])
     except RuntimeError as error:
-        return str(error) or "the geometry kernel gave up"
+        return str(error) or "the geometry kernel failed"
     if not len(faces):
         return "has no surface"
     return Mesh(np.array(vertices).reshape(-1, 3), np.array(faces, dtype=np.int32).reshape(-1, 3))

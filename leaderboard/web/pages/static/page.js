@@ -1,10 +1,10 @@
-// What the pages do beyond plain HTML: a waiting submission is followed, an upload shows how far it is. Without this
-// script the page of a waiting submission loads itself anew, and the form is sent as any form is.
+// Enhancements of the pages: polls the status of a queued submission and shows the progress of an upload. Without
+// this script, the page of a queued submission reloads periodically, and the form is submitted by the browser.
 (() => {
   "use strict";
   const POLL_MS = 2000;
 
-  // Follow a submission that waits: ask for its status, read its place from the page, show the page once it ended.
+  // Poll the status of a submission, update its queue position, and reload the page when it is scored or failed.
   function follow(state) {
     const again = () => setTimeout(() => ask().catch(again), POLL_MS);
     async function ask() {
@@ -45,7 +45,7 @@
 
     function refused(page) {
       const fresh = new DOMParser().parseFromString(page, "text/html").getElementById("refusal");
-      if (!fresh) return ended("The service gave no answer that this page understands. Please try again.");
+      if (!fresh) return ended("The service returned an unexpected response. Please try again.");
       document.getElementById("refusal")?.remove();
       document.querySelector("h1").after(fresh);
       ended("Not accepted: see above.");
@@ -58,7 +58,7 @@
       const file = form.elements.archive.files[0];
       box.hidden = false;
       bar.hidden = false;
-      if (file.size > Number(form.dataset.most)) return ended("The archive is larger than this service takes.");
+      if (file.size > Number(form.dataset.most)) return ended("The archive is larger than the upload limit.");
       button.disabled = true;
       const request = new XMLHttpRequest();
       request.upload.addEventListener("progress", ({ loaded, total }) => {

@@ -129,5 +129,5 @@ def test_triangulation_needs_enough_distinct_views() -> None:
 def test_too_few_markers_raise() -> None:
     poses, _ = reconstruct_in_other_frame(1.0, (0.0, 0.0, 0.0))
     corners = {name: {3: markers[3]} for name, markers in project_corners().items()}
-    with pytest.raises(MethodError, match=r"of the board's 6 markers 1 can be triangulated .*expected at least 2"):
+    with pytest.raises(MethodError, match=r"1 of the board's 6 markers can be triangulated .*expected at least 2"):
         fit_board(corners, poses, K, BOARD)
