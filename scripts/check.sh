@@ -18,7 +18,7 @@ trap 'kill "$static" 2>/dev/null || true; rm -f "$report"' EXIT
 status=0
 # A file's tests stay together, so that the servers and renders of a module are started once (tests/conftest.py).
 # Three processes keep two cores busy, because some tests wait for a lease or a timeout.
-"$bin/pytest" --tier "$tier" --numprocesses 3 --dist loadfile "$@" || status=$?
+"$bin/pytest" --tier "$tier" --numprocesses 3 --dist loadfile --no-loadscope-reorder "$@" || status=$?
 if ! wait "$static"; then
     cat "$report"
     status=1

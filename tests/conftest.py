@@ -96,6 +96,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if deselected:
         config.hook.pytest_deselected(items=deselected)
         items[:] = [item for item in items if item not in set(deselected)]
+    # Files that start something heavy come first, so that no process is left with a long one at the end.
+    heavy = {item.path for item in items if {marker.name for marker in item.iter_markers()} & TIERS["quick"]}
+    items.sort(key=lambda item: item.path not in heavy)
 
 
 @pytest.fixture(scope="session")
