@@ -78,7 +78,7 @@ def test_views_without_prediction_are_excluded(noisy: Depths, tiny_root: Path, a
     assert [row.k for row in study.rows] == [1, 8]
     assert study.skipped_counts == (9, 50)
     notes = " ".join(to_page(study).notes)
-    assert "1 of 9 views have no prediction: neither drawn nor scored." in notes
+    assert "1 of 9 views have no prediction: they are neither drawn nor scored." in notes
     assert "Skipped: k = 9, 50, more than the 8 views to draw from." in notes
     nothing = archive_of({view: -depth_m for view, depth_m in noisy.items()}, "nothing.zip")
     with pytest.raises(InputError, match="0 of 9 views of lattice have a prediction, expected at least 2"):

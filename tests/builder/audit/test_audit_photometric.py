@@ -68,7 +68,7 @@ def test_images_without_texture_are_skipped() -> None:
     plain = AuditedView("x", *(replace(eye, rgb=np.full_like(eye.rgb, 99)) for eye in good.eyes.values()))
     check = verdict(config(), [plain])
     assert (check.passed, check.bound) == (True, "skipped")
-    assert "only 0 pixels" in check.measured
+    assert "only 0 textured pixels" in check.measured
 
 
 @pytest.fixture(scope="module")
