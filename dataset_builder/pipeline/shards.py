@@ -77,7 +77,7 @@ def read_staged_record(path: Path) -> ViewRecord:
 
 def pack_shard(rows: Sequence[Path], target: Path) -> None:
     """Write the staged ``rows`` as one Parquet shard with one row group per view, to keep streaming cheap."""
-    schema = features().arrow_schema
+    schema = pq.read_schema(rows[0]).with_metadata(features().arrow_schema.metadata)
     with atomic_replace(target) as temporary, pq.ParquetWriter(temporary, schema, **_PARQUET) as writer:
         for path in rows:
             writer.write_table(pq.read_table(path).replace_schema_metadata(schema.metadata))

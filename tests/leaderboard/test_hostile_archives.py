@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench import load
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.scoring.ground_truth import config_truth
 from tests.leaderboard.hostile_zips import (
     KINDS,
     ValidArchive,
@@ -69,6 +71,7 @@ def attack(
     repetitions: Repetitions,
 ) -> Iterator[AttackResult]:
     folder = tmp_path_factory.mktemp("siege")
+    config_truth(open_folder(tiny_root), "lattice-orbit")  # Scoring writes this cache beside the dataset.
     state = folder / "state"
     for name in ("cwd", "home", "tmp", "forbidden"):
         (folder / name).mkdir()
