@@ -8,8 +8,43 @@ software or by the machine (exit status 1).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Self
 
 MAX_PROBLEMS_SHOWN = 20
+
+ProblemCode = Literal[
+    "syntax",  # a file that cannot be parsed at all
+    "missing",  # a key, entry or file that is required
+    "unknown",  # a key or entry that is not part of the schema or the dataset
+    "duplicate",  # a key, id or entry that occurs twice
+    "conflict",  # values that are valid alone, but not together
+    "invalid",  # a value of the wrong type or outside its range
+    "name",  # an entry's name that escapes the archive or cannot be stored
+    "kind",  # an entry that is no plain file: linked, encrypted, patch data
+    "size",  # a declared or actual size that is too large, or two sizes that differ
+    "damaged",  # data that are truncated, overlapping or corrupt
+]
+"""Kind of a problem, stable across versions, for programs and tests; ``Problem.where`` locates it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One reason for rejecting an input.
+
+    ``where`` is the entry, view or key (empty: the whole input), ``found`` describes what is there, and
+    ``expected`` what should be (empty if it is obvious).
+    """
+
+    code: ProblemCode
+    where: str
+    found: str
+    expected: str = ""
+
+    def __str__(self) -> str:
+        """Return the problem as one line, ``where: found, expected ...``."""
+        place = f"{self.where}: " if self.where else ""
+        return f"{place}{self.found}{', expected ' if self.expected else ''}{self.expected}"
 
 
 class RebarDepthError(Exception):
@@ -17,7 +52,19 @@ class RebarDepthError(Exception):
 
 
 class InputError(RebarDepthError):
-    """Invalid user input: a folder, an archive or an argument."""
+    """Invalid user input: a folder, an archive or an argument.
+
+    ``problems`` lists every reason if the input was validated as a whole; it is empty for other errors.
+    """
+
+    problems: tuple[Problem, ...] = ()
+
+    @classmethod
+    def from_problems(cls, source: object, problems: Sequence[Problem]) -> Self:
+        """Return the error of the input ``source`` (usually a path), whose message lists the problems."""
+        error = cls(f"{source}: {problem_summary(problems)}")
+        error.problems = tuple(problems)
+        return error
 
 
 class DatasetError(InputError):
@@ -33,21 +80,11 @@ class MethodError(InputError):
 
 
 class SubmissionError(InputError):
-    """Rejected submission archive; ``problems`` lists every reason, one sentence each."""
-
-    def __init__(self, archive: str, problems: Sequence[str]) -> None:
-        self.archive = archive
-        self.problems = tuple(problems)
-        super().__init__(f"{archive}: {problem_summary(self.problems)}")
+    """Rejected submission archive."""
 
 
 class CalibrationError(InputError):
-    """Rejected calibration file; ``problems`` lists every reason, one sentence each."""
-
-    def __init__(self, path: str, problems: Sequence[str]) -> None:
-        self.path = path
-        self.problems = tuple(problems)
-        super().__init__(f"{path}: {problem_summary(self.problems)}")
+    """Rejected calibration file."""
 
 
 class BuildError(RebarDepthError):
@@ -58,7 +95,7 @@ class RenderProcessError(BuildError):
     """Render process that died or returned an invalid response twice."""
 
 
-def problem_summary(problems: Sequence[str]) -> str:
+def problem_summary(problems: Sequence[Problem | str]) -> str:
     """Return the number of problems, the first ``MAX_PROBLEMS_SHOWN`` one per line, and the number omitted."""
     noun = "problem" if len(problems) == 1 else "problems"
     lines = [f"{len(problems)} {noun}", *(f"  - {problem}" for problem in problems[:MAX_PROBLEMS_SHOWN])]
@@ -72,11 +109,16 @@ _MAX_TEXT_CHARACTERS = 120
 
 
 class EntryError(InputError):
-    """Rejected entry of an archive; ``problem`` is the reason, one sentence."""
+    """Rejected entry of an archive; ``problem`` is the reason."""
 
-    def __init__(self, problem: str) -> None:
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(str(problem))
         self.problem = problem
-        super().__init__(problem)
+        self.problems = (problem,)
+
+    def __reduce__(self) -> tuple[type[Self], tuple[Problem]]:
+        """Return the constructor's call: worker processes send this error to their parent."""
+        return type(self), (self.problem,)
 
 
 def escape_text(text: str) -> str:

@@ -1,82 +1,177 @@
-"""Strict validation of TOML tables: one problem sentence for each missing, unknown or invalid key."""
+"""Validation of TOML and JSON tables with pydantic: one ``Problem`` for each missing, unknown or invalid key.
+
+A schema is a subclass of ``StrictModel`` whose field types are annotated with ``Expected``, the description of a
+valid value::
+
+    class InputTable(StrictModel):
+        width: Annotated[int, whole_number(1, 8192)]
+
+``validate_table`` returns the model of a table and appends all problems of the table to a list.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import tomllib
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Any, Generic, TypeVar, overload
+from typing import Annotated, Any, TypeGuard, TypeVar, get_args
 
-T = TypeVar("T")
-D = TypeVar("D")
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, Strict, ValidationError
+from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
+
+from rebar_depth_bench.errors import Problem, ProblemCode
+
+Model = TypeVar("Model", bound=BaseModel)
 _MAX_REPR_CHARACTERS = 60
 _MAX_MAGNITUDE = 1e9
 """Largest accepted magnitude: far above any number of a scene or model file, with powers that stay finite."""
+_EXPLAINED = "explained"
+
+
+class StrictModel(BaseModel):
+    """Base class of schemas; unknown keys and conversions between types (``"3"`` or true to 1) are rejected."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 @dataclass(frozen=True)
-class FieldType(Generic[T]):
-    """Type of a TOML value: a description of the expected value and a conversion function.
+class Expected:
+    """Annotation of a type: a description of the valid values, and a predicate that a value must fulfil.
 
-    ``convert`` returns the converted value and raises ``ValueError`` for an invalid one. The message of the
-    ``ValueError``, if not empty, replaces the value in the reported problem.
+    The description replaces pydantic's message, except for elements of a list that have their own description.
     """
 
-    expected: str
-    convert: Callable[[Any], T]
+    text: str
+    accept: Callable[[Any], bool] = lambda _: True
 
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Return the schema of the annotated type with the check of this description around it."""
+        return core_schema.no_info_wrap_validator_function(self._check, handler(source))
 
-@dataclass(frozen=True)
-class TableReader:
-    """Reader of one table that appends every problem to the shared list ``problems``.
-
-    ``where`` is the prefix of each key in a problem.
-    """
-
-    values: Mapping[str, Any]
-    where: str
-    problems: list[str]
-
-    @overload
-    def required(self, key: str, field_type: FieldType[T]) -> T | None: ...
-    @overload
-    def required(self, key: str, field_type: FieldType[T], fallback: D) -> T | D: ...
-    def required(self, key: str, field_type: FieldType[Any], fallback: Any = None) -> Any:
-        """Return the value of ``key``; if it is missing or invalid, add a problem and return ``fallback``."""
-        if key not in self.values:
-            self.problems.append(f"{self.where}{key} is missing, expected {field_type.expected}")
-        return self.optional(key, field_type, fallback)
-
-    @overload
-    def optional(self, key: str, field_type: FieldType[T]) -> T | None: ...
-    @overload
-    def optional(self, key: str, field_type: FieldType[T], default: D) -> T | D: ...
-    def optional(self, key: str, field_type: FieldType[Any], default: Any = None) -> Any:
-        """Return the value of ``key``, or ``default`` if it is missing; add a problem if it is invalid."""
-        if key not in self.values:
-            return default
+    def _check(self, value: Any, convert: core_schema.ValidatorFunctionWrapHandler) -> Any:
         try:
-            return field_type.convert(self.values[key])
-        except ValueError as error:
-            description = describe_value(error, self.values[key])
-            self.problems.append(f"{self.where}{key}: {description}, expected {field_type.expected}")
-            return default
-
-    def reject_unknown(self, known: Iterable[str]) -> None:
-        """Add a problem for every key that is not one of ``known``."""
-        names = tuple(known)
-        for key in self.values:
-            if key not in names:
-                close_matches = get_close_matches(key, names, n=1)
-                hint = (
-                    f"did you mean {close_matches[0]}?" if close_matches else f"expected only {', '.join(names)}"
-                )
-                self.problems.append(f"{self.where}{short_repr(key)} is not a known key, {hint}")
+            converted = convert(value)
+        except ValidationError as error:
+            if all(details["type"] == _EXPLAINED for details in error.errors()):
+                raise
+            raise field_error(f"got {short_repr(value)}", self.text) from None
+        if not self.accept(converted):
+            raise field_error(f"got {short_repr(value)}", self.text)
+        return converted
 
 
-def describe_value(error: ValueError, value: object) -> str:
-    """Return the part of a problem that describes the invalid value: the error's message, or else the value."""
-    return str(error) or f"got {short_repr(value)}"
+def field_error(found: str, expected: str, code: ProblemCode = "invalid") -> PydanticCustomError:
+    """Return the error that a validator raises to report what it found and expected."""
+    context = {"found": found, "expected": expected, "code": code}
+    return PydanticCustomError(_EXPLAINED, "{found}, expected {expected}", context)
+
+
+def number(low: float, high: float = _MAX_MAGNITUDE, expected: str = "") -> Expected:
+    """Return the description of finite numbers from ``low`` to ``high``; 0 is excluded if ``low`` is 0."""
+    limit = "" if high == _MAX_MAGNITUDE else f", up to {high:g}"
+    interval = f"above 0{limit}" if low == 0 else f"from {low:g} to {high:g}"
+    return Expected(
+        expected or f"a number {interval}", lambda value: low <= value <= high and not value == 0 == low
+    )
+
+
+def whole_number(low: int, high: int) -> Expected:
+    """Return the description of integers from ``low`` to ``high``."""
+    return Expected(f"a whole number from {low} to {high}", lambda value: low <= value <= high)
+
+
+def three_numbers(low: float, high: float, expected: str = "") -> Expected:
+    """Return the description of a ``Triple`` (by default RGB) of numbers from ``low`` to ``high``."""
+    return Expected(
+        expected or f"three numbers from {low:g} to {high:g}: red, green, blue",
+        lambda values: all(low <= value <= high for value in values),
+    )
+
+
+def text(max_length: int, what: str = "text on one line") -> Expected:
+    """Return the description of printable, non-blank strings of at most ``max_length`` characters."""
+    return Expected(
+        f"{what}, 1 to {max_length} characters",
+        lambda value: bool(value.strip()) and value.isprintable() and len(value) <= max_length,
+    )
+
+
+def one_of(*values: str | int) -> Expected:
+    """Return the description of values that equal one of ``values``."""
+    *others, last = (f'"{value}"' if isinstance(value, str) else f"{value}" for value in values)
+    return Expected(f"{', '.join(others)} or {last}", lambda value: value in values)
+
+
+Triple = Annotated[tuple[float, float, float], Strict(False)]
+"""Type of a list of three numbers, converted to a tuple."""
+
+Flag = Annotated[bool, Expected("true or false")]
+
+
+def validate_table(
+    model: type[Model], values: object, problems: list[Problem], where: str = "", context: Any = None
+) -> Model | None:
+    """Return the validated table, or None after adding all its problems to ``problems``.
+
+    ``where`` is the location of the table, and ``context`` is passed to validators (``info.context``).
+    """
+    try:
+        return model.model_validate(values, context=context)
+    except ValidationError as error:
+        problems += [_problem(details, model, where) for details in error.errors(include_url=False)]
+        return None
+
+
+def _problem(details: ErrorDetails, model: type[BaseModel], where: str) -> Problem:
+    location, kind = details["loc"], details["type"]
+    place = format_location(where, *location)
+    if kind == _EXPLAINED:
+        context = details["ctx"]
+        return Problem(context["code"], place, context["found"], context["expected"])
+    if kind == "missing":
+        return Problem("missing", place, "missing", _expectation(_model_at(model, location), location[-1]))
+    if kind == "extra_forbidden":
+        known = _model_at(model, location).model_fields
+        return Problem("unknown", place, "not a known key", _known_keys(str(location[-1]), known))
+    expected = "a table" if kind in ("model_type", "dict_type") else details["msg"]
+    return Problem("invalid", place, f"got {short_repr(details['input'])}", expected)
+
+
+def _model_at(model: type[BaseModel], location: Sequence[int | str]) -> type[BaseModel]:
+    """Return the model of the table that holds the last key of a location."""
+    for key in location[:-1]:
+        if isinstance(key, str):
+            annotation = model.model_fields[key].annotation
+            model = next(item for item in (annotation, *get_args(annotation)) if _is_model(item))
+    return model
+
+
+def _is_model(annotation: Any) -> TypeGuard[type[BaseModel]]:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _expectation(model: type[BaseModel], key: int | str) -> str:
+    field = model.model_fields[str(key)]
+    if _is_model(field.annotation):
+        return "a table"
+    return next((item.text for item in field.metadata if isinstance(item, Expected)), "")
+
+
+def _known_keys(key: str, known: Iterable[str]) -> str:
+    close_matches = get_close_matches(key, known, n=1)
+    return close_matches[0] if close_matches else f"only {', '.join(known)}"
+
+
+def format_location(where: str, *keys: int | str) -> str:
+    """Return the location of a value: keys joined by dots, after each index of a list, counted from 1, a colon."""
+    for key in keys:
+        if isinstance(key, int):
+            where = f"{where} {key + 1}:"
+        else:
+            name = key if key.isprintable() and len(key) <= _MAX_REPR_CHARACTERS else short_repr(key)
+            where += f"{'' if not where else ' ' if where.endswith(':') else '.'}{name}"
+    return where.removesuffix(":")
 
 
 def short_repr(value: object) -> str:
@@ -88,103 +183,11 @@ def short_repr(value: object) -> str:
     return line if len(line) <= _MAX_REPR_CHARACTERS else f"{line[:_MAX_REPR_CHARACTERS]} ..."
 
 
-def finite(value: object) -> float:
-    """Return a number as float.
-
-    Raises ``ValueError`` for anything else, including booleans, NaN and magnitudes above 1e9.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
-        raise ValueError
-    if abs(value) > _MAX_MAGNITUDE:
-        raise ValueError(f"got a number with a magnitude above {_MAX_MAGNITUDE:g}")
-    return float(value)
-
-
-def number(low: float, high: float) -> FieldType[float]:
-    """Return the type of finite numbers from ``low`` to ``high``; 0 is excluded if ``low`` is 0."""
-    interval = f"above 0, up to {high:g}" if low == 0 else f"from {low:g} to {high:g}"
-
-    def convert(value: object) -> float:
-        result = finite(value)
-        if not low <= result <= high or result == 0 == low:
-            raise ValueError
-        return result
-
-    return FieldType(f"a number {interval}", convert)
-
-
-POSITIVE = FieldType("a number above 0", number(0, _MAX_MAGNITUDE).convert)
-
-
-def three_numbers(low: float, high: float) -> FieldType[tuple[float, float, float]]:
-    """Return the type of RGB lists: three numbers from ``low`` to ``high``, converted to a tuple."""
-
-    def convert(value: object) -> tuple[float, float, float]:
-        if not isinstance(value, list) or len(value) != 3:
-            raise ValueError
-        red, green, blue = (finite(item) for item in value)
-        if not all(low <= item <= high for item in (red, green, blue)):
-            raise ValueError
-        return red, green, blue
-
-    return FieldType(f"three numbers from {low:g} to {high:g}: red, green, blue", convert)
-
-
-def whole_number(low: int, high: int) -> FieldType[int]:
-    """Return the type of integers from ``low`` to ``high``; booleans and floats such as 6.0 are rejected."""
-
-    def convert(value: object) -> int:
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise ValueError
-        return value
-
-    return FieldType(f"a whole number from {low} to {high}", convert)
-
-
-def string_matching(expected: str, accept: Callable[[str], bool]) -> FieldType[str]:
-    """Return the type of strings for which ``accept`` returns true."""
-
-    def convert(value: object) -> str:
-        if not isinstance(value, str) or not accept(value):
-            raise ValueError
-        return value
-
-    return FieldType(expected, convert)
-
-
-def text(max_length: int, what: str = "text on one line") -> FieldType[str]:
-    """Return the type of printable, non-blank strings of at most ``max_length`` characters."""
-    return string_matching(
-        f"{what}, 1 to {max_length} characters",
-        lambda value: bool(value.strip()) and value.isprintable() and len(value) <= max_length,
-    )
-
-
-def choice(choices: Mapping[T, str]) -> FieldType[T]:
-    """Return the type of values that equal a key of ``choices``, which maps each value to its TOML notation."""
-    *others, last = choices.values()
-
-    def convert(value: object) -> T:
-        for candidate in choices:
-            if type(value) is type(candidate) and value == candidate:
-                return candidate
-        raise ValueError
-
-    return FieldType(f"{', '.join(others)} or {last}", convert)
-
-
-def one_of(*names: str) -> FieldType[str]:
-    """Return the type of strings that equal one of ``names``."""
-    return choice({name: f'"{name}"' for name in names})
-
-
-FLAG: FieldType[bool] = choice({True: "true", False: "false"})
-
-
-def _table(value: object) -> Mapping[str, Any]:
-    if not isinstance(value, dict):
-        raise ValueError
-    return value
-
-
-TABLE: FieldType[Mapping[str, Any]] = FieldType("a table", _table)
+def parse_toml(content: bytes) -> tuple[dict[str, Any], list[Problem]]:
+    """Return the content of a TOML file, or an empty table and the problem of the content."""
+    try:
+        return tomllib.loads(content.decode("utf-8-sig")), []
+    except UnicodeDecodeError as error:
+        return {}, [Problem("syntax", "", f"byte {error.start} is not UTF-8", "a TOML file")]
+    except (ValueError, RecursionError) as error:
+        return {}, [Problem("syntax", "", f"not a valid TOML file: {error}", "a TOML file")]

@@ -36,7 +36,7 @@ from dataset_builder.config.specs import DomeSpec, RigSpec, RingSpec
 from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS
 from dataset_builder.scene.variants import VARIANTS
 from rebar_depth_bench.errors import InputError, problem_summary
-from rebar_depth_bench.validation import (
+from rebar_depth_bench.validation_old import (
     FLAG,
     POSITIVE,
     TABLE,

@@ -22,7 +22,7 @@ from rebar_depth_bench.data.digests import files_digest
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.onnx.session import OnnxSession, open_session
-from rebar_depth_bench.methods.onnx.spec import InputSpec, OnnxSpec, OutputSpec, read_onnx_toml
+from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, InputSpec, OnnxSpec, OutputSpec, read_onnx_toml
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,9 @@ def place_image(spec: InputSpec, width: int, height: int) -> Placement:
     ratio = min(canvas[0] / width, canvas[1] / height)
     across, down = (
         _axis_placement(
-            side, min(max(round(side * ratio), 1), canvas_side) if spec.pad else canvas_side, canvas_side
+            side,
+            min(max(round(side * ratio), 1), canvas_side) if spec.resize == "pad" else canvas_side,
+            canvas_side,
         )
         for side, canvas_side in zip((width, height), canvas, strict=True)
     )
@@ -67,8 +69,8 @@ def place_image(spec: InputSpec, width: int, height: int) -> Placement:
 
 def _canvas_px(spec: InputSpec, width: int, height: int) -> tuple[int, int]:
     """Return width and height of a variable-size input: nearest multiples that keep the aspect ratio."""
-    ratio = spec.longest_px / max(width, height)
-    across, down = (max(round(side * ratio / spec.multiple_px), 1) * spec.multiple_px for side in (width, height))
+    ratio = (spec.longest_side or 0) / max(width, height)
+    across, down = (max(round(side * ratio / spec.multiple_of), 1) * spec.multiple_of for side in (width, height))
     return across, down
 
 
@@ -85,9 +87,9 @@ def input_tensor(
     of OpenCV and torch.
     """
     size = (placement.across.resized_px, placement.down.resized_px)
-    kernel = Image.Resampling.BICUBIC if spec.bicubic else Image.Resampling.BILINEAR
+    kernel = Image.Resampling.BICUBIC if spec.interpolation == "bicubic" else Image.Resampling.BILINEAR
     resized = np.asarray(Image.fromarray(rgb).resize(size, kernel), np.float64)
-    normalised = (resized * (spec.white / 255) - np.array(spec.mean)) / np.array(spec.std)
+    normalised = (resized * (spec.range / 255) - np.array(spec.mean)) / np.array(spec.std)
     tensor = np.zeros((1, 3, placement.down.canvas_px, placement.across.canvas_px))
     tensor[0, :, _image_slice(placement.down), _image_slice(placement.across)] = normalised.transpose(2, 0, 1)
     return tensor
@@ -174,13 +176,13 @@ def onnx_method(path: Path) -> Method:
     Raises ``MethodError`` listing all problems of the file.
     """
     spec = read_onnx_toml(path)
-    canonical = spec.output.meaning.canonical
+    model, meaning = Path(spec.model), OUTPUT_MEANINGS[spec.output.meaning]
     info = MethodInfo(
         name=spec.name,
-        summary=spec.summary or f"ONNX model {spec.model.name}; its output: {spec.output.meaning.description}",
-        columns=("left_rgb", "left_K") if canonical else ("left_rgb",),
-        uses_intrinsics=canonical,
-        source=f"{spec.source or spec.model.name} (sha256:{_model_digest(path, spec.model)})",
+        summary=spec.summary or f"ONNX model {model.name}; its output: {meaning.description}",
+        columns=("left_rgb", "left_K") if meaning.canonical else ("left_rgb",),
+        uses_intrinsics=meaning.canonical,
+        source=f"{spec.source or model.name} (sha256:{_model_digest(path, model)})",
         licence=spec.licence,
     )
     return Method(info, lambda: _load(spec))
@@ -196,10 +198,11 @@ def output_to_depth_m(
     resized image that the model receives. Depth is NaN where the value is not finite, or the depth is not finite
     and above 0 or lies outside ``min_m`` to ``max_m``.
     """
-    factor = fx_at_input_px / output.focal_canonical_px if output.meaning.canonical else 1.0
+    meaning = OUTPUT_MEANINGS[output.meaning]
+    factor = fx_at_input_px / (output.focal_canonical_px or np.nan) if meaning.canonical else 1.0
     scaled = np.asarray(values, np.float64) * output.scale
     with np.errstate(all="ignore"):
-        depth_m = np.asarray(factor / scaled if output.meaning.inverse else factor * scaled)
+        depth_m = np.asarray(factor / scaled if meaning.inverse else factor * scaled)
         single = depth_m.astype(np.float32)
     valid = np.isfinite(scaled) & np.isfinite(single) & (single > 0)
     valid &= (depth_m >= output.min_m) & (depth_m <= output.max_m)
@@ -207,7 +210,7 @@ def output_to_depth_m(
 
 
 def _load(spec: OnnxSpec) -> Predictor:
-    session = open_session(spec.model, spec.input, spec.output)
+    session = open_session(Path(spec.model), spec.input, spec.output)
     width, height = TRIAL_SIZE_PX
     # The output shape of a model with dynamic sizes is only known after a run.
     session.run(
@@ -222,13 +225,16 @@ def _predict(spec: OnnxSpec, session: OnnxSession, row: Mapping[str, Any]) -> Fl
     height, width, _ = row["left_rgb"].shape
     placement = place_image(spec.input, width, height)
     values = session.run(input_tensor(spec.input, placement, row["left_rgb"]))
-    fx_at_input_px = row["left_K"][0, 0] * placement.across.scale if spec.output.meaning.canonical else np.nan
+    canonical = OUTPUT_MEANINGS[spec.output.meaning].canonical
+    fx_at_input_px = row["left_K"][0, 0] * placement.across.scale if canonical else np.nan
     # Invalid values become NaN before resampling, so that they are not interpolated with neighbours.
     valid: Float64[ndarray, "out_h out_w"] = np.where(
         np.isnan(output_to_depth_m(values, spec.output, fx_at_input_px)), np.nan, values
     )
     return output_to_depth_m(
-        sample_at_image_pixels(placement, valid, bilinear=spec.output.bilinear), spec.output, fx_at_input_px
+        sample_at_image_pixels(placement, valid, bilinear=spec.output.resize == "bilinear"),
+        spec.output,
+        fx_at_input_px,
     )
 
 

@@ -31,24 +31,27 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
-from rebar_depth_bench.errors import MethodError, problem_summary
+from pydantic import Field, ValidationInfo, field_validator
+
+from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.submission.metadata import MAX_METHOD_CHARACTERS
 from rebar_depth_bench.validation import (
-    FLAG,
-    POSITIVE,
-    TABLE,
-    TableReader,
-    choice,
+    Expected,
+    Flag,
+    StrictModel,
+    Triple,
+    field_error,
     number,
     one_of,
+    parse_toml,
+    short_repr,
     text,
-    three_numbers,
+    validate_table,
     whole_number,
 )
 
@@ -83,52 +86,124 @@ with a canonical focal length equal to its input width: in 1/z = C W / f, W and 
 """
 
 
-@dataclass(frozen=True)
-class InputSpec:
-    """Conversion of an image to the model input.
+_Side = Annotated[int, whole_number(1, MAX_SIDE_PX)]
+_Positive = Annotated[float, number(0)]
+_COLOUR = Expected("three numbers: red, green, blue")
 
-    ``size_px`` is (width, height), or None if the size follows from ``longest_px`` and ``multiple_px``. ``white``
-    is the value of white before normalisation (1 or 255); ``mean`` and ``std`` are in the same unit.
+
+class InputSpec(StrictModel):
+    """Conversion of an image to the model input: the table ``[input]``.
+
+    Sides are in pixels. ``range`` is the value of white before normalisation, also the unit of ``mean``
+    and ``std``.
     """
 
-    size_px: tuple[int, int] | None
-    longest_px: int
-    multiple_px: int
-    pad: bool
-    bicubic: bool
-    white: int
-    mean: tuple[float, float, float]
-    std: tuple[float, float, float]
+    width: _Side | None = None
+    height: _Side | None = None
+    multiple_of: _Side = 1
+    longest_side: _Side | None = Field(default=None, validate_default=True)
+    resize: Annotated[str, one_of("stretch", "pad")]
+    interpolation: Annotated[str, one_of("bilinear", "bicubic")] = "bilinear"
+    range: Annotated[int, one_of(1, 255)]
+    mean: Annotated[Triple, _COLOUR] = (0.0, 0.0, 0.0)
+    std: Annotated[Triple, _COLOUR] = (1.0, 1.0, 1.0)
+
+    @property
+    def size_px(self) -> tuple[int, int] | None:
+        """Fixed size (width, height), or None if the size follows from ``longest_side`` and ``multiple_of``."""
+        return None if self.width is None or self.height is None else (self.width, self.height)
+
+    @field_validator("longest_side")
+    @classmethod
+    def _check_size(cls, longest_px: int | None, info: ValidationInfo) -> int | None:
+        sides = {key: info.data.get(key) for key in ("width", "height")}
+        given = [key for key, value in (*sides.items(), ("longest_side", longest_px)) if value is not None]
+        if len(sides) == len(info.data.keys() & sides) and given not in (["width", "height"], ["longest_side"]):
+            found = f"got {' and '.join(given)}" if given else "missing"
+            raise field_error(found, "width and height, or longest_side", "conflict" if given else "missing")
+        multiple_px = info.data.get("multiple_of", 1)
+        if longest_px is not None and longest_px % multiple_px:
+            raise field_error(f"got {longest_px}", f"a multiple of multiple_of, {multiple_px}")
+        return longest_px
+
+    @field_validator("mean", "std")
+    @classmethod
+    def _check_colour(cls, values: Triple, info: ValidationInfo) -> Triple:
+        """Check the bounds, which catch values given for the other range, a common mistake."""
+        white = info.data.get("range")
+        low, high = (white or 1) / 255 if info.field_name == "std" else 0, white or 255
+        if not all(low <= value <= high for value in values):
+            raise field_error(
+                f"got {short_repr(list(values))}", f"three numbers from {low:g} to {high:g}: red, green, blue"
+            )
+        return values
 
 
-@dataclass(frozen=True)
-class OutputSpec:
-    """Conversion of the model output to depth; ``focal_canonical_px`` is NaN if the meaning is not canonical.
+class OutputSpec(StrictModel):
+    """Conversion of the model output to depth: the table ``[output]``.
 
-    ``name_or_index`` selects the output; None: the only one.
+    ``scale`` is in metres per unit of a non-canonical output, ``min_m`` and ``max_m`` are in metres.
     """
 
-    meaning: OutputMeaning
-    focal_canonical_px: float
-    scale: float
-    min_m: float
-    max_m: float
-    name_or_index: str | int | None
-    at_input_size: bool
-    bilinear: bool
+    meaning: Annotated[str, one_of(*OUTPUT_MEANINGS)]
+    focal_canonical_px: Annotated[float, number(1, 100_000)] | None = Field(default=None, validate_default=True)
+    scale: _Positive = 1.0
+    max_m: _Positive = math.inf
+    min_m: _Positive = 0.0
+    name: Annotated[str, text(500)] | None = None
+    index: Annotated[int, whole_number(0, 999)] | None = None
+    at_input_size: Flag = True
+    resize: Annotated[str, one_of("nearest", "bilinear")] = "nearest"
+
+    @property
+    def name_or_index(self) -> str | int | None:
+        """Name or index of the output; None: the model's only one."""
+        return self.index if self.name is None else self.name
+
+    @field_validator("focal_canonical_px")
+    @classmethod
+    def _check_focal(cls, focal_px: float | None, info: ValidationInfo) -> float | None:
+        meaning = info.data.get("meaning")
+        if meaning is not None and OUTPUT_MEANINGS[meaning].canonical != (focal_px is not None):
+            if focal_px is None:
+                raise field_error("missing", f'a number from 1 to 100000 for meaning "{meaning}"', "missing")
+            raise field_error(f"got {focal_px:g}", f'none: meaning "{meaning}" does not use it', "conflict")
+        return focal_px
+
+    @field_validator("min_m")
+    @classmethod
+    def _check_min_m(cls, min_m: float, info: ValidationInfo) -> float:
+        if min_m >= (max_m := info.data.get("max_m", math.inf)):
+            raise field_error(f"got {min_m:g}", f"less than max_m, {max_m:g}", "conflict")
+        return min_m
+
+    @field_validator("index")
+    @classmethod
+    def _check_index(cls, index: int | None, info: ValidationInfo) -> int | None:
+        if info.data.get("name") is not None:
+            raise field_error("got name and index", "one of them", "conflict")
+        return index
 
 
-@dataclass(frozen=True)
-class OnnxSpec:
-    """Parsed TOML file of an ONNX method."""
+class OnnxSpec(StrictModel):
+    """TOML file of an ONNX method; ``name`` defaults to the name of the file, ``path`` is the ONNX file."""
 
-    model: Path
-    name: str
-    summary: str
-    source: str
-    licence: str
+    model: Annotated[str, text(1000, "the ONNX file's path, relative to this file")]
+    name: Annotated[str, text(MAX_METHOD_CHARACTERS)] = ""
+    summary: Annotated[str, text(500)] = ""
+    source: Annotated[str, text(500)] = ""
+    licence: Annotated[str, text(200, "the licence of the model's weights")]
     input: InputSpec
     output: OutputSpec
+
+    @field_validator("model")
+    @classmethod
+    def _find_model(cls, name: str, info: ValidationInfo) -> str:
+        """Return the path of the ONNX file; ``info.context`` is the folder of the TOML file."""
+        path: Path = info.context / name
+        if not _is_file(path):
+            raise field_error(f"no such file: {path}", "the ONNX file", "missing")
+        return str(path)
 
 
 def read_onnx_toml(path: Path) -> OnnxSpec:
@@ -137,26 +212,15 @@ def read_onnx_toml(path: Path) -> OnnxSpec:
     Raises ``MethodError`` listing all problems if the file is not TOML, if keys are missing, unknown or invalid,
     or if the model file does not exist.
     """
-    problems: list[str] = []
-    reader = TableReader(_parse_toml(path), "", problems)
-    reader.reject_unknown(("model", "name", "summary", "source", "licence", "input", "output"))
-    file = reader.required("model", text(1000, "the ONNX file's path, relative to this file"), "")
-    name = reader.optional("name", text(MAX_METHOD_CHARACTERS), path.stem)
-    summary = reader.optional("summary", text(500), "")
-    source = reader.optional("source", text(500), "")
-    licence = reader.required("licence", text(200, "the licence of the model's weights"), "")
-    model_input = _read_input(_read_table(reader, "input"))
-    output = _read_output(_read_table(reader, "output"))
-    model = path.parent / file
-    if file and not _is_file(model):
-        problems.append(f"model: no such file: {model}, expected the ONNX file")
-    if problems:
-        raise MethodError(f"{path}: {problem_summary(problems)}")
-    return OnnxSpec(model, name, summary, source, licence, model_input, output)
+    values, problems = parse_toml(_read_file(path))
+    spec = None if problems else validate_table(OnnxSpec, {"name": path.stem, **values}, problems, "", path.parent)
+    if spec is None:
+        raise MethodError.from_problems(path, problems)
+    return spec
 
 
-def _parse_toml(path: Path) -> dict[str, Any]:
-    """Return the content of a TOML file. Raises ``MethodError`` if it cannot be read or parsed."""
+def _read_file(path: Path) -> bytes:
+    """Return the content of a small file. Raises ``MethodError`` if it cannot be read."""
     try:
         with path.open("rb") as stream:
             content = stream.read(MAX_TOML_BYTES + 1)
@@ -166,18 +230,7 @@ def _parse_toml(path: Path) -> dict[str, Any]:
         raise MethodError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if len(content) > MAX_TOML_BYTES:
         raise MethodError(f"{path}: is larger than {MAX_TOML_BYTES} bytes, expected a smaller TOML file")
-    try:
-        return tomllib.loads(content.decode("utf-8-sig"))
-    except UnicodeDecodeError as error:
-        raise MethodError(f"{path}: byte {error.start} is not UTF-8 text, expected a TOML file") from None
-    except (ValueError, RecursionError) as error:
-        raise MethodError(f"{path}: is not a valid TOML file: {error}") from None
-
-
-def _read_table(reader: TableReader, name: str) -> TableReader:
-    """Return a table of the file; a missing or invalid table is one problem, not one for each of its keys."""
-    table = reader.required(name, TABLE, None)
-    return TableReader({}, "", []) if table is None else TableReader(table, f"[{name}] ", reader.problems)
+    return content
 
 
 def _is_file(path: Path) -> bool:
@@ -185,84 +238,3 @@ def _is_file(path: Path) -> bool:
         return path.is_file()
     except OSError:  # The name is too long for the file system.
         return False
-
-
-_SIDE_PX = whole_number(1, MAX_SIDE_PX)
-_SIZE_KEYS = ("width", "height")
-_LONGEST_KEYS = ("longest_side", "multiple_of")
-
-
-def _read_input(reader: TableReader) -> InputSpec:
-    reader.reject_unknown((*_SIZE_KEYS, *_LONGEST_KEYS, "resize", "interpolation", "range", "mean", "std"))
-    size_px, longest_px, multiple_px = _read_size(reader)
-    white = reader.required("range", choice({1: "1", 255: "255"}), 0)
-    # The bounds catch mean and std given for the other range, a common mistake.
-    mean = reader.optional("mean", three_numbers(0, white or 255), (0.0, 0.0, 0.0))
-    std = reader.optional("std", three_numbers((white or 1) / 255, white or 255), (1.0, 1.0, 1.0))
-    return InputSpec(
-        size_px=size_px,
-        longest_px=longest_px,
-        multiple_px=multiple_px,
-        pad=reader.required("resize", one_of("stretch", "pad"), "") == "pad",
-        bicubic=reader.optional("interpolation", one_of("bilinear", "bicubic"), "bilinear") == "bicubic",
-        white=white,
-        mean=mean,
-        std=std,
-    )
-
-
-def _read_size(reader: TableReader) -> tuple[tuple[int, int] | None, int, int]:
-    """Return the fixed size (width, height) or None, the longest side, and the multiple of the sides; pixels."""
-    fixed = [key for key in _SIZE_KEYS if key in reader.values]
-    longest = [key for key in _LONGEST_KEYS if key in reader.values]
-    if bool(fixed) == bool(longest):
-        got = "both" if fixed else "neither"
-        reader.problems.append(f"{reader.where}size: got {got}, expected width and height, or longest_side")
-        return None, 1, 1
-    if fixed:
-        width, height = (reader.required(key, _SIDE_PX, 1) for key in _SIZE_KEYS)
-        return (width, height), max(width, height), 1
-    multiple_px = reader.optional("multiple_of", _SIDE_PX, 1)
-    longest_px = reader.required("longest_side", _SIDE_PX, multiple_px)
-    if longest_px % multiple_px:
-        reader.problems.append(
-            f"{reader.where}longest_side: got {longest_px}, expected a multiple of multiple_of, {multiple_px}"
-        )
-    return None, longest_px, multiple_px
-
-
-def _read_output(reader: TableReader) -> OutputSpec:
-    known = ("meaning", "focal_canonical_px", "scale", "min_m", "max_m", "name", "index")
-    reader.reject_unknown((*known, "at_input_size", "resize"))
-    name = reader.required("meaning", one_of(*OUTPUT_MEANINGS), "")
-    min_m = reader.optional("min_m", POSITIVE, 0.0)
-    max_m = reader.optional("max_m", POSITIVE, math.inf)
-    if min_m >= max_m:
-        reader.problems.append(f"{reader.where}min_m: got {min_m:g}, expected less than max_m, {max_m:g}")
-    if "name" in reader.values and "index" in reader.values:
-        reader.problems.append(f"{reader.where}has name and index, expected one of them")
-    output_name = reader.optional("name", text(500), "")
-    index = reader.optional("index", whole_number(0, 999), -1)
-    return OutputSpec(
-        meaning=OUTPUT_MEANINGS.get(name, OUTPUT_MEANINGS["depth"]),
-        focal_canonical_px=_read_focal_canonical_px(reader, name),
-        scale=reader.optional("scale", POSITIVE, 1.0),
-        min_m=min_m,
-        max_m=max_m,
-        name_or_index=output_name or (None if index < 0 else index),
-        at_input_size=reader.optional("at_input_size", FLAG, True),
-        bilinear=reader.optional("resize", one_of("nearest", "bilinear"), "nearest") == "bilinear",
-    )
-
-
-def _read_focal_canonical_px(reader: TableReader, meaning: str) -> float:
-    key = "focal_canonical_px"
-    if meaning not in OUTPUT_MEANINGS:
-        return math.nan
-    if OUTPUT_MEANINGS[meaning].canonical:
-        return reader.required(key, number(1, 100_000), math.nan)
-    if key in reader.values:
-        reader.problems.append(
-            f'{reader.where}{key}: got a value, expected none: meaning "{meaning}" does not use it'
-        )
-    return math.nan

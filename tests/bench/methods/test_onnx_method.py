@@ -41,7 +41,10 @@ SIDES = st.integers(1, 40)
 
 
 def spec_of(size: tuple[int, int] | None, *, pad: bool, longest: int = 1, multiple: int = 1) -> InputSpec:
-    return InputSpec(size, longest, multiple, pad, False, 255, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    sides = {"longest_side": longest, "multiple_of": multiple}
+    if size is not None:
+        sides = {"width": size[0], "height": size[1]}
+    return InputSpec(**sides, resize="pad" if pad else "stretch", range=255)
 
 
 @pytest.mark.parametrize(
@@ -112,7 +115,8 @@ def test_invalid_output_becomes_nan(tmp_path: Path) -> None:
     scale=st.floats(1e-9, 1e9),
 )
 def test_any_output_gives_depth_within_bounds(values: list[float], meaning: str, scale: float) -> None:
-    spec = OutputSpec(OUTPUT_MEANINGS[meaning], 1000.0, scale, 0.1, 30.0, None, True, False)
+    focal_px = 1000.0 if OUTPUT_MEANINGS[meaning].canonical else None
+    spec = OutputSpec(meaning=meaning, focal_canonical_px=focal_px, scale=scale, min_m=0.1, max_m=30.0)
     depth_m = output_to_depth_m(np.array(values, np.float32), spec, 700.0)
     known = ~np.isnan(depth_m)
     assert (depth_m[known] >= np.float32(0.1)).all()
