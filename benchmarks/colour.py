@@ -25,7 +25,7 @@ from dataset_builder.config.specs import ColourSpec
 from dataset_builder.config.trajectories import poses, subset
 from dataset_builder.scene.assemblies import aim_point_m, make_assembly
 from dataset_builder.scene.raycast import RayCaster
-from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
+from rebar_depth_bench.geometry.cameras import Camera, ideal_K
 
 REFERENCE = ColourSpec(samples=256, prefilter="ACCURATE")
 """Reference setting; denoised, since the noise of 256 raw samples would exceed the error of good candidates."""
@@ -55,7 +55,7 @@ def main(config: str = "lattice", views: str = "1") -> None:
     caster = RayCaster(evaluated_world_mesh())
     all_poses = poses(spec.protocol, aim_point_m(assembly), rig)
     selected = [all_poses[index] for index in subset(len(all_poses), int(views))]
-    masks = [caster.cast(pixel_rays(K, rig.width, rig.height), pose).mask for pose in selected]
+    masks = [caster.cast(Camera(K, np.zeros(5), pose, rig.width, rig.height)).mask for pose in selected]
 
     write_line = _redirect_blender_output()
 

@@ -13,9 +13,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dataset_builder.pipeline.shards import Eye, View, encode_view
+from dataset_builder.pipeline.shards import View, encode_view
 from rebar_depth_bench import SubmissionWriter
+from rebar_depth_bench.data.eye_view import EyeView
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, ViewRecord
+from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 HEIGHT, WIDTH = 90, 160
@@ -87,16 +89,15 @@ def _view(config: str, index: int) -> View:
     return View(_view_id(config, index), eye, eye, BASELINE_M)
 
 
-def _eye(index: int) -> Eye:
+def _eye(index: int) -> EyeView:
     mask = np.broadcast_to(_is_bar(), (HEIGHT, WIDTH))
-    return Eye(
+    K = np.array([[100.0, 0.0, (WIDTH - 1) / 2], [0.0, 100.0, (HEIGHT - 1) / 2], [0.0, 0.0, 1.0]])
+    return EyeView(
+        Camera(K, np.zeros(5), np.eye(4), WIDTH, HEIGHT),
         rgb=np.full((HEIGHT, WIDTH, 3), 128, dtype=np.uint8),
         depth_m=_depth_m(index),
         mask=mask,
         bars=mask.astype(np.uint16),
-        K=np.array([[100.0, 0.0, (WIDTH - 1) / 2], [0.0, 100.0, (HEIGHT - 1) / 2], [0.0, 0.0, 1.0]]),
-        distortion=np.zeros(5),
-        cam_from_world=np.eye(4),
     )
 
 

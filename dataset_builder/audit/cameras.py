@@ -19,9 +19,9 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView
+from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
 from dataset_builder.config.catalog import view_id
-from dataset_builder.config.rigs import Camera, rig_cameras
+from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import DistanceSweepSpec, DomeSpec, RigSpec, RingSpec, TrajectorySpec
 from dataset_builder.config.trajectories import poses, subset
 from dataset_builder.scene.assemblies import aim_point_m
@@ -30,7 +30,7 @@ from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
 from rebar_depth_bench.data.dataset import EYES
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.geometry.cameras import camera_centre
+from rebar_depth_bench.geometry.cameras import Camera, camera_centre
 from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
 
 _Spec = TypeVar("_Spec")
@@ -229,7 +229,7 @@ def view_projection_error_px(_: AuditedConfig, view: AuditedView) -> float:
     return max(projection_error_px(eye) for eye in view.eyes.values())
 
 
-def projection_error_px(eye: EyeView) -> float:
+def projection_error_px(eye: AuditedEye) -> float:
     """Return the largest distance of a reprojected point from its pixel centre, pixels.
 
     The result is 0 for an eye without depth. At most 60,000 evenly spaced pixels are used. A point is computed

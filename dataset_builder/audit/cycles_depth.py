@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import EyeView
+from dataset_builder.audit.views import AuditedEye
 from dataset_builder.pipeline.blender_process import BlenderProcesses, DepthTask
 
 MAX_CYCLES_MEDIAN_RATIO = 5e-6
@@ -33,7 +33,7 @@ Only a different surface explains so large a difference.
 
 
 def cycles_difference_m(
-    mesh: Path, eyes: Sequence[EyeView], progress: Callable[[int, int], None]
+    mesh: Path, eyes: Sequence[AuditedEye], progress: Callable[[int, int], None]
 ) -> Float64[ndarray, "n 2"]:
     """Return |dataset depth - Cycles depth| and the dataset depth of every steel pixel of the eyes, n x 2, metres.
 

@@ -11,7 +11,8 @@ import numpy as np
 from dataset_builder.audit.report import Check
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.data.dataset import EYES
-from rebar_depth_bench.data.digests import eye_digest, file_sha256, views_digest
+from rebar_depth_bench.data.digests import file_sha256, views_digest
+from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, ViewRecord
 from rebar_depth_bench.scoring.protocol import scored_pixels
 
@@ -87,30 +88,26 @@ def array_problems(row: Mapping[str, Any], rig: Mapping[str, Any]) -> Iterator[s
 
 def row_problems(row: Mapping[str, Any], record: ViewRecord, bar_ids: set[int]) -> Iterator[str]:
     """Yield the problems of a row with well-formed arrays: masks, bar ids, differences from the manifest."""
-    for eye in EYES:
-        for problem in _ground_truth_problems(row, eye, bar_ids):
-            yield f"{eye}: {problem}"
-    yield from _record_problems(row, record)
-
-
-def _ground_truth_problems(row: Mapping[str, Any], eye: str, bar_ids: set[int]) -> Iterator[str]:
-    depth_m, mask, bars = row[f"{eye}_depth"], row[f"{eye}_mask"], row[f"{eye}_bars"]
-    if not np.array_equal(mask, bars > 0):
-        yield "the mask differs from the pixels that have a bar id"
-    if (depth_m[mask] <= 0).any():
-        yield "steel pixels without depth"
-    unknown = set(np.unique(bars[mask]).tolist()) - bar_ids
-    if unknown:
-        yield f"bar ids {sorted(unknown)[:5]} are not in bars.parquet"
-
-
-def _record_problems(row: Mapping[str, Any], record: ViewRecord) -> Iterator[str]:
+    eyes = {name: eye_from_row(row, name) for name in EYES}
+    for name, eye in eyes.items():
+        for problem in _ground_truth_problems(eye, bar_ids):
+            yield f"{name}: {problem}"
     if row["view_id"] != record.view_id:
         yield f"the row's view_id is {row['view_id']}, expected {record.view_id}"
-    for eye, expected in (("left", record.left), ("right", record.right)):
-        kinds = ("depth", "mask", "bars", "K", "distortion", "cam_from_world")
-        if eye_digest(*(row[f"{eye}_{kind}"] for kind in kinds)) != expected:
-            yield f"{eye} ground-truth digest differs from the manifest's"
-    scored = len(scored_pixels(row["left_mask"], row["left_depth"]))
-    if (np.count_nonzero(row["left_mask"]), scored) != (record.steel_px, record.scored_px):
+    for name, expected in (("left", record.left), ("right", record.right)):
+        if eyes[name].digest() != expected:
+            yield f"{name} ground-truth digest differs from the manifest's"
+    left = eyes["left"]
+    counts = np.count_nonzero(left.mask), len(scored_pixels(left.mask, left.depth_m))
+    if counts != (record.steel_px, record.scored_px):
         yield "steel and scored pixel counts differ from the manifest's"
+
+
+def _ground_truth_problems(eye: EyeView, bar_ids: set[int]) -> Iterator[str]:
+    if not np.array_equal(eye.mask, eye.bars > 0):
+        yield "the mask differs from the pixels that have a bar id"
+    if (eye.depth_m[eye.mask] <= 0).any():
+        yield "steel pixels without depth"
+    unknown = set(np.unique(eye.bars[eye.mask]).tolist()) - bar_ids
+    if unknown:
+        yield f"bar ids {sorted(unknown)[:5]} are not in bars.parquet"

@@ -13,7 +13,7 @@ from jaxtyping import Float64, UInt16
 from numpy import ndarray
 
 from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView
+from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
@@ -134,7 +134,7 @@ def view_board_error(config: AuditedConfig, view: AuditedView) -> BoardError:
     return merged_board_errors([board_error(eye, config.board) for eye in view.eyes.values()])
 
 
-def board_error(eye: EyeView, board: BoardSpec) -> BoardError:
+def board_error(eye: AuditedEye, board: BoardSpec) -> BoardError:
     """Return the board error of the eye's non-steel points over the board's rectangle.
 
     A margin of 1 mm inside the rectangle's edge is left out, because the sheet has sides.

@@ -26,11 +26,10 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView
-from dataset_builder.config.rigs import Camera
+from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
 from rebar_depth_bench.geometry.aruco_board import MARKER_MODULES, BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.aruco_detection import Corners, detected_corners_px
-from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX, camera_centre, project, rigid, transform
+from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX, Camera, camera_centre, project, rigid, transform
 
 MIN_MARKER_WIDTH_PX = 24.0
 """Least width of a marker that must be detected, pixels: 4 px per module.
@@ -53,7 +52,7 @@ class DetectedMarkers:
     corners_m: Float64[ndarray, "n 4 3"]
 
 
-def detect_markers(eye: EyeView, board: BoardSpec) -> DetectedMarkers:
+def detect_markers(eye: AuditedEye, board: BoardSpec) -> DetectedMarkers:
     """Detect the board's markers that the eye sees completely, unobstructed and large enough."""
     layout = marker_corners_m(board)
     true_px = projected_corners_px(eye.camera, layout)
@@ -101,7 +100,7 @@ def _inward(
     return np.asarray(normal * side)
 
 
-def _is_unobstructed(eye: EyeView, quad_px: Float64[ndarray, "4 2"]) -> bool:
+def _is_unobstructed(eye: AuditedEye, quad_px: Float64[ndarray, "4 2"]) -> bool:
     """Return whether a marker and its quiet zone lie in the frame, large enough, with nothing in front of them."""
     grown = quad_px.mean(axis=0) + (quad_px - quad_px.mean(axis=0)) * (1 + 1 / MARKER_MODULES)
     size = np.array([eye.camera.width, eye.camera.height])

@@ -23,7 +23,7 @@ from numpy import ndarray
 
 from dataset_builder.audit.report import Check
 from dataset_builder.audit.stereo_consistency import project_into
-from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView
+from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
 from rebar_depth_bench.geometry.cameras import camera_centre
 
 MAX_SHIFT_PX, SHIFT_NOISE_PX = 0.1, 6.0
@@ -160,12 +160,12 @@ def photometric_verdict(config: AuditedConfig, fits: Sequence[PhotometricFit]) -
     return Check(name, measured, bound, tuple(problems))
 
 
-def _smoothed_grey(eye: EyeView) -> Float32[ndarray, "h w"]:
+def _smoothed_grey(eye: AuditedEye) -> Float32[ndarray, "h w"]:
     grey = cv2.cvtColor(eye.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     return np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX))
 
 
-def _textured_pixels(levels: Float32[ndarray, "h w"], eye: EyeView, baseline_m: float) -> Int64[ndarray, " n"]:
+def _textured_pixels(levels: Float32[ndarray, "h w"], eye: AuditedEye, baseline_m: float) -> Int64[ndarray, " n"]:
     """Return the flat indices of pixels with depth and texture, evenly subsampled to at most 120,000.
 
     Non-steel pixels near a depth discontinuity are left out.
@@ -183,7 +183,7 @@ def _textured_pixels(levels: Float32[ndarray, "h w"], eye: EyeView, baseline_m: 
 
 
 def _is_visible(
-    eye: EyeView, px: Float64[ndarray, "n 2"], depth_m: Float64[ndarray, " n"], bars: ndarray
+    eye: AuditedEye, px: Float64[ndarray, "n 2"], depth_m: Float64[ndarray, " n"], bars: ndarray
 ) -> Bool[ndarray, " n"]:
     """Return whether the eye's four pixels around each projection have the point's bar id and about its depth."""
     u, v = np.floor(px).astype(int).T
@@ -195,7 +195,7 @@ def _is_visible(
 
 
 def _is_view_independent(
-    config: AuditedConfig, eye: EyeView, pixels: Int64[ndarray, " n"], baseline_m: float
+    config: AuditedConfig, eye: AuditedEye, pixels: Int64[ndarray, " n"], baseline_m: float
 ) -> Bool[ndarray, " n"]:
     """Return whether each pixel's surface looks the same to both eyes.
 

@@ -24,7 +24,7 @@ from dataset_builder.audit.markers import detect_view_markers, marker_verdict
 from dataset_builder.audit.photometric import photometric_fit, photometric_verdict
 from dataset_builder.audit.report import AuditReport, Check
 from dataset_builder.audit.stereo_consistency import epipolar_verdict, view_epipolar_counts
-from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView, RayCache, view_from_row
+from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView, RayCache, view_from_row
 from dataset_builder.config.trajectories import subset
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.dataset import COLUMNS, iterate_rows
@@ -124,7 +124,7 @@ class _AuditAccumulator:
         self.rows = 0
         self.cameras: list[str] = []
         self.measurements: list[list[Any]] = [[] for _ in VIEW_CHECKS]
-        self.cycles_eyes: list[EyeView] = []
+        self.cycles_eyes: list[AuditedEye] = []
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Check the next row; a row with malformed arrays is not measured."""

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView
+from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.geometry.cameras import project, transform
 from rebar_depth_bench.scoring.protocol import interior
@@ -51,7 +51,7 @@ class ProjectedPoints:
     inside: Bool[ndarray, " n"]
 
 
-def project_into(eye: EyeView, points_m: Float64[ndarray, "n 3"], margin_px: int) -> ProjectedPoints:
+def project_into(eye: AuditedEye, points_m: Float64[ndarray, "n 3"], margin_px: int) -> ProjectedPoints:
     """Project world points (metres) into an eye.
 
     A point counts as inside if it is at least ``margin_px`` whole pixels away from the frame's border.

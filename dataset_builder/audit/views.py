@@ -8,16 +8,16 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
+from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
-from dataset_builder.config.rigs import Camera
 from dataset_builder.scene.model import ESTIMATED_ROLE
 from dataset_builder.scene.variants import LIGHT_SLOT, PROPS_SLOT, variants_of_slot
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.dataset import EYES
+from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, transform
+from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,17 +50,13 @@ class AuditedConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class EyeView:
-    """Arrays and camera of one eye of a view.
+class AuditedEye(EyeView):
+    """Eye of a view under audit: it has colour, pixel rays and the points that these determine.
 
     ``rays_cam`` are the pixel rays in the camera frame with z = 1, so that planar depth scales them to points.
     """
 
-    camera: Camera
     rgb: UInt8[ndarray, "h w 3"]
-    depth_m: Float32[ndarray, "h w"]
-    mask: Bool[ndarray, "h w"]
-    bars: UInt16[ndarray, "h w"]
     rays_cam: Float64[ndarray, "h w 3"]
 
     @cached_property
@@ -75,11 +71,11 @@ class AuditedView:
     """Stereo view under audit: its id and both eyes."""
 
     view_id: str
-    left: EyeView
-    right: EyeView
+    left: AuditedEye
+    right: AuditedEye
 
     @property
-    def eyes(self) -> dict[str, EyeView]:
+    def eyes(self) -> dict[str, AuditedEye]:
         """Both eyes by name (``left``, ``right``)."""
         return {"left": self.left, "right": self.right}
 
@@ -100,7 +96,7 @@ class RayCache:
             # A config has one grid per eye; damaged rows with other cameras must not fill the memory.
             if len(self._rays) >= len(EYES):
                 self._rays.clear()
-            self._rays[key] = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
+            self._rays[key] = camera.rays()
         return self._rays[key]
 
 
@@ -109,13 +105,6 @@ def view_from_row(row: Mapping[str, Any], rays: RayCache) -> AuditedView:
     return AuditedView(row["view_id"], *(_eye_from_row(row, eye, rays) for eye in EYES))
 
 
-def camera_from_row(row: Mapping[str, Any], eye: str) -> Camera:
-    """Return the camera of one eye of a row."""
-    height, width = row[f"{eye}_depth"].shape
-    return Camera(row[f"{eye}_K"], row[f"{eye}_distortion"], row[f"{eye}_cam_from_world"], width, height)
-
-
-def _eye_from_row(row: Mapping[str, Any], eye: str, rays: RayCache) -> EyeView:
-    camera = camera_from_row(row, eye)
-    cells = {kind: row[f"{eye}_{kind}"] for kind in ("rgb", "mask", "bars")}
-    return EyeView(camera=camera, depth_m=row[f"{eye}_depth"], rays_cam=rays.rays_cam(camera), **cells)
+def _eye_from_row(row: Mapping[str, Any], name: str, rays: RayCache) -> AuditedEye:
+    eye = eye_from_row(row, name)
+    return AuditedEye(**vars(eye), rays_cam=rays.rays_cam(eye.camera))

@@ -17,9 +17,8 @@ from jaxtyping import Float64
 from mathutils import Matrix
 from numpy import ndarray
 
-from dataset_builder.config.rigs import Camera
 from rebar_depth_bench.errors import BuildError
-from rebar_depth_bench.geometry.cameras import inverse_rigid
+from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid
 
 SHADER = "brown_conrady.osl"
 """File name of the OSL camera shader in this package."""

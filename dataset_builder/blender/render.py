@@ -15,10 +15,9 @@ from numpy import ndarray
 from PIL import Image
 
 from dataset_builder.blender.camera import place_camera
-from dataset_builder.config.rigs import Camera
 from dataset_builder.config.specs import ColourSpec
 from rebar_depth_bench.errors import BuildError
-from rebar_depth_bench.geometry.cameras import pixel_rays
+from rebar_depth_bench.geometry.cameras import Camera
 
 DEPTH_CHANNEL = "ViewLayer.Depth.Z"
 NO_SURFACE_M = 1e9
@@ -93,8 +92,7 @@ def render_depth(camera: Camera, scratch_dir: Path) -> Float32[ndarray, "h w"]:
 
 def _range_per_depth(camera: Camera) -> Float32[ndarray, "h w"]:
     """Return the ratio of the distance along each pixel's ray to planar depth."""
-    rays_cam = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
-    return np.asarray(np.linalg.norm(rays_cam, axis=-1), dtype=np.float32)
+    return np.asarray(np.linalg.norm(camera.rays(), axis=-1), dtype=np.float32)
 
 
 def _read_depth_m(path: Path) -> Float32[ndarray, "h w"]:

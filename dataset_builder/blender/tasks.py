@@ -12,7 +12,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +29,13 @@ from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import ColourSpec, ConfigSpec
 from dataset_builder.config.trajectories import poses
 from dataset_builder.pipeline.blender_process import DepthTask, RenderTask
-from dataset_builder.pipeline.shards import Eye, Staging, View, encode_view, stage_row
+from dataset_builder.pipeline.shards import View, encode_view, stage_row
 from dataset_builder.scene.assemblies import aim_point_m, make_assembly
 from dataset_builder.scene.mesh_ply import read_mesh_ply, write_mesh_ply
 from dataset_builder.scene.model import NOT_STEEL, Mesh, Part, WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError
-from rebar_depth_bench.geometry.cameras import pixel_rays
 
 
 class Stopwatch:
@@ -67,24 +66,21 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
     Raises ``BuildError`` if the scene's mesh differs from the one of other shards or Blender fails.
     """
     watch = Stopwatch()
-    staging = Staging(task.staging)
+    unit, staging = task.unit, task.staging
+    config = unit.config
     with watch.timing("scene"):
-        assembly = make_assembly(task.config.scene.assembly)
-        build_scene(assembly, task.config.scene)
-        configure_colour(task.config.colour, task.threads)
+        assembly = make_assembly(config.scene.assembly)
+        build_scene(assembly, config.scene)
+        configure_colour(config.colour, task.threads)
         mesh = evaluated_world_mesh()
-        _stage_mesh(mesh, staging.mesh, task.mesh_sha256)
+        _stage_mesh(mesh, staging.mesh, unit.mesh_sha256)
         caster = RayCaster(mesh)
-        left_poses = poses(task.config.protocol, aim_point_m(assembly), task.config.rig)
-        cameras = rig_cameras(task.config.rig, np.eye(4))
-        rays_cam = {
-            eye: pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
-            for eye, camera in cameras.items()
-        }
+        left_poses = poses(config.protocol, aim_point_m(assembly), config.rig)
+        rays_cam = {eye: camera.rays() for eye, camera in rig_cameras(config.rig, np.eye(4)).items()}
     report({"seconds": watch.take()})
-    with tempfile.TemporaryDirectory(dir=task.staging) as scratch:
-        context = _RenderContext(task.config, caster, rays_cam, Path(scratch))
-        for index in task.indices:
+    with tempfile.TemporaryDirectory(dir=staging.root) as scratch:
+        context = _RenderContext(config, caster, rays_cam, Path(scratch))
+        for index in unit.indices:
             path = staging.row(index)
             if not path.is_file():
                 view = _render_view(context, index, left_poses[index], watch)
@@ -115,10 +111,7 @@ def _render_view(
         with watch.timing("colour"):
             rgb = render_colour(camera, _cycles_seed(config, index, eye_index), context.scratch)
         with watch.timing("truth"):
-            truth = context.caster.cast(context.rays_cam[eye], camera.cam_from_world)
-        eyes[eye] = Eye(
-            rgb, truth.depth_m, truth.mask, truth.bars, camera.K, camera.distortion, camera.cam_from_world
-        )
+            eyes[eye] = replace(context.caster.cast(camera, context.rays_cam[eye]), rgb=rgb)
     return View(view_id(config.name, index), eyes["left"], eyes["right"], config.rig.baseline_m)
 
 

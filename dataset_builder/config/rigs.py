@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from importlib import resources
 from math import isclose
 
@@ -13,7 +12,14 @@ from numpy import ndarray
 
 from dataset_builder.config.specs import RigSpec
 from rebar_depth_bench.geometry.calibration import read_calibration
-from rebar_depth_bench.geometry.cameras import NOMINAL_HEIGHT, NOMINAL_WIDTH, ideal_K, right_camera_pose, rigid
+from rebar_depth_bench.geometry.cameras import (
+    NOMINAL_HEIGHT,
+    NOMINAL_WIDTH,
+    Camera,
+    ideal_K,
+    right_camera_pose,
+    rigid,
+)
 from rebar_depth_bench.geometry.stereo_calibration import (
     StereoCalibration,
     calibrated_baseline_m,
@@ -24,21 +30,6 @@ from rebar_depth_bench.geometry.stereo_calibration import (
 )
 
 ZED_CALIBRATION = "zed-hd720.conf"
-
-
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """One camera of a rig.
-
-    ``K`` is the pinhole matrix in pixels, ``distortion`` holds k1 k2 p1 p2 k3, ``width`` and ``height`` are in
-    pixels.
-    """
-
-    K: Float64[ndarray, "3 3"]
-    distortion: Float64[ndarray, " 5"]
-    cam_from_world: Float64[ndarray, "4 4"]
-    width: int
-    height: int
 
 
 Pose = Float64[ndarray, "4 4"]

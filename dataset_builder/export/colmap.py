@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.rigs import Camera
 from dataset_builder.export.views import CameraView
 from dataset_builder.scene.shapes.bending import resample_polyline_m
 from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.geometry.cameras import Camera
 
 HALF_PIXEL = 0.5
 """Offset of COLMAP's and nerfstudio's pixel coordinates from ours, pixels."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from dataset_builder.config.rigs import Camera
 from dataset_builder.export.images import EXPORT_FILES
 from dataset_builder.export.nerfstudio import json_lines
 from dataset_builder.export.views import CameraView
 from rebar_depth_bench.data.manifest import DatasetFolder
+from rebar_depth_bench.geometry.cameras import Camera
 
 LICENCE = "CC BY 4.0 (https://creativecommons.org/licenses/by/4.0/)"
 """Licence of the dataset."""

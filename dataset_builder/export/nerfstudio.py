@@ -16,11 +16,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.rigs import Camera
 from dataset_builder.export.colmap import HALF_PIXEL
 from dataset_builder.export.images import EXPORT_FILES, MILLIMETRE_M
 from dataset_builder.export.views import CameraView
-from rebar_depth_bench.geometry.cameras import inverse_rigid
+from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid
 
 _EMPTY_END = "[]\n}"
 """End of a JSON object whose last member is an empty list."""

@@ -6,17 +6,13 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from dataset_builder.config.rigs import Camera
 from rebar_depth_bench.data.dataset import EYES, decode_row, iterate_undecoded
-from rebar_depth_bench.data.digests import eye_digest
+from rebar_depth_bench.data.eye_view import camera_from_row, eye_from_row, truth_columns
 from rebar_depth_bench.data.manifest import DatasetFolder, ViewRecord
 from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.geometry.cameras import Camera
 
-_CAMERA_KINDS = ("K", "distortion", "cam_from_world")
-_TRUTH_KINDS = ("depth", "mask", "bars", *_CAMERA_KINDS)
-_COLUMNS = ("view_id", "baseline_m", *(f"{eye}_{kind}" for eye in EYES for kind in ("rgb", *_TRUTH_KINDS)))
+_COLUMNS = ("view_id", "baseline_m", *(name for eye in EYES for name in (f"{eye}_rgb", *truth_columns(eye))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +47,7 @@ class StoredView:
         except (OSError, ValueError) as error:
             raise DatasetError(f"view {self.record.view_id}: an image cannot be decoded: {error}") from error
         for eye, expected in (("left", self.record.left), ("right", self.record.right)):
-            digest = eye_digest(*(decoded[f"{eye}_{kind}"] for kind in _TRUTH_KINDS))
+            digest = eye_from_row(decoded, eye).digest()
             if digest != expected:
                 raise DatasetError(
                     f"view {self.record.view_id}: the {eye} ground truth has digest {digest[:16]}, "
@@ -81,12 +77,5 @@ def stored_views(folder: DatasetFolder, config: str, wanted: Collection[str]) ->
 
 def _camera_view(row: Mapping[str, Any], grid: tuple[int, int]) -> CameraView:
     """Return the cameras of a row."""
-    cameras = {eye: _camera(row, eye, grid) for eye in EYES}
+    cameras = {eye: camera_from_row(row, eye, grid) for eye in EYES}
     return CameraView(row["view_id"], float(row["baseline_m"]), cameras)
-
-
-def _camera(row: Mapping[str, Any], eye: str, grid: tuple[int, int]) -> Camera:
-    """Return the camera of one eye of a row."""
-    K, distortion, pose = (np.array(row[f"{eye}_{kind}"], np.float64) for kind in _CAMERA_KINDS)
-    height, width = grid
-    return Camera(K, distortion, cam_from_world=pose, width=width, height=height)

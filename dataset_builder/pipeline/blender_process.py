@@ -20,25 +20,23 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from dataset_builder.config.rigs import Camera
-from dataset_builder.config.specs import ConfigSpec
+from dataset_builder.pipeline.shards import Staging
+from dataset_builder.pipeline.work_units import WorkUnit
 from rebar_depth_bench.errors import BuildError, InputError, RebarDepthError, RenderProcessError
+from rebar_depth_bench.geometry.cameras import Camera
 
 
 @dataclass(frozen=True)
 class RenderTask:
-    """Task that renders views of one shard of a config into the folder ``staging``.
+    """Task that renders the views of a unit into a staging folder.
 
     The task is idempotent: views that are already staged are skipped, and interruptions do not change the bytes.
-    If ``mesh_sha256`` is not None, the task fails before rendering if the mesh of the scene has another digest.
+    It fails before rendering if the unit has a ``mesh_sha256`` and the mesh of the scene has another one.
     """
 
-    config: ConfigSpec
-    shard: int
-    indices: tuple[int, ...]
-    staging: Path
+    unit: WorkUnit
+    staging: Staging
     threads: int
-    mesh_sha256: str | None = None
 
 
 @dataclass(frozen=True)

@@ -72,6 +72,5 @@ def render_unit(
         if "view" in event:
             on_view_done(event["view"])
 
-    task = RenderTask(unit.config, unit.shard, unit.indices, staging.root, threads, unit.mesh_sha256)
-    blender.run(task, unit.label, staging.log(unit.shard), on_event)
+    blender.run(RenderTask(unit, staging, threads), unit.label, staging.log(unit.shard), on_event)
     return UnitResult(worker, dict(seconds), file_sha256(staging.mesh))

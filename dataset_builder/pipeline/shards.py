@@ -17,13 +17,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
-from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.dataset import ROW_SCHEMA, features
-from rebar_depth_bench.data.digests import eye_digest
+from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeView
 from rebar_depth_bench.data.manifest import ViewRecord
 from rebar_depth_bench.reporting.colormap import depth_preview
 from rebar_depth_bench.scoring.protocol import scored_pixels
@@ -84,29 +82,12 @@ def pack_shard(rows: Sequence[Path], target: Path) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Eye:
-    """Images and camera of one eye of a stereo view.
-
-    ``depth_m`` is planar z (0: no surface), ``mask`` marks steel pixels, ``bars`` holds bar ids (0: no steel).
-    ``K`` is in pixels, ``distortion`` holds k1 k2 p1 p2 k3.
-    """
-
-    rgb: UInt8[ndarray, "h w 3"]
-    depth_m: Float32[ndarray, "h w"]
-    mask: Bool[ndarray, "h w"]
-    bars: UInt16[ndarray, "h w"]
-    K: Float64[ndarray, "3 3"]
-    distortion: Float64[ndarray, 5]
-    cam_from_world: Float64[ndarray, "4 4"]
-
-
-@dataclass(frozen=True, eq=False)
 class View:
-    """Rendered stereo view of a config."""
+    """Rendered stereo view of a config; both eyes have colour."""
 
     view_id: str
-    left: Eye
-    right: Eye
+    left: EyeView
+    right: EyeView
     baseline_m: float
 
 
@@ -119,15 +100,14 @@ def encode_view(view: View) -> tuple[pa.Table, ViewRecord]:
     return pa.Table.from_pylist([cells], schema=ROW_SCHEMA), _view_record(view)
 
 
-def _eye_cells(eye: Eye) -> dict[str, Any]:
+def _eye_cells(eye: EyeView) -> dict[str, Any]:
+    assert eye.rgb is not None
     return {
         "rgb": _image_cell(codecs.encode_rgb(eye.rgb)),
         "depth": codecs.encode_depth(eye.depth_m),
         "mask": _image_cell(codecs.encode_mask(eye.mask)),
         "bars": _image_cell(codecs.encode_bars(eye.bars)),
-        "K": eye.K.tolist(),
-        "distortion": eye.distortion.tolist(),
-        "cam_from_world": eye.cam_from_world.tolist(),
+        **{kind: getattr(eye.camera, kind).tolist() for kind in CAMERA_KINDS},
     }
 
 
@@ -139,12 +119,8 @@ def _view_record(view: View) -> ViewRecord:
     left = view.left
     return ViewRecord(
         view_id=view.view_id,
-        left=_ground_truth_digest(left),
-        right=_ground_truth_digest(view.right),
+        left=left.digest(),
+        right=view.right.digest(),
         steel_px=int(np.count_nonzero(left.mask)),
         scored_px=len(scored_pixels(left.mask, left.depth_m)),
     )
-
-
-def _ground_truth_digest(eye: Eye) -> str:
-    return eye_digest(eye.depth_m, eye.mask, eye.bars, eye.K, eye.distortion, eye.cam_from_world)

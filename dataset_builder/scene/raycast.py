@@ -11,23 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Bool, Float32, Float64, Int32, UInt16
+from jaxtyping import Float64, Int32
 from numpy import ndarray
 
 from dataset_builder.scene.model import WorldMesh
+from rebar_depth_bench.data.eye_view import EyeView
 from rebar_depth_bench.errors import BuildError
-from rebar_depth_bench.geometry.cameras import inverse_rigid
+from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid
 
 _MISS = -1
-
-
-@dataclass(frozen=True, eq=False)
-class EyeTruth:
-    """Ground truth of one eye: planar depth (metres, 0: no surface), steel mask, bar ids (0: no steel)."""
-
-    depth_m: Float32[ndarray, "h w"]
-    mask: Bool[ndarray, "h w"]
-    bars: UInt16[ndarray, "h w"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,15 +46,15 @@ class RayCaster:
             np.ascontiguousarray(mesh.faces, dtype=np.int32),
         )
 
-    def cast(self, rays_cam: Float64[ndarray, "h w 3"], cam_from_world: Float64[ndarray, "4 4"]) -> EyeTruth:
-        """Return the ground truth of one camera, casting one ray per pixel.
+    def cast(self, camera: Camera, rays_cam: Float64[ndarray, "h w 3"] | None = None) -> EyeView:
+        """Return the ground truth of one camera without colour, casting one ray per pixel.
 
-        ``rays_cam`` are ray directions in the camera frame with z = 1, so that the ray parameter is planar depth.
-        They may belong to any grid, ideal, distorted or rectified; nothing is resampled. Raises ``BuildError`` if
-        a depth is not finite or negative.
+        ``rays_cam`` are the ``camera.rays()``, which take seconds on a distorted grid, if they are known. Their z
+        is 1, so that the ray parameter is planar depth; nothing is resampled. Raises ``BuildError`` if a depth is
+        not finite or negative.
         """
-        height, width, _ = rays_cam.shape
-        world_from_cam = inverse_rigid(cam_from_world)
+        rays_cam = camera.rays() if rays_cam is None else rays_cam
+        world_from_cam = inverse_rigid(camera.cam_from_world)
         directions = rays_cam.reshape(-1, 3) @ world_from_cam[:3, :3].T
         centre_m = world_from_cam[:3, 3]
         face = self._first_face(centre_m, directions)
@@ -73,12 +65,8 @@ class RayCaster:
             raise BuildError("a ray does not intersect the plane of the face it hit in front of the camera")
         bars = np.zeros(len(face), np.uint16)
         bars[hit] = self._face_bar_id[face[hit]]
-        shape = (height, width)
-        return EyeTruth(
-            depth_m=depth_m.astype(np.float32).reshape(shape),
-            mask=bars.reshape(shape) > 0,
-            bars=bars.reshape(shape),
-        )
+        bars = bars.reshape(camera.height, camera.width)
+        return EyeView(camera, None, depth_m.astype(np.float32).reshape(bars.shape), bars > 0, bars)
 
     def hits(self, origins_m: Float64[ndarray, "n 3"], directions: Float64[ndarray, "n 3"]) -> RayHits:
         """Return the first intersection of each ray; world frame, directions of any length.

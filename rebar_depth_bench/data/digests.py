@@ -1,4 +1,4 @@
-"""SHA-256 digests of files, decoded ground truth and parameters."""
+"""SHA-256 digests of files, the views of a config and parameters."""
 
 from __future__ import annotations
 
@@ -7,10 +7,6 @@ import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt16
-from numpy import ndarray
 
 _CHUNK_BYTES = 1 << 20
 
@@ -32,32 +28,6 @@ def files_digest(paths: Iterable[Path]) -> str:
     """
     lines = [f"{path.name} {file_sha256(path)}\n" for path in paths]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
-
-
-def eye_digest(
-    depth_m: Float32[ndarray, "h w"],
-    mask: Bool[ndarray, "h w"],
-    bars: UInt16[ndarray, "h w"],
-    K: Float64[ndarray, "3 3"],
-    distortion: Float64[ndarray, 5],
-    cam_from_world: Float64[ndarray, "4 4"],
-) -> str:
-    """Return the hex SHA-256 of the ground truth of one camera of a view.
-
-    It covers the image size and the decoded values, not their encoding.
-    """
-    digest = hashlib.sha256(np.array(depth_m.shape, "<u4").tobytes())
-    arrays = (
-        (depth_m, "<f4"),
-        (mask, "u1"),
-        (bars, "<u2"),
-        (K, "<f8"),
-        (distortion, "<f8"),
-        (cam_from_world, "<f8"),
-    )
-    for array, dtype in arrays:
-        digest.update(np.ascontiguousarray(array, dtype=dtype).data)
-    return digest.hexdigest()
 
 
 def views_digest(views: Iterable[Mapping[str, Any]]) -> str:

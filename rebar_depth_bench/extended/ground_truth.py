@@ -13,6 +13,7 @@ from numpy import ndarray
 from rebar_depth_bench.data.array_cache import ArrayCache, ViewArrays, open_cache
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeView
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.extended.depth_layers import other_layers
@@ -21,7 +22,7 @@ from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.scoring.ground_truth import cache_name_pattern, cache_path, verified_rows
+from rebar_depth_bench.scoring.ground_truth import cache_name_pattern, cache_path, verified_views
 
 _DTYPES: Mapping[str, type] = {
     "index": np.uint32,
@@ -103,30 +104,26 @@ def _view_arrays(
 ) -> Iterator[ViewArrays]:
     """Yield the cached arrays of every view with scored pixels, with K, distortion and pose as metadata."""
     rays: dict[str, Rays] = {}
-    for row, scored in verified_rows(folder, config, progress, "bars in the views"):
+    for view_id, left, scored in verified_views(folder, config, progress, "bars in the views"):
         if not len(scored):
             continue
-        metadata = {
-            "K": row["left_K"].tolist(),
-            "distortion": row["left_distortion"].tolist(),
-            "cam_from_world": row["left_cam_from_world"].tolist(),
-        }
+        metadata = {kind: getattr(left.camera, kind).tolist() for kind in CAMERA_KINDS}
         if _lens_key(metadata) not in rays:
-            rays[_lens_key(metadata)] = _rays(metadata, *row["left_depth"].shape)
-        arrays = _steel_arrays(row, scored, rays[_lens_key(metadata)], cage, diameter_m)
-        yield ViewArrays(row["view_id"], arrays, metadata)
+            rays[_lens_key(metadata)] = _rays(metadata, *left.depth_m.shape)
+        arrays = _steel_arrays(left, scored, rays[_lens_key(metadata)], cage, diameter_m)
+        yield ViewArrays(view_id, arrays, metadata)
 
 
 def _steel_arrays(
-    row: Mapping[str, Any], scored: ndarray, rays: Rays, cage: CageTruth, diameter_m: Float64[ndarray, " ids"]
+    left: EyeView, scored: ndarray, rays: Rays, cage: CageTruth, diameter_m: Float64[ndarray, " ids"]
 ) -> dict[str, ndarray]:
-    """Return the arrays of ``SteelTruth`` for one row, by field name.
+    """Return the arrays of ``SteelTruth`` for one view, by field name.
 
     ``scored`` holds the flat indices of the scored pixels. Segments and other layers are determined for these
     only.
     """
-    depth_m, bars = row["left_depth"], row["left_bars"]
-    index = np.flatnonzero(dilate_mask(row["left_mask"]) & (depth_m > 0))
+    depth_m, bars = left.depth_m, left.bars
+    index = np.flatnonzero(dilate_mask(left.mask) & (depth_m > 0))
     interior = np.zeros(depth_m.size, dtype=bool)
     interior[scored] = True
     interior = interior[index]
@@ -141,8 +138,8 @@ def _steel_arrays(
     }
     own, z_m = arrays["bar_id"][interior], arrays["depth_m"][interior]
     camera_m = np.column_stack([z_m[:, None] * rays[scored], z_m])
-    rotation, translation = row["left_cam_from_world"][:3, :3], row["left_cam_from_world"][:3, 3]
-    arrays["run"][interior] = assign_segments((camera_m - translation) @ rotation, own, cage)
+    pose = left.camera.cam_from_world
+    arrays["run"][interior] = assign_segments((camera_m - pose[:3, 3]) @ pose[:3, :3], own, cage)
     gap_m = diameter_m[own].astype(np.float32)
     front_m, behind_m = other_layers(depth_m, bars, scored, gap_m)
     arrays["front_m"][interior], arrays["behind_m"][interior] = front_m, behind_m

@@ -8,6 +8,7 @@ metres, pixels are ``(u, v)`` with u along the width, and a pose is ``cam_from_w
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -22,6 +23,24 @@ _NEWTON_STEPS = 50
 _NEWTON_TOLERANCE = 1e-15
 _NEWTON_CHUNK = 8192
 _INVERSE_TOLERANCE = 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Camera of one eye of a view: pinhole matrix ``K``, ``width`` and ``height`` in pixels, pose, distortion.
+
+    ``distortion`` holds k1 k2 p1 p2 k3 (see ``distort``), zeros without distortion.
+    """
+
+    K: Float64[ndarray, "3 3"]
+    distortion: Float64[ndarray, " 5"]
+    cam_from_world: Float64[ndarray, "4 4"]
+    width: int
+    height: int
+
+    def rays(self) -> Float[ndarray, "h w 3"]:
+        """Return the ``pixel_rays`` of the camera. Raises ``ValueError`` as that does."""
+        return pixel_rays(self.K, self.width, self.height, self.distortion)
 
 
 def ideal_K(width: int, height: int) -> Float[ndarray, "3 3"]:

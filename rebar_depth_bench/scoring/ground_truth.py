@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, overload
+from typing import overload
 
 import numpy as np
 from jaxtyping import Float32, UInt32
@@ -19,7 +19,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.data.array_cache import ArrayCache, ViewArrays, open_cache
 from rebar_depth_bench.data.dataset import iterate_rows
-from rebar_depth_bench.data.digests import eye_digest
+from rebar_depth_bench.data.eye_view import EyeView, eye_from_row, truth_columns
 from rebar_depth_bench.data.manifest import DatasetFolder, ViewRecord
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.progress import Progress, silent
@@ -28,8 +28,6 @@ from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels
 
 CACHE_FOLDER = ".rebar-cache"
 _DIGEST_CHARACTERS = 32
-_KINDS = ("rgb", "depth", "mask", "bars", "K", "distortion", "cam_from_world")
-_TRUTH_COLUMNS = ("view_id", *(f"left_{kind}" for kind in _KINDS if kind != "rgb"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,35 +115,37 @@ def cache_name_pattern(config: str, protocol: str) -> str:
     return f"{protocol}-{config}-{'?' * _DIGEST_CHARACTERS}"
 
 
-def verified_rows(
+def verified_views(
     folder: DatasetFolder, config: str, progress: Progress, task: str
-) -> Iterator[tuple[dict[str, Any], UInt32[ndarray, " n"]]]:
-    """Yield every row of a config with the flat indices of its scored pixels, verified against the manifest.
+) -> Iterator[tuple[str, EyeView, UInt32[ndarray, " n"]]]:
+    """Yield id, left eye and flat indices of the scored pixels of every view, verified against the manifest.
 
     ``task`` is its name in ``progress``. Raises ``DatasetError`` naming a view that is not in the manifest or
     does not match its digest, or, after the last row, if views of the manifest are missing.
     """
     records = {view.view_id: view for view in folder.views(config)}
     total = len(records)
-    for done, row in enumerate(iterate_rows(folder.root, config, _TRUTH_COLUMNS), start=1):
-        yield row, _verify_digest(row, records.pop(row["view_id"], None), folder.root)
+    rows = iterate_rows(folder.root, config, ("view_id", *truth_columns("left")))
+    for done, row in enumerate(rows, start=1):
+        view_id, left = row["view_id"], eye_from_row(row, "left")
+        if view_id not in records:
+            raise DatasetError(f"{folder.root}: view {view_id} is not in the manifest")
+        yield view_id, left, _verified_pixels(left, records.pop(view_id), folder.root)
         progress(f"{task} of {config}", done, total)
     if records:
         raise DatasetError(f"{folder.root}: {config} lacks {len(records)} views, among them {min(records)}")
 
 
 def _extract_views(folder: DatasetFolder, config: str, progress: Progress) -> Iterator[ViewArrays]:
-    for row, pixels in verified_rows(folder, config, progress, "ground truth"):
+    for view_id, left, pixels in verified_views(folder, config, progress, "ground truth"):
         if len(pixels):
-            depth_m = row["left_depth"].ravel()[pixels]
-            yield ViewArrays(row["view_id"], {"index": pixels, "depth_m": depth_m}, median(depth_m))
+            depth_m = left.depth_m.ravel()[pixels]
+            yield ViewArrays(view_id, {"index": pixels, "depth_m": depth_m}, median(depth_m))
 
 
-def _verify_digest(row: dict[str, ndarray], record: ViewRecord | None, root: str) -> UInt32[ndarray, " n"]:
-    if record is None:
-        raise DatasetError(f"{root}: view {row['view_id']} is not in the manifest")
-    digest = eye_digest(*(row[f"left_{kind}"] for kind in _KINDS if kind != "rgb"))
-    pixels = scored_pixels(row["left_mask"], row["left_depth"])
+def _verified_pixels(left: EyeView, record: ViewRecord, root: str) -> UInt32[ndarray, " n"]:
+    digest = left.digest()
+    pixels = scored_pixels(left.mask, left.depth_m)
     if digest != record.left or len(pixels) != record.scored_px:
         raise DatasetError(
             f"{root}: view {record.view_id}: ground truth has digest {digest[:16]} and {len(pixels)} "

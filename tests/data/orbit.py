@@ -8,7 +8,7 @@ black: multi-view methods do not read them.
 from __future__ import annotations
 
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.trajectories import poses
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.local_renderer import OnViewDone
-from dataset_builder.pipeline.shards import Eye, Staging, View, encode_view, stage_row
+from dataset_builder.pipeline.shards import Staging, View, encode_view, stage_row
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
 from dataset_builder.scene.assemblies import aim_point_m, make_assembly
 from dataset_builder.scene.mesh_ply import read_mesh_ply
@@ -26,7 +26,6 @@ from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.data.codecs import decode_rgb
 from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.geometry.cameras import pixel_rays
 
 IMAGES = Path(__file__).parent / "orbit"
 REQUEST = BuildRequest(configs=("lattice-orbit",), views=24, width=512, height=288, samples=1)
@@ -48,12 +47,9 @@ class StoredImages:
         for index in unit.indices:
             eyes = {}
             for name, camera in rig_cameras(config.rig, left_poses[index]).items():
-                rays_cam = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
-                truth = caster.cast(rays_cam, camera.cam_from_world)
                 shape = (camera.height, camera.width, 3)
                 rgb = decode_rgb(_image(index).read_bytes()) if name == "left" else np.zeros(shape, np.uint8)
-                pose = camera.cam_from_world
-                eyes[name] = Eye(rgb, truth.depth_m, truth.mask, truth.bars, camera.K, camera.distortion, pose)
+                eyes[name] = replace(caster.cast(camera), rgb=rgb)
             row, record = encode_view(
                 View(view_id(config.name, index), eyes["left"], eyes["right"], config.rig.baseline_m)
             )

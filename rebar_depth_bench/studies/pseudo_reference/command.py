@@ -18,7 +18,7 @@ from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import InputError, printable, problem_summary
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.scoring.ground_truth import verified_rows
+from rebar_depth_bench.scoring.ground_truth import verified_views
 from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
 from rebar_depth_bench.scoring.result import mean, tabulate
 from rebar_depth_bench.studies.common import add_output_arguments, write_outputs
@@ -70,8 +70,8 @@ class _StudyData:
         """
         if self.folder is not None and exact:
             config = config_of(next(iter(self.views)))
-            for row, _ in verified_rows(self.folder, config, silent, "full frame"):
-                yield FrameView(row["view_id"], row["left_depth"].shape, row["left_depth"])
+            for view_id, left, _ in verified_views(self.folder, config, silent, "full frame"):
+                yield FrameView(view_id, left.depth_m.shape, left.depth_m)
         else:
             for view_id, shape in self.views.items():
                 yield FrameView(view_id, shape)

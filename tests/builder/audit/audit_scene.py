@@ -14,18 +14,19 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
-from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView
-from dataset_builder.config.rigs import Camera, rig_cameras
+from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import RigSpec
 from dataset_builder.config.trajectories import look_at_with_rig
 from dataset_builder.scene.board_texture import board_texture
 from dataset_builder.scene.model import WorldMesh
-from dataset_builder.scene.raycast import EyeTruth, RayCaster
+from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.bar_mesh import plain_bar_mesh
 from dataset_builder.scene.shapes.bending import bent_line_m
 from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.data.eye_view import EyeView
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, transform
+from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
 from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
 
 BOARD = BoardSpec()
@@ -103,27 +104,27 @@ def view(rig: str, azimuth_deg: float = 20.0, distance_m: float = 0.35) -> Audit
     return AuditedView("scene/0000", eyes["left"], eyes["right"])
 
 
-def render_eye(camera: Camera) -> EyeView:
+def render_eye(camera: Camera) -> AuditedEye:
     """Return the view of a camera: exact depth, and colour averaged over 2 x 2 rays per pixel."""
-    rays_cam = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
-    truth = scene().caster.cast(rays_cam, camera.cam_from_world)
-    return EyeView(camera, _colour(camera), truth.depth_m, truth.mask, truth.bars, rays_cam)
+    rays_cam = camera.rays()
+    truth = scene().caster.cast(camera, rays_cam)
+    return AuditedEye(camera, _colour(camera), truth.depth_m, truth.mask, truth.bars, rays_cam)
 
 
 def _colour(camera: Camera) -> UInt8[ndarray, "h w 3"]:
     fine_K = camera.K.copy()
     fine_K[:2] *= RAYS_ACROSS
     fine_K[:2, 2] += (RAYS_ACROSS - 1) / 2
-    width, height = RAYS_ACROSS * camera.width, RAYS_ACROSS * camera.height
-    rays_cam = pixel_rays(fine_K, width, height, camera.distortion)
-    truth = scene().caster.cast(rays_cam, camera.cam_from_world)
-    levels = np.where(truth.mask, STEEL_LEVEL, _board_levels(rays_cam, truth, camera))
+    fine = replace(camera, K=fine_K, width=RAYS_ACROSS * camera.width, height=RAYS_ACROSS * camera.height)
+    rays_cam = fine.rays()
+    truth = scene().caster.cast(fine, rays_cam)
+    levels = np.where(truth.mask, STEEL_LEVEL, _board_levels(rays_cam, truth))
     mean = levels.reshape(camera.height, RAYS_ACROSS, camera.width, RAYS_ACROSS).mean(axis=(1, 3))
     return np.repeat(np.round(mean).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def _board_levels(rays_cam: Float64[ndarray, "h w 3"], truth: EyeTruth, camera: Camera) -> ndarray:
-    points_m = transform(inverse_rigid(camera.cam_from_world), rays_cam * truth.depth_m[..., None])
+def _board_levels(rays_cam: Float64[ndarray, "h w 3"], truth: EyeView) -> ndarray:
+    points_m = transform(inverse_rigid(truth.camera.cam_from_world), rays_cam * truth.depth_m[..., None])
     column = (points_m[..., 0] + BOARD.width_m / 2) * PX_PER_M - 0.5
     row = (BOARD.height_m / 2 - points_m[..., 1]) * PX_PER_M - 0.5
     at = (column.astype(np.float32), row.astype(np.float32))
@@ -136,11 +137,10 @@ def _board_texture() -> UInt8[ndarray, "h w"]:
     return board_texture(BOARD, PX_PER_M)
 
 
-def with_camera(eye: EyeView, **changes: Any) -> EyeView:
+def with_camera(eye: AuditedEye, **changes: Any) -> AuditedEye:
     """Return ``eye`` with changed camera parameters and the corresponding rays."""
     camera = replace(eye.camera, **changes)
-    rays_cam = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
-    return replace(eye, camera=camera, rays_cam=rays_cam)
+    return replace(eye, camera=camera, rays_cam=camera.rays())
 
 
 def with_depth(original: AuditedView, factor: float) -> AuditedView:

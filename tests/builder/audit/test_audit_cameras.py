@@ -23,14 +23,14 @@ from dataset_builder.audit.cameras import (
     trajectory_spec,
     view_list_problems,
 )
-from dataset_builder.config.rigs import Camera, rig_cameras
+from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import DomeSpec, RingSpec
 from dataset_builder.config.trajectories import poses
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.geometry.cameras import right_camera_pose
+from rebar_depth_bench.geometry.cameras import Camera, right_camera_pose
 from tests.builder.audit.audit_scene import RIGS
 
 Row = dict[str, Any]

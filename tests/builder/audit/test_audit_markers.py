@@ -18,7 +18,7 @@ from dataset_builder.audit.markers import (
     projected_corners_px,
 )
 from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedView, EyeView
+from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
 from rebar_depth_bench.geometry.aruco_board import marker_corners_m
 from tests.builder.audit.audit_scene import BOARD, RIGS, config, view, with_baseline, with_K_shift
 
@@ -65,7 +65,7 @@ def test_missing_distortion_is_reported() -> None:
     assert any("markers" in problem for problem in check.problems), check
 
 
-def without_markers(eye: EyeView) -> EyeView:
+def without_markers(eye: AuditedEye) -> AuditedEye:
     return replace(eye, rgb=np.full_like(eye.rgb, 128))
 
 

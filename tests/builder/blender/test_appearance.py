@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from numpy import ndarray
 
-from dataset_builder.config.rigs import Camera
 from dataset_builder.config.specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
 from dataset_builder.config.trajectories import look_at_with_rig
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
@@ -23,7 +22,7 @@ from dataset_builder.scene.variants import LIGHT_SLOT, PROPS_SLOT, STEEL_SLOT, V
 from dataset_builder.scene.variants.props import PROP_BUILDERS, make_props
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.geometry.cameras import ideal_K, look_at, pixel_rays
+from rebar_depth_bench.geometry.cameras import Camera, ideal_K, look_at
 from tests.builder.blender.cages import cage
 from tests.builder.blender.probe import RunProbe
 
@@ -62,8 +61,7 @@ def probe(folder: Path) -> None:
         configure_colour(ColourSpec(samples=2), threads=1)
         caster = RayCaster(evaluated_world_mesh())
         for azimuth, camera in cameras.items():
-            rays_cam = pixel_rays(camera.K, camera.width, camera.height)
-            ground_truth = caster.cast(rays_cam, camera.cam_from_world)
+            ground_truth = caster.cast(camera)
             arrays[f"{key}/bars/{azimuth}"] = ground_truth.bars
             arrays[f"{key}/depth/{azimuth}"] = ground_truth.depth_m
         first_camera = next(iter(cameras.values()))

@@ -18,14 +18,13 @@ import pytest
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.rigs import Camera
 from dataset_builder.config.specs import ColourSpec, LatticeSpec, SceneSpec
 from dataset_builder.config.trajectories import look_at_with_rig
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
-from rebar_depth_bench.geometry.cameras import ideal_K, look_at, pixel_rays, project, transform
+from rebar_depth_bench.geometry.cameras import Camera, ideal_K, look_at, project, transform
 from tests.builder.blender.probe import RunProbe
 
 SCENE = SceneSpec("small", LatticeSpec(pitch_m=0.05), BoardSpec(), seed=3)
@@ -171,8 +170,7 @@ def test_exposure_is_neither_dark_nor_clipped(arrays: dict[str, ndarray]) -> Non
 def test_cycles_depth_equals_evaluated_mesh(
     arrays: dict[str, ndarray], mesh: WorldMesh, name: str, camera: Camera
 ) -> None:
-    rays_cam = pixel_rays(camera.K, camera.width, camera.height)
-    truth = RayCaster(mesh).cast(rays_cam, camera.cam_from_world)
+    truth = RayCaster(mesh).cast(camera)
     assert truth.mask.mean() > 0.01
     assert arrays[name].dtype == np.float32
     error_m = np.abs(arrays[name].astype(np.float64) - truth.depth_m)

@@ -16,14 +16,14 @@ import pytest
 from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
-from dataset_builder.config.rigs import Camera, rig_cameras, zed_rig
+from dataset_builder.config.rigs import rig_cameras, zed_rig
 from dataset_builder.config.specs import ColourSpec, LatticeSpec, SceneSpec
 from dataset_builder.config.trajectories import look_at_with_rig
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
-from rebar_depth_bench.geometry.cameras import look_at, pixel_rays, project, transform
+from rebar_depth_bench.geometry.cameras import Camera, look_at, project, transform
 from tests.builder.blender.probe import RunProbe
 
 SCENE = SceneSpec("small", LatticeSpec(pitch_m=0.05), BoardSpec(), seed=3)
@@ -90,9 +90,7 @@ def caster(folder: Path) -> RayCaster:
 @pytest.mark.parametrize("name", DEPTH_CAMERAS)
 def test_cycles_depth_follows_distorted_rays(arrays: dict[str, ndarray], caster: RayCaster, name: str) -> None:
     camera, cycles_m = DEPTH_CAMERAS[name], arrays[f"depth_{name}"]
-    truth = caster.cast(
-        pixel_rays(camera.K, camera.width, camera.height, camera.distortion), camera.cam_from_world
-    )
+    truth = caster.cast(camera)
     assert cycles_m.dtype == np.float32
     assert cycles_m.shape == truth.depth_m.shape
     assert truth.mask.mean() > 0.01

@@ -10,11 +10,12 @@ import pytest
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.rigs import Camera, rig_cameras, zed_rig
+from dataset_builder.config.rigs import rig_cameras, zed_rig
 from dataset_builder.config.specs import RigSpec
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.geometry.cameras import (
+    Camera,
     camera_centre,
     ideal_K,
     inverse_rigid,
@@ -208,8 +209,7 @@ def test_raw_depth_of_sphere_matches_analytic_depth(eye: str) -> None:
 
 
 def cast_depth_m(mesh: WorldMesh, camera: Camera) -> ndarray:
-    rays_cam = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
-    return RayCaster(mesh).cast(rays_cam, camera.cam_from_world).depth_m
+    return RayCaster(mesh).cast(camera).depth_m
 
 
 def opencv_ray(camera: Camera, u: int, v: int) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from dataset_builder.config.trajectories import camera_offsets_m, poses, subset
 from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
-from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
+from rebar_depth_bench.geometry.cameras import Camera, ideal_K
 from rebar_depth_bench.scoring.protocol import scored_pixels
 
 DISTANCE_RANGES_M = {"lattice-distance": (0.22, 1.6), "pile-distance": (0.5, 2.2), "pier-distance": (5.0, 17.0)}
@@ -82,9 +82,9 @@ def test_farthest_views_have_1000_scored_pixels(config: ConfigSpec) -> None:
     caster = RayCaster(
         WorldMesh(np.concatenate([mesh.vertices_m for mesh in meshes]), faces.astype(np.int32), ids)
     )
-    rays = pixel_rays(ideal_K(1280, 720), 1280, 720)
     views = poses(config.protocol, aim_point_m(assembly), config.rig)
-    scored = [scored_pixels(truth.mask, truth.depth_m) for truth in (caster.cast(rays, views[i]) for i in (0, 95))]
+    cameras = [Camera(ideal_K(1280, 720), np.zeros(5), views[i], 1280, 720) for i in (0, 95)]
+    scored = [scored_pixels(truth.mask, truth.depth_m) for truth in map(caster.cast, cameras)]
     assert len(scored[0]) > len(scored[1]) > 1000
 
 

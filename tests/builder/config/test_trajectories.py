@@ -15,9 +15,9 @@ from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.errors import MeshError
 from rebar_depth_bench.geometry.cameras import (
+    Camera,
     camera_centre,
     ideal_K,
-    pixel_rays,
     project,
     right_camera_pose,
     transform,
@@ -85,9 +85,9 @@ def test_steel_pixel_share_matches_paper(config: ConfigSpec) -> None:
         ),
         np.ones(sum(len(mesh.faces) for mesh in meshes), np.uint16),
     )
-    caster, rays = RayCaster(steel), pixel_rays(ideal_K(160, 90), 160, 90)
+    caster, K = RayCaster(steel), ideal_K(160, 90)
     left_poses = poses(config.protocol, aim_point_m(assembly), config.rig)[::5]
-    share = np.mean([caster.cast(rays, pose).mask.mean() for pose in left_poses])
+    share = np.mean([caster.cast(Camera(K, np.zeros(5), pose, 160, 90)).mask.mean() for pose in left_poses])
     assert 0.045 <= share <= 0.072
 
 

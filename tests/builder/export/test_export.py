@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from dataset_builder.config.rigs import Camera
 from dataset_builder.export import export
 from dataset_builder.export.colmap import cameras_txt, images_txt, points_txt, quaternion_wxyz
 from dataset_builder.export.images import depth_exr, depth_mm_png
@@ -25,7 +24,15 @@ from dataset_builder.export.views import CameraView
 from rebar_depth_bench import load
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
-from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid, look_at, project, rigid, transform
+from rebar_depth_bench.geometry.cameras import (
+    Camera,
+    camera_centre,
+    inverse_rigid,
+    look_at,
+    project,
+    rigid,
+    transform,
+)
 
 Rows = dict[str, dict[str, Any]]
 CAMERA_NAMES = ("left", "right")

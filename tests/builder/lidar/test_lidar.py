@@ -18,7 +18,7 @@ from dataset_builder.lidar.scanner import BeamWidth, ReturnMode
 from dataset_builder.lidar.simulate import noise_generator, reported_range_m, simulate_scan
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
-from rebar_depth_bench.geometry.cameras import ideal_K, look_at, pixel_rays
+from rebar_depth_bench.geometry.cameras import Camera, ideal_K, look_at, pixel_rays
 from tests.builder.lidar.lidar_scenes import PERFECT, camera, concatenate_meshes, wall
 
 SHARE_OF_PEAK = {"1/e2": math.exp(-2), "1/e": math.exp(-1), "fwhm": 0.5}
@@ -106,8 +106,8 @@ def test_hits_match_ground_truth_depth_and_incidence() -> None:
     mesh = WorldMesh(
         np.array([[-9.0, -9, 0], [9, -9, 0], [0, 9, 0]]), np.array([[0, 1, 2]], np.int32), np.ones(1, np.uint16)
     )
-    rays = camera().rays
-    truth = RayCaster(mesh).cast(rays, pose)
+    left, rays = camera(), camera().rays
+    truth = RayCaster(mesh).cast(Camera(left.K, left.distortion, pose, rays.shape[1], rays.shape[0]))
     directions = rays.reshape(-1, 3) @ pose[:3, :3]
     centre = np.linalg.inv(pose)[:3, 3]
     hits = RayCaster(mesh).hits(np.broadcast_to(centre, directions.shape), directions)

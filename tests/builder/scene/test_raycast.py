@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy import ndarray
 
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
-from rebar_depth_bench.geometry.cameras import camera_centre, ideal_K, look_at, pixel_rays, transform
+from rebar_depth_bench.geometry.cameras import Camera, camera_centre, ideal_K, look_at, transform
 
 WIDTH, HEIGHT = 160, 90
+
+
+def camera(pose: ndarray) -> Camera:
+    return Camera(ideal_K(WIDTH, HEIGHT), np.zeros(5), pose, WIDTH, HEIGHT)
 
 
 def slab(z_m: float, half_m: float, bar_id: int) -> WorldMesh:
@@ -35,9 +40,8 @@ def concatenate_meshes(*meshes: WorldMesh) -> WorldMesh:
 def test_depth_of_tilted_plane_is_exact(scale: float) -> None:
     centre_m = scale * np.array([0.21, -0.13, 0.31])
     pose = look_at(centre_m, scale * np.array([0.01, 0.02, 0.0]))
-    rays = pixel_rays(ideal_K(WIDTH, HEIGHT), WIDTH, HEIGHT)
-    truth = RayCaster(slab(0.0, scale * 100, 7)).cast(rays, pose)
-    directions = rays @ pose[:3, :3]  # world directions with unit planar depth
+    truth = RayCaster(slab(0.0, scale * 100, 7)).cast(camera(pose))
+    directions = camera(pose).rays() @ pose[:3, :3]  # world directions with unit planar depth
     expected_m = np.where(directions[..., 2] < 0, -centre_m[2] / directions[..., 2], 0.0)
     hit = truth.depth_m > 0
     assert hit.mean() > 0.9
@@ -47,7 +51,7 @@ def test_depth_of_tilted_plane_is_exact(scale: float) -> None:
 def test_nearest_surface_wins_and_background_is_zero() -> None:
     mesh = concatenate_meshes(slab(0.0, 0.2, 0), slab(0.1, 0.05, 9))
     pose = look_at(np.array([0.0, -0.001, 0.5]), np.array([0.0, 0.0, 0.0]))
-    truth = RayCaster(mesh).cast(pixel_rays(ideal_K(WIDTH, HEIGHT), WIDTH, HEIGHT), pose)
+    truth = RayCaster(mesh).cast(camera(pose))
     centre = (HEIGHT // 2, WIDTH // 2)
     assert truth.bars[centre] == 9
     assert truth.depth_m[centre] == pytest.approx(0.4, abs=1e-3)
@@ -66,10 +70,9 @@ def test_unprojected_depth_is_on_surface() -> None:
         np.arange(1, 61, dtype=np.uint16),
     )
     pose = look_at(np.array([0.9, 0.4, 0.5]), np.array([0.0, 0.0, 0.2]))
-    rays = pixel_rays(ideal_K(WIDTH, HEIGHT), WIDTH, HEIGHT)
-    truth = RayCaster(mesh).cast(rays, pose)
+    truth = RayCaster(mesh).cast(camera(pose))
     assert truth.mask.sum() > 500
-    points = transform(np.linalg.inv(pose), (rays * truth.depth_m[..., None])[truth.mask])
+    points = transform(np.linalg.inv(pose), (camera(pose).rays() * truth.depth_m[..., None])[truth.mask])
     triangles = corners[truth.bars[truth.mask] - 1]
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -1,0 +1,69 @@
+"""One eye (left or right camera) of a stereo view: its camera, colour and ground truth, and their digest."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8, UInt16
+from numpy import ndarray
+
+from rebar_depth_bench.geometry.cameras import Camera
+
+CAMERA_KINDS = ("K", "distortion", "cam_from_world")
+"""Kinds of the dataset's columns that describe a camera (see ``dataset.column_kind``)."""
+
+
+@dataclass(frozen=True, eq=False)
+class EyeView:
+    """Camera and images of one eye of a view.
+
+    ``rgb`` is None where colour is not needed. ``depth_m`` is planar z (0: no surface), ``mask`` marks steel
+    pixels, ``bars`` holds bar ids (0: no steel).
+    """
+
+    camera: Camera
+    rgb: UInt8[ndarray, "h w 3"] | None
+    depth_m: Float32[ndarray, "h w"]
+    mask: Bool[ndarray, "h w"]
+    bars: UInt16[ndarray, "h w"]
+
+    def digest(self) -> str:
+        """Return the hex SHA-256 of the ground truth: of image size, depth, mask, bar ids and camera.
+
+        It covers the decoded values, not their encoding.
+        """
+        digest = hashlib.sha256(np.array(self.depth_m.shape, "<u4").tobytes())
+        arrays = (
+            (self.depth_m, "<f4"),
+            (self.mask, "u1"),
+            (self.bars, "<u2"),
+            (self.camera.K, "<f8"),
+            (self.camera.distortion, "<f8"),
+            (self.camera.cam_from_world, "<f8"),
+        )
+        for array, dtype in arrays:
+            digest.update(np.ascontiguousarray(array, dtype=dtype).data)
+        return digest.hexdigest()
+
+
+def truth_columns(eye: str) -> tuple[str, ...]:
+    """Return the names of the columns that ``eye_from_row`` requires for ``left`` or ``right``."""
+    return tuple(f"{eye}_{kind}" for kind in ("depth", "mask", "bars", *CAMERA_KINDS))
+
+
+def eye_from_row(row: Mapping[str, Any], eye: str) -> EyeView:
+    """Return one eye of a decoded row; ``rgb`` is None if the row lacks that column."""
+    depth_m = row[f"{eye}_depth"]
+    camera = camera_from_row(row, eye, depth_m.shape[:2])  # A damaged image may have a third axis.
+    return EyeView(camera, row.get(f"{eye}_rgb"), depth_m, row[f"{eye}_mask"], row[f"{eye}_bars"])
+
+
+def camera_from_row(row: Mapping[str, Any], eye: str, grid: tuple[int, int]) -> Camera:
+    """Return the camera of one eye of a row, decoded or not; ``grid`` is its image size (height, width)."""
+    K, distortion, cam_from_world = (np.asarray(row[f"{eye}_{kind}"], np.float64) for kind in CAMERA_KINDS)
+    height, width = grid
+    return Camera(K, distortion, cam_from_world, width, height)
