@@ -71,7 +71,7 @@ class _StudyData:
         if self.folder is not None and exact:
             config = config_of(next(iter(self.views)))
             for view_id, left, _ in verified_views(self.folder, config, silent, "full frame"):
-                yield FrameView(view_id, left.depth_m.shape, left.depth_m)
+                yield FrameView(view_id, (left.camera.height, left.camera.width), left.depth_m)
         else:
             for view_id, shape in self.views.items():
                 yield FrameView(view_id, shape)
