@@ -145,8 +145,9 @@ def _extract_views(folder: DatasetFolder, config: str, progress: Progress) -> It
 
 def _verified_pixels(left: EyeView, record: ViewRecord, root: str) -> UInt32[ndarray, " n"]:
     digest = left.digest()
-    pixels = scored_pixels(left.mask, left.depth_m)
-    if digest != record.left or len(pixels) != record.scored_px:
+    same_size = left.depth_m.shape == left.mask.shape == left.bars.shape  # Damaged images may differ in size.
+    pixels = scored_pixels(left.mask, left.depth_m) if same_size else np.empty(0, np.uint32)
+    if digest != record.left or not same_size or len(pixels) != record.scored_px:
         raise DatasetError(
             f"{root}: view {record.view_id}: ground truth has digest {digest[:16]} and {len(pixels)} "
             f"scored pixels, the manifest has {record.left[:16]} and {record.scored_px}"

@@ -9,14 +9,19 @@ import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rebar_depth_bench import DatasetError, SubmissionError, score
-from rebar_depth_bench.scoring.ground_truth import CACHE_FOLDER, ViewTruth
+from rebar_depth_bench.data.codecs import decode_depth, decode_mask, encode_depth, encode_mask
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.scoring.ground_truth import CACHE_FOLDER, ViewTruth, config_truth
 from rebar_depth_bench.scoring.protocol import interior
 from rebar_depth_bench.scoring.result import Table, tabulate
 from rebar_depth_bench.scoring.score import score_view
@@ -181,6 +186,27 @@ def test_damaged_ground_truth_names_view(
     with pytest.raises(DatasetError, match=f"view {view_id}: ground truth has digest"):
         score(archive_of(tiny_truth), copy)
     assert not list(copy.glob(f"{CACHE_FOLDER}/*lattice-*"))
+
+
+@pytest.mark.parametrize(
+    ("column", "damage"),
+    [
+        ("left_depth", lambda cell: encode_depth(decode_depth(cell)[:, 1:])),
+        ("left_mask", lambda cell: cell | {"bytes": encode_mask(decode_mask(cell["bytes"]).reshape(-1, 90))}),
+    ],
+)
+def test_ground_truth_images_of_other_size_name_view(
+    tiny_root: Path, tmp_path: Path, column: str, damage: Callable[[Any], Any]
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(tiny_root, copy, ignore=shutil.ignore_patterns(CACHE_FOLDER))
+    shard = next(copy.glob("lattice-orbit/*.parquet"))
+    table = pq.read_table(shard)
+    rows = table.to_pylist()
+    rows[1][column] = damage(rows[1][column])
+    pq.write_table(pa.Table.from_pylist(rows, table.schema), shard)
+    with pytest.raises(DatasetError, match=f"view {rows[1]['view_id']}: ground truth has digest"):
+        config_truth(open_folder(copy), "lattice-orbit")
 
 
 def test_damaged_cache_is_rebuilt(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
