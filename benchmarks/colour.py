@@ -25,7 +25,6 @@ from dataset_builder.config.specs import ColourSpec
 from dataset_builder.config.trajectories import poses, subset
 from dataset_builder.scene.assemblies import aim_point_m, make_assembly
 from dataset_builder.scene.raycast import RayCaster
-from rebar_depth_bench.geometry.cameras import Camera, ideal_K
 
 REFERENCE = ColourSpec(samples=256, prefilter="ACCURATE")
 """Reference setting; denoised, since the noise of 256 raw samples would exceed the error of good candidates."""
@@ -49,13 +48,12 @@ PSNR_PEAK = 255.0
 def main(config: str = "lattice", views: str = "1") -> None:
     [spec] = BuildRequest(configs=(config,)).config_specs()
     rig = spec.rig
-    K = ideal_K(rig.width, rig.height)
     assembly = make_assembly(spec.scene.assembly)
     build_scene(assembly, spec.scene)
     caster = RayCaster(evaluated_world_mesh())
     all_poses = poses(spec.protocol, aim_point_m(assembly), rig)
-    selected = [all_poses[index] for index in subset(len(all_poses), int(views))]
-    masks = [caster.cast(Camera(K, np.zeros(5), pose, rig.width, rig.height)).mask for pose in selected]
+    selected = [rig_cameras(rig, all_poses[index])["left"] for index in subset(len(all_poses), int(views))]
+    masks = [caster.cast(camera).mask for camera in selected]
 
     write_line = _redirect_blender_output()
 
@@ -63,9 +61,9 @@ def main(config: str = "lattice", views: str = "1") -> None:
         configure_colour(colour, os.cpu_count() or 1)
         pictures, seconds = [], []
         with tempfile.TemporaryDirectory() as scratch:
-            for pose in selected:
+            for camera in selected:
                 start = time.perf_counter()
-                pictures.append(render_colour(rig_cameras(rig, pose)["left"], seed, Path(scratch)))
+                pictures.append(render_colour(camera, seed, Path(scratch)))
                 seconds.append(time.perf_counter() - start)
         return pictures, float(np.median(seconds))
 

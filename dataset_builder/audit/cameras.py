@@ -28,6 +28,7 @@ from dataset_builder.scene.assemblies import aim_point_m
 from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
 from rebar_depth_bench.data.dataset import EYES
+from rebar_depth_bench.data.eye_view import CAMERA_KINDS
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, camera_centre
@@ -189,7 +190,7 @@ def camera_problems(row: Mapping[str, Any], expected: ExpectedView) -> Iterator[
     """Yield the differences of a row's cameras, grids and baseline from the expected ones."""
     for eye in EYES:
         camera = expected.cameras[eye]
-        for kind in ("K", "distortion", "cam_from_world"):
+        for kind in CAMERA_KINDS:
             value, expected_value = row[f"{eye}_{kind}"], getattr(camera, kind)
             deviation = (
                 float(np.abs(value - expected_value).max()) if value.shape == expected_value.shape else np.inf

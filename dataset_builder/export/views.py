@@ -17,7 +17,7 @@ _COLUMNS = ("view_id", "baseline_m", *(name for eye in EYES for name in (f"{eye}
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """Cameras of one stereo view by eye, without images."""
+    """Cameras of one stereo view by eye, without images: they are held for all views of a config at once."""
 
     view_id: str
     baseline_m: float
