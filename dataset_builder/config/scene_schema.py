@@ -84,7 +84,7 @@ def _to_metres(length: float, unit_m: float) -> float:
     return round(length * unit_m, METRE_DECIMALS)
 
 
-def _check_distance(distance: float, info: ValidationInfo) -> float:
+def _check_distance(distance: float, info: ValidationInfo[float]) -> float:
     """Check that a camera distance is at least the rig's baseline; ``info.context`` is the unit in metres."""
     distance_m = _to_metres(distance, info.context)
     if distance_m < RigSpec.baseline_m:
@@ -139,7 +139,7 @@ class RingTable(CamerasTable, extra="forbid"):
 
 @dataclass(frozen=True)
 class TomlBar:
-    """Bar of a ``[[bar]]`` table; ``corners_m`` are the corners of its path in the world frame, metres.
+    """One bar of a scene TOML file; ``corners_m`` are the corners of its path in the world frame, metres.
 
     ``mandrel_m`` is the mandrel diameter; None selects the minimum of EN 1992-1-1.
     """
@@ -213,7 +213,7 @@ class SceneToml(StrictModel):
 
     @field_validator("name")
     @classmethod
-    def _check_name(cls, name: str, info: ValidationInfo) -> str:
+    def _check_name(cls, name: str, info: ValidationInfo[Collection[str]]) -> str:
         """Check that the name is not reserved; ``info.context`` are the reserved names."""
         if name in info.context:
             raise field_error(f"got {name!r}", f"none of the names {', '.join(info.context)}", "conflict")
