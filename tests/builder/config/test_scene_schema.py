@@ -11,6 +11,7 @@ from dataset_builder.config.catalog import CONFIGS
 from dataset_builder.config.scene_file import scene_config
 from dataset_builder.config.scene_schema import TomlBar, read_scene_toml
 from dataset_builder.config.specs import DomeSpec
+from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
 from rebar_depth_bench.errors import InputError, MeshError
 from tests.builder.config.scene_files import BAR, MM, write_scene
 
@@ -144,6 +145,9 @@ def test_all_problems_are_reported_together(tmp_path: Path) -> None:
         "invalid board",
         "unknown foo",
     ]
+    with pytest.raises(MeshError) as raised_by_cage:
+        load_cage(cage_file_spec(write_scene(tmp_path, content)))
+    assert raised_by_cage.value.problems == raised.value.problems
     with pytest.raises(InputError, match=r"40 problems(.|\n)*and 20 more"):
         scene_config(write_scene(tmp_path, MM + "[[bar]]\n" * 20))
 
@@ -154,7 +158,7 @@ def test_conflicts_are_reported_with_other_problems(tmp_path: Path) -> None:
         + "name = 'pile'\nmesh = 'a.stl'\nboard = 7\n"
         + (BAR + "id = 5\nbend_diameter = 9\nrips = 1\n") * 2
         + "[[bar]]\nid = 5\n"
-        + f"[[bar]]\nid = 0x{'f' * 6000}\n"
+        + f"[[bar]]\nid = 0x{'f' * 6000}\n" * 2
         + "[cameras]\nkind = 'dome'\nradii = [400, 50]\nelevations_deg = [5, 90]\nazimuths = 3600\nfoo = 1\n"
     )
     with pytest.raises(InputError) as raised:
@@ -170,6 +174,7 @@ def test_conflicts_are_reported_with_other_problems(tmp_path: Path) -> None:
         "duplicate bar 2: id",
         "duplicate bar 3: id",
         "invalid bar 4: id",
+        "invalid bar 5: id",
         "invalid board",
         "invalid cameras.elevations_deg 2",
     ]
