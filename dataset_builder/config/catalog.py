@@ -22,7 +22,7 @@ from dataset_builder.config.specs import (
     SceneSpec,
 )
 from dataset_builder.scene.variants import VARIANTS, check_variants
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 LATTICE_DOME = DomeSpec(
@@ -127,8 +127,7 @@ class BuildRequest:
         combined with a config that is not a lattice.
         """
         check_variants(self.variants)
-        known = [_known_config(name) for name in dict.fromkeys(self.configs)]
-        specs = [self._with_request(spec) for spec in (*known, *self.scenes)]
+        specs = [self._with_request(spec) for spec in (*_known_configs(self.configs), *self.scenes)]
         names = [spec.name for spec in specs]
         duplicates = sorted({name for name in names if names.count(name) > 1})
         if duplicates:
@@ -165,11 +164,15 @@ class BuildRequest:
         return self.mesh
 
 
-def _known_config(name: str) -> ConfigSpec:
+def _known_configs(names: Sequence[str]) -> list[ConfigSpec]:
+    """Return the named configs, each once; raise ``InputError`` that lists the unknown names."""
     known = {**CONFIGS, **SWEEPS}
-    if name not in known:
-        raise InputError(f"no config {name!r}, expected one of {', '.join(known)}")
-    return known[name]()
+    unknown = [name for name in dict.fromkeys(names) if name not in known]
+    if unknown:
+        expected = f"one of {', '.join(known)}"
+        problems = [Problem("unknown", "--config", f"got {name!r}", expected) for name in unknown]
+        raise InputError.from_problems("build request", problems)
+    return [known[name]() for name in dict.fromkeys(names)]
 
 
 def view_id(config: str, index: int) -> str:
@@ -190,10 +193,10 @@ def check_request(request: BuildRequest) -> None:
         ("--seed", request.seed, 0, 2**31 - 1),
     )
     problems = [
-        f"{name} is {value}, expected {low} to {high}"
+        Problem("invalid", name, f"got {value}", f"{low} to {high}")
         for name, value, low, high in limits
         if value is not None and not low <= value <= high
     ]
     if problems:
-        raise InputError("; ".join(problems))
+        raise InputError.from_problems("build request", problems)
     request.config_specs()

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
-from dataset_builder.config.scene_schema import SceneToml, read_scene_toml, scene_name_type
+from dataset_builder.config.scene_schema import SCENE_NAME, SceneToml, read_scene_toml
 from dataset_builder.config.specs import AssemblySpec, ConfigSpec, DomeSpec, SceneSpec
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
@@ -42,7 +42,6 @@ OUTDOORS_CAMERA_RADIUS_M = 19.0
 """Maximum horizontal distance of cameras from the world origin outdoors, metres: the ground is clear within it."""
 
 _DEFAULT_MARKERS = {"laboratory": 6, "outdoors": 0}
-_ALL_DEFAULTS = SceneToml(None, 1.0, (), None, None, None, None, None)
 
 
 def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
@@ -102,7 +101,7 @@ def default_dome(assembly: Assembly) -> DomeSpec:
 def _read_scene(path: Path) -> SceneToml:
     suffix = path.suffix.lower()
     if suffix == ".ifc":
-        return replace(_ALL_DEFAULTS, ifc=path.name)
+        return SceneToml.model_construct(ifc=path.name)
     if suffix != ".toml":
         raise InputError(f"{path}: unsupported scene file type {suffix!r}, expected .toml or .ifc")
     try:
@@ -114,14 +113,11 @@ def _read_scene(path: Path) -> SceneToml:
 
 def _check_name(name: str, path: Path) -> None:
     """Raise ``InputError`` if ``name`` is not a valid name of a scene; ``path`` is the scene file."""
-    name_type = scene_name_type(RESERVED_NAMES)
-    try:
-        name_type.convert(name)
-    except ValueError:
+    if name in RESERVED_NAMES or not SCENE_NAME.accept(name):
         raise InputError(
-            f"{path}: the scene would be named {name!r}, expected {name_type.expected}: rename the file, "
-            "or set its name in a TOML file"
-        ) from None
+            f"{path}: the scene would be named {name!r}, expected {SCENE_NAME.text}, none of "
+            f"{', '.join(RESERVED_NAMES)}: rename the file, or set its name in a TOML file"
+        )
 
 
 def _assembly_spec(scene_toml: SceneToml, path: Path) -> AssemblySpec:

@@ -14,7 +14,7 @@ from dataset_builder.scene.assemblies.mesh_import import MAX_EXTENT_M, MIN_EXTEN
 from dataset_builder.scene.model import MAX_BARS, STEEL, Assembly, Mesh, Part
 from dataset_builder.scene.shapes.bar_mesh import RibPattern, plain_bar_mesh, ribbed_bar_mesh
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import MeshError, problem_summary
+from rebar_depth_bench.errors import MeshError, Problem
 
 MIN_DIAMETER_M, MAX_DIAMETER_M = 0.0005, 0.2
 """Bounds of a bar's diameter: thin binding wire, and far more than the thickest bar made.
@@ -82,7 +82,7 @@ def cage_assembly(bars: Sequence[CageBar], where: str) -> Assembly:
         try:
             meshes.append(_bar_mesh(bar))
         except ValueError as error:
-            problems.append(f"{bar.label}: {error}")
+            problems.append(Problem("invalid", bar.label, str(error)))
     raise_problems(problems, where)
     parts = (
         Part(f"{bar.bar.role}-{bar.bar.bar_id:03d}", mesh, bar.bar.bar_id, STEEL)
@@ -91,44 +91,40 @@ def cage_assembly(bars: Sequence[CageBar], where: str) -> Assembly:
     return Assembly(tuple(bar.bar for bar in final_bars), tuple(parts))
 
 
-def raise_problems(problems: Sequence[str], where: str) -> None:
+def raise_problems(problems: Sequence[Problem], where: str) -> None:
     """Raise ``MeshError`` with all ``problems`` of the file ``where``, if there are any."""
     if problems:
-        message = problems[0] if len(problems) == 1 else problem_summary(problems)
-        raise MeshError(f"{where}: {message}")
+        raise MeshError.from_problems(where, problems)
 
 
-def _bar_problems(bar: CageBar) -> list[str]:
+def _bar_problems(bar: CageBar) -> list[Problem]:
     """Return what is wrong with one bar: its diameter, non-finite coordinates, or points too far away."""
     axis_m = np.array(bar.bar.axis_m)
     problems = []
     if not MIN_DIAMETER_M <= bar.bar.diameter_m <= MAX_DIAMETER_M:  # The negated comparison also catches NaN.
-        problems.append(
-            f"{bar.label}: the diameter is {bar.bar.diameter_m:.6g} m, expected {MIN_DIAMETER_M:g} to "
-            f"{MAX_DIAMETER_M:g} m: is the unit right?"
-        )
+        expected = f"{MIN_DIAMETER_M:g} to {MAX_DIAMETER_M:g} m: is the unit right?"
+        problems.append(Problem("invalid", bar.label, f"the diameter is {bar.bar.diameter_m:.6g} m", expected))
     points_m = axis_m if bar.mesh is None else np.concatenate([axis_m, bar.mesh.vertices_m])
     if not np.isfinite(points_m).all():
-        problems.append(f"{bar.label}: a coordinate is not finite, expected finite numbers")
+        problems.append(Problem("invalid", bar.label, "a coordinate is not finite", "finite numbers"))
     elif np.abs(points_m).max() > MAX_EXTENT_M:
-        problems.append(
-            f"{bar.label}: extends {np.abs(points_m).max():.6g} m from the world's origin, expected at most "
-            f"{MAX_EXTENT_M:g} m: is the unit right, and is the cage at the origin?"
-        )
+        found = f"extends {np.abs(points_m).max():.6g} m from the world's origin"
+        expected = f"at most {MAX_EXTENT_M:g} m: is the unit right, and is the cage at the origin?"
+        problems.append(Problem("invalid", bar.label, found, expected))
     return problems
 
 
-def _extent_problems(bars: Sequence[CageBar]) -> list[str]:
+def _extent_problems(bars: Sequence[CageBar]) -> list[Problem]:
     """Return a problem if the largest side of the cage is implausible, else an empty list."""
     points_m = np.concatenate([np.array(bar.bar.axis_m) for bar in bars])
     extent_m = float(np.ptp(points_m, axis=0).max())
     if MIN_EXTENT_M < extent_m < MAX_EXTENT_M:
         return []
-    expected = f"{MIN_EXTENT_M:g} to {MAX_EXTENT_M:g} m"
-    return [f"the cage is {extent_m:.6g} m long, expected {expected}: is the unit right?"]
+    expected = f"{MIN_EXTENT_M:g} to {MAX_EXTENT_M:g} m: is the unit right?"
+    return [Problem("invalid", "", f"the cage is {extent_m:.6g} m long", expected)]
 
 
-def _duplicate_axis_problems(bars: Sequence[CageBar]) -> list[str]:
+def _duplicate_axis_problems(bars: Sequence[CageBar]) -> list[Problem]:
     """Return a problem for each bar whose axis equals an earlier one, in either direction, to the micrometre.
 
     The pixels of such bars would be ambiguous.
@@ -141,7 +137,8 @@ def _duplicate_axis_problems(bars: Sequence[CageBar]) -> list[str]:
         ]
         key = min(tuple(points), tuple(reversed(points)))
         if key in first_label:
-            problems.append(f"{bar.label}: has the same axis as {first_label[key]}, expected distinct axes")
+            found = f"has the same axis as {first_label[key]}"
+            problems.append(Problem("duplicate", bar.label, found, "distinct axes"))
         first_label.setdefault(key, bar.label)
     return problems
 

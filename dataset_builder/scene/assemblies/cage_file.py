@@ -19,7 +19,7 @@ from dataset_builder.scene.assemblies.ifc.bars import ifc_bars
 from dataset_builder.scene.model import Assembly, axis_of
 from dataset_builder.scene.shapes.bending import bent_line_m, mandrel_diameter_m
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import InputError, MeshError
+from rebar_depth_bench.errors import InputError, MeshError, Problem
 
 
 def cage_file_spec(path: str | os.PathLike[str]) -> CageFileSpec:
@@ -45,13 +45,14 @@ def _toml_bars(content: bytes, where: str) -> list[CageBar]:
     try:
         bars = read_scene_toml(content, where).bars
     except InputError as error:
-        raise MeshError(str(error)) from error
+        raise MeshError.from_problems(where, error.problems) from error
     cage_bars, problems = [], []
     for bar in bars:
         try:
             cage_bars.append(_bent_bar(bar))
         except ValueError as error:
-            problems.append(f"{_label(bar)}: {error}, expected a path that is long enough for its bends")
+            expected = "a path that is long enough for its bends"
+            problems.append(Problem("invalid", _label(bar), str(error), expected))
     raise_problems(problems, where)
     return cage_bars
 

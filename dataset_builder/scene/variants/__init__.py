@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import InputError, Problem
 
 LIGHT_SLOT, STEEL_SLOT, PROPS_SLOT = "light", "steel", "things"
 EXCLUSIVE_SLOTS = (LIGHT_SLOT, STEEL_SLOT)
@@ -58,19 +58,20 @@ def check_variants(names: Iterable[str]) -> None:
     """Raise ``InputError`` for unknown and repeated names, and for several variants of an exclusive slot."""
     requested = tuple(names)
     unknown = [name for name in dict.fromkeys(requested) if name not in VARIANTS]
-    problems = [f"no appearance variant {name!r}, expected one of {', '.join(VARIANTS)}" for name in unknown]
+    problems = [
+        Problem("unknown", repr(name), "no such variant", f"one of {', '.join(VARIANTS)}") for name in unknown
+    ]
     repeated = [name for name in dict.fromkeys(requested) if requested.count(name) > 1]
     problems += [
-        f"appearance variant {name!r} is given {requested.count(name)} times, expected once" for name in repeated
+        Problem("duplicate", repr(name), f"given {requested.count(name)} times", "once") for name in repeated
     ]
     for slot in EXCLUSIVE_SLOTS:
         conflicting = variants_of_slot(dict.fromkeys(requested), slot)
         if len(conflicting) > 1:
-            problems.append(
-                f"appearance variants {', '.join(conflicting)} all set the {slot}, expected one of them"
-            )
+            found = f"{', '.join(conflicting)} all set the {slot}"
+            problems.append(Problem("conflict", "", found, "one of them"))
     if problems:
-        raise InputError("; ".join(problems))
+        raise InputError.from_problems("appearance variants", problems)
 
 
 def variants_of_slot(names: Iterable[str], slot: str) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from PIL import Image
 
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
-from dataset_builder.config.catalog import CONFIGS, BuildRequest
+from dataset_builder.config.catalog import CONFIGS, BuildRequest, check_request
 from dataset_builder.config.specs import RigSpec, RingSpec
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.pipeline.contact_sheet import STRIP_PANEL_PX, TILE_PX
@@ -149,20 +149,24 @@ def test_user_scene_and_variant_are_added_to_dataset(tiny_root: Path, tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("request_", "words"),
+    ("request_", "problems"),
     [
-        (BuildRequest(variants=("rust",)), "no appearance variant 'rust', expected one of dusk"),
-        (BuildRequest(variants=("wet", "rusted")), "wet, rusted all set the steel, expected one of them"),
-        (
-            BuildRequest(configs=(), scenes=(CONFIGS["pile"](), CONFIGS["pile"]())),
-            "more than one config is named pile",
-        ),
-        (BuildRequest(configs=("pier", "latice")), "no config 'latice', expected one of lattice"),
+        (BuildRequest(variants=("rust",)), [("unknown", "'rust'")]),
+        (BuildRequest(variants=("wet", "rusted")), [("conflict", "")]),
+        (BuildRequest(configs=("pier", "latice", "pil")), [("unknown", "--config")] * 2),
+        (BuildRequest(views=0, width=2), [("invalid", "--views"), ("invalid", "--width")]),
     ],
 )
-def test_invalid_build_request_is_rejected(request_: BuildRequest, words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        request_.config_specs()
+def test_invalid_build_request_is_rejected(request_: BuildRequest, problems: list[tuple[str, str]]) -> None:
+    with pytest.raises(InputError) as raised:
+        check_request(request_)
+    assert [(problem.code, problem.where) for problem in raised.value.problems] == problems
+
+
+def test_duplicate_config_names_are_rejected() -> None:
+    request = BuildRequest(configs=(), scenes=(CONFIGS["pile"](), CONFIGS["pile"]()))
+    with pytest.raises(InputError, match="more than one config is named pile"):
+        request.config_specs()
 
 
 def test_mesh_option_is_rejected_for_other_scenes(tmp_path: Path, run_build: RunBuild) -> None:

@@ -183,9 +183,9 @@ def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--config", "latice"), "no config 'latice', expected one of lattice"),
-        (("--views", "0"), "--views is 0, expected 1 to"),
-        (("--width", "2", "--samples", "0"), "--width is 2, expected 16 to 8192; --samples is 0"),
+        (("--config", "latice"), "--config: got 'latice', expected one of lattice"),
+        (("--views", "0"), "--views: got 0, expected 1 to"),
+        (("--width", "2", "--samples", "0"), "--width: got 2, expected 16 to 8192\n  - --samples: got 0"),
         (("--workers", "0"), "--workers is 0, expected 1 or more"),
         (("--mesh", "nothing.stl"), "nothing.stl"),
         (("--mesh", __file__), "unsupported mesh file type '.py', expected"),

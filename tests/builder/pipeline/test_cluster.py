@@ -277,5 +277,5 @@ def test_local_build_does_not_import_distributed(tmp_path: Path) -> None:
     """Check ``sys.modules`` after ``--samples 0``, which is rejected only after all modules are imported."""
     prepare = "import atexit; atexit.register(lambda: print('distributed' in sys.modules, 'bpy' in sys.modules))"
     process = run_cli(prepare, "--out", str(tmp_path / "dataset"), "--samples", "0")
-    assert "--samples is 0" in process.stderr
+    assert "--samples: got 0" in process.stderr
     assert process.stdout.split() == ["False", "False"]
