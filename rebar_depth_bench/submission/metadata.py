@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 from pydantic import ConfigDict
 
 from rebar_depth_bench.errors import Problem, escape_text
-from rebar_depth_bench.validation import Expected, Flag, StrictModel, short_repr, text, validate_table
+from rebar_depth_bench.validation import Expected, Flag, StrictModel, text, validate_table
 
 METADATA_NAME = "submission.json"
 MAX_METADATA_BYTES = 4 * 1024 * 1024
@@ -28,7 +28,8 @@ def is_http_url(url: str) -> bool:
     return valid and url.isprintable() and " " not in url and len(url) <= _MAX_URL_CHARACTERS
 
 
-_Description = Annotated[str, Expected("text without NUL", lambda value: "\0" not in value)]  # PostgreSQL's limit
+# PostgreSQL cannot store NUL.
+_Description = Annotated[str, Expected("text without NUL", lambda value: "\0" not in value)]
 _HttpUrl = Annotated[str, Expected("an address that starts with http:// or https://", is_http_url)]
 _Scale = Annotated[
     float, Expected("a finite number of metres per unit above 0", lambda value: 0 < value < math.inf)
@@ -56,9 +57,8 @@ class SubmissionMeta(StrictModel):
 def parse_metadata(data: bytes) -> tuple[SubmissionMeta | None, list[Problem]]:
     """Return the validated content of ``submission.json``, or None and all its problems; null means absent."""
     if len(data) > MAX_METADATA_BYTES:
-        return None, [
-            Problem("size", METADATA_NAME, f"the size is {len(data)} bytes", f"at most {MAX_METADATA_BYTES}")
-        ]
+        found = f"the size is {len(data)} bytes"
+        return None, [Problem("size", METADATA_NAME, found, f"at most {MAX_METADATA_BYTES}")]
     try:
         values = json.loads(data.decode("utf-8"), parse_constant=_reject_constant)
         # json.loads accepts numbers like 1e999 and lone surrogates, which cannot be written as JSON again.
@@ -72,7 +72,7 @@ def parse_metadata(data: bytes) -> tuple[SubmissionMeta | None, list[Problem]]:
         return None, [Problem("syntax", METADATA_NAME, found, "a JSON object")]
     if not isinstance(values, dict):
         expected = 'an object like {"method": "name"}'
-        return None, [Problem("invalid", METADATA_NAME, f"the JSON is {short_repr(values)}", expected)]
+        return None, [Problem("invalid", METADATA_NAME, "the JSON is not an object", expected)]
     problems: list[Problem] = []
     present = {key: value for key, value in values.items() if value is not None}
     return validate_table(SubmissionMeta, present, problems, METADATA_NAME), problems

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import pytest
 
@@ -15,7 +16,7 @@ from tests.bench.submission.zips import DEPTH, FIRST, SECOND, Record, deflated, 
 def test_optional_and_unknown_keys_are_accepted() -> None:
     for text in (b'{"method": "m", "colour": [1]}', b'{"method": "m", "url": null, "depth_scale": null}'):
         assert parse_metadata(text) == (SubmissionMeta(method="m"), [])
-    full = {
+    full: dict[str, Any] = {
         "method": "Größe 2", "description": "d", "url": "http://x.org", "uses_intrinsics": False,
         "depth_scale": 1, "runtime": {"seconds": 1.5},
     }  # fmt: skip
