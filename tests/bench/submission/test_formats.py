@@ -143,6 +143,11 @@ def test_invalid_npy_is_rejected(check: Check, data: bytes, code: str) -> None:
     assert (problem.code, problem.where) == (code, "lattice/0000.npy")
 
 
+def test_pickled_objects_are_named(check: Check) -> None:
+    (problem,) = check(with_view(".npy", npy(np.array([[{}]], object), allow_pickle=True)))
+    assert "pickled Python objects" in problem.found
+
+
 INNER = zips.Record(b"depth.npy", npy(DEPTH))
 
 

@@ -67,6 +67,11 @@ def test_invalid_metadata_is_rejected(check: Check, text: str, code: ProblemCode
     assert str(problem).isprintable()
 
 
+def test_constant_that_is_not_json_is_named() -> None:
+    (problem,) = parse_metadata(b'{"method": "m", "x": -Infinity}')[1]
+    assert "-Infinity is not JSON" in problem.found
+
+
 def test_all_problems_are_reported_at_once() -> None:
     meta, problems = parse_metadata(b'{"method": 1, "url": 2, "depth_scale": -1}')
     assert meta is None
