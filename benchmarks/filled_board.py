@@ -58,7 +58,7 @@ def add_scored_submissions(database: Database, result_json: bytes, rows: int, se
     for number in range(rows):
         submission_id = submissions.new_id()
         method = f"method {number:04d}"
-        meta = SubmissionMeta(method, url="https://example.org/method" if number % 2 else None)
+        meta = SubmissionMeta(method=method, url="https://example.org/method" if number % 2 else None)
         upload = Upload(meta, secrets.token_hex(32), 1, digest)
         submissions.accept(database, submission_id, token, upload, WITHOUT_LIMIT, True)
         jobs.claim(database, "filler", 60.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import ModuleType, TracebackType
 from typing import Any, Self
 
-from rebar_depth_bench.errors import InputError, RebarDepthError, SubmissionError
+from rebar_depth_bench.errors import InputError, Problem, RebarDepthError, SubmissionError
 from rebar_depth_bench.progress import Progress, silent
 
 POLL_INTERVAL_S = 2.0
@@ -62,7 +62,8 @@ class LeaderboardClient:
             raise InputError(f"{archive}: cannot be read: {error.strerror or error}") from None
         if response.status_code == 422:
             content = _json_object(response)
-            raise SubmissionError(str(archive), content.get("problems", [content.get("detail", "rejected")]))
+            lines = content.get("problems", [content.get("detail", "rejected")])
+            raise SubmissionError.from_problems(archive, [Problem("invalid", "", line) for line in lines])
         return self._checked(response, 202, "id")
 
     def token(self) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Mapping, Sequence
 
 import structlog
 from anyio import to_thread
@@ -18,7 +18,7 @@ from leaderboard.uploads.multipart import (
     receive,
     too_large_message,
 )
-from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, RebarDepthError
+from rebar_depth_bench.errors import Problem, RebarDepthError
 
 UNAVAILABLE_MESSAGE = "the service cannot validate or store archives at the moment; try again later"
 """Detail of the 503 response if the dataset is unreadable, the disk full or the archive storage unavailable."""
@@ -28,12 +28,12 @@ _LOG = structlog.get_logger("uploads")
 class UploadRejectedError(Exception):
     """Raised when an upload is rejected.
 
-    Holds the HTTP status, the detail message and, for status 422 only, the list of problems.
+    Holds the HTTP status, the detail message and, for status 422 only, all problems.
     """
 
-    def __init__(self, status: int, detail: str, problems: tuple[str, ...] = ()) -> None:
+    def __init__(self, status: int, detail: str, problems: Sequence[Problem] = ()) -> None:
         self.status, self.detail = status, detail
-        self.problems = (problems or (detail,)) if status == 422 else None
+        self.problems = (problems or (Problem("syntax", "", detail),)) if status == 422 else ()
         super().__init__(detail)
 
 
@@ -67,7 +67,8 @@ async def _validate_and_store(service: Service, token: TokenModel, received: Rec
     verdict = await service.checker.check(received.path)
     if isinstance(verdict, tuple):
         _LOG.info("upload rejected", token=token.name, problems=len(verdict))
-        raise UploadRejectedError(422, _problem_count(verdict), truncate_problems(verdict))
+        plural = "" if len(verdict) == 1 else "s"
+        raise UploadRejectedError(422, f"the archive is invalid: {len(verdict)} problem{plural}", verdict)
     submission_id = submissions.new_id()
     upload = Upload(verdict, received.sha256, received.size, service.folder.digest)
     public = service.settings.default_visibility == "always"
@@ -88,17 +89,6 @@ async def _validate_and_store(service: Service, token: TokenModel, received: Rec
         raise _quota_exceeded(service.settings.quota) from None
     _LOG.info("upload accepted", token=token.name, submission=submission_id[:6], bytes=received.size)
     return record
-
-
-def truncate_problems(problems: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the first ``MAX_PROBLEMS_SHOWN`` problems, followed by the number of the remaining ones if any."""
-    hidden = len(problems) - MAX_PROBLEMS_SHOWN
-    more = (f"... and {hidden} more",) if hidden > 0 else ()
-    return problems[:MAX_PROBLEMS_SHOWN] + more
-
-
-def _problem_count(problems: tuple[str, ...]) -> str:
-    return f"the archive is invalid: {len(problems)} problem{'' if len(problems) == 1 else 's'}"
 
 
 def quota_used(service: Service, token: TokenModel) -> int:

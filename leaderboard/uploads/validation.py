@@ -13,14 +13,14 @@ from typing import Self
 
 from leaderboard.scoring.process_limits import limit_process
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import SubmissionError
+from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.submission import SubmissionMeta, open_submission
 
 POOL_PROCESSES = 2
-CRASHED = "the archive cannot be read: the process that reads it crashed"
-NO_MEMORY = "the archive cannot be read: this needs more memory than this service allows"
+CRASHED = Problem("damaged", "", "the archive cannot be read: the process that reads it crashed")
+NO_MEMORY = Problem("size", "", "the archive cannot be read: this needs more memory than this service allows")
 
-Verdict = SubmissionMeta | tuple[str, ...]
+Verdict = SubmissionMeta | tuple[Problem, ...]
 """The content of ``submission.json`` if the archive is valid, otherwise all problems."""
 
 
@@ -75,7 +75,5 @@ def _check_archive(archive: str, data: str) -> Verdict:
             if submission.meta is None or problems:
                 return problems
             return submission.meta
-    except SubmissionError as error:
-        return error.problems
     except MemoryError:
         return (NO_MEMORY,)

@@ -19,6 +19,7 @@ from leaderboard.web.cache import new_cache_state
 from leaderboard.web.middleware import DrainRequestBodyMiddleware, RequestMiddleware
 from leaderboard.web.pages import routes, static, submit
 from leaderboard.web.pages.rendering import error_response, make_templates
+from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.version import software_version
 
 _LOG = structlog.get_logger("http")
@@ -84,8 +85,15 @@ def _allow_header(request: Request) -> dict[str, str] | None:
 
 async def _handle_validation_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
-    problems = [f"{'.'.join(map(str, details['loc']))}: {details['msg']}" for details in error.errors()]
-    return error_response(request, 422, "the request is malformed", problems=problems)
+    problems = [
+        Problem(
+            "missing" if details["type"] == "missing" else "invalid",
+            ".".join(map(str, details["loc"])),
+            details["msg"],
+        )
+        for details in error.errors()
+    ]
+    return error_response(request, 422, "the request is malformed", problems=problems, limit=None)
 
 
 async def _handle_database_unavailable(request: Request, error: Exception) -> Response:

@@ -24,5 +24,5 @@ def run(options: argparse.Namespace) -> None:
     with ProgressBars() as bars:
         problems = check_archive(options.archive, expected, bars.update)
     if problems:
-        raise SubmissionError(str(options.archive), problems)
+        raise SubmissionError.from_problems(options.archive, problems)
     print(f"{options.archive}: no problem found")

@@ -38,7 +38,7 @@ class Evaluation:
         """Decode every entry. Raises ``SubmissionError`` with all problems."""
         problems = list(self.submission.problems(progress))
         if problems:
-            raise SubmissionError(str(self.submission.path), problems)
+            raise SubmissionError.from_problems(self.submission.path, problems)
 
     def provenance(self) -> Provenance:
         """Return the provenance of a study of the submission."""
@@ -56,5 +56,5 @@ def open_evaluation(archive: str | os.PathLike[str], root: str | Path) -> Iterat
     folder = open_folder(root)
     with open_submission(archive, folder.expected_views()) as submission:
         if submission.meta is None or submission.structure_problems:
-            raise SubmissionError(str(archive), list(submission.problems()))
+            raise SubmissionError.from_problems(archive, list(submission.problems()))
         yield Evaluation(folder, submission)

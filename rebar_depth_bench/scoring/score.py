@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from rebar_depth_bench.errors import SubmissionError
+from rebar_depth_bench.errors import Problem, SubmissionError
 from rebar_depth_bench.parallel import ordered_map
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
@@ -87,22 +87,22 @@ def _score_all(evaluation: Evaluation, workers: int | None, progress: Progress) 
     """Return the scores of every view of the archive by config. Raises ``SubmissionError`` with all problems."""
     submission = evaluation.submission
     unread = set(submission.view_ids)
-    problems: list[str] = []
+    problems: list[Problem] = []
     scores: dict[str, list[ViewScore]] = {}
     for config in evaluation.configs:
         truths = config_truth(evaluation.folder, config, progress)
         outcomes = ordered_map(partial(_score_or_problem, submission, truths), range(len(truths)), workers)
         scored = list(_report_progress(outcomes, f"scoring {config}", len(truths), progress))
         scores[config] = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
-        problems += [outcome for outcome in scored if isinstance(outcome, str)]
+        problems += [outcome for outcome in scored if isinstance(outcome, Problem)]
         unread.difference_update(truths.view_ids)
     problems += _unscored_view_problems(submission, unread)
     if problems:
-        raise SubmissionError(str(submission.path), problems)
+        raise SubmissionError.from_problems(submission.path, problems)
     return scores
 
 
-def _score_or_problem(submission: SubmissionReader, truths: ConfigTruth, index: int) -> ViewScore | str:
+def _score_or_problem(submission: SubmissionReader, truths: ConfigTruth, index: int) -> ViewScore | Problem:
     """Return a view's score, or the problem of its entry."""
     truth = truths[index]
     try:
@@ -111,7 +111,7 @@ def _score_or_problem(submission: SubmissionReader, truths: ConfigTruth, index: 
         return error.problem
 
 
-def _unscored_view_problems(submission: SubmissionReader, view_ids: Iterable[str]) -> list[str]:
+def _unscored_view_problems(submission: SubmissionReader, view_ids: Iterable[str]) -> list[Problem]:
     """Return the problems of the entries of views without scored pixels, which are decoded but not scored."""
     problems = []
     for view_id in sorted(view_ids):
@@ -123,8 +123,8 @@ def _unscored_view_problems(submission: SubmissionReader, view_ids: Iterable[str
 
 
 def _report_progress(
-    outcomes: Iterable[ViewScore | str], label: str, total: int, progress: Progress
-) -> Iterator[ViewScore | str]:
+    outcomes: Iterable[ViewScore | Problem], label: str, total: int, progress: Progress
+) -> Iterator[ViewScore | Problem]:
     for done, outcome in enumerate(outcomes, start=1):
         progress(label, done, total)
         yield outcome

@@ -11,10 +11,10 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.errors import SubmissionError, format_shape
+from rebar_depth_bench.errors import Problem, SubmissionError, format_shape
 from rebar_depth_bench.submission import EntryError, ExpectedViews, SubmissionMeta, open_submission
 from rebar_depth_bench.submission.formats import FORMATS, Depth
-from rebar_depth_bench.submission.metadata import METADATA_NAME, MetadataError, parse_metadata
+from rebar_depth_bench.submission.metadata import METADATA_NAME, parse_metadata
 
 _FILE_NAME_PATTERN = "<view_id>, or its part after the slash, with one of " + ", ".join(FORMATS)
 
@@ -74,7 +74,7 @@ class ArchiveDepths:
         if meta is None or self._reader.structure_problems:
             problems = list(self._reader.problems())
             self._reader.close()
-            raise SubmissionError(str(path), problems)
+            raise SubmissionError.from_problems(path, problems)
         self.method = meta.method
         self.view_ids = self._reader.view_ids
 
@@ -100,7 +100,7 @@ class _DepthFiles:
     """Depth files of a folder by view id, and the problems found while matching them."""
 
     files: Mapping[str, Path]
-    problems: tuple[str, ...]
+    problems: tuple[Problem, ...]
 
 
 class FolderDepths:
@@ -117,12 +117,10 @@ class FolderDepths:
         self.view_ids = tuple(sorted(depth_files.files))
         images = [file.name for file in depth_files.files.values() if file.suffix == ".png"]
         if images and self._scale is None and not problems:
-            problems = [
-                f"{METADATA_NAME}: no depth_scale, expected metres per PNG unit, since {len(images)} files "
-                f"are PNG (first {min(images)})"
-            ]
+            expected_scale = f"metres per PNG unit, since {len(images)} files are PNG (first {min(images)})"
+            problems = [Problem("missing", METADATA_NAME, "no depth_scale", expected_scale)]
         if depth_files.problems or problems:
-            raise SubmissionError(str(path), [*depth_files.problems, *problems])
+            raise SubmissionError.from_problems(path, [*depth_files.problems, *problems])
 
     def read(self, view_id: str) -> Depth:
         """Return planar depth in metres, shape (H, W). Raises ``EntryError``."""
@@ -134,11 +132,10 @@ class FolderDepths:
             with file.open("rb") as stream:
                 data = stream.read(limit + 1)
         except OSError as error:
-            raise EntryError(f"{name}: it cannot be read: {error.strerror}") from error
+            raise EntryError(Problem("damaged", name, f"it cannot be read: {error.strerror}")) from error
         if len(data) > limit and file.suffix != ".npy":  # the .npy header gives a more precise error
-            raise EntryError(
-                f"{name}: it has more than {limit} bytes, expected a map of {format_shape(shape)} (H x W)"
-            )
+            found = f"it has more than {limit} bytes"
+            raise EntryError(Problem("size", name, found, f"a map of {format_shape(shape)} (H x W)"))
         return file_format.decode(name, memoryview(data), shape, self._scale or 1.0)
 
     def sha256(self) -> str:
@@ -170,26 +167,22 @@ def _find_files(path: Path, expected: ExpectedViews) -> _DepthFiles:
         view_id = by_stem.get(file.relative_to(path).as_posix())
         if view_id is not None and file.is_file():
             files_by_view.setdefault(view_id, []).append(file)
-    problems = [
-        f"{view_id}: {len(files)} files were found ({', '.join(file.name for file in files[:4])}), expected one"
-        for view_id, files in files_by_view.items()
-        if len(files) > 1
-    ]
+    problems = []
+    for view_id, files in files_by_view.items():
+        if len(files) > 1:
+            listed = ", ".join(file.name for file in files[:4])
+            problems.append(Problem("duplicate", view_id, f"{len(files)} files were found ({listed})", "one"))
     if not files_by_view:
-        problems = [
-            f"no depth file of any view was found, expected {_FILE_NAME_PATTERN}, "
-            f"such as {next(iter(expected))}.npy"
-        ]
+        pattern = f"{_FILE_NAME_PATTERN}, such as {next(iter(expected))}.npy"
+        problems = [Problem("missing", "", "no depth file of any view was found", pattern)]
     return _DepthFiles({view_id: files[0] for view_id, files in files_by_view.items()}, tuple(problems))
 
 
-def _folder_metadata(path: Path) -> tuple[SubmissionMeta | None, list[str]]:
+def _folder_metadata(path: Path) -> tuple[SubmissionMeta | None, list[Problem]]:
     file = path / METADATA_NAME
     if not file.exists():
         return None, []
     try:
-        return parse_metadata(file.read_bytes()), []
+        return parse_metadata(file.read_bytes())
     except OSError as error:
-        return None, [f"{METADATA_NAME}: it cannot be read: {error.strerror}"]
-    except MetadataError as error:
-        return None, [f"{METADATA_NAME}: {problem}" for problem in error.problems]
+        return None, [Problem("damaged", METADATA_NAME, f"it cannot be read: {error.strerror}")]

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
-from rebar_depth_bench.errors import escape_text
+from rebar_depth_bench.errors import Problem, escape_text
 from rebar_depth_bench.submission.formats import FORMATS
 from rebar_depth_bench.submission.metadata import MAX_METADATA_BYTES, METADATA_NAME
 
 ExpectedViews = Mapping[str, tuple[int, int]]
 """Mapping of every view_id (``<config>/<0000>``) of a dataset folder to its (H, W) in pixels."""
 
-_SUFFIXES = ", ".join(FORMATS)
+_ANY_SUFFIX = f"one of {', '.join(FORMATS)}"
 _ZIP_HINT = "zip with: zip -r submission.zip submission.json <config> -x '*.DS_Store'"
 
 
@@ -28,7 +28,7 @@ class MatchedEntries:
 
     views: Mapping[str, int]
     metadata: int | None
-    problems: tuple[str, ...]
+    problems: tuple[Problem, ...]
 
 
 def config_of(view_id: str) -> str:
@@ -78,7 +78,7 @@ def match_entries(names: Sequence[str], expected: ExpectedViews) -> MatchedEntri
     return MatchedEntries(views, metadata[0] if len(metadata) == 1 else None, tuple(problems))
 
 
-def _wrapper_folder_problem(names: Sequence[str], expected: ExpectedViews) -> str | None:
+def _wrapper_folder_problem(names: Sequence[str], expected: ExpectedViews) -> Problem | None:
     """Return the problem of an archive whose valid entries all lie in one superfluous folder, or None."""
     files = [name for name in names if not name.endswith("/") and not _is_macos_metadata(name)]
     tops = {name.partition("/")[0] for name in files}
@@ -93,59 +93,59 @@ def _wrapper_folder_problem(names: Sequence[str], expected: ExpectedViews) -> st
         or METADATA_NAME in files
     ):
         return None
-    return (
-        f"{escape_text(files[0])}: all {len(files)} entries are inside the folder {escape_text(top)}/, expected "
-        f"{escape_text(inner_names[0])} at the top level: zip the folder's contents, not the folder"
+    return Problem(
+        "unknown",
+        escape_text(files[0]),
+        f"all {len(files)} entries are inside the folder {escape_text(top)}/",
+        f"{escape_text(inner_names[0])} at the top level: zip the folder's contents, not the folder",
     )
 
 
-def _unknown_entry_problems(unknown_entries: Sequence[str], expected: ExpectedViews) -> list[str]:
+def _unknown_entry_problems(unknown_entries: Sequence[str], expected: ExpectedViews) -> Iterator[Problem]:
     macos = [name for name in unknown_entries if _is_macos_metadata(name)]
-    problems = [_unknown_entry_problem(name, expected) for name in unknown_entries if not _is_macos_metadata(name)]
+    for name in unknown_entries:
+        if not _is_macos_metadata(name):
+            yield _unknown_entry_problem(name, expected)
     if macos:
-        problems.append(
-            f"{escape_text(macos[0])}: {len(macos)} entries made by macOS were found, expected none; {_ZIP_HINT}"
-        )
-    return problems
+        found = f"{len(macos)} entries made by macOS were found"
+        yield Problem("unknown", escape_text(macos[0]), found, f"none; {_ZIP_HINT}")
 
 
-def _unknown_entry_problem(name: str, expected: ExpectedViews) -> str:
+def _unknown_entry_problem(name: str, expected: ExpectedViews) -> Problem:
     path = PurePosixPath(name)
     view_id = name.removesuffix(path.suffix)
     configs = sorted({config_of(view) for view in expected})
+    found, allowed = "unknown entry", f"{METADATA_NAME} or <view_id> with {_ANY_SUFFIX}"
     if view_id in expected:
-        reason = f"the suffix is {escape_text(path.suffix or 'missing')}, expected one of {_SUFFIXES}"
+        found += f", the suffix is {escape_text(path.suffix or 'missing')}"
+        allowed = _ANY_SUFFIX
     elif path.suffix in FORMATS and config_of(name) in configs and "/" in name:
-        reason = f"the dataset has no view {escape_text(view_id)} in the config {config_of(name)}"
+        found += f", the dataset has no view {escape_text(view_id)} in the config {config_of(name)}"
+        allowed = ""
     elif path.suffix in FORMATS and "/" in name:
-        reason = f"the dataset has no config {escape_text(config_of(name))}, expected one of {', '.join(configs)}"
-    else:
-        reason = f"expected {METADATA_NAME} or <view_id> with one of {_SUFFIXES}"
-    return f"{escape_text(name)}: unknown entry, {reason}"
+        found += f", the dataset has no config {escape_text(config_of(name))}"
+        allowed = f"one of {', '.join(configs)}"
+    return Problem("unknown", escape_text(name), found, allowed)
 
 
-def _duplicate_problems(candidates: Mapping[str, Sequence[int]], names: Sequence[str]) -> list[str]:
-    return [
-        f"{key}: {len(indices)} entries were found ({', '.join(names[index] for index in indices[:4])}"
-        f"{', ...' if len(indices) > 4 else ''}), expected one"
-        for key, indices in candidates.items()
-        if len(indices) > 1
-    ]
+def _duplicate_problems(candidates: Mapping[str, Sequence[int]], names: Sequence[str]) -> Iterator[Problem]:
+    for key, indices in candidates.items():
+        if len(indices) > 1:
+            listed = ", ".join(names[index] for index in indices[:4]) + (", ..." if len(indices) > 4 else "")
+            yield Problem("duplicate", key, f"{len(indices)} entries were found ({listed})", "one")
 
 
-def _missing_problems(candidates: Mapping[str, Sequence[int]], expected: ExpectedViews) -> list[str]:
-    problems = [] if METADATA_NAME in candidates else [f'{METADATA_NAME}: missing, expected {{"method": "name"}}']
+def _missing_problems(candidates: Mapping[str, Sequence[int]], expected: ExpectedViews) -> Iterator[Problem]:
+    if METADATA_NAME not in candidates:
+        yield Problem("missing", METADATA_NAME, "missing", '{"method": "name"}')
     configs = {config_of(view_id) for view_id in candidates if view_id != METADATA_NAME}
     if not configs:
-        return [
-            *problems,
-            f"no view was found, expected <view_id> with one of {_SUFFIXES} of at least one config",
-        ]
-    missing = (view for view in sorted(expected) if config_of(view) in configs and view not in candidates)
-    return problems + [
-        f"{view}: missing, expected one of {_SUFFIXES}, because other views of {config_of(view)} are included"
-        for view in missing
-    ]
+        yield Problem("missing", "", "no view was found", f"<view_id> with {_ANY_SUFFIX} of at least one config")
+    for view in sorted(expected):
+        config = config_of(view)
+        if config in configs and view not in candidates:
+            because = f"because other views of {config} are included"
+            yield Problem("missing", view, "missing", f"{_ANY_SUFFIX}, {because}")
 
 
 def _is_macos_metadata(name: str) -> bool:

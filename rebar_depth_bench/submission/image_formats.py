@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from PIL import Image
 
-from rebar_depth_bench.errors import EntryError, escape_text, format_shape
+from rebar_depth_bench.errors import EntryError, Problem, escape_text, format_shape
 from rebar_depth_bench.submission.numpy_formats import Depth
 
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
@@ -51,39 +51,37 @@ def decode_exr(name: str, data: memoryview, shape: tuple[int, int], depth_scale:
         (channel,) = image.channels().values()
         pixels: Depth = channel.pixels
     except Exception as error:  # OpenEXR raises several unrelated exception types for damaged files.
-        raise EntryError(
-            f"{name}: the OpenEXR data is corrupt or truncated ({escape_text(str(error))})"
-        ) from error
+        found = f"the OpenEXR data is corrupt or truncated ({escape_text(str(error))})"
+        raise EntryError(Problem("damaged", name, found)) from error
     if pixels.shape != shape or pixels.dtype not in (np.float16, np.float32):
-        raise EntryError(
-            f"{name}: the image decodes to {pixels.dtype} {pixels.shape}, expected {format_shape(shape)} floats"
-        )
+        found = f"the image decodes to {pixels.dtype} {pixels.shape}"
+        raise EntryError(Problem("invalid", name, found, f"{format_shape(shape)} floats"))
     return pixels
 
 
 def _check_exr_header(name: str, data: memoryview, shape: tuple[int, int]) -> None:
     head = bytes(data[:_MAX_HEADER_BYTES])
     if len(head) < 8 or not head.startswith(_EXR_MAGIC):
-        raise EntryError(f"{name}: the bytes start with {head[:8]!r}, expected an OpenEXR file")
+        raise EntryError(Problem("syntax", name, f"the bytes start with {head[:8]!r}", "an OpenEXR file"))
     flags = int.from_bytes(head[4:8], "little")
     if flags & 0xFF != 2 or flags & ~(0xFF | _TILED | _LONG_NAMES | _DEEP | _MULTI_PART):
-        raise EntryError(f"{name}: the OpenEXR version field is {flags:#x}, expected version 2")
+        raise EntryError(Problem("invalid", name, f"the OpenEXR version field is {flags:#x}", "version 2"))
     if flags & (_DEEP | _MULTI_PART):
         layout = "deep" if flags & _DEEP else "multi-part"
-        raise EntryError(f"{name}: the OpenEXR file is {layout}, expected one flat image")
+        raise EntryError(Problem("invalid", name, f"the OpenEXR file is {layout}", "one flat image"))
     try:
         attributes = _parse_attributes(head)
         channels = list(_parse_channels(attributes["channels"]))
         window = struct.unpack("<4i", attributes["dataWindow"])
         tiles = struct.unpack("<2IB", attributes["tiles"]) if flags & _TILED else None
     except (ValueError, KeyError, struct.error) as error:
-        raise EntryError(f"{name}: the OpenEXR header is damaged ({escape_text(str(error))})") from error
+        found = f"the OpenEXR header is damaged ({escape_text(str(error))})"
+        raise EntryError(Problem("damaged", name, found)) from error
     _check_channel(name, channels)
     window_shape = (window[3] - window[1] + 1, window[2] - window[0] + 1)
     if window_shape != shape:
-        raise EntryError(
-            f"{name}: the data window is {format_shape(window_shape)}, expected {format_shape(shape)} (H x W)"
-        )
+        found = f"the data window is {format_shape(window_shape)}"
+        raise EntryError(Problem("invalid", name, found, f"{format_shape(shape)} (H x W)"))
     if tiles is not None:
         _check_tiles(name, tiles, shape)
 
@@ -93,24 +91,26 @@ def _check_channel(name: str, channels: list[tuple[str, int, int, int]]) -> None
         names = ", ".join(escape_text(channel[0]) for channel in channels[:4]) + (
             ", ..." if len(channels) > 4 else ""
         )
-        raise EntryError(f"{name}: the OpenEXR file has {len(channels)} channels ({names}), expected one")
+        raise EntryError(
+            Problem("invalid", name, f"the OpenEXR file has {len(channels)} channels ({names})", "one")
+        )
     label, pixel_type, x_step, y_step = channels[0]
     if pixel_type not in (1, 2):
         type_name = _PIXEL_TYPES.get(pixel_type, f"of type {pixel_type}")
-        raise EntryError(f"{name}: the channel {escape_text(label)} is {type_name}, expected HALF or FLOAT")
+        found = f"the channel {escape_text(label)} is {type_name}"
+        raise EntryError(Problem("invalid", name, found, "HALF or FLOAT"))
     if (x_step, y_step) != (1, 1):
-        raise EntryError(
-            f"{name}: the channel {escape_text(label)} is subsampled {x_step} x {y_step}, expected 1 x 1"
-        )
+        found = f"the channel {escape_text(label)} is subsampled {x_step} x {y_step}"
+        raise EntryError(Problem("invalid", name, found, "1 x 1"))
 
 
 def _check_tiles(name: str, tiles: tuple[int, int, int], shape: tuple[int, int]) -> None:
     max_size = max(_MAX_TILE_PX, *shape)
     width, height, level_mode = tiles
     if not (0 < width <= max_size and 0 < height <= max_size):
-        raise EntryError(f"{name}: the tiles are {height} x {width}, expected 1 to {max_size} each")
+        raise EntryError(Problem("invalid", name, f"the tiles are {height} x {width}", f"1 to {max_size} each"))
     if level_mode & 0x0F:
-        raise EntryError(f"{name}: the OpenEXR file has several resolution levels, expected one")
+        raise EntryError(Problem("invalid", name, "the OpenEXR file has several resolution levels", "one"))
 
 
 def _parse_attributes(head: bytes) -> Mapping[str, bytes]:
@@ -180,11 +180,11 @@ def decode_png(name: str, data: memoryview, shape: tuple[int, int], depth_scale:
         with Image.open(io.BytesIO(_minimal_png(header, rows)), formats=["PNG"]) as image:
             units = np.asarray(image)
     except Exception as error:  # Pillow raises several unrelated exception types for damaged files.
-        raise EntryError(f"{name}: the PNG data is corrupt ({escape_text(str(error))})") from error
+        found = f"the PNG data is corrupt ({escape_text(str(error))})"
+        raise EntryError(Problem("damaged", name, found)) from error
     if units.shape != shape or units.dtype.kind not in "ui":
-        raise EntryError(
-            f"{name}: the PNG decodes to {units.dtype} of shape {units.shape}, expected {format_shape(shape)}"
-        )
+        found = f"the PNG decodes to {units.dtype} of shape {units.shape}"
+        raise EntryError(Problem("invalid", name, found, format_shape(shape)))
     with np.errstate(over="ignore"):  # Overflow gives infinite depth, which counts as no prediction.
         return units.astype(np.float64) * depth_scale
 
@@ -195,24 +195,22 @@ def _read_chunks(name: str, data: memoryview) -> Iterator[tuple[bytes, memoryvie
     Raises ``EntryError`` for a truncated file, a wrong checksum or bytes after IEND.
     """
     if bytes(data[:8]) != _PNG_SIGNATURE:
-        raise EntryError(f"{name}: the bytes start with {bytes(data[:8])!r}, expected a PNG file")
+        raise EntryError(Problem("syntax", name, f"the bytes start with {bytes(data[:8])!r}", "a PNG file"))
     offset, kind = 8, b""
     while kind != b"IEND":
         length = int.from_bytes(data[offset : offset + 4], "big")
         end = offset + 12 + length
         if end > len(data):
-            raise EntryError(
-                f"{name}: the PNG is truncated at {len(data)} bytes, expected {max(end, offset + 12)} or more"
-            )
+            found = f"the PNG is truncated at {len(data)} bytes"
+            raise EntryError(Problem("damaged", name, found, f"{max(end, offset + 12)} or more"))
         kind, content = bytes(data[offset + 4 : offset + 8]), data[offset + 8 : end - 4]
         if zlib.crc32(data[offset + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            raise EntryError(
-                f"{name}: the PNG chunk at byte {offset} is corrupt: its checksum does not match the stored one"
-            )
+            found = f"the PNG chunk at byte {offset} is corrupt: its checksum does not match the stored one"
+            raise EntryError(Problem("damaged", name, found))
         yield kind, content
         offset = end
     if offset != len(data):
-        raise EntryError(f"{name}: {len(data) - offset} bytes follow the PNG's end, expected none")
+        raise EntryError(Problem("damaged", name, f"{len(data) - offset} bytes follow the PNG's end", "none"))
 
 
 def _check_png_header(
@@ -224,17 +222,19 @@ def _check_png_header(
         or len(content) != _IHDR.size
         or sum(chunk_kind == b"IHDR" for chunk_kind, _ in chunks) != 1
     ):
-        raise EntryError(f"{name}: the PNG does not start with its header chunk, expected exactly one IHDR")
+        found = "the PNG does not start with its header chunk"
+        raise EntryError(Problem("damaged", name, found, "exactly one IHDR"))
     header = _IHDR.unpack(content)
     width, height, bits, colour, compression, filtering, interlace = header
     if (bits, colour) != (16, 0):
         actual = f"{bits}-bit {_COLOUR_TYPES.get(colour, f'colour type {colour}')}"
-        raise EntryError(f"{name}: the PNG is {actual}, expected 16-bit greyscale")
+        raise EntryError(Problem("invalid", name, f"the PNG is {actual}", "16-bit greyscale"))
     if (height, width) != shape:
-        raise EntryError(f"{name}: the image is {height} x {width}, expected {format_shape(shape)} (H x W)")
+        found = f"the image is {height} x {width}"
+        raise EntryError(Problem("invalid", name, found, f"{format_shape(shape)} (H x W)"))
     if compression or filtering or interlace > 1:
         actual = f"compression {compression}, filter {filtering}, interlace {interlace}"
-        raise EntryError(f"{name}: the PNG header declares {actual}, expected 0, 0 and 0 or 1")
+        raise EntryError(Problem("invalid", name, f"the PNG header declares {actual}", "0, 0 and 0 or 1"))
     return header
 
 
@@ -252,17 +252,16 @@ def _filtered_row_bytes(shape: tuple[int, int], *, interlaced: bool) -> int:
 def _inflate_rows(name: str, chunks: list[tuple[bytes, memoryview]], expected: int) -> bytes:
     indices = [index for index, (kind, _) in enumerate(chunks) if kind == b"IDAT"]
     if not indices or any(after != before + 1 for before, after in pairwise(indices)):
-        raise EntryError(f"{name}: the PNG has {len(indices)} image chunks, expected one run of IDAT")
+        raise EntryError(Problem("damaged", name, f"the PNG has {len(indices)} image chunks", "one run of IDAT"))
     inflater = zlib.decompressobj()
     try:
         rows = inflater.decompress(b"".join(chunks[index][1] for index in indices), expected + 1)
     except zlib.error as error:
-        raise EntryError(f"{name}: the PNG image data is corrupt ({error})") from error
+        raise EntryError(Problem("damaged", name, f"the PNG image data is corrupt ({error})")) from error
     if len(rows) != expected or not inflater.eof:
         actual = f"more than {expected}" if len(rows) > expected else f"{len(rows)}"
-        raise EntryError(
-            f"{name}: the PNG image data inflates to {actual} bytes, expected {expected} and a complete stream"
-        )
+        found = f"the PNG image data inflates to {actual} bytes"
+        raise EntryError(Problem("size", name, found, f"{expected} and a complete stream"))
     return rows
 
 

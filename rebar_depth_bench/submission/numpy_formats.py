@@ -9,13 +9,14 @@ the archive itself.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rebar_depth_bench.errors import EntryError, escape_text, format_shape
+from rebar_depth_bench.errors import EntryError, Problem, escape_text, format_shape
 from rebar_depth_bench.submission.zip_directory import DirectoryError, MemorySource, read_directory
 from rebar_depth_bench.submission.zip_entries import check_entries, read_data
 
@@ -57,10 +58,8 @@ def decode_npy(name: str, data: memoryview, shape: tuple[int, int], depth_scale:
     actual_bytes = len(data) - header.data_offset
     expected_bytes = shape[0] * shape[1] * header.dtype.itemsize
     if actual_bytes != expected_bytes:
-        raise EntryError(
-            f"{name}: {actual_bytes} bytes of values follow the header, "
-            f"expected {expected_bytes} for {format_shape(shape)} {header.dtype.name}"
-        )
+        expected = f"{expected_bytes} for {format_shape(shape)} {header.dtype.name}"
+        raise EntryError(Problem("size", name, f"{actual_bytes} bytes of values follow the header", expected))
     values = np.frombuffer(data, header.dtype, offset=header.data_offset)
     array = values.reshape(shape[::-1]).T if header.fortran_order else values.reshape(shape)
     return np.require(array, array.dtype.newbyteorder("="), "A")
@@ -71,18 +70,18 @@ def _parse_header(name: str, data: memoryview, shape: tuple[int, int]) -> _Heade
     descr, fortran, shapes = (pattern.findall(text) for pattern in (_DESCR, _FORTRAN_ORDER, _SHAPE))
     remainder = _SHAPE.sub("", _FORTRAN_ORDER.sub("", _DESCR.sub("", text)))
     if not len(descr) == len(fortran) == len(shapes) == 1 or re.sub(r"[\s,]", "", remainder) != "{}":
-        raise EntryError(
-            f"{name}: the .npy header is {escape_text(text.strip())}, expected descr, fortran_order and shape"
-        )
+        found = f"the .npy header is {escape_text(text.strip())}"
+        raise EntryError(Problem("syntax", name, found, "descr, fortran_order and shape"))
     if _is_object(descr[0]):
-        raise EntryError(f"{name}: the array holds pickled Python objects (dtype object), expected float16/32/64")
+        found = "the array holds pickled Python objects (dtype object)"
+        raise EntryError(Problem("invalid", name, found, "float16/32/64"))
     if not _FLOAT_DESCR.fullmatch(descr[0]):
         actual = escape_text(descr[0]) if descr[0] else "structured"
-        raise EntryError(f"{name}: the dtype is {actual}, expected float16, float32 or float64")
+        raise EntryError(Problem("invalid", name, f"the dtype is {actual}", "float16, float32 or float64"))
     actual_shape = [escape_text(size) for size in shapes[0].replace("L", "").replace(",", " ").split()]
     if actual_shape != [str(size) for size in shape]:
         actual = " x ".join(actual_shape) if actual_shape else "a single value"
-        raise EntryError(f"{name}: the shape is {actual}, expected {format_shape(shape)} (H x W)")
+        raise EntryError(Problem("invalid", name, f"the shape is {actual}", f"{format_shape(shape)} (H x W)"))
     return _Header(np.dtype(descr[0].replace("|", "=")), fortran[0] == "True", data_offset)
 
 
@@ -96,15 +95,15 @@ def _header_text(name: str, head: bytes) -> tuple[str, int]:
     if version not in _LENGTH_BYTES:
         pickled = head[:1] == b"\x80"
         actual = "a Python pickle" if pickled else f"bytes that start with {head[:8]!r}"
-        raise EntryError(f"{name}: {actual} was found, expected a .npy array of version 1, 2 or 3")
+        raise EntryError(Problem("syntax", name, f"{actual} was found", "a .npy array of version 1, 2 or 3"))
     start = 8 + _LENGTH_BYTES[version]
     length = int.from_bytes(head[8:start], "little")
     if start + length > MAX_HEADER_BYTES:
-        raise EntryError(
-            f"{name}: the .npy header declares {length} bytes, expected at most {MAX_HEADER_BYTES - start}"
-        )
+        found = f"the .npy header declares {length} bytes"
+        raise EntryError(Problem("size", name, found, f"at most {MAX_HEADER_BYTES - start}"))
     if start + length > len(head):
-        raise EntryError(f"{name}: the .npy header is cut off at {len(head)} bytes, expected {start + length}")
+        found = f"the .npy header is cut off at {len(head)} bytes"
+        raise EntryError(Problem("damaged", name, found, f"{start + length}"))
     return head[start : start + length].decode("utf-8", "backslashreplace"), start + length
 
 
@@ -125,18 +124,24 @@ def decode_npz(name: str, data: memoryview, shape: tuple[int, int], depth_scale:
     try:
         directory = read_directory(source, _MAX_NPZ_MEMBERS)
     except DirectoryError as error:
-        raise EntryError(f"{name}: inside the .npz, {error}") from error
+        raise _inner_error(name, error.problems) from error
     members = [escape_text(entry.name) for entry in directory.entries]
     if len(members) != 1:
         listed = f" ({', '.join(members[:4])}{', ...' if len(members) > 4 else ''})" if members else ""
-        raise EntryError(f"{name}: the .npz holds {len(members)} arrays{listed}, expected exactly one")
+        raise EntryError(Problem("invalid", name, f"the .npz holds {len(members)} arrays{listed}", "exactly one"))
     (checked,) = check_entries(source, directory, lambda _: max_npy_bytes(shape))
     if checked.problems:
-        raise EntryError(f"{name}: inside the .npz, {'; '.join(checked.problems)}")
+        raise _inner_error(name, checked.problems)
     if not checked.entry.name.endswith(".npy"):
-        raise EntryError(f"{name}: the .npz holds {members[0]}, expected one .npy array")
+        raise EntryError(Problem("invalid", name, f"the .npz holds {members[0]}", "one .npy array"))
     try:
         values = read_data(source, checked)
     except EntryError as error:
-        raise EntryError(f"{name}: inside the .npz, {error.problem}") from error
+        raise _inner_error(name, error.problems) from error
     return decode_npy(f"{name} ({members[0]})", values, shape, depth_scale)
+
+
+def _inner_error(name: str, problems: Sequence[Problem]) -> EntryError:
+    """Return the error of an ``.npz`` entry whose zip or member has the given problems."""
+    found = f"inside the .npz, {'; '.join(map(str, problems))}"
+    return EntryError(Problem(problems[0].code, name, found))

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import Self
 
-from rebar_depth_bench.errors import EntryError
+from rebar_depth_bench.errors import EntryError, Problem
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.submission.entries import ExpectedViews, match_entries, max_entry_bytes
 from rebar_depth_bench.submission.formats import FORMATS, Depth
-from rebar_depth_bench.submission.metadata import METADATA_NAME, MetadataError, SubmissionMeta, parse_metadata
+from rebar_depth_bench.submission.metadata import METADATA_NAME, SubmissionMeta, parse_metadata
 from rebar_depth_bench.submission.zip_directory import ByteSource, DirectoryError, FileSource, read_directory
 from rebar_depth_bench.submission.zip_entries import CheckedEntry, check_entries, has_unsafe_name, read_data
 
@@ -23,7 +23,7 @@ from rebar_depth_bench.submission.zip_entries import CheckedEntry, check_entries
 class _Inspection:
     """Result of the structural checks, which decode no view; ``views`` has the entries without problems."""
 
-    problems: tuple[str, ...]
+    problems: tuple[Problem, ...]
     views: Mapping[str, CheckedEntry] = field(default_factory=dict)
     meta: SubmissionMeta | None = None
 
@@ -47,14 +47,17 @@ class SubmissionReader:
         try:
             self._source = FileSource(self.path)
         except OSError as error:
-            return _Inspection((f"the file cannot be opened: {error.strerror}, expected a readable zip archive",))
+            found = f"the file cannot be opened: {error.strerror}"
+            return _Inspection((Problem("invalid", "", found, "a readable zip archive"),))
         try:
             return _inspect(self._source, self._expected)
-        except (DirectoryError, EOFError) as error:
-            return _Inspection((str(error),))
+        except DirectoryError as error:
+            return _Inspection(error.problems)
+        except EOFError as error:
+            return _Inspection((Problem("damaged", "", str(error)),))
 
     @property
-    def structure_problems(self) -> tuple[str, ...]:
+    def structure_problems(self) -> tuple[Problem, ...]:
         """Problems that are detected without decoding a view, in a fixed order."""
         return self._inspection.problems
 
@@ -77,10 +80,11 @@ class SubmissionReader:
         """
         scale = self.meta.depth_scale if self.meta else None
         if scale is None and self._suffix(view_id) == ".png":
-            raise EntryError(f"{view_id}.png: {METADATA_NAME} has no depth_scale, expected metres per PNG unit")
+            found = f"{METADATA_NAME} has no depth_scale"
+            raise EntryError(Problem("missing", f"{view_id}.png", found, "metres per PNG unit"))
         return self._decode(view_id, scale or 1.0)
 
-    def problems(self, progress: Progress = silent) -> Iterator[str]:
+    def problems(self, progress: Progress = silent) -> Iterator[Problem]:
         """Yield all problems: structural ones first, then decoding errors of each view in sorted order."""
         yield from self.structure_problems
         scale = self.meta.depth_scale if self.meta else None
@@ -106,7 +110,9 @@ class SubmissionReader:
     def _suffix(self, view_id: str) -> str:
         checked = self._inspection.views.get(view_id)
         if checked is None:
-            raise EntryError(f"{view_id}: no valid entry was found, expected one of {', '.join(FORMATS)}")
+            raise EntryError(
+                Problem("missing", view_id, "no valid entry was found", f"one of {', '.join(FORMATS)}")
+            )
         return PurePosixPath(checked.entry.name).suffix
 
     def _decode(self, view_id: str, scale: float) -> Depth:
@@ -133,23 +139,26 @@ def open_submission(path: str | os.PathLike[str], expected: ExpectedViews) -> Su
     return SubmissionReader(path, expected)
 
 
-def check_archive(path: str | os.PathLike[str], expected: ExpectedViews, progress: Progress = silent) -> list[str]:
+def check_archive(
+    path: str | os.PathLike[str], expected: ExpectedViews, progress: Progress = silent
+) -> list[Problem]:
     """Return all problems of an archive, including decoding errors of each entry; empty if it can be scored."""
     with open_submission(path, expected) as reader:
         return list(reader.problems(progress))
 
 
-def _file_problem(path: Path) -> str | None:
+def _file_problem(path: Path) -> Problem | None:
+    expected = "a zip archive"
     try:
         status = path.stat()
     except (OSError, ValueError) as error:
         reason = "it does not exist" if isinstance(error, FileNotFoundError) else str(error)
-        return f"the file cannot be read: {reason}, expected a zip archive"
+        return Problem("missing", "", f"the file cannot be read: {reason}", expected)
     if stat.S_ISDIR(status.st_mode):
-        return "the path is a directory, expected a zip archive"
+        return Problem("kind", "", "the path is a directory", expected)
     if not stat.S_ISREG(status.st_mode):
-        return "the path is not a regular file, expected a zip archive"
-    return None if status.st_size else "the file is empty (0 bytes), expected a zip archive"
+        return Problem("kind", "", "the path is not a regular file", expected)
+    return None if status.st_size else Problem("syntax", "", "the file is empty (0 bytes)", expected)
 
 
 def _inspect(source: ByteSource, expected: ExpectedViews) -> _Inspection:
@@ -174,22 +183,20 @@ def _inspect(source: ByteSource, expected: ExpectedViews) -> _Inspection:
     return _Inspection(problems, valid_views, meta)
 
 
-def _read_meta(source: ByteSource, checked: CheckedEntry | None) -> tuple[SubmissionMeta | None, list[str]]:
+def _read_meta(
+    source: ByteSource, checked: CheckedEntry | None
+) -> tuple[SubmissionMeta | None, Sequence[Problem]]:
     if checked is None or checked.problems:
         return None, []
     try:
-        return parse_metadata(bytes(read_data(source, checked))), []
+        return parse_metadata(bytes(read_data(source, checked)))
     except EntryError as error:
-        return None, [error.problem]
-    except MetadataError as error:
-        return None, [f"{METADATA_NAME}: {problem}" for problem in error.problems]
+        return None, error.problems
 
 
-def _scale_problems(meta: SubmissionMeta | None, views: Mapping[str, CheckedEntry]) -> list[str]:
+def _scale_problems(meta: SubmissionMeta | None, views: Mapping[str, CheckedEntry]) -> list[Problem]:
     images = sorted(item.entry.name for item in views.values() if item.entry.name.endswith(".png"))
     if meta is None or meta.depth_scale is not None or not images:
         return []
-    return [
-        f"{METADATA_NAME}: depth_scale is missing, expected metres per PNG unit, "
-        f"because {len(images)} entries are PNG (first {images[0]})"
-    ]
+    because = f"because {len(images)} entries are PNG (first {images[0]})"
+    return [Problem("missing", METADATA_NAME, "depth_scale is missing", f"metres per PNG unit, {because}")]

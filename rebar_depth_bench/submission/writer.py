@@ -16,15 +16,10 @@ from typing import BinaryIO, Self
 import numpy as np
 
 from rebar_depth_bench.atomic_io import atomic_replace
-from rebar_depth_bench.errors import InputError, escape_text
-from rebar_depth_bench.submission.metadata import (
-    METADATA_NAME,
-    description_problems,
-    method_problems,
-    type_problems,
-    url_problems,
-)
+from rebar_depth_bench.errors import InputError, Problem, escape_text
+from rebar_depth_bench.submission.metadata import METADATA_NAME, SubmissionMeta
 from rebar_depth_bench.submission.numpy_formats import Depth
+from rebar_depth_bench.validation import validate_table
 
 _VIEW_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}/[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -61,7 +56,7 @@ class SubmissionWriter:
         """Check the metadata. Raises ``InputError`` if a reader would reject it."""
         self.path = Path(path)
         self._compression = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
-        self._metadata: dict[str, object] = {
+        metadata = {
             "method": method,
             "description": description,
             "url": url,
@@ -69,7 +64,8 @@ class SubmissionWriter:
             "runtime": None if runtime is None else dict(runtime),
             "notes": None if notes is None else dict(notes),
         }
-        _check_metadata(self._metadata)
+        self._metadata = {key: value for key, value in metadata.items() if value is not None}
+        _check_metadata(self.path, self._metadata)
         self._seconds: dict[str, float] = {}
         self._view_ids: set[str] = set()
         self._open = ExitStack()
@@ -130,9 +126,9 @@ class SubmissionWriter:
                 archive.fp = None
 
     def _metadata_bytes(self) -> bytes:
-        values = {key: value for key, value in self._metadata.items() if value is not None}
+        values = dict(self._metadata)
         if self._seconds:
-            runtime = self._metadata["runtime"]
+            runtime = values.get("runtime")
             values["runtime"] = {**(runtime if isinstance(runtime, dict) else {}), "seconds": self._seconds}
         return (json.dumps(values, indent=2, sort_keys=True) + "\n").encode("utf-8")
 
@@ -180,16 +176,13 @@ def _padding_field(values_offset: int) -> bytes:
     return _PADDING_FIELD_ID.to_bytes(2, "little") + length.to_bytes(2, "little") + bytes(length)
 
 
-def _check_metadata(values: Mapping[str, object]) -> None:
-    problems = [
-        *method_problems(values["method"]),
-        *description_problems(values["description"]),
-        *url_problems(values["url"]),
-        *type_problems("uses_intrinsics", values["uses_intrinsics"], bool),
-    ]
+def _check_metadata(archive: Path, values: Mapping[str, object]) -> None:
+    problems: list[Problem] = []
+    validate_table(SubmissionMeta, values, problems)
     try:
         json.dumps(values, allow_nan=False, ensure_ascii=False).encode("utf-8")
     except (TypeError, ValueError) as error:
-        problems.append(f"the metadata is not JSON ({error}), expected text, finite numbers, lists and objects")
+        found = f"the metadata is not JSON ({error})"
+        problems.append(Problem("invalid", "", found, "text, finite numbers, lists and objects"))
     if problems:
-        raise InputError("; ".join(problems))
+        raise InputError.from_problems(archive, problems)

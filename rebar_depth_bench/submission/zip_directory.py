@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from rebar_depth_bench.errors import EntryError, Problem
+
 # For smaller reads, pread is cheaper than a mapping and its page faults.
 _MIN_MAPPED_BYTES = 64 * 1024
 
@@ -107,8 +109,8 @@ _UTF8_NAME = 0x800
 _MAX_BYTES_PER_RECORD = 512
 
 
-class DirectoryError(Exception):
-    """Error for a file that is not a zip or has an invalid directory; the message is one sentence."""
+class DirectoryError(EntryError):
+    """File that is not a zip or has an invalid directory; ``where`` of the problem is empty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,16 +154,13 @@ def read_directory(source: ByteSource, max_entries: int) -> Directory:
     """
     end = _find_end_record(source)
     if end.count > max_entries or end.size > max_entries * _MAX_BYTES_PER_RECORD:
-        raise DirectoryError(
-            f"the zip directory declares {end.count} entries in {end.size} bytes, "
-            f"expected at most {max_entries} entries in {max_entries * _MAX_BYTES_PER_RECORD} bytes"
-        )
+        found = f"the zip directory declares {end.count} entries in {end.size} bytes"
+        expected = f"at most {max_entries} entries in {max_entries * _MAX_BYTES_PER_RECORD} bytes"
+        raise DirectoryError(Problem("size", "", found, expected))
     if end.offset + end.size != end.position:
-        raise DirectoryError(
-            f"the zip directory is declared at bytes {end.offset} to {end.offset + end.size}, "
-            f"expected it to end at byte {end.position}: "
-            "the file is truncated, damaged or has bytes before the archive"
-        )
+        found = f"the zip directory is declared at bytes {end.offset} to {end.offset + end.size}"
+        reason = "the file is truncated, damaged or has bytes before the archive"
+        raise DirectoryError(Problem("damaged", "", found, f"it to end at byte {end.position}: {reason}"))
     data = bytes(source.read_at(end.offset, end.size))
     return Directory(_parse_records(data, end.count), end.offset)
 
@@ -180,8 +179,10 @@ def _find_end_record(source: ByteSource) -> _EndRecord:
             )
         offset = tail.rfind(b"PK\x05\x06", 0, offset + 3)
     if bytes(source.read_at(0, min(4, source.size))) == b"PK\x03\x04":
-        raise DirectoryError("the zip has no end record, expected one at the end: the file is truncated")
-    raise DirectoryError("the file is not a zip: no zip end record was found, expected a zip archive")
+        found = "the zip has no end record"
+        raise DirectoryError(Problem("damaged", "", found, "one at the end: the file is truncated"))
+    found = "the file is not a zip: no zip end record was found"
+    raise DirectoryError(Problem("syntax", "", found, "a zip archive"))
 
 
 def _parse_end_record(source: ByteSource, position: int, record: bytes) -> _EndRecord:
@@ -191,16 +192,13 @@ def _parse_end_record(source: ByteSource, position: int, record: bytes) -> _EndR
     if zip64 is not None:
         position, expected = zip64
         if any(a not in (b, limit) for a, b, limit in zip(fields, expected, full, strict=True)):
-            raise DirectoryError(
-                f"the zip end record declares {fields}, expected the zip64 end record's {expected}"
-            )
+            found = f"the zip end record declares {fields}"
+            raise DirectoryError(Problem("damaged", "", found, f"the zip64 end record's {expected}"))
         fields = expected
     disk, start_disk, here, count, size, offset = fields
     if disk or start_disk or here != count:
-        raise DirectoryError(
-            f"the zip is part of a multi-disk set (disk {disk}, {here} of {count} entries), "
-            "expected a single complete file"
-        )
+        found = f"the zip is part of a multi-disk set (disk {disk}, {here} of {count} entries)"
+        raise DirectoryError(Problem("kind", "", found, "a single complete file"))
     return _EndRecord(position, count, size, offset)
 
 
@@ -214,14 +212,15 @@ def _find_zip64_end_record(source: ByteSource, position: int) -> tuple[int, tupl
     if magic != b"PK\x06\x07":
         return None
     if disk or disks > 1:
-        raise DirectoryError(f"the zip is part of a multi-disk set of {disks}, expected a single complete file")
+        found = f"the zip is part of a multi-disk set of {disks}"
+        raise DirectoryError(Problem("kind", "", found, "a single complete file"))
     if record_offset + _ZIP64_END_RECORD.size > locator_offset:
-        raise DirectoryError(
-            f"the zip64 end record is declared at byte {record_offset}, expected it before byte {locator_offset}"
-        )
+        found = f"the zip64 end record is declared at byte {record_offset}"
+        raise DirectoryError(Problem("damaged", "", found, f"it before byte {locator_offset}"))
     magic, length, _, _, *fields = _ZIP64_END_RECORD.unpack(source.read_at(record_offset, _ZIP64_END_RECORD.size))
     if magic != b"PK\x06\x06" or record_offset + 12 + length != locator_offset:
-        raise DirectoryError(f"no complete zip64 end record was found at byte {record_offset}, expected one")
+        found = f"no complete zip64 end record was found at byte {record_offset}"
+        raise DirectoryError(Problem("damaged", "", found, "one"))
     return record_offset, tuple(fields)
 
 
@@ -232,16 +231,15 @@ def _parse_records(data: bytes, count: int) -> tuple[ZipEntry, ...]:
         entry, offset = _parse_record(data, offset, len(entries))
         entries.append(entry)
     if len(entries) != count or offset != len(data):
-        raise DirectoryError(
-            f"the zip directory holds {len(entries)} entries in {offset} bytes, "
-            f"expected the declared {count} in {len(data)} bytes"
-        )
+        found = f"the zip directory holds {len(entries)} entries in {offset} bytes"
+        raise DirectoryError(Problem("damaged", "", found, f"the declared {count} in {len(data)} bytes"))
     return tuple(entries)
 
 
 def _parse_record(data: bytes, start: int, index: int) -> tuple[ZipEntry, int]:
     if start + _DIRECTORY_RECORD.size > len(data) or data[start : start + 4] != b"PK\x01\x02":
-        raise DirectoryError(f"no zip directory record was found for entry {index}, expected one at +{start}")
+        found = f"no zip directory record was found for entry {index}"
+        raise DirectoryError(Problem("damaged", "", found, f"one at +{start}"))
     fields = _DIRECTORY_RECORD.unpack_from(data, start)
     flags, method = fields[5], fields[6]
     crc, compressed, size, name_length, extra_length, comment_length, disk = fields[9:16]
@@ -249,7 +247,8 @@ def _parse_record(data: bytes, start: int, index: int) -> tuple[ZipEntry, int]:
     name_end = start + _DIRECTORY_RECORD.size + name_length
     extra_end = name_end + extra_length
     if extra_end + comment_length > len(data):
-        raise DirectoryError(f"the zip directory record of entry {index} extends past the directory's end")
+        found = f"the zip directory record of entry {index} extends past the directory's end"
+        raise DirectoryError(Problem("damaged", "", found))
     raw_name = data[start + _DIRECTORY_RECORD.size : name_end]
     name = raw_name.decode("utf-8" if flags & _UTF8_NAME else "cp437", errors="backslashreplace")
     size, compressed, offset = _apply_zip64_sizes((size, compressed, offset), data[name_end:extra_end], index)
@@ -264,7 +263,8 @@ def _apply_zip64_sizes(values: tuple[int, int, int], extra: bytes, index: int) -
     zip64_values = _zip64_field(extra)
     needed = sum(value == _FULL32 for value in values)
     if len(zip64_values) < 8 * needed:
-        raise DirectoryError(f"the zip directory record of entry {index} lacks its zip64 sizes, expected {needed}")
+        found = f"the zip directory record of entry {index} lacks its zip64 sizes"
+        raise DirectoryError(Problem("damaged", "", found, f"{needed}"))
     replacements = iter(struct.unpack_from(f"<{needed}Q", zip64_values))
     size, compressed, offset = (next(replacements) if value == _FULL32 else value for value in values)
     return size, compressed, offset

@@ -10,12 +10,12 @@ import re
 import stat
 import struct
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from zlib_ng import zlib_ng
 
-from rebar_depth_bench.errors import EntryError, escape_text
+from rebar_depth_bench.errors import EntryError, Problem, escape_text
 from rebar_depth_bench.submission.zip_directory import ByteSource, Directory, ZipEntry
 
 STORED = 0
@@ -44,7 +44,7 @@ class CheckedEntry:
 
     entry: ZipEntry
     data_offset: int
-    problems: tuple[str, ...]
+    problems: tuple[Problem, ...]
 
     @property
     def span(self) -> tuple[int, int]:
@@ -54,7 +54,7 @@ class CheckedEntry:
 
 def has_unsafe_name(entry: ZipEntry) -> bool:
     """Return whether the name escapes the archive or has control characters."""
-    return bool(_name_problems(entry))
+    return _name_problem(entry) is not None
 
 
 def check_entries(source: ByteSource, directory: Directory, limit: SizeLimit) -> tuple[CheckedEntry, ...]:
@@ -69,70 +69,69 @@ def check_entries(source: ByteSource, directory: Directory, limit: SizeLimit) ->
 
 def _check_entry(source: ByteSource, entry: ZipEntry, directory_offset: int, limit: SizeLimit) -> CheckedEntry:
     data_offset, local_problems = _check_local_header(source, entry, directory_offset)
-    problems = [*_name_problems(entry), *_type_problems(entry), *_size_problems(entry, limit), *local_problems]
-    return CheckedEntry(entry, data_offset, tuple(f"{escape_text(entry.name)}: {problem}" for problem in problems))
+    name_problem = _name_problem(entry)
+    problems = [name_problem] if name_problem else []
+    problems += [*_type_problems(entry), *_size_problems(entry, limit), *local_problems]
+    return CheckedEntry(entry, data_offset, tuple(problems))
 
 
-def _name_problems(entry: ZipEntry) -> list[str]:
+def _name_problem(entry: ZipEntry) -> Problem | None:
     name = entry.name
     if any(ord(character) < 32 or ord(character) == 127 for character in name):
-        return ["the name has a control character, expected plain text"]
-    escapes = name.startswith("/") or "\\" in name or re.match(r"[A-Za-z]:", name) or ".." in name.split("/")
-    return (
-        ["the name escapes the archive, expected a relative path without '..', '\\' or a drive"] if escapes else []
-    )
+        return Problem("name", escape_text(name), "the name has a control character", "plain text")
+    if name.startswith("/") or "\\" in name or re.match(r"[A-Za-z]:", name) or ".." in name.split("/"):
+        expected = "a relative path without '..', '\\' or a drive"
+        return Problem("name", escape_text(name), "the name escapes the archive", expected)
+    return None
 
 
-def _type_problems(entry: ZipEntry) -> list[str]:
-    problems = []
+def _type_problems(entry: ZipEntry) -> Iterator[Problem]:
+    name = escape_text(entry.name)
     kind = stat.S_IFMT(entry.unix_mode)
     if kind not in (0, stat.S_IFREG) and not (kind == stat.S_IFDIR and entry.name.endswith("/")):
-        problems.append(
-            f"the entry is {_FILE_TYPES.get(kind, f'of file type {kind:#o}')}, expected a regular file"
-        )
+        file_type = _FILE_TYPES.get(kind, f"of file type {kind:#o}")
+        yield Problem("kind", name, f"the entry is {file_type}", "a regular file")
     if entry.flags & _ENCRYPTED:
-        problems.append("the entry is encrypted, expected plain data")
+        yield Problem("kind", name, "the entry is encrypted", "plain data")
     if entry.flags & _PATCH_DATA:
-        problems.append("the entry is patch data, expected plain data")
+        yield Problem("kind", name, "the entry is patch data", "plain data")
     if entry.method not in (STORED, DEFLATED):
-        problems.append(
-            f"the compression method is {entry.method}, expected {STORED} (stored) or {DEFLATED} (deflated)"
-        )
+        expected = f"{STORED} (stored) or {DEFLATED} (deflated)"
+        yield Problem("kind", name, f"the compression method is {entry.method}", expected)
     if entry.disk:
-        problems.append(f"the entry is on disk {entry.disk} of a multi-disk set, expected a single complete file")
-    return problems
+        found = f"the entry is on disk {entry.disk} of a multi-disk set"
+        yield Problem("kind", name, found, "a single complete file")
 
 
-def _size_problems(entry: ZipEntry, limit: SizeLimit) -> list[str]:
-    problems = []
+def _size_problems(entry: ZipEntry, limit: SizeLimit) -> Iterator[Problem]:
+    name = escape_text(entry.name)
     allowed = 0 if entry.name.endswith("/") else limit(entry.name)
     if allowed is not None and entry.size > allowed:
-        problems.append(f"the declared size is {entry.size} bytes, expected at most {allowed}")
+        yield Problem("size", name, f"the declared size is {entry.size} bytes", f"at most {allowed}")
     if entry.method == STORED and entry.compressed_size != entry.size:
-        problems.append(f"{entry.compressed_size} bytes are stored, expected the declared {entry.size}")
+        yield Problem("size", name, f"{entry.compressed_size} bytes are stored", f"the declared {entry.size}")
     # Deflate enlarges incompressible data by at most 5 bytes per block of 16 KiB.
     max_compressed = entry.size + entry.size // 1024 + 1024
     if entry.method == DEFLATED and entry.compressed_size > max_compressed:
-        problems.append(
-            f"{entry.compressed_size} bytes are deflated for {entry.size}, expected at most {max_compressed}"
-        )
-    return problems
+        found = f"{entry.compressed_size} bytes are deflated for {entry.size}"
+        yield Problem("size", name, found, f"at most {max_compressed}")
 
 
-def _check_local_header(source: ByteSource, entry: ZipEntry, directory_offset: int) -> tuple[int, list[str]]:
+def _check_local_header(source: ByteSource, entry: ZipEntry, directory_offset: int) -> tuple[int, list[Problem]]:
     """Compare the entry with its local header; return its data's byte offset (0 if unknown) and the problems."""
-    start = entry.header_offset
+    start, name = entry.header_offset, escape_text(entry.name)
+    before_directory = f"it before the directory at {directory_offset}"
     if start + _LOCAL_HEADER.size > directory_offset:
-        return 0, [f"the data is declared at byte {start}, expected it before the directory at {directory_offset}"]
+        return 0, [Problem("damaged", name, f"the data is declared at byte {start}", before_directory)]
     magic, _, flags, method, _, _, crc, compressed, size, name_length, extra_length = _LOCAL_HEADER.unpack(
         source.read_at(start, _LOCAL_HEADER.size)
     )
     if magic != b"PK\x03\x04":
-        return 0, [f"no local header was found at byte {start}, expected one"]
+        return 0, [Problem("damaged", name, f"no local header was found at byte {start}", "one")]
     data_offset = start + _LOCAL_HEADER.size + name_length + extra_length
     end = data_offset + entry.compressed_size
     if end > directory_offset:
-        return 0, [f"the data ends at byte {end}, expected it before the directory at {directory_offset}"]
+        return 0, [Problem("damaged", name, f"the data ends at byte {end}", before_directory)]
     raw_name = bytes(source.read_at(start + _LOCAL_HEADER.size, name_length))
     comparisons: list[tuple[str, object, object]] = [
         ("name", raw_name, entry.raw_name),
@@ -145,25 +144,29 @@ def _check_local_header(source: ByteSource, entry: ZipEntry, directory_offset: i
         comparisons += [("size", size, entry.size)] if size != _FULL32 else []
         comparisons += [("compressed size", compressed, entry.compressed_size)] if compressed != _FULL32 else []
     return data_offset, [
-        f"the {field} in the local header is {escape_text(str(local))}, "
-        f"expected the directory's {escape_text(str(central))}"
+        Problem(
+            "damaged",
+            name,
+            f"the {field} in the local header is {escape_text(str(local))}",
+            f"the directory's {escape_text(str(central))}",
+        )
         for field, local, central in comparisons
         if local != central
     ]
 
 
-def _overlap_problems(checked: Sequence[CheckedEntry]) -> dict[int, tuple[str, ...]]:
+def _overlap_problems(checked: Sequence[CheckedEntry]) -> dict[int, tuple[Problem, ...]]:
     """Return, by entry index, the problem of every entry whose byte range overlaps that of another entry."""
     located = [index for index, check in enumerate(checked) if check.data_offset]
     located.sort(key=lambda index: (checked[index].span, index))
-    problems: dict[int, tuple[str, ...]] = {}
+    problems: dict[int, tuple[Problem, ...]] = {}
     widest = -1
     for index in located:
         start, end = checked[index].span
         if widest >= 0 and start < checked[widest].span[1]:
             name, other = escape_text(checked[index].entry.name), escape_text(checked[widest].entry.name)
-            problem = f"{name}: the data from byte {start} overlaps that of {other}, expected separate data"
-            problems[index] = (problem,)
+            found = f"the data from byte {start} overlaps that of {other}"
+            problems[index] = (Problem("damaged", name, found, "separate data"),)
         if widest < 0 or end > checked[widest].span[1]:
             widest = index
     return problems
@@ -180,13 +183,15 @@ def read_data(source: ByteSource, checked: CheckedEntry) -> memoryview:
     try:
         data = source.read_at(checked.data_offset, entry.compressed_size)
     except EOFError as error:
-        raise EntryError(f"{name}: the archive was truncated while it was read: {error}") from error
+        found = f"the archive was truncated while it was read: {error}"
+        raise EntryError(Problem("damaged", name, found)) from error
     if entry.method == DEFLATED:
         data = _inflate(name, data, entry.size)
     # zlib-ng's CRC-32 is six times as fast as zlib's, whose time exceeds the rest of reading a view.
     crc = zlib_ng.crc32(data)
     if crc != entry.crc:
-        raise EntryError(f"{name}: the data is corrupt: its checksum is {crc:08x}, expected {entry.crc:08x}")
+        found = f"the data is corrupt: its checksum is {crc:08x}"
+        raise EntryError(Problem("damaged", name, found, f"{entry.crc:08x}"))
     return data
 
 
@@ -196,11 +201,15 @@ def _inflate(name: str, data: memoryview, size: int) -> memoryview:
         # One byte more than declared suffices to detect a stream that is too long.
         inflated = inflater.decompress(data, size + 1)
     except zlib.error as error:
-        raise EntryError(f"{name}: the deflated data is corrupt ({error}), expected {size} bytes") from error
+        found = f"the deflated data is corrupt ({error})"
+        raise EntryError(Problem("damaged", name, found, f"{size} bytes")) from error
     if len(inflated) > size:
-        raise EntryError(f"{name}: the data inflates to more than {size} bytes, expected the declared {size}")
+        found = f"the data inflates to more than {size} bytes"
+        raise EntryError(Problem("size", name, found, f"the declared {size}"))
     if not inflater.eof or len(inflated) != size:
-        raise EntryError(f"{name}: the data inflates to {len(inflated)} bytes and stops, expected {size}")
+        found = f"the data inflates to {len(inflated)} bytes and stops"
+        raise EntryError(Problem("size", name, found, f"{size}"))
     if inflater.unused_data:
-        raise EntryError(f"{name}: {len(inflater.unused_data)} bytes follow the deflated data, expected none")
+        found = f"{len(inflater.unused_data)} bytes follow the deflated data"
+        raise EntryError(Problem("damaged", name, found, "none"))
     return memoryview(inflated)

@@ -17,6 +17,7 @@ import httpx2
 import pytest
 
 from rebar_depth_bench import load
+from rebar_depth_bench.errors import Problem
 from tests.leaderboard.conftest import SharedServer, WriteArchive, filled_board
 from tests.leaderboard.postgres import Postgres
 from tests.leaderboard.serving import RunServer, Server
@@ -173,6 +174,8 @@ def test_rejected_archive_lists_problems_and_keeps_quota(
     for view_id in view_ids(tiny_root):
         assert any(view_id in problem for problem in problems), problems
     assert not any(str(private_server.state) in problem for problem in problems)
+    details = [Problem(**detail) for detail in response.json()["problem_details"]]
+    assert [str(detail) for detail in details] == problems
     assert private_server.submit(small_archive, token).status_code == 202
 
 
@@ -294,6 +297,9 @@ def test_leaderboard_without_config_is_422(board: SharedServer) -> None:
     response = call(board.server, "GET", "/api/v1/leaderboard")
     assert response.status_code == 422
     assert response.json()["problems"] == ["query.config: Field required"]
+    assert response.json()["problem_details"] == [
+        {"code": "missing", "where": "query.config", "found": "Field required", "expected": ""}
+    ]
 
 
 def test_all_responses_have_security_headers(board: SharedServer) -> None:

@@ -52,7 +52,7 @@ def add_scored_submission(
     record = find_token(database, token)
     assert record is not None
     submission_id = submissions.new_id()
-    upload = Upload(SubmissionMeta(method), "0" * 64, 1, "sha256:0")
+    upload = Upload(SubmissionMeta(method=method), "0" * 64, 1, "sha256:0")
     submissions.accept(database, submission_id, record, upload, 1000, public)
     finish_scoring(database, submission_id, method, error)
     return submission_id

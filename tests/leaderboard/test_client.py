@@ -148,6 +148,7 @@ def test_client_library_raises_errors_of_command(board: SharedServer, tmp_path: 
         (tmp_path / "broken.zip").write_bytes(b"x")
         with pytest.raises(SubmissionError) as raised:
             leaderboard.submit(tmp_path / "broken.zip")
+        assert "the file is not a zip" in str(raised.value)
         assert raised.value.problems
         with pytest.raises(ServiceError, match="status for the result is 404"):
             leaderboard.result("nope")

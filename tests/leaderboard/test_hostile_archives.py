@@ -18,6 +18,7 @@ import pytest
 
 from rebar_depth_bench import load
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem
 from rebar_depth_bench.scoring.ground_truth import config_truth
 from tests.leaderboard.hostile_zips import (
     KINDS,
@@ -168,12 +169,14 @@ def test_rejections_list_readable_problems_without_secrets(attack: AttackResult,
     for kind, response in attack.answers:
         if response.status_code == 422:
             content = response.json()
-            assert set(content) == {"detail", "problems"}
+            assert set(content) == {"detail", "problems", "problem_details"}
             assert content["problems"], kind
             assert all(
                 isinstance(problem, str) and problem.isprintable() and 10 < len(problem) < 2000
                 for problem in content["problems"]
             )
+            details = [str(Problem(**detail)) for detail in content["problem_details"]]
+            assert details == content["problems"][:MAX_PROBLEMS_SHOWN]
             assert "problem" in content["detail"]
             assert not any(secret in response.text for secret in secrets), response.text
 

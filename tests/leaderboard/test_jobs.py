@@ -44,7 +44,7 @@ def alice(database: Database) -> TokenModel:
 def queue(database: Database, token: TokenModel, count: int, quota: int = 1000) -> list[str]:
     ids = [submissions.new_id() for _ in range(count)]
     for submission_id in ids:
-        upload = Upload(SubmissionMeta("m"), "0" * 64, 5, "sha256:0")
+        upload = Upload(SubmissionMeta(method="m"), "0" * 64, 5, "sha256:0")
         submissions.accept(database, submission_id, token, upload, quota, True)
     return ids
 

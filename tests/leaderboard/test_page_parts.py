@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
+from fastapi import Request
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -24,7 +25,8 @@ from leaderboard.web.pages.leaderboard import (
     parse_order,
     sort_indices,
 )
-from leaderboard.web.pages.rendering import clean_text, format_size, format_time, link
+from leaderboard.web.pages.rendering import clean_text, error_response, format_size, format_time, link
+from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.reporting.html.rows import table_row
 from rebar_depth_bench.scoring.result import tabulate
 from rebar_depth_bench.scoring.result_io import read_result
@@ -217,3 +219,14 @@ def test_clean_text_keeps_newlines_and_removes_controls() -> None:
         "8 GiB",
         "21.1 MiB",
     ]
+
+
+@pytest.mark.parametrize(("limit", "shown"), [(20, 20), (None, 23)])
+def test_error_response_lists_text_and_details_in_same_order(limit: int | None, shown: int) -> None:
+    request = Request({"type": "http", "path": "/api/v1/submissions", "headers": []})
+    problems = [Problem("invalid", f"{index}.npy", "the dtype is <i4", "float32") for index in range(23)]
+    content = json.loads(bytes(error_response(request, 422, "invalid", None, problems, limit).body))
+    assert list(content) == ["detail", "problems", "problem_details"]
+    assert [Problem(**detail) for detail in content["problem_details"]] == problems[:shown]
+    assert content["problems"][:shown] == [str(problem) for problem in problems[:shown]]
+    assert content["problems"][shown:] == (["... and 3 more"] if limit else [])

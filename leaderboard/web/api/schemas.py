@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from leaderboard.db.models import SubmissionModel
 from leaderboard.db.rankings import LeaderboardEntry
+from rebar_depth_bench.errors import ProblemCode
 
 _ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
 
@@ -24,20 +25,41 @@ class Problem(BaseModel):
     detail: str
 
 
+class ProblemDetail(BaseModel):
+    """One problem of a request or of an archive."""
+
+    code: ProblemCode = Field(description="kind of the problem, stable across versions")
+    where: str = Field(description="entry, key or parameter; empty if the problem concerns the whole input")
+    found: str
+    expected: str = Field(description="empty if it is obvious")
+
+
 class Problems(BaseModel):
-    """Problems of a rejected upload, which does not count against the quota."""
+    """Problems of a malformed request, or of a rejected upload, which does not count against the quota.
+
+    Of a rejected upload, the first 20 problems are listed; ``problems`` then ends with the number of the others.
+    """
 
     model_config = ConfigDict(
         json_schema_extra={
             "example": {
                 "detail": "the archive is invalid: 1 problem",
-                "problems": ["lattice/0042.npy: missing, expected all 504 views of the config"],
+                "problems": ["lattice/0042.npy: the dtype is <i4, expected float16, float32 or float64"],
+                "problem_details": [
+                    {
+                        "code": "invalid",
+                        "where": "lattice/0042.npy",
+                        "found": "the dtype is <i4",
+                        "expected": "float16, float32 or float64",
+                    }
+                ],
             }
         }
     )
 
     detail: str
-    problems: list[str]
+    problems: list[str] = Field(description="the problems as text")
+    problem_details: list[ProblemDetail] = Field(description="the same problems, in the same order")
 
 
 class Submission(BaseModel):

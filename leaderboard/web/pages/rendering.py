@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any
 from urllib.parse import urlsplit
@@ -15,11 +15,11 @@ from jinja2 import Environment, PackageLoader
 from leaderboard.service import Service
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.pages.static import static_path
-from rebar_depth_bench.errors import printable
+from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
-from rebar_depth_bench.submission.metadata import url_problems
+from rebar_depth_bench.submission.metadata import is_http_url
 from rebar_depth_bench.version import software_version
 
 
@@ -119,7 +119,7 @@ def clean_text(text: str | None, limit: int = MAX_TEXT_CHARS) -> str:
 
 def link(url: str | None) -> Link | None:
     """Return the link for a method's URL, or None if it is not a valid http or https URL."""
-    if not url or url_problems(url):
+    if not url or not is_http_url(url):
         return None
     return Link(url, printable(urlsplit(url).hostname or "", 60))
 
@@ -132,6 +132,13 @@ def format_size(count: int) -> str:
     return f"{count} bytes"
 
 
+def problem_lines(problems: Sequence[Problem], limit: int | None = MAX_PROBLEMS_SHOWN) -> list[str]:
+    """Return the first ``limit`` problems (None: all) as text, followed by the number of the others if any."""
+    shown = problems[:limit]
+    omitted = len(problems) - len(shown)
+    return [*map(str, shown), *([f"... and {omitted} more"] if omitted else [])]
+
+
 _TITLES = {404: "Page not found", 405: "Method not allowed", 422: "Invalid request"}
 
 
@@ -140,12 +147,19 @@ def error_response(
     status: int,
     detail: str,
     headers: Mapping[str, str] | None = None,
-    problems: Sequence[str] | None = None,
+    problems: Sequence[Problem] = (),
+    limit: int | None = MAX_PROBLEMS_SHOWN,
 ) -> Response:
-    """Return an error response: a page if a browser requests a path outside the API, otherwise JSON."""
+    """Return an error response: a page if a browser requests a path outside the API, otherwise JSON.
+
+    At most ``limit`` problems are shown.
+    """
+    content: dict[str, Any] = {"detail": detail}
+    if problems:
+        content["problems"] = problem_lines(problems, limit)
+        content["problem_details"] = [asdict(problem) for problem in problems[:limit]]
     if not request.url.path.startswith("/api/") and "text/html" in request.headers.get("accept", ""):
-        return _error_page(request, status, "\n".join(problems or (detail,)), headers)
-    content = {"detail": detail} if problems is None else {"detail": detail, "problems": list(problems)}
+        return _error_page(request, status, "\n".join(content.get("problems", [detail])), headers)
     return JSONResponse(content, status, headers)
 
 

@@ -17,7 +17,7 @@ from leaderboard.uploads.multipart import UploadError, read_leading_field
 from leaderboard.web.api.auth import ServiceDep
 from leaderboard.web.api.submissions import page_url
 from leaderboard.web.cache import NO_STORE, REVALIDATE
-from leaderboard.web.pages.rendering import clean_text, format_size, render, service_address
+from leaderboard.web.pages.rendering import clean_text, format_size, problem_lines, render, service_address
 
 router = APIRouter(include_in_schema=False)
 
@@ -34,7 +34,7 @@ async def submit(request: Request, service: ServiceDep) -> Response:
     try:
         record = await _accept_form_upload(service, request.stream(), request)
     except UploadRejectedError as error:
-        return how_to_page(request, error.status, error.detail, error.problems or ())
+        return how_to_page(request, error.status, error.detail, problem_lines(error.problems))
     # Path only: behind a proxy, Content-Security-Policy form-action rejects a scheme other than the browser's.
     return RedirectResponse(urlsplit(page_url(request, record)).path, 303)
 

@@ -19,7 +19,7 @@ from typing import get_args
 import numpy as np
 
 from rebar_depth_bench.console import ProgressBars, add_workers
-from rebar_depth_bench.errors import InputError, SubmissionError
+from rebar_depth_bench.errors import InputError, Problem, SubmissionError
 from rebar_depth_bench.parallel import ordered_map
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
@@ -58,7 +58,7 @@ class _ImageOutcome:
 
     score: ImageScore | None = None
     digest: str = ""
-    problem: str | None = None
+    problem: Problem | None = None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -127,7 +127,7 @@ def run_kitti_study(
             progress("scoring KITTI", done, len(truths))
         problems = [outcome.problem for outcome in outcomes if outcome.problem]
         if problems:
-            raise SubmissionError(str(predictions), problems)
+            raise SubmissionError.from_problems(predictions, problems)
         scores = [outcome.score for outcome in outcomes if outcome.score is not None]
         if not scores:
             raise InputError(
@@ -179,10 +179,9 @@ def _open_predictions(path: str | Path, images: Sequence[KittiImage], truths: Se
         source = open_depths(path, optional | expected, PNG_SCALE)
         missing = sorted(expected.keys() - set(source.view_ids))
         if missing:
-            problems = [
-                f"{view_id.partition('/')[2]}: no file, expected one of {_SUFFIXES}" for view_id in missing
-            ]
-            raise SubmissionError(str(path), problems)
+            names = (view_id.partition("/")[2] for view_id in missing)
+            problems = [Problem("missing", name, "no file", f"one of {_SUFFIXES}") for name in names]
+            raise SubmissionError.from_problems(path, problems)
         return source
     present = _entry_stems(Path(path), 4 * len(images) + 1024)
     return open_depths(

@@ -210,7 +210,7 @@ def _improved_depth(file: TruthFile) -> Float32[ndarray, "h w"]:
     try:
         return decode_png(str(file.path), memoryview(data), file.shape, PNG_SCALE).astype(np.float32)
     except EntryError as error:
-        raise DatasetError(error.problem) from None
+        raise DatasetError(str(error)) from None
 
 
 def _png_shape(path: Path) -> tuple[int, int]:

@@ -236,7 +236,7 @@ def _raise_problems(outcomes: Sequence[FrameOutcome], sources: Mapping[str, Dept
     """Raise ``InputError`` with the problems of all entries, each prefixed by its archive or folder, if any."""
     problems = [problem for outcome in outcomes for problem in outcome.problems]
     if problems:
-        raise InputError(problem_summary([f"{sources[label].path}: {sentence}" for label, sentence in problems]))
+        raise InputError(problem_summary([f"{sources[label].path}: {problem}" for label, problem in problems]))
 
 
 def _depth_references(outcomes: Sequence[FrameOutcome], pseudo: Mapping[str, DepthSource]) -> list[DepthReference]:

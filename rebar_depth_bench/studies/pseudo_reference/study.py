@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.parallel import ordered_map
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.ground_truth import ViewTruth
@@ -164,14 +164,14 @@ class FrameOutcome:
     """Outcome of one view.
 
     ``scores`` is keyed by (method, reference), ``shares`` (fraction of the frame with depth) by reference, and
-    ``agreements`` by pairs of references. ``problems`` are (source label, message); if there are any, the other
+    ``agreements`` by pairs of references. ``problems`` are (source label, problem); if there are any, the other
     fields are empty.
     """
 
     scores: Mapping[tuple[str, str], FrameScore] = field(default_factory=dict)
     shares: Mapping[str, float] = field(default_factory=dict)
     agreements: Mapping[tuple[str, str], Agreement] = field(default_factory=dict)
-    problems: tuple[tuple[str, str], ...] = ()
+    problems: tuple[tuple[str, Problem], ...] = ()
 
 
 def exact_label_within(reference: str) -> str:
@@ -206,7 +206,7 @@ def score_frame_view(
     depth_range: DepthRange,
 ) -> FrameOutcome:
     """Score one view of every method against every reference, and against the exact depth if available."""
-    problems: list[tuple[str, str]] = []
+    problems: list[tuple[str, Problem]] = []
     predictions = {
         name: _read_depth(name, source, view, depth_range, problems) for name, source in methods.items()
     }
@@ -247,7 +247,7 @@ def _exact_maps(view: FrameView, pseudo: Mapping[str, DepthMap], depth_range: De
 
 
 def _read_depth(
-    name: str, source: DepthSource, view: FrameView, depth_range: DepthRange, problems: list[tuple[str, str]]
+    name: str, source: DepthSource, view: FrameView, depth_range: DepthRange, problems: list[tuple[str, Problem]]
 ) -> DepthMap | None:
     """Return the masked map of a view from a source, None if it is missing or invalid (then add a problem)."""
     if view.view_id not in source.view_ids:

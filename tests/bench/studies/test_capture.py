@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from rebar_depth_bench import SubmissionWriter
-from rebar_depth_bench.errors import CalibrationError, InputError, SubmissionError
+from rebar_depth_bench.errors import CalibrationError, InputError, ProblemCode, SubmissionError
 from rebar_depth_bench.studies.depth_source import open_depths
 from rebar_depth_bench.studies.pseudo_reference.capture import is_capture, open_capture
 from rebar_depth_bench.submission import EntryError
@@ -160,38 +160,42 @@ def test_folder_and_archive_are_read_alike(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("files", "words"),
+    ("files", "code", "where"),
     [
-        ({}, "no depth file of any view was found, expected <view_id>"),
-        ({"c.npy": b""}, "no depth file of any view was found"),
-        ({"a.npy": b"", "a.npz": b""}, r"walk/a: 2 files were found \(a.npy, a.npz\), expected one"),
-        ({"a.png": b""}, r"no depth_scale, expected metres per PNG unit, since 1 files are PNG \(first a.png\)"),
-        ({"a.npy": b"", "submission.json": b"{"}, "submission.json: the text is not valid JSON"),
-        ({"a.npy": b"", "submission.json": b'{"method": 1}'}, "submission.json: method is a number"),
+        ({}, "missing", ""),
+        ({"c.npy": b""}, "missing", ""),
+        ({"a.npy": b"", "a.npz": b""}, "duplicate", "walk/a"),
+        ({"a.png": b""}, "missing", "submission.json"),
+        ({"a.npy": b"", "submission.json": b"{"}, "syntax", "submission.json"),
+        ({"a.npy": b"", "submission.json": b'{"method": 1}'}, "invalid", "submission.json.method"),
     ],
 )
-def test_invalid_depth_folder_raises_on_open(files: dict[str, bytes], words: str, tmp_path: Path) -> None:
+def test_invalid_depth_folder_raises_on_open(
+    files: dict[str, bytes], code: ProblemCode, where: str, tmp_path: Path
+) -> None:
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
-    with pytest.raises(SubmissionError, match=words):
+    with pytest.raises(SubmissionError) as caught:
         open_depths(tmp_path, VIEWS)
+    assert [(problem.code, problem.where) for problem in caught.value.problems] == [(code, where)]
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "words"),
+    ("name", "content", "code"),
     [
-        ("a.npy", b"\x93NUMPY\x01\x00", "a.npy: the .npy header is cut off"),
-        ("a.npz", b"PK\x03\x04", "a.npz: inside the .npz, the zip has no end record"),
-        ("a.exr", b"none", "a.exr: the bytes start with"),
-        ("a.png", png(np.ones((3, 4)), bits=8), "a.png: the PNG is 8-bit greyscale, expected 16-bit"),
-        ("a.png", png(np.ones((4, 3))), r"a.png: the image is 4 x 3, expected 3 x 4 \(H x W\)"),
-        ("a.png", bytes(10_000_000), r"a.png: it has more than 262171 bytes, expected a map of 3 x 4 \(H x W\)"),
+        ("a.npy", b"\x93NUMPY\x01\x00", "damaged"),
+        ("a.npz", b"PK\x03\x04", "damaged"),
+        ("a.exr", b"none", "syntax"),
+        ("a.png", png(np.ones((3, 4)), bits=8), "invalid"),
+        ("a.png", png(np.ones((4, 3))), "invalid"),
+        ("a.png", bytes(10_000_000), "size"),
     ],
 )
-def test_damaged_depth_file_raises_on_read(name: str, content: bytes, words: str, tmp_path: Path) -> None:
+def test_damaged_depth_file_raises_on_read(name: str, content: bytes, code: ProblemCode, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
-    with open_depths(tmp_path, VIEWS, png_scale=0.001) as source, pytest.raises(EntryError, match=words):
+    with open_depths(tmp_path, VIEWS, png_scale=0.001) as source, pytest.raises(EntryError) as caught:
         source.read("walk/a")
+    assert (caught.value.problem.code, caught.value.problem.where) == (code, name)
 
 
 def test_deleted_depth_file_raises_on_read(tmp_path: Path) -> None:

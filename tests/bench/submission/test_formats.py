@@ -102,78 +102,82 @@ def test_tiled_exr_is_decoded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "words"),
+    ("data", "code"),
     [
         (
             npy(np.array([[{}]], object), allow_pickle=True),
-            "pickled Python objects (dtype object), expected float16/32/64",
+            "invalid",
         ),
-        (pickle.dumps(DEPTH), "a Python pickle was found, expected a .npy array"),
-        (npy(DEPTH.astype(int)), "the dtype is <i8, expected float16, float32 or float64"),
-        (npy(DEPTH.astype(complex)), "the dtype is <c16, expected float16"),
-        (npy(np.zeros(SHAPE, [("z", "<f4")])), "the dtype is structured, expected float16"),
-        (npy(DEPTH.T), "the shape is 4 x 3, expected 3 x 4 (H x W)"),
-        (npy(DEPTH[None]), "the shape is 1 x 3 x 4, expected 3 x 4"),
-        (npy(np.array(3.0)), "the shape is a single value, expected 3 x 4"),
+        (pickle.dumps(DEPTH), "syntax"),
+        (npy(DEPTH.astype(int)), "invalid"),
+        (npy(DEPTH.astype(complex)), "invalid"),
+        (npy(np.zeros(SHAPE, [("z", "<f4")])), "invalid"),
+        (npy(DEPTH.T), "invalid"),
+        (npy(DEPTH[None]), "invalid"),
+        (npy(np.array(3.0)), "invalid"),
         (
             npy_header(HEADER.format("'<f4'", "(400000, 400000)")) + VALUES,
-            "the shape is 400000 x 400000, expected",
+            "invalid",
         ),
-        (npy(DEPTH)[:-1], "47 bytes of values follow the header, expected 48 for 3 x 4 float32"),
-        (npy(DEPTH) + b"x", "49 bytes of values follow the header, expected 48"),
-        (npy(DEPTH)[:40], "the .npy header is cut off at 40 bytes, expected 128"),
-        (npy(DEPTH)[:8], "the .npy header"),
-        (npy_header(" " * 4090, b"\2\0"), "the .npy header declares 4090 bytes, expected at most 4084"),
-        (npy_header("", b"\2\0")[:8] + b"\xff\xff\xff\xff", "declares 4294967295 bytes, expected at most"),
+        (npy(DEPTH)[:-1], "size"),
+        (npy(DEPTH) + b"x", "size"),
+        (npy(DEPTH)[:40], "damaged"),
+        (npy(DEPTH)[:8], "damaged"),
+        (npy_header(" " * 4090, b"\2\0"), "size"),
+        (npy_header("", b"\2\0")[:8] + b"\xff\xff\xff\xff", "size"),
         (
             npy_header("__import__('os')"),
-            "the .npy header is __import__('os'), expected descr, fortran_order and shape",
+            "syntax",
         ),
         (
             npy_header(HEADER.format("'<f4'", "(3, 4)") + "; x") + VALUES,
-            "expected descr, fortran_order and shape",
+            "syntax",
         ),
-        (npy_header("{'shape': (3, 4)}" + VALUES.hex()), "expected descr, fortran_order and shape"),
-        (b"\x93NUMPY\x09\0" + VALUES, "expected a .npy array of version 1, 2 or 3"),
-        (b"", "bytes that start with b'' was found, expected a .npy array"),
+        (npy_header("{'shape': (3, 4)}" + VALUES.hex()), "syntax"),
+        (b"\x93NUMPY\x09\0" + VALUES, "syntax"),
+        (b"", "syntax"),
     ],
 )
-def test_invalid_npy_is_rejected(check: Check, data: bytes, words: str) -> None:
+def test_invalid_npy_is_rejected(check: Check, data: bytes, code: str) -> None:
     (problem,) = check(with_view(".npy", data))
-    assert problem.startswith("lattice/0000.npy: ")
-    assert words in problem
+    assert (problem.code, problem.where) == (code, "lattice/0000.npy")
+
+
+def test_pickled_objects_are_named(check: Check) -> None:
+    (problem,) = check(with_view(".npy", npy(np.array([[{}]], object), allow_pickle=True)))
+    assert "pickled Python objects" in problem.found
 
 
 INNER = zips.Record(b"depth.npy", npy(DEPTH))
 
 
 @pytest.mark.parametrize(
-    ("data", "words"),
+    ("data", "code"),
     [
-        (npz(a=DEPTH, b=DEPTH), "the .npz holds 2 arrays (a.npy, b.npy), expected exactly one"),
-        (npz(), "the .npz holds 0 arrays, expected exactly one"),
-        (npz(a=DEPTH.T), "(a.npy): the shape is 4 x 3, expected 3 x 4"),
+        (npz(a=DEPTH, b=DEPTH), "invalid"),
+        (npz(), "invalid"),
+        (npz(a=DEPTH.T), "invalid"),
         (
             npz(a=np.zeros((300, 300))),
-            "inside the .npz, a.npy: the declared size is 720128 bytes, expected at most",
+            "size",
         ),
-        (b"not a zip at all, nor long", "inside the .npz, the file is not a zip"),
-        (npz(a=DEPTH)[:-5], "inside the .npz, the zip has no end record"),
-        (zips.build([INNER, INNER]), "the .npz holds 2 arrays (depth.npy, depth.npy), expected exactly one"),
-        (zips.build([zips.Record(b"a.txt", b"x")]), "the .npz holds a.txt, expected one .npy array"),
+        (b"not a zip at all, nor long", "syntax"),
+        (npz(a=DEPTH)[:-5], "damaged"),
+        (zips.build([INNER, INNER]), "invalid"),
+        (zips.build([zips.Record(b"a.txt", b"x")]), "invalid"),
         (
             zips.build([replace(INNER, flags=1)]),
-            "depth.npy: the entry is encrypted, expected plain data",
+            "kind",
         ),
-        (zips.build([replace(INNER, crc=1)]), "inside the .npz, depth.npy: the data is corrupt"),
-        (zips.build([replace(INNER, name=b"../a.npy")]), "the name escapes the archive"),
-        (zips.build([INNER], count=7), "inside the .npz, the zip directory holds 1 entries"),
+        (zips.build([replace(INNER, crc=1)]), "damaged"),
+        (zips.build([replace(INNER, name=b"../a.npy")]), "name"),
+        (zips.build([INNER], count=7), "damaged"),
     ],
 )
-def test_invalid_npz_is_rejected(check: Check, data: bytes, words: str) -> None:
+def test_invalid_npz_is_rejected(check: Check, data: bytes, code: str) -> None:
     (problem,) = check(with_view(".npz", data))
-    assert problem.startswith("lattice/0000.npz")
-    assert words in problem
+    assert problem.code == code
+    assert problem.where.startswith("lattice/0000.npz")
 
 
 ROWS = b"".join(b"\0" + row.astype(">u2").tobytes() for row in UNITS)
@@ -182,33 +186,32 @@ IEND = chunk(b"IEND", b"")
 
 
 @pytest.mark.parametrize(
-    ("data", "words"),
+    ("data", "code"),
     [
-        (png(UNITS, bits=8), "the PNG is 8-bit greyscale, expected 16-bit greyscale"),
-        (png(UNITS, colour=2), "the PNG is 16-bit RGB, expected 16-bit greyscale"),
-        (png(UNITS.T), "the image is 4 x 3, expected 3 x 4 (H x W)"),
-        (png(UNITS, interlace=3), "interlace 3, expected 0, 0 and 0 or 1"),
-        (GOOD_PNG[:-20], "the PNG is truncated at"),
-        (GOOD_PNG[:20], "the PNG is truncated at 20 bytes"),
-        (GOOD_PNG + b"x", "1 bytes follow the PNG's end, expected none"),
-        (GOOD_PNG[:50] + b"\xff" + GOOD_PNG[51:], "the PNG chunk at byte 33 is corrupt"),
+        (png(UNITS, bits=8), "invalid"),
+        (png(UNITS, colour=2), "invalid"),
+        (png(UNITS.T), "invalid"),
+        (png(UNITS, interlace=3), "invalid"),
+        (GOOD_PNG[:-20], "damaged"),
+        (GOOD_PNG[:20], "damaged"),
+        (GOOD_PNG + b"x", "damaged"),
+        (GOOD_PNG[:50] + b"\xff" + GOOD_PNG[51:], "damaged"),
         (
             png(UNITS, idat=zlib.compress(ROWS[:-9])),
-            "the PNG image data inflates to 18 bytes, expected 27 and a complete stream",
+            "size",
         ),
-        (png(UNITS, idat=zlib.compress(ROWS)[:-4]), "inflates to 27 bytes, expected 27 and a complete stream"),
-        (png(UNITS, idat=zlib.compress(bytes(10**6))), "inflates to more than 27 bytes, expected 27"),
-        (png(UNITS, idat=b"nonsense"), "the PNG image data is corrupt"),
-        (png(UNITS, idat=zlib.compress(b"\x07" + ROWS[1:])), "the PNG data is corrupt"),
-        (GOOD_PNG[:33] + IEND, "the PNG has 0 image chunks, expected one run of IDAT"),
-        (GOOD_PNG[:8] + GOOD_PNG[33:], "the PNG does not start with its header chunk"),
-        (b"GIF89a..", "the bytes start with b'GIF89a..', expected a PNG file"),
+        (png(UNITS, idat=zlib.compress(ROWS)[:-4]), "size"),
+        (png(UNITS, idat=zlib.compress(bytes(10**6))), "size"),
+        (png(UNITS, idat=b"nonsense"), "damaged"),
+        (png(UNITS, idat=zlib.compress(b"\x07" + ROWS[1:])), "damaged"),
+        (GOOD_PNG[:33] + IEND, "damaged"),
+        (GOOD_PNG[:8] + GOOD_PNG[33:], "damaged"),
+        (b"GIF89a..", "syntax"),
     ],
 )
-def test_invalid_png_is_rejected(check: Check, data: bytes, words: str) -> None:
+def test_invalid_png_is_rejected(check: Check, data: bytes, code: str) -> None:
     (problem,) = check(with_view(".png", data))
-    assert problem.startswith("lattice/0000.png: ")
-    assert words in problem
+    assert (problem.code, problem.where) == (code, "lattice/0000.png")
 
 
 def test_png_ancillary_chunks_never_reach_pillow(check: Check) -> None:
@@ -227,24 +230,23 @@ def test_invalid_exr_is_rejected(check: Check, tmp_path: Path) -> None:
         str(tmp_path / "b")
     )
     cases = [
-        (exr({"R": DEPTH, "G": DEPTH, "B": DEPTH}), "has 3 channels (B, G, R), expected one"),
-        (exr({"Z": DEPTH.astype(np.uint32)}), "the channel Z is UINT, expected HALF or FLOAT"),
-        (exr({"Z": np.ascontiguousarray(DEPTH.T)}), "the data window is 4 x 3, expected 3 x 4 (H x W)"),
-        ((tmp_path / "b").read_bytes(), "the OpenEXR file is multi-part, expected one flat image"),
-        (good[:5] + b"\x08" + good[6:], "the OpenEXR file is deep, expected one flat image"),
-        (good[:4] + b"\x01" + good[5:], "the OpenEXR version field is 0x1, expected version 2"),
-        (good.replace(window, struct.pack("<4i", 0, 0, 2**31 - 2, 2**31 - 2), 1), "expected 3 x 4"),
+        (exr({"R": DEPTH, "G": DEPTH, "B": DEPTH}), "invalid"),
+        (exr({"Z": DEPTH.astype(np.uint32)}), "invalid"),
+        (exr({"Z": np.ascontiguousarray(DEPTH.T)}), "invalid"),
+        ((tmp_path / "b").read_bytes(), "invalid"),
+        (good[:5] + b"\x08" + good[6:], "invalid"),
+        (good[:4] + b"\x01" + good[5:], "invalid"),
+        (good.replace(window, struct.pack("<4i", 0, 0, 2**31 - 2, 2**31 - 2), 1), "invalid"),
         (
             good.replace(channel_list, b"Z\0" + struct.pack("<iI2i", 2, 0, 2, 2), 1),
-            "is subsampled 2 x 2, expected 1 x 1",
+            "invalid",
         ),
-        (good.replace(b"dataWindow", b"dataWindov", 1), "the OpenEXR header is damaged"),
-        (good[:60], "the OpenEXR header is damaged"),
-        (good[:-3], "the OpenEXR data is corrupt or truncated"),
-        (flat[:-8] + b"\xff" * 8, "the OpenEXR data is corrupt or truncated"),
-        (b"nothing", "the bytes start with b'nothing', expected an OpenEXR file"),
+        (good.replace(b"dataWindow", b"dataWindov", 1), "damaged"),
+        (good[:60], "damaged"),
+        (good[:-3], "damaged"),
+        (flat[:-8] + b"\xff" * 8, "damaged"),
+        (b"nothing", "syntax"),
     ]
-    for data, words in cases:
+    for data, code in cases:
         (problem,) = check(with_view(".exr", data))
-        assert problem.startswith("lattice/0000.exr: ")
-        assert words in problem
+        assert (problem.code, problem.where) == (code, "lattice/0000.exr")
