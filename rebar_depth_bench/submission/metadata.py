@@ -75,7 +75,7 @@ def parse_metadata(data: bytes) -> tuple[SubmissionMeta | None, list[Problem]]:
         return None, [Problem("invalid", METADATA_NAME, "the JSON is not an object", expected)]
     problems: list[Problem] = []
     present = {key: value for key, value in values.items() if value is not None}
-    return validate_table(SubmissionMeta, present, problems, METADATA_NAME), problems
+    return validate_table(SubmissionMeta, present, problems, f"{METADATA_NAME}:"), problems
 
 
 def _reject_constant(constant: str) -> NoReturn:

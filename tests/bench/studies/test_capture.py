@@ -167,7 +167,7 @@ def test_folder_and_archive_are_read_alike(tmp_path: Path) -> None:
         ({"a.npy": b"", "a.npz": b""}, "duplicate", "walk/a"),
         ({"a.png": b""}, "missing", "submission.json"),
         ({"a.npy": b"", "submission.json": b"{"}, "syntax", "submission.json"),
-        ({"a.npy": b"", "submission.json": b'{"method": 1}'}, "invalid", "submission.json.method"),
+        ({"a.npy": b"", "submission.json": b'{"method": 1}'}, "invalid", "submission.json: method"),
     ],
 )
 def test_invalid_depth_folder_raises_on_open(

@@ -195,7 +195,7 @@ def test_all_problems_are_reported_in_fixed_order(check: Check) -> None:
     assert located(problems) == [
         ("kind", ENTRY),
         ("unknown", "x"),
-        ("missing", "submission.json.method"),
+        ("missing", "submission.json: method"),
         ("invalid", "lattice/0001.npy"),
     ]
     assert check(bad) == problems
