@@ -49,6 +49,7 @@ from rebar_depth_bench.validation import (
     number,
     one_of,
     parse_toml,
+    read_small_file,
     short_repr,
     text,
     validate_table,
@@ -209,28 +210,15 @@ class OnnxSpec(StrictModel):
 def read_onnx_toml(path: Path) -> OnnxSpec:
     """Return the parsed TOML file of an ONNX method; the module docstring shows all keys.
 
-    Raises ``MethodError`` listing all problems if the file is not TOML, if keys are missing, unknown or invalid,
-    or if the model file does not exist.
+    Raises ``MethodError`` listing all problems if the file cannot be read or is not TOML, if keys are missing,
+    unknown or invalid, or if the model file does not exist.
     """
-    values, problems = parse_toml(_read_file(path))
+    expected = "a TOML file that describes an ONNX model"
+    values, problems = parse_toml(read_small_file(path, MAX_TOML_BYTES, expected, MethodError))
     spec = None if problems else validate_table(OnnxSpec, {"name": path.stem, **values}, problems, "", path.parent)
     if spec is None:
         raise MethodError.from_problems(path, problems)
     return spec
-
-
-def _read_file(path: Path) -> bytes:
-    """Return the content of a small file. Raises ``MethodError`` if it cannot be read."""
-    try:
-        with path.open("rb") as stream:
-            content = stream.read(MAX_TOML_BYTES + 1)
-    except FileNotFoundError:
-        raise MethodError(f"{path}: no such file, expected a TOML file that describes an ONNX model") from None
-    except (OSError, ValueError) as error:
-        raise MethodError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    if len(content) > MAX_TOML_BYTES:
-        raise MethodError(f"{path}: is larger than {MAX_TOML_BYTES} bytes, expected a smaller TOML file")
-    return content
 
 
 def _is_file(path: Path) -> bool:
