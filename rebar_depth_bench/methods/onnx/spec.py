@@ -88,6 +88,7 @@ with a canonical focal length equal to its input width: in 1/z = C W / f, W and 
 
 
 _Side = Annotated[int, whole_number(1, MAX_SIDE_PX)]
+_SIZE_KEYS = ("width", "height", "longest_side", "multiple_of")
 _Positive = Annotated[float, number(0)]
 _COLOUR = Expected("three numbers: red, green, blue")
 
@@ -101,7 +102,7 @@ class InputSpec(StrictModel):
 
     width: _Side | None = None
     height: _Side | None = None
-    multiple_of: _Side = 1
+    multiple_of: _Side | None = None
     longest_side: _Side | None = Field(default=None, validate_default=True)
     resize: Annotated[str, one_of("stretch", "pad")]
     interpolation: Annotated[str, one_of("bilinear", "bicubic")] = "bilinear"
@@ -117,13 +118,13 @@ class InputSpec(StrictModel):
     @field_validator("longest_side")
     @classmethod
     def _check_size(cls, longest_px: int | None, info: ValidationInfo) -> int | None:
-        sides = {key: info.data.get(key) for key in ("width", "height")}
-        given = [key for key, value in (*sides.items(), ("longest_side", longest_px)) if value is not None]
-        if len(sides) == len(info.data.keys() & sides) and given not in (["width", "height"], ["longest_side"]):
+        values = {**info.data, "longest_side": longest_px}
+        given = [key for key in _SIZE_KEYS if values.get(key) is not None]
+        all_valid = values.keys() >= set(_SIZE_KEYS)
+        if all_valid and given not in (["width", "height"], ["longest_side"], ["longest_side", "multiple_of"]):
             found = f"got {' and '.join(given)}" if given else "missing"
-            raise field_error(found, "width and height, or longest_side", "conflict" if given else "missing")
-        multiple_px = info.data.get("multiple_of", 1)
-        if longest_px is not None and longest_px % multiple_px:
+            raise field_error(found, "width and height, or longest_side", "conflict" if given[1:] else "missing")
+        if longest_px is not None and longest_px % (multiple_px := values.get("multiple_of") or 1):
             raise field_error(f"got {longest_px}", f"a multiple of multiple_of, {multiple_px}")
         return longest_px
 
