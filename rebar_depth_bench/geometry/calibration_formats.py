@@ -10,7 +10,7 @@ import configparser
 import math
 from collections.abc import Mapping
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field, Strict, ValidationInfo, field_validator
@@ -77,27 +77,25 @@ def read_conf(content: bytes, width: int, height: int, problems: list[Problem]) 
     suffix = _nearest_suffix(sections, width, height, problems)
     if suffix is None:
         return None
-    grid = STEREOLABS_GRIDS[suffix]
+    width, height = STEREOLABS_GRIDS[suffix]
+    names = (f"LEFT_CAM_{suffix}", f"RIGHT_CAM_{suffix}", "STEREO")
+    problems += [Problem("missing", name, "missing", "a section") for name in names if name not in sections]
     value = partial(_conf_number, sections, problems)
-    lenses = []
-    cameras = (f"LEFT_CAM_{suffix}", f"RIGHT_CAM_{suffix}")
-    problems += [
-        Problem("missing", name, "missing", "a section") for name in (*cameras, "STEREO") if name not in sections
-    ]
-    for section in cameras:
-        fx, fy = (value(section, [key], _FOCAL_PX) for key in ("fx", "fy"))
-        cx, cy = (
-            value(section, [key], _principal_point(side)) for key, side in zip(("cx", "cy"), grid, strict=True)
-        )
+
+    def lens(section: str) -> Lens:
+        fx, fy = value(section, ["fx"], _FOCAL_PX), value(section, ["fy"], _FOCAL_PX)
+        cx, cy = value(section, ["cx"], _principal_point(width)), value(section, ["cy"], _principal_point(height))
         k1, k2 = (value(section, [key], _DISTORTION) for key in ("k1", "k2"))
         p1, p2, k3 = (value(section, [key], _DISTORTION, default=0.0) for key in ("p1", "p2", "k3"))
-        lenses.append(Lens(fx, fy, cx, cy, (k1, k2, p1, p2, k3)))
+        return Lens(fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+
+    left, right = lens(names[0]), lens(names[1])
     baseline_mm = value("STEREO", [f"Baseline_{suffix}", "Baseline"], _BASELINE_MM)
     y_mm, z_mm = (value("STEREO", [f"{key}_{suffix}", key], _OFFSET_MM, default=0.0) for key in ("TY", "TZ"))
     rx, cv, rz = (value("STEREO", [f"{key}_{suffix}", key], _ANGLE_RAD) for key in ("RX", "CV", "RZ"))
     # The whole vector is negated, which keeps it on the line that the vendor's rectification uses.
     translation_m = (0.0 - baseline_mm / 1000, 0.0 - y_mm / 1000, 0.0 - z_mm / 1000)
-    return None if problems else StereoCalibration(*grid, *lenses, (rx, cv, rz), translation_m)
+    return None if problems else StereoCalibration(width, height, left, right, (rx, cv, rz), translation_m)
 
 
 def _read_sections(content: bytes, problems: list[Problem]) -> Sections:
@@ -225,7 +223,7 @@ class _LensTable(StrictModel):
 
     @field_validator("cx", "cy")
     @classmethod
-    def _check_inside_image(cls, value: float, info: ValidationInfo) -> float:
+    def _check_inside_image(cls, value: float, info: ValidationInfo[Mapping[str, Any]]) -> float:
         side_px = info.context["width" if info.field_name == "cx" else "height"]
         expected = _principal_point(side_px if side_px in _SIDES_PX else _SIDES_PX[-1])
         if not expected.accept(value):

@@ -200,9 +200,9 @@ class OnnxSpec(StrictModel):
 
     @field_validator("model")
     @classmethod
-    def _find_model(cls, name: str, info: ValidationInfo) -> str:
+    def _find_model(cls, name: str, info: ValidationInfo[Path]) -> str:
         """Return the path of the ONNX file; ``info.context`` is the folder of the TOML file."""
-        path: Path = info.context / name
+        path = info.context / name
         if not _is_file(path):
             raise field_error(f"no such file: {path}", "the ONNX file", "missing")
         return str(path)
