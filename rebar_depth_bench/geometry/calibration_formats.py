@@ -109,11 +109,8 @@ def _read_sections(content: bytes, problems: list[Problem]) -> Sections:
     )
     try:
         parser.read_string(content.decode("utf-8-sig"), "the file")
-    except UnicodeDecodeError as error:
-        problems.append(Problem("syntax", "", f"byte {error.start} is not UTF-8", "an INI file"))
-        return {}
-    except configparser.Error as error:
-        problems.append(Problem("syntax", "", f"not a valid INI file: {' '.join(error.message.split())}"))
+    except (UnicodeDecodeError, configparser.Error) as error:
+        problems.append(Problem("syntax", "", f"not a valid INI file: {' '.join(str(error).split())}"))
         return {}
     sections: dict[str, Mapping[str, str]] = {}
     for name in parser.sections():

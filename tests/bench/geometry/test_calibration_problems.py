@@ -70,7 +70,7 @@ def test_invalid_conf_is_rejected(tmp_path: Path, old: str, new: str, location: 
     [
         (b"", "missing", "the file has no section, expected one of"),
         (b"\x00" * 100, "syntax", "not a valid INI file"),
-        (b"\xff\xfe[\x00L\x00", "syntax", "byte 0 is not UTF-8"),
+        (b"\xff\xfe[\x00L\x00", "syntax", "can't decode byte 0xff in position 0"),
         (b"[STEREO]\nBaseline=120\n", "missing", "the file has [STEREO], expected one of [LEFT_CAM_2K]"),
         (b"[DEFAULT]\nfx=1\n", "missing", "the file has [DEFAULT], expected"),
         (b"; " + b"x" * 1_000_001, "size", "more than 1000000 bytes"),
