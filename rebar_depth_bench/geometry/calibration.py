@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from rebar_depth_bench.errors import CalibrationError
-from rebar_depth_bench.geometry.calibration_formats import parse_conf, parse_toml
+from rebar_depth_bench.errors import CalibrationError, Problem
+from rebar_depth_bench.geometry.calibration_formats import read_conf, read_toml
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration, check_invertible, scale_calibration
+from rebar_depth_bench.validation import read_small_file
 
 MAX_FILE_BYTES = 1_000_000
 """Size limit of a calibration file, bytes; real ones have a few kilobytes."""
 
-Parser = Callable[[str, int, int, list[str]], StereoCalibration | None]
-PARSERS: Mapping[str, Parser] = {".conf": parse_conf, ".toml": parse_toml}
+Parser = Callable[[bytes, int, int, list[Problem]], StereoCalibration | None]
+PARSERS: Mapping[str, Parser] = {".conf": read_conf, ".toml": read_toml}
 
 
 def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibration:
@@ -48,45 +49,32 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
         rotation = [-9.17e-4, 6.24e-3, 7.70e-4]    # Rodrigues vector, radians
         translation_m = [-0.119978, 0.0, 0.0]
 
-    Raises ``CalibrationError`` with every problem, each naming section, key, value and expected value; also if a
-    distortion model cannot be inverted over the whole image.
+    Raises ``CalibrationError`` with all problems of the file; also if a distortion model cannot be inverted over
+    the whole image.
     """
     path = Path(path)
-    if path.suffix.lower() not in PARSERS:
-        raise CalibrationError(str(path), [f"the file suffix is {path.suffix!r}, expected {' or '.join(PARSERS)}"])
-    problems: list[str] = []
-    calibration = PARSERS[path.suffix.lower()](_read_text(path), width, height, problems)
-    if calibration is not None and not problems:
+    parser = PARSERS.get(path.suffix.lower())
+    if parser is None:
+        problem = Problem("invalid", "", f"the file suffix is {path.suffix!r}", " or ".join(PARSERS))
+        raise CalibrationError.from_problems(path, [problem])
+    content = read_small_file(path, MAX_FILE_BYTES, "a calibration file", CalibrationError)
+    problems: list[Problem] = []
+    calibration = parser(content, width, height, problems)
+    if calibration is not None:
         _check_rig(calibration, problems)
     if calibration is None or problems:
-        raise CalibrationError(str(path), problems)
+        raise CalibrationError.from_problems(path, problems)
     return scale_calibration(calibration, width, height)
 
 
-def _read_text(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            content = file.read(MAX_FILE_BYTES + 1)
-    except OSError as error:
-        raise CalibrationError(str(path), [f"the file cannot be read: {error.strerror}"]) from error
-    if len(content) > MAX_FILE_BYTES:
-        raise CalibrationError(
-            str(path), [f"the file is larger than {MAX_FILE_BYTES} bytes, expected a calibration file"]
-        )
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise CalibrationError(str(path), [f"the file is not UTF-8: byte {error.start} is invalid"]) from error
-
-
-def _check_rig(calibration: StereoCalibration, problems: list[str]) -> None:
+def _check_rig(calibration: StereoCalibration, problems: list[Problem]) -> None:
     x_m, y_m, z_m = calibration.translation_m
     if max(abs(y_m), abs(z_m)) > abs(x_m) / 2:
-        problems.append(
-            f"the right camera is at {(-x_m, -y_m, -z_m)} m from the left one, expected an offset mostly along x"
-        )
+        found = f"the right camera is at {(-x_m, -y_m, -z_m)} m from the left one"
+        problems.append(Problem("conflict", "stereo", found, "an offset mostly along x"))
     for eye, lens in (("left", calibration.left), ("right", calibration.right)):
         try:
             check_invertible(lens, calibration.width, calibration.height)
         except ValueError as error:
-            problems.append(f"the {eye} distortion cannot be inverted at the image border: {error}")
+            found = f"the distortion cannot be inverted at the image border: {error}"
+            problems.append(Problem("conflict", eye, found))

@@ -12,7 +12,8 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import Any
+
+from pydantic import TypeAdapter
 
 
 @dataclass(frozen=True)
@@ -110,31 +111,15 @@ Configs with other trajectories, optics, appearance variants or user scenes show
 def load_published() -> PublishedNumbers:
     """Return the published numbers from the package's ``published.json``."""
     content = json.loads(files("rebar_depth_bench.reporting").joinpath("published.json").read_text("utf-8"))
-    anchor = content["anchor"]
-    return PublishedNumbers(
-        title=content["title"],
-        parts={
-            name: PublishedPart(part["place"], part["protocol"], part["mark"])
-            for name, part in content.items()
-            if name != "title"
-        },
-        scenes={
-            name: PublishedScene(scene["title"], scene["distance"], _rows(scene))
-            for name, scene in content["synthetic"]["scenes"].items()
-        },
-        references={
-            name: PublishedReference(reference["coverage_percent"], _rows(reference))
-            for name, reference in content["physical"]["references"].items()
-        },
-        kitti=tuple(PublishedKitti(**row) for row in content["kitti"]["figures"]),
-        anchor=PublishedAnchor(
-            anchor["one_view_scale_within_percent"], anchor["rmse_cm_6_markers"], anchor["rmse_cm_12_markers"]
-        ),
-    )
-
-
-def _rows(entry: Mapping[str, Any]) -> tuple[PublishedRow, ...]:
-    return tuple(PublishedRow(**row) for row in entry["rows"])
+    values = {
+        "title": content.pop("title"),
+        "parts": content,
+        "scenes": content["synthetic"]["scenes"],
+        "references": content["physical"]["references"],
+        "kitti": content["kitti"]["figures"],
+        "anchor": content["anchor"],
+    }
+    return TypeAdapter(PublishedNumbers).validate_python(values)
 
 
 def published_rows(scene: str) -> tuple[PublishedRow, ...]:

@@ -70,7 +70,8 @@ def place_image(spec: InputSpec, width: int, height: int) -> Placement:
 def _canvas_px(spec: InputSpec, width: int, height: int) -> tuple[int, int]:
     """Return width and height of a variable-size input: nearest multiples that keep the aspect ratio."""
     ratio = (spec.longest_side or 0) / max(width, height)
-    across, down = (max(round(side * ratio / spec.multiple_of), 1) * spec.multiple_of for side in (width, height))
+    multiple_px = spec.multiple_of or 1
+    across, down = (max(round(side * ratio / multiple_px), 1) * multiple_px for side in (width, height))
     return across, down
 
 

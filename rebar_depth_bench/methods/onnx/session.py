@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.errors import MethodError, problem_summary
+from rebar_depth_bench.errors import MethodError, Problem
 from rebar_depth_bench.methods.onnx.spec import InputSpec, OutputSpec
 
 PROVIDERS = ("CUDAExecutionProvider", "CPUExecutionProvider")
@@ -95,71 +95,65 @@ def open_session(path: Path, input_spec: InputSpec, output_spec: OutputSpec) -> 
     problems = _input_problems(inputs, input_spec)
     output = _select_output(outputs, output_spec.name_or_index, problems)
     if problems or output is None:
-        raise MethodError(f"{path}: {problem_summary(problems)}")
+        raise MethodError.from_problems(path, problems)
     return OnnxSession(
         session, str(path), inputs[0].name, _FLOAT_DTYPES[inputs[0].type], output.name, output_spec.at_input_size
     )
 
 
-def _input_problems(inputs: Sequence[Any], spec: InputSpec) -> list[str]:
+def _input_problems(inputs: Sequence[Any], spec: InputSpec) -> list[Problem]:
     """Return problems of the model's inputs: exactly one, floating point, of the expected shape."""
     if len(inputs) != 1:
         names = ", ".join(repr(entry.name) for entry in inputs) or "none"
-        return [f"the model takes {len(inputs)} inputs ({names}), expected one: the image"]
+        return [Problem("invalid", "input", f"the model takes {len(inputs)} ({names})", "one: the image")]
     [image_input] = inputs
-    problems = []
-    if image_input.type not in _FLOAT_DTYPES:
-        problems.append(
-            f"input {image_input.name!r} is {image_input.type}, expected one of {', '.join(_FLOAT_DTYPES)}"
-        )
-    if image_input.shape:  # The shape is empty if the model leaves even the rank undefined.
-        problems += [
-            f"input {image_input.name!r} {problem}" for problem in _shape_problems(image_input.shape, spec)
-        ]
-    return problems
+    # The shape is empty if the model leaves even the rank undefined.
+    shape_problems = _shape_problems(image_input.shape, spec) if image_input.shape else []
+    return [*_dtype_problems("input", image_input), *shape_problems]
 
 
-def _shape_problems(shape: Sequence[int | str | None], spec: InputSpec) -> list[str]:
+def _dtype_problems(where: str, entry: Any) -> list[Problem]:
+    """Return the problem of an input or output that is not floating point."""
+    found, expected = f"{entry.name!r} is {entry.type}", f"one of {', '.join(_FLOAT_DTYPES)}"
+    return [] if entry.type in _FLOAT_DTYPES else [Problem("invalid", where, found, expected)]
+
+
+def _shape_problems(shape: Sequence[int | str | None], spec: InputSpec) -> list[Problem]:
     """Return problems of an input shape; sides that are not positive integers are dynamic."""
-    shape_text = " x ".join(str(side) if _is_fixed(side) else "?" for side in shape)
+    found = f"the model takes {' x '.join(str(side) if _is_fixed(side) else '?' for side in shape)}"
     if len(shape) != 4:
-        return [f"has the shape {shape_text}, expected 1 x 3 x H x W"]
-    problems = []
+        return [Problem("invalid", "input", found, "1 x 3 x H x W")]
     batch, channels, *sides = shape
     configured = (None, None) if spec.size_px is None else spec.size_px[::-1]
     channels_last = shape[-1] == 3 != channels and configured[1] != 3
     if channels_last or (_is_fixed(batch) and batch != 1) or (_is_fixed(channels) and channels != 3):
         hint = ": channels come before height and width" if channels_last else ""
-        problems.append(f"has the shape {shape_text}, expected 1 x 3 x H x W{hint}")
-    for name, side, configured_side in zip(("height", "width"), sides, configured, strict=True):
-        if not problems and _is_fixed(side) and side != configured_side:
-            got = "a variable size (longest_side)" if configured_side is None else str(configured_side)
-            problems.append(f"has the shape {shape_text}: got {got}, expected [input] {name} = {side}")
-    return problems
+        return [Problem("invalid", "input", found, f"1 x 3 x H x W{hint}")]
+    return [
+        Problem("size", f"input.{name}", f"got {got or 'a variable size (longest_side)'}, {found}", str(side))
+        for name, side, got in zip(("height", "width"), sides, configured, strict=True)
+        if _is_fixed(side) and side != got
+    ]
 
 
 def _is_fixed(side: int | str | None) -> bool:
     return isinstance(side, int) and side > 0
 
 
-def _select_output(outputs: Sequence[Any], name_or_index: str | int | None, problems: list[str]) -> Any:
+def _select_output(outputs: Sequence[Any], name_or_index: str | int | None, problems: list[Problem]) -> Any:
     """Return the output that the TOML file selects; if it does not exist, append to ``problems``, return None."""
-    names = ", ".join(repr(output.name) for output in outputs)
+    expected = f"one of {', '.join(repr(output.name) for output in outputs)}"
     if name_or_index is None and len(outputs) != 1:
-        problems.append(f"the model has {len(outputs)} outputs, expected [output] name to be one of {names}")
+        problems.append(Problem("missing", "output.name", f"the model has {len(outputs)} outputs", expected))
         return None
     if isinstance(name_or_index, str):
-        matches = [output for output in outputs if output.name == name_or_index]
+        where, matches = "output.name", [output for output in outputs if output.name == name_or_index]
     else:
-        index = name_or_index or 0
-        matches = list(outputs[index : index + 1])
+        where, matches = "output.index", list(outputs[name_or_index or 0 :][:1])
     if not matches:
-        problems.append(f"the model has no output {name_or_index!r}, expected one of {names}")
+        problems.append(Problem("unknown", where, f"the model has no output {name_or_index!r}", expected))
         return None
-    if matches[0].type not in _FLOAT_DTYPES:
-        dtypes = ", ".join(_FLOAT_DTYPES)
-        problems.append(f"output {matches[0].name!r} is {matches[0].type}, expected one of {dtypes}")
-        return None
+    problems += _dtype_problems("output", matches[0])
     return matches[0]
 
 

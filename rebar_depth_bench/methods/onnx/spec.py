@@ -49,6 +49,7 @@ from rebar_depth_bench.validation import (
     number,
     one_of,
     parse_toml,
+    read_small_file,
     short_repr,
     text,
     validate_table,
@@ -87,6 +88,7 @@ with a canonical focal length equal to its input width: in 1/z = C W / f, W and 
 
 
 _Side = Annotated[int, whole_number(1, MAX_SIDE_PX)]
+_SIZE_KEYS = ("width", "height", "longest_side", "multiple_of")
 _Positive = Annotated[float, number(0)]
 _COLOUR = Expected("three numbers: red, green, blue")
 
@@ -100,7 +102,7 @@ class InputSpec(StrictModel):
 
     width: _Side | None = None
     height: _Side | None = None
-    multiple_of: _Side = 1
+    multiple_of: _Side | None = None
     longest_side: _Side | None = Field(default=None, validate_default=True)
     resize: Annotated[str, one_of("stretch", "pad")]
     interpolation: Annotated[str, one_of("bilinear", "bicubic")] = "bilinear"
@@ -116,13 +118,13 @@ class InputSpec(StrictModel):
     @field_validator("longest_side")
     @classmethod
     def _check_size(cls, longest_px: int | None, info: ValidationInfo) -> int | None:
-        sides = {key: info.data.get(key) for key in ("width", "height")}
-        given = [key for key, value in (*sides.items(), ("longest_side", longest_px)) if value is not None]
-        if len(sides) == len(info.data.keys() & sides) and given not in (["width", "height"], ["longest_side"]):
+        values = {**info.data, "longest_side": longest_px}
+        given = [key for key in _SIZE_KEYS if values.get(key) is not None]
+        all_valid = values.keys() >= set(_SIZE_KEYS)
+        if all_valid and given not in (["width", "height"], ["longest_side"], ["longest_side", "multiple_of"]):
             found = f"got {' and '.join(given)}" if given else "missing"
-            raise field_error(found, "width and height, or longest_side", "conflict" if given else "missing")
-        multiple_px = info.data.get("multiple_of", 1)
-        if longest_px is not None and longest_px % multiple_px:
+            raise field_error(found, "width and height, or longest_side", "conflict" if given[1:] else "missing")
+        if longest_px is not None and longest_px % (multiple_px := values.get("multiple_of") or 1):
             raise field_error(f"got {longest_px}", f"a multiple of multiple_of, {multiple_px}")
         return longest_px
 
@@ -198,9 +200,9 @@ class OnnxSpec(StrictModel):
 
     @field_validator("model")
     @classmethod
-    def _find_model(cls, name: str, info: ValidationInfo) -> str:
+    def _find_model(cls, name: str, info: ValidationInfo[Path]) -> str:
         """Return the path of the ONNX file; ``info.context`` is the folder of the TOML file."""
-        path: Path = info.context / name
+        path = info.context / name
         if not _is_file(path):
             raise field_error(f"no such file: {path}", "the ONNX file", "missing")
         return str(path)
@@ -209,28 +211,15 @@ class OnnxSpec(StrictModel):
 def read_onnx_toml(path: Path) -> OnnxSpec:
     """Return the parsed TOML file of an ONNX method; the module docstring shows all keys.
 
-    Raises ``MethodError`` listing all problems if the file is not TOML, if keys are missing, unknown or invalid,
-    or if the model file does not exist.
+    Raises ``MethodError`` listing all problems if the file cannot be read or is not TOML, if keys are missing,
+    unknown or invalid, or if the model file does not exist.
     """
-    values, problems = parse_toml(_read_file(path))
+    expected = "a TOML file that describes an ONNX model"
+    values, problems = parse_toml(read_small_file(path, MAX_TOML_BYTES, expected, MethodError))
     spec = None if problems else validate_table(OnnxSpec, {"name": path.stem, **values}, problems, "", path.parent)
     if spec is None:
         raise MethodError.from_problems(path, problems)
     return spec
-
-
-def _read_file(path: Path) -> bytes:
-    """Return the content of a small file. Raises ``MethodError`` if it cannot be read."""
-    try:
-        with path.open("rb") as stream:
-            content = stream.read(MAX_TOML_BYTES + 1)
-    except FileNotFoundError:
-        raise MethodError(f"{path}: no such file, expected a TOML file that describes an ONNX model") from None
-    except (OSError, ValueError) as error:
-        raise MethodError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    if len(content) > MAX_TOML_BYTES:
-        raise MethodError(f"{path}: is larger than {MAX_TOML_BYTES} bytes, expected a smaller TOML file")
-    return content
 
 
 def _is_file(path: Path) -> bool:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
-from rebar_depth_bench.errors import InputError, problem_summary
+from rebar_depth_bench.errors import InputError, Problem, escape_text
 from rebar_depth_bench.geometry.calibration import read_calibration
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration, calibrated_baseline_m
 
@@ -28,6 +28,7 @@ CAPTURE_LAYOUT = "left/<name>.png|jpg, right/<name>.png|jpg, calibration.conf|to
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _CALIBRATION_FILES = ("calibration.conf", "calibration.toml")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+_NAME_RULE = "a name of 1 to 100 letters, digits, . _ -"
 _SQUARE_PIXEL_TOLERANCE = 0.03
 """Maximum deviation of fx / fy from 1.
 
@@ -78,49 +79,58 @@ def open_capture(path: str | os.PathLike[str]) -> Capture:
     """
     root = Path(path)
     name = root.resolve().name
-    problems = [] if _NAME.fullmatch(name) else [f"the folder is called {name!r}, expected letters, digits, . _ -"]
+    problems: list[Problem] = []
+    if not _NAME.fullmatch(name):
+        problems.append(Problem("name", "", f"the folder is called {name!r}", _NAME_RULE))
     left, right = (_image_files(root / eye, problems) for eye in ("left", "right"))
-    problems += [f"left/{left[stem].name}: has no right/{stem}" for stem in sorted(left.keys() - right.keys())]
-    problems += [f"right/{right[stem].name}: has no left/{stem}" for stem in sorted(right.keys() - left.keys())]
+    for files, other, other_eye in ((left, right, "right"), (right, left, "left")):
+        unpaired = sorted(files.keys() - other.keys())
+        problems += [Problem("missing", _entry(files[stem]), f"has no {other_eye}/{stem}") for stem in unpaired]
     sizes = {file: _image_size(file, problems) for files in (left, right) for file in files.values()}
     if left:
         width, height = sizes[min(left.values())]
         problems += [
-            f"{file.parent.name}/{file.name}: is {size[0]} x {size[1]}, expected {width} x {height} as the first"
+            Problem("size", _entry(file), f"is {size[0]} x {size[1]}", f"{width} x {height} as the first")
             for file, size in sizes.items()
             if size != (width, height) and all(size)
         ]
-    if problems or not left:
-        empty = [] if problems else ["left/ has no images"]
-        raise InputError(f"{root}: {problem_summary([*problems, *empty])}\nexpected a capture: {CAPTURE_LAYOUT}")
+    elif not problems:
+        problems.append(Problem("missing", "left/", "has no images"))
+    if problems:
+        raise InputError.from_problems(f"{root}: expected a capture ({CAPTURE_LAYOUT})", problems)
     view_ids = tuple(f"{name}/{stem}" for stem in sorted(left))
     return Capture(root, view_ids, height, width, _read_calibration(root, width, height))
 
 
-def _image_files(folder: Path, problems: list[str]) -> dict[str, Path]:
+def _entry(file: Path) -> str:
+    """Return the location of an image in the capture, for error messages."""
+    return escape_text(f"{file.parent.name}/{file.name}")
+
+
+def _image_files(folder: Path, problems: list[Problem]) -> dict[str, Path]:
     """Return the image files of a folder by stem; append the problems of their names to ``problems``."""
     if not folder.is_dir():
-        problems.append(f"{folder.name}/: no such folder")
+        problems.append(Problem("missing", f"{folder.name}/", "no such folder"))
         return {}
     files: dict[str, Path] = {}
     for file in sorted(folder.iterdir()):
         if file.suffix.lower() not in _IMAGE_SUFFIXES or not file.is_file():
             continue
         if file.stem in files:
-            problems.append(f"{folder.name}/{file.name}: the name occurs twice, expected one image per view")
+            problems.append(Problem("duplicate", _entry(file), "the name occurs twice", "one image per view"))
         if not _NAME.fullmatch(file.stem):
-            problems.append(f"{folder.name}/{file.name}: expected a name of letters, digits, . _ -")
+            problems.append(Problem("name", _entry(file), "invalid name", _NAME_RULE))
         files[file.stem] = file
     return files
 
 
-def _image_size(file: Path, problems: list[str]) -> tuple[int, int]:
+def _image_size(file: Path, problems: list[Problem]) -> tuple[int, int]:
     """Return (width, height) from the image header; if unreadable, return zeros and append to ``problems``."""
     try:
         with Image.open(file) as image:
             return image.size
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        problems.append(f"{file.parent.name}/{file.name}: is not a readable image ({type(error).__name__})")
+        problems.append(Problem("damaged", _entry(file), f"is not a readable image ({type(error).__name__})"))
         return 0, 0
 
 

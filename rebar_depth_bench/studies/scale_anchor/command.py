@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from rebar_depth_bench.console import ProgressBars, add_data
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.ground_truth import config_truth
@@ -152,15 +152,16 @@ def run_anchor_study(
 
 
 def _check_arguments(given_scale: float, counts: Sequence[int], draws: int, seed: int) -> None:
-    problems = []
-    if not (math.isfinite(given_scale) and given_scale > 0):
-        problems.append(f"--baseline-scale is {given_scale:g}, expected a finite number above 0")
-    problems += [f"--num-anchor-views has {k}, expected 1 or more" for k in counts if k < 1]
-    if not counts:
-        problems.append("--num-anchor-views has no number of views, expected one or more")
-    if not 1 <= draws <= MAX_DRAWS:
-        problems.append(f"--draws is {draws}, expected 1 to {MAX_DRAWS}")
-    if not 0 <= seed < 2**31:
-        problems.append(f"--seed is {seed}, expected 0 to {2**31 - 1}")
+    checks = [
+        ("--baseline-scale", given_scale, 0 < given_scale < math.inf, "a finite number above 0"),
+        *(("--num-anchor-views", k, k >= 1, "1 or more") for k in counts or [0]),
+        ("--draws", draws, 1 <= draws <= MAX_DRAWS, f"1 to {MAX_DRAWS}"),
+        ("--seed", seed, 0 <= seed < 2**31, f"0 to {2**31 - 1}"),
+    ]
+    problems = [
+        Problem("invalid", option, f"got {value}", expected)
+        for option, value, valid, expected in checks
+        if not valid
+    ]
     if problems:
-        raise InputError("; ".join(problems))
+        raise InputError.from_problems("options", problems)

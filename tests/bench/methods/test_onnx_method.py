@@ -7,6 +7,7 @@ import sys
 import zipfile
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ SIDES = st.integers(1, 40)
 
 
 def spec_of(size: tuple[int, int] | None, *, pad: bool, longest: int = 1, multiple: int = 1) -> InputSpec:
-    sides = {"longest_side": longest, "multiple_of": multiple}
+    sides: dict[str, Any] = {"longest_side": longest, "multiple_of": multiple}
     if size is not None:
         sides = {"width": size[0], "height": size[1]}
     return InputSpec(**sides, resize="pad" if pad else "stretch", range=255)

@@ -2,104 +2,124 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from textwrap import dedent
-from typing import Any
+from typing import Annotated
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.errors import MethodError, Problem
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.onnx import spec as onnx_toml
-from rebar_depth_bench.validation import FieldType, TableReader, choice, number, text, three_numbers, whole_number
+from rebar_depth_bench.validation import (
+    StrictModel,
+    Triple,
+    number,
+    one_of,
+    text,
+    three_numbers,
+    validate_table,
+    whole_number,
+)
 from tests.bench.methods.onnx_models import write_mixer_model, write_toml
 
+NO_SIZE = "expected width and height, or longest_side"
 INVALID_EDITS = [
-    ("licence = 'MIT'", "", "licence is missing, expected the licence of the model's weights"),
-    ("'MIT'", "'  '", "licence: got ' ', expected the licence"),
-    ("'MIT'", "7", "licence: got 7, expected"),
-    ("'model.onnx'", "'no.onnx'", "model: no such file: "),
-    ("'model.onnx'", "'.'", "model: no such file: "),
-    ("'model.onnx'", f"'{'x' * 900}'", "model: no such file: "),
-    ("'model.onnx'", "'a\\u0000b'".replace("'", '"'), "model: got 'a\\x00b', expected the ONNX file's path"),
-    ("licence", "naem = 'x'\nlicence", "'naem' is not a known key, did you mean name?"),
-    ("[output]", "[outptu]", "'outptu' is not a known key, did you mean output?\n  - output is missing"),
-    ("[input]\n", "input = 3\n[x]\n", "input: got 3, expected a table"),
-    ("width = 6", "", "[input] width is missing, expected a whole number from 1 to 8192"),
-    ("width = 6\nheight = 4", "", "[input] size: got neither, expected width and height, or longest_side"),
-    ("width = 6", "width = 6\nlongest_side = 9", "[input] size: got both, expected"),
-    ("width = 6", "width = 6.0", "[input] width: got 6.0, expected a whole number"),
-    ("width = 6", "width = true", "[input] width: got True"),
-    ("height = 4", "height = 0", "[input] height: got 0"),
-    ("height = 4", "height = 9999", "[input] height: got 9999"),
+    ("licence = 'MIT'", "", "missing licence", "expected the licence of the model's weights"),
+    ("'MIT'", "'  '", "invalid licence", "got ' '"),
+    ("'MIT'", "7", "invalid licence", "got 7"),
+    ("'model.onnx'", "'no.onnx'", "missing model", "no such file: "),
+    ("'model.onnx'", "'.'", "missing model", "no such file: "),
+    ("'model.onnx'", f"'{'x' * 900}'", "missing model", "no such file: "),
+    ("'model.onnx'", '"a\\u0000b"', "invalid model", "got 'a\\x00b', expected the ONNX file's path"),
+    ("licence", "naem = 'x'\nlicence", "unknown naem", "expected name"),
+    ("[output]", "[outptu]", "missing output, unknown outptu", "expected a table"),
+    ("[input]\n", "input = 3\n[x]\n", "invalid input, unknown x", "got 3, expected a table"),
+    ("width = 6", "", "missing input.longest_side", f"got height, {NO_SIZE}"),
+    ("width = 6\nheight = 4", "", "missing input.longest_side", NO_SIZE),
+    ("width = 6", "width = 6\nlongest_side = 9", "conflict input.longest_side", NO_SIZE),
+    ("width = 6", "width = 6\nmultiple_of = 1", "conflict input.longest_side", NO_SIZE),
+    ("width = 6", "width = 6.0", "invalid input.width", "got 6.0, expected a whole number"),
+    ("width = 6", "width = true", "invalid input.width", "got True"),
+    ("height = 4", "height = 0", "invalid input.height", "got 0"),
+    ("height = 4", "height = 9999", "invalid input.height", "got 9999"),
     (
         "width = 6\nheight = 4",
-        "longest_side = 500\nmultiple_of = 14",
-        "got 500, expected a multiple of multiple_of",
+        "longest_side = 50\nmultiple_of = 14",
+        "invalid input.longest_side",
+        "multiple_of, 14",
     ),
-    ("width = 6\nheight = 4", "multiple_of = 14", "[input] longest_side is missing"),
-    ("'stretch'", "'crop'", '[input] resize: got \'crop\', expected "stretch" or "pad"'),
-    ("range = 255", "range = 256", "[input] range: got 256, expected 1 or 255"),
-    ("range = 255", "range = true", "[input] range: got True, expected 1 or 255"),
-    ("range = 255", "", "[input] range is missing, expected 1 or 255"),
-    ("range = 255", "range = 1\nmean = [123.7, 116.3, 103.5]", "expected three numbers from 0 to 1: red, green"),
-    ("range = 255", "range = 255\nstd = [0.229, 0.224, 0.225]", "expected three numbers from 1 to 255"),
-    ("range = 255", "range = 255\nmean = [1, 2]", "[input] mean: got [1, 2], expected three numbers"),
-    ("range = 255", "range = 255\nstd = [1, 2, nan]", "[input] std: got [1, 2, nan], expected"),
-    ("range = 255", "range = 255\nstd = [0, 0, 0]", "[input] std: got [0, 0, 0], expected"),
-    ("range = 255", "range = 255\nlayout = 'NHWC'", "[input] 'layout' is not a known key, expected only width"),
-    ("'depth'", "'disparity'", '[output] meaning: got \'disparity\', expected "depth", "inverse-depth", "canon'),
-    ("'depth'", "'canonical-depth'", "[output] focal_canonical_px is missing, expected a number from 1 to 100000"),
-    ("'depth'", "'depth'\nfocal_canonical_px = 1000", 'expected none: meaning "depth" does not use it'),
-    ("'depth'", "'depth'\nscale = 0", "[output] scale: got 0, expected a number above 0"),
-    (
-        "'depth'",
-        "'depth'\nscale = inf",
-        "[output] scale: got a number with a magnitude above 1e+09, expected a number above 0",
-    ),
-    ("'depth'", "'depth'\nscale = '1'", "[output] scale: got '1', expected a number above 0"),
-    ("'depth'", "'depth'\nmin_m = 3\nmax_m = 2", "[output] min_m: got 3, expected less than max_m, 2"),
-    ("'depth'", "'depth'\nname = 'y'\nindex = 0", "[output] has name and index, expected one of them"),
-    ("'depth'", "'depth'\nindex = -1", "[output] index: got -1, expected a whole number from 0"),
-    ("'depth'", "'depth'\nat_input_size = 1", "[output] at_input_size: got 1, expected true or false"),
-    ("'depth'", "'depth'\nresize = 'area'", '[output] resize: got \'area\', expected "nearest" or "bilinear"'),
-    ("range = 255", f"range = {'9' * 4000}", "[input] range: got 9999"),
-    ("range = 255", f"range = {'9' * 5000}", "is not a valid TOML file"),
-    ("range = 255", f"range = {'[' * 5000}", "is not a valid TOML file"),
-    ("range = 255", "range = 255\nrange = 1", "is not a valid TOML file: Cannot overwrite a value"),
+    ("width = 6\nheight = 4", "multiple_of = 14", "missing input.longest_side", NO_SIZE),
+    ("'stretch'", "'crop'", "invalid input.resize", 'got \'crop\', expected "stretch" or "pad"'),
+    ("range = 255", "range = 256", "invalid input.range", "got 256, expected 1 or 255"),
+    ("range = 255", "range = true", "invalid input.range", "got True, expected 1 or 255"),
+    ("range = 255", "", "missing input.range", "expected 1 or 255"),
+    ("range = 255", "range = 1\nmean = [123.7, 116.3, 103.5]", "invalid input.mean", "from 0 to 1: red"),
+    ("range = 255", "range = 255\nstd = [0.229, 0.224, 0.225]", "invalid input.std", "from 1 to 255"),
+    ("range = 255", "range = 255\nmean = [1, 2]", "invalid input.mean", "got [1, 2], expected three numbers"),
+    ("range = 255", "range = 255\nstd = [1, 2, nan]", "invalid input.std", "nan]"),
+    ("range = 255", "range = 255\nstd = [0, 0, 0]", "invalid input.std", ""),
+    ("range = 255", "range = 255\nlayout = 'NHWC'", "unknown input.layout", "expected only width"),
+    ("'depth'", "'disparity'", "invalid output.meaning", 'expected "depth", "inverse-depth", "canon'),
+    ("'depth'", "'canonical-depth'", "missing output.focal_canonical_px", "expected a number from 1 to 100000"),
+    ("'depth'", "'depth'\nfocal_canonical_px = 1000", "conflict output.focal_canonical_px", 'meaning "depth"'),
+    ("'depth'", "'depth'\nscale = 0", "invalid output.scale", "got 0, expected a number above 0"),
+    ("'depth'", "'depth'\nscale = inf", "invalid output.scale", "got inf"),
+    ("'depth'", "'depth'\nscale = '1'", "invalid output.scale", "got '1'"),
+    ("'depth'", "'depth'\nmin_m = 3\nmax_m = 2", "conflict output.min_m", "got 3, expected less than max_m, 2"),
+    ("'depth'", "'depth'\nname = 'y'\nindex = 0", "conflict output.index", ""),
+    ("'depth'", "'depth'\nindex = -1", "invalid output.index", "got -1, expected a whole number from 0"),
+    ("'depth'", "'depth'\nat_input_size = 1", "invalid output.at_input_size", "got 1, expected true or false"),
+    ("'depth'", "'depth'\nresize = 'area'", "invalid output.resize", 'expected "nearest" or "bilinear"'),
+    ("range = 255", f"range = {'9' * 4000}", "invalid input.range", "got 9999"),
+    ("range = 255", f"range = {'9' * 5000}", "syntax ", "not a valid TOML file"),
+    ("range = 255", f"range = {'[' * 5000}", "syntax ", "not a valid TOML file"),
+    ("range = 255", "range = 255\nrange = 1", "syntax ", "not a valid TOML file: Cannot overwrite a value"),
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "words"), INVALID_EDITS)
-def test_invalid_toml_raises_with_reason(old: str, new: str, words: str, tmp_path: Path) -> None:
+def located(problems: tuple[Problem, ...]) -> list[str]:
+    return [f"{problem.code} {problem.where}" for problem in problems]
+
+
+@pytest.mark.parametrize(("old", "new", "locations", "words"), INVALID_EDITS)
+def test_invalid_toml_raises_with_reason(old: str, new: str, locations: str, words: str, tmp_path: Path) -> None:
     write_mixer_model(tmp_path)
     path = write_toml(tmp_path)
     find_method(str(path))
     content = path.read_text()
     assert old in content
     path.write_text(content.replace(old, new, 1))
-    with pytest.raises(MethodError, match=re.escape(words)) as caught:
+    with pytest.raises(MethodError) as caught:
         find_method(str(path))
+    assert located(caught.value.problems) == locations.split(", ")
+    assert words in str(caught.value.problems[0])
     assert str(caught.value).startswith(f"{path}: ")
     assert max(map(len, str(caught.value).splitlines())) < 1500
 
 
-def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("content", "locations"),
+    [
+        (
+            "nmae = 1\n[output]\n",
+            ["missing model", "missing licence", "missing input", "missing output.meaning", "unknown nmae"],
+        ),
+        (
+            "model = 3\nlicence = 'MIT'\n[input]\nwidth = 0\nrange = 3\nresize = 'pad'\n",
+            ["invalid model", "invalid input.width", "invalid input.range", "missing output"],
+        ),
+    ],
+)
+def test_all_problems_are_reported_at_once(content: str, locations: list[str], tmp_path: Path) -> None:
     path = tmp_path / "bad.toml"
-    path.write_text("nmae = 1\n[output]\n")
+    path.write_text(content)
     with pytest.raises(MethodError) as caught:
         find_method(str(path))
-    assert [line.split(",")[0] for line in str(caught.value).splitlines()[1:]] == [
-        "  - 'nmae' is not a known key",
-        "  - model is missing",
-        "  - licence is missing",
-        "  - input is missing",
-        "  - [output] meaning is missing",
-    ]
+    assert located(caught.value.problems) == locations
 
 
 def test_example_in_docstring_is_valid(tmp_path: Path) -> None:
@@ -112,45 +132,54 @@ def test_example_in_docstring_is_valid(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "code", "words"),
     [
-        (None, "no such file, expected a TOML file that describes an ONNX model"),
-        (b"\xff\xfe", "byte 0 is not UTF-8 text"),
-        (b"#" * (1 << 21), "is larger than 1048576 bytes"),
-        (b"\x00", "is not a valid TOML file"),
+        (
+            None,
+            "missing",
+            "cannot be read: No such file or directory, expected a TOML file that describes an ONNX model",
+        ),
+        (b"\xff\xfe", "syntax", "byte 0 is not UTF-8"),
+        (b"#" * (1 << 21), "size", "more than 1048576 bytes"),
+        (b"\x00", "syntax", "not a valid TOML file"),
     ],
 )
-def test_unreadable_file_raises_with_reason(content: bytes | None, words: str, tmp_path: Path) -> None:
+def test_unreadable_file_raises_with_reason(content: bytes | None, code: str, words: str, tmp_path: Path) -> None:
     path = tmp_path / "x.toml"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(MethodError, match=words):
+    with pytest.raises(MethodError, match=words) as caught:
         find_method(str(path))
+    assert located(caught.value.problems) == [f"{code} "]
     path.unlink(missing_ok=True)
     path.mkdir()
-    with pytest.raises(MethodError, match=r"cannot be read|no such file"):
+    with pytest.raises(MethodError) as caught:
         find_method(str(path))
+    assert located(caught.value.problems) == ["invalid "]
 
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=2),
 )
-FIELD_TYPES: list[FieldType[Any]] = [
-    number(0, 9),
-    whole_number(1, 9),
-    text(5),
-    choice({1: "1", 255: "255"}),
-    three_numbers(0, 1),
-]
 
 
-@given(value=VALUES, kind=st.sampled_from(FIELD_TYPES))
-def test_any_value_is_accepted_or_gives_one_line(value: object, kind: FieldType[Any]) -> None:
-    problems: list[str] = []
-    parsed = TableReader({"key": value}, "[t] ", problems).required("key", kind, "fallback")
-    assert (parsed == "fallback") == bool(problems)
-    assert all(problem.startswith("[t] key: got ") and "\n" not in problem for problem in problems)
+class Fields(StrictModel):
+    """One field for each description of valid values."""
+
+    real: Annotated[float, number(0, 9)] = 1
+    whole: Annotated[int, whole_number(1, 9)] = 1
+    line: Annotated[str, text(5)] = "line"
+    choice: Annotated[int, one_of(1, 255)] = 1
+    triple: Annotated[Triple, three_numbers(0, 1)] = (0, 0, 0)
+
+
+@given(value=VALUES, key=st.sampled_from([*Fields.model_fields]))
+def test_any_value_is_accepted_or_gives_one_line(value: object, key: str) -> None:
+    problems: list[Problem] = []
+    parsed = validate_table(Fields, {key: value}, problems, "t")
+    assert located(tuple(problems)) == ([f"invalid t.{key}"] if parsed is None else [])
+    assert all(problem.found.startswith("got ") and "\n" not in str(problem) for problem in problems)
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)

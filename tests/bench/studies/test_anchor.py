@@ -122,11 +122,11 @@ def test_archive_of_several_configs_needs_config_option(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--baseline-scale", "0"), "--baseline-scale is 0, expected a finite number above 0"),
-        (("--baseline-scale", "nan"), "--baseline-scale is nan, expected a finite number above 0"),
-        (("--num-anchor-views", "0", "3"), "--num-anchor-views has 0, expected 1 or more"),
-        (("--draws", "0"), "--draws is 0, expected 1 to 1000"),
-        (("--seed", "-1"), "--seed is -1, expected 0 to"),
+        (("--baseline-scale", "0"), "--baseline-scale: got 0.0, expected a finite number above 0"),
+        (("--baseline-scale", "nan"), "--baseline-scale: got nan, expected a finite number above 0"),
+        (("--num-anchor-views", "0", "3"), "--num-anchor-views: got 0, expected 1 or more"),
+        (("--draws", "0"), "--draws: got 0, expected 1 to 1000"),
+        (("--seed", "-1"), "--seed: got -1, expected 0 to"),
         ((), "no such folder"),
     ],
 )
