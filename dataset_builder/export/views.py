@@ -11,7 +11,7 @@ import numpy as np
 from dataset_builder.config.rigs import Camera
 from rebar_depth_bench.data.dataset import EYES, decode_row, iterate_undecoded
 from rebar_depth_bench.data.digests import eye_digest
-from rebar_depth_bench.data.manifest import DatasetFolder, ViewRecord
+from rebar_depth_bench.data.manifest import DatasetConfig, ViewRecord
 from rebar_depth_bench.errors import DatasetError
 
 _CAMERA_KINDS = ("K", "distortion", "cam_from_world")
@@ -60,23 +60,22 @@ class StoredView:
         return decoded
 
 
-def stored_views(folder: DatasetFolder, config: str, wanted: Collection[str]) -> Iterator[StoredView]:
+def stored_views(config: DatasetConfig, wanted: Collection[str]) -> Iterator[StoredView]:
     """Yield the wanted views of a config in the folder's order, one row in memory at a time.
 
     Raises ``DatasetError`` for shards that cannot be read, lack a wanted view or contain an unknown one.
     """
-    records = {record.view_id: record for record in folder.views(config)}
+    records = {record.view_id: record for record in config.views}
     missing = set(wanted)
-    grid = folder.grid(config)
-    for row in iterate_undecoded(folder.root, config, _COLUMNS):
+    for row in iterate_undecoded(config, _COLUMNS):
         view_id = row["view_id"]
         if view_id not in records:
-            raise DatasetError(f"{folder.root}: view {view_id} is not in the manifest")
+            raise DatasetError(f"{config.root}: view {view_id} is not in the manifest")
         if view_id in missing:
             missing.remove(view_id)
-            yield StoredView(_camera_view(row, grid), records[view_id], row)
+            yield StoredView(_camera_view(row, config.grid), records[view_id], row)
     if missing:
-        raise DatasetError(f"{folder.root}: {config} lacks {len(missing)} views, among them {min(missing)}")
+        raise DatasetError(f"{config.root}: {config.name} lacks {len(missing)} views, among them {min(missing)}")
 
 
 def _camera_view(row: Mapping[str, Any], grid: tuple[int, int]) -> CameraView:

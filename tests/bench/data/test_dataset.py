@@ -141,27 +141,62 @@ def test_damaged_shard_raises_dataset_error(tiny_root: Path, tmp_path: Path, dam
         else:
             shard.write_bytes(shard.read_bytes()[:-100])
     with pytest.raises(rdb.DatasetError, match=r"dataset: (config lattice cannot be read|has no lattice/)"):
-        list(iterate_rows(copy, "lattice", ["view_id"]))
+        list(iterate_rows(open_folder(copy).config("lattice"), ["view_id"]))
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "code", "where"),
     [
-        (lambda manifest: manifest.pop("configs"), "lacks configs"),
-        (lambda manifest: manifest.update(format="other"), "format is 'other', expected 'rebar-depth-dataset-1'"),
-        (lambda manifest: manifest.update(configs=[]), "configs is a list, expected an object"),
-        (lambda manifest: manifest["configs"]["lattice"].pop("views"), "config lattice lacks views"),
+        (lambda manifest: manifest.pop("configs"), "missing", "configs"),
+        (lambda manifest: manifest.update(format="other"), "invalid", "format"),
+        (lambda manifest: manifest.update(configs=[]), "invalid", "configs"),
+        (lambda manifest: manifest["configs"]["lattice"].pop("views"), "missing", "configs.lattice.views"),
         (
             lambda manifest: manifest["configs"]["lattice"]["views"][0].pop("left"),
-            "a view of config lattice does not have exactly the keys",
+            "missing",
+            "configs.lattice.views 1: left",
         ),
+        (
+            lambda manifest: manifest["configs"]["lattice"]["views"][1].update(depth=3),
+            "unknown",
+            "configs.lattice.views 2: depth",
+        ),
+        (
+            lambda manifest: manifest["configs"]["lattice"]["rig"].update(height="90"),
+            "invalid",
+            "configs.lattice.rig.height",
+        ),
+        (lambda manifest: manifest["files"].update(x=None), "invalid", "files.x"),
     ],
 )
 def test_damaged_manifest_raises_dataset_error(
-    tiny_root: Path, tmp_path: Path, change: Callable[[dict[str, Any]], object], words: str
+    tiny_root: Path, tmp_path: Path, change: Callable[[dict[str, Any]], object], code: str, where: str
 ) -> None:
     manifest = json.loads((tiny_root / "manifest.json").read_text())
     change(manifest)
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(rdb.DatasetError, match=words):
+    with pytest.raises(rdb.DatasetError) as caught:
         open_folder(tmp_path)
+    assert [(problem.code, problem.where) for problem in caught.value.problems] == [(code, where)]
+
+
+def test_all_problems_of_a_manifest_are_listed(tiny_root: Path, tmp_path: Path) -> None:
+    manifest = json.loads((tiny_root / "manifest.json").read_text())
+    manifest["configs"]["lattice"]["rig"] = {}
+    manifest["configs"]["lattice-orbit"]["shards"] = "lattice-orbit/test.parquet"
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(rdb.DatasetError) as caught:
+        open_folder(tmp_path)
+    assert [problem.where for problem in caught.value.problems] == [
+        "configs.lattice.rig.width",
+        "configs.lattice.rig.height",
+        "configs.lattice-orbit.shards",
+    ]
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe\x00", b"[" * 100_000, b"1" * 5000])
+def test_manifest_that_is_not_json_is_rejected(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "manifest.json").write_bytes(content)
+    with pytest.raises(rdb.DatasetError) as caught:
+        open_folder(tmp_path)
+    assert [problem.code for problem in caught.value.problems] == ["syntax"]
