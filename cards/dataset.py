@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from huggingface_hub import DatasetCardData
 
 from cards.templates import render
 from rebar_depth_bench.data.dataset import COLUMN_DESCRIPTIONS, column_kind, features
-from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 if TYPE_CHECKING:
@@ -26,18 +26,19 @@ _OPTICS_TEXTS = {
 _SIZE_CATEGORIES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 
 
-def dataset_card(folder: DatasetFolder) -> str:
-    """Return the text of the ``README.md`` of a dataset folder.
+def dataset_card(version: str, digest: str, configs: Sequence[DatasetConfig]) -> str:
+    """Return the text of the ``README.md`` of a dataset folder, for its version and ground-truth digest.
 
     Its YAML header is sufficient for ``datasets.load_dataset(ROOT, config)``. The file pattern of each config
     contains the digest of its shards, so that the cache of ``datasets`` never serves an older build of a config.
     """
     return render(
         "dataset_card.md.j2",
-        yaml=_card_metadata(folder).to_yaml(),
-        dataset=folder,
+        yaml=_card_metadata(version, configs).to_yaml(),
+        version=version,
+        digest=digest,
         protocol=PROTOCOL,
-        configs=[_config_row(config) for config in folder.config_by_name.values()],
+        configs=[_config_row(config) for config in configs],
         columns=column_rows(),
     )
 
@@ -62,11 +63,10 @@ def _type_name(feature: Any) -> str:
     return "image" if kind == "Image" else str(feature.dtype)
 
 
-def _card_metadata(folder: DatasetFolder) -> DatasetCardData:
+def _card_metadata(version: str, configs: Sequence[DatasetConfig]) -> DatasetCardData:
     from datasets.info import DatasetInfosDict
 
-    configs = folder.config_by_name
-    views = sum(len(config.views) for config in configs.values())
+    views = sum(len(config.views) for config in configs)
     card = DatasetCardData(
         license="cc-by-4.0",
         pretty_name="Industrial rebar metric depth",
@@ -74,11 +74,11 @@ def _card_metadata(folder: DatasetFolder) -> DatasetCardData:
         tags=["depth", "stereo", "construction", "rebar", "synthetic"],
         size_categories=[next((name for limit, name in _SIZE_CATEGORIES if views < limit), "100K<n<1M")],
     )
-    infos = {name: _dataset_info(config, folder.version) for name, config in configs.items()}
+    infos = {config.name: _dataset_info(config, version) for config in configs}
     DatasetInfosDict(infos).to_dataset_card_data(card)
     card["configs"] = [
-        {"config_name": name, "data_files": [{"split": SPLIT, "path": _shard_pattern(config.shards)}]}
-        for name, config in configs.items()
+        {"config_name": config.name, "data_files": [{"split": SPLIT, "path": _shard_pattern(config.shards)}]}
+        for config in configs
     ]
     return card
 

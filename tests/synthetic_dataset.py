@@ -63,7 +63,7 @@ def _write_config(folder: Path, config: str, views: int) -> list[ViewRecord]:
 def _config_entry(config: str, records: Sequence[ViewRecord]) -> dict[str, object]:
     digest = _digest([record.left for record in records])
     return {
-        "scene": {"name": config},
+        "scene": {"name": config, "board": None},
         "rig": {"height": HEIGHT, "width": WIDTH},
         "views": [record.model_dump() for record in records],
         "ground_truth_digest": digest,

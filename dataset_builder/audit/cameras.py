@@ -1,7 +1,7 @@
 """Camera checks of the audit: poses and intrinsics against the manifest, pixel rays against OpenCV.
 
 The expected cameras are rebuilt from the manifest entry of a config: its JSON values are parsed back to the specs
-of trajectory, rig and board that they were written from, and the trajectory's poses are passed through the rig.
+of trajectory and rig that they were written from, and the trajectory's poses are passed through the rig.
 The lens model is checked by projecting the 3-D point of each pixel with ``cv2.projectPoints``: it must return to
 its pixel.
 """
@@ -30,7 +30,6 @@ from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
 from rebar_depth_bench.data.dataset import EYES
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import camera_centre
 from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
 
@@ -43,40 +42,22 @@ _TRAJECTORY_SPECS: Mapping[str, Callable[..., TrajectorySpec]] = {
 
 
 def trajectory_spec(config: DatasetConfig) -> TrajectorySpec:
-    """Return the camera trajectory of a config.
-
-    Raises ``DatasetError`` if its manifest entry holds no valid one.
-    """
-    return _spec_from_manifest(config, "protocol", config.entry, _trajectory_from_json)
+    """Return the camera trajectory of a config; raise ``DatasetError`` if its manifest entry has no valid one."""
+    return _spec_from_manifest(config, "protocol", _trajectory_from_json)
 
 
 def rig_spec(config: DatasetConfig) -> RigSpec:
-    """Return the stereo rig of a config.
-
-    Raises ``DatasetError`` if its manifest entry holds no valid one.
-    """
-    return _spec_from_manifest(config, "rig", config.entry, _rig_from_json)
+    """Return the stereo rig of a config; raise ``DatasetError`` if its manifest entry has no valid one."""
+    return _spec_from_manifest(config, "rig", _rig_from_json)
 
 
-def board_spec(config: DatasetConfig) -> BoardSpec | None:
-    """Return the ArUco board of a config's scene, None for a scene without one.
-
-    Raises ``DatasetError`` if the board's values are invalid.
-    """
-    return _spec_from_manifest(
-        config, "board", config.entry["scene"], lambda board: None if board is None else BoardSpec(**board)
-    )
-
-
-def _spec_from_manifest(
-    config: DatasetConfig, key: str, table: Mapping[str, Any], make_spec: Callable[[Any], _Spec]
-) -> _Spec:
+def _spec_from_manifest(config: DatasetConfig, key: str, make_spec: Callable[[Any], _Spec]) -> _Spec:
     try:
-        return make_spec(table[key])
+        return make_spec(config.entry[key])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DatasetError(
-            f"manifest: the {key} of config {config.name} is {table.get(key)!r}, expected a value that this "
-            f"version writes: {type(error).__name__}: {error}"
+            f"manifest: the {key} of config {config.name} is {config.entry.get(key)!r}, expected a value that "
+            f"this version writes: {type(error).__name__}: {error}"
         ) from None
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 from dataset_builder.audit.cameras import (
     ExpectedView,
-    board_spec,
     camera_problems,
     checked_aim_point_m,
     expected_views,
@@ -83,7 +82,7 @@ def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent
 def _config_checks(config: DatasetConfig, root: Path, depth_views: int, progress: Progress) -> Iterator[Check]:
     name, mesh = config.name, root / config.mesh
     steel = read_bars(root / BARS_FILE)[config.scene.name]
-    audited = AuditedConfig(name, config.scene.appearance.variants, steel, board_spec(config))
+    audited = AuditedConfig(name, config.scene.appearance.variants, steel, config.scene.board)
     aim_m, aim_problems = checked_aim_point_m(config, mesh)
     expected = expected_views(config, aim_m)
     accumulator = _AuditAccumulator(config, audited, expected, depth_views)
@@ -107,11 +106,7 @@ class _AuditAccumulator:
     """Accumulator over a config's rows: problems, measurements of every check, and eyes to render in Cycles."""
 
     def __init__(
-        self,
-        config: DatasetConfig,
-        audited: AuditedConfig,
-        expected: Sequence[ExpectedView],
-        depth_views: int,
+        self, config: DatasetConfig, audited: AuditedConfig, expected: Sequence[ExpectedView], depth_views: int
     ) -> None:
         self._config, self._audited, self._expected = config, audited, expected
         self._records = config.views

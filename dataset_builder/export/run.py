@@ -93,7 +93,7 @@ def _select_view_ids(config: DatasetConfig, views: int | None) -> list[str]:
         raise DatasetError(f"{config.root}: the name of config {config.name!r} is not a valid folder name")
     if views is not None and views < 1:
         raise InputError(f"--views is {views}, expected 1 or more")
-    return [config.view_ids[index] for index in subset(len(config.views), views)]
+    return [config.views[index].view_id for index in subset(len(config.views), views)]
 
 
 def _read_bars(folder: DatasetFolder) -> dict[str, tuple[Bar, ...]]:

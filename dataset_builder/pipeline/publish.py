@@ -9,7 +9,7 @@ of a folder do not match its manifest, a build was interrupted in between, and t
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -64,26 +64,26 @@ def build_lock(folder: Path) -> Iterator[None]:
 
 def is_published(out: Path, plan: ConfigPlan) -> bool:
     """Return whether the folder already contains the shards and the mesh of the plan, with matching digests."""
-    folder = _open_or_empty(out)
-    config = folder.config_by_name.get(plan.spec.name)
-    if config is None or config.key != plan.key:
+    if not (out / MANIFEST_FILE).is_file():
         return False
-    return all(_matches_manifest(out, name, folder.files) for name in (*config.shards, config.mesh))
+    folder = open_folder(out)
+    config = folder.config_by_name.get(plan.spec.name)
+    return config is not None and config.key == plan.key and _files_match(folder, (*config.shards, config.mesh))
 
 
 def repair_metadata(out: Path, plan: ConfigPlan) -> None:
     """Rewrite bars, card, pictures and manifest if any of them does not match the manifest."""
     folder = open_folder(out)
     config = folder.config(plan.spec.name)
-    descriptions = (BARS_FILE, CARD, STRIP, config.sheet)
-    if not all(_matches_manifest(out, name, folder.files) for name in descriptions):
+    if not _files_match(folder, (BARS_FILE, CARD, STRIP, config.sheet)):
         write_contact_sheet(out, config.shards, out / _sheet_name(plan))
         _write_bars(out, plan)
         _write_manifest(out, folder.config_by_name)
 
 
-def _matches_manifest(out: Path, name: str, files: Mapping[str, str]) -> bool:
-    return (out / name).is_file() and file_sha256(out / name) == files.get(name)
+def _files_match(folder: DatasetFolder, names: Iterable[str]) -> bool:
+    paths = {name: Path(folder.root, name) for name in names}
+    return all(path.is_file() and file_sha256(path) == folder.files.get(name) for name, path in paths.items())
 
 
 def check_folder(out: Path) -> None:
@@ -98,29 +98,24 @@ def check_folder(out: Path) -> None:
         )
 
 
-def check_retained_files(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    """Raise ``InputError`` if a shard or the mesh of a config that is not being built is missing."""
+def check_retained_configs(out: Path, plans: Sequence[ConfigPlan]) -> None:
+    """Raise ``InputError`` if a config that is not being built lacks a file, or if its scene is being changed."""
     planned = {plan.spec.name for plan in plans}
-    for name, config in _open_or_empty(out).config_by_name.items():
-        missing_files = [file for file in (*config.shards, config.mesh) if not (out / file).is_file()]
-        if missing_files and name not in planned:
-            raise InputError(
-                f"{out}: {missing_files[0]} of config {name} is missing; rebuild this config too: --config {name}"
-            )
-
-
-def check_shared_scenes(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    """Raise ``InputError`` if a config that is not being built uses a scene being built with other parameters."""
-    planned = {plan.spec.name for plan in plans}
-    for name, config in _open_or_empty(out).config_by_name.items():
+    for name, config in _published_configs(out).items():
+        if name in planned:
+            continue
         for plan in plans:
             scene = plan.parameters["scene"]
-            same_name = config.scene.name == scene["name"]
-            if name not in planned and same_name and config.entry["scene"] != json.loads(json.dumps(scene)):
+            if config.scene.name == scene["name"] and config.entry["scene"] != json.loads(json.dumps(scene)):
                 raise InputError(
                     f"{out}: config {name} was built with other parameters of scene {scene['name']!r}; "
                     f"rebuild it too (--config {name} {plan.spec.name}) or choose another folder"
                 )
+        missing_files = [file for file in (*config.shards, config.mesh) if not (out / file).is_file()]
+        if missing_files:
+            raise InputError(
+                f"{out}: {missing_files[0]} of config {name} is missing; rebuild this config too: --config {name}"
+            )
 
 
 def publish_config(out: Path, plan: ConfigPlan) -> None:
@@ -145,7 +140,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
         "views": [record.model_dump() for record in records],
     }
     config = DatasetConfig(**entry, root=str(out), entry=entry)
-    _write_manifest(out, {**_open_or_empty(out).config_by_name, config.name: config})
+    _write_manifest(out, {**_published_configs(out), config.name: config})
 
 
 def _write_bars(out: Path, plan: ConfigPlan) -> None:
@@ -160,7 +155,7 @@ def _sheet_name(plan: ConfigPlan) -> str:
 
 def remove_leftovers(out: Path) -> None:
     """Remove the files left by an interrupted build: temporary files and files not listed in the manifest."""
-    _remove_unlisted_files(out, _open_or_empty(out))
+    _remove_unlisted_files(out, _published_configs(out).values())
     configs = {path.parent for path in out.glob(_SHARDS)}
     for folder in (out, out / MESHES, out / PICTURES, *configs, *(out / name for name in CONFIGS)):
         for temporary in folder.glob(TEMPORARY_PATTERN):
@@ -186,30 +181,24 @@ def _publish_shards(out: Path, plan: ConfigPlan) -> list[str]:
 
 def _write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
     order = [*CONFIGS, *sorted(set(configs) - set(CONFIGS))]
-    folder = DatasetFolder(
-        root=str(out),
-        version=software_version(),
-        digest=views_digest(view for config in configs.values() for view in config.views),
-        files={},
-        config_by_name={name: configs[name] for name in order if name in configs},
-    )
-    ordered = list(folder.config_by_name.values())
+    ordered = [configs[name] for name in order if name in configs]
+    version, digest = software_version(), views_digest(view for config in ordered for view in config.views)
     for config in ordered:
         if not (out / config.sheet).is_file():
             write_contact_sheet(out, config.shards, out / config.sheet)
     by_scene = {_strip_key(config): config for config in reversed(ordered)}
     write_scenes_strip(out, list(reversed(by_scene.values())), out / STRIP)
-    write_text(out / CARD, dataset_card(folder))
+    write_text(out / CARD, dataset_card(version, digest, ordered))
     manifest = {
         "format": MANIFEST_FORMAT,
-        "version": folder.version,
+        "version": version,
         "protocol": PROTOCOL,
-        "ground_truth": {"digest": folder.digest},
+        "ground_truth": {"digest": digest},
         "configs": {config.name: config.entry for config in ordered},
-        "files": {name: file_sha256(out / name) for name in sorted({CARD, BARS_FILE, *_listed_files(folder)})},
+        "files": {name: file_sha256(out / name) for name in sorted({CARD, BARS_FILE, *_listed_files(ordered)})},
     }
     write_text(out / MANIFEST_FILE, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
-    _remove_unlisted_files(out, folder)
+    _remove_unlisted_files(out, ordered)
 
 
 def _strip_key(config: DatasetConfig) -> str:
@@ -218,21 +207,17 @@ def _strip_key(config: DatasetConfig) -> str:
     return str(assembly.get("sha256", assembly["kind"]))
 
 
-def _listed_files(folder: DatasetFolder) -> set[str]:
-    """Return the paths of the shards, meshes and pictures of a dataset."""
-    configs = folder.config_by_name.values()
+def _listed_files(configs: Iterable[DatasetConfig]) -> set[str]:
     return {STRIP, *(name for config in configs for name in (*config.shards, config.mesh, config.sheet))}
 
 
-def _remove_unlisted_files(out: Path, folder: DatasetFolder) -> None:
-    listed_files = _listed_files(folder)
+def _remove_unlisted_files(out: Path, configs: Iterable[DatasetConfig]) -> None:
+    listed_files = _listed_files(configs)
     for path in [*out.glob(_SHARDS), *(out / MESHES).glob("*.ply"), *(out / PICTURES).glob("*.webp")]:
         if path.relative_to(out).as_posix() not in listed_files:
             path.unlink()
 
 
-def _open_or_empty(out: Path) -> DatasetFolder:
-    """Return the dataset in the folder, or one without configs if there is none yet."""
-    if not (out / MANIFEST_FILE).is_file():
-        return DatasetFolder(root=str(out), version="", digest="", files={}, config_by_name={})
-    return open_folder(out)
+def _published_configs(out: Path) -> Mapping[str, DatasetConfig]:
+    """Return the configs of the folder by name, none if it has no manifest yet."""
+    return open_folder(out).config_by_name if (out / MANIFEST_FILE).is_file() else {}

@@ -223,11 +223,7 @@ def decode_batch(batch: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
 
 
 def _decoder(column: str) -> Callable[[Any], Any]:
-    return _DECODERS.get(column_kind(column), _identity)
-
-
-def _identity(cell: Any) -> Any:
-    return cell
+    return _DECODERS.get(column_kind(column), lambda cell: cell)
 
 
 def _validated_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
@@ -262,12 +258,8 @@ class ConfigViews:
 
     @property
     def board(self) -> BoardSpec | None:
-        """ArUco board under the assembly, or None. Raises ``DatasetError`` if its description is invalid."""
-        board = self.entry.scene.board
-        try:
-            return None if board is None else BoardSpec(**board)
-        except TypeError as error:
-            raise DatasetError(f"{self.entry.root}: config {self.config}: the board is damaged: {error}") from None
+        """ArUco board under the assembly, or None."""
+        return self.entry.scene.board
 
     @property
     def mesh(self) -> Path:

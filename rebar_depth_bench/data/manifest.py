@@ -7,10 +7,11 @@ import re
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, Strict
+from pydantic import ConfigDict, Field, Strict, field_validator
 
-from rebar_depth_bench.errors import DatasetError, Problem
-from rebar_depth_bench.validation import Expected, StrictModel, format_location, validate_table
+from rebar_depth_bench.errors import DatasetError, Problem, escape_text
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
+from rebar_depth_bench.validation import Expected, StrictModel, field_error, format_location, validate_table
 
 MANIFEST_FILE = "manifest.json"
 MANIFEST_FORMAT = "rebar-depth-dataset-1"
@@ -40,21 +41,29 @@ class _ManifestTable(StrictModel):
 
 
 class Appearance(_ManifestTable):
-    """Appearance of a scene; ``variants`` are the names of its appearance variants."""
+    """Names of the appearance variants of a scene."""
 
     variants: _Names = ()
 
 
 class Scene(_ManifestTable):
-    """Scene of a config; ``board`` holds the fields of its ``BoardSpec``, None without a board."""
+    """Scene of a config; ``board`` is the ArUco board under the assembly, or None."""
 
     name: str
-    board: dict[str, Any] | None = None
+    board: BoardSpec | None
     appearance: Appearance = Appearance()
+
+    @field_validator("board", mode="before")
+    @classmethod
+    def _make_board(cls, fields: Any) -> BoardSpec | None:
+        try:
+            return None if fields is None else BoardSpec(**fields)
+        except TypeError as error:
+            raise field_error(escape_text(str(error)), "the fields of a board") from None
 
 
 class Rig(_ManifestTable):
-    """Stereo rig of a config; ``width`` and ``height`` are in pixels."""
+    """Image size of a stereo rig, pixels."""
 
     width: int
     height: int
@@ -80,11 +89,7 @@ class _Located(_ManifestTable):
 
 
 class DatasetConfig(_Located):
-    """Config of a dataset.
-
-    ``entry`` is its whole manifest entry as parsed JSON, with all parameters of the build. The sheet is the
-    contact sheet; paths are relative to the dataset folder.
-    """
+    """Config of a dataset; ``entry`` is its manifest entry as it was written, with all parameters of the build."""
 
     name: str
     scene: Scene
@@ -109,10 +114,7 @@ class DatasetConfig(_Located):
 
 
 class DatasetFolder(_Located):
-    """Dataset with a validated manifest.
-
-    ``digest`` is the ground-truth digest, ``sha256:...``; ``files`` maps paths to hex SHA-256 digests.
-    """
+    """Dataset with a validated manifest; ``files`` are the hex SHA-256 digests of its files, by path."""
 
     version: str
     digest: str
@@ -140,6 +142,8 @@ class _GroundTruth(_ManifestTable):
 
 
 class _Manifest(_ManifestTable):
+    """Manifest; its configs are validated one by one."""
+
     format: Annotated[str, Expected(f'"{MANIFEST_FORMAT}"', lambda name: name == MANIFEST_FORMAT)]
     version: str
     ground_truth: _GroundTruth
@@ -154,30 +158,23 @@ def open_folder(root: str | Path) -> DatasetFolder:
     """
     root = str(root)
     path = _manifest_path(root)
-    problems: list[Problem] = []
-    manifest = validate_table(_Manifest, _read_json(path), problems)
-    configs = {}
-    for name, entry in manifest.configs.items() if manifest else ():
-        values = {**entry, "root": root, "name": name, "entry": entry}
-        if config := validate_table(DatasetConfig, values, problems, format_location("configs", name)):
-            configs[name] = config
-    if manifest is None or problems:
-        raise DatasetError.from_problems(path, problems)
-    return DatasetFolder(
-        root=root,
-        version=manifest.version,
-        digest=manifest.ground_truth.digest,
-        files=manifest.files,
-        config_by_name=configs,
-    )
-
-
-def _read_json(path: Path) -> Any:
     try:
-        return json.loads(path.read_bytes())
+        values = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         problem = Problem("syntax", "", f"cannot be read as JSON: {error}")
         raise DatasetError.from_problems(path, [problem]) from None
+    problems: list[Problem] = []
+    head = validate_table(_Manifest, values, problems)
+    configs = {}
+    for name, entry in head.configs.items() if head else ():
+        fields = {**entry, "root": root, "name": name, "entry": entry}
+        if config := validate_table(DatasetConfig, fields, problems, format_location("configs", name)):
+            configs[name] = config
+    if head is None or problems:
+        raise DatasetError.from_problems(path, problems)
+    return DatasetFolder(
+        root=root, version=head.version, digest=head.ground_truth.digest, files=head.files, config_by_name=configs
+    )
 
 
 def _manifest_path(root: str) -> Path:

@@ -53,4 +53,6 @@ def test_dataset_card_steel_share_matches_masks(tiny_root: Path, tiny_masks: dic
 
 
 def test_dataset_card_is_rendered_from_manifest(tiny_root: Path) -> None:
-    assert dataset_card(open_folder(tiny_root)) == (tiny_root / "README.md").read_text()
+    folder = open_folder(tiny_root)
+    card = dataset_card(folder.version, folder.digest, list(folder.config_by_name.values()))
+    assert card == (tiny_root / "README.md").read_text()

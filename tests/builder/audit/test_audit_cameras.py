@@ -14,7 +14,6 @@ import pytest
 import rebar_depth_bench as rdb
 from dataset_builder.audit.cameras import (
     ExpectedView,
-    board_spec,
     camera_problems,
     checked_aim_point_m,
     expected_views,
@@ -29,7 +28,6 @@ from dataset_builder.config.trajectories import poses
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from rebar_depth_bench.data.manifest import DatasetConfig, ViewRecord, open_folder
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import right_camera_pose
 from tests.builder.audit.audit_scene import RIGS
 
@@ -52,12 +50,6 @@ def test_rig_is_read_from_manifest(name: str) -> None:
 @pytest.mark.parametrize("protocol", [RING, DomeSpec((0.2, 0.3), (10.0, 20.0), 5)])
 def test_trajectory_is_read_from_manifest(protocol: RingSpec | DomeSpec) -> None:
     assert trajectory_spec(manifest_config(protocol=asdict(protocol))) == protocol
-
-
-def test_board_or_null_is_read_from_manifest() -> None:
-    board = BoardSpec(markers=12)
-    assert board_spec(manifest_config(scene={"board": asdict(board)})) == board
-    assert board_spec(manifest_config(scene={"board": None})) is None
 
 
 @pytest.mark.parametrize(
