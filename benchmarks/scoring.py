@@ -85,7 +85,7 @@ def _torch_numbers(p: torch.Tensor, z: torch.Tensor) -> list[float]:
 
 def extended_rows(root: str, config: str, submission: SubmissionReader) -> list[tuple[str, str]]:
     """Return the milliseconds per view of each measure family, native and scaled together, and their sum."""
-    steel = load_steel_truth(open_folder(root), config)
+    steel = load_steel_truth(open_folder(root).config(config))
     views = []
     for index in range(len(steel)):
         truth = steel.view(index)
@@ -117,7 +117,7 @@ def main(root: str, config: str = "lattice") -> None:
     folder = open_folder(root)
     rows = list(rdb.load(root, config, columns=["view_id", "left_depth", "left_mask"]))
     truths = {row["view_id"]: (row["left_depth"], row["left_mask"]) for row in rows}
-    scored = config_truth(folder, config)
+    scored = config_truth(folder.config(config))
     pixels = sum(len(truth.index) for truth in scored) / len(scored)
     print(f"{len(rows)} views, {pixels:.0f} scored pixels each; {machine_description()}\n")
     with tempfile.TemporaryDirectory() as scratch:

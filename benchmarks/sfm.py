@@ -26,7 +26,7 @@ from rebar_depth_bench.methods.multiview.pose_errors import aligned_report, boar
 
 def main(root: str, config: str = "lattice-orbit") -> None:
     print(f"{config} of {root}; pycolmap {pycolmap.__version__}; {machine_description()}\n")
-    views = ConfigViews(open_folder(root), config)
+    views = ConfigViews(open_folder(root).config(config))
     with tempfile.TemporaryDirectory() as scratch:
         pictures = write_left_images(views, Path(scratch) / "images")
         start = time.perf_counter()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +10,8 @@ from huggingface_hub import DatasetCardData
 
 from cards.templates import render
 from rebar_depth_bench.data.dataset import COLUMN_DESCRIPTIONS, column_kind, features
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 if TYPE_CHECKING:
     from datasets import DatasetInfo
@@ -24,17 +26,19 @@ _OPTICS_TEXTS = {
 _SIZE_CATEGORIES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 
 
-def dataset_card(manifest: Mapping[str, Any]) -> str:
-    """Return the text of the dataset folder's ``README.md``.
+def dataset_card(version: str, digest: str, configs: Sequence[DatasetConfig]) -> str:
+    """Return the text of the ``README.md`` of a dataset folder, for its version and ground-truth digest.
 
     Its YAML header is sufficient for ``datasets.load_dataset(ROOT, config)``. The file pattern of each config
     contains the digest of its shards, so that the cache of ``datasets`` never serves an older build of a config.
     """
     return render(
         "dataset_card.md.j2",
-        yaml=_card_metadata(manifest).to_yaml(),
-        manifest=manifest,
-        configs=[_config_row(name, entry) for name, entry in manifest["configs"].items()],
+        yaml=_card_metadata(version, configs).to_yaml(),
+        version=version,
+        digest=digest,
+        protocol=PROTOCOL,
+        configs=[_config_row(config) for config in configs],
         columns=column_rows(),
     )
 
@@ -59,11 +63,10 @@ def _type_name(feature: Any) -> str:
     return "image" if kind == "Image" else str(feature.dtype)
 
 
-def _card_metadata(manifest: Mapping[str, Any]) -> DatasetCardData:
-    configs: Mapping[str, Mapping[str, Any]] = manifest["configs"]
+def _card_metadata(version: str, configs: Sequence[DatasetConfig]) -> DatasetCardData:
     from datasets.info import DatasetInfosDict
 
-    views = sum(len(entry["views"]) for entry in configs.values())
+    views = sum(len(config.views) for config in configs)
     card = DatasetCardData(
         license="cc-by-4.0",
         pretty_name="Industrial rebar metric depth",
@@ -71,24 +74,24 @@ def _card_metadata(manifest: Mapping[str, Any]) -> DatasetCardData:
         tags=["depth", "stereo", "construction", "rebar", "synthetic"],
         size_categories=[next((name for limit, name in _SIZE_CATEGORIES if views < limit), "100K<n<1M")],
     )
-    infos = {name: _dataset_info(name, entry, manifest["version"]) for name, entry in configs.items()}
+    infos = {config.name: _dataset_info(config, version) for config in configs}
     DatasetInfosDict(infos).to_dataset_card_data(card)
     card["configs"] = [
-        {"config_name": name, "data_files": [{"split": SPLIT, "path": _shard_pattern(entry["shards"])}]}
-        for name, entry in configs.items()
+        {"config_name": config.name, "data_files": [{"split": SPLIT, "path": _shard_pattern(config.shards)}]}
+        for config in configs
     ]
     return card
 
 
-def _dataset_info(name: str, entry: Mapping[str, Any], version: str) -> DatasetInfo:
+def _dataset_info(config: DatasetConfig, version: str) -> DatasetInfo:
     from datasets import DatasetInfo, SplitDict, SplitInfo
 
-    size = entry["bytes"]
-    split = SplitInfo(SPLIT, num_examples=len(entry["views"]), num_bytes=size)
+    size = config.entry["bytes"]
+    split = SplitInfo(SPLIT, num_examples=len(config.views), num_bytes=size)
     return DatasetInfo(
         features=features(),
         splits=SplitDict({SPLIT: split}),
-        config_name=name,
+        config_name=config.name,
         version=version,
         dataset_size=size,
         download_size=size,
@@ -101,24 +104,24 @@ def _shard_pattern(shards: Iterable[str]) -> str:
     return f"{shard.partition('/')[0]}/{SPLIT}-*-{shard.rpartition('-')[2]}"
 
 
-def _config_row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
-    rig, views = entry["rig"], entry["views"]
-    steel = np.array([view["steel_px"] for view in views], float)
-    scored = np.array([view["scored_px"] for view in views], float)
+def _config_row(config: DatasetConfig) -> dict[str, Any]:
+    entry, rig, views = config.entry, config.rig, config.views
+    steel = np.array([view.steel_px for view in views], float)
+    scored = np.array([view.scored_px for view in views], float)
     with_steel = steel > 0
     return {
-        "name": name,
+        "name": config.name,
         "views": f"{len(views)} of {entry['protocol_views']}",
         "samples": entry["colour"]["samples"],
         "steel_source": _steel_source(entry["scene"]["assembly"]),
-        "grid": f"{rig['width']} x {rig['height']}",
+        "grid": f"{rig.width} x {rig.height}",
         "distance": _distance(entry["protocol"]),
-        "steel": f"{100 * np.mean(steel) / (rig['width'] * rig['height']):.1f} %",
+        "steel": f"{100 * np.mean(steel) / (rig.width * rig.height):.1f} %",
         "kept": f"{100 * np.mean(scored[with_steel] / steel[with_steel]):.0f} %" if with_steel.any() else "none",
         "out_of_protocol": int(np.count_nonzero(scored == 0)),
-        "sheet": entry["sheet"],
-        "variants": entry["scene"]["appearance"]["variants"],
-        "optics": _OPTICS_TEXTS[rig["grid"]],
+        "sheet": config.sheet,
+        "variants": config.scene.appearance.variants,
+        "optics": _OPTICS_TEXTS[entry["rig"]["grid"]],
         "megabytes": f"{entry['bytes'] / 1e6:.1f}",
     }
 

@@ -28,6 +28,7 @@ _MAX_REPR_CHARACTERS = 60
 _MAX_MAGNITUDE = 1e9
 """Largest accepted magnitude: far above any number of a scene or model file, with powers that stay finite."""
 _EXPLAINED = "explained"
+_TYPES = {"model_type": "a table", "dict_type": "a table", "tuple_type": "a list"}
 
 
 class StrictModel(BaseModel):
@@ -135,7 +136,7 @@ def _problem(details: ErrorDetails, model: type[BaseModel], where: str) -> Probl
     if kind == "extra_forbidden":
         known = _model_at(model, location).model_fields
         return Problem("unknown", place, "not a known key", _known_keys(str(location[-1]), known))
-    expected = "a table" if kind in ("model_type", "dict_type") else details["msg"]
+    expected = _TYPES.get(kind, details["msg"].removeprefix("Input should be "))
     return Problem("invalid", place, f"got {short_repr(details['input'])}", expected)
 
 

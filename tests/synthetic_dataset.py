@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -66,9 +65,9 @@ def _write_config(folder: Path, config: str, views: int) -> list[ViewRecord]:
 def _config_entry(config: str, records: Sequence[ViewRecord]) -> dict[str, object]:
     digest = _digest([record.left for record in records])
     return {
-        "scene": {"name": config},
+        "scene": {"name": config, "board": None},
         "rig": {"height": HEIGHT, "width": WIDTH},
-        "views": [asdict(record) for record in records],
+        "views": [record.model_dump() for record in records],
         "ground_truth_digest": digest,
         "key": "",
         "shards": [f"{config}/test.parquet"],

@@ -1,7 +1,7 @@
 """Camera checks of the audit: poses and intrinsics against the manifest, pixel rays against OpenCV.
 
 The expected cameras are rebuilt from the manifest entry of a config: its JSON values are parsed back to the specs
-of trajectory, rig and board that they were written from, and the trajectory's poses are passed through the rig.
+of trajectory and rig that they were written from, and the trajectory's poses are passed through the rig.
 The lens model is checked by projecting the 3-D point of each pixel with ``cv2.projectPoints``: it must return to
 its pixel.
 """
@@ -29,8 +29,8 @@ from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
 from rebar_depth_bench.data.dataset import EYES
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, camera_centre
 from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
 
@@ -42,41 +42,23 @@ _TRAJECTORY_SPECS: Mapping[str, Callable[..., TrajectorySpec]] = {
 }
 
 
-def trajectory_spec(config: str, entry: Mapping[str, Any]) -> TrajectorySpec:
-    """Return the camera trajectory of a config's manifest entry.
-
-    Raises ``DatasetError`` if the entry holds no valid one.
-    """
-    return _spec_from_manifest(config, "protocol", entry, _trajectory_from_json)
+def trajectory_spec(config: DatasetConfig) -> TrajectorySpec:
+    """Return the camera trajectory of a config; raise ``DatasetError`` if its manifest entry has no valid one."""
+    return _spec_from_manifest(config, "protocol", _trajectory_from_json)
 
 
-def rig_spec(config: str, entry: Mapping[str, Any]) -> RigSpec:
-    """Return the stereo rig of a config's manifest entry.
-
-    Raises ``DatasetError`` if the entry holds no valid one.
-    """
-    return _spec_from_manifest(config, "rig", entry, _rig_from_json)
+def rig_spec(config: DatasetConfig) -> RigSpec:
+    """Return the stereo rig of a config; raise ``DatasetError`` if its manifest entry has no valid one."""
+    return _spec_from_manifest(config, "rig", _rig_from_json)
 
 
-def board_spec(config: str, entry: Mapping[str, Any]) -> BoardSpec | None:
-    """Return the ArUco board of a config's scene, None for a scene without one.
-
-    Raises ``DatasetError`` if the board's values are invalid.
-    """
-    return _spec_from_manifest(
-        config, "board", entry["scene"], lambda board: None if board is None else BoardSpec(**board)
-    )
-
-
-def _spec_from_manifest(
-    config: str, key: str, entry: Mapping[str, Any], make_spec: Callable[[Any], _Spec]
-) -> _Spec:
+def _spec_from_manifest(config: DatasetConfig, key: str, make_spec: Callable[[Any], _Spec]) -> _Spec:
     try:
-        return make_spec(entry[key])
+        return make_spec(config.entry[key])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DatasetError(
-            f"manifest: the {key} of config {config} is {entry.get(key)!r}, expected a value that this "
-            f"version writes: {type(error).__name__}: {error}"
+            f"manifest: the {key} of config {config.name} is {config.entry.get(key)!r}, expected a value that "
+            f"this version writes: {type(error).__name__}: {error}"
         ) from None
 
 
@@ -134,42 +116,42 @@ def mesh_aim_point_m(mesh: Path) -> Float64[ndarray, " 3"]:
     return aim_point_m(Assembly((), (Part("steel", Mesh(steel, faces[:0]), 1, "steel"),)))
 
 
-def checked_aim_point_m(entry: Mapping[str, Any], mesh: Path) -> tuple[Float64[ndarray, " 3"], tuple[str, ...]]:
+def checked_aim_point_m(config: DatasetConfig, mesh: Path) -> tuple[Float64[ndarray, " 3"], tuple[str, ...]]:
     """Return a config's aim point, world metres, and the problems found with it.
 
     This is ``aim_point_m`` of the manifest entry if it agrees with the middle of the mesh's steel. If the manifest
     has no aim point, or a different one (a problem), the middle of the steel is returned.
     """
     middle_m = mesh_aim_point_m(mesh)
-    if "aim_point_m" not in entry:
+    if "aim_point_m" not in config.entry:
         return middle_m, ()
-    aim_m = np.asarray(entry["aim_point_m"], dtype=np.float64)
+    aim_m = np.asarray(config.entry["aim_point_m"], dtype=np.float64)
     if aim_m.shape != (3,) or not np.abs(aim_m - middle_m).max() <= _AIM_TOLERANCE_M:
         return middle_m, (
-            f"aim_point_m is {entry['aim_point_m']}, expected {middle_m.tolist()}, the centre of the steel",
+            f"aim_point_m is {config.entry['aim_point_m']}, expected {middle_m.tolist()}, the centre of the steel",
         )
     return aim_m, ()
 
 
-def expected_views(config: str, entry: Mapping[str, Any], aim_m: Float64[ndarray, " 3"]) -> list[ExpectedView]:
-    """Return the expected views of a config in order, from its manifest entry and aim point (world metres).
+def expected_views(config: DatasetConfig, aim_m: Float64[ndarray, " 3"]) -> list[ExpectedView]:
+    """Return the expected views of a config in order, from its manifest entry and the aim point (world metres).
 
     Raises ``DatasetError`` if the manifest's trajectory or rig is not one that this version writes.
     """
-    rig = rig_spec(config, entry)
-    left_poses = poses(trajectory_spec(config, entry), aim_m, rig)
+    rig = rig_spec(config)
+    left_poses = poses(trajectory_spec(config), aim_m, rig)
     try:
         return [
-            ExpectedView(view_id(config, index), rig_cameras(rig, left_poses[index]), rig.baseline_m)
-            for index in subset(len(left_poses), len(entry["views"]))
+            ExpectedView(view_id(config.name, index), rig_cameras(rig, left_poses[index]), rig.baseline_m)
+            for index in subset(len(left_poses), len(config.views))
         ]
     except ValueError as error:
-        raise DatasetError(f"manifest: the rig of config {config} is invalid: {error}") from None
+        raise DatasetError(f"manifest: the rig of config {config.name} is invalid: {error}") from None
 
 
-def view_list_problems(entry: Mapping[str, Any], views: Sequence[ExpectedView]) -> Iterator[str]:
+def view_list_problems(config: DatasetConfig, views: Sequence[ExpectedView]) -> Iterator[str]:
     """Yield a problem if the manifest's view ids are not those of the expected views, in order."""
-    listed_ids = [view["view_id"] for view in entry["views"]]
+    listed_ids = list(config.view_ids)
     expected_ids = [view.view_id for view in views]
     if listed_ids != expected_ids:
         first_mismatch = next(

@@ -19,26 +19,25 @@ from rebar_depth_bench.scoring.protocol import scored_pixels
 
 def check_files(folder: DatasetFolder, root: Path) -> Check:
     """Check that every file of the manifest exists with its SHA-256, and that the folder has no other file."""
-    listed = folder.manifest["files"]
-    problems = [problem for name, sha256 in listed.items() if (problem := _file_problem(root, name, sha256))]
-    unlisted = sorted(_existing_files(root) - set(listed) - {MANIFEST_FILE})
+    problems = [problem for name, sha256 in folder.files.items() if (problem := _file_problem(root, name, sha256))]
+    unlisted = sorted(_existing_files(root) - set(folder.files) - {MANIFEST_FILE})
     problems += [f"{name}: is not in the manifest" for name in unlisted]
     if (root / BUILD_FOLDER).exists():
         problems.append(
             f"{BUILD_FOLDER}: the folder contains an unfinished build; run rebar-build again or remove it"
         )
-    return Check("files against the manifest", f"{len(listed)} files", "all SHA-256 equal", tuple(problems))
+    return Check("files against the manifest", f"{len(folder.files)} files", "all SHA-256 equal", tuple(problems))
 
 
 def check_digests(folder: DatasetFolder) -> Check:
     """Check the ground-truth digest of the dataset and of each config against the digests of the views."""
-    entries = {config: folder.config(config) for config in folder.configs}
+    configs = folder.config_by_name.values()
     problems = [
-        f"{config}: ground_truth_digest is {entry['ground_truth_digest']}, expected {views_digest(entry['views'])}"
-        for config, entry in entries.items()
-        if entry["ground_truth_digest"] != views_digest(entry["views"])
+        f"{config.name}: ground_truth_digest is {config.ground_truth_digest}, expected {digest}"
+        for config in configs
+        if config.ground_truth_digest != (digest := views_digest(config.views))
     ]
-    expected = views_digest([view for entry in entries.values() for view in entry["views"]])
+    expected = views_digest(view for config in configs for view in config.views)
     if folder.digest != expected:
         problems.append(f"the ground-truth digest is {folder.digest}, expected {expected}")
     return Check("digests of the manifest", folder.digest[:23], "equal to the views'", tuple(problems))
@@ -70,11 +69,11 @@ _IMAGES: Mapping[str, tuple[str, tuple[int, ...]]] = {
 _MATRICES: Mapping[str, tuple[int, ...]] = {"K": (3, 3), "distortion": (5,), "cam_from_world": (4, 4)}
 
 
-def array_problems(row: Mapping[str, Any], rig: Mapping[str, Any]) -> Iterator[str]:
+def array_problems(row: Mapping[str, Any], grid: tuple[int, int]) -> Iterator[str]:
     """Yield the faults that make a decoded row unusable: wrong dtypes or shapes, non-finite or negative values."""
     for eye in EYES:
         for kind, (dtype, extra) in _IMAGES.items():
-            array, expected = row[f"{eye}_{kind}"], (rig["height"], rig["width"], *extra)
+            array, expected = row[f"{eye}_{kind}"], (*grid, *extra)
             if array.shape != expected or array.dtype != dtype:
                 yield f"{eye} {kind} is {array.dtype} {array.shape}, expected {dtype} {expected}"
         depth_m = row[f"{eye}_depth"]

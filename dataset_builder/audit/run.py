@@ -9,7 +9,6 @@ from typing import Any
 
 from dataset_builder.audit.cameras import (
     ExpectedView,
-    board_spec,
     camera_problems,
     checked_aim_point_m,
     expected_views,
@@ -28,7 +27,7 @@ from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView, 
 from dataset_builder.config.trajectories import subset
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.dataset import COLUMNS, iterate_rows
-from rebar_depth_bench.data.manifest import DatasetFolder, ViewRecord, open_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
 
@@ -75,32 +74,30 @@ def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent
     files = check_files(folder, folder.local)
     checks = [files, check_digests(folder)]
     if files.passed:  # Rows of damaged files cannot be checked.
-        for config in folder.configs:
-            checks += _config_checks(folder, folder.local, config, depth_views, progress)
+        for config in folder.config_by_name.values():
+            checks += _config_checks(config, folder.local, depth_views, progress)
     return AuditReport(str(root), tuple(checks))
 
 
-def _config_checks(
-    folder: DatasetFolder, root: Path, name: str, depth_views: int, progress: Progress
-) -> Iterator[Check]:
-    entry = folder.config(name)
-    steel = read_bars(root / BARS_FILE)[entry["scene"]["name"]]
-    config = AuditedConfig(name, entry, steel, board_spec(name, entry))
-    aim_m, aim_problems = checked_aim_point_m(entry, root / entry["mesh"])
-    expected = expected_views(name, entry, aim_m)
-    accumulator = _AuditAccumulator(config, folder.views(name), expected, depth_views)
-    for row in iterate_rows(root, name, [column for column in COLUMNS if column not in _NOT_AUDITED]):
+def _config_checks(config: DatasetConfig, root: Path, depth_views: int, progress: Progress) -> Iterator[Check]:
+    name, mesh = config.name, root / config.mesh
+    steel = read_bars(root / BARS_FILE)[config.scene.name]
+    audited = AuditedConfig(name, config.scene.appearance.variants, steel, config.scene.board)
+    aim_m, aim_problems = checked_aim_point_m(config, mesh)
+    expected = expected_views(config, aim_m)
+    accumulator = _AuditAccumulator(config, audited, expected, depth_views)
+    for row in iterate_rows(config, [column for column in COLUMNS if column not in _NOT_AUDITED]):
         accumulator.add(row)
-        progress(f"audit of {name}", accumulator.rows, len(entry["views"]))
+        progress(f"audit of {name}", accumulator.rows, len(config.views))
     yield accumulator.rows_check()
     yield _cameras_check(
-        name, expected, [*aim_problems, *view_list_problems(entry, expected), *accumulator.cameras]
+        name, expected, [*aim_problems, *view_list_problems(config, expected), *accumulator.cameras]
     )
     for check, measurements in zip(VIEW_CHECKS, accumulator.measurements, strict=True):
-        yield check.verdict(config, measurements)
+        yield check.verdict(audited, measurements)
     cycles_eyes = accumulator.cycles_eyes
     difference_and_depth_m = cycles_difference_m(
-        root / entry["mesh"], cycles_eyes, lambda done, total: progress(f"Cycles depth of {name}", done, total)
+        mesh, cycles_eyes, lambda done, total: progress(f"Cycles depth of {name}", done, total)
     )
     yield cycles_verdict(name, difference_and_depth_m, len(cycles_eyes) // 2)
 
@@ -109,17 +106,14 @@ class _AuditAccumulator:
     """Accumulator over a config's rows: problems, measurements of every check, and eyes to render in Cycles."""
 
     def __init__(
-        self,
-        config: AuditedConfig,
-        records: Sequence[ViewRecord],
-        expected: Sequence[ExpectedView],
-        depth_views: int,
+        self, config: DatasetConfig, audited: AuditedConfig, expected: Sequence[ExpectedView], depth_views: int
     ) -> None:
-        self._config, self._records, self._expected = config, records, expected
-        self._bar_ids = {bar.bar_id for bar in config.steel}
+        self._config, self._audited, self._expected = config, audited, expected
+        self._records = config.views
+        self._bar_ids = {bar.bar_id for bar in audited.steel}
         self._rays = RayCache()
-        self._measured = [set(subset(len(records), check.views)) for check in VIEW_CHECKS]
-        self._cycles_indices = set(subset(len(records), depth_views) if depth_views else ())
+        self._measured = [set(subset(len(config.views), check.views)) for check in VIEW_CHECKS]
+        self._cycles_indices = set(subset(len(config.views), depth_views) if depth_views else ())
         self._problems: list[str] = []
         self.rows = 0
         self.cameras: list[str] = []
@@ -133,7 +127,7 @@ class _AuditAccumulator:
         if n >= len(self._records):
             return
         view_id = self._records[n].view_id
-        array_faults = list(array_problems(row, self._config.entry["rig"]))
+        array_faults = list(array_problems(row, self._config.grid))
         row_faults = array_faults or row_problems(row, self._records[n], self._bar_ids)
         self._problems += [f"{view_id}: {problem}" for problem in row_faults]
         if array_faults:
@@ -143,7 +137,7 @@ class _AuditAccumulator:
         view = view_from_row(row, self._rays)
         for check, measurements, selected in zip(VIEW_CHECKS, self.measurements, self._measured, strict=True):
             if n in selected:
-                measurements.append(check.measure(self._config, view))
+                measurements.append(check.measure(self._audited, view))
         if n in self._cycles_indices:
             self.cycles_eyes += [view.left, view.right]
 

@@ -1,8 +1,8 @@
-"""Inputs of the audit checks: a config with its manifest entry, and a stereo view with its two eyes."""
+"""Inputs of the audit checks: a config with its steel and board, and a stereo view with its two eyes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,10 +22,10 @@ from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
 
 @dataclass(frozen=True, eq=False)
 class AuditedConfig:
-    """Config under audit: its manifest entry, the bars of its scene, and its board (None without one)."""
+    """Config under audit: its appearance variants, the bars of its scene, and its board (None without one)."""
 
     name: str
-    entry: Mapping[str, Any]
+    variants: tuple[str, ...]
     steel: tuple[Bar, ...]
     board: BoardSpec | None
 
@@ -37,16 +37,12 @@ class AuditedConfig:
     @property
     def has_props(self) -> bool:
         """Whether the scene has props, which may stand on the board or hide it."""
-        return bool(variants_of_slot(self._variants, PROPS_SLOT))
+        return bool(variants_of_slot(self.variants, PROPS_SLOT))
 
     @property
     def has_lighting_variant(self) -> bool:
         """Whether the scene has a lighting variant, under which markers may not be detected."""
-        return bool(variants_of_slot(self._variants, LIGHT_SLOT))
-
-    @property
-    def _variants(self) -> Sequence[str]:
-        return tuple(self.entry["scene"].get("appearance", {}).get("variants", ()))
+        return bool(variants_of_slot(self.variants, LIGHT_SLOT))
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from typing import Any
 from dataset_builder.export.images import EXPORT_FILES
 from dataset_builder.export.nerfstudio import json_lines
 from dataset_builder.export.views import CameraView
-from rebar_depth_bench.data.manifest import DatasetFolder
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.geometry.cameras import Camera
 
 LICENCE = "CC BY 4.0 (https://creativecommons.org/licenses/by/4.0/)"
@@ -31,14 +31,13 @@ _NOT_PARAMETERS = ("views", "shards", "ground_truth_digest", "key", "mesh", "byt
 """Keys of a config's manifest entry that are not scene parameters."""
 
 
-def cameras_json(folder: DatasetFolder, config: str, views: Sequence[CameraView]) -> str:
+def cameras_json(folder: DatasetFolder, config: DatasetConfig, views: Sequence[CameraView]) -> str:
     """Return ``cameras.json``: conventions, origin of the data, and one entry per view and eye."""
-    entry = folder.config(config)
     head = {
         "conventions": CONVENTIONS,
         "dataset": {"digest": folder.digest, "version": folder.version},
-        "config": config,
-        "parameters": {name: value for name, value in entry.items() if name not in _NOT_PARAMETERS},
+        "config": config.name,
+        "parameters": {name: value for name, value in config.entry.items() if name not in _NOT_PARAMETERS},
         "licence": LICENCE,
     }
     cameras = [_camera(view, eye, camera) for view in views for eye, camera in view.cameras.items()]

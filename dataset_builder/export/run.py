@@ -16,7 +16,7 @@ from dataset_builder.export.target import export_target
 from dataset_builder.export.views import CameraView, StoredView, stored_views
 from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
-from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
 
@@ -60,14 +60,15 @@ def export(
     an earlier export of the same data, and for one that cannot be written.
     """
     folder = _local_folder(root)
-    names = tuple(dict.fromkeys(configs or folder.configs))
-    wanted = {name: _select_view_ids(folder, name, views) for name in names}
+    chosen = [folder.config(name) for name in dict.fromkeys(configs or folder.configs)]
+    wanted = {config.name: _select_view_ids(config, views) for config in chosen}
     bars = _read_bars(folder)
     target = Path(to)
     try:
         with export_target(target, folder, wanted):
             exported = [
-                _export_config(folder, name, wanted[name], bars, target / name, progress) for name in names
+                _export_config(folder, config, wanted[config.name], bars, target / config.name, progress)
+                for config in chosen
             ]
     except OSError as error:  # Only writing raises OSError here: reading raises DatasetError.
         raise InputError(f"{to}: cannot be written: {error}") from error
@@ -83,17 +84,16 @@ def _local_folder(root: str | Path) -> DatasetFolder:
     return open_folder(root)
 
 
-def _select_view_ids(folder: DatasetFolder, config: str, views: int | None) -> list[str]:
+def _select_view_ids(config: DatasetConfig, views: int | None) -> list[str]:
     """Return the ids of the selected views of a config.
 
     Raises ``DatasetError`` if the config's name cannot name a folder, ``InputError`` for fewer than one view.
     """
-    view_ids = [record.view_id for record in folder.views(config)]
-    if not _FOLDER_NAME.fullmatch(config):
-        raise DatasetError(f"{folder.root}: the name of config {config!r} is not a valid folder name")
+    if not _FOLDER_NAME.fullmatch(config.name):
+        raise DatasetError(f"{config.root}: the name of config {config.name!r} is not a valid folder name")
     if views is not None and views < 1:
         raise InputError(f"--views is {views}, expected 1 or more")
-    return [view_ids[index] for index in subset(len(view_ids), views)]
+    return [config.views[index].view_id for index in subset(len(config.views), views)]
 
 
 def _read_bars(folder: DatasetFolder) -> dict[str, tuple[Bar, ...]]:
@@ -104,7 +104,7 @@ def _read_bars(folder: DatasetFolder) -> dict[str, tuple[Bar, ...]]:
 
 def _export_config(
     folder: DatasetFolder,
-    config: str,
+    config: DatasetConfig,
     wanted: Sequence[str],
     bars: dict[str, tuple[Bar, ...]],
     into: Path,
@@ -113,23 +113,22 @@ def _export_config(
     """Write a config's images, then the metadata that refers to them."""
     views: list[CameraView] = []
     written = 0
-    for stored in stored_views(folder, config, wanted):
+    for stored in stored_views(config, wanted):
         written += _write_missing(stored, into)
         views.append(stored.view)
-        progress(f"export of {config}", len(views), len(wanted))
-    scene = str(folder.config(config)["scene"]["name"])
+        progress(f"export of {config.name}", len(views), len(wanted))
     texts = {
         "sparse/0/cameras.txt": cameras_txt(views),
         "sparse/0/images.txt": images_txt(views),
-        "sparse/0/points3D.txt": points_txt(bars.get(scene, ())),
+        "sparse/0/points3D.txt": points_txt(bars.get(config.scene.name, ())),
         "transforms.json": transforms_json(views),
         "cameras.json": cameras_json(folder, config, views),
-        "README.txt": readme_txt(folder, config, len(views)),
+        "README.txt": readme_txt(folder, config.name, len(views)),
     }
     for name, text in texts.items():
         write_text(into / name, text)
     file_count = sum(len(view.cameras) for view in views) * len(EXPORT_FILES)
-    return ConfigExport(config, len(views), written, file_count - written)
+    return ConfigExport(config.name, len(views), written, file_count - written)
 
 
 def _write_missing(stored: StoredView, into: Path) -> int:

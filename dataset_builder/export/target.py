@@ -78,9 +78,7 @@ def _merged_configs(
     to: Path, folder: DatasetFolder, wanted: Mapping[str, Sequence[str]]
 ) -> dict[str, _ExportedConfig]:
     """Return the configs in ``to`` after the export: earlier ones remain, wanted ones are added or extended."""
-    configs = {
-        name: _ExportedConfig(str(folder.config(name)["key"]), tuple(views)) for name, views in wanted.items()
-    }
+    configs = {name: _ExportedConfig(folder.config(name).key, tuple(views)) for name, views in wanted.items()}
     earlier = _read_marker(to / MARKER, folder) if (to / MARKER).is_file() else {}
     for name in earlier.keys() & configs.keys():
         _check_same_build(to, name, earlier[name], configs[name])

@@ -8,7 +8,7 @@ from typing import Any
 
 from rebar_depth_bench.data.dataset import EYES, decode_row, iterate_undecoded
 from rebar_depth_bench.data.eye_view import camera_from_row, eye_from_row, truth_columns
-from rebar_depth_bench.data.manifest import DatasetFolder, ViewRecord
+from rebar_depth_bench.data.manifest import DatasetConfig, ViewRecord
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera
 
@@ -56,23 +56,22 @@ class StoredView:
         return decoded
 
 
-def stored_views(folder: DatasetFolder, config: str, wanted: Collection[str]) -> Iterator[StoredView]:
+def stored_views(config: DatasetConfig, wanted: Collection[str]) -> Iterator[StoredView]:
     """Yield the wanted views of a config in the folder's order, one row in memory at a time.
 
     Raises ``DatasetError`` for shards that cannot be read, lack a wanted view or contain an unknown one.
     """
-    records = {record.view_id: record for record in folder.views(config)}
+    records = {record.view_id: record for record in config.views}
     missing = set(wanted)
-    grid = folder.grid(config)
-    for row in iterate_undecoded(folder.root, config, _COLUMNS):
+    for row in iterate_undecoded(config, _COLUMNS):
         view_id = row["view_id"]
         if view_id not in records:
-            raise DatasetError(f"{folder.root}: view {view_id} is not in the manifest")
+            raise DatasetError(f"{config.root}: view {view_id} is not in the manifest")
         if view_id in missing:
             missing.remove(view_id)
-            yield StoredView(_camera_view(row, grid), records[view_id], row)
+            yield StoredView(_camera_view(row, config.grid), records[view_id], row)
     if missing:
-        raise DatasetError(f"{folder.root}: {config} lacks {len(missing)} views, among them {min(missing)}")
+        raise DatasetError(f"{config.root}: {config.name} lacks {len(missing)} views, among them {min(missing)}")
 
 
 def _camera_view(row: Mapping[str, Any], grid: tuple[int, int]) -> CameraView:

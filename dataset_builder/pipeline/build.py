@@ -17,8 +17,7 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, plan_request
 from dataset_builder.pipeline.publish import (
     build_lock,
     check_folder,
-    check_retained_files,
-    check_shared_scenes,
+    check_retained_configs,
     is_published,
     publish_config,
     remove_leftovers,
@@ -64,8 +63,7 @@ def build(
     with build_lock(out / BUILD_FOLDER):
         try:
             remove_leftovers(out)
-            check_shared_scenes(out, plans)
-            check_retained_files(out, plans)
+            check_retained_configs(out, plans)
             with nullcontext(cluster) if cluster else local_processes(workers, threads) as renderer:
                 return _build_plans(plans, out, renderer, progress)
         finally:

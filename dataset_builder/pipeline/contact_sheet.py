@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw
 
 from dataset_builder.config.trajectories import subset
 from rebar_depth_bench.atomic_io import write_bytes
+from rebar_depth_bench.data.manifest import DatasetConfig
 
 TILE_PX = (320, 180)
 """Width and height of a tile, pixels."""
@@ -37,12 +38,12 @@ def write_contact_sheet(root: Path, shards: Sequence[str], target: Path) -> None
     _save_webp(sheet, target)
 
 
-def write_scenes_strip(root: Path, configs: Sequence[Mapping[str, Any]], target: Path) -> None:
-    """Write a WebP with one colour view per config (a manifest entry): the view with the median steel pixels."""
+def write_scenes_strip(root: Path, configs: Sequence[DatasetConfig], target: Path) -> None:
+    """Write a WebP with one colour view per config: the view with the median steel pixels."""
     strip = Image.new("RGB", (STRIP_PANEL_PX[0] * len(configs), STRIP_PANEL_PX[1]), _BACKGROUND)
-    for n, entry in enumerate(configs):
-        by_steel = sorted(range(len(entry["views"])), key=lambda index: entry["views"][index]["steel_px"])
-        [row] = _read_rows(root, entry["shards"], [by_steel[len(by_steel) // 2]])
+    for n, config in enumerate(configs):
+        by_steel = sorted(range(len(config.views)), key=lambda index: config.views[index].steel_px)
+        [row] = _read_rows(root, config.shards, [by_steel[len(by_steel) // 2]])
         strip.paste(_letterboxed(row["left_rgb"], STRIP_PANEL_PX), (n * STRIP_PANEL_PX[0], 0))
     _save_webp(strip, target)
 

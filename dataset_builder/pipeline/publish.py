@@ -11,9 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from cards import dataset_card
 from dataset_builder.config.catalog import CONFIGS
@@ -25,7 +23,13 @@ from dataset_builder.scene.assemblies import aim_point_m
 from rebar_depth_bench.atomic_io import TEMPORARY_PATTERN, exclusive_lock, write_bytes, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest, views_digest
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, read_manifest
+from rebar_depth_bench.data.manifest import (
+    MANIFEST_FILE,
+    MANIFEST_FORMAT,
+    DatasetConfig,
+    DatasetFolder,
+    open_folder,
+)
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.version import software_version
@@ -60,25 +64,26 @@ def build_lock(folder: Path) -> Iterator[None]:
 
 def is_published(out: Path, plan: ConfigPlan) -> bool:
     """Return whether the folder already contains the shards and the mesh of the plan, with matching digests."""
-    manifest = _read_manifest_or_empty(out)
-    entry = manifest["configs"].get(plan.spec.name)
-    if entry is None or entry["key"] != plan.key:
+    if not (out / MANIFEST_FILE).is_file():
         return False
-    return all(_matches_manifest(out, name, manifest) for name in (*entry["shards"], entry["mesh"]))
+    folder = open_folder(out)
+    config = folder.config_by_name.get(plan.spec.name)
+    return config is not None and config.key == plan.key and _files_match(folder, (*config.shards, config.mesh))
 
 
 def repair_metadata(out: Path, plan: ConfigPlan) -> None:
     """Rewrite bars, card, pictures and manifest if any of them does not match the manifest."""
-    manifest = _read_manifest_or_empty(out)
-    descriptions = (BARS_FILE, CARD, STRIP, manifest["configs"][plan.spec.name]["sheet"])
-    if not all(_matches_manifest(out, name, manifest) for name in descriptions):
-        write_contact_sheet(out, manifest["configs"][plan.spec.name]["shards"], out / _sheet_name(plan))
+    folder = open_folder(out)
+    config = folder.config(plan.spec.name)
+    if not _files_match(folder, (BARS_FILE, CARD, STRIP, config.sheet)):
+        write_contact_sheet(out, config.shards, out / _sheet_name(plan))
         _write_bars(out, plan)
-        _write_manifest(out, manifest["configs"])
+        _write_manifest(out, folder.config_by_name)
 
 
-def _matches_manifest(out: Path, name: str, manifest: Mapping[str, Any]) -> bool:
-    return (out / name).is_file() and file_sha256(out / name) == manifest["files"].get(name)
+def _files_match(folder: DatasetFolder, names: Iterable[str]) -> bool:
+    paths = {name: Path(folder.root, name) for name in names}
+    return all(path.is_file() and file_sha256(path) == folder.files.get(name) for name, path in paths.items())
 
 
 def check_folder(out: Path) -> None:
@@ -86,36 +91,31 @@ def check_folder(out: Path) -> None:
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, expected a folder")
     if (out / MANIFEST_FILE).is_file():
-        read_manifest(out / MANIFEST_FILE)
+        open_folder(out)
     elif out.is_dir() and any(out.iterdir()) and not (out / BUILD_FOLDER / LOCK).is_file():
         raise InputError(
             f"{out}: is not empty and has no {MANIFEST_FILE}, expected a new folder or a dataset folder"
         )
 
 
-def check_retained_files(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    """Raise ``InputError`` if a shard or the mesh of a config that is not being built is missing."""
+def check_retained_configs(out: Path, plans: Sequence[ConfigPlan]) -> None:
+    """Raise ``InputError`` if a config that is not being built lacks a file, or if its scene is being changed."""
     planned = {plan.spec.name for plan in plans}
-    for name, entry in _read_manifest_or_empty(out)["configs"].items():
-        missing_files = [file for file in (*entry["shards"], entry["mesh"]) if not (out / file).is_file()]
-        if missing_files and name not in planned:
-            raise InputError(
-                f"{out}: {missing_files[0]} of config {name} is missing; rebuild this config too: --config {name}"
-            )
-
-
-def check_shared_scenes(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    """Raise ``InputError`` if a config that is not being built uses a scene being built with other parameters."""
-    planned = {plan.spec.name for plan in plans}
-    for name, entry in _read_manifest_or_empty(out)["configs"].items():
+    for name, config in _published_configs(out).items():
+        if name in planned:
+            continue
         for plan in plans:
             scene = plan.parameters["scene"]
-            same_name = entry["scene"]["name"] == scene["name"]
-            if name not in planned and same_name and entry["scene"] != json.loads(json.dumps(scene)):
+            if config.scene.name == scene["name"] and config.entry["scene"] != json.loads(json.dumps(scene)):
                 raise InputError(
                     f"{out}: config {name} was built with other parameters of scene {scene['name']!r}; "
                     f"rebuild it too (--config {name} {plan.spec.name}) or choose another folder"
                 )
+        missing_files = [file for file in (*config.shards, config.mesh) if not (out / file).is_file()]
+        if missing_files:
+            raise InputError(
+                f"{out}: {missing_files[0]} of config {name} is missing; rebuild this config too: --config {name}"
+            )
 
 
 def publish_config(out: Path, plan: ConfigPlan) -> None:
@@ -136,10 +136,11 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
         "sheet": _sheet_name(plan),
         "shards": shards,
         "bytes": sum((out / name).stat().st_size for name in shards),
-        "ground_truth_digest": views_digest([asdict(record) for record in records]),
-        "views": [asdict(record) for record in records],
+        "ground_truth_digest": views_digest(records),
+        "views": [record.model_dump() for record in records],
     }
-    _write_manifest(out, {**_read_manifest_or_empty(out)["configs"], plan.spec.name: entry})
+    config = DatasetConfig(**entry, root=str(out), entry=entry)
+    _write_manifest(out, {**_published_configs(out), config.name: config})
 
 
 def _write_bars(out: Path, plan: ConfigPlan) -> None:
@@ -154,7 +155,7 @@ def _sheet_name(plan: ConfigPlan) -> str:
 
 def remove_leftovers(out: Path) -> None:
     """Remove the files left by an interrupted build: temporary files and files not listed in the manifest."""
-    _remove_unlisted_files(out, _read_manifest_or_empty(out))
+    _remove_unlisted_files(out, _published_configs(out).values())
     configs = {path.parent for path in out.glob(_SHARDS)}
     for folder in (out, out / MESHES, out / PICTURES, *configs, *(out / name for name in CONFIGS)):
         for temporary in folder.glob(TEMPORARY_PATTERN):
@@ -178,49 +179,45 @@ def _publish_shards(out: Path, plan: ConfigPlan) -> list[str]:
     return names
 
 
-def _write_manifest(out: Path, configs: Mapping[str, Any]) -> None:
+def _write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
     order = [*CONFIGS, *sorted(set(configs) - set(CONFIGS))]
-    ordered = {name: configs[name] for name in order if name in configs}
-    views = [view for entry in ordered.values() for view in entry["views"]]
-    manifest: dict[str, Any] = {
-        "format": MANIFEST_FORMAT,
-        "version": software_version(),
-        "protocol": PROTOCOL,
-        "ground_truth": {"digest": views_digest(views)},
-        "configs": ordered,
-    }
-    for entry in ordered.values():
-        if not (out / entry["sheet"]).is_file():
-            write_contact_sheet(out, entry["shards"], out / entry["sheet"])
-    by_scene = {_strip_key(entry): entry for entry in reversed(ordered.values())}
+    ordered = [configs[name] for name in order if name in configs]
+    version, digest = software_version(), views_digest(view for config in ordered for view in config.views)
+    for config in ordered:
+        if not (out / config.sheet).is_file():
+            write_contact_sheet(out, config.shards, out / config.sheet)
+    by_scene = {_strip_key(config): config for config in reversed(ordered)}
     write_scenes_strip(out, list(reversed(by_scene.values())), out / STRIP)
-    write_text(out / CARD, dataset_card(manifest))
-    listed_files = [CARD, BARS_FILE, STRIP, *_config_files(ordered.values())]
-    manifest["files"] = {name: file_sha256(out / name) for name in sorted(set(listed_files))}
+    write_text(out / CARD, dataset_card(version, digest, ordered))
+    manifest = {
+        "format": MANIFEST_FORMAT,
+        "version": version,
+        "protocol": PROTOCOL,
+        "ground_truth": {"digest": digest},
+        "configs": {config.name: config.entry for config in ordered},
+        "files": {name: file_sha256(out / name) for name in sorted({CARD, BARS_FILE, *_listed_files(ordered)})},
+    }
     write_text(out / MANIFEST_FILE, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
-    _remove_unlisted_files(out, manifest)
+    _remove_unlisted_files(out, ordered)
 
 
-def _strip_key(entry: Mapping[str, Any]) -> str:
+def _strip_key(config: DatasetConfig) -> str:
     """Return the key that selects one panel of the strip: assembly kind, or file digest of a user's assembly."""
-    assembly = entry["scene"]["assembly"]
+    assembly = config.entry["scene"]["assembly"]
     return str(assembly.get("sha256", assembly["kind"]))
 
 
-def _config_files(entries: Iterable[Mapping[str, Any]]) -> list[str]:
-    return [name for entry in entries for name in (*entry["shards"], entry["mesh"], entry["sheet"])]
+def _listed_files(configs: Iterable[DatasetConfig]) -> set[str]:
+    return {STRIP, *(name for config in configs for name in (*config.shards, config.mesh, config.sheet))}
 
 
-def _remove_unlisted_files(out: Path, manifest: Mapping[str, Any]) -> None:
-    listed_files = set(_config_files(manifest["configs"].values()))
-    listed_files.add(STRIP)
+def _remove_unlisted_files(out: Path, configs: Iterable[DatasetConfig]) -> None:
+    listed_files = _listed_files(configs)
     for path in [*out.glob(_SHARDS), *(out / MESHES).glob("*.ply"), *(out / PICTURES).glob("*.webp")]:
         if path.relative_to(out).as_posix() not in listed_files:
             path.unlink()
 
 
-def _read_manifest_or_empty(out: Path) -> dict[str, Any]:
-    """Return the manifest of the folder, or an empty one if there is none yet."""
-    if not (out / MANIFEST_FILE).is_file():
-        return {"configs": {}}
-    return read_manifest(out / MANIFEST_FILE)
+def _published_configs(out: Path) -> Mapping[str, DatasetConfig]:
+    """Return the configs of the folder by name, none if it has no manifest yet."""
+    return open_folder(out).config_by_name if (out / MANIFEST_FILE).is_file() else {}

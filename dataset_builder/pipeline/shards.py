@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,7 @@ def split_into_shards(indices: Sequence[int]) -> list[tuple[int, ...]]:
 
 def stage_row(path: Path, row: pa.Table, record: ViewRecord) -> None:
     """Write the row of one view, with its record in the metadata, atomically."""
-    metadata = {_RECORD_KEY: json.dumps(asdict(record)).encode()}
+    metadata = {_RECORD_KEY: json.dumps(record.model_dump()).encode()}
     with atomic_replace(path) as temporary:
         pq.write_table(row.replace_schema_metadata(metadata), temporary, **_PARQUET)
 

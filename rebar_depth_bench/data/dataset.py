@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from rebar_depth_bench.data import codecs
-from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
@@ -141,28 +141,27 @@ def load(
     """
     from datasets import IterableDataset
 
-    undecoded = load_undecoded(root, config, streaming=streaming, columns=columns)
+    undecoded = load_undecoded(open_folder(root).config(config), streaming=streaming, columns=columns)
     if isinstance(undecoded, IterableDataset):
         return undecoded.map(decode_row)
     return undecoded.with_transform(decode_batch)
 
 
 def load_undecoded(
-    root: str | Path, config: str, *, streaming: bool, columns: Sequence[str] | None
+    config: DatasetConfig, *, streaming: bool, columns: Sequence[str] | None
 ) -> Dataset | IterableDataset:
     """Load a config with image and depth cells left as bytes, to be decoded by ``decode_row``.
 
     Raises ``DatasetError`` as ``load`` does.
     """
     import datasets
-    from datasets.exceptions import DatasetGenerationError, DatasetsError
+    from datasets.exceptions import DatasetsError
 
-    open_folder(root).config(config)
     selected_columns = _validated_columns(columns)
     try:
-        loaded = datasets.load_dataset(str(root), config, split=SPLIT, streaming=streaming)
-    except (DatasetsError, DatasetGenerationError, OSError, pa.ArrowException) as error:
-        raise DatasetError(f"{root}: config {config} cannot be loaded: {error}") from error
+        loaded = datasets.load_dataset(config.root, config.name, split=SPLIT, streaming=streaming)
+    except (DatasetsError, OSError, pa.ArrowException) as error:
+        raise DatasetError(f"{config.root}: config {config.name} cannot be loaded: {error}") from error
     selected = loaded.select_columns(list(selected_columns))
     for name in selected_columns:
         if isinstance(selected.features[name], datasets.Image):
@@ -170,50 +169,47 @@ def load_undecoded(
     return selected
 
 
-def iterate_rows(root: str | Path, config: str, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+def iterate_rows(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Yield the decoded rows of a config, one at a time, without a cache.
 
     Raises ``DatasetError`` if the config cannot be loaded or a shard is damaged.
     """
-    for row in iterate_undecoded(root, config, columns):
+    for row in iterate_undecoded(config, columns):
         try:
             decoded = decode_row(row)
         except (OSError, TypeError, ValueError) as error:
-            raise DatasetError(f"{root}: config {config} cannot be read: {error}") from error
+            raise DatasetError(f"{config.root}: config {config.name} cannot be read: {error}") from error
         yield decoded
 
 
-def iterate_undecoded(root: str | Path, config: str, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+def iterate_undecoded(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Yield the rows of a config with encoded images and depth, one at a time, to be decoded by ``decode_row``.
 
     The shards of a local folder are read with pyarrow: ``datasets`` takes a second to import, and imports torch,
     which takes several, to stream. Hub repositories are streamed. Raises ``DatasetError`` as ``iterate_rows``.
     """
-    folder = open_folder(root)
-    folder.config(config)
-    if folder.local is None:
-        return _streamed_rows(root, config, columns)
-    return _shard_rows(folder, config, _validated_columns(columns))
+    read = _streamed_rows if config.local is None else _shard_rows
+    return read(config, _validated_columns(columns))
 
 
-def _shard_rows(folder: DatasetFolder, config: str, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+def _shard_rows(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
     schema = pa.schema([ROW_SCHEMA.field(name) for name in columns])
     try:
-        for name in folder.config(config)["shards"]:
-            with pq.ParquetFile(folder.file(name)) as shard:
+        for name in config.shards:
+            with pq.ParquetFile(config.file(name)) as shard:
                 for batch in shard.iter_batches(batch_size=1, columns=schema.names):
                     yield from batch.select(schema.names).cast(schema).to_pylist()
     except (KeyError, OSError, pa.ArrowException) as error:
-        raise DatasetError(f"{folder.root}: config {config} cannot be read: {error}") from error
+        raise DatasetError(f"{config.root}: config {config.name} cannot be read: {error}") from error
 
 
-def _streamed_rows(root: str | Path, config: str, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    from datasets.exceptions import DatasetGenerationError, DatasetsError
+def _streamed_rows(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    from datasets.exceptions import DatasetsError
 
     try:
-        yield from load_undecoded(root, config, streaming=True, columns=columns)
-    except (OSError, pa.ArrowException, DatasetsError, DatasetGenerationError) as error:
-        raise DatasetError(f"{root}: config {config} cannot be read: {error}") from error
+        yield from load_undecoded(config, streaming=True, columns=columns)
+    except (DatasetsError, OSError, pa.ArrowException) as error:
+        raise DatasetError(f"{config.root}: config {config.name} cannot be read: {error}") from error
 
 
 def decode_row(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -227,11 +223,7 @@ def decode_batch(batch: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
 
 
 def _decoder(column: str) -> Callable[[Any], Any]:
-    return _DECODERS.get(column_kind(column), _identity)
-
-
-def _identity(cell: Any) -> Any:
-    return cell
+    return _DECODERS.get(column_kind(column), lambda cell: cell)
 
 
 def _validated_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
@@ -247,35 +239,33 @@ def _validated_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
 class ConfigViews:
     """Views, image size, board and mesh of one config of a dataset folder."""
 
-    folder: DatasetFolder
-    config: str
+    entry: DatasetConfig
+
+    @property
+    def config(self) -> str:
+        """Name of the config."""
+        return self.entry.name
 
     @property
     def view_ids(self) -> tuple[str, ...]:
         """Ids of the views, in order."""
-        return tuple(view.view_id for view in self.folder.views(self.config))
+        return self.entry.view_ids
 
     @property
     def grid(self) -> tuple[int, int]:
         """Image size (height, width), pixels."""
-        return self.folder.grid(self.config)
+        return self.entry.grid
 
     @property
     def board(self) -> BoardSpec | None:
-        """ArUco board under the assembly, or None. Raises ``DatasetError`` if its description is invalid."""
-        board = self.folder.config(self.config)["scene"].get("board")
-        try:
-            return None if board is None else BoardSpec(**board)
-        except TypeError as error:
-            raise DatasetError(
-                f"{self.folder.root}: config {self.config}: the board is damaged: {error}"
-            ) from None
+        """ArUco board under the assembly, or None."""
+        return self.entry.scene.board
 
     @property
     def mesh(self) -> Path:
         """Path of the scene's PLY mesh, which is ground truth. Raises ``DatasetError`` if it is missing."""
-        return self.folder.file(self.folder.config(self.config)["mesh"])
+        return self.entry.file(self.entry.mesh)
 
     def rows(self, *columns: str) -> Iterator[dict[str, Any]]:
         """Yield the decoded ``view_id`` and named columns of each view, in order."""
-        return iterate_rows(self.folder.root, self.config, ("view_id", *columns))
+        return iterate_rows(self.entry, ("view_id", *columns))

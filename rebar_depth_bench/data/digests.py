@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+
+from rebar_depth_bench.data.manifest import ViewRecord
 
 _CHUNK_BYTES = 1 << 20
 
@@ -30,9 +31,9 @@ def files_digest(paths: Iterable[Path]) -> str:
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
-def views_digest(views: Iterable[Mapping[str, Any]]) -> str:
+def views_digest(views: Iterable[ViewRecord]) -> str:
     """Return the ground-truth digest, ``sha256:...``, over the ids and eye digests of the views, sorted by id."""
-    lines = sorted(f"{view['view_id']} {view['left']} {view['right']}\n" for view in views)
+    lines = sorted(f"{view.view_id} {view.left} {view.right}\n" for view in views)
     return "sha256:" + hashlib.sha256("".join(lines).encode()).hexdigest()
 
 

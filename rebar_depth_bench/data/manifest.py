@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from huggingface_hub import hf_hub_download
-from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError, LocalEntryNotFoundError
+from pydantic import ConfigDict, Field, Strict, field_validator
 
-from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.errors import DatasetError, Problem, escape_text
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
+from rebar_depth_bench.validation import Expected, StrictModel, field_error, format_location, validate_table
 
 MANIFEST_FILE = "manifest.json"
 MANIFEST_FORMAT = "rebar-depth-dataset-1"
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
+_Names = Annotated[tuple[str, ...], Strict(False)]
+"""Type of a list of strings, converted to a tuple."""
 
 
-@dataclass(frozen=True)
-class ViewRecord:
+class ViewRecord(StrictModel):
     """Manifest entry of one view.
 
     ``left`` and ``right`` are the hex SHA-256 digests of the cameras' ground truth; ``steel_px`` and ``scored_px``
@@ -34,56 +34,51 @@ class ViewRecord:
     scored_px: int
 
 
-_VIEW_KEYS = {field.name for field in fields(ViewRecord)}
-_CONFIG_KEYS = {"scene", "rig", "views", "ground_truth_digest", "key", "shards", "mesh"}
+class _ManifestTable(StrictModel):
+    """Base class of the objects that may contain further keys, which are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
 
 
-@dataclass(frozen=True)
-class DatasetFolder:
-    """Dataset with a validated manifest; ``root`` is a folder path or a Hub repository id."""
+class Appearance(_ManifestTable):
+    """Names of the appearance variants of a scene."""
+
+    variants: _Names = ()
+
+
+class Scene(_ManifestTable):
+    """Scene of a config; ``board`` is the ArUco board under the assembly, or None."""
+
+    name: str
+    board: BoardSpec | None
+    appearance: Appearance = Appearance()
+
+    @field_validator("board", mode="before")
+    @classmethod
+    def _make_board(cls, fields: Any) -> BoardSpec | None:
+        try:
+            return None if fields is None else BoardSpec(**fields)
+        except TypeError as error:
+            raise field_error(escape_text(str(error)), "the fields of a board") from None
+
+
+class Rig(_ManifestTable):
+    """Image size of a stereo rig, pixels."""
+
+    width: int
+    height: int
+
+
+class _Located(_ManifestTable):
+    """Dataset, or part of one; ``root`` is a folder path or a Hub repository id."""
 
     root: str
-    manifest: Mapping[str, Any]
 
     @property
     def local(self) -> Path | None:
         """Path of a local dataset folder, or None for a Hub repository."""
         path = Path(self.root)
         return path if path.is_dir() else None
-
-    @property
-    def digest(self) -> str:
-        """Ground-truth digest, ``sha256:...``."""
-        return str(self.manifest["ground_truth"]["digest"])
-
-    @property
-    def version(self) -> str:
-        """Version of the dataset."""
-        return str(self.manifest["version"])
-
-    @property
-    def configs(self) -> tuple[str, ...]:
-        """Names of the configs."""
-        return tuple(self.manifest["configs"])
-
-    def config(self, name: str) -> Mapping[str, Any]:
-        """Return the manifest entry of a config; raise ``DatasetError`` if there is no such config."""
-        try:
-            entry: Mapping[str, Any] = self.manifest["configs"][name]
-        except KeyError:
-            raise DatasetError(
-                f"{self.root}: no config {name!r}, expected one of {', '.join(self.configs)}"
-            ) from None
-        return entry
-
-    def views(self, config: str) -> list[ViewRecord]:
-        """Return the manifest entries of a config's views, in order."""
-        return [ViewRecord(**view) for view in self.config(config)["views"]]
-
-    def grid(self, config: str) -> tuple[int, int]:
-        """Return the image size (height, width) of a config, pixels."""
-        rig = self.config(config)["rig"]
-        return int(rig["height"]), int(rig["width"])
 
     def file(self, name: str) -> Path:
         """Return the local path of a file of the dataset, downloaded first if the dataset is a Hub repository.
@@ -92,51 +87,94 @@ class DatasetFolder:
         """
         return _local_path(self.root, name)
 
+
+class DatasetConfig(_Located):
+    """Config of a dataset; ``entry`` is its manifest entry as it was written, with all parameters of the build."""
+
+    name: str
+    scene: Scene
+    rig: Rig
+    views: Annotated[tuple[ViewRecord, ...], Strict(False)]
+    ground_truth_digest: str
+    key: str
+    shards: _Names
+    mesh: str
+    sheet: str = ""
+    entry: dict[str, Any] = Field(repr=False)
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Image size (height, width), pixels."""
+        return self.rig.height, self.rig.width
+
+    @property
+    def view_ids(self) -> tuple[str, ...]:
+        """Ids of the views, in order."""
+        return tuple(view.view_id for view in self.views)
+
+
+class DatasetFolder(_Located):
+    """Dataset with a validated manifest; ``files`` are the hex SHA-256 digests of its files, by path."""
+
+    version: str
+    digest: str
+    files: dict[str, str]
+    config_by_name: dict[str, DatasetConfig]
+
+    @property
+    def configs(self) -> tuple[str, ...]:
+        """Names of the configs."""
+        return tuple(self.config_by_name)
+
+    def config(self, name: str) -> DatasetConfig:
+        """Return a config; raise ``DatasetError`` if there is none of that name."""
+        if name not in self.config_by_name:
+            raise DatasetError(f"{self.root}: no config {name!r}, expected one of {', '.join(self.configs)}")
+        return self.config_by_name[name]
+
     def expected_views(self) -> dict[str, tuple[int, int]]:
         """Return the (height, width) of every view of every config, keyed by view id."""
-        return {view.view_id: self.grid(config) for config in self.configs for view in self.views(config)}
+        return {view_id: config.grid for config in self.config_by_name.values() for view_id in config.view_ids}
+
+
+class _GroundTruth(_ManifestTable):
+    digest: str
+
+
+class _Manifest(_ManifestTable):
+    """Manifest; its configs are validated one by one."""
+
+    format: Annotated[str, Expected(f'"{MANIFEST_FORMAT}"', lambda name: name == MANIFEST_FORMAT)]
+    version: str
+    ground_truth: _GroundTruth
+    configs: dict[str, dict[str, Any]]
+    files: dict[str, str]
 
 
 def open_folder(root: str | Path) -> DatasetFolder:
     """Open a dataset folder or Hub dataset repository.
 
-    Raises ``DatasetError`` if ``root`` is neither or its manifest is invalid.
+    Raises ``DatasetError`` if ``root`` is neither, or with all problems of its manifest if that is invalid.
     """
-    manifest = read_manifest(_manifest_path(str(root)))
-    return DatasetFolder(str(root), manifest)
-
-
-def read_manifest(path: Path) -> dict[str, Any]:
-    """Read a manifest and check its format, its keys and its view entries.
-
-    Raises ``DatasetError`` if it cannot be read or is invalid.
-    """
+    root = str(root)
+    path = _manifest_path(root)
     try:
-        manifest = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise DatasetError(f"{path}: cannot be read as JSON: {error}") from None
-    format_name = manifest.get("format") if isinstance(manifest, dict) else type(manifest).__name__
-    if format_name != MANIFEST_FORMAT:
-        raise DatasetError(f"{path}: format is {format_name!r}, expected {MANIFEST_FORMAT!r}")
-    missing = [key for key in ("version", "ground_truth", "configs", "files") if key not in manifest]
-    if missing:
-        raise DatasetError(f"{path}: lacks {', '.join(missing)}")
-    _check_configs(path, manifest["configs"])
-    return dict(manifest)
-
-
-def _check_configs(path: Path, configs: object) -> None:
-    if not isinstance(configs, dict):
-        raise DatasetError(f"{path}: configs is a {type(configs).__name__}, expected an object")
-    for name, entry in configs.items():
-        keys = set(entry) if isinstance(entry, dict) else set()
-        missing = sorted(_CONFIG_KEYS - keys)
-        if missing:
-            raise DatasetError(f"{path}: config {name} lacks {', '.join(missing)}")
-        if any(not isinstance(view, dict) or set(view) != _VIEW_KEYS for view in entry["views"]):
-            raise DatasetError(
-                f"{path}: a view of config {name} does not have exactly the keys {', '.join(sorted(_VIEW_KEYS))}"
-            )
+        values = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        problem = Problem("syntax", "", f"cannot be read as JSON: {error}")
+        raise DatasetError.from_problems(path, [problem]) from None
+    problems: list[Problem] = []
+    head = validate_table(_Manifest, values, problems)
+    configs = {}
+    for name, entry in head.configs.items() if head else ():
+        fields = {**entry, "root": root, "name": name, "entry": entry}
+        if config := validate_table(DatasetConfig, fields, problems, format_location("configs", name)):
+            configs[name] = config
+    if head is None or problems:
+        raise DatasetError.from_problems(path, problems)
+    return DatasetFolder(
+        root=root, version=head.version, digest=head.ground_truth.digest, files=head.files, config_by_name=configs
+    )
 
 
 def _manifest_path(root: str) -> Path:
@@ -152,6 +190,10 @@ def _local_path(root: str, name: str) -> Path:
         if not path.is_file():
             raise DatasetError(f"{root}: has no {name}, expected a complete dataset folder written by rebar-build")
         return path
+    # Imported on use: it takes a fifth of a second, which local folders do not need.
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError, LocalEntryNotFoundError
+
     try:
         return Path(hf_hub_download(root, name, repo_type="dataset"))
     except (EntryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError) as error:

@@ -133,7 +133,7 @@ def score_extended(
     tables: dict[str, ExtendedTable] = {}
     views: list[ViewNumbers] = []
     for config in result.tables:
-        steel = load_steel_truth(evaluation.folder, config, progress)
+        steel = load_steel_truth(evaluation.folder.config(config), progress)
         work = partial(_view, evaluation.submission, steel, scales)
         outcomes = ordered_map(work, range(len(steel)), workers)
         config_views = []

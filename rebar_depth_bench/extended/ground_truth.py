@@ -14,7 +14,7 @@ from rebar_depth_bench.data.array_cache import ArrayCache, ViewArrays, open_cach
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeView
-from rebar_depth_bench.data.manifest import DatasetFolder
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.extended.depth_layers import other_layers
 from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_segments, cage_truth
@@ -74,37 +74,36 @@ class ConfigSteelTruth:
         )
 
 
-def load_steel_truth(folder: DatasetFolder, config: str, progress: Progress = silent) -> ConfigSteelTruth:
+def load_steel_truth(config: DatasetConfig, progress: Progress = silent) -> ConfigSteelTruth:
     """Return a config's ground truth for extended measures, from the cache or else computed from the dataset.
 
     Raises ``DatasetError`` if the bars of the scene are missing or a view contradicts the manifest.
     """
-    bars_path = folder.file(BARS_FILE)
-    scene = folder.config(config)["scene"]["name"]
-    bars = read_bars(bars_path).get(scene)
+    bars_path = config.file(BARS_FILE)
+    bars = read_bars(bars_path).get(config.scene.name)
     if bars is None:
-        raise DatasetError(f"{bars_path}: has no bars for scene {scene!r} of config {config}")
+        raise DatasetError(f"{bars_path}: has no bars for scene {config.scene.name!r} of config {config.name}")
     cage = cage_truth(bars)
     diameter_m = np.full(max((bar.bar_id for bar in bars), default=0) + 1, np.nan)
     diameter_m[[bar.bar_id for bar in bars]] = [bar.diameter_m for bar in bars]
     cache = open_cache(
-        cache_path(folder, config, EXTENDED_PROTOCOL, file_sha256(bars_path)),
+        cache_path(config, EXTENDED_PROTOCOL, file_sha256(bars_path)),
         _DTYPES,
-        lambda: _view_arrays(folder, config, cage, diameter_m, progress),
-        stale_pattern=cache_name_pattern(config, EXTENDED_PROTOCOL),
+        lambda: _view_arrays(config, cage, diameter_m, progress),
+        stale_pattern=cache_name_pattern(config.name, EXTENDED_PROTOCOL),
     )
-    height, width = folder.grid(config)
+    height, width = config.grid
     lenses = {_lens_key(metadata): metadata for metadata in cache.metadata}
     rays = {lens: _rays(metadata, height, width) for lens, metadata in lenses.items()}
     return ConfigSteelTruth(height, width, cage, diameter_m, rays, cache)
 
 
 def _view_arrays(
-    folder: DatasetFolder, config: str, cage: CageTruth, diameter_m: Float64[ndarray, " ids"], progress: Progress
+    config: DatasetConfig, cage: CageTruth, diameter_m: Float64[ndarray, " ids"], progress: Progress
 ) -> Iterator[ViewArrays]:
     """Yield the cached arrays of every view with scored pixels, with K, distortion and pose as metadata."""
     rays: dict[str, Rays] = {}
-    for view_id, left, scored in verified_views(folder, config, progress, "bars in the views"):
+    for view_id, left, scored in verified_views(config, progress, "bars in the views"):
         if not len(scored):
             continue
         metadata = {kind: getattr(left.camera, kind).tolist() for kind in CAMERA_KINDS}

@@ -24,7 +24,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import atomic_replace, write_text
 from rebar_depth_bench.data.dataset import decode_row, iterate_undecoded
-from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.errors import InputError, MethodError, RebarDepthError
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
 from rebar_depth_bench.progress import Progress, silent
@@ -125,39 +125,36 @@ def predict(
     returns invalid values.
     """
     folder = open_folder(root)
-    names = tuple(dict.fromkeys(configs or folder.configs))
-    totals = {name: len(folder.views(name)) for name in names}
+    chosen = [folder.config(name) for name in dict.fromkeys(configs or folder.configs)]
     target = Path(archive)
     key = {
         "method": vars(method.info),
-        "dataset": {
-            name: [folder.config(name)[field] for field in ("key", "ground_truth_digest")] for name in names
-        },
+        "dataset": {config.name: [config.key, config.ground_truth_digest] for config in chosen},
         "software": software_version(),
     }
     if isinstance(method, MultiViewMethod):
-        for name in names:
-            with _wrap_errors(f"{method.info.name}: {name}: check"):
-                method.check(ConfigViews(folder, name))
+        for config in chosen:
+            with _wrap_errors(f"{method.info.name}: {config.name}: check"):
+                method.check(ConfigViews(config))
     # Loading comes first so that its errors occur before anything is written.
     loaded = _load_method(method) if isinstance(method, Method) else None
     views = PredictedViews.open(target.with_name(f".{target.name}.views"), key)
     if len(views):
         print(f"resuming: {len(views)} views are in {views.path}; delete it to start over", file=sys.stderr)
-    for name in names:
-        done = [view.view_id for view in folder.views(name) if view.view_id in views]
-        if len(done) == totals[name]:
+    for config in chosen:
+        done = [view_id for view_id in config.view_ids if view_id in views]
+        if len(done) == len(config.views):
             continue
-        predictor = loaded or _prepare_method(method, ConfigViews(folder, name), views, progress)
-        for count, row in enumerate(_remaining_rows(method, folder, name, set(done)), start=len(done) + 1):
+        predictor = loaded or _prepare_method(method, ConfigViews(config), views, progress)
+        for count, row in enumerate(_remaining_rows(method, config, set(done)), start=len(done) + 1):
             start = time.perf_counter()
             with _wrap_errors(f"{method.info.name}: {row['view_id']}: the predictor, given {', '.join(row)}"):
                 prediction = predictor(row)
-            depth_m = _validated_depth(method, row["view_id"], prediction, folder.grid(name))
+            depth_m = _validated_depth(method, row["view_id"], prediction, config.grid)
             views.put(row["view_id"], depth_m, time.perf_counter() - start)
-            progress(f"{method.info.name} on {name}", count, totals[name])
-    reports = {name: report for name in names if (report := views.get_preparation(name))}
-    _write_archive(method, target, views, [view.view_id for name in names for view in folder.views(name)], reports)
+            progress(f"{method.info.name} on {config.name}", count, len(config.views))
+    reports = {config.name: report for config in chosen if (report := views.get_preparation(config.name))}
+    _write_archive(method, target, views, [view_id for config in chosen for view_id in config.view_ids], reports)
     shutil.rmtree(views.path)
     return reports
 
@@ -221,12 +218,10 @@ def _prepare_method(
     return prepared.predict
 
 
-def _remaining_rows(
-    method: AnyMethod, folder: DatasetFolder, config: str, done: set[str]
-) -> Iterator[dict[str, Any]]:
+def _remaining_rows(method: AnyMethod, config: DatasetConfig, done: set[str]) -> Iterator[dict[str, Any]]:
     """Yield the decoded rows of the views that are not in ``done``; the others are not decoded."""
     columns = ("view_id", *method.info.columns)
-    for row in iterate_undecoded(folder.root, config, columns):
+    for row in iterate_undecoded(config, columns):
         if row["view_id"] not in done:
             yield decode_row(row)
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
 from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.protocol import PROTOCOL
@@ -29,10 +29,10 @@ class Evaluation:
         return self.submission.meta.method if self.submission.meta else ""
 
     @property
-    def configs(self) -> tuple[str, ...]:
-        """Names of the configs that the submission contains, in the order of the folder."""
+    def configs(self) -> tuple[DatasetConfig, ...]:
+        """Configs that the submission contains, in the order of the folder."""
         present = {config_of(view_id) for view_id in self.submission.view_ids}
-        return tuple(config for config in self.folder.configs if config in present)
+        return tuple(config for name, config in self.folder.config_by_name.items() if name in present)
 
     def check_entries(self, progress: Progress = silent) -> None:
         """Decode every entry. Raises ``SubmissionError`` with all problems."""

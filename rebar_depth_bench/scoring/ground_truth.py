@@ -20,7 +20,7 @@ from numpy import ndarray
 from rebar_depth_bench.data.array_cache import ArrayCache, ViewArrays, open_cache
 from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.eye_view import EyeView, eye_from_row, truth_columns
-from rebar_depth_bench.data.manifest import DatasetFolder, ViewRecord
+from rebar_depth_bench.data.manifest import DatasetConfig, ViewRecord
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.metrics import median
@@ -76,38 +76,38 @@ class ConfigTruth(Sequence[ViewTruth]):
         return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], float(view.metadata))
 
 
-def config_truth(folder: DatasetFolder, config: str, progress: Progress = silent) -> ConfigTruth:
+def config_truth(config: DatasetConfig, progress: Progress = silent) -> ConfigTruth:
     """Return the ground truth of a config, from the cache or else extracted from the dataset.
 
     Views without scored pixels are omitted. Raises ``DatasetError`` naming the view if its ground truth does not
     match its digest in the manifest.
     """
     cache = open_cache(
-        cache_path(folder, config, PROTOCOL),
+        cache_path(config, PROTOCOL),
         {"index": np.uint32, "depth_m": np.float32},
-        lambda: _extract_views(folder, config, progress),
-        stale_pattern=cache_name_pattern(config, PROTOCOL),
+        lambda: _extract_views(config, progress),
+        stale_pattern=cache_name_pattern(config.name, PROTOCOL),
     )
     return ConfigTruth(cache)
 
 
-def cache_path(folder: DatasetFolder, config: str, protocol: str, extra_digest: str = "") -> Path:
+def cache_path(config: DatasetConfig, protocol: str, extra_digest: str = "") -> Path:
     """Return the path of the array cache of a config under a protocol.
 
     It lies in the dataset folder if that is local and writable, or else in the user's cache. ``extra_digest`` is
     the hex SHA-256 of further inputs, other than the views, that the cached arrays depend on.
     """
-    digest = str(folder.config(config)["ground_truth_digest"]).removeprefix("sha256:")
+    digest = config.ground_truth_digest.removeprefix("sha256:")
     if extra_digest:
         digest = hashlib.sha256(f"{digest} {extra_digest}".encode()).hexdigest()
-    local = folder.local
+    local = config.local
     if local is not None and os.access(local, os.W_OK):
         base = local / CACHE_FOLDER
     else:
         user = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "rebar-depth-bench"
         # The folder is keyed by the dataset root as well: different datasets share config names.
-        base = user / hashlib.sha256(str(folder.root).encode()).hexdigest()[:16]
-    return base / f"{protocol}-{config}-{digest[:_DIGEST_CHARACTERS]}"
+        base = user / hashlib.sha256(config.root.encode()).hexdigest()[:16]
+    return base / f"{protocol}-{config.name}-{digest[:_DIGEST_CHARACTERS]}"
 
 
 def cache_name_pattern(config: str, protocol: str) -> str:
@@ -116,28 +116,28 @@ def cache_name_pattern(config: str, protocol: str) -> str:
 
 
 def verified_views(
-    folder: DatasetFolder, config: str, progress: Progress, task: str
+    config: DatasetConfig, progress: Progress, task: str
 ) -> Iterator[tuple[str, EyeView, UInt32[ndarray, " n"]]]:
     """Yield id, left eye and flat indices of the scored pixels of every view, verified against the manifest.
 
     ``task`` is its name in ``progress``. Raises ``DatasetError`` naming a view that is not in the manifest or
     does not match its digest, or, after the last row, if views of the manifest are missing.
     """
-    records = {view.view_id: view for view in folder.views(config)}
+    records = {view.view_id: view for view in config.views}
     total = len(records)
-    rows = iterate_rows(folder.root, config, ("view_id", *truth_columns("left")))
+    rows = iterate_rows(config, ("view_id", *truth_columns("left")))
     for done, row in enumerate(rows, start=1):
         view_id, left = row["view_id"], eye_from_row(row, "left")
         if view_id not in records:
-            raise DatasetError(f"{folder.root}: view {view_id} is not in the manifest")
-        yield view_id, left, _verified_pixels(left, records.pop(view_id), folder.root)
-        progress(f"{task} of {config}", done, total)
+            raise DatasetError(f"{config.root}: view {view_id} is not in the manifest")
+        yield view_id, left, _verified_pixels(left, records.pop(view_id), config.root)
+        progress(f"{task} of {config.name}", done, total)
     if records:
-        raise DatasetError(f"{folder.root}: {config} lacks {len(records)} views, among them {min(records)}")
+        raise DatasetError(f"{config.root}: {config.name} lacks {len(records)} views, among them {min(records)}")
 
 
-def _extract_views(folder: DatasetFolder, config: str, progress: Progress) -> Iterator[ViewArrays]:
-    for view_id, left, pixels in verified_views(folder, config, progress, "ground truth"):
+def _extract_views(config: DatasetConfig, progress: Progress) -> Iterator[ViewArrays]:
+    for view_id, left, pixels in verified_views(config, progress, "ground truth"):
         if len(pixels):
             depth_m = left.depth_m.ravel()[pixels]
             yield ViewArrays(view_id, {"index": pixels, "depth_m": depth_m}, median(depth_m))

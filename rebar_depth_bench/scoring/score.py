@@ -90,10 +90,10 @@ def _score_all(evaluation: Evaluation, workers: int | None, progress: Progress) 
     problems: list[Problem] = []
     scores: dict[str, list[ViewScore]] = {}
     for config in evaluation.configs:
-        truths = config_truth(evaluation.folder, config, progress)
+        truths = config_truth(config, progress)
         outcomes = ordered_map(partial(_score_or_problem, submission, truths), range(len(truths)), workers)
-        scored = list(_report_progress(outcomes, f"scoring {config}", len(truths), progress))
-        scores[config] = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
+        scored = list(_report_progress(outcomes, f"scoring {config.name}", len(truths), progress))
+        scores[config.name] = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
         problems += [outcome for outcome in scored if isinstance(outcome, Problem)]
         unread.difference_update(truths.view_ids)
     problems += _unscored_view_problems(submission, unread)

@@ -22,6 +22,7 @@ from rich.text import Text
 
 from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.console import add_output_file
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.parallel import ordered_map
 from rebar_depth_bench.progress import Progress, silent
@@ -118,20 +119,20 @@ class ViewPairs:
     z_m: Float64[ndarray, " n"]
 
 
-def select_config(evaluation: Evaluation, wanted: str | None) -> str:
+def select_config(evaluation: Evaluation, wanted: str | None) -> DatasetConfig:
     """Return the config to study: ``wanted``, or the only config of the submission if ``wanted`` is None.
 
     Raises ``InputError`` if the submission does not contain ``wanted``, or if ``wanted`` is None and the
     submission does not contain exactly one config.
     """
-    present, path = evaluation.configs, evaluation.submission.path
+    present, path = {config.name: config for config in evaluation.configs}, evaluation.submission.path
     if wanted is None and len(present) == 1:
-        return present[0]
+        [wanted] = present
     if wanted is None:
         raise InputError(f"{path}: holds {', '.join(present)}, expected --config with one of them")
     if wanted not in present:
         raise InputError(f"{path}: has no config {wanted!r}, expected one of {', '.join(present)}")
-    return wanted
+    return present[wanted]
 
 
 def map_views(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import rebar_depth_bench as rdb
 from cards import benchmark_card, dataset_card
 from cards.dataset import column_rows
 from rebar_depth_bench.data.dataset import features
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods import own_methods
 
 
@@ -53,5 +53,6 @@ def test_dataset_card_steel_share_matches_masks(tiny_root: Path, tiny_masks: dic
 
 
 def test_dataset_card_is_rendered_from_manifest(tiny_root: Path) -> None:
-    manifest = json.loads((tiny_root / "manifest.json").read_text())
-    assert dataset_card(manifest) == (tiny_root / "README.md").read_text()
+    folder = open_folder(tiny_root)
+    card = dataset_card(folder.version, folder.digest, list(folder.config_by_name.values()))
+    assert card == (tiny_root / "README.md").read_text()

@@ -116,7 +116,7 @@ def _error_maps(service: Service, submission_id: str, result: Result) -> list[Er
 
 
 def _error_map(service: Service, view: ViewScore) -> ErrorMap:
-    height, width = service.folder.grid(config_of(view.view_id))
+    height, width = service.folder.config(config_of(view.view_id)).grid
     step = max(1, round(width / PANEL_WIDTH))
     return ErrorMap(
         f"error-maps/{view.view_id}.webp", math.ceil(width / step), math.ceil(height / step), view_row(view)

@@ -182,7 +182,7 @@ def iter_view_panels(chosen: Mapping[str, list[ViewScore]], evaluation: Evaluati
     for config, views in chosen.items():
         scores = {view.view_id: view for view in views}
         if scores:
-            for row in iterate_undecoded(evaluation.folder.root, config, _COLUMNS):
+            for row in iterate_undecoded(evaluation.folder.config(config), _COLUMNS):
                 if row["view_id"] in scores:
                     yield _panels(scores[row["view_id"]], decode_row(row), evaluation.submission)
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rebar_depth_bench.console import ProgressBars, add_archive, add_data
-from rebar_depth_bench.data.manifest import DatasetFolder
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import open_evaluation
@@ -86,7 +86,7 @@ def run_distance_study(
     with open_evaluation(archive, root) as evaluation:
         result = score_evaluation(evaluation, progress=progress)
         names = _select_configs(archive, result, configs)
-        points = {name: _distance_points(result, evaluation.folder, name) for name in names}
+        points = {name: _distance_points(result, evaluation.folder.config(name)) for name in names}
         provenance = evaluation.provenance()
     empty = [name for name, views in points.items() if not views]
     if empty:
@@ -114,12 +114,12 @@ def _select_configs(archive: str | os.PathLike[str], result: Result, configs: Se
     return wanted
 
 
-def _distance_points(result: Result, folder: DatasetFolder, config: str) -> list[DistancePoint]:
-    truths = config_truth(folder, config)
+def _distance_points(result: Result, config: DatasetConfig) -> list[DistancePoint]:
+    truths = config_truth(config)
     distances_m = dict(zip(truths.view_ids, truths.medians_m, strict=True))
     views = [view for view in result.views if view.view_id in distances_m]
     indices = protocol_indices([view.view_id for view in views])
     return [
-        DistancePoint(config, index, distances_m[view.view_id], view)
+        DistancePoint(config.name, index, distances_m[view.view_id], view)
         for index, view in zip(indices, views, strict=True)
     ]

@@ -15,7 +15,7 @@ from pathlib import Path
 from statistics import median
 
 from rebar_depth_bench.console import ProgressBars, add_workers
-from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
 from rebar_depth_bench.errors import InputError, printable, problem_summary
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.ground_truth import verified_views
@@ -38,7 +38,7 @@ from rebar_depth_bench.studies.pseudo_reference.study import (
     FrameView,
     score_frame_views,
 )
-from rebar_depth_bench.submission import ExpectedViews, config_of
+from rebar_depth_bench.submission import ExpectedViews
 
 PROTOCOL = "rebar-pseudo-reference-1"
 SUMMARY = "score methods on the full frame against two pseudo-references (the paper's Table II)"
@@ -52,15 +52,16 @@ Views = Iterator[FrameView]
 class _StudyData:
     """Opened dataset config or capture.
 
-    ``views`` are the views to score; ``archive_views`` are all views that an archive may contain. Exactly one of
-    ``folder`` and ``capture`` is set.
+    ``views`` are the views to score; ``archive_views`` are all views that an archive may contain. Either
+    ``folder`` and ``config`` or ``capture`` are set.
     """
 
     name: str
     views: ExpectedViews
     archive_views: ExpectedViews
-    folder: DatasetFolder | None
-    capture: Capture | None
+    folder: DatasetFolder | None = None
+    config: DatasetConfig | None = None
+    capture: Capture | None = None
 
     def frames(self, exact: bool) -> Views:
         """Yield the views to score.
@@ -68,9 +69,8 @@ class _StudyData:
         If ``exact`` is true and the data are a dataset folder, the views have their exact depth, verified against
         the digests of the manifest.
         """
-        if self.folder is not None and exact:
-            config = config_of(next(iter(self.views)))
-            for view_id, left, _ in verified_views(self.folder, config, silent, "full frame"):
+        if self.config is not None and exact:
+            for view_id, left, _ in verified_views(self.config, silent, "full frame"):
                 yield FrameView(view_id, (left.camera.height, left.camera.width), left.depth_m)
         else:
             for view_id, shape in self.views.items():
@@ -196,15 +196,15 @@ def _open_data(data: str, config: str | None) -> _StudyData:
             raise InputError(f"{data}: is a capture, expected no --config (found {config!r})")
         capture = open_capture(data)
         views = capture.expected_views()
-        return _StudyData(f"capture {capture.path.resolve().name}", views, views, None, capture)
+        return _StudyData(f"capture {capture.path.resolve().name}", views, views, capture=capture)
     folder = open_folder(data)
     if config is None and len(folder.configs) != 1:
         raise InputError(
             f"{data}: has {len(folder.configs)} configs, expected --config with one of {', '.join(folder.configs)}"
         )
-    name = config or folder.configs[0]
-    views = {view.view_id: folder.grid(name) for view in folder.views(name)}
-    return _StudyData(f"config {name}", views, folder.expected_views(), folder, None)
+    chosen = folder.config(config or folder.configs[0])
+    views = dict.fromkeys(chosen.view_ids, chosen.grid)
+    return _StudyData(f"config {chosen.name}", views, folder.expected_views(), folder, chosen)
 
 
 def _label_sources(sources: Sequence[DepthSource], views: ExpectedViews) -> dict[str, DepthSource]:

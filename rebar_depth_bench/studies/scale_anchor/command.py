@@ -116,8 +116,8 @@ def run_anchor_study(
     with open_evaluation(archive, root) as evaluation:
         evaluation.check_entries(progress)
         submission = evaluation.submission
-        name = select_config(evaluation, config)
-        truths = config_truth(evaluation.folder, name, progress)
+        chosen = select_config(evaluation, config)
+        name, truths = chosen.name, config_truth(chosen, progress)
         view_ratios = map_views(submission, truths, len(truths), view_ratio, f"ratios of {name}", progress)
         ratios = np.array([view.ratio for view in view_ratios if view.ratio is not None])
         usable_counts = [k for k in sorted(set(counts)) if k <= len(ratios)]

@@ -16,6 +16,7 @@ import torch
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.dataset import features, iterate_rows
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import ideal_K, right_camera_pose
 
 HEIGHT, WIDTH, VIEWS = 90, 160, 9
@@ -141,27 +142,66 @@ def test_damaged_shard_raises_dataset_error(tiny_root: Path, tmp_path: Path, dam
         else:
             shard.write_bytes(shard.read_bytes()[:-100])
     with pytest.raises(rdb.DatasetError, match=r"dataset: (config lattice cannot be read|has no lattice/)"):
-        list(iterate_rows(copy, "lattice", ["view_id"]))
+        list(iterate_rows(open_folder(copy).config("lattice"), ["view_id"]))
+
+
+@pytest.fixture
+def manifest(tiny_root: Path) -> Any:
+    return json.loads((tiny_root / "manifest.json").read_text())
+
+
+def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(rdb.DatasetError) as caught:
+        open_folder(folder)
+    return [(problem.code, problem.where) for problem in caught.value.problems]
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "code", "where"),
     [
-        (lambda manifest: manifest.pop("configs"), "lacks configs"),
-        (lambda manifest: manifest.update(format="other"), "format is 'other', expected 'rebar-depth-dataset-1'"),
-        (lambda manifest: manifest.update(configs=[]), "configs is a list, expected an object"),
-        (lambda manifest: manifest["configs"]["lattice"].pop("views"), "config lattice lacks views"),
+        (lambda manifest, _: manifest.pop("configs"), "missing", "configs"),
+        (lambda manifest, _: manifest.update(format="other"), "invalid", "format"),
+        (lambda manifest, _: manifest.update(configs=[]), "invalid", "configs"),
+        (lambda manifest, _: manifest["files"].update(x=None), "invalid", "files.x"),
+        (lambda _, config: config.pop("views"), "missing", "configs.lattice.views"),
+        (lambda _, config: config["views"][0].pop("left"), "missing", "configs.lattice.views 1: left"),
+        (lambda _, config: config["views"][1].update(x=3), "unknown", "configs.lattice.views 2: x"),
+        (lambda _, config: config["rig"].update(height="90"), "invalid", "configs.lattice.rig.height"),
         (
-            lambda manifest: manifest["configs"]["lattice"]["views"][0].pop("left"),
-            "a view of config lattice does not have exactly the keys",
+            lambda _, config: config["scene"]["board"].update({"\ud800": 1}),
+            "invalid",
+            "configs.lattice.scene.board",
         ),
+        (lambda _, config: config["scene"].update(board=7), "invalid", "configs.lattice.scene.board"),
+        (lambda _, config: config["scene"].pop("board"), "missing", "configs.lattice.scene.board"),
     ],
 )
 def test_damaged_manifest_raises_dataset_error(
-    tiny_root: Path, tmp_path: Path, change: Callable[[dict[str, Any]], object], words: str
+    manifest: Any, tmp_path: Path, change: Callable[[Any, Any], object], code: str, where: str
 ) -> None:
-    manifest = json.loads((tiny_root / "manifest.json").read_text())
-    change(manifest)
+    change(manifest, manifest["configs"]["lattice"])
+    assert manifest_problems(tmp_path, manifest) == [(code, where)]
+
+
+def test_problems_of_all_configs_are_listed(manifest: Any, tmp_path: Path) -> None:
+    for entry in manifest["configs"].values():
+        entry["shards"] = "test.parquet"
+    expected = [("invalid", f"configs.{name}.shards") for name in ("lattice", "lattice-orbit")]
+    assert manifest_problems(tmp_path, manifest) == expected
+
+
+def test_manifest_that_is_not_json_is_rejected(tmp_path: Path) -> None:
+    for content in (b"", b"\xff\xfe\x00", b"[" * 100_000, b"1" * 5000):
+        (tmp_path / "manifest.json").write_bytes(content)
+        with pytest.raises(rdb.DatasetError, match="cannot be read as JSON"):
+            open_folder(tmp_path)
+
+
+def test_board_is_read_from_manifest(manifest: Any, tmp_path: Path) -> None:
+    manifest["configs"]["lattice"]["scene"]["board"]["markers"] = 12
+    manifest["configs"]["lattice-orbit"]["scene"]["board"] = None
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(rdb.DatasetError, match=words):
-        open_folder(tmp_path)
+    folder = open_folder(tmp_path)
+    assert folder.config("lattice").scene.board == BoardSpec(markers=12)
+    assert folder.config("lattice-orbit").scene.board is None

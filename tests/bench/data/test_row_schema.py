@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rebar_depth_bench.data.dataset import COLUMNS, ROW_SCHEMA, features, iterate_undecoded, load_undecoded
+from rebar_depth_bench.data.manifest import open_folder
 
 
 def test_row_schema_is_that_of_the_features() -> None:
@@ -12,5 +13,6 @@ def test_row_schema_is_that_of_the_features() -> None:
 
 
 def test_local_rows_equal_those_of_datasets(tiny_root: Path) -> None:
-    streamed = load_undecoded(tiny_root, "lattice", streaming=True, columns=COLUMNS)
-    assert list(iterate_undecoded(tiny_root, "lattice", COLUMNS)) == list(streamed)
+    config = open_folder(tiny_root).config("lattice")
+    streamed = load_undecoded(config, streaming=True, columns=COLUMNS)
+    assert list(iterate_undecoded(config, COLUMNS)) == list(streamed)

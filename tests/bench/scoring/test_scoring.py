@@ -207,7 +207,7 @@ def test_ground_truth_images_of_other_size_name_view(
     rows[1][column] = damage(rows[1][column])
     pq.write_table(pa.Table.from_pylist(rows, table.schema), shard)
     with pytest.raises(DatasetError, match=f"view {rows[1]['view_id']}: ground truth has digest"):
-        config_truth(open_folder(copy), "lattice-orbit")
+        config_truth(open_folder(copy).config("lattice-orbit"))
 
 
 def test_damaged_cache_is_rebuilt(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:

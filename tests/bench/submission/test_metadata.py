@@ -40,25 +40,25 @@ def test_runtime_is_kept_unchanged(runtime: str) -> None:
         ('{"method": "m", "x": 1e999}', "syntax", ""),
         ('{"method": "m", "x": "\\ud800"}', "syntax", ""),
         ("[" * 100_000, "syntax", ""),
-        ("{}", "missing", ".method"),
-        ('{"method": null}', "missing", ".method"),
-        ('{"method": 3}', "invalid", ".method"),
-        ('{"method": "  "}', "invalid", ".method"),
-        ('{"method": "a\\u0000b"}', "invalid", ".method"),
-        ('{"method": "' + "m" * 201 + '"}', "invalid", ".method"),
-        ('{"method": "m", "description": 3}', "invalid", ".description"),
-        ('{"method": "m", "description": "a\\u0000b"}', "invalid", ".description"),
-        ('{"method": "m", "url": "javascript:alert(1)"}', "invalid", ".url"),
-        ('{"method": "m", "url": "http://[::1"}', "invalid", ".url"),
-        ('{"method": "m", "url": true}', "invalid", ".url"),
-        ('{"method": "m", "uses_intrinsics": 1}', "invalid", ".uses_intrinsics"),
-        ('{"method": "m", "depth_scale": 0}', "invalid", ".depth_scale"),
-        ('{"method": "m", "depth_scale": true}', "invalid", ".depth_scale"),
-        ('{"method": "m", "depth_scale": "0.001"}', "invalid", ".depth_scale"),
-        ('{"method": "m", "depth_scale": 1' + "0" * 400 + "}", "invalid", ".depth_scale"),
+        ("{}", "missing", ": method"),
+        ('{"method": null}', "missing", ": method"),
+        ('{"method": 3}', "invalid", ": method"),
+        ('{"method": "  "}', "invalid", ": method"),
+        ('{"method": "a\\u0000b"}', "invalid", ": method"),
+        ('{"method": "' + "m" * 201 + '"}', "invalid", ": method"),
+        ('{"method": "m", "description": 3}', "invalid", ": description"),
+        ('{"method": "m", "description": "a\\u0000b"}', "invalid", ": description"),
+        ('{"method": "m", "url": "javascript:alert(1)"}', "invalid", ": url"),
+        ('{"method": "m", "url": "http://[::1"}', "invalid", ": url"),
+        ('{"method": "m", "url": true}', "invalid", ": url"),
+        ('{"method": "m", "uses_intrinsics": 1}', "invalid", ": uses_intrinsics"),
+        ('{"method": "m", "depth_scale": 0}', "invalid", ": depth_scale"),
+        ('{"method": "m", "depth_scale": true}', "invalid", ": depth_scale"),
+        ('{"method": "m", "depth_scale": "0.001"}', "invalid", ": depth_scale"),
+        ('{"method": "m", "depth_scale": 1' + "0" * 400 + "}", "invalid", ": depth_scale"),
         ('{"method": "m", "x": 1' + "0" * 5000 + "}", "syntax", ""),
-        ('{"method": "m", "runtime": [1]}', "invalid", ".runtime"),
-        ('{"method": "m", "runtime": true}', "invalid", ".runtime"),
+        ('{"method": "m", "runtime": [1]}', "invalid", ": runtime"),
+        ('{"method": "m", "runtime": true}', "invalid", ": runtime"),
     ],
 )
 def test_invalid_metadata_is_rejected(check: Check, text: str, code: ProblemCode, key: str) -> None:
@@ -76,7 +76,7 @@ def test_all_problems_are_reported_at_once() -> None:
     meta, problems = parse_metadata(b'{"method": 1, "url": 2, "depth_scale": -1}')
     assert meta is None
     assert [problem.where for problem in problems] == [
-        f"submission.json.{key}" for key in ("method", "url", "depth_scale")
+        f"submission.json: {key}" for key in ("method", "url", "depth_scale")
     ]
 
 

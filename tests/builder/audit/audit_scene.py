@@ -87,10 +87,9 @@ def scene() -> Scene:
     return Scene(steel, RayCaster(WorldMesh(np.concatenate(vertices), all_faces, ids)))
 
 
-def config(board: BoardSpec | None = BOARD, kind: str = "pile", variants: tuple[str, ...] = ()) -> AuditedConfig:
-    """Return the config of the scene with those keys of a manifest entry that the checks read."""
-    entry: dict[str, Any] = {"scene": {"assembly": {"kind": kind}, "appearance": {"variants": list(variants)}}}
-    return AuditedConfig("scene", entry, scene().steel, board)
+def config(board: BoardSpec | None = BOARD, variants: tuple[str, ...] = ()) -> AuditedConfig:
+    """Return the config of the scene."""
+    return AuditedConfig("scene", variants, scene().steel, board)
 
 
 @cache

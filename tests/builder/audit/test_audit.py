@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -104,9 +103,9 @@ def with_cells(row: Row, **cells: Any) -> Row:
 def test_malformed_arrays_are_reported(
     tiny_root: Path, row: Row, damage: Callable[[Row], Row], words: str
 ) -> None:
-    rig = open_folder(tiny_root).config("lattice")["rig"]
-    assert list(array_problems(row, rig)) == []
-    problems = list(array_problems(with_cells(row, **damage(row)), rig))
+    grid = open_folder(tiny_root).config("lattice").grid
+    assert list(array_problems(row, grid)) == []
+    problems = list(array_problems(with_cells(row, **damage(row)), grid))
     assert any(words in problem for problem in problems), problems
 
 
@@ -130,7 +129,7 @@ def test_malformed_arrays_are_reported(
 def test_broken_row_invariants_are_reported(
     tiny_root: Path, row: Row, damage: Callable[[Row], Row], words: str
 ) -> None:
-    record = open_folder(tiny_root).views("lattice")[4]
+    record = open_folder(tiny_root).config("lattice").views[4]
     bar_ids = {bar.bar_id for bar in read_bars(tiny_root / "bars.parquet")["lattice"]}
     assert list(row_problems(row, record, bar_ids)) == []
     problems = list(row_problems(with_cells(row, **damage(row)), record, bar_ids))
@@ -166,7 +165,7 @@ def test_swapped_rows_are_reported(copy: Path) -> None:
 
 
 def test_all_fields_of_view_record_are_compared(tiny_root: Path, row: Row) -> None:
-    folder = open_folder(tiny_root)
-    record = replace(folder.views("lattice")[4], scored_px=1)
+    view = open_folder(tiny_root).config("lattice").views[4]
+    record = view.model_copy(update={"scored_px": 1})
     problems = list(row_problems(row, record, set(range(1, 76))))
     assert problems == ["steel and scored pixel counts differ from the manifest's"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ import pytest
 import rebar_depth_bench as rdb
 from dataset_builder.audit.cameras import (
     ExpectedView,
-    board_spec,
     camera_problems,
     checked_aim_point_m,
     expected_views,
@@ -27,9 +26,8 @@ from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import DomeSpec, RingSpec
 from dataset_builder.config.trajectories import poses
 from dataset_builder.scene.mesh_ply import write_mesh_ply
-from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, ViewRecord, open_folder
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, right_camera_pose
 from tests.builder.audit.audit_scene import RIGS
 
@@ -38,25 +36,20 @@ AIM_M = np.array([0.0, 0.0, 0.05])
 RING = RingSpec(0.4, 40.0, 6)
 
 
-def manifest_entry(**values: Any) -> dict[str, Any]:
-    """Return a manifest entry after a JSON round trip."""
-    entry: dict[str, Any] = json.loads(json.dumps(values))
-    return entry
+def manifest_config(view_ids: Sequence[str] = (), **entry: Any) -> DatasetConfig:
+    """Return a config with the given views and manifest entry, after a JSON round trip."""
+    views = tuple(ViewRecord(view_id=view_id, left="", right="", steel_px=0, scored_px=0) for view_id in view_ids)
+    return DatasetConfig.model_construct(name="c", views=views, entry=json.loads(json.dumps(entry)))
 
 
 @pytest.mark.parametrize("name", RIGS)
 def test_rig_is_read_from_manifest(name: str) -> None:
-    assert rig_spec("c", manifest_entry(rig=asdict(RIGS[name]))) == RIGS[name]
+    assert rig_spec(manifest_config(rig=asdict(RIGS[name]))) == RIGS[name]
 
 
 @pytest.mark.parametrize("protocol", [RING, DomeSpec((0.2, 0.3), (10.0, 20.0), 5)])
 def test_trajectory_is_read_from_manifest(protocol: RingSpec | DomeSpec) -> None:
-    assert trajectory_spec("c", manifest_entry(protocol=asdict(protocol))) == protocol
-
-
-def test_board_or_null_is_read_from_manifest() -> None:
-    assert board_spec("c", manifest_entry(scene={"board": asdict(BoardSpec(markers=12))})) == BoardSpec(markers=12)
-    assert board_spec("c", manifest_entry(scene={"board": None})) is None
+    assert trajectory_spec(manifest_config(protocol=asdict(protocol))) == protocol
 
 
 @pytest.mark.parametrize(
@@ -64,14 +57,14 @@ def test_board_or_null_is_read_from_manifest() -> None:
 )
 def test_damaged_rig_is_rejected(entry: dict[str, Any]) -> None:
     with pytest.raises((DatasetError), match="the rig of config c is"):
-        rig_spec("c", entry)
+        rig_spec(manifest_config(**entry))
 
 
 def test_rig_with_unknown_grid_is_rejected() -> None:
     rig = asdict(replace(RIGS["raw"], grid="fish"))
-    entry = manifest_entry(rig=rig, protocol=asdict(RING), views=[{"view_id": "c/0000"}])
+    config = manifest_config(["c/0000"], rig=rig, protocol=asdict(RING))
     with pytest.raises(DatasetError, match=r"the rig of config c is invalid: .*fish"):
-        expected_views("c", entry, AIM_M)
+        expected_views(config, AIM_M)
 
 
 def make_row(cameras: dict[str, Camera], baseline_m: float) -> Row:
@@ -85,10 +78,10 @@ def make_row(cameras: dict[str, Camera], baseline_m: float) -> Row:
 @pytest.fixture(params=list(RIGS))
 def row_and_expected(request: pytest.FixtureRequest) -> tuple[Row, ExpectedView]:
     rig = RIGS[request.param]
-    views = [{"view_id": f"c/{index:04d}"} for index in (1, 3, 5)]
-    entry = manifest_entry(rig=asdict(rig), protocol=asdict(RING), views=views)
-    expected = expected_views("c", entry, AIM_M)
-    assert list(view_list_problems(entry, expected)) == []
+    view_ids = [f"c/{index:04d}" for index in (1, 3, 5)]
+    config = manifest_config(view_ids, rig=asdict(rig), protocol=asdict(RING))
+    expected = expected_views(config, AIM_M)
+    assert list(view_list_problems(config, expected)) == []
     pose = poses(RING, AIM_M, rig)[3]
     return make_row(rig_cameras(rig, pose), rig.baseline_m), expected[1]
 
@@ -145,26 +138,27 @@ def test_displaced_right_camera_is_reported() -> None:
 
 @pytest.mark.slow
 def test_cameras_of_rendered_dataset_match_manifest(tiny_root: Path) -> None:
-    entry = open_folder(tiny_root).config("lattice")
-    aim_m, problems = checked_aim_point_m(entry, tiny_root / entry["mesh"])
+    config = open_folder(tiny_root).config("lattice")
+    aim_m, problems = checked_aim_point_m(config, tiny_root / config.mesh)
     assert problems == ()
     assert aim_m == pytest.approx([0, 0, 0.05], abs=1e-3)
-    expected = expected_views("lattice", entry, aim_m)
+    expected = expected_views(config, aim_m)
     for row, view in zip(rdb.load(tiny_root, "lattice"), expected, strict=True):
         assert row["view_id"] == view.view_id
         assert list(camera_problems(row, view)) == []
-    higher = expected_views("lattice", entry, aim_m + np.array([0, 0, 0.001]))
+    higher = expected_views(config, aim_m + np.array([0, 0, 0.001]))
     assert list(camera_problems(rdb.load(tiny_root, "lattice")[0], higher[0]))
 
 
 def test_wrong_view_indices_are_reported() -> None:
-    views = [{"view_id": "c/0001"}, {"view_id": "c/0002"}]
-    entry = manifest_entry(rig=asdict(RIGS["ideal"]), protocol=asdict(RING), views=views)
-    problems = list(view_list_problems(entry, expected_views("c", entry, AIM_M)))
+    view_ids = ["c/0001", "c/0002"]
+    entry = {"rig": asdict(RIGS["ideal"]), "protocol": asdict(RING)}
+    config = manifest_config(view_ids, **entry)
+    problems = list(view_list_problems(config, expected_views(config, AIM_M)))
     assert len(problems) == 1
     assert problems[0].endswith("the first difference is c/0002, expected c/0004")
-    repeated_entry = manifest_entry(rig=asdict(RIGS["ideal"]), protocol=asdict(RING), views=[*views * 4])
-    assert len(list(view_list_problems(repeated_entry, expected_views("c", repeated_entry, AIM_M)))) == 1
+    repeated = manifest_config(view_ids * 4, **entry)
+    assert len(list(view_list_problems(repeated, expected_views(repeated, AIM_M)))) == 1
 
 
 def test_aim_point_is_centre_of_steel_only(tmp_path: Path) -> None:
@@ -172,11 +166,11 @@ def test_aim_point_is_centre_of_steel_only(tmp_path: Path) -> None:
     mesh = tmp_path / "m.ply"
     write_mesh_ply(mesh, vertices_m, np.array([[0, 1, 2], [3, 4, 5]]), np.array([4, 0]))
     assert mesh_aim_point_m(mesh).tolist() == [0.2, 0.2, 0.1]
-    assert checked_aim_point_m({}, mesh)[0].tolist() == [0.2, 0.2, 0.1]
-    aim_m, problems = checked_aim_point_m({"aim_point_m": [0.2, 0.2, 0.101]}, mesh)
+    assert checked_aim_point_m(manifest_config(), mesh)[0].tolist() == [0.2, 0.2, 0.1]
+    aim_m, problems = checked_aim_point_m(manifest_config(aim_point_m=[0.2, 0.2, 0.101]), mesh)
     assert (aim_m.tolist(), problems) == ([0.2, 0.2, 0.101], ())
     for wrong in ([0.2, 0.2, 0.11], [0.2, 0.2], [0.2, 0.2, float("nan")]):
-        aim_m, problems = checked_aim_point_m({"aim_point_m": wrong}, mesh)
+        aim_m, problems = checked_aim_point_m(manifest_config(aim_point_m=wrong), mesh)
         assert aim_m.tolist() == [0.2, 0.2, 0.1]
         assert "expected [0.2, 0.2, 0.1], the centre of the steel" in problems[0]
 

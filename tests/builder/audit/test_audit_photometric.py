@@ -16,7 +16,6 @@ from dataset_builder.audit.photometric import best_shift_px, photometric_fit, ph
 from dataset_builder.audit.report import Check
 from dataset_builder.audit.views import AuditedConfig, AuditedView, RayCache, view_from_row
 from rebar_depth_bench.data.bars import read_bars
-from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from tests.builder.audit.audit_scene import RIGS, config, view, with_baseline, with_depth, with_K_shift
 
@@ -75,7 +74,7 @@ def test_images_without_texture_are_skipped() -> None:
 def tiny(tiny_root: Path) -> tuple[AuditedConfig, list[AuditedView]]:
     """Return the config and its nine rendered views of 160 x 90 pixels with one sample per pixel (very noisy)."""
     steel = read_bars(tiny_root / "bars.parquet")["lattice"]
-    audited = AuditedConfig("lattice", open_folder(tiny_root).config("lattice"), steel, BoardSpec())
+    audited = AuditedConfig("lattice", (), steel, BoardSpec())
     rays = RayCache()
     return audited, [view_from_row(row, rays) for row in rdb.load(tiny_root, "lattice")]
 

@@ -93,7 +93,7 @@ def test_swept_depth_is_metric(archive: Path, orbit_root: Path) -> None:
 
 
 def test_anchored_scale_agrees_with_board_scale(work: Path, orbit_root: Path) -> None:
-    views = ConfigViews(open_folder(orbit_root), "lattice-orbit")
+    views = ConfigViews(open_folder(orbit_root).config("lattice-orbit"))
     by_board, by_truth = (
         multi_view_method(name).prepare(views, work / "kept", silent) for name in ("sweep-aruco", "sweep-anchored")
     )
@@ -107,7 +107,7 @@ def test_anchored_scale_agrees_with_board_scale(work: Path, orbit_root: Path) ->
 
 
 def test_board_plane_matches_visible_board(orbit_root: Path) -> None:
-    views = ConfigViews(open_folder(orbit_root), "lattice-orbit")
+    views = ConfigViews(open_folder(orbit_root).config("lattice-orbit"))
     predictor = multi_view_method("board-plane").prepare(views, orbit_root, silent).predict
     errors_m = []
     for row in load(orbit_root, "lattice-orbit").select(range(4)):
