@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from html.parser import HTMLParser
 from pathlib import Path
@@ -12,7 +13,10 @@ import pytest
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.bars import read_bars
-from rebar_depth_bench.reporting.tables import frame_csv
+from rebar_depth_bench.extended.result import ExtendedResult
+from rebar_depth_bench.reporting.comparison_tables import comparison_csv
+from rebar_depth_bench.reporting.extended_tables import extended_csv
+from rebar_depth_bench.reporting.tables import frame_csv, result_csv
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.scoring.result import VIEW_METRICS, Result
@@ -78,6 +82,18 @@ def test_integers_with_missing_values_stay_integers() -> None:
     assert isinstance(frame["count"].dtype, pd.Int64Dtype)
     assert frame_csv(frame) == "count,text\n3,a\n,\n"
     assert frame_csv(make_frame([])) == ""
+
+
+def test_csv_without_rows_has_the_header(two_configs: Result) -> None:
+    extended = ExtendedResult(measures={}, tables={}, views=())
+    empty = dataclasses.replace(two_configs, tables={}, views=(), extended=extended)
+    assert result_csv(empty) == result_csv(two_configs).splitlines(keepends=True)[0]
+    compared = comparison_csv([compare(two_configs, two_configs)])
+    assert comparison_csv([]) == compared.splitlines(keepends=True)[0]
+    assert extended_csv(empty) == (
+        "method,config,alignment,measure,unit,statistic,value,low,high,samples,"
+        "protocol,dataset_digest,submission_sha256,software_version\n"
+    )
 
 
 def test_bars_of_a_dataset_folder(tiny_root: Path) -> None:
