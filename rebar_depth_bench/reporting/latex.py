@@ -10,10 +10,11 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import PackageLoader, Template
 
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.reporting import formatting
+from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.published import PublishedRow, load_published, paper_scene, published_rows
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, PROTOCOL
 from rebar_depth_bench.scoring.result import Result, Table
@@ -93,17 +94,10 @@ def escape_latex(text: str) -> str:
 
 def _template() -> Template:
     """Return the template of the table; its delimiters do not occur in LaTeX, its filter ``tex`` escapes text."""
-    environment = Environment(
-        *("<%", "%>", "<<", ">>", "<#", "#>"),
-        loader=PackageLoader("rebar_depth_bench", "reporting"),
-        autoescape=False,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters["tex"] = escape_latex
-    return environment.get_template("table.tex.j2")
+    loader = PackageLoader("rebar_depth_bench", "reporting")
+    latex_environment = environment(loader).overlay("<%", "%>", "<<", ">>", "<#", "#>", autoescape=False)
+    latex_environment.filters["tex"] = escape_latex
+    return latex_environment.get_template("table.tex.j2")
 
 
 def _config_title(config: str) -> str:
