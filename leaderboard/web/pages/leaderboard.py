@@ -18,7 +18,7 @@ from leaderboard.db.rankings import LeaderboardEntry, RankingVersion, leaderboar
 from leaderboard.web.pages.rendering import DisplayTime, Link, format_time, link
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
-from rebar_depth_bench.reporting.html.published import PaperRow, finite_interval, published_row
+from rebar_depth_bench.reporting.html.published import PaperRow, finite_interval, published_row, scatter_points
 from rebar_depth_bench.reporting.html.rows import ScoreRow, table_row
 from rebar_depth_bench.reporting.published import PublishedNumbers, load_published, paper_scene
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
@@ -190,7 +190,7 @@ def make_config_ranking(
         lines=[_ranking_line(rows[index], marks.get(index, ""), formatted[index].row) for index in indices],
         published=published,
         distance=distance,
-        chart=_chart(printable(config), points, tuple(_published_points(published))) if points else None,
+        chart=_chart(printable(config), points, tuple(scatter_points(published, {}))) if points else None,
         plotted=len(points),
     )
 
@@ -254,12 +254,3 @@ def _published(config: str) -> tuple[list[PaperRow], str]:
         return [], ""
     rows = [published_row(chr(_FIRST_UPPERCASE + k), row) for k, row in enumerate(scene.rows)]
     return rows, scene.distance
-
-
-def _published_points(rows: Sequence[PaperRow]) -> list[ScatterPoint]:
-    points = []
-    for row in rows:
-        native, scaled = row.cells[1].value, row.cells[2].value
-        if native is not None and scaled is not None:
-            points.append(ScatterPoint(row.mark, row.name, native, scaled, True))
-    return points
