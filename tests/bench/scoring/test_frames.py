@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -20,18 +19,8 @@ from rebar_depth_bench.reporting.tables import frame_csv, result_csv
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.scoring.result import VIEW_METRICS, Result
+from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredicted_view
-
-
-class TagCollector(HTMLParser):
-    """Parser that keeps the names of the start tags."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
 
 
 @pytest.fixture
@@ -119,7 +108,6 @@ def test_repr_fits_a_screen() -> None:
 
 def test_notebook_shows_escaped_table(two_configs: Result) -> None:
     html = result(*two_configs.views, method=HOSTILE)._repr_html_()
-    parser = TagCollector()
-    parser.feed(html)
-    assert parser.tags.count("tr") == 3
-    assert set(parser.tags) <= {"p", "b", "table", "thead", "tbody", "tr", "th", "td"}
+    page = Page(html)
+    assert page.count("tr") == 3
+    assert {tag for tag, _ in page.tags} <= {"p", "b", "table", "thead", "tbody", "tr", "th", "td"}
