@@ -31,8 +31,8 @@ RENAMED_OPTIONS = {"--to": "--out"}
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-build``; return its exit status."""
     options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
-    command = {"audit": _audit, "export": _export}.get(options.command, _build)
-    return run_command(lambda: command(options), interrupted="interrupted; run the same command again to continue")
+    interrupted = "interrupted; run the same command again to continue"
+    return run_command(lambda: options.run(options), interrupted=interrupted)
 
 
 def _check_extra() -> None:
@@ -150,6 +150,22 @@ def argument_parser() -> argparse.ArgumentParser:
         description="Render a dataset folder of stereo views with exact depth, or resume an interrupted build.",
     )
     parser.add_argument("--version", action="version", version=software_version())
+    _add_build_arguments(parser)
+    _add_scene_arguments(parser)
+    parser.set_defaults(run=_build)
+    commands = parser.add_subparsers(metavar="{audit,export}")
+    auditing = commands.add_parser("audit", help="check a dataset folder and its ground truth")
+    _add_audit_arguments(auditing)
+    auditing.set_defaults(run=_audit)
+    exporting = commands.add_parser(
+        "export", help="export a dataset folder as PNG, OpenEXR, COLMAP and nerfstudio files"
+    )
+    _add_export_arguments(exporting)
+    exporting.set_defaults(run=_export)
+    return parser
+
+
+def _add_build_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="ROOT", help="dataset folder to build or resume")
     parser.add_argument(
         "--config",
@@ -187,6 +203,9 @@ def argument_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--seed", type=int, default=0, help="random seed of surfaces and noise (default: %(default)s)"
     )
+
+
+def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mesh", metavar="FILE", help="STL, PLY, OBJ or glTF file that replaces the lattice's rods"
     )
@@ -210,32 +229,28 @@ def argument_parser() -> argparse.ArgumentParser:
         metavar="NAME",
         help=f"appearance variants, appended to the config name: {', '.join(VARIANTS)}",
     )
-    _add_commands(parser)
-    return parser
 
 
-def _add_commands(parser: argparse.ArgumentParser) -> None:
-    commands = parser.add_subparsers(dest="command", metavar="{audit,export}")
-    checking = commands.add_parser("audit", help="check a dataset folder and its ground truth")
-    checking.add_argument("root", metavar="ROOT", help="dataset folder")
-    checking.add_argument(
+def _add_audit_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("root", metavar="ROOT", help="dataset folder")
+    parser.add_argument(
         "--depth-views",
         type=int,
         default=4,
         metavar="N",
         help="number of views per config whose depth is compared with Cycles' depth pass (default: %(default)s)",
     )
-    exporting = commands.add_parser(
-        "export", help="export a dataset folder as PNG, OpenEXR, COLMAP and nerfstudio files"
-    )
-    exporting.add_argument("root", metavar="ROOT", help="dataset folder")
-    exporting.add_argument(
+
+
+def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("root", metavar="ROOT", help="dataset folder")
+    parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="output folder: new, or an earlier export to resume"
     )
-    exporting.add_argument(
+    parser.add_argument(
         "--config", nargs="+", action="extend", metavar="NAME", help="configs to export (default: all)"
     )
-    exporting.add_argument(
+    parser.add_argument(
         "--views",
         type=int,
         metavar="N",

@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 from dataset_builder.pipeline.plan import BUILD_FOLDER
+from tests.processes import processes_below
 
 TINY = ("--width", "160", "--height", "90", "--samples", "1")
 TINY_VIEWS = 9
@@ -34,40 +34,11 @@ def start_build(root: Path, *arguments: str) -> subprocess.Popen[bytes]:
 
 
 def render_processes_of(pid: int) -> list[int]:
-    children = [child for task in tasks_of(pid) for child in children_of(task)]
-    return [int(child) for child in children if b"dataset_builder.blender" in command_line(child)]
-
-
-def tasks_of(pid: int) -> list[Path]:
-    try:
-        return list(Path(f"/proc/{pid}/task").iterdir())
-    except OSError:
-        return []  # it has ended
-
-
-def children_of(task: Path) -> list[str]:
-    try:
-        return (task / "children").read_text().split()
-    except OSError:
-        return []  # threads come and go
-
-
-def command_line(pid: str) -> bytes:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes()
-    except OSError:
-        return b""  # it has ended
+    return processes_below(pid, b"dataset_builder.blender")
 
 
 def staged_rows(root: Path) -> int:
     return len(list(root.glob(f"{BUILD_FOLDER}/*/rows/????.parquet")))
-
-
-def wait_until(condition: Callable[[], object], timeout_s: float = 120) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "waited too long"
-        time.sleep(0.02)
 
 
 def progressed_or_ended(root: Path, already: int, build: subprocess.Popen[bytes]) -> bool:

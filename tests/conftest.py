@@ -22,8 +22,9 @@ os.environ.update(HF_HOME=_CACHES.name, XDG_CACHE_HOME=_CACHES.name, HF_HUB_OFFL
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
 
 from rebar_depth_bench import SubmissionWriter, load  # noqa: E402
-from tests import building, requirements  # noqa: E402
+from tests import building, dask_cluster, requirements  # noqa: E402
 from tests.building import RunBuild, StartBuild  # noqa: E402
+from tests.dask_cluster import NewCluster  # noqa: E402
 from tests.requirements import Repetitions  # noqa: E402
 
 # A shell that runs the tests in the background ignores this signal, and child processes would inherit that.
@@ -40,7 +41,6 @@ FIXTURE_MARKERS = {
     "running_server": "server",
     "running_scorer": "server",
     "running_postgres": "postgres",
-    "cluster": "dask",
     "new_cluster": "dask",
     "chromium_program": "browser",
 }
@@ -130,6 +130,12 @@ def run_build(blender: None) -> RunBuild:
 def start_build(blender: None) -> StartBuild:
     """Start ``rebar-build`` in a process group of its own."""
     return building.start_build
+
+
+@pytest.fixture(scope="session")
+def new_cluster() -> NewCluster:
+    """Make a dask cluster that ends with a block."""
+    return dask_cluster.new_cluster
 
 
 @pytest.fixture(scope="session")

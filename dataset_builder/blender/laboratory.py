@@ -51,8 +51,8 @@ def _bench() -> tuple[Part, ...]:
     return (_part("bench-top", box((-x, -y, under), (x, y, BENCH_TOP_M)), "wood"), *legs)
 
 
-def _leg(x_m: float, y_m: float, top_m: float, half_m: float = 0.03) -> Mesh:
-    gap_m = 0.0005
+def _leg(x_m: float, y_m: float, top_m: float) -> Mesh:
+    half_m, gap_m = 0.03, 0.0005
     return box((x_m - half_m, y_m - half_m, FLOOR_M + gap_m), (x_m + half_m, y_m + half_m, top_m - gap_m))
 
 

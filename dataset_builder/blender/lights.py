@@ -149,7 +149,7 @@ def _add_lamp_object(light: bpy.types.Light, at_m: Point, direction: Vector) -> 
     bpy.context.scene.collection.objects.link(added)
 
 
-WARM, COOL, WHITE = (1.0, 0.93, 0.85), (0.82, 0.91, 1.0), (1.0, 0.98, 0.95)
+WARM, WHITE = (1.0, 0.93, 0.85), (1.0, 0.98, 0.95)
 EMBER = (1.0, 0.60, 0.30)
 
 

@@ -15,6 +15,7 @@ from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
 from dataset_builder.scene.shapes.solids import box, merge_meshes, rotated_box, rotation_about_z, transformed
 
 CLEAR_M = 19.0
+_CORRUGATION_PITCH_M = 0.28
 """Least distance in plan of objects from the origin."""
 
 SLAB_HALF_M = 3.2
@@ -63,9 +64,9 @@ def _containers() -> tuple[Part, ...]:
     return tuple(parts)
 
 
-def _corrugated(length_m: float, width_m: float, height_m: float, pitch_m: float = 0.28) -> Mesh:
+def _corrugated(length_m: float, width_m: float, height_m: float) -> Mesh:
     """Return a box along x, its base at z = 0.08, with trapezoidal corrugation on its long sides."""
-    folds = round(length_m / pitch_m)
+    folds = round(length_m / _CORRUGATION_PITCH_M)
     x = np.append((np.arange(folds)[:, None] + [0.0, 0.3, 0.5, 0.8]).ravel(), folds) * length_m / folds
     inset = np.append(np.tile([0.0, 0.0, 0.045, 0.045], folds), 0.0)
     half = width_m / 2 - inset

@@ -140,9 +140,9 @@ def _stage_mesh(mesh: WorldMesh, path: Path, expected_sha256: str | None) -> Non
 
 
 def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None]) -> None:
-    """Render planar depth for each camera of a task into ``task.out``, and report each camera.
+    """Render the planar depth of a mesh for each camera of a task into ``task.out``, and report each camera.
 
-    Writes ``<n>.npy`` for camera n: (H, W) float32, metres, 0.0 where there is no surface.
+    The file ``<n>.npy`` of camera n holds float32 depth in metres, (H, W); pixels without a surface are 0.0.
     """
     vertices_m, faces, _ = read_mesh_ply(task.mesh)
     bpy.ops.wm.read_factory_settings(use_empty=True)

@@ -16,7 +16,7 @@ LINE_M = 0.0005
 """Width of the border line, metres."""
 LINE_INSET_M = 0.002
 """Distance of the border line from the edge of the board, metres."""
-PAPER, INK, GREY_INK = 255, 0, 120
+PAPER, GREY_INK = 255, 120
 
 
 def board_texture(spec: BoardSpec, px_per_m: float) -> UInt8[ndarray, "h w"]:

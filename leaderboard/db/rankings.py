@@ -5,10 +5,8 @@ The queries select columns instead of ORM objects, so that a page with hundreds 
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 from sqlalchemy import and_, false, func, or_, select
 from sqlalchemy.orm import aliased
@@ -18,23 +16,11 @@ from leaderboard.db.models import ErrorMapModel, LeaderboardRowModel, Submission
 from leaderboard.db.submissions import QUEUED, SCORED
 
 
-class VersionedRow(Protocol):
-    """The fields of a row that determine the ranking version."""
-
-    @property
-    def submission_id(self) -> str:
-        """Id of the submission."""
-
-    @property
-    def finished_at(self) -> float | None:
-        """Unix timestamp of the end of scoring."""
-
-
 @dataclass(frozen=True)
 class LeaderboardEntry:
     """A submission's row of one config; ``rank`` is None if the row is not ranked.
 
-    ``table`` is the config's table from the result JSON.
+    ``table_json`` is the JSON text of the config's table in the result.
     """
 
     rank: int | None
@@ -47,12 +33,11 @@ class LeaderboardEntry:
     created_at: float
     finished_at: float | None
     public: bool
-    table: Mapping[str, Any]
+    table_json: str
 
 
 _COLUMNS = (
     LeaderboardRowModel.ranked,
-    LeaderboardRowModel.json,
     SubmissionModel.id,
     LeaderboardRowModel.config,
     SubmissionModel.method,
@@ -62,9 +47,9 @@ _COLUMNS = (
     SubmissionModel.created_at,
     SubmissionModel.finished_at,
     SubmissionModel.public,
+    LeaderboardRowModel.json,
 )
-"""Columns selected for a ``LeaderboardEntry``; loading ORM objects would take longer."""
-
+"""Columns selected for a ``LeaderboardEntry``: whether it is ranked, then its fields after ``rank``."""
 
 _IDS = func.aggregate_strings(LeaderboardRowModel.submission_id, " ")
 
@@ -93,7 +78,7 @@ def ranking_versions(database: Database) -> dict[str, RankingVersion]:
     return {config: RankingVersion(frozenset(ids.split(" ")), newest or 0.0) for config, ids, newest in rows}
 
 
-def ranking_version(rows: Sequence[VersionedRow]) -> RankingVersion:
+def ranking_version(rows: Sequence[LeaderboardEntry]) -> RankingVersion:
     """Return the version of the given public rows of a config."""
     newest = max((row.finished_at or 0.0 for row in rows), default=0.0)
     return RankingVersion(frozenset(row.submission_id for row in rows), newest)
@@ -125,7 +110,7 @@ def leaderboard_entries(
     for row in rows:
         has_rank = row.ranked and row.public
         rank += has_rank
-        entries.append(_entry(row, rank if has_rank else None))
+        entries.append(LeaderboardEntry(rank if has_rank else None, *row[1:]))
     return entries
 
 
@@ -143,68 +128,12 @@ def error_map_webp(database: Database, submission_id: str, view_id: str) -> byte
         return None if record is None else record.webp
 
 
-def _entry(row: Any, rank: int | None) -> LeaderboardEntry:
-    return LeaderboardEntry(
-        rank=rank,
-        submission_id=row.id,
-        config=row.config,
-        method=row.method,
-        submitter=row.name,
-        url=row.url,
-        uses_intrinsics=row.uses_intrinsics,
-        created_at=row.created_at,
-        finished_at=row.finished_at,
-        public=row.public,
-        table=json.loads(row.json),
-    )
-
-
-@dataclass(frozen=True)
-class RankedRow:
-    """A public row of a config; ``rank`` is None if the row is not ranked, ``table`` is the table's JSON text."""
-
-    rank: int | None
-    submission_id: str
-    method: str
-    submitter: str
-    url: str | None
-    created_at: float
-    finished_at: float | None
-    table: str
-
-
 @dataclass(frozen=True)
 class QueuePosition:
     """Position of a submission in the queue, where 1 is next, and the number of waiting submissions."""
 
     number: int
     waiting: int
-
-
-def ranked_rows(database: Database, config: str) -> list[RankedRow]:
-    """Return the public rows of a config in leaderboard order: ranked by native AbsRel, then unranked."""
-    columns = (
-        LeaderboardRowModel.ranked,
-        SubmissionModel.id,
-        SubmissionModel.method,
-        TokenModel.name,
-        SubmissionModel.url,
-        SubmissionModel.created_at,
-        SubmissionModel.finished_at,
-        LeaderboardRowModel.json,
-    )
-    query = (
-        select(*columns)
-        .join(SubmissionModel, SubmissionModel.id == LeaderboardRowModel.submission_id)
-        .join(TokenModel, TokenModel.id == SubmissionModel.token_id)
-        .where(LeaderboardRowModel.config == config, SubmissionModel.status == SCORED, SubmissionModel.public)
-        .order_by(
-            LeaderboardRowModel.ranked.desc(), LeaderboardRowModel.abs_rel.nulls_last(), SubmissionModel.created_at
-        )
-    )
-    with database.read() as session:
-        rows = session.execute(query).all()
-    return [RankedRow(rank if row[0] else None, *row[1:]) for rank, row in enumerate(rows, 1)]
 
 
 def ranks(database: Database, submission: SubmissionModel) -> dict[str, int]:

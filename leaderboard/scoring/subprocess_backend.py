@@ -19,7 +19,7 @@ from leaderboard.scoring.task import ERROR_MAPS_DIR, PROBLEM_FILE, RESULT_FILE, 
 from leaderboard.scoring.worker import POLL_INTERVAL_S, RENEWALS_PER_LEASE, BackendUnavailableError, ScoringBackend
 from leaderboard.settings import Settings
 
-OUTPUT_FILE = "complaints.txt"
+OUTPUT_FILE = "output.txt"
 _LOG = structlog.get_logger("worker")
 
 
@@ -85,7 +85,6 @@ def _read_outcome(out: Path, status: int) -> Outcome | None:
         raise BackendUnavailableError((out / UNAVAILABLE_FILE).read_text())
     if status in (-signal.SIGKILL, -signal.SIGTERM):
         return None  # Killed from outside, not caused by the archive: try again.
-    _LOG.error(
-        "scoring process crashed", status=status, said=(out / OUTPUT_FILE).read_text(errors="replace")[-2000:]
-    )
+    output = (out / OUTPUT_FILE).read_text(errors="replace")[-2000:]
+    _LOG.error("scoring process crashed", status=status, output=output)
     return Outcome(reason=f"the scoring process exited with status {status} without a result")

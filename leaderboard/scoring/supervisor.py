@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import threading
-from types import TracebackType
 from typing import Self
 
 import structlog
@@ -31,9 +30,7 @@ class WorkerSupervisor:
         self._watcher.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stopping.set()
         self._watcher.join()
 

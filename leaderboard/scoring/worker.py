@@ -63,7 +63,7 @@ def _score_submission(
     score: ScoringBackend,
     stop: threading.Event,
 ) -> None:
-    log = _LOG.bind(submission=submission_id[:6], scorer=name)
+    log = _LOG.bind(submission=submission_id[:6], worker=name)
     record = _retry_until_available(lambda: submissions.find(database, submission_id), stop)
     if record is None:  # Deleted after it was leased.
         return

@@ -58,6 +58,11 @@ class MeasureFamily:
     evaluate: EvaluateView
     alignments: tuple[str, ...]
 
+    @property
+    def by_name(self) -> dict[str, Measure]:
+        """The measures by name."""
+        return {measure.name: measure for measure in self.measures}
+
 
 def _clouds(predictions: Predictions, truth: SteelTruth, _: ConfigSteelTruth) -> list[Samples]:
     """Return the point cloud samples of each prediction; the true cloud is built once."""

@@ -13,11 +13,13 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample
-from rebar_depth_bench.scoring.frames import make_frame
+from rebar_depth_bench.scoring.frames import frame_of_values
 from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+_ESTIMATE_COLUMNS = ("config", "alignment", "measure", "unit", "statistic", "value", "low", "high", "samples")
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,15 @@ class ExtendedResult:
 
     def to_pandas(self) -> DataFrame:
         """Return one row per config, alignment and measure: value, 95 % interval and number of samples."""
-        return make_frame([_estimate_row(*item) for item in self.estimates()])
+        rows = [
+            (
+                *(config, alignment, measure.name, measure.unit, measure.statistic, estimate.value),
+                *(rounded_interval(estimate.interval) or (None, None)),
+                estimate.samples,
+            )
+            for config, alignment, measure, estimate in self.estimates()
+        ]
+        return frame_of_values(_ESTIMATE_COLUMNS, rows)
 
     def estimates(self) -> Iterator[tuple[str, str, Measure, MeasureEstimate]]:
         """Yield config, alignment, measure and estimate, in order."""
@@ -187,22 +197,6 @@ def _table_dict(table: ExtendedTable) -> dict[str, Any]:
         for alignment, alignment_estimates in table.numbers.items()
     }
     return {"views": table.views, **numbers}
-
-
-def _estimate_row(config: str, alignment: str, measure: Measure, estimate: MeasureEstimate) -> dict[str, Any]:
-    """Return the row of an estimate in the frame."""
-    low, high = rounded_interval(estimate.interval) or (None, None)
-    return {
-        "config": config,
-        "alignment": alignment,
-        "measure": measure.name,
-        "unit": measure.unit,
-        "statistic": measure.statistic,
-        "value": estimate.value,
-        "low": low,
-        "high": high,
-        "samples": estimate.samples,
-    }
 
 
 def _estimate_dict(entry: MeasureEstimate) -> dict[str, Any]:

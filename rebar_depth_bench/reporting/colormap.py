@@ -50,12 +50,12 @@ Both ends are equally dark.
 """
 
 
-def robust_range(values: Float[ndarray, " n"], share: float = 0.02) -> tuple[float, float]:
-    """Return the order statistics that exclude ``share`` of ``values`` at either end, without interpolation.
+def robust_range(values: Float[ndarray, " n"]) -> tuple[float, float]:
+    """Return the order statistics that exclude 2 % of ``values`` at either end, without interpolation.
 
     ``values`` must not be empty, and all values must be finite.
     """
-    low = int(share * (values.size - 1))
+    low = int(0.02 * (values.size - 1))
     high = values.size - 1 - low
     ordered = np.partition(values, (low, high))
     return float(ordered[low]), float(ordered[high])

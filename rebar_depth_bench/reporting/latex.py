@@ -1,16 +1,20 @@
 r"""LaTeX table of results in the layout of the paper's Table I: RMSE, AbsRel, AbsRel_s and s of each config.
 
-The output requires only ``\usepackage{booktabs}``. Non-Latin letters require XeLaTeX or LuaLaTeX.
+The output of the template ``table.tex.j2`` requires only ``\usepackage{booktabs}``. Non-Latin letters require
+XeLaTeX or LuaLaTeX.
 """
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+
+from jinja2 import PackageLoader, Template
 
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.reporting import formatting
+from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.published import PublishedRow, load_published, paper_scene, published_rows
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, PROTOCOL
 from rebar_depth_bench.scoring.result import Result, Table
@@ -22,7 +26,6 @@ _COLUMNS = 4
 _MISSING = "--"
 _UNRANKED_MARK = r"$^{\ddagger}$"
 _ANCHORED_MARK = r"$^{\dagger}$"
-_HEADS = (r"RMSE $\downarrow$", r"AbsRel $\downarrow$", r"AbsRel$_s$ $\downarrow$", "$s$")
 _LATEX_ESCAPES = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
@@ -40,14 +43,6 @@ _LATEX_ESCAPES = {
 _LIGATURE = re.compile(r"([-',])(?=\1)")
 
 
-@dataclass(frozen=True)
-class _TableLine:
-    """One row of a table block: its escaped name and its cells, ``_COLUMNS`` for each config."""
-
-    name: str
-    cells: list[str]
-
-
 def latex_table(results: Sequence[Result], *, published: bool, intervals: bool = False) -> str:
     r"""Return ``results`` as a LaTeX ``table*`` with one row per result and four columns per config.
 
@@ -63,21 +58,33 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
     if len(digests) != 1:
         digest_list = ", ".join(sorted(map(formatting.short_digest, digests))) or "no result"
         raise InputError(f"LaTeX table: results of {len(digests)} datasets ({digest_list}), expected one dataset")
-    configs = list(dict.fromkeys(config for result in results for config in result.tables))
+    views = {config: table.views for result in results for config, table in result.tables.items()}
+    configs = list(views)
     configs_per_block = 1 if intervals else CONFIGS_PER_BLOCK
     blocks = [configs[start : start + configs_per_block] for start in range(0, len(configs), configs_per_block)]
-    lines = [
-        r"% needs \usepackage{booktabs}",
-        r"\begin{table*}[t]",
-        r"\centering",
-        rf"\caption{{{_caption(results, configs, published=published, intervals=intervals)}}}",
-        r"\label{tab:rebar-depth}",
-        r"\setlength{\tabcolsep}{4pt}",
-        r"\small",
-        "\n\n\\medskip\n".join(_block(results, block, published, intervals) for block in blocks),
-        r"\end{table*}",
-    ]
-    return "\n".join(lines) + "\n"
+    paper_rows = [row for config in configs for row in _paper_rows(config)] if published else []
+    return _template().render(
+        protocol=PROTOCOL,
+        version=results[0].dataset_version,
+        digest=formatting.short_digest(results[0].dataset_digest, 16),
+        view_counts=[f"{escape_latex(config)} {formatting.counted(views[config], 'view')}" for config in configs],
+        unranked=any(not table.ranked for result in results for table in result.tables.values()),
+        unranked_mark=_UNRANKED_MARK,
+        min_coverage_percent=f"{MIN_RANKED_COVERAGE * 100:.0f}",
+        intervals=intervals,
+        anchored=any(row.median_anchored for row in paper_rows),
+        anchored_mark=_ANCHORED_MARK,
+        published=bool(paper_rows),
+        paper=load_published(),
+        blocks=[
+            {
+                "titles": [_config_title(config) for config in block],
+                "rows": _result_rows(results, block, intervals),
+                "published_rows": _published_rows(block) if published else [],
+            }
+            for block in blocks
+        ],
+    )
 
 
 def escape_latex(text: str) -> str:
@@ -85,39 +92,12 @@ def escape_latex(text: str) -> str:
     return _LIGATURE.sub(r"\1{}", "".join(_LATEX_ESCAPES.get(char, char) for char in printable(text)))
 
 
-def _block(results: Sequence[Result], configs: Sequence[str], published: bool, intervals: bool) -> str:
-    groups = [rf"\multicolumn{{{_COLUMNS}}}{{c}}{{{_config_title(config)}}}" for config in configs]
-    rules = [
-        rf"\cmidrule(lr){{{first}-{first + _COLUMNS - 1}}}"
-        for first in range(2, 2 + _COLUMNS * len(configs), _COLUMNS)
-    ]
-    result_lines = _result_lines(results, configs, intervals)
-    published_lines = _published_lines(configs) if published else []
-    mark = escape_latex(load_published().parts["synthetic"].mark)
-    width = 1 + _COLUMNS * len(configs)
-    return "\n".join(
-        [
-            rf"\begin{{tabular}}{{l{'r' * _COLUMNS * len(configs)}}}",
-            r"\toprule",
-            rf" & {' & '.join(groups)} \\",
-            " ".join(rules),
-            rf"Method & {' & '.join(_HEADS * len(configs))} \\",
-            r"\midrule",
-            *(_format_line(line) for line in result_lines),
-            *(
-                [r"\midrule", rf"\multicolumn{{{width}}}{{l}}{{\emph{{Published, {mark}}}}} \\"]
-                if published_lines
-                else []
-            ),
-            *(_format_line(line) for line in published_lines),
-            r"\bottomrule",
-            r"\end{tabular}",
-        ]
-    )
-
-
-def _format_line(line: _TableLine) -> str:
-    return rf"{line.name} & {' & '.join(line.cells)} \\"
+def _template() -> Template:
+    """Return the template of the table; its delimiters do not occur in LaTeX, its filter ``tex`` escapes text."""
+    loader = PackageLoader("rebar_depth_bench", "reporting")
+    latex_environment = environment(loader).overlay("<%", "%>", "<<", ">>", "<#", "#>", autoescape=False)
+    latex_environment.filters["tex"] = escape_latex
+    return latex_environment.get_template("table.tex.j2")
 
 
 def _config_title(config: str) -> str:
@@ -128,15 +108,17 @@ def _config_title(config: str) -> str:
     return f"{escape_latex(config)} ({scenes[config].distance.replace('–', '--')})"
 
 
-def _result_lines(results: Sequence[Result], configs: Sequence[str], intervals: bool) -> list[_TableLine]:
+def _result_rows(results: Sequence[Result], configs: Sequence[str], intervals: bool) -> list[list[str]]:
+    """Return the rows of a block, each a name and four cells for each config."""
     best = {config: _best_texts([result.tables.get(config) for result in results]) for config in configs}
-    lines = []
-    for result in results:
-        tables = {config: result.tables.get(config) for config in configs}
-        if any(tables.values()):
-            cells = [cell for config in configs for cell in _cells(tables[config], best[config], intervals)]
-            lines.append(_TableLine(escape_latex(result.method), cells))
-    return lines
+    return [
+        [
+            escape_latex(result.method),
+            *(cell for name in configs for cell in _cells(result.tables.get(name), best[name], intervals)),
+        ]
+        for result in results
+        if any(name in result.tables for name in configs)
+    ]
 
 
 def _cells(table: Table | None, best: Sequence[str | None], intervals: bool) -> list[str]:
@@ -166,77 +148,32 @@ def _best_texts(tables: Iterable[Table | None]) -> list[str | None]:
 
     All are None if fewer than two tables are ranked.
     """
-    ranked = [table for table in tables if table is not None and table.ranked]
+    ranked = [(_errors(table), _number_texts(table)) for table in tables if table is not None and table.ranked]
     if len(ranked) < 2:
         return [None] * _COLUMNS
-    lowest = (min(ranked, key=key) for key in (_rmse_cm, _abs_rel, _abs_rel_scaled))
-    return [*(_number_texts(table)[column] for column, table in enumerate(lowest)), None]
+    return [*(min(ranked, key=lambda row: row[0][column])[1][column] for column in range(3)), None]
 
 
-def _rmse_cm(table: Table) -> float:
-    return table.native.rmse_cm if table.native else float("inf")
+def _errors(table: Table) -> tuple[float, float, float]:
+    """Return RMSE and AbsRel, native, and AbsRel after the oracle scale; infinity where there is none."""
+    rmse_cm, abs_rel = (table.native.rmse_cm, table.native.abs_rel) if table.native else (math.inf, math.inf)
+    return rmse_cm, abs_rel, table.scaled.abs_rel if table.scaled else math.inf
 
 
-def _abs_rel(table: Table) -> float:
-    return table.native.abs_rel if table.native else float("inf")
+def _paper_rows(config: str) -> tuple[PublishedRow, ...]:
+    return published_rows(paper_scene(config) or "")
 
 
-def _abs_rel_scaled(table: Table) -> float:
-    return table.scaled.abs_rel if table.scaled else float("inf")
-
-
-def _published_lines(configs: Sequence[str]) -> list[_TableLine]:
-    by_config = {config: _published_by_method(config) for config in configs}
+def _published_rows(configs: Sequence[str]) -> list[list[str]]:
+    by_config = {config: {row.method: _published_cells(row) for row in _paper_rows(config)} for config in configs}
     methods = dict.fromkeys(method for rows in by_config.values() for method in rows)
+    missing = [_MISSING] * _COLUMNS
     return [
-        _TableLine(
-            escape_latex(method),
-            [cell for config in configs for cell in _published_cells(by_config[config].get(method))],
-        )
+        [escape_latex(method), *(cell for rows in by_config.values() for cell in rows.get(method, missing))]
         for method in methods
     ]
 
 
-def _published_by_method(config: str) -> Mapping[str, PublishedRow]:
-    return {row.method: row for row in published_rows(paper_scene(config) or "")}
-
-
-def _published_cells(row: PublishedRow | None) -> list[str]:
-    if row is None:
-        return [_MISSING] * _COLUMNS
+def _published_cells(row: PublishedRow) -> list[str]:
     rmse_cm, *others = row.cells
     return [rmse_cm + (_ANCHORED_MARK if row.median_anchored else ""), *others]
-
-
-def _caption(results: Sequence[Result], configs: Sequence[str], *, published: bool, intervals: bool) -> str:
-    """Return the caption: protocol, dataset, views, alignment, and the meaning of each mark in the table."""
-    tables = [(config, result.tables[config]) for result in results for config in result.tables]
-    views = dict(tables)
-    counts = ", ".join(
-        f"{escape_latex(config)} {formatting.counted(views[config].views, 'view')}" for config in configs
-    )
-    digest = escape_latex(formatting.short_digest(results[0].dataset_digest, 16))
-    version = escape_latex(results[0].dataset_version)
-    sentences = [
-        f"Depth on steel, protocol {escape_latex(PROTOCOL)}, dataset {version} ({digest}): {counts}.",
-        "RMSE in cm and AbsRel are native, without any alignment; AbsRel$_s$ is after the oracle scale"
-        r" $s = \mathrm{med}(\mathrm{GT})/\mathrm{med}(\mathrm{pred})$ of each view; means over views,"
-        " $s$: median over views.",
-    ]
-    if any(not table.ranked for _, table in tables):
-        coverage_percent = f"{MIN_RANKED_COVERAGE * 100:.0f}"
-        sentences.append(
-            rf"{_UNRANKED_MARK}Not ranked (coverage below {coverage_percent}\,\%, a view without prediction, "
-            "or an overflow)."
-        )
-    if intervals:
-        sentences.append(r"In brackets: 95\,\% intervals, block bootstrap over views.")
-    paper_methods = [row for config in configs for row in published_rows(paper_scene(config) or "")]
-    if published and any(row.median_anchored for row in paper_methods):
-        sentences.append(rf"{_ANCHORED_MARK}Median-anchored to ground truth (no fiducial).")
-    if published and paper_methods:
-        paper = load_published()
-        sentences.append(
-            f"Published rows: ``{escape_latex(paper.title)}'', {paper.parts['synthetic'].place}, not ranked."
-        )
-    return " ".join(sentences)

@@ -5,7 +5,7 @@ pandas takes half a second to import, which commands without CSV output do not n
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES
@@ -31,6 +31,16 @@ TABLE_COLUMNS = (
 )
 """Column names of the numbers of a config's table, without intervals."""
 
+_TABLE_FRAME_COLUMNS = (
+    *("protocol", "method", "config", *TABLE_COLUMNS),
+    *(f"{column}_{end}" for column in METRIC_COLUMNS.values() for end in ("low", "high")),
+    *("dataset_digest", "dataset_version", "submission_sha256", "software_version"),
+)
+_DIFFERENCE_COLUMNS = (
+    *("first_method", "other_method", "config", "number", "views", "first", "other", "difference", "low", "high"),
+    *("verdict", "protocol", "dataset_digest", "software_version", "first_sha256", "other_sha256"),
+)
+
 
 def table_values(table: Mapping[str, Any]) -> list[Any]:
     """Return a config's numbers in the order of ``TABLE_COLUMNS``, from its table in the result's JSON."""
@@ -43,18 +53,25 @@ def table_values(table: Mapping[str, Any]) -> list[Any]:
     ]
 
 
-def make_frame(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> DataFrame:
-    """Return rows with equal keys as a frame; ``columns`` names the columns if there may be no rows.
+def make_frame(rows: Sequence[Mapping[str, Any]]) -> DataFrame:
+    """Return rows with equal keys as the frame of ``frame_of_values``; without rows it has no columns."""
+    names = list(rows[0]) if rows else []
+    return frame_of_values(names, [[row[name] for name in names] for row in rows])
+
+
+def frame_of_values(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> DataFrame:
+    """Return rows of one value per column as a frame, which has the columns even if there are no rows.
 
     Floats are rounded as in the JSON. Undefined numbers are NaN, or <NA> among integers, which stay integers.
     """
     import pandas as pd
 
-    names = list(rows[0]) if rows else list(columns)
-    frame = pd.DataFrame({name: [_rounded(row[name]) for row in rows] for name in names}, columns=names)
-    for name in names:
-        values = [row[name] for row in rows if row[name] is not None]
-        if values and len(values) < len(rows) and all(type(value) is int for value in values):
+    by_column = list(zip(*rows, strict=True)) or [()] * len(columns)
+    values = {name: [_rounded(value) for value in column] for name, column in zip(columns, by_column, strict=True)}
+    frame = pd.DataFrame(values, columns=list(columns))
+    for name, column in values.items():
+        defined = [value for value in column if value is not None]
+        if defined and len(defined) < len(rows) and all(type(value) is int for value in defined):
             frame[name] = frame[name].astype("Int64")
     return frame
 
@@ -65,21 +82,17 @@ def tables_frame(documents: Sequence[Mapping[str, Any]]) -> DataFrame:
     The 95 % interval of a metric is in the columns ``<metric>_low`` and ``<metric>_high``.
     """
     rows = [
-        {
-            "protocol": document["protocol"],
-            "method": document["submission"]["method"],
-            "config": config,
-            **dict(zip(TABLE_COLUMNS, table_values(table), strict=True)),
-            **_interval_columns(table["ci95"]),
-            "dataset_digest": document["dataset"]["digest"],
-            "dataset_version": document["dataset"]["version"],
-            "submission_sha256": document["submission"]["sha256"],
-            "software_version": document["software"]["version"],
-        }
+        (
+            *(document["protocol"], document["submission"]["method"], config),
+            *table_values(table),
+            *_interval_bounds(table["ci95"]),
+            *(document["dataset"]["digest"], document["dataset"]["version"]),
+            *(document["submission"]["sha256"], document["software"]["version"]),
+        )
         for document in documents
         for config, table in document["tables"].items()
     ]
-    return make_frame(rows)
+    return frame_of_values(_TABLE_FRAME_COLUMNS, rows)
 
 
 def views_frame(document: Mapping[str, Any]) -> DataFrame:
@@ -98,39 +111,27 @@ def views_frame(document: Mapping[str, Any]) -> DataFrame:
 
 def differences_frame(documents: Sequence[Mapping[str, Any]]) -> DataFrame:
     """Return one row per comparison, config and metric from the JSON objects of comparisons."""
-    rows = []
+    rows: list[tuple[Any, ...]] = []
     for document in documents:
         first, other = document["submissions"]
         for config, differences in document["configs"].items():
-            for difference in differences:
-                low, high = difference["ci95"] or (None, None)
-                rows.append(
-                    {
-                        "first_method": first["method"],
-                        "other_method": other["method"],
-                        "config": config,
-                        "number": difference["name"],
-                        **{key: difference[key] for key in ("views", "first", "other", "difference")},
-                        "low": low,
-                        "high": high,
-                        "verdict": difference["verdict"],
-                        "protocol": document["protocol"],
-                        "dataset_digest": document["dataset"]["digest"],
-                        "software_version": document["software"]["version"],
-                        "first_sha256": first["sha256"],
-                        "other_sha256": other["sha256"],
-                    }
+            rows += [
+                (
+                    *(first["method"], other["method"], config, difference["name"]),
+                    *(difference[key] for key in ("views", "first", "other", "difference")),
+                    *(difference["ci95"] or (None, None)),
+                    *(difference["verdict"], document["protocol"], document["dataset"]["digest"]),
+                    *(document["software"]["version"], first["sha256"], other["sha256"]),
                 )
-    return make_frame(rows)
+                for difference in differences
+            ]
+    return frame_of_values(_DIFFERENCE_COLUMNS, rows)
 
 
-def _interval_columns(intervals: Mapping[str, Any]) -> dict[str, float | None]:
-    columns: dict[str, float | None] = {}
-    for name, column in METRIC_COLUMNS.items():
+def _interval_bounds(intervals: Mapping[str, Any]) -> Iterator[float | None]:
+    for name in METRIC_COLUMNS:
         group, _, key = name.rpartition(".")
-        bounds = (intervals[group] if group else intervals)[key] or (None, None)
-        columns[f"{column}_low"], columns[f"{column}_high"] = bounds
-    return columns
+        yield from (intervals[group] if group else intervals)[key] or (None, None)
 
 
 def _rounded(value: Any) -> Any:

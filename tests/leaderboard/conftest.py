@@ -14,9 +14,8 @@ import pytest
 from playwright.sync_api import Browser, sync_playwright
 
 from rebar_depth_bench import SubmissionWriter, load
-from tests.leaderboard import dask_cluster, serving
 from tests.leaderboard import postgres as postgres_server
-from tests.leaderboard.dask_cluster import NewCluster
+from tests.leaderboard import serving
 from tests.leaderboard.postgres import Postgres, RunPostgres
 from tests.leaderboard.serving import RunScorer, RunServer, Server, make_token
 
@@ -71,6 +70,12 @@ def write_archive(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.fixture(scope="session")
+def small_archive(write_archive: WriteArchive) -> Path:
+    """Write an archive of the two views of ``lattice-orbit`` by the method ``small``."""
+    return write_archive("small", configs=("lattice-orbit",))
+
+
+@pytest.fixture(scope="session")
 def running_server() -> RunServer:
     """Run ``rebar-leaderboard serve`` until a block ends."""
     return serving.running_server
@@ -86,12 +91,6 @@ def running_scorer() -> RunScorer:
 def running_postgres() -> RunPostgres:
     """Run a PostgreSQL server of its own until a block ends."""
     return postgres_server.running_postgres
-
-
-@pytest.fixture(scope="session")
-def new_cluster() -> NewCluster:
-    """Make a dask cluster that ends with a block."""
-    return dask_cluster.new_cluster
 
 
 @pytest.fixture(scope="session")

@@ -14,6 +14,8 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.processes import children
+
 _UNPRIVILEGED = "nobody"
 """User of the PostgreSQL process if the tests run as root, which PostgreSQL does not allow."""
 START_S = 60.0
@@ -49,12 +51,12 @@ class Postgres:
     def kill(self) -> None:
         """Kill the server and all its backends without shutdown."""
         assert self.process is not None
-        backends = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        backends = children(self.process.pid)
         self.process.kill()
         self.process.wait()
         for backend in backends:  # Each backend leads its own session.
             with suppress(ProcessLookupError):
-                os.kill(int(backend), signal.SIGKILL)
+                os.kill(backend, signal.SIGKILL)
 
     def new_database(self, name: str) -> str:
         """Create an empty database and return its URL."""

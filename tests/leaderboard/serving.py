@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -23,6 +24,9 @@ from leaderboard.settings import read_settings
 
 START_S = 120.0
 ENDED = ("scored", "failed")
+SCORER = b"leaderboard.scoring\0"
+SCORING = b"leaderboard.scoring.sandbox"
+"""Parts of the command lines of a scorer and of the process in which it scores one archive."""
 
 
 @dataclass
@@ -82,6 +86,14 @@ def make_token(state: Path, name: str, db: str = "") -> str:
     with closing(Database(settings.database_url)) as database:
         database.migrate()
         return create_token(database, name)
+
+
+def submission_row(state: Path, submission_id: str) -> dict[str, Any]:
+    """Return the columns of a submission in the SQLite database of a state folder."""
+    with closing(sqlite3.connect(state / "leaderboard.sqlite")) as connection:
+        connection.row_factory = sqlite3.Row
+        query = "SELECT * FROM submissions WHERE id = ?"
+        return dict(connection.execute(query, (submission_id,)).fetchone())
 
 
 @contextmanager

@@ -71,11 +71,6 @@ def private_server(
         yield server
 
 
-@pytest.fixture(scope="session")
-def small_archive(write_archive: WriteArchive) -> Path:
-    return write_archive("small", configs=("lattice-orbit",))
-
-
 @pytest.fixture
 def invalid_archive(tiny_root: Path, tmp_path: Path) -> Path:
     """Return an archive with a single view that is not an array; the other views are missing."""

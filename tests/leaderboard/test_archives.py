@@ -28,9 +28,8 @@ from leaderboard.storage.archive_store import ArchiveNotFoundError, ArchiveStore
 from leaderboard.uploads.accept import UNAVAILABLE_MESSAGE as UPLOADS_UNAVAILABLE
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError
-from tests.leaderboard.conftest import WriteArchive
 from tests.leaderboard.serving import RunServer, make_token
-from tests.leaderboard.watching import wait_until
+from tests.processes import wait_until
 
 USER, PASSWORD = "keeper", "open-sesame"
 CONTENT = bytes(range(256)) * 1000
@@ -178,13 +177,13 @@ def test_unknown_modification_time_is_none(told: dict[str, object]) -> None:
 
 
 def test_service_stores_archives_remotely_and_cleans_up(
-    tiny_root: Path, tmp_path: Path, write_archive: WriteArchive, ftp: ArchiveLocation, running_server: RunServer
+    tiny_root: Path, tmp_path: Path, small_archive: Path, ftp: ArchiveLocation, running_server: RunServer
 ) -> None:
     state, folder = tmp_path / "state", ftp.folder / "service"
-    archive, settings = write_archive("small", configs=("lattice-orbit",)), {"archives": f"{ftp.url}/service"}
+    settings = {"archives": f"{ftp.url}/service"}
     token = make_token(state, "alice")
     with running_server(tiny_root, state, workers=0, **settings) as server:
-        first = server.submit_accepted(archive, token)
+        first = server.submit_accepted(small_archive, token)
     for name, age_s in (("orphan", 2 * ORPHAN_AGE_S), ("young", 0.0)):
         (folder / f"{name}.zip").write_bytes(CONTENT)
         os.utime(folder / f"{name}.zip", (time.time() - age_s,) * 2)
@@ -192,8 +191,8 @@ def test_service_stores_archives_remotely_and_cleans_up(
         names = {path.name for path in folder.iterdir()}
         assert names == {"young.zip", f"{first}.zip"}, "archives of nobody are cleared once old"
         (folder / "young.zip").unlink()
-        second = server.submit_accepted(archive, token)
-        assert (folder / f"{second}.zip").read_bytes() == archive.read_bytes()
+        second = server.submit_accepted(small_archive, token)
+        assert (folder / f"{second}.zip").read_bytes() == small_archive.read_bytes()
         for submission in (first, second):
             assert server.wait_until_ended(submission)["status"] == "scored"
             address, owner = f"{server.url}/api/v1/submissions/{submission}", {"Authorization": f"Bearer {token}"}
@@ -207,9 +206,9 @@ def test_service_stores_archives_remotely_and_cleans_up(
 
 
 def test_storage_outage_keeps_quota_and_requeues_job(
-    tiny_root: Path, tmp_path: Path, write_archive: WriteArchive, running_server: RunServer
+    tiny_root: Path, tmp_path: Path, small_archive: Path, running_server: RunServer
 ) -> None:
-    state, port, archive = tmp_path / "state", free_port(), write_archive("small", configs=("lattice-orbit",))
+    state, port = tmp_path / "state", free_port()
     (tmp_path / "ftp").mkdir()
     with ExitStack() as stack:
         first_ftp_server = stack.enter_context(ExitStack())
@@ -217,10 +216,10 @@ def test_storage_outage_keeps_quota_and_requeues_job(
         server = stack.enter_context(running_server(tiny_root, state, archives=f"{url}/kept", quota=1, workers=0))
         token = server.token("alice")
         first_ftp_server.close()
-        response = server.submit(archive, token)
+        response = server.submit(small_archive, token)
         assert (response.status_code, response.json()["detail"]) == (503, UPLOADS_UNAVAILABLE)
         stack.enter_context(ftp_server(tmp_path / "ftp", port))
-        submission = server.submit_accepted(archive, token)
+        submission = server.submit_accepted(small_archive, token)
         assert not list((state / "spool").glob("*/*.upload"))
     settings = read_settings(None, {"data": str(tiny_root), "state_dir": state, "archives": f"{url}/kept"})
     score, job = make_subprocess_backend(settings, tmp_path), Job(submission, open_folder(str(tiny_root)).digest)

@@ -21,9 +21,8 @@ import pytest
 from leaderboard.db.jobs import MAX_ATTEMPTS
 from tests.leaderboard.conftest import WriteArchive
 from tests.leaderboard.postgres import Postgres, RunPostgres
-from tests.leaderboard.processes import descendants, is_running
-from tests.leaderboard.serving import RunServer, Server, make_token
-from tests.leaderboard.watching import SCORER, SCORING, processes_below, wait_until
+from tests.leaderboard.serving import SCORER, SCORING, RunServer, Server, make_token
+from tests.processes import descendants, is_running, processes_below, wait_until
 from tests.requirements import Repetitions
 
 UPLOADERS = 2

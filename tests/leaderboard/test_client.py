@@ -118,15 +118,12 @@ def test_wrong_token_or_url_is_reported_before_upload(
     assert "uploading" not in process.stderr
 
 
-def test_scoring_failure_and_exceeded_quota_are_reported(
-    strict_server: Server, write_archive: WriteArchive
-) -> None:
+def test_scoring_failure_and_exceeded_quota_are_reported(strict_server: Server, small_archive: Path) -> None:
     token = strict_server.token("alice")
-    small = write_archive("small", configs=("lattice-orbit",))
-    failed = run("submit", small, "--url", strict_server.url, token=token)
+    failed = run("submit", small_archive, "--url", strict_server.url, token=token)
     assert failed.returncode == 2
     assert "scoring failed: scoring took longer than the limit of 0.01 s" in failed.stderr
-    over_quota = run("submit", small, "--url", strict_server.url, token=token)
+    over_quota = run("submit", small_archive, "--url", strict_server.url, token=token)
     assert over_quota.returncode == 2
     assert "the quota of 1 submissions per day (UTC) is used up" in over_quota.stderr
 

@@ -14,10 +14,9 @@ import pytest
 
 from leaderboard.scoring.dask_backend import settings_for_workers
 from leaderboard.settings import Settings
-from tests.leaderboard.conftest import WriteArchive
-from tests.leaderboard.dask_cluster import Cluster, NewCluster
-from tests.leaderboard.serving import RunServer, Server
-from tests.leaderboard.watching import SCORING, processes_below, submission_row, wait_until
+from tests.dask_cluster import Cluster, NewCluster
+from tests.leaderboard.serving import SCORING, RunServer, Server, submission_row
+from tests.processes import processes_below, wait_until
 
 UNAVAILABLE = "scoring backend unavailable; job requeued"
 """Log event of a worker that cannot reach the dask scheduler."""
@@ -28,11 +27,6 @@ def cluster(tmp_path: Path, new_cluster: NewCluster) -> Iterator[Cluster]:
     (tmp_path / "dask").mkdir()
     with new_cluster(tmp_path / "dask") as cluster:
         yield cluster
-
-
-@pytest.fixture(scope="module")
-def small_archive(write_archive: WriteArchive) -> Path:
-    return write_archive("small", configs=("lattice-orbit",))
 
 
 def is_logged(server: Server, event: str) -> bool:

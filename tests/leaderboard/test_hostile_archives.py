@@ -27,8 +27,8 @@ from tests.leaderboard.hostile_zips import (
     pickle_payload_npy,
     unusual_valid_archives,
 )
-from tests.leaderboard.processes import children, memory_bytes, num_open_files
 from tests.leaderboard.serving import ENDED, RunServer, Server
+from tests.processes import children, memory_bytes, num_open_files
 from tests.requirements import Repetitions
 
 CLIENTS = 4

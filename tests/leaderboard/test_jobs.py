@@ -143,7 +143,7 @@ def test_job_scored_twice_has_one_result(database: Database, alice: TokenModel) 
     assert not jobs.finish(database, submission_id, "a", Outcome(result=first))
     assert submissions.result_json(database, submission_id) == second
     [row] = leaderboard_entries(database, "lattice")
-    assert row.table == json.loads(second)["tables"]["lattice"]
+    assert json.loads(row.table_json) == json.loads(second)["tables"]["lattice"]
 
 
 def test_submission_deleted_while_scoring_stays_deleted(database: Database, alice: TokenModel) -> None:

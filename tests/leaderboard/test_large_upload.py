@@ -16,9 +16,9 @@ import httpx2
 import pytest
 
 from tests.leaderboard.conftest import WriteArchive
-from tests.leaderboard.processes import descendants, memory_bytes, num_open_files
 from tests.leaderboard.raw_http import END, MULTIPART, connect, multipart_part, read_response, request_head
 from tests.leaderboard.serving import RunServer, Server
+from tests.processes import descendants, memory_bytes, num_open_files
 from tests.requirements import Repetitions
 
 API = "/api/v1/submissions"

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from tests.leaderboard.conftest import WriteArchive
-from tests.leaderboard.processes import memory_bytes, num_open_files
 from tests.leaderboard.raw_http import (
     BOUNDARY,
     DISPOSITION,
@@ -26,6 +25,7 @@ from tests.leaderboard.raw_http import (
     request_head,
 )
 from tests.leaderboard.serving import RunServer, Server
+from tests.processes import memory_bytes, num_open_files
 
 API = "/api/v1/submissions"
 MAX_UPLOAD_BYTES = 400_000

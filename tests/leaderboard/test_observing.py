@@ -13,10 +13,9 @@ import httpx2
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from tests.leaderboard.conftest import WriteArchive
 from tests.leaderboard.postgres import Postgres, RunPostgres
 from tests.leaderboard.serving import RunServer, Server
-from tests.leaderboard.watching import wait_until
+from tests.processes import wait_until
 
 PASSWORD = "correct-horse-battery"
 WRONG_TOKEN = "rdb_nobody-ever-made-this-token"
@@ -67,13 +66,12 @@ def restart_database(server: Server, database: Postgres, page: str) -> tuple[tup
 @pytest.fixture(scope="module")
 def run(
     tiny_root: Path,
-    write_archive: WriteArchive,
+    small_archive: Path,
     tmp_path_factory: pytest.TempPathFactory,
     running_server: RunServer,
     running_postgres: RunPostgres,
 ) -> Iterator[ServiceRun]:
     folder = tmp_path_factory.mktemp("observing")
-    archive = write_archive("small", configs=("lattice-orbit",))
     (folder / "broken.zip").write_bytes(b"no zip")
     with running_postgres() as database:
         db = with_password(database.url)
@@ -81,14 +79,14 @@ def run(
             tiny_root, folder / "state", db=db, default_visibility="owner", lease_seconds=5
         ) as server:
             token = server.token("alice")
-            first = server.submit_accepted(archive, token)
-            assert server.submit(archive, WRONG_TOKEN).status_code == 401
+            first = server.submit_accepted(small_archive, token)
+            assert server.submit(small_archive, WRONG_TOKEN).status_code == 401
             assert server.submit(folder / "broken.zip", token).status_code == 422
             send_invalid_http(server)
             assert server.wait_until_ended(first)["status"] == "scored"
             page = f"{server.url}/api/v1/submissions/{first}"
             health_codes, away = restart_database(server, database, page)
-            second = server.submit_accepted(archive, token)
+            second = server.submit_accepted(small_archive, token)
             assert server.wait_until_ended(second)["status"] == "scored"
             delete = httpx2.delete(page, headers={"Authorization": f"Bearer {token}"})
             assert delete.status_code == 204

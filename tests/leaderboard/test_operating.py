@@ -20,8 +20,8 @@ import httpx2
 import pytest
 
 from tests.leaderboard.conftest import WriteArchive
-from tests.leaderboard.serving import RunServer, Server, make_token
-from tests.leaderboard.watching import SCORER, SCORING, processes_below, submission_row, wait_until
+from tests.leaderboard.serving import SCORER, SCORING, RunServer, Server, make_token, submission_row
+from tests.processes import processes_below, wait_until
 
 NUM_UPLOADS = 2
 
@@ -50,11 +50,6 @@ def inodes_and_mtimes(folder: Path) -> dict[str, tuple[int, int]]:
 def statuses(state: Path) -> list[str]:
     with closing(sqlite3.connect(state / "leaderboard.sqlite")) as connection:
         return [status for (status,) in connection.execute("SELECT status FROM submissions")]
-
-
-@pytest.fixture(scope="module")
-def small_archive(write_archive: WriteArchive) -> Path:
-    return write_archive("small", configs=("lattice-orbit",))
 
 
 @dataclass

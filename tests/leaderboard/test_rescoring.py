@@ -10,8 +10,8 @@ from pathlib import Path
 import httpx2
 
 from leaderboard.uploads.accept import UNAVAILABLE_MESSAGE
-from tests.leaderboard.serving import RunScorer, RunServer, Server
-from tests.leaderboard.watching import submission_row, wait_until
+from tests.leaderboard.serving import RunScorer, RunServer, Server, submission_row
+from tests.processes import wait_until
 from tests.synthetic_dataset import write_archive, write_dataset
 
 

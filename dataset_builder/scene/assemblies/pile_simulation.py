@@ -126,10 +126,8 @@ def simulate_drop(pile: PileSpec, starts: Sequence[Pose], physics: PhysicsSpec) 
     return _settled_pile(data, deepest_m)
 
 
-def find_problems(
-    settled_pile: SettledPile, pile: PileSpec, requirements: PileRequirements = REQUIREMENTS
-) -> list[str]:
-    """Return a message for each acceptance limit that a pile violates.
+def find_problems(settled_pile: SettledPile, pile: PileSpec) -> list[str]:
+    """Return a message for each limit of ``REQUIREMENTS`` that a pile violates.
 
     Checked are motion, overlap, reach, number of free markers, height and tilt.
     """
@@ -139,13 +137,13 @@ def find_problems(
     fastest, tilt_deg = max(*settled_pile.speeds, *settled_pile.spins), max(tilts_deg(settled_pile.poses))
     checks = {
         f"still moves at {fastest:.1e}": fastest < PHYSICS.rest_speed,
-        f"overlaps by {-settled_pile.gap_m:.1e} m": settled_pile.gap_m > -requirements.overlap_m,
+        f"overlaps by {-settled_pile.gap_m:.1e} m": settled_pile.gap_m > -REQUIREMENTS.overlap_m,
         # With an overlap deeper than its radius, a bar may have passed through another one.
         f"overlapped by {settled_pile.deepest_m:.1e} m on the way": settled_pile.deepest_m < radius_m,
-        f"reaches {reach_m(lines_m, radius_m):.3f} m": reach_m(lines_m, radius_m) <= requirements.reach_m,
-        f"leaves only the markers {free} free": len(free) >= requirements.free_markers,
-        f"is {height_m(lines_m, radius_m):.3f} m high": height_m(lines_m, radius_m) >= requirements.height_m,
-        f"tilts by {tilt_deg:.1f} degrees at most": tilt_deg >= requirements.tilt_deg,
+        f"reaches {reach_m(lines_m, radius_m):.3f} m": reach_m(lines_m, radius_m) <= REQUIREMENTS.reach_m,
+        f"leaves only the markers {free} free": len(free) >= REQUIREMENTS.free_markers,
+        f"is {height_m(lines_m, radius_m):.3f} m high": height_m(lines_m, radius_m) >= REQUIREMENTS.height_m,
+        f"tilts by {tilt_deg:.1f} degrees at most": tilt_deg >= REQUIREMENTS.tilt_deg,
     }
     return [problem for problem, fulfilled in checks.items() if not fulfilled]
 

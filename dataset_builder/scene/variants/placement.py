@@ -18,8 +18,10 @@ from dataset_builder.scene.shapes.bar_mesh import outer_radius_m, plain_outer_ra
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.geometry.aruco_board import marker_corners_m
 
+MIN_CROSSING_ANGLE_DEG = 30.0
+"""Smallest angle between the axes of a crossing, degrees."""
 _EPSILON = 1e-12
-"""Smallest squared sine of the angle, and smallest axis distance in metres, of a crossing."""
+"""Smallest distance between the axes of a crossing, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +79,10 @@ class Crossing:
     points_m: tuple[Float64[ndarray, " 3"], Float64[ndarray, " 3"]]
 
 
-def find_crossings(capsules: Capsules, gap_m: float, least_angle_deg: float = 30.0) -> list[Crossing]:
+def find_crossings(capsules: Capsules, gap_m: float) -> list[Crossing]:
     """Return the crossings of straight legs of different bars.
 
-    The surfaces are at most ``gap_m`` apart, and the angle between the legs is at least ``least_angle_deg``.
-    Pieces of at most two diameters belong to bends and are omitted.
+    Their surfaces are at most ``gap_m`` apart. Pieces of at most two diameters belong to bends and are omitted.
     """
     crossings = []
     legs = np.linalg.norm(capsules.b_m - capsules.a_m, axis=1) > 4 * capsules.radius_m
@@ -91,19 +92,17 @@ def find_crossings(capsules: Capsules, gap_m: float, least_angle_deg: float = 30
         later = legs & capsules.overlapping(low[piece], high[piece]) & (capsules.bar > capsules.bar[piece])
         others = np.flatnonzero(later)
         if len(others):
-            crossings += _crossings_of(int(piece), others, capsules, gap_m, np.deg2rad(least_angle_deg))
+            crossings += _crossings_of(int(piece), others, capsules, gap_m)
     return crossings
 
 
-def _crossings_of(
-    piece: int, others: Int64[ndarray, " k"], capsules: Capsules, gap_m: float, least_angle: float
-) -> list[Crossing]:
+def _crossings_of(piece: int, others: Int64[ndarray, " k"], capsules: Capsules, gap_m: float) -> list[Crossing]:
     u = capsules.b_m[piece] - capsules.a_m[piece]
     v = capsules.b_m[others] - capsules.a_m[others]
     w = capsules.a_m[piece] - capsules.a_m[others]
     uu, uv, vv, uw, vw = u @ u, v @ u, (v * v).sum(axis=1), w @ u, (w * v).sum(axis=1)
     squared_sine = 1.0 - uv**2 / (uu * vv)
-    steep = squared_sine > max(np.sin(least_angle) ** 2, _EPSILON)
+    steep = squared_sine > np.sin(np.deg2rad(MIN_CROSSING_ANGLE_DEG)) ** 2
     across = np.where(steep, uu * vv - uv**2, 1.0)
     s, t = (uv * vw - vv * uw) / across, (uu * vw - uv * uw) / across
     # A closest point beyond the end of a piece is a crossing of the adjacent piece, or no crossing.

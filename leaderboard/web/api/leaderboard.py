@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from typing import Annotated
 
@@ -33,7 +34,10 @@ def entries_to_csv(rows: Sequence[LeaderboardEntry]) -> str:
     """
     header = ["rank", "id", "method", "submitter", "config", *TABLE_COLUMNS]
     cells = (
-        [row.rank, row.submission_id, row.method, row.submitter, row.config, *table_values(row.table)]
+        [
+            *(row.rank, row.submission_id, row.method, row.submitter, row.config),
+            *table_values(json.loads(row.table_json)),
+        ]
         for row in rows
     )
     return csv_text([header, *cells])

@@ -5,6 +5,7 @@ The docstrings of the models are part of the OpenAPI document.
 
 from __future__ import annotations
 
+import json
 from datetime import UTC, datetime
 from typing import Any, Literal
 
@@ -163,7 +164,7 @@ def row_schema(row: LeaderboardEntry) -> LeaderboardRow:
         uses_intrinsics=row.uses_intrinsics,
         created_at=_utc_datetime(row.created_at),
         public=row.public,
-        table=dict(row.table),
+        table=json.loads(row.table_json),
     )
 
 

@@ -14,11 +14,11 @@ from typing import Any
 from markupsafe import Markup
 
 from leaderboard.db.engine import Database
-from leaderboard.db.rankings import RankedRow, RankingVersion, ranked_rows, ranking_version
+from leaderboard.db.rankings import LeaderboardEntry, RankingVersion, leaderboard_entries, ranking_version
 from leaderboard.web.pages.rendering import DisplayTime, Link, format_time, link
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
-from rebar_depth_bench.reporting.html.published import PaperRow, finite_interval, published_row
+from rebar_depth_bench.reporting.html.published import PaperRow, finite_interval, published_row, scatter_points
 from rebar_depth_bench.reporting.html.rows import ScoreRow, table_row
 from rebar_depth_bench.reporting.published import PublishedNumbers, load_published, paper_scene
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
@@ -174,8 +174,8 @@ def make_config_ranking(
     database: Database, config: str, order: Order, max_rows: int | None = None
 ) -> ConfigRanking:
     """Return the ranking of a config in the given order, limited to the first ``max_rows`` rows."""
-    rows = ranked_rows(database, config)
-    formatted = [_format_row(row.method, row.table) for row in rows]
+    rows = leaderboard_entries(database, config)
+    formatted = [_format_row(row.method, row.table_json) for row in rows]
     marks = _plot_marks(rows, formatted)
     indices = sort_indices([(row.rank, numbers.row) for row, numbers in zip(rows, formatted, strict=True)], order)[
         :max_rows
@@ -190,7 +190,7 @@ def make_config_ranking(
         lines=[_ranking_line(rows[index], marks.get(index, ""), formatted[index].row) for index in indices],
         published=published,
         distance=distance,
-        chart=_chart(printable(config), points, tuple(_published_points(published))) if points else None,
+        chart=_chart(printable(config), points, tuple(scatter_points(published, {}))) if points else None,
         plotted=len(points),
     )
 
@@ -213,19 +213,19 @@ def _chart(config: str, own: tuple[ScatterPoint, ...], published: tuple[ScatterP
     return scatter_chart(f"{config}: native and scaled AbsRel", [*own, *published])
 
 
-def _ranking_line(ranked_row: RankedRow, mark: str, row: ScoreRow) -> RankingLine:
+def _ranking_line(entry: LeaderboardEntry, mark: str, row: ScoreRow) -> RankingLine:
     return RankingLine(
-        rank=ranked_row.rank,
+        rank=entry.rank,
         mark=mark,
-        submission_id=ranked_row.submission_id,
-        submitter=printable(ranked_row.submitter),
-        link=link(ranked_row.url),
-        when=format_time(ranked_row.created_at),
+        submission_id=entry.submission_id,
+        submitter=printable(entry.submitter),
+        link=link(entry.url),
+        when=format_time(entry.created_at),
         row=row,
     )
 
 
-def _plot_marks(rows: Sequence[RankedRow], formatted: Sequence[_FormattedRow]) -> dict[int, str]:
+def _plot_marks(rows: Sequence[LeaderboardEntry], formatted: Sequence[_FormattedRow]) -> dict[int, str]:
     """Return the plot labels by row index: ranks, or lowercase letters for unranked rows."""
     marks: dict[int, str] = {}
     unranked = 0
@@ -254,12 +254,3 @@ def _published(config: str) -> tuple[list[PaperRow], str]:
         return [], ""
     rows = [published_row(chr(_FIRST_UPPERCASE + k), row) for k, row in enumerate(scene.rows)]
     return rows, scene.distance
-
-
-def _published_points(rows: Sequence[PaperRow]) -> list[ScatterPoint]:
-    points = []
-    for row in rows:
-        native, scaled = row.cells[1].value, row.cells[2].value
-        if native is not None and scaled is not None:
-            points.append(ScatterPoint(row.mark, row.name, native, scaled, True))
-    return points

@@ -110,11 +110,11 @@ def format_time(seconds: float) -> DisplayTime:
     return DisplayTime(when.strftime("%Y-%m-%d %H:%M UTC"), when.strftime("%Y-%m-%dT%H:%M:%SZ"))
 
 
-def clean_text(text: str | None, limit: int = MAX_TEXT_CHARS) -> str:
-    """Return untrusted text without control and bidirectional characters, cut to ``limit``; lines are kept."""
-    truncated = (text or "")[: limit + 1]
-    clean = "\n".join(printable(line, limit + 1) for line in truncated.splitlines())
-    return clean if len(clean) <= limit else clean[: limit - 1] + "…"
+def clean_text(text: str | None) -> str:
+    """Return untrusted text without control characters, cut to ``MAX_TEXT_CHARS`` characters; lines are kept."""
+    truncated = (text or "")[: MAX_TEXT_CHARS + 1]
+    clean = "\n".join(printable(line, MAX_TEXT_CHARS + 1) for line in truncated.splitlines())
+    return clean if len(clean) <= MAX_TEXT_CHARS else clean[: MAX_TEXT_CHARS - 1] + "…"
 
 
 def link(url: str | None) -> Link | None:

@@ -176,8 +176,8 @@ def _capability_measure(title: str, tolerance: Tolerance, p95: Measure) -> Measu
         title=f"{title}: {tolerance.limit_mm:g} mm / p95",
         unit="",
         better="higher",
-        definition=f"Capability: {tolerance.limit_mm:g} mm / {p95.name}; 1 or more where 95 % of all judged stay "
-        f"within the tolerance, not told where that p95 is {MISS_MM:g} mm, of what was not found.",
+        definition=f"Capability: {tolerance.limit_mm:g} mm / {p95.name}; 1 or more if 95 % of all judged stay "
+        f"within the tolerance; undefined if {p95.name} is {MISS_MM:g} mm, which stands for what was not found.",
         convert=partial(defined_capability, tolerance.limit_mm),
     )
 

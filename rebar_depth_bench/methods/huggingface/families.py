@@ -90,10 +90,10 @@ def family_of(config: Mapping[str, Any], where: str) -> ModelFamily:
 def network_output_to_depth_m(
     output: OutputKind, values: Float[ndarray, "h w"], K: Float64[ndarray, "3 3"] | None = None
 ) -> Float32[ndarray, "h w"]:
-    """Return planar depth in metres (for relative output: in an unknown unit), NaN where there is no prediction.
+    """Return planar depth in metres; for relative output, its unit is unknown.
 
     ``values`` is the network output on the left grid; ``K`` holds the intrinsics of that grid in pixels and is
-    required for Depth Pro only. Depths that are not finite or not above 0 become NaN.
+    required for Depth Pro only. Depths that are not finite or not above 0 become NaN, which means no prediction.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         if output is OutputKind.CANONICAL:

@@ -37,6 +37,8 @@ MAX_REPROJECTION_ERROR_PX = 3.0
 """Reprojection error up to which a view is an inlier."""
 MIN_MARKERS = 2
 """Smallest number of triangulated markers."""
+_TRIANGULATION_STEPS = 3
+"""Number of reweighted least-squares solutions for the position of a corner."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,12 +138,12 @@ def _has_wide_rays(point: Float64[ndarray, " 3"], observations: Sequence[_Observ
 
 
 def _triangulate_linear(
-    observations: Sequence[_Observation], K: Float64[ndarray, "3 3"], steps: int = 3
+    observations: Sequence[_Observation], K: Float64[ndarray, "3 3"]
 ) -> Float64[ndarray, " 3"]:
     rows = np.array([np.outer(pixel, (K @ pose[:3])[2]) - (K @ pose[:3])[:2] for pixel, pose in observations])
     depth_rows = np.array([pose[2] for _, pose in observations])
     weight = np.ones(len(observations))
-    for _ in range(steps):
+    for _ in range(_TRIANGULATION_STEPS):
         system = (rows * weight[:, None, None]).reshape(-1, 4)
         point = np.linalg.lstsq(system[:, :3], -system[:, 3], rcond=None)[0]
         depths = depth_rows[:, :3] @ point + depth_rows[:, 3]

@@ -48,10 +48,10 @@ def patch_match(images: Path, model: Path, work: Path) -> Path:
 
 
 def read_depth_map(path: Path) -> Float32[ndarray, "h w"]:
-    """Return the depth map in a ``.bin`` file of COLMAP, in the reconstruction's unit; NaN where there is none.
+    """Return the depth map in a ``.bin`` file of COLMAP, in the unit of the reconstruction.
 
-    The format is the text ``WIDTH&HEIGHT&CHANNELS&`` followed by little-endian float32 values, row by row, plane
-    by plane. Raises ``MethodError`` for any other file.
+    Pixels without depth are NaN. The format is the text ``WIDTH&HEIGHT&CHANNELS&`` followed by little-endian
+    float32 values, row by row, plane by plane. Raises ``MethodError`` for any other file.
     """
     data = path.read_bytes()
     header = _HEADER.match(data[:_HEADER_BYTES])

@@ -21,7 +21,7 @@ from rebar_depth_bench.extended.profiles import AXES, bin_names
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting.charts.profile import ProfileBin, profile_chart
 from rebar_depth_bench.reporting.extended_tables import MISSED, UNDEFINED, is_miss
-from rebar_depth_bench.reporting.formatting import DASH, number
+from rebar_depth_bench.reporting.formatting import DASH, interval_cell, number
 from rebar_depth_bench.reporting.html.rows import Cell
 
 _DECIMALS: Mapping[str, int] = {"mm": 2, "cm": 2, "m": 3, "%": 1, "": 4}
@@ -56,7 +56,9 @@ def measure_rows(table: ExtendedTable, measures: Iterable[Measure], alignments: 
     for measure in measures:
         estimates = [table.numbers[alignment][measure.name] for alignment in alignments]
         if any(estimate.samples for estimate in estimates):
-            rows.append(_measure_row(measure, estimates))
+            cells = [estimate_cell(estimate, measure) for estimate in estimates]
+            samples = " / ".join(dict.fromkeys(str(estimate.samples) for estimate in estimates))
+            rows.append(MeasureRow(measure.title, measure.unit, _ARROWS[measure.better], cells, samples))
     return rows
 
 
@@ -74,7 +76,7 @@ def estimate_cell(estimate: MeasureEstimate, measure: Measure) -> Cell:
             MISSED, estimate.value, _interval_text(estimate.interval, factor, decimals) if informative else ""
         )
     return Cell(
-        _format_signed(estimate.value * factor, decimals),
+        number(estimate.value * factor, decimals).replace("-", "−"),
         estimate.value,
         _interval_text(estimate.interval, factor, decimals),
     )
@@ -107,21 +109,9 @@ def _measure_definition(title: str, measures: Sequence[Measure]) -> MeasureDefin
     return MeasureDefinition(title, f"{definition}; N: {', '.join(steps)}")
 
 
-def _measure_row(measure: Measure, estimates: Sequence[MeasureEstimate]) -> MeasureRow:
-    samples = list(dict.fromkeys(str(estimate.samples) for estimate in estimates))
-    cells = [estimate_cell(estimate, measure) for estimate in estimates]
-    return MeasureRow(measure.title, measure.unit, _ARROWS[measure.better], cells, " / ".join(samples))
-
-
 def _interval_text(ends: tuple[float, float] | None, factor: float, decimals: int) -> str:
-    if ends is None or not all(map(math.isfinite, ends)):
-        return ""
-    joint = " to " if ends[0] < 0 else " – "
-    return joint.join(_format_signed(end * factor, decimals) for end in ends)
-
-
-def _format_signed(value: float, decimals: int) -> str:
-    return number(value, decimals).replace("-", "−")
+    text = interval_cell(ends, decimals, factor).replace("-", "−")
+    return text.replace(" – ", " to ") if ends is not None and ends[0] < 0 else text
 
 
 _ALIGNMENT_NOTES: Mapping[str, str] = {NATIVE: "no alignment", SCALED: "oracle median scale per view"}
@@ -214,8 +204,8 @@ def extended_section(extended: ExtendedResult) -> ExtendedSection:
 
 def _extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
     inspection = MEASURE_FAMILIES["inspection"]
-    by_name = {measure.name: measure for measure in INSPECTION_MEASURES}
-    pass_rate_names = {pass_sample(tolerance) for profile in PROFILES for tolerance in profile.tolerances}
+    tolerances = [(profile, tolerance) for profile in PROFILES for tolerance in profile.tolerances]
+    pass_rate_names = {pass_sample(tolerance) for _, tolerance in tolerances}
     other = [
         measure
         for measure in INSPECTION_MEASURES
@@ -228,16 +218,12 @@ def _extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
         views=table.views,
         charts=[(title, chart) for title, chart in charts if chart],
         main_inspection=_measure_table(
-            table, inspection.title, inspection, [by_name[key] for key in MAIN_INSPECTION_MEASURES]
+            table, inspection.title, inspection, [inspection.by_name[name] for name in MAIN_INSPECTION_MEASURES]
         ),
         other_inspection=_measure_table(table, "Inspection: spread, median, found bars only", inspection, other),
-        tolerances=[_tolerance_row(table, *line) for line in _all_tolerances()],
+        tolerances=[_tolerance_row(table, *line) for line in tolerances],
         families=[family for family in [*folded, _profile_table(table)] if family.rows],
     )
-
-
-def _all_tolerances() -> list[tuple[ToleranceProfile, Tolerance]]:
-    return [(profile, tolerance) for profile in PROFILES for tolerance in profile.tolerances]
 
 
 def _folded_table(table: ExtendedTable, key: str) -> ExtendedMeasureTable:
@@ -248,20 +234,18 @@ def _folded_table(table: ExtendedTable, key: str) -> ExtendedMeasureTable:
 
 
 def _measure_table(
-    table: ExtendedTable, title: str, family: MeasureFamily, measures: Iterable[Measure], once_aside: str = ""
+    table: ExtendedTable, title: str, family: MeasureFamily, measures: Sequence[Measure], once_aside: str = ""
 ) -> ExtendedMeasureTable:
-    listed = list(measures)
-    heads = [
-        AlignmentHead(alignment, once_aside if alignment == ONCE else _ALIGNMENT_NOTES[alignment])
-        for alignment in family.alignments
-    ]
-    rows = measure_rows(table, listed, family.alignments)
-    return ExtendedMeasureTable(title, "rows", heads, rows, measure_definitions(listed), _miss_note(rows))
-
-
-def _miss_note(rows: Iterable[MeasureRow]) -> str:
+    rows = measure_rows(table, measures, family.alignments)
     has_miss = any(cell.text == MISSED for row in rows for cell in row.cells)
-    return f"{MISSED}: not found, counted as {MISS_MM:g} mm." if has_miss else ""
+    note = f"{MISSED}: not found, counted as {MISS_MM:g} mm." if has_miss else ""
+    heads = _alignment_heads(family, once_aside)
+    return ExtendedMeasureTable(title, "rows", heads, rows, measure_definitions(measures), note)
+
+
+def _alignment_heads(family: MeasureFamily, once_aside: str = "") -> list[AlignmentHead]:
+    notes = {**_ALIGNMENT_NOTES, ONCE: once_aside}
+    return [AlignmentHead(alignment, notes[alignment]) for alignment in family.alignments]
 
 
 def _profile_table(table: ExtendedTable) -> ExtendedMeasureTable:
@@ -271,22 +255,23 @@ def _profile_table(table: ExtendedTable) -> ExtendedMeasureTable:
 
 def _cloud_table(table: ExtendedTable, family: MeasureFamily) -> ExtendedMeasureTable:
     """Return one row per tolerance with accuracy, completeness and F-score, first native, then scaled."""
-    measures = {measure.name: measure for measure in family.measures}
     rows = []
     for tolerance_mm in TOLERANCES_MM:
         names = [f"cloud_{kind}_{tolerance_mm}mm" for kind in _CLOUD_KINDS]
         estimates_and_measures = [
-            (table.numbers[alignment][name], measures[name]) for alignment in family.alignments for name in names
+            (table.numbers[alignment][name], family.by_name[name])
+            for alignment in family.alignments
+            for name in names
         ]
         if any(estimate.samples for estimate, _ in estimates_and_measures):
             cells = [estimate_cell(estimate, measure) for estimate, measure in estimates_and_measures]
             rows.append(MeasureRow(f"{tolerance_mm}", "mm", "", cells, str(estimates_and_measures[0][0].samples)))
-    heads = [AlignmentHead(alignment, _ALIGNMENT_NOTES[alignment]) for alignment in family.alignments]
-    return ExtendedMeasureTable(family.title, "grid", heads, rows, measure_definitions(family.measures))
+    definitions = measure_definitions(family.measures)
+    return ExtendedMeasureTable(family.title, "grid", _alignment_heads(family), rows, definitions)
 
 
 def _tolerance_row(table: ExtendedTable, profile: ToleranceProfile, tolerance: Tolerance) -> ToleranceRow:
-    measures = {measure.name: measure for measure in MEASURE_FAMILIES["inspection"].measures}
+    measures = MEASURE_FAMILIES["inspection"].by_name
     cells = [
         estimate_cell(table.numbers[alignment][name], measures[name])
         for name in (pass_sample(tolerance), capability_name(tolerance))

@@ -57,11 +57,10 @@ class ConfigViewTables:
     views: int
 
 
-def render_report(result: Result, panels: Iterable[ViewPanels], *, title: str | None = None) -> str:
+def render_report(result: Result, panels: Iterable[ViewPanels]) -> str:
     """Return the HTML report of ``result`` with the images of ``panels``, by config, worst view first.
 
-    ``panels`` may be in any order and is iterated once; only the encoded images stay in memory. ``title`` defaults
-    to the method's name.
+    ``panels`` may be in any order and is iterated once; only the encoded images stay in memory.
     """
     views = views_by_config(result)
     shown = shown_views(panels, list(result.tables))
@@ -70,7 +69,6 @@ def render_report(result: Result, panels: Iterable[ViewPanels], *, title: str | 
         environment()
         .get_template("report.html.j2")
         .render(
-            title=printable(title if title is not None else result.method),
             method=printable(result.method),
             stamps=_provenance(result),
             protocol=PROTOCOL,

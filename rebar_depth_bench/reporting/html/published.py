@@ -56,7 +56,7 @@ def _paper_scene(name: str, scene: PublishedScene, tables: Mapping[str, Table]) 
     rows = [_own_row(*arguments) for arguments in zip(letters, tables.items(), strict=True)]
     rows += [published_row(*arguments) for arguments in zip(numbers, scene.rows, strict=True)]
     heading = scene.title if scene.title.lower() == name else f"{scene.title} ({name})"
-    chart = scatter_chart(f"{heading}: native and scaled AbsRel", _scatter_points(rows, tables))
+    chart = scatter_chart(f"{heading}: native and scaled AbsRel", scatter_points(rows, tables))
     return PaperScene(heading, scene.distance, chart, rows)
 
 
@@ -74,8 +74,8 @@ def published_row(mark: str, row: PublishedRow) -> PaperRow:
     return PaperRow(mark, row.method, True, row.median_anchored, [Cell(text, float(text)) for text in row.cells])
 
 
-def _scatter_points(rows: Iterable[PaperRow], tables: Mapping[str, Table]) -> list[ScatterPoint]:
-    """Return the points of the rows with both values; the first rows must be those of ``tables``, in order."""
+def scatter_points(rows: Iterable[PaperRow], tables: Mapping[str, Table]) -> list[ScatterPoint]:
+    """Return the points of the rows with both values; rows that are not published are those of ``tables``."""
     intervals = [table.intervals for table in tables.values()]
     points = []
     for index, row in enumerate(rows):

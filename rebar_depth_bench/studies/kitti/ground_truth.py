@@ -1,4 +1,4 @@
-"""KITTI ground-truth depth and calibration: projected laser scans and improved depth maps.
+"""Reader of KITTI's calibration and ground-truth depth.
 
 Two kinds of ground truth are supported:
 
@@ -6,8 +6,8 @@ Two kinds of ground truth are supported:
   reflectance) and the two calibration files of the day; available for all 697 images of the Eigen split.
 - ``improved``, accumulated from several scans: ``proj_depth/groundtruth/image_02/<frame>.png`` of the drive (Uhrig
   et al., "Sparsity Invariant CNNs", 3DV 2017), below ``ROOT``, ``ROOT/train``, ``ROOT/val``, or ``train`` or
-  ``val`` inside ``ROOT/data_depth_annotated``; 16-bit PNG in metres times 256, 0 where there is no depth;
-  available for 652 images of the Eigen split.
+  ``val`` inside ``ROOT/data_depth_annotated``; 16-bit PNG in metres times 256, in which pixels without depth
+  are 0; available for 652 images of the Eigen split.
 
 Laser points are projected into the rectified colour images as in Geiger et al., "Vision meets Robotics: The KITTI
 Dataset", IJRR 2013, equation 8: ``y = P_rect_i  R_rect_00  T_velo_to_cam  x`` in homogeneous coordinates.
@@ -151,7 +151,7 @@ def find_truth(
 
 
 def read_truth(file: TruthFile, lidar_depth: LidarDepthConvention = "camera") -> Float32[ndarray, "h w"]:
-    """Return the ground-truth depth of an image in metres, 0 where there is none.
+    """Return the ground-truth depth of an image in metres; pixels without ground truth are 0.
 
     Raises ``DatasetError`` if the file cannot be read.
     """
@@ -179,7 +179,7 @@ def read_scan(path: Path) -> Float32[ndarray, "n 4"]:
 def project_scan(
     points: Float32[ndarray, "n 4"], camera: KittiCamera, lidar_depth: LidarDepthConvention = "camera"
 ) -> Float32[ndarray, "h w"]:
-    """Project a scan to a sparse depth map in metres, 0 where there is no point.
+    """Return the sparse depth map of a scan in metres; pixels without a laser point are 0.
 
     If several points fall on one pixel, the nearest is kept. The pixel indices, counted from 0, are
     ``round(u) - 1, round(v) - 1`` with halves rounded to even, as in Monodepth (Godard et al., CVPR 2017), which

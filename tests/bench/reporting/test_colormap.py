@@ -56,7 +56,6 @@ def test_colour_indices_clip_and_map_nan_to_zero() -> None:
 def test_robust_range_takes_order_statistics() -> None:
     values = np.arange(101, dtype=float)[::-1]
     assert robust_range(values) == (2.0, 98.0)
-    assert robust_range(values, share=0.1) == (10.0, 90.0)
     assert robust_range(np.array([3.0])) == (3.0, 3.0)
 
 

@@ -49,13 +49,12 @@ def test_page_shows_numbers_provenance_and_alignment() -> None:
 
 def test_hostile_names_are_escaped() -> None:
     hostile = result(scored_view("<b>x/0000"), method=HOSTILE)
-    rendered = render_report(hostile, [panels("<b>x/0000")], title="<i>mine</i>")
+    rendered = render_report(hostile, [panels("<b>x/0000")])
     page = Page(rendered)
     assert len(page.attributes_of("script")) == 1, "the page's own"
-    benign = Page(render_report(result(scored_view("beam/0000")), [panels("beam/0000")], title="mine"))
+    benign = Page(render_report(result(scored_view("beam/0000")), [panels("beam/0000")]))
     assert len(page.attributes_of("b")) == len(benign.attributes_of("b"))
     assert "<b>x" not in rendered
-    assert "<i>mine" not in rendered
     assert '=<script src="//evil.example/x.js">alert(1)</script>[red]' in page.text
     assert "\x1b" not in rendered
     assert "\u202e" not in rendered

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -12,22 +12,15 @@ import pytest
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.bars import read_bars
-from rebar_depth_bench.reporting.tables import frame_csv
+from rebar_depth_bench.extended.result import ExtendedResult
+from rebar_depth_bench.reporting.comparison_tables import comparison_csv
+from rebar_depth_bench.reporting.extended_tables import extended_csv
+from rebar_depth_bench.reporting.tables import frame_csv, result_csv
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.scoring.result import VIEW_METRICS, Result
+from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredicted_view
-
-
-class TagCollector(HTMLParser):
-    """Parser that keeps the names of the start tags."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
 
 
 @pytest.fixture
@@ -80,6 +73,18 @@ def test_integers_with_missing_values_stay_integers() -> None:
     assert frame_csv(make_frame([])) == ""
 
 
+def test_csv_without_rows_has_the_header(two_configs: Result) -> None:
+    extended = ExtendedResult(measures={}, tables={}, views=())
+    empty = dataclasses.replace(two_configs, tables={}, views=(), extended=extended)
+    assert result_csv(empty) == result_csv(two_configs).splitlines(keepends=True)[0]
+    compared = comparison_csv([compare(two_configs, two_configs)])
+    assert comparison_csv([]) == compared.splitlines(keepends=True)[0]
+    assert extended_csv(empty) == (
+        "method,config,alignment,measure,unit,statistic,value,low,high,samples,"
+        "protocol,dataset_digest,submission_sha256,software_version\n"
+    )
+
+
 def test_bars_of_a_dataset_folder(tiny_root: Path) -> None:
     frame = rdb.bars(tiny_root)
     bars = read_bars(tiny_root / "bars.parquet")["lattice"]
@@ -103,7 +108,6 @@ def test_repr_fits_a_screen() -> None:
 
 def test_notebook_shows_escaped_table(two_configs: Result) -> None:
     html = result(*two_configs.views, method=HOSTILE)._repr_html_()
-    parser = TagCollector()
-    parser.feed(html)
-    assert parser.tags.count("tr") == 3
-    assert set(parser.tags) <= {"p", "b", "table", "thead", "tbody", "tr", "th", "td"}
+    page = Page(html)
+    assert page.count("tr") == 3
+    assert {tag for tag, _ in page.tags} <= {"p", "b", "table", "thead", "tbody", "tr", "th", "td"}

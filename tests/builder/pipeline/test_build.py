@@ -27,8 +27,8 @@ from tests.building import (
     progressed_or_ended,
     render_processes_of,
     staged_rows,
-    wait_until,
 )
+from tests.processes import wait_until
 from tests.requirements import Repetitions
 
 SMALL = ("--scene", str(TWO_BARS), "--views", str(TINY_VIEWS), *TINY)
@@ -70,7 +70,7 @@ def test_killed_build_leaves_no_render_process(tmp_path: Path, start_build: Star
     assert all(process_dir.exists() for process_dir in process_dirs)
     os.kill(build.pid, signal.SIGKILL)
     build.communicate()
-    wait_until(lambda: not any(process_dir.exists() for process_dir in process_dirs), timeout_s=120)
+    wait_until(lambda: not any(process_dir.exists() for process_dir in process_dirs))
     assert not any(process_dir.exists() for process_dir in process_dirs)
 
 

@@ -9,8 +9,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -31,74 +31,19 @@ from tests.building import (
     contents,
     render_processes_of,
     staged_rows,
-    wait_until,
 )
+from tests.dask_cluster import Cluster, NewCluster
+from tests.processes import wait_until
 
 VIEWS = 9
 """Number of views: a shard of eight and one of one, that is two work units."""
 SMALL = ("--scene", str(TWO_BARS), "--views", str(VIEWS), *TINY)
 
 
-@dataclass
-class Cluster:
-    """Dask scheduler and workers on this machine, started with the ``dask`` command line."""
-
-    folder: Path
-    processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
-    workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
-
-    @property
-    def address(self) -> str:
-        return str(json.loads(self._scheduler_file.read_text())["address"])
-
-    @property
-    def _scheduler_file(self) -> Path:
-        return self.folder / "scheduler.json"
-
-    def start_scheduler(self) -> None:
-        file = str(self._scheduler_file)
-        self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", file)
-        wait_until(self._scheduler_file.is_file)
-
-    def start_worker(self, **environment: str) -> None:
-        scratch = self.folder / f"worker-{len(self.processes)}"
-        scratch.mkdir()
-        options = ("--nthreads", "1", "--no-nanny", "--local-directory", str(scratch))
-        log = self.folder / f"worker-{len(self.processes)}.log"
-        self.workers.append(self._start("worker", self.address, *options, **environment))
-        wait_until(lambda: b"Registered to" in log.read_bytes())
-
-    def _start(self, role: str, *arguments: str, **environment: str) -> subprocess.Popen[bytes]:
-        with (self.folder / f"{role}-{len(self.processes)}.log").open("wb") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "dask", role, *arguments, "--no-dashboard"],
-                cwd=self.folder,
-                env={**os.environ, **environment},
-                stdout=log,
-                stderr=log,
-            )
-        self.processes.append(process)
-        return process
-
-    def end(self) -> None:
-        for process in self.processes:
-            process.kill()
-            process.wait()
-
-
-@contextmanager
-def running_cluster(folder: Path) -> Iterator[Cluster]:
-    cluster = Cluster(folder)
-    try:
-        cluster.start_scheduler()
-        yield cluster
-    finally:
-        cluster.end()
-
-
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    with running_cluster(tmp_path_factory.mktemp("cluster")) as started:
+def cluster(tmp_path_factory: pytest.TempPathFactory, new_cluster: NewCluster) -> Iterator[Cluster]:
+    with new_cluster(tmp_path_factory.mktemp("cluster")) as started:
+        started.start_scheduler()
         for _ in range(2):
             started.start_worker()
         yield started
@@ -156,7 +101,7 @@ def test_interrupted_build_resumes_and_dead_worker_is_replaced(
     assert "Traceback" not in stderr.decode()
     staged_before = staged_rows(root)
     assert 0 < staged_before < VIEWS
-    wait_until(lambda: not render_pids(cluster), timeout_s=300)  # Cancelled units end at their next view.
+    wait_until(lambda: not render_pids(cluster), within_s=300)  # Cancelled units end at their next view.
 
     build = start_build(root, *SMALL, "--cluster", cluster.address)
     wait_until(lambda: render_pids(cluster) or build.poll() is not None)
@@ -170,7 +115,7 @@ def test_interrupted_build_resumes_and_dead_worker_is_replaced(
     assert build.returncode == 0, stderr.decode()
     assert f"two-bars: {staged_before} of {VIEWS}" in stderr.decode()
     assert contents(root) == contents(local_root)
-    wait_until(lambda: not any(process_dir.exists() for process_dir in orphans), timeout_s=120)
+    wait_until(lambda: not any(process_dir.exists() for process_dir in orphans))
 
 
 def render_pids(cluster: Cluster) -> list[int]:
@@ -219,11 +164,14 @@ def test_input_errors_on_workers_are_raised_in_client(cluster: Cluster, staging:
             futures[1].result(timeout=120)
 
 
-def test_worker_with_other_software_is_rejected(tmp_path: Path, run_build: RunBuild) -> None:
+def test_worker_with_other_software_is_rejected(
+    tmp_path: Path, new_cluster: NewCluster, run_build: RunBuild
+) -> None:
     dist_info = tmp_path / "site" / "embreex-0.0.1.dist-info"
     dist_info.mkdir(parents=True)
     (dist_info / "METADATA").write_text("Metadata-Version: 2.1\nName: embreex\nVersion: 0.0.1\n")
-    with running_cluster(tmp_path) as started:
+    with new_cluster(tmp_path) as started:
+        started.start_scheduler()
         started.start_worker(PYTHONPATH=os.pathsep.join([str(dist_info.parent), os.environ.get("PYTHONPATH", "")]))
         process = run_build("--out", tmp_path / "dataset", *SMALL, "--cluster", started.address)
     assert process.returncode == 2, process.stderr
@@ -231,8 +179,11 @@ def test_worker_with_other_software_is_rejected(tmp_path: Path, run_build: RunBu
     assert not (tmp_path / "dataset").exists()
 
 
-def test_unusable_cluster_is_rejected_and_nothing_written(tmp_path: Path, start_build: StartBuild) -> None:
-    with running_cluster(tmp_path) as idle:
+def test_unusable_cluster_is_rejected_and_nothing_written(
+    tmp_path: Path, new_cluster: NewCluster, start_build: StartBuild
+) -> None:
+    with new_cluster(tmp_path) as idle:
+        idle.start_scheduler()
         expected_messages = {
             "tcp://127.0.0.1:1": "--cluster tcp://127.0.0.1:1: no dask scheduler responds at this address",
             "nonsense": "--cluster nonsense: is not a valid address (missing port number in address 'nonsense')",

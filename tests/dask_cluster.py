@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.leaderboard.watching import wait_until
+from tests.processes import wait_until
 
 
 @dataclass
@@ -20,6 +21,7 @@ class Cluster:
     folder: Path
     port: int
     processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
+    workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     @property
     def address(self) -> str:
@@ -27,23 +29,26 @@ class Cluster:
 
     def start_scheduler(self) -> subprocess.Popen[bytes]:
         """Start a scheduler and wait until it listens."""
-        options = ("--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard")
-        return self._start("scheduler", "Scheduler at", *options)
+        return self._start("scheduler", "Scheduler at", "--host", "127.0.0.1", "--port", str(self.port))
 
-    def start_worker(self) -> subprocess.Popen[bytes]:
-        """Start a worker in ``folder`` and wait until it is registered with the scheduler."""
-        options = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(self.folder))
-        return self._start("worker", "Registered to", self.address, *options)
+    def start_worker(self, **environment: str) -> subprocess.Popen[bytes]:
+        """Start a worker with its own scratch folder and wait until it is registered with the scheduler."""
+        scratch = self.folder / f"worker-{len(self.processes)}"
+        scratch.mkdir()
+        options = (self.address, "--nthreads", "1", "--no-nanny", "--local-directory", str(scratch))
+        worker = self._start("worker", "Registered to", *options, **environment)
+        self.workers.append(worker)
+        return worker
 
-    def logs(self) -> str:
-        """Return the concatenated logs of the scheduler and the workers."""
-        return "\n".join(path.read_text() for path in sorted(self.folder.glob("*.log")))
-
-    def _start(self, role: str, ready: str, *arguments: str) -> subprocess.Popen[bytes]:
+    def _start(self, role: str, ready: str, *arguments: str, **environment: str) -> subprocess.Popen[bytes]:
         path = self.folder / f"{role}-{len(self.processes)}.log"
         with path.open("wb") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", "dask", role, *arguments], cwd=self.folder, stdout=log, stderr=log
+                [sys.executable, "-m", "dask", role, *arguments, "--no-dashboard"],
+                cwd=self.folder,
+                env={**os.environ, **environment},
+                stdout=log,
+                stderr=log,
             )
         self.processes.append(process)
         wait_until(lambda: ready in path.read_text() or process.poll() is not None, f"the {role} is ready")
