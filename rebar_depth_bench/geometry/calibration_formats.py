@@ -10,7 +10,7 @@ import configparser
 import math
 from collections.abc import Mapping
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field, Strict, ValidationInfo, field_validator
@@ -200,7 +200,7 @@ _ROTATION = Expected(
 
 
 class _LensTable(StrictModel):
-    """Table ``[left]`` or ``[right]``; ``info.context`` is the table around it, not yet validated."""
+    """Table ``[left]`` or ``[right]``; ``info.context`` is the image size."""
 
     K: Annotated[_Matrix, _PINHOLE] | None = None
     fx: Annotated[float, _FOCAL_PX] = Field(default=None, validate_default=True)
@@ -220,9 +220,8 @@ class _LensTable(StrictModel):
 
     @field_validator("cx", "cy")
     @classmethod
-    def _check_inside_image(cls, value: float, info: ValidationInfo[Mapping[str, Any]]) -> float:
-        side_px = info.context["width" if info.field_name == "cx" else "height"]
-        expected = _principal_point(side_px if side_px in _SIDES_PX else _SIDES_PX[-1])
+    def _check_inside_image(cls, value: float, info: ValidationInfo[Mapping[str, int]]) -> float:
+        expected = _principal_point(info.context["width" if info.field_name == "cx" else "height"])
         if not expected.accept(value):
             raise field_error(f"got {value}", expected.text)
         return value
@@ -281,8 +280,10 @@ def read_toml(content: bytes, width: int, height: int, problems: list[Problem]) 
     """Return the calibration of a TOML file, for the image size in the file or else ``width`` x ``height``."""
     document, syntax_problems = parse_toml(content)
     problems += syntax_problems
-    values = {"width": width, "height": height, **document}
-    table = None if problems else validate_table(_CalibrationTable, values, problems, context=values)
+    sides_px = {"width": width, "height": height}
+    values = {**sides_px, **document}
+    context = {key: values[key] if values[key] in _SIDES_PX else side_px for key, side_px in sides_px.items()}
+    table = None if problems else validate_table(_CalibrationTable, values, problems, context=context)
     if table is None:
         return None
     rotation = np.array(table.stereo.rotation)
