@@ -162,4 +162,4 @@ def messages() -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    print("\n".join(messages()))
+    print("\n".join(messages()), end="")
