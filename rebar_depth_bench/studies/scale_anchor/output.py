@@ -20,7 +20,7 @@ from rebar_depth_bench.reporting.charts.lines import (
     linear_axis,
     log_axis,
 )
-from rebar_depth_bench.reporting.html.study_page import PageFigure, PageTable, StudyPage
+from rebar_depth_bench.reporting.html.study_page import Columns, PageFigure, PageTable, StudyPage, page_table
 from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE
 from rebar_depth_bench.studies.scale_anchor.study import AnchorRow, AnchorStudy, Spread
@@ -160,36 +160,21 @@ def _spread_chart(study: AnchorStudy, spreads: list[tuple[int, Spread]], labels:
 
 
 def _table(study: AnchorStudy) -> PageTable:
-    return PageTable(
-        caption=(
-            "The archive multiplied by one scale from k known-depth views, relative to the archive multiplied by "
-            f"{study.given.scale:g}: mean ± standard deviation over {len(study.draws[0])} draws, and the range."
-        ),
-        heads=(
-            ("k", "views"),
-            ("Scale", "mean ± sd"),
-            ("Deviation", "%"),
-            ("Deviation", "% range"),
-            ("AbsRel change", "mean ± sd"),
-            ("AbsRel change", "range"),
-            ("RMSE change", "cm, mean ± sd"),
-            ("RMSE change", "cm, range"),
-        ),
-        rows=[_row_cells(row) for row in study.rows],
+    caption = (
+        "The archive multiplied by one scale from k known-depth views, relative to the archive multiplied by "
+        f"{study.given.scale:g}: mean ± standard deviation over {len(study.draws[0])} draws, and the range."
     )
-
-
-def _row_cells(row: AnchorRow) -> list[str]:
-    return [
-        str(row.k),
-        f"{formatting.number(row.scale.mean, 5)} ± {formatting.number(row.scale.sd, 5)}",
-        f"{_format_signed(row.deviation_percent.mean, 3)} ± {formatting.number(row.deviation_percent.sd, 3)}",
-        _format_range(row.deviation_percent, 3),
-        f"{_format_signed(row.abs_rel_change.mean, 6)} ± {formatting.number(row.abs_rel_change.sd, 6)}",
-        _format_range(row.abs_rel_change, 6),
-        f"{_format_signed(row.rmse_cm_change.mean, 4)} ± {formatting.number(row.rmse_cm_change.sd, 4)}",
-        _format_range(row.rmse_cm_change, 4),
-    ]
+    columns: Columns[AnchorRow] = (
+        ("k", "views", lambda row: str(row.k)),
+        ("Scale", "mean ± sd", lambda row: f"{formatting.number(row.scale.mean, 5)} ± {_format_sd(row.scale, 5)}"),
+        ("Deviation", "%", lambda row: _format_change(row.deviation_percent, 3)),
+        ("Deviation", "% range", lambda row: _format_range(row.deviation_percent, 3)),
+        ("AbsRel change", "mean ± sd", lambda row: _format_change(row.abs_rel_change, 6)),
+        ("AbsRel change", "range", lambda row: _format_range(row.abs_rel_change, 6)),
+        ("RMSE change", "cm, mean ± sd", lambda row: _format_change(row.rmse_cm_change, 4)),
+        ("RMSE change", "cm, range", lambda row: _format_range(row.rmse_cm_change, 4)),
+    )
+    return page_table(caption, columns, study.rows)
 
 
 def _notes(study: AnchorStudy) -> list[str]:
@@ -219,6 +204,14 @@ def _notes(study: AnchorStudy) -> list[str]:
             f"{study.views - len(study.views_without_prediction)} views to draw from."
         )
     return notes
+
+
+def _format_sd(spread: Spread, decimals: int) -> str:
+    return formatting.number(spread.sd, decimals)
+
+
+def _format_change(spread: Spread, decimals: int) -> str:
+    return f"{_format_signed(spread.mean, decimals)} ± {_format_sd(spread, decimals)}"
 
 
 def _format_range(spread: Spread, decimals: int) -> str:
