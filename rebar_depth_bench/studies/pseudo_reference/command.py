@@ -17,6 +17,7 @@ from statistics import median
 from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
 from rebar_depth_bench.errors import InputError, printable, problem_summary
+from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.ground_truth import verified_views
 from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
@@ -36,7 +37,7 @@ from rebar_depth_bench.studies.pseudo_reference.study import (
     DepthRange,
     FrameOutcome,
     FrameView,
-    score_frame_views,
+    score_frame_view,
 )
 from rebar_depth_bench.submission import ExpectedViews
 
@@ -163,14 +164,13 @@ def run_pseudo_reference_study(
         names = list(sources)
         by_method = {name: sources[name] for name in names[: len(methods)]}
         by_reference = {name: sources[name] for name in names[len(methods) :]}
-        outcomes = score_frame_views(
+        outcomes = map_with_progress(
+            lambda view: score_frame_view(view, by_method, by_reference, depth_range),
             study_data.frames(exact),
-            len(study_data.views),
-            by_method,
-            by_reference,
-            depth_range,
             workers,
             progress,
+            "scoring the full frame",
+            len(study_data.views),
         )
         _raise_problems(outcomes, sources)
         stamps = [ArchiveIdentity(name, source.sha256()) for name, source in sources.items()]

@@ -9,7 +9,7 @@ finite and positive in the evaluation range". The metrics of a view are those of
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import permutations
 
@@ -18,8 +18,6 @@ from jaxtyping import Bool, Float, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.errors import InputError, Problem
-from rebar_depth_bench.parallel import ordered_map
-from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.ground_truth import ViewTruth
 from rebar_depth_bench.scoring.result import ViewScore
 from rebar_depth_bench.scoring.score import score_view
@@ -177,26 +175,6 @@ class FrameOutcome:
 def exact_label_within(reference: str) -> str:
     """Return the label of the exact depth restricted to the pixels of a pseudo-reference."""
     return f"{EXACT_LABEL} where {reference} has depth"
-
-
-def score_frame_views(
-    views: Iterable[FrameView],
-    total: int,
-    methods: Mapping[str, DepthSource],
-    references: Mapping[str, DepthSource],
-    depth_range: DepthRange,
-    workers: int | None = None,
-    progress: Progress = silent,
-) -> list[FrameOutcome]:
-    """Score ``total`` views on ``workers`` threads, with only a few views in memory at a time."""
-    outcomes = []
-    ordered_outcomes = ordered_map(
-        lambda view: score_frame_view(view, methods, references, depth_range), views, workers
-    )
-    for done, outcome in enumerate(ordered_outcomes, start=1):
-        outcomes.append(outcome)
-        progress("scoring the full frame", done, total)
-    return outcomes
 
 
 def score_frame_view(
