@@ -106,7 +106,7 @@ def _score_all(evaluation: Evaluation, workers: int | None, progress: Progress) 
 
 def _score_or_problem(submission: SubmissionReader, truths: ConfigTruth, index: int) -> ViewScore | Problem:
     """Return a view's score, or the problem of its entry."""
-    truth = truths[index]
+    truth = truths.view(index)
     try:
         return score_view(truth, submission.read(truth.view_id))
     except EntryError as error:
