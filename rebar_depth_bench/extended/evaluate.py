@@ -100,7 +100,7 @@ MEASURE_FAMILIES: Mapping[str, MeasureFamily] = {
     "clouds": MeasureFamily("Point clouds", point_cloud.MEASURES, _clouds, _BOTH),
     "inspection": MeasureFamily(
         "Inspection, bar by bar",
-        (*inspection.MEASURES, *inspection_measures.CAPABILITY_MEASURES),
+        (*inspection_measures.INSPECTION_MEASURES, *inspection_measures.CAPABILITY_MEASURES),
         _inspection,
         _BOTH,
     ),
