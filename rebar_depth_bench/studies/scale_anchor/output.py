@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -108,16 +109,12 @@ def _lead(study: AnchorStudy) -> str:
 
 
 def _change_figure(study: AnchorStudy) -> PageFigure:
-    changes = [(row.k, row.abs_rel_change) for row in study.rows]
     svg = _spread_chart(
         study,
-        changes,
-        ChartText(
-            "Change of AbsRel over the number of known-depth views",
-            "; ".join(f"k = {k}: {_format_signed(change.mean, 6)}" for k, change in changes),
-            "known-depth views k",
-            "change of mean AbsRel",
-        ),
+        [(row.k, row.abs_rel_change) for row in study.rows],
+        "Change of AbsRel over the number of known-depth views",
+        "change of mean AbsRel",
+        lambda change: _format_signed(change, 6),
     )
     caption = (
         "relative to the given scale (dashed line). Below it the anchored archive is better. Line: mean of "
@@ -127,26 +124,27 @@ def _change_figure(study: AnchorStudy) -> PageFigure:
 
 
 def _scale_figure(study: AnchorStudy) -> PageFigure:
-    deviations = [(row.k, row.deviation_percent) for row in study.rows]
     svg = _spread_chart(
         study,
-        deviations,
-        ChartText(
-            "Deviation of the scale over the number of known-depth views",
-            "; ".join(f"k = {k}: {_format_signed(deviation.mean, 3)} %" for k, deviation in deviations),
-            "known-depth views k",
-            "scale against the given one, %",
-        ),
+        [(row.k, row.deviation_percent) for row in study.rows],
+        "Deviation of the scale over the number of known-depth views",
+        "scale against the given one, %",
+        lambda deviation: f"{_format_signed(deviation, 3)} %",
     )
-    return PageFigure(
-        svg,
-        "Deviation of the scale",
-        "from the given one (dashed line). Line: mean of the draws; band: their range.",
-    )
+    caption = "from the given one (dashed line). Line: mean of the draws; band: their range."
+    return PageFigure(svg, "Deviation of the scale", caption)
 
 
-def _spread_chart(study: AnchorStudy, spreads: list[tuple[int, Spread]], labels: ChartText) -> Markup:
+def _spread_chart(
+    study: AnchorStudy,
+    spreads: list[tuple[int, Spread]],
+    title: str,
+    y_title: str,
+    format_mean: Callable[[float], str],
+) -> Markup:
     """Return the chart of the mean and range of draws over k, with a line at 0."""
+    description = "; ".join(f"k = {k}: {format_mean(spread.mean)}" for k, spread in spreads)
+    labels = ChartText(title, description, "known-depth views k", y_title)
     ks = [float(k) for k, _ in spreads]
     ends = [end for _, spread in spreads for end in (spread.low, spread.high)]
     band = Series(
