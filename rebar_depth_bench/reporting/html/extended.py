@@ -211,7 +211,11 @@ def _extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
     inspection = MEASURE_FAMILIES["inspection"]
     shown = {*MAIN_INSPECTION_MEASURES, *(pass_sample(tolerance) for _, tolerance in TOLERANCES)}
     other = [measure for measure in INSPECTION_MEASURES if measure.name not in shown]
-    folded = [_folded_table(table, key) for key in _FOLDED_FAMILIES]
+    profile = MEASURE_FAMILIES["profile"]
+    folded = [
+        *(_folded_table(table, key) for key in _FOLDED_FAMILIES),
+        _measure_table(table, f"{profile.title}: values", profile, profile.measures),
+    ]
     charts = [(_AXIS_TITLES[axis][0], _profile_chart(table, axis)) for axis in AXES]
     return ExtendedConfig(
         name=printable(name),
@@ -222,7 +226,7 @@ def _extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
         ),
         other_inspection=_measure_table(table, "Inspection: spread, median, found bars only", inspection, other),
         tolerances=[_tolerance_row(table, *line) for line in TOLERANCES],
-        families=[family for family in [*folded, _profile_table(table)] if family.rows],
+        families=[family for family in folded if family.rows],
     )
 
 
@@ -246,11 +250,6 @@ def _measure_table(
 def _alignment_heads(family: MeasureFamily, once_aside: str = "") -> list[AlignmentHead]:
     notes = {**_ALIGNMENT_NOTES, ONCE: once_aside}
     return [AlignmentHead(alignment, notes[alignment]) for alignment in family.alignments]
-
-
-def _profile_table(table: ExtendedTable) -> ExtendedMeasureTable:
-    family = MEASURE_FAMILIES["profile"]
-    return _measure_table(table, f"{family.title}: values", family, family.measures)
 
 
 def _cloud_table(table: ExtendedTable, family: MeasureFamily) -> ExtendedMeasureTable:
