@@ -9,6 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.progress import Progress
 
 _Item = TypeVar("_Item")
 _Done = TypeVar("_Done")
@@ -35,3 +36,19 @@ def ordered_map(work: Callable[[_Item], _Done], items: Iterable[_Item], workers:
             yield pending.popleft().result()
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def map_with_progress(
+    work: Callable[[_Item], _Done],
+    items: Iterable[_Item],
+    workers: int | None,
+    progress: Progress,
+    task: str,
+    total: int,
+) -> list[_Done]:
+    """Return the results of ``ordered_map``, and report each of the ``total`` items as a step of ``task``."""
+    results = []
+    for done, result in enumerate(ordered_map(work, items, workers), start=1):
+        results.append(result)
+        progress(task, done, total)
+    return results

@@ -4,28 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from collections.abc import Mapping, Sequence
 
 from rebar_depth_bench.cli import check, compare, demo, methods, predict, score, submit, table
-from rebar_depth_bench.console import check_outputs, replace_renamed_options, run_command
-from rebar_depth_bench.studies.registry import add_study_commands
+from rebar_depth_bench.console import Command, add_commands, check_outputs, replace_renamed_options, run_command
+from rebar_depth_bench.studies.registry import STUDIES
 from rebar_depth_bench.version import software_version
-
-
-class Command(Protocol):
-    """Interface of a command module: one-line summary, arguments and entry point."""
-
-    SUMMARY: str
-
-    @property
-    def add_arguments(self) -> Callable[[argparse.ArgumentParser], None]:
-        """Function that adds the command's arguments to its parser."""
-
-    @property
-    def run(self) -> Callable[[argparse.Namespace], None]:
-        """Function that runs the command: results to standard output, progress to standard error."""
-
 
 COMMANDS: Mapping[str, Command] = {
     "score": score,
@@ -63,10 +47,6 @@ def argument_parser() -> argparse.ArgumentParser:
         description="Score metric depth on reinforcement against exact ground truth.",
     )
     parser.add_argument("--version", action="version", version=software_version())
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for name, command in COMMANDS.items():
-        subparser = commands.add_parser(name, help=command.SUMMARY, description=command.SUMMARY)
-        command.add_arguments(subparser)
-        subparser.set_defaults(run=command.run)
-    add_study_commands(commands.add_parser("study", help=_STUDY_SUMMARY, description=_STUDY_SUMMARY))
+    commands = add_commands(parser, COMMANDS, "COMMAND")
+    add_commands(commands.add_parser("study", help=_STUDY_SUMMARY, description=_STUDY_SUMMARY), STUDIES, "NAME")
     return parser

@@ -25,7 +25,7 @@ from rebar_depth_bench.extended.result import (
     view_numbers,
 )
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.parallel import ordered_map
+from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
@@ -100,7 +100,7 @@ MEASURE_FAMILIES: Mapping[str, MeasureFamily] = {
     "clouds": MeasureFamily("Point clouds", point_cloud.MEASURES, _clouds, _BOTH),
     "inspection": MeasureFamily(
         "Inspection, bar by bar",
-        (*inspection.MEASURES, *inspection_measures.CAPABILITY_MEASURES),
+        (*inspection_measures.INSPECTION_MEASURES, *inspection_measures.CAPABILITY_MEASURES),
         _inspection,
         _BOTH,
     ),
@@ -140,11 +140,8 @@ def score_extended(
     for config in result.tables:
         steel = load_steel_truth(evaluation.folder.config(config), progress)
         work = partial(_view, evaluation.submission, steel, scales)
-        outcomes = ordered_map(work, range(len(steel)), workers)
-        config_views = []
-        for done, view in enumerate(outcomes, start=1):
-            config_views.append(view)
-            progress(f"extended measures of {config}", done, len(steel))
+        task = f"extended measures of {config}"
+        config_views = map_with_progress(work, range(len(steel)), workers, progress, task, len(steel))
         tables[config] = tabulate_extended(
             config_views, protocol_indices([view.view_id for view in config_views]), measures
         )

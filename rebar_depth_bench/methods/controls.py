@@ -21,14 +21,10 @@ from numpy import ndarray
 from rebar_depth_bench.data.dataset import ConfigViews
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import pixel_rays
-from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Predictor, Prepared
+from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.progress import Progress
 
 CONSTANT_DEPTH_M = 1.0
-
-
-def _load_constant() -> Predictor:
-    return _predict_constant
 
 
 def _predict_constant(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
@@ -44,7 +40,7 @@ CONSTANT = Method(
         source="this project",
         licence="Apache-2.0",
     ),
-    _load_constant,
+    lambda: _predict_constant,
 )
 
 

@@ -57,15 +57,20 @@ def coverage_percent(share: float | None) -> str:
     return str((Decimal(repr(share)) * 100).quantize(Decimal("0.1"), rounding=ROUND_DOWN))
 
 
+def metric_cell(metrics: DepthMetrics | None, name: str) -> str:
+    """Return one field of ``metrics`` as text; a dash if ``metrics`` is None."""
+    return number(getattr(metrics, name, None), METRIC_DECIMALS[name])
+
+
 def metric_cells(metrics: DepthMetrics | None) -> list[str]:
     """Return AbsRel, RMSE (cm), MAE (cm) and delta1 as text; dashes if ``metrics`` is None."""
-    return [number(getattr(metrics, name, None), decimals) for name, decimals in METRIC_DECIMALS.items()]
+    return [metric_cell(metrics, name) for name in METRIC_DECIMALS]
 
 
 def paper_cells(table: Table) -> list[str]:
     """Return RMSE (cm) and AbsRel native, AbsRel scaled and the median s as text, as in the paper's Table I."""
-    native, scaled = metric_cells(table.native), metric_cells(table.scaled)
-    return [native[1], native[0], scaled[0], scale_cell(table.scale_median)]
+    native = (metric_cell(table.native, name) for name in ("rmse_cm", "abs_rel"))
+    return [*native, metric_cell(table.scaled, "abs_rel"), scale_cell(table.scale_median)]
 
 
 def scale_cell(scale: float | None) -> str:

@@ -64,19 +64,6 @@ class PublishedKitti:
 
 
 @dataclass(frozen=True)
-class PublishedAnchor:
-    """Scale-anchor numbers of section III.C.
-
-    The difference between COLMAP's scale from one known-depth view and ArUco's (per cent), and RMSE (cm) by number
-    of markers.
-    """
-
-    one_view_scale_within_percent: str
-    rmse_cm_6_markers: str
-    rmse_cm_12_markers: str
-
-
-@dataclass(frozen=True)
 class PublishedPart:
     """Source of one part of the numbers: place in the paper, protocol, and the mark shown with the numbers."""
 
@@ -87,10 +74,10 @@ class PublishedPart:
 
 @dataclass(frozen=True)
 class PublishedNumbers:
-    """All published numbers in the package.
+    """Published numbers that are shown beside results.
 
     The keys of ``parts`` are ``synthetic`` (``scenes``, Table I), ``physical`` (``references``, Table II),
-    ``kitti`` and ``anchor``.
+    ``kitti`` and ``anchor``, whose numbers (section III.C) are only in ``published.json``.
     """
 
     title: str
@@ -98,7 +85,6 @@ class PublishedNumbers:
     scenes: Mapping[str, PublishedScene]
     references: Mapping[str, PublishedReference]
     kitti: tuple[PublishedKitti, ...]
-    anchor: PublishedAnchor
 
 
 _TABLE_I_CONFIGS: Mapping[str, str] = {"lattice": "lattice", "pile": "pile", "pier": "pier"}
@@ -117,7 +103,6 @@ def load_published() -> PublishedNumbers:
         "scenes": content["synthetic"]["scenes"],
         "references": content["physical"]["references"],
         "kitti": content["kitti"]["figures"],
-        "anchor": content["anchor"],
     }
     return TypeAdapter(PublishedNumbers).validate_python(values)
 

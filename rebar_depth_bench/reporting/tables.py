@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -31,11 +31,47 @@ _FORMULA_STARTS = ("=", "+", "-", "@")
 
 @dataclass(frozen=True)
 class _ColumnGroup:
-    """Columns that are printed together, under a title that states their alignment."""
+    """Columns that are printed together, under a title that states their alignment.
+
+    ``cells`` returns the cells of a config, as many as there are ``heads``.
+    """
 
     title: str
-    heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    heads: Sequence[str]
+    cells: Callable[[Table], Sequence[str]]
+
+
+_METRIC_HEADS = [f"{name} {better}\n{unit}" for name, unit, better in formatting.METRIC_HEADS]
+_BASE = _ColumnGroup(
+    "",
+    ["views\nscored\n/all", "cover-\nage ↑\n%", "ranked\n"],
+    lambda table: [
+        f"{table.views_scored}/{table.views}",
+        formatting.coverage_percent(table.coverage),
+        "yes" if table.ranked else "no",
+    ],
+)
+_NATIVE = _ColumnGroup(
+    formatting.NATIVE_TITLE,
+    [f"native\n{head}" for head in _METRIC_HEADS],
+    lambda table: formatting.metric_cells(table.native),
+)
+_SCALED = _ColumnGroup(
+    formatting.SCALED_TITLE,
+    [*(f"scaled\n{head}" for head in _METRIC_HEADS), "scale\ns\n"],
+    lambda table: [*formatting.metric_cells(table.scaled), formatting.scale_cell(table.scale_median)],
+)
+_WITHIN = _ColumnGroup(
+    formatting.WITHIN_TITLE,
+    [f"within\n{tolerance_mm} mm\n% ↑" for tolerance_mm in WITHIN_MM],
+    lambda table: formatting.within_cells(table.within_mm),
+)
+_LAYOUTS = (
+    [[_BASE, _NATIVE, _SCALED, _WITHIN]],
+    [[_NATIVE, _SCALED], [_BASE, _WITHIN]],
+    [[_BASE, _NATIVE], [_SCALED], [_WITHIN]],
+)
+"""Column groups of each table to print, from the widest to the narrowest layout."""
 
 
 def print_table(result: Result, console: Console) -> None:
@@ -45,13 +81,12 @@ def print_table(result: Result, console: Console) -> None:
     """
     _print_line(console, _headline(result), style="bold")
     _print_line(console, _provenance(result), style="dim")
-    names = [printable(name) for name in result.tables]
-    for groups in _fitting_layout(names, list(result.tables.values()), console):
+    for groups in _fitting_layout(result.tables, console):
         console.print()
         for group in groups:
             if group.title:
                 _print_line(console, group.title, style="italic")
-        print_unwrapped(console, _rich_table(names, groups))
+        print_unwrapped(console, _rich_table(result.tables, groups))
     _print_notes(result, console)
 
 
@@ -103,70 +138,29 @@ def _print_notes(result: Result, console: Console) -> None:
         reasons = formatting.unranked_reasons(table)
         if reasons:
             _print_line(console, f"{printable(name)}: not ranked: {'; '.join(reasons)}.", style="yellow")
-    if formatting.has_dash(row for group in _column_groups(list(result.tables.values())) for row in group.rows):
+    [all_groups] = _LAYOUTS[0]
+    if formatting.has_dash(group.cells(table) for group in all_groups for table in result.tables.values()):
         _print_line(console, formatting.DASH_NOTE)
 
 
-def _column_groups(tables: Sequence[Table]) -> tuple[_ColumnGroup, _ColumnGroup, _ColumnGroup, _ColumnGroup]:
-    """Return the column groups: coverage and rank, native, scaled, tolerances."""
-    metric_heads = tuple(f"{name} {better}\n{unit}" for name, unit, better in formatting.METRIC_HEADS)
-    return (
-        _ColumnGroup(
-            "",
-            ("views\nscored\n/all", "cover-\nage ↑\n%", "ranked\n"),
-            tuple(
-                (
-                    f"{table.views_scored}/{table.views}",
-                    formatting.coverage_percent(table.coverage),
-                    "yes" if table.ranked else "no",
-                )
-                for table in tables
-            ),
-        ),
-        _ColumnGroup(
-            formatting.NATIVE_TITLE,
-            tuple(f"native\n{head}" for head in metric_heads),
-            tuple(tuple(formatting.metric_cells(table.native)) for table in tables),
-        ),
-        _ColumnGroup(
-            formatting.SCALED_TITLE,
-            (*(f"scaled\n{head}" for head in metric_heads), "scale\ns\n"),
-            tuple(
-                (*formatting.metric_cells(table.scaled), formatting.scale_cell(table.scale_median))
-                for table in tables
-            ),
-        ),
-        _ColumnGroup(
-            formatting.WITHIN_TITLE,
-            tuple(f"within\n{tolerance_mm} mm\n% ↑" for tolerance_mm in WITHIN_MM),
-            tuple(tuple(formatting.within_cells(table.within_mm)) for table in tables),
-        ),
-    )
-
-
-def _fitting_layout(names: Sequence[str], tables: Sequence[Table], console: Console) -> list[list[_ColumnGroup]]:
-    """Return the column groups of each table to print, with as few tables as the console's width allows."""
-    base, native, scaled, within = _column_groups(tables)
-    layouts = [
-        [[base, native, scaled, within]],
-        [[native, scaled], [base, within]],
-        [[base, native], [scaled], [within]],
-    ]
-    for layout in layouts[:-1]:
-        if all(_width(_rich_table(names, groups), console) <= console.width for groups in layout):
+def _fitting_layout(tables: Mapping[str, Table], console: Console) -> list[list[_ColumnGroup]]:
+    """Return the layout with as few tables as the console's width allows."""
+    for layout in _LAYOUTS[:-1]:
+        if all(_width(_rich_table(tables, groups), console) <= console.width for groups in layout):
             return layout
-    return layouts[-1]
+    return _LAYOUTS[-1]
 
 
-def _rich_table(names: Sequence[str], groups: Sequence[_ColumnGroup]) -> RichTable:
+def _rich_table(tables: Mapping[str, Table], groups: Sequence[_ColumnGroup]) -> RichTable:
     table = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
     heads = [head for group in groups for head in group.heads]
     lines = max(head.count("\n") for head in heads)
     table.add_column(_header("config", lines), no_wrap=True)
     for head in heads:
         table.add_column(_header(head, lines), justify="right", no_wrap=True)
-    for index, name in enumerate(names):
-        table.add_row(Text(name), *(Text(cell) for group in groups for cell in group.rows[index]))
+    for name, config_table in tables.items():
+        cells = [cell for group in groups for cell in group.cells(config_table)]
+        table.add_row(*map(Text, [printable(name), *cells]))
     return table
 
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 from jaxtyping import Float32, UInt32
@@ -45,8 +44,8 @@ class ViewTruth:
 
 
 @dataclass(frozen=True, eq=False)
-class ConfigTruth(Sequence[ViewTruth]):
-    """Sequence of the views of a config that have scored pixels, each read from the cache on access."""
+class ConfigTruth:
+    """Views of a config that have scored pixels, each read from the cache on access."""
 
     cache: ArrayCache
 
@@ -63,16 +62,12 @@ class ConfigTruth(Sequence[ViewTruth]):
     def __len__(self) -> int:
         return len(self.cache)
 
-    @overload
-    def __getitem__(self, index: int) -> ViewTruth: ...
+    def __iter__(self) -> Iterator[ViewTruth]:
+        return map(self.view, range(len(self)))
 
-    @overload
-    def __getitem__(self, index: slice) -> list[ViewTruth]: ...
-
-    def __getitem__(self, index: int | slice) -> ViewTruth | list[ViewTruth]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        view = self.cache.view(range(len(self))[index])
+    def view(self, position: int) -> ViewTruth:
+        """Return the view at ``position`` in protocol order."""
+        view = self.cache.view(position)
         return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], float(view.metadata))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench.errors import Problem, SubmissionError
-from rebar_depth_bench.parallel import ordered_map
+from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.ground_truth import ConfigTruth, ViewTruth, config_truth
@@ -91,8 +91,10 @@ def _score_all(evaluation: Evaluation, workers: int | None, progress: Progress) 
     scores: dict[str, list[ViewScore]] = {}
     for config in evaluation.configs:
         truths = config_truth(config, progress)
-        outcomes = ordered_map(partial(_score_or_problem, submission, truths), range(len(truths)), workers)
-        scored = list(_report_progress(outcomes, f"scoring {config.name}", len(truths), progress))
+        work = partial(_score_or_problem, submission, truths)
+        scored = map_with_progress(
+            work, range(len(truths)), workers, progress, f"scoring {config.name}", len(truths)
+        )
         scores[config.name] = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
         problems += [outcome for outcome in scored if isinstance(outcome, Problem)]
         unread.difference_update(truths.view_ids)
@@ -104,7 +106,7 @@ def _score_all(evaluation: Evaluation, workers: int | None, progress: Progress) 
 
 def _score_or_problem(submission: SubmissionReader, truths: ConfigTruth, index: int) -> ViewScore | Problem:
     """Return a view's score, or the problem of its entry."""
-    truth = truths[index]
+    truth = truths.view(index)
     try:
         return score_view(truth, submission.read(truth.view_id))
     except EntryError as error:
@@ -120,11 +122,3 @@ def _unscored_view_problems(submission: SubmissionReader, view_ids: Iterable[str
         except EntryError as error:
             problems.append(error.problem)
     return problems
-
-
-def _report_progress(
-    outcomes: Iterable[ViewScore | Problem], label: str, total: int, progress: Progress
-) -> Iterator[ViewScore | Problem]:
-    for done, outcome in enumerate(outcomes, start=1):
-        progress(label, done, total)
-        yield outcome

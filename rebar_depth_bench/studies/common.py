@@ -24,7 +24,7 @@ from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.console import add_output_file
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.parallel import ordered_map
+from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.reporting.html.study_page import PageTable, StudyPage, render_study
 from rebar_depth_bench.reporting.tables import frame_csv, print_unwrapped
@@ -148,14 +148,11 @@ def map_views(
     Views are processed on all cores; only a few are in memory at a time. ``label`` names the step in the progress
     display.
     """
-    results: list[T] = []
-    outcomes = ordered_map(
-        lambda truth: compute(pair_with_truth(truth, submission.read(truth.view_id))), truths, None
-    )
-    for done, outcome in enumerate(outcomes, start=1):
-        progress(label, done, total)
-        results.append(outcome)
-    return results
+
+    def compute_view(truth: ViewTruth) -> T:
+        return compute(pair_with_truth(truth, submission.read(truth.view_id)))
+
+    return map_with_progress(compute_view, truths, None, progress, label, total)
 
 
 def pair_with_truth(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewPairs:

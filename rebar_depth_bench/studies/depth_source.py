@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from abc import abstractmethod
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
-from typing import Protocol, Self
 
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import Problem, SubmissionError, format_shape
@@ -19,33 +17,27 @@ from rebar_depth_bench.submission.metadata import METADATA_NAME, parse_metadata
 _FILE_NAME_PATTERN = "<view_id>, or its part after the slash, with one of " + ", ".join(FORMATS)
 
 
-class DepthSource(Protocol):
-    """Context manager that gives access to depth maps by view id; ``read`` is thread-safe."""
+class DepthSource(AbstractContextManager["DepthSource"]):
+    """Depth maps by view id of one method; ``read`` is thread-safe.
+
+    ``method`` is the name of the method that predicted the maps, ``view_ids`` are the sorted ids of the views that
+    have a map.
+    """
 
     path: Path
+    method: str
+    view_ids: tuple[str, ...]
 
-    @property
-    def method(self) -> str:
-        """Name of the method that predicted the maps."""
-
-    @property
-    def view_ids(self) -> tuple[str, ...]:
-        """Sorted ids of the views that have a map."""
-
+    @abstractmethod
     def read(self, view_id: str) -> Depth:
         """Return planar depth in metres, shape (H, W); values that are not finite or <= 0 mean no depth.
 
         Raises ``EntryError`` if the map cannot be read or decoded.
         """
 
+    @abstractmethod
     def sha256(self) -> str:
         """Return the hex SHA-256 of all content that ``read`` can return."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
 
 
 def open_depths(
@@ -64,7 +56,7 @@ def open_depths(
     return FolderDepths(Path(path), expected, png_scale) if Path(path).is_dir() else ArchiveDepths(path, expected)
 
 
-class ArchiveDepths:
+class ArchiveDepths(DepthSource):
     """Depth maps of a submission archive."""
 
     def __init__(self, path: str | os.PathLike[str], expected: ExpectedViews) -> None:
@@ -86,41 +78,27 @@ class ArchiveDepths:
         """Return the hex SHA-256 of the archive file."""
         return self._reader.sha256()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._reader.close()
 
 
-@dataclass(frozen=True)
-class _DepthFiles:
-    """Depth files of a folder by view id, and the problems found while matching them."""
-
-    files: Mapping[str, Path]
-    problems: tuple[Problem, ...]
-
-
-class FolderDepths:
+class FolderDepths(DepthSource):
     """Depth maps of a folder. Files with names that match no view are ignored."""
 
     def __init__(self, path: Path, expected: ExpectedViews, png_scale: float | None) -> None:
         self.path = path
         self._expected = expected
-        depth_files = _find_files(path, expected)
+        self._files, file_problems = _find_files(path, expected)
         meta, problems = _folder_metadata(path)
         self._scale = png_scale if meta is None or meta.depth_scale is None else meta.depth_scale
-        self._files = depth_files.files
         self.method = path.resolve().name if meta is None else meta.method
-        self.view_ids = tuple(sorted(depth_files.files))
-        images = [file.name for file in depth_files.files.values() if file.suffix == ".png"]
+        self.view_ids = tuple(sorted(self._files))
+        images = [file.name for file in self._files.values() if file.suffix == ".png"]
         if images and self._scale is None and not problems:
             expected_scale = f"metres per PNG unit, since {len(images)} files are PNG (first {min(images)})"
             problems = [Problem("missing", METADATA_NAME, "no depth_scale", expected_scale)]
-        if depth_files.problems or problems:
-            raise SubmissionError.from_problems(path, [*depth_files.problems, *problems])
+        if file_problems or problems:
+            raise SubmissionError.from_problems(path, [*file_problems, *problems])
 
     def read(self, view_id: str) -> Depth:
         """Return planar depth in metres, shape (H, W). Raises ``EntryError``."""
@@ -145,17 +123,12 @@ class FolderDepths:
             digest.update(f"{view_id} {file_sha256(self._files[view_id])}\n".encode())
         return digest.hexdigest()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Do nothing: files are closed after each read."""
 
 
-def _find_files(path: Path, expected: ExpectedViews) -> _DepthFiles:
-    """Return the depth file of each view.
+def _find_files(path: Path, expected: ExpectedViews) -> tuple[dict[str, Path], list[Problem]]:
+    """Return the depth file of each view, and the problems found while matching them.
 
     Two or more files for one view are a problem, and so is a folder without any depth file.
     """
@@ -175,7 +148,7 @@ def _find_files(path: Path, expected: ExpectedViews) -> _DepthFiles:
     if not files_by_view:
         pattern = f"{_FILE_NAME_PATTERN}, such as {next(iter(expected))}.npy"
         problems = [Problem("missing", "", "no depth file of any view was found", pattern)]
-    return _DepthFiles({view_id: files[0] for view_id, files in files_by_view.items()}, tuple(problems))
+    return {view_id: files[0] for view_id, files in files_by_view.items()}, problems
 
 
 def _folder_metadata(path: Path) -> tuple[SubmissionMeta | None, list[Problem]]:

@@ -17,13 +17,12 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.inspection.cylinder_fit import CylinderFits, fit_cylinders
 from rebar_depth_bench.extended.inspection.measures import (
-    INSPECTION_MEASURES,
     MIN_PREDICTED_SHARE,
     MIN_VISIBLE_OVERLAP_DIAMETERS,
     MISS_MM,
 )
 from rebar_depth_bench.extended.inspection.segments import CageTruth
-from rebar_depth_bench.extended.inspection.tolerances import PROFILES, ErrorKind, pass_sample
+from rebar_depth_bench.extended.inspection.tolerances import TOLERANCES, ErrorKind, pass_sample
 from rebar_depth_bench.extended.inspection.visible_segments import VisibleSegments, visible_segments
 from rebar_depth_bench.extended.measures import Samples
 from rebar_depth_bench.extended.steel_truth import SteelTruth
@@ -32,9 +31,6 @@ MAX_DEPTH_M = 1e6
 """Upper bound applied to predicted depth, metres, so that its squares do not overflow."""
 
 _MM = 1000.0
-
-MEASURES = INSPECTION_MEASURES
-"""Measures computed by ``inspection_samples``, in table order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +65,7 @@ class _SegmentPairs:
 def inspection_samples(
     p_m: Float64[ndarray, " n"], truth: SteelTruth, cage: CageTruth, visible: VisibleSegments | None = None
 ) -> Samples:
-    """Return the inspection samples of one view; ``MEASURES`` defines what each one is.
+    """Return the inspection samples of one view; ``INSPECTION_MEASURES`` defines what each is.
 
     ``p_m`` is the predicted planar depth on ``truth.index`` in metres; values that are not finite and > 0 count
     as missing. ``visible`` is ``visible_segments(truth, cage)``, if already computed. The lengths of the samples
@@ -231,6 +227,5 @@ def _pass_samples(errors_mm: Mapping[ErrorKind, Float64[ndarray, " n"]]) -> dict
         pass_sample(tolerance): (_with_misses_mm(errors_mm[tolerance.kind]) <= tolerance.limit_mm).astype(
             np.float64
         )
-        for profile in PROFILES
-        for tolerance in profile.tolerances
+        for _, tolerance in TOLERANCES
     }

@@ -9,9 +9,9 @@ from functools import partial
 
 from rebar_depth_bench.extended.inspection.segments import MAX_MATCH_RADIUS_M
 from rebar_depth_bench.extended.inspection.tolerances import (
-    CAPABILITY_INPUTS,
-    PROFILES,
+    TOLERANCES,
     Tolerance,
+    ToleranceProfile,
     pass_sample,
     process_capability,
 )
@@ -131,8 +131,7 @@ def _pass_measures() -> tuple[Measure, ...]:
             f"Share of all judged with an error of at most {tolerance.limit_mm:g} mm either way; what was not "
             f"found fails. Error: {_DEFINITIONS[tolerance.kind]}. Tolerance: {profile.source}.",
         )
-        for profile in PROFILES
-        for tolerance in profile.tolerances
+        for profile, tolerance in TOLERANCES
     )  # fmt: skip
 
 
@@ -157,23 +156,14 @@ def defined_capability(limit_mm: float, p95_mm: float) -> float | None:
     return None if p95_mm >= MISS_MM else process_capability(limit_mm, p95_mm)
 
 
-def _capability_measures() -> tuple[Measure, ...]:
-    """Return the capability measures of all tolerances."""
-    p95 = {measure.name: measure for measure in INSPECTION_MEASURES}
-    profile_of = {tolerance.key: profile for profile in PROFILES for tolerance in profile.tolerances}
-    return tuple(
-        _capability_measure(f"{profile_of[tolerance.key].title}, {tolerance.title}", tolerance, p95[p95_name])
-        for tolerance, p95_name in CAPABILITY_INPUTS
-    )
-
-
-def _capability_measure(title: str, tolerance: Tolerance, p95: Measure) -> Measure:
-    """Return the measure that divides ``tolerance`` by the statistic of the measure ``p95``."""
+def _capability_measure(profile: ToleranceProfile, tolerance: Tolerance) -> Measure:
+    """Return the measure that divides ``tolerance`` by the p95 of the error that it bounds."""
+    [p95] = (measure for measure in INSPECTION_MEASURES if measure.name == f"{tolerance.kind}_p95_mm")
     return Measure(
         name=capability_name(tolerance),
         sample=p95.sample,
         statistic=p95.statistic,
-        title=f"{title}: {tolerance.limit_mm:g} mm / p95",
+        title=f"{profile.title}, {tolerance.title}: {tolerance.limit_mm:g} mm / p95",
         unit="",
         better="higher",
         definition=f"Capability: {tolerance.limit_mm:g} mm / {p95.name}; 1 or more if 95 % of all judged stay "
@@ -182,5 +172,5 @@ def _capability_measure(title: str, tolerance: Tolerance, p95: Measure) -> Measu
     )
 
 
-CAPABILITY_MEASURES: tuple[Measure, ...] = _capability_measures()
-"""Capability of each tolerance, in the order of ``PROFILES``."""
+CAPABILITY_MEASURES: tuple[Measure, ...] = tuple(_capability_measure(*entry) for entry in TOLERANCES)
+"""Capability of each tolerance, in the order of ``TOLERANCES``."""

@@ -70,21 +70,13 @@ EN_13670_CLASS_2 = ToleranceProfile(
 PROFILES: tuple[ToleranceProfile, ...] = (GB_50204, EN_13670_CLASS_1, EN_13670_CLASS_2)
 """All tolerance profiles, in report order."""
 
+TOLERANCES = tuple((profile, tolerance) for profile in PROFILES for tolerance in profile.tolerances)
+"""All tolerances with their profiles, in report order."""
+
 
 def pass_sample(tolerance: Tolerance) -> str:
     """Return the name of a tolerance's 0/1 sample and of the pass-rate measure over it."""
     return f"pass_{tolerance.key}"
-
-
-def p95_measure(kind: ErrorKind) -> str:
-    """Return the name of the measure whose p95 is compared with tolerances of this kind."""
-    return f"{kind}_p95_mm"
-
-
-CAPABILITY_INPUTS: tuple[tuple[Tolerance, str], ...] = tuple(
-    (tolerance, p95_measure(tolerance.kind)) for profile in PROFILES for tolerance in profile.tolerances
-)
-"""Each tolerance with the name of the measure that ``process_capability`` divides it by."""
 
 
 def process_capability(tolerance_mm: float, p95_mm: float) -> float:

@@ -15,13 +15,7 @@ from typing import Any
 
 from rebar_depth_bench.data.digests import files_digest
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.monocular.hub import (
-    HUB_ACCESS,
-    announce_download,
-    download_error,
-    local_copy_hint,
-    snapshot,
-)
+from rebar_depth_bench.methods.monocular.hub import hub_download, local_copy_hint, snapshot
 
 CONFIG, PREPROCESSOR = "config.json", "preprocessor_config.json"
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
@@ -116,10 +110,9 @@ def _read_json_object(path: Path) -> dict[str, Any]:
 
 def _fetch_weights(repository: str, commit: str) -> None:
     """Download weights (of one kind only) and settings of a commit into the Hub cache."""
-    from huggingface_hub import HfApi, constants, snapshot_download
+    from huggingface_hub import HfApi, snapshot_download
 
-    announce_download(repository, "the weights", constants.ENDPOINT, _local_copy_hint(repository))
-    try:
+    with hub_download(repository, "the weights", _local_copy_hint(repository)):
         files = HfApi().model_info(repository, revision=commit, files_metadata=True).siblings or []
         sizes = {file.rfilename: file.size or 0 for file in files if "/" not in file.rfilename}
         weight_pattern = next(
@@ -128,10 +121,6 @@ def _fetch_weights(repository: str, commit: str) -> None:
         file_names = [name for name in sizes if Path(name).match(weight_pattern) or name.endswith(".json")]
         print(f"{repository}: {sum(sizes[name] for name in file_names) / 1e6:.1f} MB", file=sys.stderr, flush=True)
         snapshot_download(repository, revision=commit, allow_patterns=file_names)
-    except Exception as error:  # huggingface_hub raises its own, httpx and OS errors.
-        raise download_error(
-            repository, constants.ENDPOINT, error, _local_copy_hint(repository), HUB_ACCESS
-        ) from None
 
 
 def _local_copy_hint(repository: str) -> str:

@@ -53,14 +53,7 @@ def fit_letterbox(grid: tuple[int, int], target: tuple[int, int]) -> Letterbox:
     """
     scale = min(target[0] / grid[0], target[1] / grid[1])
     height, width = (max(1, int(side * scale)) for side in grid)
-    margin_rows, margin_columns = target[0] - height, target[1] - width
-    margins = Margins(
-        top=margin_rows // 2,
-        bottom=margin_rows - margin_rows // 2,
-        left=margin_columns // 2,
-        right=margin_columns - margin_columns // 2,
-    )
-    return Letterbox(scale, height, width, margins)
+    return Letterbox(scale, height, width, _centring_margins(target[0] - height, target[1] - width))
 
 
 def margins_to_multiple(grid: tuple[int, int], step_px: int) -> Margins:
@@ -68,19 +61,19 @@ def margins_to_multiple(grid: tuple[int, int], step_px: int) -> Margins:
 
     Both images of a stereo pair get the same margins, so that disparities are unchanged.
     """
-    margin_rows, margin_columns = (-side % step_px for side in grid)
-    return Margins(
-        top=margin_rows // 2,
-        bottom=margin_rows - margin_rows // 2,
-        left=margin_columns // 2,
-        right=margin_columns - margin_columns // 2,
-    )
+    return _centring_margins(-grid[0] % step_px, -grid[1] % step_px)
+
+
+def _centring_margins(rows: int, columns: int) -> Margins:
+    """Return as many margin pixels in total, evenly on both sides; an odd one goes to the bottom or right."""
+    return Margins(rows // 2, rows - rows // 2, columns // 2, columns - columns // 2)
 
 
 def padded(image: ndarray, margins: Margins, colour: tuple[int, ...] | None = None) -> ndarray:
     """Return an H x W x C image with margins of one colour, or of repeated border pixels if ``colour`` is None."""
     if colour is None:
-        return np.pad(image, _pad_widths(image, margins), mode="edge")
+        widths = ((margins.top, margins.bottom), (margins.left, margins.right), (0, 0))
+        return np.pad(image, widths, mode="edge")
     height, width, channels = image.shape
     padded_shape = (height + margins.top + margins.bottom, width + margins.left + margins.right, channels)
     canvas = np.broadcast_to(np.asarray(colour, image.dtype), padded_shape).copy()
@@ -125,7 +118,3 @@ def positive_or_nan(depth_m: Float[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
     with np.errstate(over="ignore"):
         single = depth_m.astype(np.float32)
     return np.where(np.isfinite(single) & (single > 0), single, np.float32(np.nan))
-
-
-def _pad_widths(image: ndarray, margins: Margins) -> tuple[tuple[int, int], ...]:
-    return (margins.top, margins.bottom), (margins.left, margins.right), *((0, 0),) * (image.ndim - 2)

@@ -9,7 +9,8 @@ none was tested. The commit in use is part of the method's summary and thus of a
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,9 +18,6 @@ from pathlib import Path
 from rebar_depth_bench.errors import MethodError, exception_summary
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.monocular.third_party import check_folder, with_weights_digest
-
-HUB_ACCESS = "a network connection (and HF_TOKEN if the model is not public)"
-"""Requirements for downloads from the Hub, for error messages."""
 
 
 def snapshot(repository: str, file: str, local_hint: str) -> Path:
@@ -30,18 +28,15 @@ def snapshot(repository: str, file: str, local_hint: str) -> Path:
 
     Raises ``MethodError`` if the download fails.
     """
-    from huggingface_hub import constants, hf_hub_download
+    from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import LocalEntryNotFoundError
 
     try:
         return Path(hf_hub_download(repository, file, local_files_only=True)).parent
     except LocalEntryNotFoundError:
         pass
-    announce_download(repository, file, constants.ENDPOINT, local_hint)
-    try:
+    with hub_download(repository, file, local_hint):
         return Path(hf_hub_download(repository, file)).parent
-    except Exception as error:  # huggingface_hub raises its own, httpx and OS errors.
-        raise download_error(repository, constants.ENDPOINT, error, local_hint, HUB_ACCESS) from None
 
 
 def complete_snapshot(repository: str, folder: Path, files: Sequence[str], local_hint: str) -> None:
@@ -49,19 +44,29 @@ def complete_snapshot(repository: str, folder: Path, files: Sequence[str], local
 
     Raises ``MethodError`` if the download fails.
     """
-    from huggingface_hub import constants, snapshot_download
+    from huggingface_hub import snapshot_download
 
     missing = [name for name in files if not (folder / name).is_file()]
     if not missing:
         return
-    announce_download(repository, " and ".join(missing), constants.ENDPOINT, local_hint)
-    try:
+    with hub_download(repository, " and ".join(missing), local_hint):
         snapshot_download(repository, revision=folder.name, allow_patterns=missing)
-    except Exception as error:
-        raise download_error(repository, constants.ENDPOINT, error, local_hint, HUB_ACCESS) from None
     for name in missing:  # snapshot_download ignores files that the Hub does not list.
         if not (folder / name).is_file():
             raise MethodError(f"{repository}: no {name} at commit {folder.name}, expected {' and '.join(files)}")
+
+
+@contextmanager
+def hub_download(repository: str, what: str, local_hint: str) -> Iterator[None]:
+    """Announce a download from the Hub, and convert all of its errors into ``MethodError``."""
+    from huggingface_hub import constants
+
+    announce_download(repository, what, constants.ENDPOINT, local_hint)
+    try:
+        yield
+    except Exception as error:  # huggingface_hub raises its own, httpx and OS errors.
+        access = "a network connection (and HF_TOKEN if the model is not public)"
+        raise download_error(repository, constants.ENDPOINT, error, local_hint, access) from None
 
 
 def local_copy_hint(prefix: str, repository: str) -> str:

@@ -23,7 +23,7 @@ from rebar_depth_bench.methods.multiview.images import LeftImages
 from rebar_depth_bench.methods.multiview.patch_match import patch_match, read_depth_map, require_cuda
 from rebar_depth_bench.methods.multiview.plane_sweep import PlaneSweepSpec, PosedImage, sweep_depth
 from rebar_depth_bench.methods.multiview.sfm import SparseReconstruction
-from rebar_depth_bench.parallel import ordered_map
+from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress
 
 MAX_RELATIVE_DIFFERENCE = 0.01
@@ -159,8 +159,8 @@ def _plane_sweep(
             with atomic_replace(path) as temporary, temporary.open("wb") as stream:
                 np.save(stream, depth)
 
-    for done, _ in enumerate(ordered_map(store_depth, list(reconstruction.cam_from_sfm), None), start=1):
-        progress("plane sweep", done, len(reconstruction.cam_from_sfm))
+    names = list(reconstruction.cam_from_sfm)
+    map_with_progress(store_depth, names, None, progress, "plane sweep", len(names))
 
     def read(name: str) -> Float32[ndarray, "h w"]:
         poses = reconstruction.cam_from_sfm

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -130,10 +129,7 @@ def load_predictor(installation: Installation) -> Predictor:
             padded_px = disparity_px.float().cpu().numpy().reshape(pair[0].shape[-2:])
         return np.asarray(crop_margins(padded_px, margins), np.float32)
 
-    def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
-        return stereo_depth_m(row, match)
-
-    return predict
+    return lambda row: stereo_depth_m(row, match)
 
 
 def _possible_downloads(torch: Any) -> list[str]:

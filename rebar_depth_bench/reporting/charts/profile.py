@@ -60,19 +60,10 @@ def profile_chart(title: str, unit: str, bins: Sequence[ProfileBin]) -> Markup:
         _edge_grid(x, known_bins) + _value_grid(error, error.ticks()) + _value_grid(scale, [1.0, *scale.ticks()])
     )
     body += f'<path class="one" d="M{_LEFT:g} {scale.at(1.0):.1f}H{_RIGHT:g}"/>'
-    body += _series(
-        [(_bin_centre(x, entry) + _MARKER_OFFSET_PX, entry.scaled) for entry in known_bins],
-        error,
-        "scaled",
-        "ring",
-    )
-    body += _series(
-        [(_bin_centre(x, entry) - _MARKER_OFFSET_PX, entry.native) for entry in known_bins],
-        error,
-        "native",
-        "fill",
-    )
-    body += _series([(_bin_centre(x, entry), entry.scale) for entry in known_bins], scale, "native", "fill")
+    centred = [((x.at(entry.low) + x.at(entry.high)) / 2, entry) for entry in known_bins]
+    body += _series([(at + _MARKER_OFFSET_PX, entry.scaled) for at, entry in centred], error, "scaled", "ring")
+    body += _series([(at - _MARKER_OFFSET_PX, entry.native) for at, entry in centred], error, "native", "fill")
+    body += _series([(at, entry.scale) for at, entry in centred], scale, "native", "fill")
     body += svg_text(_LEFT, _ERROR_TOP - 10, "AbsRel") + svg_text(_LEFT, _SCALE_TOP - 10, "s, native")
     body += svg_text((_LEFT + _RIGHT) / 2, _HEIGHT - 4, f"{title}, {unit}", "middle")
     return svg_figure(f"Against {title}", f"By {title}: {_description(known_bins, unit)}.", _HEIGHT, body)
@@ -86,10 +77,6 @@ def _axis_values(estimates: Iterable[MeasureEstimate]) -> list[float]:
         if value is not None
     ]
     return [value * margin for value in values for margin in (0.95, 1.05)]
-
-
-def _bin_centre(x: LogAxis, profile_bin: ProfileBin) -> float:
-    return (x.at(profile_bin.low) + x.at(profile_bin.high)) / 2
 
 
 def _edge_grid(x: LogAxis, bins: Sequence[ProfileBin]) -> str:

@@ -12,9 +12,14 @@ from markupsafe import Markup
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, NATIVE, ONCE, SCALED, MeasureFamily
-from rebar_depth_bench.extended.inspection.evaluate import MEASURES as INSPECTION_MEASURES
-from rebar_depth_bench.extended.inspection.measures import MISS_MM, capability_name
-from rebar_depth_bench.extended.inspection.tolerances import PROFILES, Tolerance, ToleranceProfile, pass_sample
+from rebar_depth_bench.extended.inspection.measures import INSPECTION_MEASURES, MISS_MM, capability_name
+from rebar_depth_bench.extended.inspection.tolerances import (
+    PROFILES,
+    TOLERANCES,
+    Tolerance,
+    ToleranceProfile,
+    pass_sample,
+)
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.point_cloud import TOLERANCES_MM
 from rebar_depth_bench.extended.profiles import AXES, bin_names
@@ -204,14 +209,13 @@ def extended_section(extended: ExtendedResult) -> ExtendedSection:
 
 def _extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
     inspection = MEASURE_FAMILIES["inspection"]
-    tolerances = [(profile, tolerance) for profile in PROFILES for tolerance in profile.tolerances]
-    pass_rate_names = {pass_sample(tolerance) for _, tolerance in tolerances}
-    other = [
-        measure
-        for measure in INSPECTION_MEASURES
-        if measure.name not in pass_rate_names and measure.name not in MAIN_INSPECTION_MEASURES
+    shown = {*MAIN_INSPECTION_MEASURES, *(pass_sample(tolerance) for _, tolerance in TOLERANCES)}
+    other = [measure for measure in INSPECTION_MEASURES if measure.name not in shown]
+    profile = MEASURE_FAMILIES["profile"]
+    folded = [
+        *(_folded_table(table, key) for key in _FOLDED_FAMILIES),
+        _measure_table(table, f"{profile.title}: values", profile, profile.measures),
     ]
-    folded = [_folded_table(table, key) for key in _FOLDED_FAMILIES]
     charts = [(_AXIS_TITLES[axis][0], _profile_chart(table, axis)) for axis in AXES]
     return ExtendedConfig(
         name=printable(name),
@@ -221,8 +225,8 @@ def _extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
             table, inspection.title, inspection, [inspection.by_name[name] for name in MAIN_INSPECTION_MEASURES]
         ),
         other_inspection=_measure_table(table, "Inspection: spread, median, found bars only", inspection, other),
-        tolerances=[_tolerance_row(table, *line) for line in tolerances],
-        families=[family for family in [*folded, _profile_table(table)] if family.rows],
+        tolerances=[_tolerance_row(table, *line) for line in TOLERANCES],
+        families=[family for family in folded if family.rows],
     )
 
 
@@ -246,11 +250,6 @@ def _measure_table(
 def _alignment_heads(family: MeasureFamily, once_aside: str = "") -> list[AlignmentHead]:
     notes = {**_ALIGNMENT_NOTES, ONCE: once_aside}
     return [AlignmentHead(alignment, notes[alignment]) for alignment in family.alignments]
-
-
-def _profile_table(table: ExtendedTable) -> ExtendedMeasureTable:
-    family = MEASURE_FAMILIES["profile"]
-    return _measure_table(table, f"{family.title}: values", family, family.measures)
 
 
 def _cloud_table(table: ExtendedTable, family: MeasureFamily) -> ExtendedMeasureTable:

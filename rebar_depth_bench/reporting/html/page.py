@@ -80,7 +80,7 @@ def render_report(result: Result, panels: Iterable[ViewPanels]) -> str:
             min_coverage=f"{MIN_RANKED_COVERAGE * 100:.0f}",
             **results_context(result, views),
             **paper_context(result),
-            **_extended_context(result),
+            extended=None if result.extended is None else extended_section(result.extended),
             **_browser_context(shown, views),
             **_views_context(result, views),
         )
@@ -107,11 +107,6 @@ def paper_context(result: Result) -> dict[str, object]:
         "paper_title": published.title,
         "paper_part": published.parts["synthetic"],
     }
-
-
-def _extended_context(result: Result) -> dict[str, object]:
-    """Return the context of ``part_extended.html.j2``, None for a result without extended measures."""
-    return {"extended": None if result.extended is None else extended_section(result.extended)}
 
 
 def _browser_context(shown: Sequence[ShownView], views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:

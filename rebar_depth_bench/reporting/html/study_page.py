@@ -6,8 +6,9 @@ All text passes through Jinja's escaping; text from a submission or a dataset mu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 from markupsafe import Markup
 
@@ -40,6 +41,17 @@ class PageTable:
             raise ValueError(
                 f"table {self.caption!r}: a row has {wrong_lengths[0]} cells, expected {len(self.heads)}"
             )
+
+
+T = TypeVar("T")
+Columns = Sequence[tuple[str, str, Callable[[T], str]]]
+"""Columns of a table: name, unit, and the function that returns the cell of a row's item."""
+
+
+def page_table(caption: str, columns: Columns[T], items: Iterable[T]) -> PageTable:
+    """Return the table with one row per item."""
+    rows = [[cell(item) for _, _, cell in columns] for item in items]
+    return PageTable(caption, [(name, unit) for name, unit, _ in columns], rows)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.lines import HEIGHT, LEFT, RIGHT, TOP, ChartText, Series, chart, log_axis
-from rebar_depth_bench.reporting.html.study_page import PageFigure, PageTable, StudyPage
+from rebar_depth_bench.reporting.html.study_page import Columns, PageFigure, PageTable, StudyPage, page_table
 from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS
 from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.studies.distance.study import (
@@ -89,7 +89,7 @@ def _slope_sentence(slope: ScaleSlope) -> str:
     if interval[0] <= 0 <= interval[1]:
         return f"{name}: {power} {interval_text}, which is consistent with one scale for all distances."
     return (
-        f"{name}: {power} {interval_text}: doubling the distance multiplies s by {formatting.number(2**value, 3)}."
+        f"{name}: {power} {interval_text}: doubling the distance multiplies s by {_format_doubling_factor(value)}."
     )
 
 
@@ -185,61 +185,33 @@ def _error_bars(bins: Sequence[DistanceBin], name: str) -> list[tuple[float, flo
 
 
 def _slope_table(slopes: Sequence[ScaleSlope]) -> PageTable:
-    return PageTable(
-        caption="Slope of log s over log distance, least squares over views: 0 means one scale for all distances.",
-        heads=(
-            ("Config", ""),
-            ("Views", "with s"),
-            ("Distance", "m"),
-            ("Slope", ""),
-            ("Slope", "95 % interval"),
-            ("s at twice the distance", "times"),
-        ),
-        rows=[
-            (
-                printable(slope.config),
-                str(slope.views),
-                f"{_format_metres(slope.nearest_m)} to {_format_metres(slope.farthest_m)}",
-                formatting.number(slope.slope.value, 3),
-                formatting.interval_text(slope.slope.interval, 3),
-                formatting.number(None if slope.slope.value is None else 2**slope.slope.value, 3),
-            )
-            for slope in slopes
-        ],
+    caption = "Slope of log s over log distance, least squares over views: 0 means one scale for all distances."
+    columns: Columns[ScaleSlope] = (
+        ("Config", "", lambda row: printable(row.config)),
+        ("Views", "with s", lambda row: str(row.views)),
+        ("Distance", "m", lambda row: _format_metre_range(row.nearest_m, row.farthest_m)),
+        ("Slope", "", lambda row: formatting.number(row.slope.value, 3)),
+        ("Slope", "95 % interval", lambda row: formatting.interval_text(row.slope.interval, 3)),
+        ("s at twice the distance", "times", lambda row: _format_doubling_factor(row.slope.value)),
     )
+    return page_table(caption, columns, slopes)
 
 
 def _bin_table(bins: Sequence[DistanceBin]) -> PageTable:
-    return PageTable(
-        caption="Bins of distance: native (no alignment) and scaled (oracle median scale per view), same pixels.",
-        heads=(
-            ("Config", ""),
-            ("Distance", "m, from to"),
-            ("Views", "scored/all"),
-            ("s", "median"),
-            ("s", "95 % interval"),
-            ("s", "minimum to maximum"),
-            ("AbsRel ↓", "native"),
-            ("AbsRel ↓", "95 % interval"),
-            ("AbsRel ↓", "scaled"),
-            ("AbsRel ↓", "95 % interval"),
-        ),
-        rows=[
-            (
-                printable(bin_.config),
-                f"{_format_metres(bin_.low_m)} to {_format_metres(bin_.high_m)}",
-                f"{bin_.views_scored}/{bin_.views}",
-                formatting.scale_cell(bin_.scale.value),
-                formatting.interval_text(bin_.scale.interval, 3),
-                formatting.interval_text(bin_.scale_range, 3),
-                formatting.number(bin_.native_abs_rel.value, 4),
-                formatting.interval_text(bin_.native_abs_rel.interval, 4),
-                formatting.number(bin_.scaled_abs_rel.value, 4),
-                formatting.interval_text(bin_.scaled_abs_rel.interval, 4),
-            )
-            for bin_ in bins
-        ],
+    caption = "Bins of distance: native (no alignment) and scaled (oracle median scale per view), same pixels."
+    columns: Columns[DistanceBin] = (
+        ("Config", "", lambda row: printable(row.config)),
+        ("Distance", "m, from to", lambda row: _format_metre_range(row.low_m, row.high_m)),
+        ("Views", "scored/all", lambda row: f"{row.views_scored}/{row.views}"),
+        ("s", "median", lambda row: formatting.scale_cell(row.scale.value)),
+        ("s", "95 % interval", lambda row: formatting.interval_text(row.scale.interval, 3)),
+        ("s", "minimum to maximum", lambda row: formatting.interval_text(row.scale_range, 3)),
+        ("AbsRel ↓", "native", lambda row: formatting.number(row.native_abs_rel.value, 4)),
+        ("AbsRel ↓", "95 % interval", lambda row: formatting.interval_text(row.native_abs_rel.interval, 4)),
+        ("AbsRel ↓", "scaled", lambda row: formatting.number(row.scaled_abs_rel.value, 4)),
+        ("AbsRel ↓", "95 % interval", lambda row: formatting.interval_text(row.scaled_abs_rel.interval, 4)),
     )
+    return page_table(caption, columns, bins)
 
 
 def _notes(study: DistanceStudy) -> list[str]:
@@ -276,3 +248,12 @@ def _estimate_cells(name: str, estimate: IntervalEstimate) -> dict[str, float | 
 
 def _format_metres(value: float) -> str:
     return formatting.number(value, 2)
+
+
+def _format_metre_range(low_m: float, high_m: float) -> str:
+    return f"{_format_metres(low_m)} to {_format_metres(high_m)}"
+
+
+def _format_doubling_factor(slope: float | None) -> str:
+    """Return the factor by which s changes over twice the distance."""
+    return formatting.number(None if slope is None else 2**slope, 3)

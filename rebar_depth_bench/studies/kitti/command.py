@@ -13,6 +13,7 @@ import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -20,7 +21,7 @@ import numpy as np
 
 from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.errors import InputError, Problem, SubmissionError
-from rebar_depth_bench.parallel import ordered_map
+from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
 from rebar_depth_bench.studies.common import add_output_arguments, write_outputs
@@ -120,11 +121,8 @@ def run_kitti_study(
     split = eigen_test_images() if images is None else images
     truths, missing = find_truth(root, split, protocol.ground_truth)
     with _open_predictions(predictions, split, truths) as source:
-        outcomes: list[_ImageOutcome] = []
-        work = ordered_map(lambda truth: _score_file(truth, source, protocol), truths, workers)
-        for done, outcome in enumerate(work, start=1):
-            outcomes.append(outcome)
-            progress("scoring KITTI", done, len(truths))
+        work = partial(_score_file, source=source, protocol=protocol)
+        outcomes = map_with_progress(work, truths, workers, progress, "scoring KITTI", len(truths))
         problems = [outcome.problem for outcome in outcomes if outcome.problem]
         if problems:
             raise SubmissionError.from_problems(predictions, problems)

@@ -15,15 +15,16 @@ from pathlib import Path
 from statistics import median
 
 from rebar_depth_bench.console import ProgressBars, add_workers
-from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.errors import InputError, printable, problem_summary
+from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.ground_truth import verified_views
 from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
 from rebar_depth_bench.scoring.result import mean, tabulate
 from rebar_depth_bench.studies.common import add_output_arguments, write_outputs
 from rebar_depth_bench.studies.depth_source import DepthSource, open_depths
-from rebar_depth_bench.studies.pseudo_reference.capture import CAPTURE_LAYOUT, Capture, is_capture, open_capture
+from rebar_depth_bench.studies.pseudo_reference.capture import CAPTURE_LAYOUT, is_capture, open_capture
 from rebar_depth_bench.studies.pseudo_reference.output import to_page, to_pandas
 from rebar_depth_bench.studies.pseudo_reference.result import (
     AgreementRow,
@@ -36,7 +37,7 @@ from rebar_depth_bench.studies.pseudo_reference.study import (
     DepthRange,
     FrameOutcome,
     FrameView,
-    score_frame_views,
+    score_frame_view,
 )
 from rebar_depth_bench.submission import ExpectedViews
 
@@ -45,25 +46,24 @@ SUMMARY = "score methods on the full frame against two pseudo-references (the pa
 DEFAULT_NEAR_M, DEFAULT_FAR_M = 0.1, 20.0
 """Ends of the default evaluation range, metres."""
 
-Views = Iterator[FrameView]
-
 
 @dataclass(frozen=True)
 class _StudyData:
     """Opened dataset config or capture.
 
-    ``views`` are the views to score; ``archive_views`` are all views that an archive may contain. Either
-    ``folder`` and ``config`` or ``capture`` are set.
+    ``views`` are the views to score; ``archive_views`` are all views that an archive may contain. ``config``,
+    ``digest`` and ``version`` are those of a dataset folder, ``camera`` describes the camera of a capture.
     """
 
     name: str
     views: ExpectedViews
     archive_views: ExpectedViews
-    folder: DatasetFolder | None = None
     config: DatasetConfig | None = None
-    capture: Capture | None = None
+    digest: str | None = None
+    version: str | None = None
+    camera: str | None = None
 
-    def frames(self, exact: bool) -> Views:
+    def frames(self, exact: bool) -> Iterator[FrameView]:
         """Yield the views to score.
 
         If ``exact`` is true and the data are a dataset folder, the views have their exact depth, verified against
@@ -163,26 +163,22 @@ def run_pseudo_reference_study(
         names = list(sources)
         by_method = {name: sources[name] for name in names[: len(methods)]}
         by_reference = {name: sources[name] for name in names[len(methods) :]}
-        outcomes = score_frame_views(
+        outcomes = map_with_progress(
+            lambda view: score_frame_view(view, by_method, by_reference, depth_range),
             study_data.frames(exact),
-            len(study_data.views),
-            by_method,
-            by_reference,
-            depth_range,
             workers,
             progress,
+            "scoring the full frame",
+            len(study_data.views),
         )
         _raise_problems(outcomes, sources)
         stamps = [ArchiveIdentity(name, source.sha256()) for name, source in sources.items()]
     depth_references = _depth_references(outcomes, by_reference)
     _check_references_have_depth(depth_references, depth_range)
-    digest, version = (
-        (None, None) if study_data.folder is None else (study_data.folder.digest, study_data.folder.version)
-    )
     return PseudoReferenceResult(
-        provenance=Provenance(PROTOCOL, digest, version, stamps),
+        provenance=Provenance(PROTOCOL, study_data.digest, study_data.version, stamps),
         data=study_data.name,
-        camera=None if study_data.capture is None else study_data.capture.describe_camera(),
+        camera=study_data.camera,
         depth_range=depth_range,
         references=depth_references,
         rows=_method_rows(outcomes),
@@ -196,7 +192,8 @@ def _open_data(data: str, config: str | None) -> _StudyData:
             raise InputError(f"{data}: is a capture, expected no --config (found {config!r})")
         capture = open_capture(data)
         views = capture.expected_views()
-        return _StudyData(f"capture {capture.path.resolve().name}", views, views, capture=capture)
+        name = f"capture {capture.path.resolve().name}"
+        return _StudyData(name, views, views, camera=capture.describe_camera())
     folder = open_folder(data)
     if config is None and len(folder.configs) != 1:
         raise InputError(
@@ -204,7 +201,8 @@ def _open_data(data: str, config: str | None) -> _StudyData:
         )
     chosen = folder.config(config or folder.configs[0])
     views = dict.fromkeys(chosen.view_ids, chosen.grid)
-    return _StudyData(f"config {chosen.name}", views, folder.expected_views(), folder, chosen)
+    archive_views = folder.expected_views()
+    return _StudyData(f"config {chosen.name}", views, archive_views, chosen, folder.digest, folder.version)
 
 
 def _label_sources(sources: Sequence[DepthSource], views: ExpectedViews) -> dict[str, DepthSource]:

@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.html.study_page import PageTable, StudyPage
+from rebar_depth_bench.reporting.html.study_page import Columns, PageTable, StudyPage, page_table
 from rebar_depth_bench.reporting.published import PublishedNumbers, load_published
 from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.studies.pseudo_reference.result import (
     ALIGNMENTS,
     AgreementRow,
+    Alignment,
     DepthReference,
     MethodRow,
     PseudoReferenceResult,
@@ -20,23 +21,6 @@ from rebar_depth_bench.studies.pseudo_reference.result import (
 
 if TYPE_CHECKING:
     from pandas import DataFrame
-
-_SCORE_HEADS = (
-    ("method", ""),
-    ("covers", "% of its pixels"),
-    ("scored", "% of frame"),
-    ("AbsRel ↓", ""),
-    ("its interval", "95 %"),
-    ("RMSE ↓", "cm"),
-    ("MAE ↓", "cm"),
-    ("δ1 ↑", ""),
-    ("AbsRel_s ↓", "scaled"),
-    ("RMSE_s ↓", "cm, scaled"),
-    ("s", ""),
-    ("ratio", "of AbsRel"),
-    ("ratio_s", "of AbsRel_s"),
-    ("ranked", ""),
-)
 
 
 def to_page(result: PseudoReferenceResult) -> StudyPage:
@@ -100,86 +84,69 @@ def _ranking_change(result: PseudoReferenceResult, reference: str) -> str:
 
 
 def _score_table(result: PseudoReferenceResult, reference: DepthReference) -> PageTable:
-    rows = [row for row in result.rows if row.reference == reference.name]
+    def ratio(row: MethodRow, alignment: Alignment) -> str:
+        return formatting.number(result.ratio(row.method, row.reference, alignment), 2)
+
     kind = "exact depth" if reference.exact else "pseudo-reference"
     share = f"depth on {reference.frame_share * 100:.1f} % of the frame"
+    columns: Columns[MethodRow] = (
+        ("method", "", lambda row: printable(row.method)),
+        ("covers", "% of its pixels", lambda row: formatting.coverage_percent(row.table.coverage)),
+        ("scored", "% of frame", lambda row: formatting.percent(row.frame_share)),
+        ("AbsRel ↓", "", lambda row: formatting.metric_cell(row.table.native, "abs_rel")),
+        ("its interval", "95 %", lambda row: formatting.interval_text(row.table.intervals["native.abs_rel"], 4)),
+        ("RMSE ↓", "cm", lambda row: formatting.metric_cell(row.table.native, "rmse_cm")),
+        ("MAE ↓", "cm", lambda row: formatting.metric_cell(row.table.native, "mae_cm")),
+        ("δ1 ↑", "", lambda row: formatting.metric_cell(row.table.native, "delta1")),
+        ("AbsRel_s ↓", "scaled", lambda row: formatting.metric_cell(row.table.scaled, "abs_rel")),
+        ("RMSE_s ↓", "cm, scaled", lambda row: formatting.metric_cell(row.table.scaled, "rmse_cm")),
+        ("s", "", lambda row: formatting.scale_cell(row.table.scale_median)),
+        ("ratio", "of AbsRel", lambda row: ratio(row, "native")),
+        ("ratio_s", "of AbsRel_s", lambda row: ratio(row, "scaled")),
+        ("ranked", "", lambda row: "yes" if row.table.ranked else "no"),
+    )
     caption = f"Against {printable(reference.name)} ({kind}; {share})"
-    return PageTable(caption, _SCORE_HEADS, [_score_cells(result, row) for row in rows])
-
-
-def _score_cells(result: PseudoReferenceResult, row: MethodRow) -> list[str]:
-    table = row.table
-    native, scaled = formatting.metric_cells(table.native), formatting.metric_cells(table.scaled)
-    return [
-        printable(row.method),
-        formatting.coverage_percent(table.coverage),
-        formatting.percent(row.frame_share),
-        native[0],
-        formatting.interval_text(table.intervals.get("native.abs_rel"), 4),
-        *native[1:],
-        scaled[0],
-        scaled[1],
-        formatting.scale_cell(table.scale_median),
-        *(formatting.number(result.ratio(row.method, row.reference, alignment), 2) for alignment in ALIGNMENTS),
-        "yes" if table.ranked else "no",
-    ]
+    return page_table(caption, columns, [row for row in result.rows if row.reference == reference.name])
 
 
 def _ranking_table(result: PseudoReferenceResult) -> PageTable:
-    def cells(reference: str) -> list[str]:
-        orders = [
-            printable(" < ".join(result.ranking(reference, alignment)), 500) or formatting.DASH
-            for alignment in ALIGNMENTS
-        ]
-        taus = [formatting.number(result.tau(reference, alignment), 2) for alignment in ALIGNMENTS]
-        return [printable(reference), orders[0], taus[0], orders[1], taus[1]]
+    def order(reference: str, alignment: Alignment) -> str:
+        return printable(" < ".join(result.ranking(reference, alignment)), 500) or formatting.DASH
 
-    heads = (
-        ("reference", ""),
-        ("by AbsRel", "best first"),
-        ("tau", ""),
-        ("by AbsRel_s", "best first"),
-        ("tau", ""),
+    def tau(reference: str, alignment: Alignment) -> str:
+        return formatting.number(result.tau(reference, alignment), 2)
+
+    columns: Columns[str] = (
+        ("reference", "", printable),
+        ("by AbsRel", "best first", lambda reference: order(reference, "native")),
+        ("tau", "", lambda reference: tau(reference, "native")),
+        ("by AbsRel_s", "best first", lambda reference: order(reference, "scaled")),
+        ("tau", "", lambda reference: tau(reference, "scaled")),
     )
     caption = f"Ranking, with Kendall's tau relative to the ranking under {printable(result.references[0].name)}"
-    return PageTable(caption, heads, [cells(reference.name) for reference in result.references])
+    return page_table(caption, columns, [reference.name for reference in result.references])
 
 
 def _reference_table(result: PseudoReferenceResult) -> PageTable:
-    heads = (("reference", ""), ("coverage", "% of frame"), ("views", "with depth / all"))
-    rows = [
-        [
-            printable(reference.name),
-            formatting.percent(reference.frame_share),
-            f"{reference.views_with}/{reference.views}",
-        ]
-        for reference in result.references
-    ]
-    return PageTable("Coverage of the references: depth in range, mean over all views", heads, rows)
+    columns: Columns[DepthReference] = (
+        ("reference", "", lambda row: printable(row.name)),
+        ("coverage", "% of frame", lambda row: formatting.percent(row.frame_share)),
+        ("views", "with depth / all", lambda row: f"{row.views_with}/{row.views}"),
+    )
+    return page_table(
+        "Coverage of the references: depth in range, mean over all views", columns, result.references
+    )
 
 
 def _agreement_table(result: PseudoReferenceResult) -> PageTable:
-    def cells(row: AgreementRow) -> list[str]:
-        return [
-            f"{printable(row.reference)} against {printable(row.against)}",
-            formatting.percent(row.common_share),
-            formatting.number(row.abs_rel, 4),
-            formatting.number(row.median_ratio, 4),
-            str(row.views),
-        ]
-
-    heads = (
-        ("a against b", ""),
-        ("common", "% of frame"),
-        ("AbsRel", "|a-b|/b"),
-        ("ratio", "median a/b"),
-        ("views", ""),
+    columns: Columns[AgreementRow] = (
+        ("a against b", "", lambda row: f"{printable(row.reference)} against {printable(row.against)}"),
+        ("common", "% of frame", lambda row: formatting.percent(row.common_share)),
+        ("AbsRel", "|a-b|/b", lambda row: formatting.number(row.abs_rel, 4)),
+        ("ratio", "median a/b", lambda row: formatting.number(row.median_ratio, 4)),
+        ("views", "", lambda row: str(row.views)),
     )
-    return PageTable(
-        "Differences between the references where both have depth",
-        heads,
-        [cells(row) for row in result.agreements],
-    )
+    return page_table("Differences between the references where both have depth", columns, result.agreements)
 
 
 def _published_tables(published: PublishedNumbers) -> list[PageTable]:

@@ -9,7 +9,7 @@ finite and positive in the evaluation range". The metrics of a view are those of
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import permutations
 
@@ -18,8 +18,6 @@ from jaxtyping import Bool, Float, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.errors import InputError, Problem
-from rebar_depth_bench.parallel import ordered_map
-from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.ground_truth import ViewTruth
 from rebar_depth_bench.scoring.result import ViewScore
 from rebar_depth_bench.scoring.score import score_view
@@ -54,7 +52,6 @@ class FrameScore:
     reference's pixels with a valid prediction.
     """
 
-    view_id: str
     frame_px: int
     reference_px: int
     score: ViewScore | None
@@ -107,19 +104,11 @@ def reference_as_truth(view_id: str, reference_m: Float[ndarray, "h w"]) -> View
     return ViewTruth(view_id, index, z_m, float(np.median(z_m)))
 
 
-def score_frame(
-    view_id: str, shape: tuple[int, int], truth: ViewTruth | None, prediction_m: Float[ndarray, "h w"] | None
-) -> FrameScore:
-    """Score a masked prediction on the pixels of a reference.
-
-    ``shape`` is the (H, W) of the view. ``truth`` is None if the reference has no depth in the view,
-    ``prediction_m`` is None if there is no prediction for the view.
-    """
-    frame_px = shape[0] * shape[1]
+def score_frame(truth: ViewTruth | None, prediction_m: Float[ndarray, "h w"]) -> FrameScore:
+    """Score a masked prediction on a reference's pixels; ``truth`` is None if that has no depth in the view."""
     if truth is None:
-        return FrameScore(view_id, frame_px, 0, None)
-    predicted_m = empty_depth_map(shape) if prediction_m is None else prediction_m
-    return FrameScore(view_id, frame_px, len(truth.index), score_view(truth, predicted_m))
+        return FrameScore(prediction_m.size, 0, None)
+    return FrameScore(prediction_m.size, len(truth.index), score_view(truth, prediction_m))
 
 
 def compare_references(first_m: Float[ndarray, "h w"], other_m: Float[ndarray, "h w"]) -> Agreement:
@@ -133,11 +122,6 @@ def compare_references(first_m: Float[ndarray, "h w"], other_m: Float[ndarray, "
     with np.errstate(over="ignore", under="ignore"):
         ratio = a_m / b_m
         return Agreement(share, float(np.mean(np.abs(ratio - 1))), float(np.median(ratio)))
-
-
-def empty_depth_map(shape: tuple[int, int]) -> Float[ndarray, "h w"]:
-    """Return a map of shape (H, W) without depth (all NaN)."""
-    return np.full(shape, np.nan, dtype=np.float32)
 
 
 def restrict_to_pixels(masked_m: Float[ndarray, "h w"], pixels: Bool[ndarray, "h w"]) -> Float[ndarray, "h w"]:
@@ -179,26 +163,6 @@ def exact_label_within(reference: str) -> str:
     return f"{EXACT_LABEL} where {reference} has depth"
 
 
-def score_frame_views(
-    views: Iterable[FrameView],
-    total: int,
-    methods: Mapping[str, DepthSource],
-    references: Mapping[str, DepthSource],
-    depth_range: DepthRange,
-    workers: int | None = None,
-    progress: Progress = silent,
-) -> list[FrameOutcome]:
-    """Score ``total`` views on ``workers`` threads, with only a few views in memory at a time."""
-    outcomes = []
-    ordered_outcomes = ordered_map(
-        lambda view: score_frame_view(view, methods, references, depth_range), views, workers
-    )
-    for done, outcome in enumerate(ordered_outcomes, start=1):
-        outcomes.append(outcome)
-        progress("scoring the full frame", done, total)
-    return outcomes
-
-
 def score_frame_view(
     view: FrameView,
     methods: Mapping[str, DepthSource],
@@ -210,13 +174,7 @@ def score_frame_view(
     predictions = {
         name: _read_depth(name, source, view, depth_range, problems) for name, source in methods.items()
     }
-    reference_maps = {
-        name: _read_depth(name, source, view, depth_range, problems) for name, source in references.items()
-    }
-    pseudo = {
-        name: empty_depth_map(view.shape) if depth_m is None else depth_m
-        for name, depth_m in reference_maps.items()
-    }
+    pseudo = {name: _read_depth(name, source, view, depth_range, problems) for name, source in references.items()}
     if problems:
         return FrameOutcome(problems=tuple(problems))
     maps = {**pseudo, **_exact_maps(view, pseudo, depth_range)}
@@ -225,7 +183,7 @@ def score_frame_view(
         truth = reference_as_truth(view.view_id, reference_m)
         shares[name] = float(has_depth(reference_m).mean())
         for method, prediction_m in predictions.items():
-            scores[method, name] = score_frame(view.view_id, view.shape, truth, prediction_m)
+            scores[method, name] = score_frame(truth, prediction_m)
     compared = [*pseudo, *([EXACT_LABEL] if EXACT_LABEL in maps else [])]
     pairs = [(first, other) for first, other in permutations(compared, 2) if first != EXACT_LABEL]
     return FrameOutcome(scores, shares, {pair: compare_references(maps[pair[0]], maps[pair[1]]) for pair in pairs})
@@ -248,12 +206,11 @@ def _exact_maps(view: FrameView, pseudo: Mapping[str, DepthMap], depth_range: De
 
 def _read_depth(
     name: str, source: DepthSource, view: FrameView, depth_range: DepthRange, problems: list[tuple[str, Problem]]
-) -> DepthMap | None:
-    """Return the masked map of a view from a source, None if it is missing or invalid (then add a problem)."""
-    if view.view_id not in source.view_ids:
-        return None
-    try:
-        return mask_invalid_depth(source.read(view.view_id), depth_range)
-    except EntryError as error:
-        problems.append((name, error.problem))
-        return None
+) -> DepthMap:
+    """Return the masked map of a view, without any depth if it is missing or invalid (then add a problem)."""
+    if view.view_id in source.view_ids:
+        try:
+            return mask_invalid_depth(source.read(view.view_id), depth_range)
+        except EntryError as error:
+            problems.append((name, error.problem))
+    return np.full(view.shape, np.nan, dtype=np.float32)

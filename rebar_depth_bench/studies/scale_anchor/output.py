@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,7 @@ from rebar_depth_bench.reporting.charts.lines import (
     linear_axis,
     log_axis,
 )
-from rebar_depth_bench.reporting.html.study_page import PageFigure, PageTable, StudyPage
+from rebar_depth_bench.reporting.html.study_page import Columns, PageFigure, PageTable, StudyPage, page_table
 from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE
 from rebar_depth_bench.studies.scale_anchor.study import AnchorRow, AnchorStudy, Spread
@@ -108,16 +109,12 @@ def _lead(study: AnchorStudy) -> str:
 
 
 def _change_figure(study: AnchorStudy) -> PageFigure:
-    changes = [(row.k, row.abs_rel_change) for row in study.rows]
     svg = _spread_chart(
         study,
-        changes,
-        ChartText(
-            "Change of AbsRel over the number of known-depth views",
-            "; ".join(f"k = {k}: {_format_signed(change.mean, 6)}" for k, change in changes),
-            "known-depth views k",
-            "change of mean AbsRel",
-        ),
+        [(row.k, row.abs_rel_change) for row in study.rows],
+        "Change of AbsRel over the number of known-depth views",
+        "change of mean AbsRel",
+        lambda change: _format_signed(change, 6),
     )
     caption = (
         "relative to the given scale (dashed line). Below it the anchored archive is better. Line: mean of "
@@ -127,26 +124,27 @@ def _change_figure(study: AnchorStudy) -> PageFigure:
 
 
 def _scale_figure(study: AnchorStudy) -> PageFigure:
-    deviations = [(row.k, row.deviation_percent) for row in study.rows]
     svg = _spread_chart(
         study,
-        deviations,
-        ChartText(
-            "Deviation of the scale over the number of known-depth views",
-            "; ".join(f"k = {k}: {_format_signed(deviation.mean, 3)} %" for k, deviation in deviations),
-            "known-depth views k",
-            "scale against the given one, %",
-        ),
+        [(row.k, row.deviation_percent) for row in study.rows],
+        "Deviation of the scale over the number of known-depth views",
+        "scale against the given one, %",
+        lambda deviation: f"{_format_signed(deviation, 3)} %",
     )
-    return PageFigure(
-        svg,
-        "Deviation of the scale",
-        "from the given one (dashed line). Line: mean of the draws; band: their range.",
-    )
+    caption = "from the given one (dashed line). Line: mean of the draws; band: their range."
+    return PageFigure(svg, "Deviation of the scale", caption)
 
 
-def _spread_chart(study: AnchorStudy, spreads: list[tuple[int, Spread]], labels: ChartText) -> Markup:
+def _spread_chart(
+    study: AnchorStudy,
+    spreads: list[tuple[int, Spread]],
+    title: str,
+    y_title: str,
+    format_mean: Callable[[float], str],
+) -> Markup:
     """Return the chart of the mean and range of draws over k, with a line at 0."""
+    description = "; ".join(f"k = {k}: {format_mean(spread.mean)}" for k, spread in spreads)
+    labels = ChartText(title, description, "known-depth views k", y_title)
     ks = [float(k) for k, _ in spreads]
     ends = [end for _, spread in spreads for end in (spread.low, spread.high)]
     band = Series(
@@ -160,36 +158,21 @@ def _spread_chart(study: AnchorStudy, spreads: list[tuple[int, Spread]], labels:
 
 
 def _table(study: AnchorStudy) -> PageTable:
-    return PageTable(
-        caption=(
-            "The archive multiplied by one scale from k known-depth views, relative to the archive multiplied by "
-            f"{study.given.scale:g}: mean ± standard deviation over {len(study.draws[0])} draws, and the range."
-        ),
-        heads=(
-            ("k", "views"),
-            ("Scale", "mean ± sd"),
-            ("Deviation", "%"),
-            ("Deviation", "% range"),
-            ("AbsRel change", "mean ± sd"),
-            ("AbsRel change", "range"),
-            ("RMSE change", "cm, mean ± sd"),
-            ("RMSE change", "cm, range"),
-        ),
-        rows=[_row_cells(row) for row in study.rows],
+    caption = (
+        "The archive multiplied by one scale from k known-depth views, relative to the archive multiplied by "
+        f"{study.given.scale:g}: mean ± standard deviation over {len(study.draws[0])} draws, and the range."
     )
-
-
-def _row_cells(row: AnchorRow) -> list[str]:
-    return [
-        str(row.k),
-        f"{formatting.number(row.scale.mean, 5)} ± {formatting.number(row.scale.sd, 5)}",
-        f"{_format_signed(row.deviation_percent.mean, 3)} ± {formatting.number(row.deviation_percent.sd, 3)}",
-        _format_range(row.deviation_percent, 3),
-        f"{_format_signed(row.abs_rel_change.mean, 6)} ± {formatting.number(row.abs_rel_change.sd, 6)}",
-        _format_range(row.abs_rel_change, 6),
-        f"{_format_signed(row.rmse_cm_change.mean, 4)} ± {formatting.number(row.rmse_cm_change.sd, 4)}",
-        _format_range(row.rmse_cm_change, 4),
-    ]
+    columns: Columns[AnchorRow] = (
+        ("k", "views", lambda row: str(row.k)),
+        ("Scale", "mean ± sd", lambda row: f"{formatting.number(row.scale.mean, 5)} ± {_format_sd(row.scale, 5)}"),
+        ("Deviation", "%", lambda row: _format_change(row.deviation_percent, 3)),
+        ("Deviation", "% range", lambda row: _format_range(row.deviation_percent, 3)),
+        ("AbsRel change", "mean ± sd", lambda row: _format_change(row.abs_rel_change, 6)),
+        ("AbsRel change", "range", lambda row: _format_range(row.abs_rel_change, 6)),
+        ("RMSE change", "cm, mean ± sd", lambda row: _format_change(row.rmse_cm_change, 4)),
+        ("RMSE change", "cm, range", lambda row: _format_range(row.rmse_cm_change, 4)),
+    )
+    return page_table(caption, columns, study.rows)
 
 
 def _notes(study: AnchorStudy) -> list[str]:
@@ -219,6 +202,14 @@ def _notes(study: AnchorStudy) -> list[str]:
             f"{study.views - len(study.views_without_prediction)} views to draw from."
         )
     return notes
+
+
+def _format_sd(spread: Spread, decimals: int) -> str:
+    return formatting.number(spread.sd, decimals)
+
+
+def _format_change(spread: Spread, decimals: int) -> str:
+    return f"{_format_signed(spread.mean, decimals)} ± {_format_sd(spread, decimals)}"
 
 
 def _format_range(spread: Spread, decimals: int) -> str:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
-from rebar_depth_bench.extended.inspection.evaluate import MEASURES, inspection_samples
-from rebar_depth_bench.extended.inspection.measures import MISS_MM
+from rebar_depth_bench.extended.inspection.evaluate import inspection_samples
+from rebar_depth_bench.extended.inspection.measures import INSPECTION_MEASURES, MISS_MM
 from rebar_depth_bench.extended.inspection.segments import cage_truth
 from rebar_depth_bench.extended.inspection.tolerances import PROFILES, pass_sample
 from rebar_depth_bench.extended.measures import STATISTICS, Samples
@@ -235,11 +235,13 @@ def test_samples_are_deterministic_and_input_is_unchanged() -> None:
 
 def test_measures_have_samples_and_unique_names() -> None:
     samples = samples_of(EXACT_M)
-    assert {measure.sample for measure in MEASURES} <= set(samples)
-    assert len({measure.name for measure in MEASURES}) == len(MEASURES)
-    assert all(np.isfinite(STATISTICS[measure.statistic](samples[measure.sample])) for measure in MEASURES)
+    assert {measure.sample for measure in INSPECTION_MEASURES} <= set(samples)
+    assert len({measure.name for measure in INSPECTION_MEASURES}) == len(INSPECTION_MEASURES)
+    assert all(
+        np.isfinite(STATISTICS[measure.statistic](samples[measure.sample])) for measure in INSPECTION_MEASURES
+    )
     # A measure that omits missed bars has no better direction.
-    assert all(measure.better == "" for measure in MEASURES if measure.sample in DETECTED_BARS_ONLY)
+    assert all(measure.better == "" for measure in INSPECTION_MEASURES if measure.sample in DETECTED_BARS_ONLY)
 
 
 def test_rendered_truth_is_perfect_up_to_ribs(tiny_root: Path) -> None:

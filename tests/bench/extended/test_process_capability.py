@@ -21,7 +21,7 @@ from rebar_depth_bench.extended.inspection.measures import (
     capability_name,
     defined_capability,
 )
-from rebar_depth_bench.extended.inspection.tolerances import CAPABILITY_INPUTS, GB_50204
+from rebar_depth_bench.extended.inspection.tolerances import GB_50204, TOLERANCES
 from rebar_depth_bench.extended.measures import Measure
 from rebar_depth_bench.extended.result import (
     ExtendedResult,
@@ -67,14 +67,15 @@ def measure_of(tolerance_index: int = 0) -> Measure:
 
 
 def test_each_tolerance_has_one_capability_per_alignment() -> None:
-    names = [capability_name(tolerance) for tolerance, _ in CAPABILITY_INPUTS]
+    names = [capability_name(tolerance) for _, tolerance in TOLERANCES]
     assert [measure.name for measure in CAPABILITY_MEASURES] == names
     listed = measures_by_alignment()
     for alignment in (NATIVE, SCALED):
         assert set(names) < {measure.name for measure in listed[alignment]}
     assert not set(names) & {measure.name for measure in listed[ONCE]}
-    for measure, (tolerance, p95) in zip(CAPABILITY_MEASURES, CAPABILITY_INPUTS, strict=True):
-        assert (measure.sample, measure.statistic) == (BY_NAME[p95].sample, BY_NAME[p95].statistic)
+    for measure, (_, tolerance) in zip(CAPABILITY_MEASURES, TOLERANCES, strict=True):
+        p95 = BY_NAME[f"{tolerance.kind}_p95_mm"]
+        assert (measure.sample, measure.statistic) == (p95.sample, p95.statistic)
         assert f"{tolerance.limit_mm:g} mm / p95" in measure.title
         assert measure.better == "higher"
 

@@ -6,10 +6,10 @@ import math
 
 import pytest
 
-from rebar_depth_bench.extended.inspection.evaluate import MEASURES
+from rebar_depth_bench.extended.inspection.measures import INSPECTION_MEASURES
 from rebar_depth_bench.extended.inspection.tolerances import (
-    CAPABILITY_INPUTS,
     PROFILES,
+    TOLERANCES,
     pass_sample,
     process_capability,
 )
@@ -31,17 +31,18 @@ def test_invalid_tolerance_or_error_raises_value_error(values: tuple[float, floa
 
 
 def test_tolerances_use_p95_measures_that_count_misses() -> None:
-    measures = {measure.name: measure for measure in MEASURES}
+    measures = {measure.name: measure for measure in INSPECTION_MEASURES}
     tolerances = [tolerance for profile in PROFILES for tolerance in profile.tolerances]
-    assert [tolerance for tolerance, _ in CAPABILITY_INPUTS] == tolerances
-    for tolerance, name in CAPABILITY_INPUTS:
+    assert [tolerance for _, tolerance in TOLERANCES] == tolerances
+    for tolerance in tolerances:
+        name = f"{tolerance.kind}_p95_mm"
         assert measures[name].statistic == "p95"
         assert measures[name].sample == f"{tolerance.kind}_judged_mm"
         assert f"{tolerance.limit_mm:g} mm" in measures[pass_sample(tolerance)].title
 
 
 def test_keys_are_unique_and_sources_are_declared() -> None:
-    keys = [tolerance.key for tolerance, _ in CAPABILITY_INPUTS]
+    keys = [tolerance.key for _, tolerance in TOLERANCES]
     assert len(set(keys)) == len(keys)
     assert all("secondary source" in profile.source for profile in PROFILES)
     assert not any("ACI" in profile.source for profile in PROFILES)

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from types import ModuleType
 
-from rebar_depth_bench.console import run_command
-from rebar_depth_bench.studies.registry import add_study_commands
+from rebar_depth_bench.console import add_commands, run_command
+from rebar_depth_bench.studies.registry import STUDIES
 
 
 def run_study(module: ModuleType, *arguments: str | Path) -> int:
@@ -21,6 +21,6 @@ def run_study(module: ModuleType, *arguments: str | Path) -> int:
 def run_study_command(*arguments: str | Path) -> int:
     """Run ``rebar-bench study`` without the other commands and return the exit status."""
     parser = argparse.ArgumentParser()
-    add_study_commands(parser)
+    add_commands(parser, STUDIES, "NAME")
     options = parser.parse_args([str(argument) for argument in arguments])
     return run_command(lambda: options.run(options))

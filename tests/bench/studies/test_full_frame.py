@@ -29,11 +29,9 @@ MAPS = arrays.arrays(
 )
 
 
-def score_maps(reference: np.ndarray, prediction: np.ndarray | None) -> FrameScore:
+def score_maps(reference: np.ndarray, prediction: np.ndarray) -> FrameScore:
     truth = reference_as_truth("v/0", mask_invalid_depth(reference, ALLOWED))
-    return score_frame(
-        "v/0", SHAPE, truth, None if prediction is None else mask_invalid_depth(prediction, ALLOWED)
-    )
+    return score_frame(truth, mask_invalid_depth(prediction, ALLOWED))
 
 
 def test_depth_range_includes_its_ends() -> None:
@@ -70,7 +68,7 @@ def test_score_of_known_view() -> None:
 
 
 def test_missing_prediction_has_zero_coverage() -> None:
-    frame = score_maps(np.ones(SHAPE), None)
+    frame = score_maps(np.ones(SHAPE), np.full(SHAPE, np.nan))
     assert frame.score is not None
     assert (frame.score.native, frame.score.coverage, frame.frame_share) == (None, 0, 0)
 
