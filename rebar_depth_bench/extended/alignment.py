@@ -16,7 +16,7 @@ from rebar_depth_bench.extended.measures import Measure, Samples, finite_sample
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.scoring.metrics import (
     METRIC_NAMES,
-    METRIC_TITLES,
+    METRICS,
     depth_metrics,
     is_valid_prediction,
     median,
@@ -103,7 +103,7 @@ _SAMPLE_NAMES = (
 
 def _aligned_measures(prefix: str, title: str, alignment: str) -> list[Measure]:
     """Return the measures of the metrics after one alignment."""
-    names = [(f"{prefix}_{key}", head, unit) for key, (head, unit) in METRIC_TITLES.items()]
+    names = [(f"{prefix}_{name}", info.title, info.unit) for name, info in METRICS.items()]
     return [
         Measure(name, name, "mean", f"{head}, {title}", unit, "", f"{head} after {alignment}, an oracle per view")
         for name, head, unit in names

@@ -19,7 +19,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.scoring.metrics import METRIC_NAMES, METRIC_TITLES, is_valid_prediction, metrics_at_scales
+from rebar_depth_bench.scoring.metrics import METRIC_NAMES, METRICS, is_valid_prediction, metrics_at_scales
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 
 
@@ -72,9 +72,11 @@ _REGIONS = {
 
 def _error_measure(region: str, metric: str) -> Measure:
     """Return the measure of one error metric on one region."""
-    (short, pixels), (title, unit) = _REGIONS[region], METRIC_TITLES[metric]
+    (short, pixels), info = _REGIONS[region], METRICS[metric]
     definition = f"{metric} as rebar-1 defines it, over the predicted {pixels}; to set beside the other region's"
-    return Measure(f"{region}_{metric}", f"{region}_{metric}", "mean", f"{title}, {short}", unit, "", definition)
+    return Measure(
+        f"{region}_{metric}", f"{region}_{metric}", "mean", f"{info.title}, {short}", info.unit, "", definition
+    )
 
 
 def _share_measure(region: str, metric: str) -> Measure:
@@ -91,7 +93,7 @@ def _share_measure(region: str, metric: str) -> Measure:
 
 MEASURES: tuple[Measure, ...] = (
     *(
-        _error_measure(region, number) if number in METRIC_TITLES else _share_measure(region, number)
+        _error_measure(region, number) if number in METRICS else _share_measure(region, number)
         for number in _NUMBER_NAMES
         for region in _REGIONS
     ),

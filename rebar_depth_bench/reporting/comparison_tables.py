@@ -22,6 +22,7 @@ from rebar_depth_bench.reporting.tables import frame_csv
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_VIEWS
 from rebar_depth_bench.scoring.comparison import Comparison, Difference
 from rebar_depth_bench.scoring.frames import differences_frame
+from rebar_depth_bench.scoring.metrics import METRICS
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.result import SCALE_MEDIAN, Result, Table
 from rebar_depth_bench.version import software_version
@@ -31,11 +32,9 @@ def _titles() -> dict[str, tuple[str, int, float]]:
     """Return title, number of decimals and display factor by name of the number."""
     titles = {"coverage": ("coverage, % ↑", 1, 100.0)}
     for alignment in ("native", "scaled"):
-        for (key, decimals), (name, unit, better) in zip(
-            formatting.METRIC_DECIMALS.items(), formatting.METRIC_HEADS, strict=True
-        ):
-            title = f"{alignment} {name}{f', {unit}' if unit else ''} {better}"
-            titles[f"{alignment}.{key}"] = (title, decimals, 1.0)
+        for (name, info), (title, unit, better) in zip(METRICS.items(), formatting.METRIC_HEADS, strict=True):
+            head = f"{alignment} {title}{f', {unit}' if unit else ''} {better}"
+            titles[f"{alignment}.{name}"] = (head, info.decimals, 1.0)
     titles[SCALE_MEDIAN] = ("scale s, median", 3, 1.0)
     return titles | {f"within_mm.{t}": (f"within {t} mm, % ↑", 1, 100.0) for t in WITHIN_MM}
 

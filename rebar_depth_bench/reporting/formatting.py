@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from decimal import ROUND_DOWN, Decimal
 
-from rebar_depth_bench.scoring.metrics import METRIC_TITLES, DepthMetrics
+from rebar_depth_bench.scoring.metrics import METRICS, DepthMetrics
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, WITHIN_MM
 from rebar_depth_bench.scoring.result import Table
 
@@ -23,10 +23,7 @@ INTERVAL_NOTE = (
     "Small figures: 95 % interval, block bootstrap over views (other views of the same scene, not other scenes)."
 )
 
-METRIC_DECIMALS: Mapping[str, int] = {"abs_rel": 4, "rmse_cm": 2, "mae_cm": 2, "delta1": 3}
-"""Number of decimals of each field of ``DepthMetrics``."""
-
-METRIC_HEADS = tuple((*titles, "↑" if name == "delta1" else "↓") for name, titles in METRIC_TITLES.items())
+METRIC_HEADS = tuple((info.title, info.unit, "↑" if info.higher_is_better else "↓") for info in METRICS.values())
 """Name, unit and better direction of each number that ``metric_cells`` formats."""
 
 
@@ -59,12 +56,12 @@ def coverage_percent(share: float | None) -> str:
 
 def metric_cell(metrics: DepthMetrics | None, name: str) -> str:
     """Return one field of ``metrics`` as text; a dash if ``metrics`` is None."""
-    return number(getattr(metrics, name, None), METRIC_DECIMALS[name])
+    return number(getattr(metrics, name, None), METRICS[name].decimals)
 
 
 def metric_cells(metrics: DepthMetrics | None) -> list[str]:
     """Return AbsRel, RMSE (cm), MAE (cm) and delta1 as text; dashes if ``metrics`` is None."""
-    return [metric_cell(metrics, name) for name in METRIC_DECIMALS]
+    return [metric_cell(metrics, name) for name in METRICS]
 
 
 def paper_cells(table: Table) -> list[str]:
@@ -108,9 +105,7 @@ def metric_interval_cells(intervals: Mapping[str, tuple[float, float] | None], a
 
     ``alignment`` is ``native`` or ``scaled``.
     """
-    return [
-        interval_cell(intervals.get(f"{alignment}.{name}"), decimals) for name, decimals in METRIC_DECIMALS.items()
-    ]
+    return [interval_cell(intervals.get(f"{alignment}.{name}"), info.decimals) for name, info in METRICS.items()]
 
 
 def short_digest(digest: str, digits: int = 12) -> str:

@@ -14,7 +14,8 @@ import numpy as np
 
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.bootstrap import Interval, interval, resample
-from rebar_depth_bench.scoring.frames import differences_frame
+from rebar_depth_bench.scoring.frames import ALIGNMENTS, differences_frame
+from rebar_depth_bench.scoring.metrics import METRICS
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
 from rebar_depth_bench.scoring.result import (
@@ -36,7 +37,15 @@ Verdict = Literal["better", "worse", "equal", "undecided", "not ranked", ""]
 _ALL_VIEWS_PREFIXES = ("coverage", "within_mm.")
 """Name prefixes of the metrics that every view has, also a view without predictions."""
 
-_HIGHER_IS_BETTER_PREFIXES = ("coverage", "native.delta1", "scaled.delta1", "within_mm.")
+_HIGHER_IS_BETTER_PREFIXES = (
+    *_ALL_VIEWS_PREFIXES,
+    *(
+        f"{alignment}.{name}"
+        for alignment in ALIGNMENTS
+        for name, info in METRICS.items()
+        if info.higher_is_better
+    ),
+)
 """Name prefixes of the metrics whose larger value is better."""
 
 

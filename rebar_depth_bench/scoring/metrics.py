@@ -36,16 +36,25 @@ class DepthMetrics:
     delta1: float
 
 
-METRIC_TITLES: Mapping[str, tuple[str, str]] = {
-    "abs_rel": ("AbsRel", ""),
-    "rmse_cm": ("RMSE", "cm"),
-    "mae_cm": ("MAE", "cm"),
-    "delta1": ("δ1", ""),
-}
-"""Title and unit of each field of ``DepthMetrics``."""
+@dataclass(frozen=True)
+class MetricInfo:
+    """Presentation of a metric: title, unit, number of decimals, and whether a larger value is better."""
 
-METRIC_NAMES = tuple(METRIC_TITLES)
-"""Names of the fields of ``DepthMetrics``, in order."""
+    title: str
+    unit: str
+    decimals: int
+    higher_is_better: bool = False
+
+
+METRICS: Mapping[str, MetricInfo] = {
+    "abs_rel": MetricInfo("AbsRel", "", 4),
+    "rmse_cm": MetricInfo("RMSE", "cm", 2),
+    "mae_cm": MetricInfo("MAE", "cm", 2),
+    "delta1": MetricInfo("δ1", "", 3, higher_is_better=True),
+}
+"""Presentation of each field of ``DepthMetrics``, in order, in all tables and pages."""
+
+METRIC_NAMES = tuple(METRICS)
 
 
 def depth_metrics(p_m: Float[ndarray, " n"], z_m: Float[ndarray, " n"], scale: float = 1.0) -> DepthMetrics:

@@ -21,6 +21,7 @@ from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_cha
 from rebar_depth_bench.reporting.html.published import PaperRow, finite_interval, published_row, scatter_points
 from rebar_depth_bench.reporting.html.rows import ScoreRow, table_row
 from rebar_depth_bench.reporting.published import PublishedNumbers, load_published, paper_scene
+from rebar_depth_bench.scoring.metrics import METRICS
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Table
 from rebar_depth_bench.scoring.result_io import read_table
@@ -50,7 +51,8 @@ def _within(index: int) -> Callable[[ScoreRow], Value]:
 
 
 NATIVE = tuple(
-    Column(name, name == "delta1", _native(k)) for k, name in enumerate(("abs_rel", "rmse", "mae", "delta1"))
+    Column(name.removesuffix("_cm"), info.higher_is_better, _native(k))
+    for k, (name, info) in enumerate(METRICS.items())
 )
 SCALED = tuple(
     Column(f"scaled_{column.name}", column.largest_first, _scaled(k)) for k, column in enumerate(NATIVE)

@@ -75,7 +75,7 @@ def table_row(name: str, table: Table) -> ScoreRow:
 
 def view_row(view: ViewScore) -> ScoreRow:
     """Return the row of a view; its ``views`` cell holds the number of scored pixels."""
-    no_intervals = [""] * len(formatting.METRIC_HEADS)
+    no_intervals = [""] * len(METRIC_NAMES)
     return ScoreRow(
         name=printable(view.view_id),
         views=Cell(f"{view.scored_px:,}".replace(",", "\N{NARROW NO-BREAK SPACE}"), view.scored_px),
@@ -86,7 +86,7 @@ def view_row(view: ViewScore) -> ScoreRow:
         scaled=_metric_cells(view.scaled, no_intervals),
         scale=_cell(formatting.scale_cell(view.scale), view.scale),
         within=_cells(
-            formatting.within_cells(view.within_mm), [view.within_mm[t] for t in WITHIN_MM], no_intervals
+            formatting.within_cells(view.within_mm), [view.within_mm[t] for t in WITHIN_MM], [""] * len(WITHIN_MM)
         ),
     )
 
