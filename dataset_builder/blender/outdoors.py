@@ -12,7 +12,14 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
-from dataset_builder.scene.shapes.solids import box, merge_meshes, rotated_box, rotation_about_z, transformed
+from dataset_builder.scene.shapes.solids import (
+    box,
+    merge_meshes,
+    ring_faces,
+    rotated_box,
+    rotation_about_z,
+    transformed,
+)
 
 CLEAR_M = 19.0
 _CORRUGATION_PITCH_M = 0.28
@@ -186,14 +193,11 @@ def _mound(rings: int, columns: int, radius_m: float, height_m: float, random: n
     height[0] = -0.3
     sides = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1).reshape(-1, 3)
     vertices = np.concatenate([sides, [[0.0, 0.0, height_m], [0.0, 0.0, -0.3]]])
-    ring, column = (grid.ravel() for grid in np.meshgrid(np.arange(rings - 1), np.arange(columns), indexing="ij"))
-    here, beside = ring * columns + column, ring * columns + (column + 1) % columns
     rim = np.arange(columns)
     following, top, last = (rim + 1) % columns, rings * columns, (rings - 1) * columns
     faces = np.concatenate(
         [
-            np.stack([here, beside, beside + columns], 1),
-            np.stack([here, beside + columns, here + columns], 1),
+            ring_faces(rings, columns),
             np.stack([last + rim, last + following, np.full(columns, top)], 1),
             np.stack([following, rim, np.full(columns, top + 1)], 1),
         ]
@@ -224,11 +228,5 @@ def _ring(
     outline: list[tuple[Float64[ndarray, " c"], Float64[ndarray, " c"]]], angle: Float64[ndarray, " c"]
 ) -> Mesh:
     """Return a closed ring about z from an outline of (radius, height), metres, given for each angle (radians)."""
-    rows, columns = len(outline), len(angle)
     vertices = np.concatenate([np.stack([r * np.cos(angle), r * np.sin(angle), h], axis=1) for r, h in outline])
-    row, column = (grid.ravel() for grid in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
-    here, up = row * columns + column, (row + 1) % rows * columns + column
-    beside = row * columns + (column + 1) % columns
-    beside_up = (row + 1) % rows * columns + (column + 1) % columns
-    faces = np.concatenate([np.stack([here, beside, beside_up], 1), np.stack([here, beside_up, up], 1)])
-    return Mesh(vertices, faces.astype(np.int32))
+    return Mesh(vertices, ring_faces(len(outline), len(angle), closed=True))
