@@ -50,6 +50,11 @@ class Part:
     material: str
 
 
+def surface(name: str, mesh: Mesh, material: str) -> Part:
+    """Return a part that is not steel."""
+    return Part(name, mesh, NOT_STEEL, material)
+
+
 @dataclass(frozen=True, eq=False)
 class Assembly:
     """Steel of a scene: its bars, and one part per bar."""

@@ -22,10 +22,10 @@ _BOX_FACES = [
 ]  # fmt: skip
 
 
-def box(low_m: Point, high_m: Point) -> Mesh:
-    """Return the axis-aligned box between two opposite corners."""
+def box(corner_m: Point, opposite_m: Point) -> Mesh:
+    """Return the axis-aligned box between two opposite corners, in any order."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
-    low, high = np.array(low_m), np.array(high_m)
+    low, high = np.minimum(corner_m, opposite_m), np.maximum(corner_m, opposite_m)
     return Mesh(low + corners * (high - low), np.array(_BOX_FACES, dtype=np.int32))
 
 
