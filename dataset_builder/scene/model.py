@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,6 +62,13 @@ class Assembly:
 
     bars: tuple[Bar, ...]
     parts: tuple[Part, ...]
+
+    @classmethod
+    def from_meshes(cls, bars_and_meshes: Iterable[tuple[Bar, Mesh]]) -> Assembly:
+        """Return the assembly of bars and their meshes (world frame); a part is named by its bar's role and id."""
+        pairs = tuple(bars_and_meshes)
+        parts = (Part(f"{bar.role}-{bar.bar_id:03d}", mesh, bar.bar_id, STEEL) for bar, mesh in pairs)
+        return cls(tuple(bar for bar, _ in pairs), tuple(parts))
 
     @property
     def vertices_m(self) -> Float64[ndarray, "v 3"]:
