@@ -41,11 +41,12 @@ _BOARD_PLANE_TOLERANCE_M = 0.001
 
 @dataclass(frozen=True, eq=False)
 class DetectedMarkers:
-    """Markers of one eye: the number that must be detected, and the corners of those that are.
+    """Markers of one eye: its camera, the number that must be detected, and the corners of those that are.
 
     ``detected_px`` and ``true_px`` are pixels, ``corners_m`` world metres.
     """
 
+    camera: Camera
     expected: int
     detected_px: Float64[ndarray, "n 4 2"]
     true_px: Float64[ndarray, "n 4 2"]
@@ -60,6 +61,7 @@ def detect_markers(eye: AuditedEye, board: BoardSpec) -> DetectedMarkers:
     detected = detected_corners_px(eye.rgb, board.dictionary) if visible_ids else {}
     found_ids = [marker for marker in visible_ids if marker in detected]
     return DetectedMarkers(
+        camera=eye.camera,
         expected=len(visible_ids),
         detected_px=np.array([detected[marker] for marker in found_ids]).reshape(-1, 4, 2),
         true_px=np.array([true_px[marker] for marker in found_ids]).reshape(-1, 4, 2),
@@ -154,22 +156,12 @@ _MIN_MARKERS = 2
 """Markers needed for a pose: one marker alone leaves the pose ambiguous with its mirror image."""
 
 
-@dataclass(frozen=True, eq=False)
-class ViewMarkers:
-    """Camera and markers of both eyes of a view; empty for a scene without a board."""
-
-    eyes: tuple[tuple[Camera, DetectedMarkers], ...]
+def detect_view_markers(config: AuditedConfig, view: AuditedView) -> list[DetectedMarkers]:
+    """Detect the markers in both images of a view; the list is empty for a scene without a board."""
+    return [] if config.board is None else [detect_markers(eye, config.board) for eye in view.eyes.values()]
 
 
-def detect_view_markers(config: AuditedConfig, view: AuditedView) -> ViewMarkers:
-    """Detect the markers in both images of a view."""
-    board = config.board
-    if board is None:
-        return ViewMarkers(())
-    return ViewMarkers(tuple((eye.camera, detect_markers(eye, board)) for eye in view.eyes.values()))
-
-
-def pose_error(camera: Camera, markers: DetectedMarkers, inset_px: float) -> tuple[float, float] | None:
+def pose_error(markers: DetectedMarkers, inset_px: float) -> tuple[float, float] | None:
     """Return the position (mm) and rotation (degrees) errors of the pose recovered from the markers.
 
     The pose is that of ``cv2.solvePnP``, refined by Levenberg-Marquardt. The common inset is subtracted from the
@@ -177,6 +169,7 @@ def pose_error(camera: Camera, markers: DetectedMarkers, inset_px: float) -> tup
     """
     if len(markers.detected_px) < _MIN_MARKERS:
         return None
+    camera = markers.camera
     detected_px = markers.detected_px - inset_px * inset_directions(markers.detected_px)
     points_m, points_px = markers.corners_m.reshape(-1, 3), detected_px.reshape(-1, 2)
     solved, rotation_rad, translation_m = cv2.solvePnP(
@@ -193,13 +186,12 @@ def pose_error(camera: Camera, markers: DetectedMarkers, inset_px: float) -> tup
     return float(centre_error_m * 1000), float(np.rad2deg(turn_rad))
 
 
-def marker_verdict(config: AuditedConfig, views: Sequence[ViewMarkers]) -> Check:
+def marker_verdict(config: AuditedConfig, views: Sequence[Sequence[DetectedMarkers]]) -> Check:
     """Return the check of corners, detected share and poses of all views together."""
     name = f"{config.name}: ArUco markers"
     if config.board is None:
         return Check(name, "no board in this scene", "skipped")
-    cameras_and_eyes = [pair for view in views for pair in view.eyes]
-    eyes = [eye for _, eye in cameras_and_eyes]
+    eyes = [eye for view in views for eye in view]
     expected, detected = sum(eye.expected for eye in eyes), sum(len(eye.detected_px) for eye in eyes)
     if not expected:
         return Check(name, f"no unoccluded marker of {MIN_MARKER_WIDTH_PX:g} px or more", "skipped")
@@ -210,7 +202,7 @@ def marker_verdict(config: AuditedConfig, views: Sequence[ViewMarkers]) -> Check
         else (f"{detected} of {expected} unoccluded, large markers are detected",)
     )
     inset_px, corner_rms_px, centre_rms_px = fit_inset(eyes)
-    errors = _nominal_pose_errors(cameras_and_eyes, inset_px)
+    errors = _nominal_pose_errors(eyes, inset_px)
     off_mm, off_deg = np.median(errors, axis=0).tolist() if len(errors) else (0.0, 0.0)
     poses = (
         f"{len(errors)} poses recovered within {off_mm:.2f} mm/m, {off_deg:.3f} deg"
@@ -227,19 +219,17 @@ def marker_verdict(config: AuditedConfig, views: Sequence[ViewMarkers]) -> Check
     )
 
 
-def _nominal_pose_errors(
-    cameras_and_eyes: Sequence[tuple[Camera, DetectedMarkers]], inset_px: float
-) -> Float64[ndarray, "n 2"]:
+def _nominal_pose_errors(eyes: Sequence[DetectedMarkers], inset_px: float) -> Float64[ndarray, "n 2"]:
     """Return the pose errors, n x 2: mm per metre of distance from the board's middle, and degrees.
 
     Both are scaled to ``NOMINAL_FOCAL_PX`` (700 px).
     """
     errors = []
-    for camera, eye in cameras_and_eyes:
-        error = pose_error(camera, eye, inset_px)
+    for eye in eyes:
+        error = pose_error(eye, inset_px)
         if error is not None:
-            distance_m = float(np.linalg.norm(camera_centre(camera.cam_from_world)))
-            zoom = camera.K[0, 0] / NOMINAL_FOCAL_PX
+            distance_m = float(np.linalg.norm(camera_centre(eye.camera.cam_from_world)))
+            zoom = eye.camera.K[0, 0] / NOMINAL_FOCAL_PX
             errors.append((error[0] / distance_m * zoom, error[1] * zoom))
     return np.array(errors).reshape(-1, 2)
 

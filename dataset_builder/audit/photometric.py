@@ -69,8 +69,8 @@ class PhotometricFit:
 
     cost: Float64[ndarray, "2 7"]
     pixels: int
-    off_levels: tuple[float, float]
-    correlation: tuple[float, float]
+    off_levels: tuple[float, ...]
+    correlation: tuple[float, ...]
 
 
 def photometric_fit(config: AuditedConfig, view: AuditedView) -> PhotometricFit:
@@ -87,29 +87,24 @@ def photometric_fit(config: AuditedConfig, view: AuditedView) -> PhotometricFit:
         )
     ]
     view_independent = _is_view_independent(config, view.left, pixels[visible], baseline_m)
-    left_values, surface_stats, cost = (
-        left_levels.ravel()[pixels[visible]],
-        [],
-        np.zeros((2, 2 * SEARCH_RADIUS_PX + 1)),
-    )
-    for sampled in (
-        _evenly_subsampled(np.flatnonzero(view_independent)),
-        _evenly_subsampled(np.flatnonzero(~view_independent)),
-    ):
-        expected_levels = left_values[sampled]
-        right_values = _bilinear(right_levels, projected.px[visible[sampled]])
-        surface_stats.append(
-            (_median(np.abs(right_values - expected_levels)), _correlation(right_values, expected_levels))
-        )
-    sampled = _evenly_subsampled(np.flatnonzero(view_independent))
+    left_values = left_levels.ravel()[pixels[visible]]
+    samples = [_evenly_subsampled(np.flatnonzero(chosen)) for chosen in (view_independent, ~view_independent)]
+    levels = [
+        (_bilinear(right_levels, projected.px[visible[sampled]]), left_values[sampled]) for sampled in samples
+    ]
+    checked_px, expected_levels = projected.px[visible[samples[0]]], left_values[samples[0]]
+    cost = np.zeros((2, 2 * SEARCH_RADIUS_PX + 1))
     for axis in (0, 1):
         for n in range(2 * SEARCH_RADIUS_PX + 1):
             shift_px = np.zeros(2)
             shift_px[axis] = n - SEARCH_RADIUS_PX
-            difference = _bilinear(right_levels, projected.px[visible[sampled]] + shift_px) - left_values[sampled]
+            difference = _bilinear(right_levels, checked_px + shift_px) - expected_levels
             cost[axis, n] = np.minimum(difference * difference, _MAX_DIFFERENCE_LEVELS**2).sum()
     return PhotometricFit(
-        cost, len(sampled), (surface_stats[0][0], surface_stats[1][0]), (surface_stats[0][1], surface_stats[1][1])
+        cost,
+        len(samples[0]),
+        off_levels=tuple(_median(np.abs(right - left)) for right, left in levels),
+        correlation=tuple(_correlation(right, left) for right, left in levels),
     )
 
 

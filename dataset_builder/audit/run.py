@@ -22,7 +22,7 @@ from dataset_builder.audit.geometry import axis_verdict, board_verdict, max_axis
 from dataset_builder.audit.markers import detect_view_markers, marker_verdict
 from dataset_builder.audit.photometric import photometric_fit, photometric_verdict
 from dataset_builder.audit.report import AuditReport, Check
-from dataset_builder.audit.stereo_consistency import epipolar_verdict, view_epipolar_counts
+from dataset_builder.audit.stereo_consistency import epipolar_counts, epipolar_verdict
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView, RayCache, view_from_row
 from dataset_builder.config.trajectories import subset
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
@@ -47,7 +47,7 @@ class ViewCheck:
 VIEW_CHECKS: tuple[ViewCheck, ...] = (
     ViewCheck(max_axis_distance_ratio, axis_verdict),
     ViewCheck(view_board_error, board_verdict),
-    ViewCheck(view_epipolar_counts, epipolar_verdict),
+    ViewCheck(epipolar_counts, epipolar_verdict),
     # The camera check compares K and distortion of every view, so a few views suffice for the lens model.
     ViewCheck(view_projection_error_px, projection_verdict, views=12),
     ViewCheck(photometric_fit, photometric_verdict),
@@ -90,9 +90,8 @@ def _config_checks(config: DatasetConfig, root: Path, depth_views: int, progress
         accumulator.add(row)
         progress(f"audit of {name}", accumulator.rows, len(config.views))
     yield accumulator.rows_check()
-    yield _cameras_check(
-        name, expected, [*aim_problems, *view_list_problems(config, expected), *accumulator.cameras]
-    )
+    camera_faults = (*aim_problems, *view_list_problems(config, expected), *accumulator.cameras)
+    yield Check(f"{name}: cameras", f"{len(expected)} poses of the protocol", "equal to 1e-12", camera_faults)
     for check, measurements in zip(VIEW_CHECKS, accumulator.measurements, strict=True):
         yield check.verdict(audited, measurements)
     cycles_eyes = accumulator.cycles_eyes
@@ -109,7 +108,6 @@ class _AuditAccumulator:
         self, config: DatasetConfig, audited: AuditedConfig, expected: Sequence[ExpectedView], depth_views: int
     ) -> None:
         self._config, self._audited, self._expected = config, audited, expected
-        self._records = config.views
         self._bar_ids = {bar.bar_id for bar in audited.steel}
         self._rays = RayCache()
         self._measured = [set(subset(len(config.views), check.views)) for check in VIEW_CHECKS]
@@ -124,11 +122,11 @@ class _AuditAccumulator:
         """Check the next row; a row with malformed arrays is not measured."""
         n = self.rows
         self.rows += 1
-        if n >= len(self._records):
+        if n >= len(self._config.views):
             return
-        view_id = self._records[n].view_id
+        view_id = self._config.views[n].view_id
         array_faults = list(array_problems(row, self._config.grid))
-        row_faults = array_faults or row_problems(row, self._records[n], self._bar_ids)
+        row_faults = array_faults or row_problems(row, self._config.views[n], self._bar_ids)
         self._problems += [f"{view_id}: {problem}" for problem in row_faults]
         if array_faults:
             return
@@ -143,13 +141,8 @@ class _AuditAccumulator:
 
     def rows_check(self) -> Check:
         """Return the check of the number of rows and of their invariants."""
+        name, views = self._config.name, len(self._config.views)
         problems = list(self._problems)
-        if self.rows != len(self._records):
-            problems.append(
-                f"{self._config.name} has {self.rows} rows, expected the manifest's {len(self._records)} views"
-            )
-        return Check(f"{self._config.name}: rows", f"{self.rows} views", "all invariants", tuple(problems))
-
-
-def _cameras_check(name: str, expected: Sequence[ExpectedView], problems: Sequence[str]) -> Check:
-    return Check(f"{name}: cameras", f"{len(expected)} poses of the protocol", "equal to 1e-12", tuple(problems))
+        if self.rows != views:
+            problems.append(f"{name} has {self.rows} rows, expected the manifest's {views} views")
+        return Check(f"{name}: rows", f"{self.rows} views", "all invariants", tuple(problems))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,6 @@ from numpy import ndarray
 
 from dataset_builder.audit.report import Check
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
-from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.geometry.cameras import project, transform
 from rebar_depth_bench.scoring.protocol import interior
 
@@ -69,12 +68,7 @@ def project_into(eye: AuditedEye, points_m: Float64[ndarray, "n 3"], margin_px: 
     return ProjectedPoints(px, points_cam[:, 2], inside)
 
 
-def view_epipolar_counts(config: AuditedConfig, view: AuditedView) -> EpipolarCounts:
-    """Return ``epipolar_counts`` of a view with the bars of its scene."""
-    return epipolar_counts(view, config.steel)
-
-
-def epipolar_counts(view: AuditedView, steel: Iterable[Bar]) -> EpipolarCounts:
+def epipolar_counts(config: AuditedConfig, view: AuditedView) -> EpipolarCounts:
     """Return the counts of the left view's interior steel pixels, projected into the right view.
 
     The right view is read at the 4 x 4 pixel centres around the projection. Depth is compared along the right
@@ -84,7 +78,7 @@ def epipolar_counts(view: AuditedView, steel: Iterable[Bar]) -> EpipolarCounts:
     """
     left, right = view.left, view.right
     diameter_of = np.zeros(np.iinfo(np.uint16).max + 1)
-    for bar in steel:
+    for bar in config.steel:
         diameter_of[bar.bar_id] = bar.diameter_m
     diameter_m = diameter_of[left.bars]
     wide_enough = diameter_m * left.camera.K[0, 0] >= _MIN_BAR_WIDTH_PX * left.depth_m

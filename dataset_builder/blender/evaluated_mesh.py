@@ -7,20 +7,20 @@ from dataclasses import dataclass
 
 import bpy
 import numpy as np
-from jaxtyping import Float64, Int32
+from jaxtyping import Int32
 from numpy import ndarray
 
 from dataset_builder.blender.scene import BAR_ID
 from dataset_builder.scene.model import NOT_STEEL, Mesh, WorldMesh
+from dataset_builder.scene.shapes.solids import merge_meshes, transformed
 
 
 @dataclass(frozen=True, eq=False)
 class _MeshInstance:
-    """An object or an instance of it: sort key, mesh in its own frame, pose and bar id."""
+    """An object or an instance of it: sort key, mesh in the world frame and bar id."""
 
     order: tuple[str, tuple[int, ...]]
-    local: Mesh
-    world_from_local: Float64[ndarray, "4 4"]
+    mesh: Mesh
     bar_id: int
 
 
@@ -31,11 +31,9 @@ def evaluated_world_mesh() -> WorldMesh:
     Objects are ordered by name.
     """
     placed_meshes = sorted(_mesh_instances(), key=lambda item: item.order)
-    vertices = [_world_vertices_m(item) for item in placed_meshes]
-    starts = np.cumsum([0, *(len(v) for v in vertices)])
-    faces = [item.local.faces + start for item, start in zip(placed_meshes, starts, strict=False)]
-    ids = [np.full(len(item.local.faces), item.bar_id, dtype=np.uint16) for item in placed_meshes]
-    return WorldMesh(np.concatenate(vertices), np.concatenate(faces).astype(np.int32), np.concatenate(ids))
+    mesh = merge_meshes([item.mesh for item in placed_meshes])
+    ids = [np.full(len(item.mesh.faces), item.bar_id, dtype=np.uint16) for item in placed_meshes]
+    return WorldMesh(mesh.vertices_m, mesh.faces, np.concatenate(ids))
 
 
 def _mesh_instances() -> Iterator[_MeshInstance]:
@@ -50,10 +48,10 @@ def _mesh_instances() -> Iterator[_MeshInstance]:
         key = evaluated.data.as_pointer()
         if key not in local_meshes:
             local_meshes[key] = _local_mesh(evaluated.data)
+        world_from_local = np.array(instance.matrix_world, dtype=np.float64)
         yield _MeshInstance(
             order=(evaluated.name, tuple(instance.persistent_id) if instance.is_instance else ()),
-            local=local_meshes[key],
-            world_from_local=np.array(instance.matrix_world, dtype=np.float64),
+            mesh=transformed(local_meshes[key], world_from_local[:3, :3], world_from_local[:3, 3]),
             bar_id=int(evaluated.get(BAR_ID, NOT_STEEL)),
         )
 
@@ -71,9 +69,3 @@ def _local_mesh(data: bpy.types.Mesh) -> Mesh:
     corners: Int32[ndarray, " n"] = np.empty(len(data.loop_triangles) * 3, dtype=np.int32)
     data.loop_triangles.foreach_get("vertices", corners)
     return Mesh(co.reshape(-1, 3).astype(np.float64), corners.reshape(-1, 3))
-
-
-def _world_vertices_m(item: _MeshInstance) -> Float64[ndarray, "n 3"]:
-    """Return an instance's vertices in the world frame, metres."""
-    matrix = item.world_from_local
-    return np.asarray(item.local.vertices_m @ matrix[:3, :3].T + matrix[:3, 3])

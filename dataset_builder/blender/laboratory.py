@@ -7,7 +7,7 @@ the dome reaches that high, and light that leaves the room costs no further boun
 
 from __future__ import annotations
 
-from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
+from dataset_builder.scene.model import Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import Point, box, cylinder, rotated_box
 
 SHEET_THICKNESS_M = 0.0003
@@ -23,20 +23,16 @@ def laboratory() -> tuple[Part, ...]:
     return (*_floor_and_walls(), *_bench(), *_furniture(), *_bench_items())
 
 
-def _part(name: str, mesh: Mesh, material: str) -> Part:
-    return Part(name, mesh, NOT_STEEL, material)
-
-
 def _floor_and_walls() -> tuple[Part, ...]:
     """Return floor and four walls, as slabs that lie outside of the room and do not overlap."""
     t = WALL_THICKNESS_M
     low, high = FLOOR_M, WALL_TOP_M
     return (
-        _part("floor", box((WEST_M, SOUTH_M, low - t), (EAST_M, NORTH_M, low)), "floor"),
-        _part("wall-west", box((WEST_M - t, SOUTH_M, low), (WEST_M, NORTH_M, high)), "plaster"),
-        _part("wall-east", box((EAST_M, SOUTH_M, low), (EAST_M + t, NORTH_M, high)), "plaster"),
-        _part("wall-south", box((WEST_M, SOUTH_M - t, low), (EAST_M, SOUTH_M, high)), "plaster"),
-        _part("wall-north", box((WEST_M, NORTH_M, low), (EAST_M, NORTH_M + t, high)), "plaster"),
+        surface("floor", box((WEST_M, SOUTH_M, low - t), (EAST_M, NORTH_M, low)), "floor"),
+        surface("wall-west", box((WEST_M - t, SOUTH_M, low), (WEST_M, NORTH_M, high)), "plaster"),
+        surface("wall-east", box((EAST_M, SOUTH_M, low), (EAST_M + t, NORTH_M, high)), "plaster"),
+        surface("wall-south", box((WEST_M, SOUTH_M - t, low), (EAST_M, SOUTH_M, high)), "plaster"),
+        surface("wall-north", box((WEST_M, NORTH_M, low), (EAST_M, NORTH_M + t, high)), "plaster"),
     )
 
 
@@ -45,10 +41,10 @@ def _bench() -> tuple[Part, ...]:
     x, y, thickness = 0.95, 0.70, 0.036
     under = BENCH_TOP_M - thickness
     legs = [
-        _part(f"bench-leg-{k}", _leg(sx * (x - 0.08), sy * (y - 0.08), under), "painted metal")
+        surface(f"bench-leg-{k}", _leg(sx * (x - 0.08), sy * (y - 0.08), under), "painted metal")
         for k, (sx, sy) in enumerate([(-1, -1), (-1, 1), (1, -1), (1, 1)])
     ]
-    return (_part("bench-top", box((-x, -y, under), (x, y, BENCH_TOP_M)), "wood"), *legs)
+    return (surface("bench-top", box((-x, -y, under), (x, y, BENCH_TOP_M)), "wood"), *legs)
 
 
 def _leg(x_m: float, y_m: float, top_m: float) -> Mesh:
@@ -61,22 +57,22 @@ def _furniture() -> tuple[Part, ...]:
     foot = FLOOR_M + 0.001
     north, east, west, south = NORTH_M - 0.002, EAST_M - 0.002, WEST_M + 0.002, SOUTH_M + 0.002
     cabinets = [
-        _part(f"cabinet-{k}", box((x, north - 0.5, foot), (x + 0.594, north, 0.12)), "cabinet")
+        surface(f"cabinet-{k}", box((x, north - 0.5, foot), (x + 0.594, north, 0.12)), "cabinet")
         for k, x in enumerate([-1.9, -1.3, -0.7, -0.1, 0.5])
     ]
     shelf_boards = [
-        _part(f"shelf-{k}", box((east - 0.35, -1.2, z), (east, 1.0, z + 0.025)), "wood")
+        surface(f"shelf-{k}", box((east - 0.35, -1.2, z), (east, 1.0, z + 0.025)), "wood")
         for k, z in enumerate([-0.42, 0.0, 0.42, 0.84])
     ]
     return (
         *cabinets,
-        _part("worktop", box((-1.92, north - 0.53, 0.121), (1.12, north, 0.155)), "dark laminate"),
+        surface("worktop", box((-1.92, north - 0.53, 0.121), (1.12, north, 0.155)), "dark laminate"),
         *shelf_boards,
-        *(_part(f"crate-{k}", mesh, colour) for k, (mesh, colour) in enumerate(_crates(east))),
-        _part("pinboard", box((-1.3, north - 0.02, 0.42), (0.3, north, 1.25)), "cork"),
-        _part("radiator", box((west, -0.9, -0.66), (west + 0.09, 0.9, -0.1)), "painted metal"),
-        _part("door", box((-0.2, south, foot), (0.72, south + 0.04, 1.28)), "door"),
-        _part("locker", box((-1.75, south, foot), (-0.85, south + 0.45, 1.05)), "cabinet"),
+        *(surface(f"crate-{k}", mesh, colour) for k, (mesh, colour) in enumerate(_crates(east))),
+        surface("pinboard", box((-1.3, north - 0.02, 0.42), (0.3, north, 1.25)), "cork"),
+        surface("radiator", box((west, -0.9, -0.66), (west + 0.09, 0.9, -0.1)), "painted metal"),
+        surface("door", box((-0.2, south, foot), (0.72, south + 0.04, 1.28)), "door"),
+        surface("locker", box((-1.75, south, foot), (-0.85, south + 0.45, 1.05)), "cabinet"),
     )
 
 
@@ -102,12 +98,12 @@ def _bench_items() -> tuple[Part, ...]:
         return rotated_box((x, y, z + size[2] / 2), size, turn)
 
     return (
-        _part("cube-a", standing(-0.70, 0.50, (0.10, 0.10, 0.10), 14), "concrete"),
-        _part("cube-b", standing(-0.55, 0.58, (0.10, 0.10, 0.10), -8), "concrete"),
-        _part("cylinder", cylinder((-0.80, 0.36, z), 0.05, 0.20), "concrete"),
-        _part("toolbox", standing(0.70, 0.54, (0.34, 0.17, 0.14), -12), "red paint"),
-        _part("toolbox-lid", rotated_box((0.70, 0.54, z + 0.1555), (0.35, 0.18, 0.03), -12), "dark laminate"),
-        _part("notebook", standing(-0.72, -0.45, (0.21, 0.15, 0.014), 24), "blue plastic"),
-        _part("carton", standing(0.76, -0.48, (0.20, 0.15, 0.11), 31), "cardboard"),
-        _part("mug", cylinder((0.80, 0.10, z), 0.041, 0.095), "white glaze"),
+        surface("cube-a", standing(-0.70, 0.50, (0.10, 0.10, 0.10), 14), "concrete"),
+        surface("cube-b", standing(-0.55, 0.58, (0.10, 0.10, 0.10), -8), "concrete"),
+        surface("cylinder", cylinder((-0.80, 0.36, z), 0.05, 0.20), "concrete"),
+        surface("toolbox", standing(0.70, 0.54, (0.34, 0.17, 0.14), -12), "red paint"),
+        surface("toolbox-lid", rotated_box((0.70, 0.54, z + 0.1555), (0.35, 0.18, 0.03), -12), "dark laminate"),
+        surface("notebook", standing(-0.72, -0.45, (0.21, 0.15, 0.014), 24), "blue plastic"),
+        surface("carton", standing(0.76, -0.48, (0.20, 0.15, 0.11), 31), "cardboard"),
+        surface("mug", cylinder((0.80, 0.10, z), 0.041, 0.095), "white glaze"),
     )

@@ -29,13 +29,12 @@ class Sky:
 
 @dataclass(frozen=True)
 class Panel:
-    """A rectangular light of ``size_m`` at ``at_m``, facing ``towards_m`` (world, metres)."""
+    """A rectangular light of ``size_m`` at ``at_m``, facing ``towards_m`` (world, metres); ``energy`` in watts."""
 
-    name: str
     at_m: Point
     towards_m: Point
     size_m: tuple[float, float]
-    power_w: float
+    energy: float
     colour: Colour
 
 
@@ -45,7 +44,7 @@ class Sun:
 
     from_direction: Point
     angle_deg: float
-    strength: float
+    energy: float
     colour: Colour
 
 
@@ -53,35 +52,29 @@ class Sun:
 class Spot:
     """A spot lamp at ``at_m``, facing ``towards_m`` (world, metres).
 
-    ``radius_m`` is the radius of the lamp, ``cone_deg`` the full angle of its cone.
+    ``radius_m`` is the radius of the lamp, ``cone_deg`` the full angle of its cone, ``energy`` its power in watts.
     """
 
     at_m: Point
     towards_m: Point
     radius_m: float
     cone_deg: float
-    power_w: float
+    energy: float
     colour: Colour
 
 
 @dataclass(frozen=True)
 class LightRig:
-    """The sky and the lamps of a scene."""
+    """The sky and the lamp of a scene."""
 
     sky: Sky
-    lamps: tuple[Panel | Sun | Spot, ...]
+    lamp: Panel | Sun | Spot
 
 
 def add_light(rig: LightRig) -> None:
-    """Add the sky and the lamps of ``rig`` to the open scene, which must have no light yet."""
+    """Add the sky and the lamp of ``rig`` to the open scene, which must have no light yet."""
     _add_sky(rig.sky)
-    for number, lamp in enumerate(rig.lamps):
-        if isinstance(lamp, Panel):
-            _add_panel(lamp)
-        elif isinstance(lamp, Sun):
-            _add_sun(lamp, f"sun-{number}")
-        else:
-            _add_spot(lamp, f"spot-{number}")
+    _add_lamp(rig.lamp)
 
 
 def _add_sky(sky: Sky) -> None:
@@ -112,37 +105,25 @@ def _sky_gradient(tree: NodeTreeBuilder, sky: Sky) -> Socket:
     return colour
 
 
-def _add_panel(panel: Panel) -> None:
-    light = bpy.data.lights.new(panel.name, "AREA")
-    light.shape = "RECTANGLE"
-    light.size, light.size_y = panel.size_m
-    light.energy = panel.power_w
-    light.color = panel.colour
-    _add_lamp_object(light, panel.at_m, Vector(panel.towards_m) - Vector(panel.at_m))
-
-
-def _add_sun(sun: Sun, name: str) -> None:
-    light = bpy.data.lights.new(name, "SUN")
-    light.angle = radians(sun.angle_deg)
-    light.energy = sun.strength
-    light.color = sun.colour
-    _add_lamp_object(light, (0.0, 0.0, 0.0), -Vector(sun.from_direction))
-
-
-def _add_spot(spot: Spot, name: str) -> None:
-    light = bpy.data.lights.new(name, "SPOT")
-    light.shadow_soft_size = spot.radius_m
-    light.spot_size = radians(spot.cone_deg)
-    light.spot_blend = 0.35
-    light.energy = spot.power_w
-    light.color = spot.colour
-    _add_lamp_object(light, spot.at_m, Vector(spot.towards_m) - Vector(spot.at_m))
-
-
-def _add_lamp_object(light: bpy.types.Light, at_m: Point, direction: Vector) -> None:
-    """Add a light to the open scene at ``at_m``, shining along ``direction``, invisible to cameras."""
+def _add_lamp(lamp: Panel | Sun | Spot) -> None:
+    """Add a lamp to the open scene, invisible to cameras."""
+    kind = {Panel: "AREA", Sun: "SUN", Spot: "SPOT"}[type(lamp)]
+    light = bpy.data.lights.new("lamp", kind)
+    light.energy, light.color = lamp.energy, lamp.colour
     added = bpy.data.objects.new(light.name, light)
-    added.location = at_m
+    if isinstance(lamp, Sun):
+        light.angle = radians(lamp.angle_deg)
+        direction = -Vector(lamp.from_direction)
+    else:
+        added.location = lamp.at_m
+        direction = Vector(lamp.towards_m) - Vector(lamp.at_m)
+    if isinstance(lamp, Panel):
+        light.shape = "RECTANGLE"
+        light.size, light.size_y = lamp.size_m
+    elif isinstance(lamp, Spot):
+        light.shadow_soft_size = lamp.radius_m
+        light.spot_size = radians(lamp.cone_deg)
+        light.spot_blend = 0.35
     # Lights in Blender shine along their -z axis.
     added.rotation_euler = direction.to_track_quat("-Z", "Y").to_euler()
     added.visible_camera = False
@@ -162,40 +143,40 @@ LABORATORY_LIGHT: Mapping[str | None, LightRig] = {
     None: LightRig(
         # One lamp and a bright sky, because a second lamp from the side increased the noise on steel.
         _uniform_sky((0.86, 0.93, 1.0), 0.80),
-        (Panel("ceiling-panel", (-0.35, 0.45, 1.9), (0.0, 0.05, 0.0), (0.9, 0.45), 62.0, WARM),),
+        Panel((-0.35, 0.45, 1.9), (0.0, 0.05, 0.0), (0.9, 0.45), 62.0, WARM),
     ),
     "dusk": LightRig(
         _uniform_sky((0.42, 0.55, 1.0), 0.13),
-        (Panel("window", (-1.9, -0.9, 0.9), (0.0, 0.0, 0.05), (1.1, 0.5), 14.0, EMBER),),
+        Panel((-1.9, -0.9, 0.9), (0.0, 0.0, 0.05), (1.1, 0.5), 14.0, EMBER),
     ),
     "spotlight": LightRig(
         _uniform_sky((0.7, 0.8, 1.0), 0.05),
-        (Spot((-0.95, 0.10, 0.85), (0.0, 0.0, 0.03), 0.012, 62.0, 75.0, WHITE),),
+        Spot((-0.95, 0.10, 0.85), (0.0, 0.0, 0.03), 0.012, 62.0, 75.0, WHITE),
     ),
     "backlight": LightRig(
         _uniform_sky((0.86, 0.93, 1.0), 0.07),
-        (Panel("low-window", (0.2, 2.0, 0.85), (0.0, 0.0, 0.05), (1.4, 0.6), 75.0, WHITE),),
+        Panel((0.2, 2.0, 0.85), (0.0, 0.0, 0.05), (1.4, 0.6), 75.0, WHITE),
     ),
-    SHADOWS: LightRig(_uniform_sky((0.80, 0.90, 1.0), 0.30), (Sun(SUN_FROM, 0.5, 3.6, WARM),)),
+    SHADOWS: LightRig(_uniform_sky((0.80, 0.90, 1.0), 0.30), Sun(SUN_FROM, 0.5, 3.6, WARM)),
 }
 """Lights of the laboratory by light variant; None is the default."""
 
 _DAY = Sky((0.70, 0.82, 0.95), (0.17, 0.35, 0.74), 0.80, clouds=True)
 
 OUTDOOR_LIGHT: Mapping[str | None, LightRig] = {
-    None: LightRig(_DAY, (Sun((-0.55, -0.45, 0.70), 1.2, 4.0, WARM),)),
+    None: LightRig(_DAY, Sun((-0.55, -0.45, 0.70), 1.2, 4.0, WARM)),
     "dusk": LightRig(
         Sky((0.95, 0.52, 0.30), (0.10, 0.16, 0.38), 0.28, clouds=False),
-        (Sun((-0.85, -0.45, 0.16), 6.0, 0.55, EMBER),),
+        Sun((-0.85, -0.45, 0.16), 6.0, 0.55, EMBER),
     ),
     "spotlight": LightRig(
         Sky((0.05, 0.07, 0.12), (0.015, 0.022, 0.05), 0.4),
-        (Spot((-14.0, -19.0, 10.5), (0.0, 0.0, 2.6), 0.25, 34.0, 26_000.0, WHITE),),
+        Spot((-14.0, -19.0, 10.5), (0.0, 0.0, 2.6), 0.25, 34.0, 26_000.0, WHITE),
     ),
     "backlight": LightRig(
         Sky((0.90, 0.84, 0.74), (0.34, 0.46, 0.66), 0.42),
-        (Sun((0.22, 0.90, 0.30), 0.6, 4.2, WARM),),
+        Sun((0.22, 0.90, 0.30), 0.6, 4.2, WARM),
     ),
-    SHADOWS: LightRig(_DAY, (Sun(SUN_FROM, 0.5, 3.8, WARM),)),
+    SHADOWS: LightRig(_DAY, Sun(SUN_FROM, 0.5, 3.8, WARM)),
 }
 """Lights of the building site by light variant; None is the default."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import bpy
 import numpy as np
@@ -36,7 +37,7 @@ def material(name: str) -> bpy.types.Material:
     """Return the material ``name`` of the open file, created on first use."""
     blender_material = bpy.data.materials.get(name)
     if blender_material is None:
-        blender_material = _MATERIAL_BUILDERS[name](name)
+        blender_material = _MATERIAL_BUILDERS[name](MaterialBuilder(name))
     return blender_material
 
 
@@ -66,12 +67,14 @@ def _image(name: str, texture: UInt8[ndarray, "h w"]) -> bpy.types.Image:
 
 
 def _steel(
+    shader: MaterialBuilder,
+    *,
     rust_shift: tuple[float, float] = (-0.15, 0.12),
     tint: float = 1.0,
     metallic: float = 0.40,
     roughness: tuple[float, float] = (0.50, 0.74),
-) -> Callable[[str], bpy.types.Material]:
-    """Return a builder of blue-grey mill scale with patches of rust.
+) -> bpy.types.Material:
+    """Return blue-grey mill scale with patches of rust.
 
     Amount, pattern and tone are read from each bar's custom properties. ``rust_shift`` are the offsets of the rust
     threshold for the amounts 0 and 1, ``roughness`` the values for scale and rust; ``tint`` multiplies both
@@ -81,30 +84,23 @@ def _steel(
     def tinted(red: float, green: float, blue: float) -> Colour:
         return red * tint, green * tint, blue * tint
 
-    def make(name: str) -> bpy.types.Material:
-        shader = MaterialBuilder(name)
-        pattern_point = shader.shifted(shader.position(), shader.object_value(PATTERN_PROPERTY))
-        patches, grain = shader.noise(pattern_point, 70.0, 3.0), shader.noise(pattern_point, 700.0, 1.0)
-        dark = shader.mix(
-            shader.object_value(TONE_PROPERTY), tinted(0.105, 0.118, 0.140), tinted(0.190, 0.200, 0.218)
-        )
-        scale = shader.mix(shader.step(grain, 0.25, 0.85), dark, tinted(0.255, 0.262, 0.275))
-        rust = shader.mix(shader.step(grain, 0.3, 0.7), tinted(0.095, 0.042, 0.022), tinted(0.250, 0.105, 0.045))
-        threshold = shader.add(patches, shader.remap(shader.object_value(RUST_PROPERTY), 0.0, 1.0, *rust_shift))
-        rusty = shader.step(shader.add(threshold, shader.remap(grain, 0.0, 1.0, -0.05, 0.05)), 0.46, 0.62)
-        gloss = shader.add(shader.remap(rusty, 0.0, 1.0, *roughness), shader.remap(grain, 0, 1, -0.06, 0.08))
-        return shader.surface(
-            Base_Color=shader.mix(rusty, scale, rust),
-            Metallic=shader.remap(rusty, 0.0, 1.0, metallic, 0.05),
-            Roughness=gloss,
-        )
-
-    return make
+    pattern_point = shader.shifted(shader.position(), shader.object_value(PATTERN_PROPERTY))
+    patches, grain = shader.noise(pattern_point, 70.0, 3.0), shader.noise(pattern_point, 700.0, 1.0)
+    dark = shader.mix(shader.object_value(TONE_PROPERTY), tinted(0.105, 0.118, 0.140), tinted(0.190, 0.200, 0.218))
+    scale = shader.mix(shader.step(grain, 0.25, 0.85), dark, tinted(0.255, 0.262, 0.275))
+    rust = shader.mix(shader.step(grain, 0.3, 0.7), tinted(0.095, 0.042, 0.022), tinted(0.250, 0.105, 0.045))
+    threshold = shader.add(patches, shader.remap(shader.object_value(RUST_PROPERTY), 0.0, 1.0, *rust_shift))
+    rusty = shader.step(shader.add(threshold, shader.remap(grain, 0.0, 1.0, -0.05, 0.05)), 0.46, 0.62)
+    gloss = shader.add(shader.remap(rusty, 0.0, 1.0, *roughness), shader.remap(grain, 0, 1, -0.06, 0.08))
+    return shader.surface(
+        Base_Color=shader.mix(rusty, scale, rust),
+        Metallic=shader.remap(rusty, 0.0, 1.0, metallic, 0.05),
+        Roughness=gloss,
+    )
 
 
-def _wood(name: str) -> bpy.types.Material:
+def _wood(shader: MaterialBuilder) -> bpy.types.Material:
     """Return oiled beech with the grain along x."""
-    shader = MaterialBuilder(name)
     pattern_point = shader.position()
     figure = shader.noise(shader.stretched(pattern_point, (1.0, 12.0, 12.0)), 4.0)
     pores = shader.noise(shader.stretched(pattern_point, (22.0, 330.0, 330.0)), 2.0, 0.0)
@@ -112,87 +108,79 @@ def _wood(name: str) -> bpy.types.Material:
     return shader.matt(shader.mix(shader.step(pores, 0.55, 0.85), base, (0.25, 0.15, 0.083)))
 
 
-def _speckled(light: Colour, dark: Colour, per_metre: float) -> Callable[[str], bpy.types.Material]:
-    """Return a builder of a matt, speckled material of two colours."""
-
-    def make(name: str) -> bpy.types.Material:
-        shader = MaterialBuilder(name)
-        share = shader.step(shader.noise(shader.position(), per_metre), 0.35, 0.65)
-        return shader.matt(shader.mix(share, dark, light))
-
-    return make
+def _speckled(light: Colour, dark: Colour, per_metre: float, shader: MaterialBuilder) -> bpy.types.Material:
+    """Return a matt, speckled material of two colours."""
+    share = shader.step(shader.noise(shader.position(), per_metre), 0.35, 0.65)
+    return shader.matt(shader.mix(share, dark, light))
 
 
 def _mottled(
-    light: Colour, dark: Colour, per_metre: float, stains_per_metre: float, stain: Colour
-) -> Callable[[str], bpy.types.Material]:
-    """Return a builder of a matt ground material: grain of two colours under large stains."""
-
-    def make(name: str) -> bpy.types.Material:
-        shader = MaterialBuilder(name)
-        pattern_point = shader.position()
-        grain = shader.mix(shader.step(shader.noise(pattern_point, per_metre, 1.0), 0.3, 0.7), dark, light)
-        stains = shader.step(shader.noise(pattern_point, stains_per_metre, 2.0), 0.42, 0.72)
-        return shader.matt(shader.mix(stains, grain, stain))
-
-    return make
+    light: Colour,
+    dark: Colour,
+    per_metre: float,
+    stains_per_metre: float,
+    stain: Colour,
+    shader: MaterialBuilder,
+) -> bpy.types.Material:
+    """Return a matt ground material: grain of two colours under large stains."""
+    pattern_point = shader.position()
+    grain = shader.mix(shader.step(shader.noise(pattern_point, per_metre, 1.0), 0.3, 0.7), dark, light)
+    stains = shader.step(shader.noise(pattern_point, stains_per_metre, 2.0), 0.42, 0.72)
+    return shader.matt(shader.mix(stains, grain, stain))
 
 
 def _grained(
-    light: Colour, dark: Colour, scale: tuple[float, float, float]
-) -> Callable[[str], bpy.types.Material]:
-    """Return a builder of sawn wood; ``scale`` is the number of features per metre along x, y and z."""
-
-    def make(name: str) -> bpy.types.Material:
-        shader = MaterialBuilder(name)
-        grain = shader.noise(shader.stretched(shader.position(), scale), 1.0)
-        return shader.matt(shader.mix(shader.step(grain, 0.25, 0.75), dark, light))
-
-    return make
+    light: Colour, dark: Colour, scale: tuple[float, float, float], shader: MaterialBuilder
+) -> bpy.types.Material:
+    """Return sawn wood; ``scale`` is the number of features per metre along x, y and z."""
+    grain = shader.noise(shader.stretched(shader.position(), scale), 1.0)
+    return shader.matt(shader.mix(shader.step(grain, 0.25, 0.75), dark, light))
 
 
-def _matt(colour: Colour) -> Callable[[str], bpy.types.Material]:
-    """Return a builder of a matt material of one colour."""
-    return lambda name: MaterialBuilder(name).matt(colour)
+def _matt(colour: Colour, shader: MaterialBuilder) -> bpy.types.Material:
+    """Return a matt material of one colour."""
+    return shader.matt(colour)
 
 
-def _glossy(colour: Colour, roughness: float) -> Callable[[str], bpy.types.Material]:
-    """Return a builder of a Principled material of one colour."""
-    return lambda name: MaterialBuilder(name).surface(Base_Color=colour, Roughness=roughness)
+def _glossy(colour: Colour, roughness: float, shader: MaterialBuilder) -> bpy.types.Material:
+    """Return a Principled material of one colour."""
+    return shader.surface(Base_Color=colour, Roughness=roughness)
 
 
-_MATERIAL_BUILDERS: dict[str, Callable[[str], bpy.types.Material]] = {
-    "steel": _steel(),
-    "steel, mill-scale": _steel(rust_shift=(-0.45, -0.16), tint=1.15, metallic=0.8, roughness=(0.30, 0.60)),
-    "steel, rusted": _steel(rust_shift=(0.10, 0.30), tint=1.15),
-    "steel, wet": _steel(tint=0.48, metallic=0.45, roughness=(0.13, 0.17)),
+_MATERIAL_BUILDERS: dict[str, Callable[[MaterialBuilder], bpy.types.Material]] = {
+    "steel": _steel,
+    "steel, mill-scale": partial(
+        _steel, rust_shift=(-0.45, -0.16), tint=1.15, metallic=0.8, roughness=(0.30, 0.60)
+    ),
+    "steel, rusted": partial(_steel, rust_shift=(0.10, 0.30), tint=1.15),
+    "steel, wet": partial(_steel, tint=0.48, metallic=0.45, roughness=(0.13, 0.17)),
     "wood": _wood,
-    "concrete": _speckled((0.40, 0.40, 0.39), (0.335, 0.335, 0.325), 60.0),
-    "plaster": _speckled((0.63, 0.62, 0.59), (0.585, 0.575, 0.55), 5.0),
-    "floor": _speckled((0.25, 0.26, 0.27), (0.17, 0.18, 0.19), 60.0),
-    "cork": _speckled((0.36, 0.22, 0.11), (0.20, 0.115, 0.055), 120.0),
-    "cardboard": _speckled((0.40, 0.27, 0.155), (0.34, 0.225, 0.125), 25.0),
-    "painted metal": _matt((0.42, 0.44, 0.45)),
-    "cabinet": _matt((0.50, 0.52, 0.53)),
-    "dark laminate": _matt((0.045, 0.047, 0.052)),
-    "door": _matt((0.26, 0.31, 0.34)),
-    "blue plastic": _matt((0.05, 0.11, 0.26)),
-    "grey plastic": _matt((0.20, 0.21, 0.22)),
-    "sheet edge": _matt((0.70, 0.70, 0.68)),
-    "red paint": _glossy((0.33, 0.045, 0.035), 0.35),
-    "white glaze": _glossy((0.66, 0.66, 0.64), 0.15),
-    "plywood": _grained((0.52, 0.34, 0.17), (0.40, 0.25, 0.12), (9.0, 9.0, 1.6)),
-    "timber": _grained((0.56, 0.41, 0.23), (0.42, 0.28, 0.14), (14.0, 14.0, 14.0)),
-    "orange plastic": _matt((0.62, 0.17, 0.02)),
-    "black rubber": _matt((0.022, 0.022, 0.024)),
-    "black wire": _glossy((0.03, 0.03, 0.033), 0.45),
-    "site concrete": _mottled((0.44, 0.43, 0.41), (0.36, 0.355, 0.34), 26.0, 0.7, (0.31, 0.30, 0.28)),
-    "blinding": _matt((0.47, 0.46, 0.44)),
-    "gravel": _mottled((0.42, 0.36, 0.28), (0.25, 0.21, 0.165), 14.0, 0.11, (0.29, 0.235, 0.172)),
-    "soil": _mottled((0.26, 0.175, 0.105), (0.15, 0.10, 0.062), 3.5, 0.5, (0.21, 0.15, 0.09)),
-    "trees": _mottled((0.085, 0.115, 0.045), (0.03, 0.05, 0.022), 0.9, 0.12, (0.055, 0.07, 0.03)),
-    "container blue": _matt((0.045, 0.13, 0.26)),
-    "container sand": _matt((0.45, 0.37, 0.24)),
-    "hoarding white": _matt((0.66, 0.66, 0.64)),
-    "hoarding blue": _matt((0.06, 0.17, 0.42)),
+    "concrete": partial(_speckled, (0.40, 0.40, 0.39), (0.335, 0.335, 0.325), 60.0),
+    "plaster": partial(_speckled, (0.63, 0.62, 0.59), (0.585, 0.575, 0.55), 5.0),
+    "floor": partial(_speckled, (0.25, 0.26, 0.27), (0.17, 0.18, 0.19), 60.0),
+    "cork": partial(_speckled, (0.36, 0.22, 0.11), (0.20, 0.115, 0.055), 120.0),
+    "cardboard": partial(_speckled, (0.40, 0.27, 0.155), (0.34, 0.225, 0.125), 25.0),
+    "painted metal": partial(_matt, (0.42, 0.44, 0.45)),
+    "cabinet": partial(_matt, (0.50, 0.52, 0.53)),
+    "dark laminate": partial(_matt, (0.045, 0.047, 0.052)),
+    "door": partial(_matt, (0.26, 0.31, 0.34)),
+    "blue plastic": partial(_matt, (0.05, 0.11, 0.26)),
+    "grey plastic": partial(_matt, (0.20, 0.21, 0.22)),
+    "sheet edge": partial(_matt, (0.70, 0.70, 0.68)),
+    "red paint": partial(_glossy, (0.33, 0.045, 0.035), 0.35),
+    "white glaze": partial(_glossy, (0.66, 0.66, 0.64), 0.15),
+    "plywood": partial(_grained, (0.52, 0.34, 0.17), (0.40, 0.25, 0.12), (9.0, 9.0, 1.6)),
+    "timber": partial(_grained, (0.56, 0.41, 0.23), (0.42, 0.28, 0.14), (14.0, 14.0, 14.0)),
+    "orange plastic": partial(_matt, (0.62, 0.17, 0.02)),
+    "black rubber": partial(_matt, (0.022, 0.022, 0.024)),
+    "black wire": partial(_glossy, (0.03, 0.03, 0.033), 0.45),
+    "site concrete": partial(_mottled, (0.44, 0.43, 0.41), (0.36, 0.355, 0.34), 26.0, 0.7, (0.31, 0.30, 0.28)),
+    "blinding": partial(_matt, (0.47, 0.46, 0.44)),
+    "gravel": partial(_mottled, (0.42, 0.36, 0.28), (0.25, 0.21, 0.165), 14.0, 0.11, (0.29, 0.235, 0.172)),
+    "soil": partial(_mottled, (0.26, 0.175, 0.105), (0.15, 0.10, 0.062), 3.5, 0.5, (0.21, 0.15, 0.09)),
+    "trees": partial(_mottled, (0.085, 0.115, 0.045), (0.03, 0.05, 0.022), 0.9, 0.12, (0.055, 0.07, 0.03)),
+    "container blue": partial(_matt, (0.045, 0.13, 0.26)),
+    "container sand": partial(_matt, (0.45, 0.37, 0.24)),
+    "hoarding white": partial(_matt, (0.66, 0.66, 0.64)),
+    "hoarding blue": partial(_matt, (0.06, 0.17, 0.42)),
 }

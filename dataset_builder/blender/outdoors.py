@@ -11,8 +11,16 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
-from dataset_builder.scene.shapes.solids import box, merge_meshes, rotated_box, rotation_about_z, transformed
+from dataset_builder.scene.model import Mesh, Part, surface
+from dataset_builder.scene.shapes.solids import (
+    Point,
+    box,
+    merge_meshes,
+    ring_faces,
+    rotated_box,
+    rotation_about_z,
+    transformed,
+)
 
 CLEAR_M = 19.0
 _CORRUGATION_PITCH_M = 0.28
@@ -35,33 +43,34 @@ def outdoors() -> tuple[Part, ...]:
     return (*_ground(), *_containers(), *_hoarding(), *_stacks(), _spoil_heap(), _trees())
 
 
-def _part(name: str, mesh: Mesh, material: str) -> Part:
-    return Part(name, mesh, NOT_STEEL, material)
+def _placed(name: str, mesh: Mesh, at_m: Point, turn_deg: float, material: str) -> Part:
+    """Return the part whose mesh is rotated about the vertical by ``turn_deg`` and moved to ``at_m``."""
+    return surface(name, transformed(mesh, rotation_about_z(turn_deg), at_m), material)
 
 
 def _ground() -> tuple[Part, ...]:
     """Return the footing slab on its blinding, and the ground, into which the slab extends."""
     s, g, b = SLAB_HALF_M, GROUND_HALF_M, SLAB_HALF_M + 0.35
     return (
-        _part("slab", box((-s, -s, -0.6), (s, s, 0.0)), "site concrete"),
-        _part("blinding", box((-b, -b, -0.5), (b, b, -0.075)), "blinding"),
-        _part("ground", box((-g, -g, GROUND_M - 1.0), (g, g, GROUND_M)), "gravel"),
+        surface("slab", box((-s, -s, -0.6), (s, s, 0.0)), "site concrete"),
+        surface("blinding", box((-b, -b, -0.5), (b, b, -0.075)), "blinding"),
+        surface("ground", box((-g, -g, GROUND_M - 1.0), (g, g, GROUND_M)), "gravel"),
     )
 
 
 def _containers() -> tuple[Part, ...]:
     """Return two site containers with corrugated long sides, frames and doors."""
-    places = {"blue": ((-17.0, 21.0), 12.0, "container blue"), "sand": ((-8.5, 25.0), -6.0, "container sand")}
-    parts = []
-    for name, ((x, y), turn_deg, material) in places.items():
-        for piece, mesh, look in (("body", _corrugated(5.9, 2.3, 2.45), material), ("frame", _frame(), material)):
-            moved = transformed(mesh, rotation_about_z(turn_deg), (x, y, _PROP_BASE_M))
-            parts.append(_part(f"container-{name}-{piece}", moved, look))
-        door = transformed(
-            box((3.035, -1.0, 0.2), (3.06, 1.0, 2.35)), rotation_about_z(turn_deg), (x, y, _PROP_BASE_M)
+    places = {"blue": ((-17.0, 21.0), 12.0), "sand": ((-8.5, 25.0), -6.0)}
+    door = box((3.035, -1.0, 0.2), (3.06, 1.0, 2.35))
+    return tuple(
+        _placed(f"container-{name}-{piece}", mesh, (x, y, _PROP_BASE_M), turn_deg, material)
+        for name, ((x, y), turn_deg) in places.items()
+        for piece, mesh, material in (
+            ("body", _corrugated(5.9, 2.3, 2.45), f"container {name}"),
+            ("frame", _frame(), f"container {name}"),
+            ("door", door, "painted metal"),
         )
-        parts.append(_part(f"container-{name}-door", door, "painted metal"))
-    return tuple(parts)
+    )
 
 
 def _corrugated(length_m: float, width_m: float, height_m: float) -> Mesh:
@@ -93,39 +102,23 @@ def _strip(here: ndarray, row: int, other: int, count: int) -> list[ndarray]:
 def _frame() -> Mesh:
     """Return a container's corner posts and rails, which enclose the ends of the corrugated body."""
     x, y, t, h = 3.03, 1.22, 0.16, 2.6
-    posts = [
-        box(_post_low(sx, x, t, sy, y, 0.0), _post_high(sx, x, t, sy, y, h)) for sx in (-1, 1) for sy in (-1, 1)
-    ]
+    posts = [box((sx * x, sy * y, 0.0), (sx * (x - t), sy * (y - t), h)) for sx in (-1, 1) for sy in (-1, 1)]
     inner = x - t - 0.001
-    rails = [
-        box((-inner, min(s * y, s * (y - 0.12)), z), (inner, max(s * y, s * (y - 0.12)), z + 0.15))
-        for s in (-1, 1)
-        for z in (0.01, h - 0.16)
-    ]
+    rails = [box((-inner, s * y, z), (inner, s * (y - 0.12), z + 0.15)) for s in (-1, 1) for z in (0.01, h - 0.16)]
     ends = [
-        box((min(s * x, s * (x - 0.12)), -y + t + 0.001, z), (max(s * x, s * (x - 0.12)), y - t - 0.001, z + 0.15))
+        box((s * x, -y + t + 0.001, z), (s * (x - 0.12), y - t - 0.001, z + 0.15))
         for s in (-1, 1)
         for z in (0.01, h - 0.16)
     ]
     return merge_meshes([*posts, *rails, *ends])
 
 
-def _post_low(sx: int, x: float, t: float, sy: int, y: float, z: float) -> tuple[float, float, float]:
-    """Return the lower corner of a post of thickness ``t`` at the signs ``sx``, ``sy``."""
-    return min(sx * x, sx * (x - t)), min(sy * y, sy * (y - t)), z
-
-
-def _post_high(sx: int, x: float, t: float, sy: int, y: float, z: float) -> tuple[float, float, float]:
-    """Return the upper corner of a post of thickness ``t`` at the signs ``sx``, ``sy``."""
-    return max(sx * x, sx * (x - t)), max(sy * y, sy * (y - t)), z
-
-
 def _hoarding() -> tuple[Part, ...]:
     """Return two rows of closed panels, 60 mm apart, each panel on a concrete foot."""
-    runs = {"east": ((31.0, -16.0), 97.0, 14), "south": ((-24.0, -29.0), 4.0, 18)}
+    runs = (((31.0, -16.0), 97.0, 14), ((-24.0, -29.0), 4.0, 18))  # The east and the south run.
     sheets: dict[str, list[Mesh]] = {"hoarding white": [], "hoarding blue": []}
     feet = []
-    for (x, y), turn_deg, panels in runs.values():
+    for (x, y), turn_deg, panels in runs:
         along = rotation_about_z(turn_deg)[:, 0]
         for k in range(panels):
             at = np.array([x, y, _PROP_BASE_M]) + 2.46 * k * along
@@ -133,9 +126,9 @@ def _hoarding() -> tuple[Part, ...]:
             sheets[colour].append(rotated_box((at[0], at[1], at[2] + 1.2), (2.4, 0.04, 2.0), turn_deg))
             feet.append(rotated_box((at[0], at[1], at[2] + 0.09), (0.7, 0.25, 0.18), turn_deg))
     panels_of = tuple(
-        _part(f"hoarding-{colour[9:]}", merge_meshes(meshes), colour) for colour, meshes in sheets.items()
+        surface(f"hoarding-{colour[9:]}", merge_meshes(meshes), colour) for colour, meshes in sheets.items()
     )
-    return (*panels_of, _part("hoarding-feet", merge_meshes(feet), "site concrete"))
+    return (*panels_of, surface("hoarding-feet", merge_meshes(feet), "site concrete"))
 
 
 def _stacks() -> tuple[Part, ...]:
@@ -151,22 +144,11 @@ def _stacks() -> tuple[Part, ...]:
         for row in range(2)
         for k in range(4 - row)
     ]
+    timber_at_m = (22.5, 7.5, _PROP_BASE_M)
     return (
-        _part(
-            "timber",
-            transformed(merge_meshes(timber), rotation_about_z(35.0), (22.5, 7.5, _PROP_BASE_M)),
-            "timber",
-        ),
-        _part(
-            "bearers",
-            transformed(merge_meshes(bearers), rotation_about_z(35.0), (22.5, 7.5, _PROP_BASE_M)),
-            "timber",
-        ),
-        _part(
-            "blocks",
-            transformed(merge_meshes(blocks), rotation_about_z(-64.0), (-25.0, -6.5, _PROP_BASE_M)),
-            "site concrete",
-        ),
+        _placed("timber", merge_meshes(timber), timber_at_m, 35.0, "timber"),
+        _placed("bearers", merge_meshes(bearers), timber_at_m, 35.0, "timber"),
+        _placed("blocks", merge_meshes(blocks), (-25.0, -6.5, _PROP_BASE_M), -64.0, "site concrete"),
     )
 
 
@@ -174,7 +156,7 @@ def _spoil_heap() -> Part:
     """Return a low mound of soil whose base is below the ground."""
     random = np.random.default_rng(11)
     heap = _mound(rings=9, columns=36, radius_m=7.0, height_m=3.1, random=random)
-    return _part("spoil-heap", transformed(heap, np.diag([1.35, 1.0, 1.0]), (12.0, 31.5, GROUND_M)), "soil")
+    return surface("spoil-heap", transformed(heap, np.diag([1.35, 1.0, 1.0]), (12.0, 31.5, GROUND_M)), "soil")
 
 
 def _mound(rings: int, columns: int, radius_m: float, height_m: float, random: np.random.Generator) -> Mesh:
@@ -186,14 +168,11 @@ def _mound(rings: int, columns: int, radius_m: float, height_m: float, random: n
     height[0] = -0.3
     sides = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1).reshape(-1, 3)
     vertices = np.concatenate([sides, [[0.0, 0.0, height_m], [0.0, 0.0, -0.3]]])
-    ring, column = (grid.ravel() for grid in np.meshgrid(np.arange(rings - 1), np.arange(columns), indexing="ij"))
-    here, beside = ring * columns + column, ring * columns + (column + 1) % columns
     rim = np.arange(columns)
     following, top, last = (rim + 1) % columns, rings * columns, (rings - 1) * columns
     faces = np.concatenate(
         [
-            np.stack([here, beside, beside + columns], 1),
-            np.stack([here, beside + columns, here + columns], 1),
+            ring_faces(rings, columns),
             np.stack([last + rim, last + following, np.full(columns, top)], 1),
             np.stack([following, rim, np.full(columns, top + 1)], 1),
         ]
@@ -217,18 +196,12 @@ def _trees() -> Part:
         (top_m, crest_m),
         (inner_m, 0.5 * crest_m),
     ]
-    return _part("trees", _ring(outline, angle), "trees")
+    return surface("trees", _ring(outline, angle), "trees")
 
 
 def _ring(
     outline: list[tuple[Float64[ndarray, " c"], Float64[ndarray, " c"]]], angle: Float64[ndarray, " c"]
 ) -> Mesh:
     """Return a closed ring about z from an outline of (radius, height), metres, given for each angle (radians)."""
-    rows, columns = len(outline), len(angle)
     vertices = np.concatenate([np.stack([r * np.cos(angle), r * np.sin(angle), h], axis=1) for r, h in outline])
-    row, column = (grid.ravel() for grid in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
-    here, up = row * columns + column, (row + 1) % rows * columns + column
-    beside = row * columns + (column + 1) % columns
-    beside_up = (row + 1) % rows * columns + (column + 1) % columns
-    faces = np.concatenate([np.stack([here, beside, beside_up], 1), np.stack([here, beside_up, up], 1)])
-    return Mesh(vertices, faces.astype(np.int32))
+    return Mesh(vertices, ring_faces(len(outline), len(angle), closed=True))

@@ -16,7 +16,7 @@ from dataset_builder.blender.materials import STEEL_VARIANT_MATERIALS, material,
 from dataset_builder.blender.outdoors import outdoors
 from dataset_builder.config.specs import SceneSpec
 from dataset_builder.scene.board_texture import board_texture
-from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
+from dataset_builder.scene.model import Assembly, Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box
 from dataset_builder.scene.variants import LIGHT_SLOT, STEEL_SLOT, check_variants, exclusive_variant
 from dataset_builder.scene.variants.props import make_props
@@ -149,4 +149,4 @@ def _add_board(spec: BoardSpec) -> None:
     uv = sheet.vertices_m[:, :2] / np.array([spec.width_m, spec.height_m]) + 0.5
     layer = data.uv_layers.new(name="print")
     layer.data.foreach_set("uv", uv[sheet.faces.ravel()].astype(np.float32).ravel())
-    add_object(Part("board", sheet, NOT_STEEL, "paper"), data, np.zeros(3))
+    add_object(surface("board", sheet, "paper"), data, np.zeros(3))

@@ -32,7 +32,7 @@ from dataset_builder.pipeline.blender_process import DepthTask, RenderTask
 from dataset_builder.pipeline.shards import View, encode_view, stage_row
 from dataset_builder.scene.assemblies import aim_point_m, make_assembly
 from dataset_builder.scene.mesh_ply import read_mesh_ply, write_mesh_ply
-from dataset_builder.scene.model import NOT_STEEL, Mesh, Part, WorldMesh
+from dataset_builder.scene.model import Mesh, WorldMesh, surface
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError
@@ -146,7 +146,7 @@ def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None])
     """
     vertices_m, faces, _ = read_mesh_ply(task.mesh)
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    part = Part("dataset", Mesh(vertices_m, faces), NOT_STEEL, "steel")
+    part = surface("dataset", Mesh(vertices_m, faces), "steel")
     add_object(part, mesh_data(part.name, part.mesh, part.material), np.zeros(3))
     configure_colour(ColourSpec(samples=1, denoise=False), task.threads)
     with tempfile.TemporaryDirectory(dir=task.out) as scratch:

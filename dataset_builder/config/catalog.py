@@ -123,9 +123,10 @@ class BuildRequest:
     def config_specs(self) -> list[ConfigSpec]:
         """Return the specs of all requested configs.
 
-        Raises ``InputError`` for unknown configs, invalid variants and duplicate config names, and if ``mesh`` is
-        combined with a config that is not a lattice.
+        Raises ``InputError`` that names every value out of range, and ``InputError`` for unknown configs, invalid
+        variants and duplicate config names, and if ``mesh`` is combined with a config that is not a lattice.
         """
+        self._check_ranges()
         check_variants(self.variants)
         specs = [self._with_request(spec) for spec in (*_known_configs(self.configs), *self.scenes)]
         names = [spec.name for spec in specs]
@@ -135,6 +136,22 @@ class BuildRequest:
                 f"more than one config is named {', '.join(duplicates)}, expected unique names: rename the scene"
             )
         return specs
+
+    def _check_ranges(self) -> None:
+        limits: Sequence[tuple[str, int | None, int, int]] = (
+            ("--views", self.views, 1, 1_000_000),
+            ("--width", self.width, 16, 8192),
+            ("--height", self.height, 16, 8192),
+            ("--samples", self.samples, 1, 65_536),
+            ("--seed", self.seed, 0, 2**31 - 1),
+        )
+        problems = [
+            Problem("invalid", name, f"got {value}", f"{low} to {high}")
+            for name, value, low, high in limits
+            if value is not None and not low <= value <= high
+        ]
+        if problems:
+            raise InputError.from_problems("build request", problems)
 
     def _with_request(self, spec: ConfigSpec) -> ConfigSpec:
         variants = tuple(
@@ -178,25 +195,3 @@ def _known_configs(names: Sequence[str]) -> list[ConfigSpec]:
 def view_id(config: str, index: int) -> str:
     """Return the id of a view, ``<config>/<index>``, from its index in the full trajectory."""
     return f"{config}/{index:04d}"
-
-
-def check_request(request: BuildRequest) -> None:
-    """Raise ``InputError`` naming every value of the request that is out of range.
-
-    Also raises the errors of ``BuildRequest.config_specs``.
-    """
-    limits: Sequence[tuple[str, int | None, int, int]] = (
-        ("--views", request.views, 1, 1_000_000),
-        ("--width", request.width, 16, 8192),
-        ("--height", request.height, 16, 8192),
-        ("--samples", request.samples, 1, 65_536),
-        ("--seed", request.seed, 0, 2**31 - 1),
-    )
-    problems = [
-        Problem("invalid", name, f"got {value}", f"{low} to {high}")
-        for name, value, low, high in limits
-        if value is not None and not low <= value <= high
-    ]
-    if problems:
-        raise InputError.from_problems("build request", problems)
-    request.config_specs()

@@ -7,7 +7,10 @@ with ``dataclasses.asdict``: field names and defaults are part of the dataset fo
 from __future__ import annotations
 
 import hashlib
+import os
+from collections.abc import Collection
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from rebar_depth_bench.errors import MeshError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
@@ -71,6 +74,20 @@ class PinnedFile:
                 f"expected {self.sha256}"
             )
         return content
+
+
+def read_assembly_file(path: str | os.PathLike[str], kind: str, suffixes: Collection[str]) -> bytes:
+    """Return the bytes of a user's file; ``kind`` is ``mesh`` or ``cage``.
+
+    Raises ``MeshError`` if its suffix is not one of ``suffixes`` or it cannot be read.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in suffixes:
+        raise MeshError(f"{path}: unsupported {kind} file type {suffix!r}, expected {', '.join(suffixes)}")
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise MeshError(f"{path}: the {kind} file cannot be read: {error.strerror or error}") from error
 
 
 @dataclass(frozen=True)

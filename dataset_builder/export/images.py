@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import OpenEXR
-from jaxtyping import Bool, Float32, UInt8, UInt16
+from jaxtyping import Bool, Float32
 from numpy import ndarray
 from PIL import Image
 
@@ -26,19 +26,16 @@ _LARGEST_MM = np.iinfo(np.uint16).max
 """Largest depth that a 16-bit PNG can store, millimetres."""
 
 
-def colour_png(rgb: UInt8[ndarray, "h w 3"]) -> bytes:
-    """Encode 8-bit colour as PNG."""
-    return _png(rgb)
+def plain_png(pixels: ndarray) -> bytes:
+    """Encode 8-bit colour, 8-bit grey or 16-bit grey pixels as PNG."""
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "PNG", compress_level=_PNG_LEVEL)
+    return stream.getvalue()
 
 
 def mask_png(mask: Bool[ndarray, "h w"]) -> bytes:
     """Encode a mask as 8-bit grey PNG, 255 where true, which all common mask readers accept."""
-    return _png(np.where(mask, np.uint8(255), np.uint8(0)))
-
-
-def bars_png(bars: UInt16[ndarray, "h w"]) -> bytes:
-    """Encode bar ids as 16-bit grey PNG."""
-    return _png(bars)
+    return plain_png(np.where(mask, np.uint8(255), np.uint8(0)))
 
 
 def depth_exr(depth_m: Float32[ndarray, "h w"]) -> bytes:
@@ -55,7 +52,7 @@ def depth_mm_png(depth_m: Float32[ndarray, "h w"]) -> bytes:
     0 where there is no surface, or where it is farther than 65.535 m.
     """
     depth_mm = np.rint(depth_m.astype(np.float64) / MILLIMETRE_M)
-    return _png(np.where(depth_mm <= _LARGEST_MM, depth_mm, 0).astype(np.uint16))
+    return plain_png(np.where(depth_mm <= _LARGEST_MM, depth_mm, 0).astype(np.uint16))
 
 
 @dataclass(frozen=True)
@@ -73,17 +70,10 @@ class ExportFile:
 
 
 EXPORT_FILES: Mapping[str, ExportFile] = {
-    "image": ExportFile("images", ".png", "rgb", colour_png),
+    "image": ExportFile("images", ".png", "rgb", plain_png),
     "depth": ExportFile("depth", ".exr", "depth", depth_exr),
     "depth_mm": ExportFile("depth_mm", ".png", "depth", depth_mm_png),
     "mask": ExportFile("masks", ".png", "mask", mask_png),
-    "bars": ExportFile("bars", ".png", "bars", bars_png),
+    "bars": ExportFile("bars", ".png", "bars", plain_png),
 }
 """Files exported for each eye, by their key in ``cameras.json``."""
-
-
-def _png(pixels: ndarray) -> bytes:
-    """Encode an array as PNG."""
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "PNG", compress_level=_PNG_LEVEL)
-    return stream.getvalue()

@@ -62,7 +62,8 @@ def export(
     folder = _local_folder(root)
     chosen = [folder.config(name) for name in dict.fromkeys(configs or folder.configs)]
     wanted = {config.name: _select_view_ids(config, views) for config in chosen}
-    bars = _read_bars(folder)
+    bars_file = Path(folder.root) / BARS_FILE
+    bars = read_bars(bars_file) if bars_file.is_file() else {}
     target = Path(to)
     try:
         with export_target(target, folder, wanted):
@@ -94,12 +95,6 @@ def _select_view_ids(config: DatasetConfig, views: int | None) -> list[str]:
     if views is not None and views < 1:
         raise InputError(f"--views is {views}, expected 1 or more")
     return [config.views[index].view_id for index in subset(len(config.views), views)]
-
-
-def _read_bars(folder: DatasetFolder) -> dict[str, tuple[Bar, ...]]:
-    """Return the bars by scene, none if the file is missing. Raises ``DatasetError`` if it cannot be read."""
-    path = Path(folder.root) / BARS_FILE
-    return read_bars(path) if path.is_file() else {}
 
 
 def _export_config(

@@ -69,12 +69,7 @@ def stored_views(config: DatasetConfig, wanted: Collection[str]) -> Iterator[Sto
             raise DatasetError(f"{config.root}: view {view_id} is not in the manifest")
         if view_id in missing:
             missing.remove(view_id)
-            yield StoredView(_camera_view(row, config.grid), records[view_id], row)
+            cameras = {eye: camera_from_row(row, eye, config.grid) for eye in EYES}
+            yield StoredView(CameraView(view_id, float(row["baseline_m"]), cameras), records[view_id], row)
     if missing:
         raise DatasetError(f"{config.root}: {config.name} lacks {len(missing)} views, among them {min(missing)}")
-
-
-def _camera_view(row: Mapping[str, Any], grid: tuple[int, int]) -> CameraView:
-    """Return the cameras of a row."""
-    cameras = {eye: camera_from_row(row, eye, grid) for eye in EYES}
-    return CameraView(row["view_id"], float(row["baseline_m"]), cameras)

@@ -116,13 +116,6 @@ class ScannerSpec:
         pose[:3, 3] = -array(self.position_left_m)
         return pose
 
-    def diameter_m(self, range_m: float) -> float:
-        """Return the beam's diameter at a range, by ``beam_width``: d^2 = d0^2 + (divergence * range)^2.
-
-        This is the hyperbola of ISO 11146-1 with its waist at the exit.
-        """
-        return math.hypot(self.exit_diameter_m, self.divergence_rad * range_m)
-
     def to_dict(self) -> dict[str, Any]:
         """Return every parameter as plain JSON values."""
         return asdict(self) | {

@@ -6,7 +6,6 @@ The hits of a beam's sub-rays are grouped into returns, of which one or none is 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -109,7 +108,9 @@ def simulate_scan(
     world_from_lidar = inverse_rigid(lidar_from_world)
     row, column = sector.beams()
     range_m = np.full(len(row), np.nan)
-    for batch in _batches(len(row), max(_MAX_RAYS_PER_BATCH // spec.rays_per_beam, 1)):
+    batch_size = max(_MAX_RAYS_PER_BATCH // spec.rays_per_beam, 1)
+    for start in range(0, len(row), batch_size):
+        batch = slice(start, start + batch_size)
         origins, directions = sub_rays(spec, *beam_angles(spec, row[batch], column[batch]))
         hits = caster.hits(
             transform(world_from_lidar, origins).reshape(-1, 3),
@@ -127,9 +128,3 @@ def simulate_scan(
 def noise_generator(view_id: str) -> np.random.Generator:
     """Return the noise generator of a view; its seed depends on the view id alone."""
     return np.random.default_rng(int.from_bytes(hashlib.sha256(view_id.encode()).digest()[:8], "little"))
-
-
-def _batches(count: int, size: int) -> Iterator[slice]:
-    """Yield consecutive slices of at most ``size`` out of ``count`` items."""
-    for start in range(0, count, size):
-        yield slice(start, start + size)

@@ -11,9 +11,9 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dataset_builder.config.catalog import BuildRequest, check_request
+from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.pipeline.local_renderer import Renderer, local_processes
-from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, plan_request
+from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, plan_config
 from dataset_builder.pipeline.publish import (
     build_lock,
     check_folder,
@@ -55,8 +55,7 @@ def build(
     Raises ``InputError`` for a request that cannot be built, ``RenderProcessError`` if a render process dies
     twice, and ``BuildError`` if rendered data does not match its digests.
     """
-    check_request(request)
-    plans = plan_request(request, out)
+    plans = [plan_config(spec, request.views, out) for spec in request.config_specs()]
     for plan in plans:  # Report an unusable mesh file before anything is written.
         check_fits(plan.assembly, plan.spec)
     check_folder(out)

@@ -9,7 +9,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.specs import ConfigSpec
 from dataset_builder.config.trajectories import camera_offsets_m, subset
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging
@@ -50,11 +49,6 @@ class ConfigPlan:
         """Bars and meshes of the config, made on first access. Raises what ``make_assembly`` raises."""
         return make_assembly(self.spec.scene.assembly)
 
-    @property
-    def parameters(self) -> dict[str, Any]:
-        """Parameters of the config as written to the manifest."""
-        return config_parameters(self.spec)
-
 
 def plan_config(spec: ConfigSpec, views: int | None, out: Path) -> ConfigPlan:
     """Return the plan of one config in the dataset folder ``out``; ``views`` limits the number of views."""
@@ -62,11 +56,6 @@ def plan_config(spec: ConfigSpec, views: int | None, out: Path) -> ConfigPlan:
     key_inputs = [config_parameters(spec), indices, VIEWS_PER_SHARD, generator_versions()]
     key = parameters_digest(key_inputs)
     return ConfigPlan(spec, indices, key, Staging(out / BUILD_FOLDER / f"{spec.name}-{key[:_KEY_CHARACTERS]}"))
-
-
-def plan_request(request: BuildRequest, out: Path) -> list[ConfigPlan]:
-    """Return the plans of all requested configs; raise ``InputError`` as ``BuildRequest.config_specs`` does."""
-    return [plan_config(spec, request.views, out) for spec in request.config_specs()]
 
 
 def config_parameters(spec: ConfigSpec) -> dict[str, Any]:

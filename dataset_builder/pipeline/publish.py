@@ -17,7 +17,7 @@ from cards import dataset_card
 from dataset_builder.config.catalog import CONFIGS
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.pipeline.contact_sheet import write_contact_sheet, write_scenes_strip
-from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, generator_versions
+from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.shards import pack_shard, read_staged_record, split_into_shards
 from dataset_builder.scene.assemblies import aim_point_m
 from rebar_depth_bench.atomic_io import TEMPORARY_PATTERN, exclusive_lock, write_bytes, write_text
@@ -105,7 +105,7 @@ def check_retained_configs(out: Path, plans: Sequence[ConfigPlan]) -> None:
         if name in planned:
             continue
         for plan in plans:
-            scene = plan.parameters["scene"]
+            scene = config_parameters(plan.spec)["scene"]
             if config.scene.name == scene["name"] and config.entry["scene"] != json.loads(json.dumps(scene)):
                 raise InputError(
                     f"{out}: config {name} was built with other parameters of scene {scene['name']!r}; "
@@ -127,7 +127,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
     _write_bars(out, plan)
     records = [read_staged_record(plan.staging.row(index)) for index in plan.indices]
     entry = {
-        **plan.parameters,
+        **config_parameters(plan.spec),
         "key": plan.key,
         "aim_point_m": aim_point_m(plan.assembly).tolist(),
         "protocol_views": len(camera_offsets_m(plan.spec.protocol)),

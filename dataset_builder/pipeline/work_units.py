@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dataset_builder.config.specs import ConfigSpec
@@ -102,13 +102,8 @@ def check_software_versions(expected: Mapping[str, str], worker: str, actual: Ma
 def with_payload(result: UnitResult, unit: WorkUnit, staging: Staging) -> UnitResult:
     """Return the result with the bytes of the rows of the unit, and of the mesh if the unit requests it."""
     contents = {index: staging.row(index).read_bytes() for index in unit.indices}
-    return UnitResult(
-        result.worker,
-        result.seconds,
-        result.mesh_sha256,
-        mesh=staging.mesh.read_bytes() if unit.with_mesh else None,
-        rows=tuple(StagedRow(index, content, _sha256(content)) for index, content in contents.items()),
-    )
+    rows = tuple(StagedRow(index, content, _sha256(content)) for index, content in contents.items())
+    return replace(result, mesh=staging.mesh.read_bytes() if unit.with_mesh else None, rows=rows)
 
 
 def accept_result(unit: WorkUnit, result: UnitResult, staging: Staging) -> None:

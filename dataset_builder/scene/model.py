@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,12 +51,24 @@ class Part:
     material: str
 
 
+def surface(name: str, mesh: Mesh, material: str) -> Part:
+    """Return a part that is not steel."""
+    return Part(name, mesh, NOT_STEEL, material)
+
+
 @dataclass(frozen=True, eq=False)
 class Assembly:
     """Steel of a scene: its bars, and one part per bar."""
 
     bars: tuple[Bar, ...]
     parts: tuple[Part, ...]
+
+    @classmethod
+    def from_meshes(cls, bars_and_meshes: Iterable[tuple[Bar, Mesh]]) -> Assembly:
+        """Return the assembly of bars and their meshes (world frame); a part is named by its bar's role and id."""
+        pairs = tuple(bars_and_meshes)
+        parts = (Part(f"{bar.role}-{bar.bar_id:03d}", mesh, bar.bar_id, STEEL) for bar, mesh in pairs)
+        return cls(tuple(bar for bar, _ in pairs), tuple(parts))
 
     @property
     def vertices_m(self) -> Float64[ndarray, "v 3"]:

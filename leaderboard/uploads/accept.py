@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping
 
 import structlog
 from anyio import to_thread
@@ -14,27 +14,15 @@ from leaderboard.service import Service
 from leaderboard.uploads.multipart import (
     MAX_OVERHEAD_BYTES,
     ReceivedArchive,
-    UploadError,
+    UploadRejectedError,
     receive,
     too_large_message,
 )
-from rebar_depth_bench.errors import Problem, RebarDepthError
+from rebar_depth_bench.errors import RebarDepthError
 
 UNAVAILABLE_MESSAGE = "the service cannot validate or store archives at the moment; try again later"
 """Detail of the 503 response if the dataset is unreadable, the disk full or the archive storage unavailable."""
 _LOG = structlog.get_logger("uploads")
-
-
-class UploadRejectedError(Exception):
-    """Raised when an upload is rejected.
-
-    Holds the HTTP status, the detail message and, for status 422 only, all problems.
-    """
-
-    def __init__(self, status: int, detail: str, problems: Sequence[Problem] = ()) -> None:
-        self.status, self.detail = status, detail
-        self.problems = (problems or (Problem("syntax", "", detail),)) if status == 422 else ()
-        super().__init__(detail)
 
 
 async def accept_upload(
@@ -56,8 +44,6 @@ async def accept_upload(
             return await _validate_and_store(service, token, received)
         finally:
             await to_thread.run_sync(received.path.unlink, True)
-    except UploadError as error:
-        raise UploadRejectedError(error.status, error.detail) from None
     except (OSError, RebarDepthError) as error:
         _LOG.error("upload failed: service unavailable", error=str(error))
         raise UploadRejectedError(503, UNAVAILABLE_MESSAGE) from None

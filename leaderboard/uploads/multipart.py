@@ -5,13 +5,15 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from anyio import to_thread
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
+
+from rebar_depth_bench.errors import Problem
 
 ARCHIVE_FIELD = "archive"
 MAX_FIELD_BYTES = 1 << 10
@@ -22,11 +24,15 @@ MAX_OVERHEAD_BYTES = 64 << 10
 """Maximum size in bytes of everything in the body except the content of the archive."""
 
 
-class UploadError(Exception):
-    """Raised when an upload cannot be received; holds the HTTP status and the detail message."""
+class UploadRejectedError(Exception):
+    """Raised when an upload is rejected.
 
-    def __init__(self, status: int, detail: str) -> None:
+    Holds the HTTP status, the detail message and, for status 422 only, all problems.
+    """
+
+    def __init__(self, status: int, detail: str, problems: Sequence[Problem] = ()) -> None:
         self.status, self.detail = status, detail
+        self.problems = (problems or (Problem("syntax", "", detail),)) if status == 422 else ()
         super().__init__(detail)
 
 
@@ -132,8 +138,8 @@ class _FirstPart(_PartHeaders):
 async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, max_bytes: int) -> ReceivedArchive:
     """Write the field ``archive`` of a multipart body to a new file in ``spool`` and return the received archive.
 
-    Raises ``UploadError``, and leaves no file, if the body is not valid multipart (422) or the archive has more
-    than ``max_bytes`` bytes (413).
+    Raises ``UploadRejectedError``, and leaves no file, if the body is not valid multipart (422) or the archive has
+    more than ``max_bytes`` bytes (413).
     """
     boundary = boundary_of(content_type)
     parts = _ArchivePart()
@@ -155,19 +161,19 @@ async def receive(stream: AsyncIterator[bytes], content_type: str, spool: Path, 
                 waiting = sum(map(len, parts.waiting))
                 _check_parts(parts, received_bytes - size - waiting)
                 if size + waiting > max_bytes:
-                    raise UploadError(413, too_large_message(max_bytes))
+                    raise UploadRejectedError(413, too_large_message(max_bytes))
                 if waiting >= WRITE_CHUNK_BYTES:
                     size += await to_thread.run_sync(flush)
             parser.finalize()
             size += await to_thread.run_sync(flush)
         if not parts.complete or not parts.archives:
-            raise UploadError(
+            raise UploadRejectedError(
                 422, f"the body is incomplete or has no field {ARCHIVE_FIELD!r}, expected a zip file in this field"
             )
         return ReceivedArchive(path, sha256.hexdigest(), size)
     except FormParserError as error:
         path.unlink(missing_ok=True)
-        raise UploadError(422, f"the body is not valid multipart/form-data: {error}") from None
+        raise UploadRejectedError(422, f"the body is not valid multipart/form-data: {error}") from None
     except BaseException:
         path.unlink(missing_ok=True)
         raise
@@ -179,8 +185,8 @@ async def read_leading_field(
     """Read the first field of a multipart body; return its text and a stream of the whole body.
 
     The text is "" if the first field is not ``name`` or is too long. The form sends its token this way, so that
-    the uploader is identified before the archive is stored. Raises ``UploadError`` (422) if the body is not
-    multipart.
+    the uploader is identified before the archive is stored. Raises ``UploadRejectedError`` (422) if the body is
+    not multipart.
     """
     first = _FirstPart()
     parser = MultipartParser(boundary_of(content_type), first.callbacks())  # type: ignore[arg-type]
@@ -198,7 +204,7 @@ async def read_leading_field(
             ):
                 break
     except FormParserError as error:
-        raise UploadError(422, f"the body is not valid multipart/form-data: {error}") from None
+        raise UploadRejectedError(422, f"the body is not valid multipart/form-data: {error}") from None
     is_complete = first.ended and first.name == name.encode() and len(first.text) <= MAX_FIELD_BYTES
     return (first.text.decode(errors="replace") if is_complete else ""), _replay(chunks, stream)
 
@@ -211,11 +217,11 @@ async def _replay(chunks: list[bytes], stream: AsyncIterator[bytes]) -> AsyncIte
 
 
 def boundary_of(content_type: str) -> bytes:
-    """Return the boundary of a multipart body. Raises ``UploadError`` (422) for any other content type."""
+    """Return the boundary of a multipart body. Raises ``UploadRejectedError`` (422) for any other content type."""
     kind, options = parse_options_header(content_type)
     boundary = options.get(b"boundary")
     if kind != b"multipart/form-data" or not boundary:
-        raise UploadError(
+        raise UploadRejectedError(
             422, f"the content type is {content_type!r}, expected multipart/form-data with a boundary"
         )
     return boundary
@@ -228,8 +234,8 @@ def too_large_message(max_bytes: int) -> str:
 
 def _check_parts(parts: _ArchivePart, overhead_bytes: int) -> None:
     if parts.archives > 1:
-        raise UploadError(422, f"the body has the field {ARCHIVE_FIELD!r} twice, expected once")
+        raise UploadRejectedError(422, f"the body has the field {ARCHIVE_FIELD!r} twice, expected once")
     if overhead_bytes > MAX_OVERHEAD_BYTES:  # including preamble and epilogue
-        raise UploadError(
+        raise UploadRejectedError(
             422, f"the body has more than {MAX_OVERHEAD_BYTES} bytes outside the field {ARCHIVE_FIELD!r}"
         )

@@ -8,7 +8,6 @@ import os
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from leaderboard.scoring.process_limits import limit_process
@@ -32,14 +31,12 @@ class ArchiveChecker:
 
     def __init__(self, data: str, memory: int) -> None:
         self._data, self._memory = data, memory
-        self._pool = self._new_pool()
+        self._pool = self._new_pool(POOL_PROCESSES)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     async def check(self, archive: Path) -> Verdict:
@@ -49,23 +46,20 @@ class ArchiveChecker:
             return await asyncio.wrap_future(pool.submit(_check_archive, str(archive), self._data))
         except BrokenProcessPool:
             if self._pool is pool:
-                self._pool = self._new_pool()
+                self._pool = self._new_pool(POOL_PROCESSES)
             return await self._check_alone(archive)
 
     async def _check_alone(self, archive: Path) -> Verdict:
         """Validate an archive in a separate pool, because a broken pool does not reveal which archive broke it."""
-        with ProcessPoolExecutor(1, _context(), limit_process, (self._memory, os.getpid())) as pool:
+        with self._new_pool(1) as pool:
             try:
                 return await asyncio.wrap_future(pool.submit(_check_archive, str(archive), self._data))
             except BrokenProcessPool:
                 return (CRASHED,)
 
-    def _new_pool(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(POOL_PROCESSES, _context(), limit_process, (self._memory, os.getpid()))
-
-
-def _context() -> multiprocessing.context.SpawnContext:
-    return multiprocessing.get_context("spawn")  # A fork would inherit locks held by the server's threads.
+    def _new_pool(self, processes: int) -> ProcessPoolExecutor:
+        spawn = multiprocessing.get_context("spawn")  # A fork would inherit locks held by the server's threads.
+        return ProcessPoolExecutor(processes, spawn, limit_process, (self._memory, os.getpid()))
 
 
 def _check_archive(archive: str, data: str) -> Verdict:

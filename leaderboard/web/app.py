@@ -11,8 +11,7 @@ from starlette.requests import ClientDisconnect
 
 from leaderboard.db.engine import DATABASE_UNAVAILABLE
 from leaderboard.service import Service
-from leaderboard.uploads.accept import UploadRejectedError
-from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES
+from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES, UploadRejectedError
 from leaderboard.web.api import health, leaderboard, submissions, token
 from leaderboard.web.api.schemas import DATABASE_UNAVAILABLE_MESSAGE
 from leaderboard.web.cache import new_cache_state

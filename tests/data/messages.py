@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dataset_builder.config.catalog import BuildRequest, check_request
+from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.scene_schema import read_scene_toml
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
 from rebar_depth_bench.data.manifest import open_folder
@@ -133,8 +133,8 @@ def rejected_inputs(folder: Path) -> Mapping[str, Callable[[], object]]:
         "scene file": lambda: read_scene_toml(SCENE.encode(), "beam.toml", ("lattice", "pile")),
         "scene file that is not TOML": lambda: read_scene_toml(b"unit = ", "beam.toml"),
         "bars of a scene file": lambda: load_cage(cage_file_spec(folder / "cage.toml")),
-        "build options": lambda: check_request(BuildRequest(configs=("lattice",), views=0, width=9)),
-        "configs": lambda: check_request(BuildRequest(configs=("latice", "pier"))),
+        "build options": lambda: BuildRequest(configs=("lattice",), views=0, width=9).config_specs(),
+        "configs": lambda: BuildRequest(configs=("latice", "pier")).config_specs(),
         "ONNX method": lambda: read_onnx_toml(folder / "model.toml"),
         "TOML calibration": lambda: read_calibration(folder / "rig.toml", 1280, 720),
         "INI calibration": lambda: read_calibration(folder / "rig.conf", 1280, 720),

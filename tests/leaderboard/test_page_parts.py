@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from leaderboard.db.engine import Database
 from leaderboard.db.models import LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
 from leaderboard.db.rankings import leaderboard_entries, queue_position, ranks
-from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadError, read_leading_field
+from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadRejectedError, read_leading_field
 from leaderboard.web.pages.leaderboard import (
     COLUMNS,
     MAX_PLOTTED,
@@ -191,9 +191,9 @@ def test_other_or_too_long_first_field_is_empty(parts: list[tuple[str, bytes]]) 
 
 
 def test_non_multipart_body_is_rejected() -> None:
-    with pytest.raises(UploadError, match="expected multipart/form-data"):
+    with pytest.raises(UploadRejectedError, match="expected multipart/form-data"):
         first_field(b"{}", 10, "application/json")
-    with pytest.raises(UploadError, match="not valid multipart/form-data"):
+    with pytest.raises(UploadRejectedError, match="not valid multipart/form-data"):
         first_field(b"hello", 10)
 
 

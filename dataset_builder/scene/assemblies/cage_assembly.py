@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.assemblies.mesh_import import MAX_EXTENT_M, MIN_EXTENT_M
-from dataset_builder.scene.model import MAX_BARS, STEEL, Assembly, Mesh, Part
+from dataset_builder.scene.model import MAX_BARS, Assembly, Mesh
 from dataset_builder.scene.shapes.bar_mesh import RibPattern, plain_bar_mesh, ribbed_bar_mesh
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import MeshError, Problem
@@ -80,15 +80,11 @@ def cage_assembly(bars: Sequence[CageBar], where: str) -> Assembly:
     meshes, problems = [], []
     for bar in final_bars:
         try:
-            meshes.append(_bar_mesh(bar))
+            meshes.append((bar.bar, _bar_mesh(bar)))
         except ValueError as error:
             problems.append(Problem("invalid", bar.label, str(error)))
     raise_problems(problems, where)
-    parts = (
-        Part(f"{bar.bar.role}-{bar.bar.bar_id:03d}", mesh, bar.bar.bar_id, STEEL)
-        for bar, mesh in zip(final_bars, meshes, strict=True)
-    )
-    return Assembly(tuple(bar.bar for bar in final_bars), tuple(parts))
+    return Assembly.from_meshes(meshes)
 
 
 def raise_problems(problems: Sequence[Problem], where: str) -> None:

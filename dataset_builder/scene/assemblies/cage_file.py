@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from dataset_builder.config.scene_schema import TomlBar, read_scene_toml
-from dataset_builder.config.specs import CageFileSpec
+from dataset_builder.config.specs import CageFileSpec, read_assembly_file
 from dataset_builder.scene.assemblies.cage_assembly import CageBar, cage_assembly, raise_problems
 from dataset_builder.scene.assemblies.ifc.bars import ifc_bars
 from dataset_builder.scene.model import Assembly, axis_of
@@ -27,7 +27,7 @@ def cage_file_spec(path: str | os.PathLike[str]) -> CageFileSpec:
 
     Raises ``MeshError`` if it cannot be read or its suffix is neither ``.toml`` nor ``.ifc``.
     """
-    return CageFileSpec(os.fspath(path), hashlib.sha256(_read_content(path)).hexdigest())
+    return CageFileSpec(os.fspath(path), hashlib.sha256(read_assembly_file(path, "cage", _READERS)).hexdigest())
 
 
 def load_cage(spec: CageFileSpec) -> Assembly:
@@ -36,8 +36,8 @@ def load_cage(spec: CageFileSpec) -> Assembly:
     Raises ``MeshError`` if the file cannot be read, does not match ``spec.sha256``, violates its format or has
     invalid bars (see ``cage_assembly``); ``InputError`` if it is an IFC file and ifcopenshell is not installed.
     """
-    content = spec.check(_read_content(spec.path))
-    return cage_assembly(_READERS[_lower_suffix(spec.path)](content, spec.path), spec.path)
+    content = spec.check(read_assembly_file(spec.path, "cage", _READERS))
+    return cage_assembly(_READERS[Path(spec.path).suffix.lower()](content, spec.path), spec.path)
 
 
 def _toml_bars(content: bytes, where: str) -> list[CageBar]:
@@ -70,19 +70,3 @@ def _label(bar: TomlBar) -> str:
 
 
 _READERS: Mapping[str, Callable[[bytes, str], list[CageBar]]] = {".toml": _toml_bars, ".ifc": ifc_bars}
-
-
-def _lower_suffix(path: str | os.PathLike[str]) -> str:
-    return Path(path).suffix.lower()
-
-
-def _read_content(path: str | os.PathLike[str]) -> bytes:
-    """Return a cage file's bytes; raise ``MeshError`` if its suffix is unknown or it cannot be read."""
-    if _lower_suffix(path) not in _READERS:
-        raise MeshError(
-            f"{path}: unsupported cage file type {_lower_suffix(path)!r}, expected {', '.join(_READERS)}"
-        )
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise MeshError(f"{path}: the cage file cannot be read: {error.strerror or error}") from error

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.config.specs import LatticeSpec
-from dataset_builder.scene.model import STEEL, Assembly, Mesh, Part, axis_of
+from dataset_builder.scene.model import Assembly, Mesh, axis_of
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m, ribbed_bar_mesh
 from rebar_depth_bench.data.bars import Bar
 
@@ -39,16 +39,12 @@ def lattice_assembly(spec: LatticeSpec) -> Assembly:
     ``spec`` would touch or leave the cube.
     """
     _check_spec(spec)
-    along_x = {
-        diameter_m: ribbed_bar_mesh(_centred_line_m(spec.extent_m), diameter_m) for diameter_m in spec.diameters_m
-    }
-    bars, parts = [], []
-    for bar_id, rod in enumerate(_rods(spec), start=1):
-        bar = _bar(bar_id, rod, spec.extent_m)
-        bars.append(bar)
-        mesh = _place_rod(along_x[rod.diameter_m], rod)
-        parts.append(Part(f"{bar.role}-{bar_id:03d}", mesh, bar_id, STEEL))
-    return Assembly(tuple(bars), tuple(parts))
+    line_m = np.array([[-spec.extent_m / 2, 0.0, 0.0], [spec.extent_m / 2, 0.0, 0.0]])
+    along_x = {diameter_m: ribbed_bar_mesh(line_m, diameter_m) for diameter_m in spec.diameters_m}
+    return Assembly.from_meshes(
+        _placed_rod(bar_id, rod, line_m, along_x[rod.diameter_m])
+        for bar_id, rod in enumerate(_rods(spec), start=1)
+    )
 
 
 def _layer_offset_m(spec: LatticeSpec) -> float:
@@ -104,15 +100,10 @@ def _rod_middle_m(axis: int, slow_m: float, fast_m: float, spec: LatticeSpec) ->
     return (float(middle[0]), float(middle[1]), float(middle[2]))
 
 
-def _centred_line_m(length_m: float) -> Float64[ndarray, "2 3"]:
-    return np.array([[-length_m / 2, 0.0, 0.0], [length_m / 2, 0.0, 0.0]])
-
-
-def _place_rod(along_x: Mesh, rod: _Rod) -> Mesh:
-    """Return a mesh along x moved to the rod's position; a cyclic permutation of axes rotates without rounding."""
-    return Mesh(np.roll(along_x.vertices_m, rod.axis, axis=1) + np.array(rod.middle_m), along_x.faces)
-
-
-def _bar(bar_id: int, rod: _Rod, length_m: float) -> Bar:
-    ends = np.roll(_centred_line_m(length_m), rod.axis, axis=1) + np.array(rod.middle_m)
-    return Bar(bar_id, f"{AXIS_NAMES[rod.axis]}-rod", rod.diameter_m, axis_of(ends))
+def _placed_rod(bar_id: int, rod: _Rod, line_m: Float64[ndarray, "2 3"], along_x: Mesh) -> tuple[Bar, Mesh]:
+    """Return bar and mesh of a rod, whose centreline and mesh along x are rotated by a permutation of the axes."""
+    axis_m, vertices_m = (
+        np.roll(points_m, rod.axis, axis=1) + np.array(rod.middle_m) for points_m in (line_m, along_x.vertices_m)
+    )
+    bar = Bar(bar_id, f"{AXIS_NAMES[rod.axis]}-rod", rod.diameter_m, axis_of(axis_m))
+    return bar, Mesh(vertices_m, along_x.faces)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +17,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.config.scene_schema import UNITS_M
-from dataset_builder.config.specs import MeshFileSpec
+from dataset_builder.config.specs import MeshFileSpec, read_assembly_file
 from dataset_builder.scene.assemblies.mesh_import import SUFFIXES, read_parts
 from dataset_builder.scene.model import ESTIMATED_ROLE, STEEL, Assembly, Mesh, Part, axis_of
 from rebar_depth_bench.data.bars import Bar
@@ -91,7 +90,9 @@ def mesh_file_spec(path: str | os.PathLike[str], unit: str | float) -> MeshFileS
         raise MeshError(f"{path}: unknown unit {unit!r}, expected one of {', '.join(UNITS_M)} or metres")
     unit_m = UNITS_M[unit] if isinstance(unit, str) else float(unit)
     _check_unit(unit_m, str(path))
-    return MeshFileSpec(os.fspath(path), hashlib.sha256(_read_content(path)).hexdigest(), unit_m)
+    return MeshFileSpec(
+        os.fspath(path), hashlib.sha256(read_assembly_file(path, "mesh", SUFFIXES)).hexdigest(), unit_m
+    )
 
 
 def load_assembly(spec: MeshFileSpec) -> Assembly:
@@ -103,7 +104,7 @@ def load_assembly(spec: MeshFileSpec) -> Assembly:
     65,535 bars, a bar without area or a non-finite coordinate, or if its extent is implausible for the unit.
     """
     _check_unit(spec.unit_m, spec.path)
-    meshes = read_parts(spec.check(_read_content(spec.path)), spec)
+    meshes = read_parts(spec.check(read_assembly_file(spec.path, "mesh", SUFFIXES)), spec)
     return Assembly(
         bars=tuple(_estimated_bar(bar_id, mesh, spec.path) for bar_id, mesh in meshes.items()),
         parts=tuple(Part(f"bar-{bar_id:03d}", mesh, bar_id, STEEL) for bar_id, mesh in meshes.items()),
@@ -124,14 +125,3 @@ def _check_unit(unit_m: float, where: str) -> None:
     """Raise ``MeshError`` unless a file unit is a positive finite length."""
     if not (math.isfinite(unit_m) and unit_m > 0):
         raise MeshError(f"{where}: one file unit is {unit_m} m, expected a positive length")
-
-
-def _read_content(path: str | os.PathLike[str]) -> bytes:
-    """Return a mesh file's bytes; raise ``MeshError`` if its suffix is unknown or it cannot be read."""
-    suffix = Path(path).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise MeshError(f"{path}: unsupported mesh file type {suffix!r}, expected {', '.join(SUFFIXES)}")
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise MeshError(f"{path}: the mesh file cannot be read: {error.strerror or error}") from error

@@ -20,7 +20,7 @@ from dataset_builder.scene.assemblies.pier_layout import (
     tie_row,
     vertical_positions_m,
 )
-from dataset_builder.scene.model import STEEL, Assembly, Mesh, Part, axis_of
+from dataset_builder.scene.model import Assembly, Mesh, axis_of
 from dataset_builder.scene.shapes.bar_mesh import plain_bar_mesh
 from dataset_builder.scene.shapes.bending import bent_line_m
 from rebar_depth_bench.data.bars import Bar
@@ -62,13 +62,13 @@ def pier_assembly(spec: PierSpec) -> Assembly:
 
     Raises ``ValueError`` if bars of ``spec`` would touch, would not fit or would be longer than stock bars.
     """
-    layout = pier_layout(spec)
-    bars, parts = [], []
-    for bar_id, (shape, shift_m) in enumerate(_placed_shapes(spec, layout), start=1):
-        bars.append(Bar(bar_id, shape.role, shape.diameter_m, axis_of(shape.line_m + shift_m)))
-        mesh = Mesh(shape.mesh.vertices_m + shift_m, shape.mesh.faces)
-        parts.append(Part(f"{shape.role}-{bar_id:03d}", mesh, bar_id, STEEL))
-    return Assembly(tuple(bars), tuple(parts))
+    return Assembly.from_meshes(
+        (
+            Bar(bar_id, shape.role, shape.diameter_m, axis_of(shape.line_m + shift_m)),
+            Mesh(shape.mesh.vertices_m + shift_m, shape.mesh.faces),
+        )
+        for bar_id, (shape, shift_m) in enumerate(_placed_shapes(spec, pier_layout(spec)), start=1)
+    )
 
 
 def _placed_shapes(spec: PierSpec, layout: PierLayout) -> Iterator[tuple[_BarShape, Float64[ndarray, " 3"]]]:

@@ -21,7 +21,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.config.specs import PileSpec
-from dataset_builder.scene.model import STEEL, Assembly, Mesh, Part, axis_of
+from dataset_builder.scene.model import Assembly, Mesh, axis_of
 from dataset_builder.scene.shapes.bar_mesh import RibPattern, outer_radius_m, ribbed_bar_mesh
 from dataset_builder.scene.shapes.bending import bend_radius_m, bent_line_m
 from rebar_depth_bench.data.bars import Bar
@@ -134,12 +134,13 @@ def pile_assembly(spec: PileSpec) -> Assembly:
     """
     line_m = spec_centreline_m(spec)
     local = ribbed_bar_mesh(line_m, spec.diameter_m, RIBS)
-    bars, parts = [], []
-    for bar_id, pose in enumerate(load_settled_poses(spec), start=1):
-        bars.append(Bar(bar_id, ROLE, spec.diameter_m, axis_of(points_in_world_m(line_m, pose))))
-        mesh = Mesh(points_in_world_m(local.vertices_m, pose), local.faces)
-        parts.append(Part(f"{ROLE}-{bar_id:03d}", mesh, bar_id, STEEL))
-    return Assembly(tuple(bars), tuple(parts))
+    return Assembly.from_meshes(
+        (
+            Bar(bar_id, ROLE, spec.diameter_m, axis_of(points_in_world_m(line_m, pose))),
+            Mesh(points_in_world_m(local.vertices_m, pose), local.faces),
+        )
+        for bar_id, pose in enumerate(load_settled_poses(spec), start=1)
+    )
 
 
 def spec_centreline_m(spec: PileSpec) -> Float64[ndarray, "n 3"]:

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float64, Int32
+from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import Mesh
+from dataset_builder.scene.shapes.solids import tube_faces
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def ribbed_bar_mesh(
     s_m = diameter_m * _inclined_ring_positions(ring_position, theta, ribs)
     side = axis.surface_points_m(s_m, theta, radius_m)
     vertices = np.concatenate([side.reshape(-1, 3), axis.points_m[[0, -1]]])
-    return Mesh(vertices, _tube_faces(len(ring_position), len(theta)))
+    return Mesh(vertices, tube_faces(len(ring_position), len(theta)))
 
 
 def plain_bar_mesh(centreline_m: Float64[ndarray, "n 3"], diameter_m: float, segments: int = 24) -> Mesh:
@@ -80,7 +81,7 @@ def plain_bar_mesh(centreline_m: Float64[ndarray, "n 3"], diameter_m: float, seg
     s_m = np.repeat(axis.arc_m[:, None], segments, axis=1)
     side = axis.surface_points_m(s_m, theta, np.full_like(s_m, radius_m))
     vertices = np.concatenate([side.reshape(-1, 3), axis.points_m[[0, -1]]])
-    return Mesh(vertices, _tube_faces(len(axis.points_m), segments))
+    return Mesh(vertices, tube_faces(len(axis.points_m), segments))
 
 
 def plain_outer_radius_m(diameter_m: float, segments: int = 24) -> float:
@@ -160,26 +161,6 @@ def _inclined_ring_positions(
     # Reducing the tilt over twice the lead keeps neighbouring rings from crossing.
     tilt = lead * np.clip(distance_to_end / (2 * lead), 0.0, 1.0)
     return np.asarray(ring_position[:, None] - tilt[:, None] * np.cos(theta))
-
-
-def _tube_faces(rings: int, segments: int) -> Int32[ndarray, "f 3"]:
-    """Return the triangles of a tube of vertex rings, closed by fans around the last two vertices."""
-    ring, segment = np.meshgrid(np.arange(rings - 1), np.arange(segments), indexing="ij")
-    here = (ring * segments + segment).ravel()
-    beside = (ring * segments + (segment + 1) % segments).ravel()
-    side = np.concatenate(
-        [
-            np.stack([here, beside, beside + segments], axis=1),
-            np.stack([here, beside + segments, here + segments], axis=1),
-        ]
-    )
-    rim = np.arange(segments)
-    rim_next = (rim + 1) % segments
-    first_centre, last_centre, last_ring = rings * segments, rings * segments + 1, (rings - 1) * segments
-    first_cap = np.stack([np.full(segments, first_centre), rim_next, rim], axis=1)
-    last_cap = np.stack([np.full(segments, last_centre), last_ring + rim, last_ring + rim_next], axis=1)
-    faces: Int32[ndarray, "f 3"] = np.concatenate([side, first_cap, last_cap]).astype(np.int32)
-    return faces
 
 
 @dataclass(frozen=True, eq=False)

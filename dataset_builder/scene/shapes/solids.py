@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int32
 from numpy import ndarray
 
 from dataset_builder.scene.model import Mesh
@@ -22,10 +22,10 @@ _BOX_FACES = [
 ]  # fmt: skip
 
 
-def box(low_m: Point, high_m: Point) -> Mesh:
-    """Return the axis-aligned box between two opposite corners."""
+def box(corner_m: Point, opposite_m: Point) -> Mesh:
+    """Return the axis-aligned box between two opposite corners, in any order."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
-    low, high = np.array(low_m), np.array(high_m)
+    low, high = np.minimum(corner_m, opposite_m), np.maximum(corner_m, opposite_m)
     return Mesh(low + corners * (high - low), np.array(_BOX_FACES, dtype=np.int32))
 
 
@@ -42,17 +42,30 @@ def cylinder(foot_m: Point, radius_m: float, height_m: float, segments: int = 64
     rim = radius_m * np.stack([np.cos(angle), np.sin(angle), np.zeros(segments)], axis=1)
     up = np.array([0.0, 0.0, height_m])
     vertices = np.array(foot_m) + np.concatenate([rim, rim + up, [np.zeros(3), up]])
-    here = np.arange(segments)
-    beside = (here + 1) % segments
-    faces = np.concatenate(
-        [
-            np.stack([here, beside, beside + segments], axis=1),
-            np.stack([here, beside + segments, here + segments], axis=1),
-            np.stack([np.full(segments, 2 * segments), beside, here], axis=1),
-            np.stack([np.full(segments, 2 * segments + 1), here + segments, beside + segments], axis=1),
-        ]
-    )
-    return Mesh(vertices, faces.astype(np.int32))
+    return Mesh(vertices, tube_faces(2, segments))
+
+
+def ring_faces(rings: int, segments: int, *, closed: bool = False) -> Int32[ndarray, "f 3"]:
+    """Return the triangles between neighbouring rings of ``segments`` vertices each.
+
+    If ``closed``, the last ring is connected to the first one.
+    """
+    count = rings if closed else rings - 1
+    ring, segment = (grid.ravel() for grid in np.indices((count, segments), dtype=np.int32))
+    beside, above = (segment + 1) % segments, (ring + 1) % rings * segments
+    here, diagonal = ring * segments + segment, above + beside
+    lower = np.stack([here, ring * segments + beside, diagonal], axis=1)
+    return np.concatenate([lower, np.stack([here, diagonal, above + segment], axis=1)])
+
+
+def tube_faces(rings: int, segments: int) -> Int32[ndarray, "f 3"]:
+    """Return the triangles of a tube of vertex rings, closed by fans around the last two vertices."""
+    rim = np.arange(segments, dtype=np.int32)
+    rim_next = (rim + 1) % segments
+    first_centre, last_centre, last_ring = rings * segments, rings * segments + 1, (rings - 1) * segments
+    first_cap = np.stack([np.full_like(rim, first_centre), rim_next, rim], axis=1)
+    last_cap = np.stack([np.full_like(rim, last_centre), last_ring + rim, last_ring + rim_next], axis=1)
+    return np.concatenate([ring_faces(rings, segments), first_cap, last_cap])
 
 
 def lathe(profile_m: Float64[ndarray, "n 2"], segments: int = 32) -> Mesh:

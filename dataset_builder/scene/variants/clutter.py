@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
+from dataset_builder.scene.model import Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box, lathe, rotation_about_z, transformed
 from dataset_builder.scene.variants.placement import GAP_M, PlacementContext, Rect
 
@@ -53,7 +53,7 @@ def clutter(context: PlacementContext) -> tuple[Part, ...]:
             circles.append(_covering_circles(item, at_m, turn_deg))
             for k, (mesh, material) in enumerate(item.pieces()):
                 placed_mesh = transformed(mesh, rotation_about_z(turn_deg), (at_m[0], at_m[1], GAP_M))
-                parts.append(Part(f"clutter-{number}-{item.name}-{k}", placed_mesh, NOT_STEEL, material))
+                parts.append(surface(f"clutter-{number}-{item.name}-{k}", placed_mesh, material))
     return tuple(parts)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
+from dataset_builder.scene.model import Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box, merge_meshes, rotation_about_z, transformed
 from dataset_builder.scene.variants import SUN_FROM
 from dataset_builder.scene.variants.placement import GAP_M, PlacementContext
@@ -43,20 +43,13 @@ class _Panel:
 def formwork(context: PlacementContext) -> tuple[Part, ...]:
     """Return the panels and their battens; the seed of the scene selects the sides."""
     first = int(context.rng("formwork").integers(4))
+    middle_m = context.middle_m * [1, 1, 0]
     parts: list[Part] = []
     for n, share in enumerate(PANEL_WIDTHS):
         side = (first + n) % 4
-        panel = _panel(context, side, share, shift=0.25 * n)
-        for name, mesh, material in _panel_meshes(panel):
-            middle_m = np.array([context.middle_m[0], context.middle_m[1], 0.0])
-            parts.append(
-                Part(
-                    f"formwork-{n}-{name}",
-                    transformed(mesh, rotation_about_z(90.0 * side), middle_m),
-                    NOT_STEEL,
-                    material,
-                )
-            )
+        rotation = rotation_about_z(90.0 * side)
+        for name, mesh, material in _panel_meshes(_panel(context, side, share, shift=0.25 * n)):
+            parts.append(surface(f"formwork-{n}-{name}", transformed(mesh, rotation, middle_m), material))
     return tuple(parts)
 
 
@@ -130,7 +123,7 @@ def slatted_screen(context: PlacementContext) -> tuple[Part, ...]:
         for u_m in (-0.7 * half_m, 0.7 * half_m)
     ]
     return tuple(
-        Part(f"screen-{name}", transformed(merge_meshes(meshes), world_from_screen, middle_m), NOT_STEEL, "timber")
+        surface(f"screen-{name}", transformed(merge_meshes(meshes), world_from_screen, middle_m), "timber")
         for name, meshes in (("slats", slats), ("rails", rails))
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.scene.model import NOT_STEEL, Mesh, Part
+from dataset_builder.scene.model import Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box, lathe, merge_meshes, rotation_about_z, transformed
 from dataset_builder.scene.variants.placement import GAP_M, Capsules, PlacementContext
 
@@ -57,7 +57,7 @@ def spacers(context: PlacementContext) -> tuple[Part, ...]:
             wheel, at_m, direction = placement
             wheel_centres_m = np.concatenate([wheel_centres_m, at_m[None]])
             mesh = transformed(_wheel_mesh(wheel), _frame_along(direction), at_m)
-            parts.append(Part(f"spacer-{len(parts)}", mesh, NOT_STEEL, "orange plastic"))
+            parts.append(surface(f"spacer-{len(parts)}", mesh, "orange plastic"))
     return tuple(parts)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.scene.model import NOT_STEEL, Part
+from dataset_builder.scene.model import Part, surface
 from dataset_builder.scene.shapes.bar_mesh import plain_bar_mesh
 from dataset_builder.scene.shapes.solids import merge_meshes
 from dataset_builder.scene.variants.placement import GAP_M, Capsules, Crossing, PlacementContext, find_crossings
@@ -35,7 +35,7 @@ def tie_wire(context: PlacementContext) -> tuple[Part, ...]:
     tied = min(len(crossings), max(MIN_TIES, min(MAX_TIES, round(TIED_SHARE * len(crossings)))))
     lines = (_tie_line_m(crossings[k], context) for k in sorted(rng.permutation(len(crossings))[:tied]))
     meshes = [plain_bar_mesh(line, WIRE_M, SEGMENTS) for line in lines if line is not None]
-    return (Part("tie-wire", merge_meshes(meshes), NOT_STEEL, "black wire"),) if meshes else ()
+    return (surface("tie-wire", merge_meshes(meshes), "black wire"),) if meshes else ()
 
 
 def _tie_line_m(crossing: Crossing, context: PlacementContext) -> Float64[ndarray, "n 3"] | None:

@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from operator import itemgetter
 
 from markupsafe import Markup
 
@@ -38,27 +38,20 @@ class Column:
     value: Callable[[ScoreRow], Value]
 
 
-def _native(index: int) -> Callable[[ScoreRow], Value]:
-    return lambda row: row.native[index].value
-
-
-def _scaled(index: int) -> Callable[[ScoreRow], Value]:
-    return lambda row: row.scaled[index].value
-
-
-def _within(index: int) -> Callable[[ScoreRow], Value]:
-    return lambda row: row.within[index].value
+def _value(group: str, index: int) -> Callable[[ScoreRow], Value]:
+    """Return a function of a row that returns a value of its ``native``, ``scaled`` or ``within`` numbers."""
+    return lambda row: getattr(row, group)[index].value
 
 
 NATIVE = tuple(
-    Column(name.removesuffix("_cm"), info.higher_is_better, _native(k))
+    Column(name.removesuffix("_cm"), info.higher_is_better, _value("native", k))
     for k, (name, info) in enumerate(METRICS.items())
 )
 SCALED = tuple(
-    Column(f"scaled_{column.name}", column.largest_first, _scaled(k)) for k, column in enumerate(NATIVE)
+    Column(f"scaled_{column.name}", column.largest_first, _value("scaled", k)) for k, column in enumerate(NATIVE)
 )
 SCALE = Column("scale", False, lambda row: row.scale.value)
-WITHIN = tuple(Column(f"within_{t}mm", True, _within(k)) for k, t in enumerate(WITHIN_MM))
+WITHIN = tuple(Column(f"within_{t}mm", True, _value("within", k)) for k, t in enumerate(WITHIN_MM))
 COVERAGE = Column("coverage", True, lambda row: row.coverage.value)
 METHOD = Column("method", False, lambda row: row.name.casefold())
 COLUMNS = {column.name: column for column in (METHOD, *NATIVE, *SCALED, SCALE, *WITHIN, COVERAGE)}
@@ -99,13 +92,8 @@ def sort_indices(rows: Sequence[tuple[int | None, ScoreRow]], order: Order) -> l
     keys = [rank if order.name == RANK else COLUMNS[order.name].value(row) for rank, row in rows]
     present = [(key, index) for index, key in enumerate(keys) if key is not None]
     missing = [index for index, key in enumerate(keys) if key is None]
-    present.sort(key=_sort_key, reverse=order.is_descending)
+    present.sort(key=itemgetter(0), reverse=order.is_descending)
     return [index for _, index in present] + missing
-
-
-def _sort_key(pair: tuple[Any, int]) -> Any:
-    """Return the value without the index, so that the sort is stable."""
-    return pair[0]
 
 
 MAX_PLOTTED = 16

@@ -12,8 +12,8 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from leaderboard.db.models import SubmissionModel
 from leaderboard.db.tokens import find_token
 from leaderboard.service import Service
-from leaderboard.uploads.accept import UploadRejectedError, accept_upload
-from leaderboard.uploads.multipart import UploadError, read_leading_field
+from leaderboard.uploads.accept import accept_upload
+from leaderboard.uploads.multipart import UploadRejectedError, read_leading_field
 from leaderboard.web.api.auth import ServiceDep
 from leaderboard.web.api.submissions import page_url
 from leaderboard.web.cache import NO_STORE, REVALIDATE
@@ -68,10 +68,7 @@ async def _accept_form_upload(service: Service, body: AsyncIterator[bytes], requ
 
     Raises ``UploadRejectedError``.
     """
-    try:
-        text, full_body = await read_leading_field(body, request.headers.get("content-type", ""), TOKEN_FIELD)
-    except UploadError as error:
-        raise UploadRejectedError(error.status, error.detail) from None
+    text, full_body = await read_leading_field(body, request.headers.get("content-type", ""), TOKEN_FIELD)
     if not text.strip():
         raise UploadRejectedError(401, "no token, expected the token that you received from the operator")
     token = await to_thread.run_sync(find_token, service.database, text.strip())

@@ -46,7 +46,7 @@ def test_correct_depth_passes_on_every_grid(rig: str) -> None:
     error = view_board_error(config(), audited)
     assert error.pixels > 100_000
     assert error.off_m < MAX_BOARD_ERROR_M
-    counts = epipolar_counts(audited, scene().steel)
+    counts = epipolar_counts(config(), audited)
     assert counts.contradicted == 0
     assert counts.seen > 2000
     assert max(projection_error_px(eye) for eye in audited.eyes.values()) < MAX_PROJECTION_ERROR_PX
@@ -63,8 +63,8 @@ def test_depth_scaled_by_1_percent_fails_board_and_axes(rig: str) -> None:
 def test_wrong_depth_contradicts_other_camera(rig: str) -> None:
     correct = view(rig)
     too_near = replace(correct, left=replace(correct.left, depth_m=correct.left.depth_m * np.float32(0.7)))
-    counts = epipolar_counts(too_near, scene().steel)
-    assert counts.contradicted > 0.2 * epipolar_counts(correct, scene().steel).seen
+    counts = epipolar_counts(config(), too_near)
+    assert counts.contradicted > 0.2 * epipolar_counts(config(), correct).seen
     assert not epipolar_verdict(config(), [counts]).passed
 
 

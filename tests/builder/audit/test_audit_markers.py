@@ -98,17 +98,15 @@ def test_check_is_skipped_without_large_markers_or_board() -> None:
 
 
 def test_inset_is_estimated_and_removed() -> None:
+    camera = view("ideal").left.camera
     square = np.array([[[0.0, 0.0], [40.0, 0.0], [40.0, 40.0], [0.0, 40.0]]])
     assert inset_directions(square)[0].tolist() == [[1, 1], [-1, 1], [-1, -1], [1, -1]]
     assert inset_directions(square[:, ::-1])[0].tolist() == [[1, -1], [-1, -1], [-1, 1], [1, 1]]
     detected_px = square + 0.6 * inset_directions(square) + np.array([0.1, 0.0])
-    inset_and_residuals = fit_inset([DetectedMarkers(1, detected_px, square, np.zeros((1, 4, 3)))])
+    inset_and_residuals = fit_inset([DetectedMarkers(camera, 1, detected_px, square, np.zeros((1, 4, 3)))])
     assert inset_and_residuals == pytest.approx((0.6, 0.1, 0.1))
-    assert fit_inset([DetectedMarkers(1, np.zeros((0, 4, 2)), np.zeros((0, 4, 2)), np.zeros((0, 4, 3)))]) == (
-        0,
-        0,
-        0,
-    )
+    none = DetectedMarkers(camera, 1, np.zeros((0, 4, 2)), np.zeros((0, 4, 2)), np.zeros((0, 4, 3)))
+    assert fit_inset([none]) == (0, 0, 0)
 
 
 def test_minimum_width_of_slanted_marker_is_its_height() -> None:

@@ -15,7 +15,7 @@ from PIL import Image
 
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
-from dataset_builder.config.catalog import CONFIGS, BuildRequest, check_request
+from dataset_builder.config.catalog import CONFIGS, BuildRequest
 from dataset_builder.config.specs import RigSpec, RingSpec
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.pipeline.contact_sheet import STRIP_PANEL_PX, TILE_PX
@@ -159,7 +159,7 @@ def test_user_scene_and_variant_are_added_to_dataset(tiny_root: Path, tmp_path: 
 )
 def test_invalid_build_request_is_rejected(request_: BuildRequest, problems: list[tuple[str, str]]) -> None:
     with pytest.raises(InputError) as raised:
-        check_request(request_)
+        request_.config_specs()
     assert [(problem.code, problem.where) for problem in raised.value.problems] == problems
 
 

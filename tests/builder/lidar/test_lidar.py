@@ -40,7 +40,8 @@ def beam_axis_x_m(depth_m: float) -> float:
 
 
 def sigma_on_wall_m(spec: ScannerSpec, depth_m: float) -> float:
-    return spec.diameter_m(depth_m) / 4 if spec.beam_width == "1/e2" else spec.diameter_m(depth_m) / 8**0.5
+    diameter_m = math.hypot(spec.exit_diameter_m, spec.divergence_rad * depth_m)  # The hyperbola of ISO 11146-1.
+    return diameter_m / 4 if spec.beam_width == "1/e2" else diameter_m / 8**0.5
 
 
 @pytest.mark.parametrize("width", SHARE_OF_PEAK)

@@ -138,11 +138,11 @@ def test_blender_and_ifcopenshell_share_a_process() -> None:
     code = """
 import bpy
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
-from dataset_builder.scene.assemblies.ifc.model import open_model, world_meshes
+from dataset_builder.scene.assemblies.ifc.model import open_model, world_mesh
 from pathlib import Path
 assert len(load_cage(cage_file_spec("examples/column.ifc")).bars) == 13
 model = open_model(Path("examples/column.ifc").read_bytes(), "a")
-assert len(next(iter(world_meshes(model, [33])))[0]) > 100
+assert len(world_mesh(model, 33)[0]) > 100
 bpy.ops.wm.read_factory_settings(use_empty=True)
 """
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -64,10 +64,10 @@ def import_ifcopenshell() -> Any:
         ) from error
 
 
-def world_meshes(model: Model, ids: list[int]) -> Any:
-    """Yield vertices (flat, world, metres) and triangles (flat) of each instance number in ``ids``.
+def world_mesh(model: Model, number: int) -> tuple[Any, Any]:
+    """Return vertices (flat, world, metres) and triangles (flat) of the instance ``number``.
 
-    Raises ``RuntimeError`` if the geometry kernel cannot tessellate an instance. The kernel may also hang or
+    Raises ``RuntimeError`` if the geometry kernel cannot tessellate it. The kernel may also hang or
     crash, so call this in a separate process.
     """
     geom = importlib.import_module("ifcopenshell.geom")
@@ -75,9 +75,8 @@ def world_meshes(model: Model, ids: list[int]) -> Any:
     settings.set("use-world-coords", True)
     settings.set("mesher-linear-deflection", 1e-5)
     settings.set("mesher-angular-deflection", 0.15)
-    for number in ids:
-        shape = geom.create_shape(settings, model.by_id(number))
-        yield shape.geometry.verts, shape.geometry.faces
+    geometry = geom.create_shape(settings, model.by_id(number)).geometry
+    return geometry.verts, geometry.faces
 
 
 def length_unit_m(model: Model, where: str) -> float:

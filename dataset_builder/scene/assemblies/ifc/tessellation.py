@@ -17,7 +17,7 @@ from io import BytesIO
 
 import numpy as np
 
-from dataset_builder.scene.assemblies.ifc.model import open_model, world_meshes
+from dataset_builder.scene.assemblies.ifc.model import open_model, world_mesh
 from dataset_builder.scene.model import Mesh
 
 SECONDS_PER_SHAPE = 60
@@ -67,7 +67,7 @@ def main() -> None:
 def _tessellate_instance(model: object, number: int) -> Mesh | str:
     """Return the surface of one instance (world, metres), or an error message."""
     try:
-        [(vertices, faces)] = world_meshes(model, [number])
+        vertices, faces = world_mesh(model, number)
     except RuntimeError as error:
         return str(error) or "the geometry kernel failed"
     if not len(faces):
