@@ -136,7 +136,9 @@ def _problem(details: ErrorDetails, model: type[BaseModel], where: str) -> Probl
     if kind == "extra_forbidden":
         known = _model_at(model, location).model_fields
         return Problem("unknown", place, "not a known key", _known_keys(str(location[-1]), known))
-    expected = _TYPES.get(kind, details["msg"].removeprefix("Input should be "))
+    expected = _TYPES.get(
+        kind, details["msg"].removeprefix("Input should be ").replace("String should match", "text that matches")
+    )
     return Problem("invalid", place, f"got {short_repr(details['input'])}", expected)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,6 @@ from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_f
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
 
-_FOLDER_NAME = re.compile(r"\w[\w.-]*")
 """Config names that are used as folder names."""
 
 
@@ -88,10 +86,8 @@ def _local_folder(root: str | Path) -> DatasetFolder:
 def _select_view_ids(config: DatasetConfig, views: int | None) -> list[str]:
     """Return the ids of the selected views of a config.
 
-    Raises ``DatasetError`` if the config's name cannot name a folder, ``InputError`` for fewer than one view.
+    Raises ``InputError`` for fewer than one view.
     """
-    if not _FOLDER_NAME.fullmatch(config.name):
-        raise DatasetError(f"{config.root}: the name of config {config.name!r} is not a valid folder name")
     if views is not None and views < 1:
         raise InputError(f"--views is {views}, expected 1 or more")
     return [config.views[index].view_id for index in subset(len(config.views), views)]

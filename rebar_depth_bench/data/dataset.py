@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
-from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 if TYPE_CHECKING:
@@ -172,9 +172,12 @@ def load_undecoded(
 def iterate_rows(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Yield the decoded rows of a config, one at a time, without a cache.
 
-    Raises ``DatasetError`` if the config cannot be loaded or a shard is damaged.
+    Raises ``DatasetError`` if the config cannot be loaded, a shard is damaged or holds a view of another config.
     """
+    known = frozenset(config.view_ids)
     for row in iterate_undecoded(config, columns):
+        if "view_id" in row and row["view_id"] not in known:  # Ids become names of files.
+            raise DatasetError(f"{config.root}: view {escape_text(str(row['view_id']))} is not in the manifest")
         try:
             decoded = decode_row(row)
         except (OSError, TypeError, ValueError) as error:

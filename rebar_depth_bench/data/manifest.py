@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, Strict, field_validator
+from pydantic import ConfigDict, Field, Strict, StringConstraints, field_validator
 
 from rebar_depth_bench.errors import DatasetError, Problem, escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
@@ -16,8 +16,12 @@ from rebar_depth_bench.validation import Expected, StrictModel, field_error, for
 MANIFEST_FILE = "manifest.json"
 MANIFEST_FORMAT = "rebar-depth-dataset-1"
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
-_Names = Annotated[tuple[str, ...], Strict(False)]
-"""Type of a list of strings, converted to a tuple."""
+_Sha256 = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
+_Digest = Annotated[str, StringConstraints(pattern="^sha256:[0-9a-f]{64}$")]
+# Names become parts of paths, also of files that are written and deleted: no name starts with a dot or a slash.
+_Name = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]*$", max_length=200)]
+_Path = Annotated[str, StringConstraints(pattern=r"^(\w[\w.-]*/)*\w[\w.-]*$", max_length=400)]
+_ViewId = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]*/\w[\w.-]*$", max_length=400)]
 
 
 class ViewRecord(StrictModel):
@@ -27,9 +31,9 @@ class ViewRecord(StrictModel):
     count steel and scored pixels.
     """
 
-    view_id: str
-    left: str
-    right: str
+    view_id: _ViewId
+    left: _Sha256
+    right: _Sha256
     steel_px: int
     scored_px: int
 
@@ -43,13 +47,13 @@ class _ManifestTable(StrictModel):
 class Appearance(_ManifestTable):
     """Names of the appearance variants of a scene."""
 
-    variants: _Names = ()
+    variants: Annotated[tuple[_Name, ...], Strict(False)] = ()
 
 
 class Scene(_ManifestTable):
     """Scene of a config; ``board`` is the ArUco board under the assembly, or None."""
 
-    name: str
+    name: _Name
     board: BoardSpec | None
     appearance: Appearance = Appearance()
 
@@ -91,15 +95,15 @@ class _Located(_ManifestTable):
 class DatasetConfig(_Located):
     """Config of a dataset; ``entry`` is its manifest entry as it was written, with all parameters of the build."""
 
-    name: str
+    name: _Name
     scene: Scene
     rig: Rig
     views: Annotated[tuple[ViewRecord, ...], Strict(False)]
-    ground_truth_digest: str
+    ground_truth_digest: _Digest
     key: str
-    shards: _Names
-    mesh: str
-    sheet: str = ""
+    shards: Annotated[tuple[_Path, ...], Strict(False)]
+    mesh: _Path
+    sheet: _Path = ""
     entry: dict[str, Any] = Field(repr=False)
 
     @property
@@ -138,7 +142,7 @@ class DatasetFolder(_Located):
 
 
 class _GroundTruth(_ManifestTable):
-    digest: str
+    digest: _Digest
 
 
 class _Manifest(_ManifestTable):
@@ -148,7 +152,7 @@ class _Manifest(_ManifestTable):
     version: str
     ground_truth: _GroundTruth
     configs: dict[str, dict[str, Any]]
-    files: dict[str, str]
+    files: dict[_Path, _Sha256]
 
 
 def open_folder(root: str | Path) -> DatasetFolder:

@@ -10,6 +10,8 @@ from typing import Any
 
 import datasets
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 
@@ -164,6 +166,8 @@ def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
         (lambda manifest, _: manifest.update(format="other"), "invalid", "format"),
         (lambda manifest, _: manifest.update(configs=[]), "invalid", "configs"),
         (lambda manifest, _: manifest["files"].update(x=None), "invalid", "files.x"),
+        (lambda manifest, _: manifest["files"].update({"../x": "0" * 64}), "invalid", "files.../x.[key]"),
+        (lambda manifest, _: manifest["ground_truth"].update(digest="sha256:"), "invalid", "ground_truth.digest"),
         (lambda _, config: config.pop("views"), "missing", "configs.lattice.views"),
         (lambda _, config: config["views"][0].pop("left"), "missing", "configs.lattice.views 1: left"),
         (lambda _, config: config["views"][1].update(x=3), "unknown", "configs.lattice.views 2: x"),
@@ -175,6 +179,21 @@ def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
         ),
         (lambda _, config: config["scene"].update(board=7), "invalid", "configs.lattice.scene.board"),
         (lambda _, config: config["scene"].pop("board"), "missing", "configs.lattice.scene.board"),
+        *(
+            (lambda _, config, key=key, name=name: config.update({key: name}), "invalid", f"configs.lattice.{key}")
+            for key in ("ground_truth_digest", "mesh", "sheet")
+            for name in ("/../../../Documents", "../x", "/tmp/x", "a/../b", "a//b", "a\n", ".hidden", "a\\b")
+        ),
+        (lambda _, config: config.update(shards=["../x.parquet"]), "invalid", "configs.lattice.shards 1"),
+        (lambda _, config: config["views"][1].update(left="x"), "invalid", "configs.lattice.views 2: left"),
+        *(
+            (
+                lambda _, config, view_id=view_id: config["views"][0].update(view_id=view_id),
+                "invalid",
+                "configs.lattice.views 1: view_id",
+            )
+            for view_id in ("../../../x/evil", "/lattice/0000", "lattice", "lattice/..", "lattice/0000/1", "a/b\0")
+        ),
     ],
 )
 def test_damaged_manifest_raises_dataset_error(
@@ -205,3 +224,13 @@ def test_board_is_read_from_manifest(manifest: Any, tmp_path: Path) -> None:
     folder = open_folder(tmp_path)
     assert folder.config("lattice").scene.board == BoardSpec(markers=12)
     assert folder.config("lattice-orbit").scene.board is None
+
+
+def test_view_id_of_shard_that_manifest_lacks_is_rejected(tiny_root: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(tiny_root, tmp_path / "copy", ignore=shutil.ignore_patterns(".rebar-cache"))
+    shard = next(copy.glob("lattice-orbit/*.parquet"))
+    table = pq.read_table(shard)
+    rows = [row | {"view_id": "../../../x/evil"} for row in table.to_pylist()]
+    pq.write_table(pa.Table.from_pylist(rows, table.schema), shard)
+    with pytest.raises(rdb.DatasetError, match=r"view \.\./\.\./\.\./x/evil is not in the manifest"):
+        list(iterate_rows(open_folder(copy).config("lattice-orbit"), ["view_id", "left_K"]))

@@ -68,7 +68,7 @@ def test_changed_missing_and_extra_files_are_reported(copy: Path) -> None:
 @pytest.mark.slow
 def test_wrong_ground_truth_digest_is_reported(copy: Path) -> None:
     manifest = json.loads((copy / "manifest.json").read_text())
-    manifest["ground_truth"]["digest"] = "sha256:00"
+    manifest["ground_truth"]["digest"] = "sha256:" + "0" * 64
     (copy / "manifest.json").write_text(json.dumps(manifest))
     assert (
         "the ground-truth digest is sha256:00, expected sha256:"

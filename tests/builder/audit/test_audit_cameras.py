@@ -38,7 +38,8 @@ RING = RingSpec(0.4, 40.0, 6)
 
 def manifest_config(view_ids: Sequence[str] = (), **entry: Any) -> DatasetConfig:
     """Return a config with the given views and manifest entry, after a JSON round trip."""
-    views = tuple(ViewRecord(view_id=view_id, left="", right="", steel_px=0, scored_px=0) for view_id in view_ids)
+    truth = {"left": "0" * 64, "right": "0" * 64, "steel_px": 0, "scored_px": 0}
+    views = tuple(ViewRecord.model_validate({"view_id": view_id, **truth}) for view_id in view_ids)
     return DatasetConfig.model_construct(name="c", views=views, entry=json.loads(json.dumps(entry)))
 
 
