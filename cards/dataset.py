@@ -86,7 +86,7 @@ def _card_metadata(version: str, configs: Sequence[DatasetConfig]) -> DatasetCar
 def _dataset_info(config: DatasetConfig, version: str) -> DatasetInfo:
     from datasets import DatasetInfo, SplitDict, SplitInfo
 
-    size = config.entry["bytes"]
+    size = config.manifest_entry["bytes"]
     split = SplitInfo(SPLIT, num_examples=len(config.views), num_bytes=size)
     return DatasetInfo(
         features=features(),
@@ -105,7 +105,7 @@ def _shard_pattern(shards: Iterable[str]) -> str:
 
 
 def _config_row(config: DatasetConfig) -> dict[str, Any]:
-    entry, rig, views = config.entry, config.rig, config.views
+    entry, rig, views = config.manifest_entry, config.rig, config.views
     steel = np.array([view.steel_px for view in views], float)
     scored = np.array([view.scored_px for view in views], float)
     with_steel = steel > 0

@@ -1,6 +1,6 @@
 """Exception hierarchy of the project, and helpers that format problems for error messages.
 
-Every message is one sentence that names the file or entry, the value found and the value expected. An
+A message names the file or entry, what was found and what was expected, in one line for each problem. An
 ``InputError`` is caused by the user's input (exit status 2); any other ``RebarDepthError`` is caused by this
 software or by the machine (exit status 1).
 """
@@ -16,6 +16,7 @@ MAX_PROBLEMS_SHOWN = 20
 ProblemCode = Literal[
     "syntax",  # a file that cannot be parsed at all
     "missing",  # a key, entry or file that is required
+    "unreadable",  # a file that exists and cannot be read
     "unknown",  # a key or entry that is not part of the schema or the dataset
     "duplicate",  # a key, id or entry that occurs twice
     "conflict",  # values that are valid alone, but not together
@@ -83,6 +84,19 @@ class SubmissionError(InputError):
     """Rejected submission archive."""
 
 
+class EntryError(InputError):
+    """Rejected entry of an archive; ``problem`` is the reason."""
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(str(problem))
+        self.problem = problem
+        self.problems = (problem,)
+
+    def __reduce__(self) -> tuple[type[Self], tuple[Problem]]:
+        """Return the constructor's call: worker processes send this error to their parent."""
+        return type(self), (self.problem,)
+
+
 class CalibrationError(InputError):
     """Rejected calibration file."""
 
@@ -106,19 +120,6 @@ def problem_summary(problems: Sequence[Problem | str]) -> str:
 
 
 _MAX_TEXT_CHARACTERS = 120
-
-
-class EntryError(InputError):
-    """Rejected entry of an archive; ``problem`` is the reason."""
-
-    def __init__(self, problem: Problem) -> None:
-        super().__init__(str(problem))
-        self.problem = problem
-        self.problems = (problem,)
-
-    def __reduce__(self) -> tuple[type[Self], tuple[Problem]]:
-        """Return the constructor's call: worker processes send this error to their parent."""
-        return type(self), (self.problem,)
 
 
 def escape_text(text: str) -> str:

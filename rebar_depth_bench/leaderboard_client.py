@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Self
 
+from pydantic import TypeAdapter, ValidationError
+
 from rebar_depth_bench.errors import InputError, Problem, RebarDepthError, SubmissionError
 from rebar_depth_bench.progress import Progress, silent
 
+_PROBLEMS = TypeAdapter(tuple[Problem, ...])
 POLL_INTERVAL_S = 2.0
 """Time between two status requests, seconds."""
 MAX_FAILED_POLLS = 30
@@ -60,8 +63,7 @@ class LeaderboardClient:
             raise InputError(f"{archive}: cannot be read: {error.strerror or error}") from None
         if response.status_code == 422:
             content = _json_object(response)
-            lines = content.get("problems", [content.get("detail", "rejected")])
-            raise SubmissionError.from_problems(archive, [Problem("invalid", "", line) for line in lines])
+            raise _rejection(archive, content)
         return self._checked(response, 202, "id")
 
     def token(self) -> dict[str, Any]:
@@ -142,6 +144,17 @@ class _ProgressReader:
         self._bytes_read += len(data)
         self._on_read(self._bytes_read)
         return data
+
+
+def _rejection(archive: Path, content: Mapping[str, Any]) -> SubmissionError:
+    """Return the error of a rejected archive, with the lines of the service and its ``problem_details``."""
+    lines = "".join(f"\n  - {line}" for line in content.get("problems", ()))
+    error = SubmissionError(f"{archive}: {content.get('detail', 'rejected')}{lines}")
+    try:
+        error.problems = _PROBLEMS.validate_python(content.get("problem_details", ()))
+    except ValidationError:  # Another version of the service.
+        error.problems = ()
+    return error
 
 
 def _json_object(response: Any) -> dict[str, Any]:

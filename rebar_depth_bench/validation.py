@@ -28,6 +28,8 @@ _MAX_REPR_CHARACTERS = 60
 _MAX_MAGNITUDE = 1e9
 """Largest accepted magnitude: far above any number of a scene or model file, with powers that stay finite."""
 _EXPLAINED = "explained"
+_INVALID_KEY = "[key]"
+"""Last part of the location at which pydantic reports an invalid key of a dict."""
 _TYPES = {"model_type": "a table", "dict_type": "a table", "tuple_type": "a list"}
 
 
@@ -71,8 +73,7 @@ def field_error(found: str, expected: str, code: ProblemCode = "invalid") -> Pyd
 
 def number(low: float, high: float = _MAX_MAGNITUDE, expected: str = "") -> Expected:
     """Return the description of finite numbers from ``low`` to ``high``; 0 is excluded if ``low`` is 0."""
-    limit = "" if high == _MAX_MAGNITUDE else f", up to {high:g}"
-    interval = f"above 0{limit}" if low == 0 else f"from {low:g} to {high:g}"
+    interval = f"above 0, up to {high:g}" if low == 0 else f"from {low:g} to {high:g}"
     return Expected(
         expected or f"a number {interval}", lambda value: low <= value <= high and not value == 0 == low
     )
@@ -84,7 +85,7 @@ def whole_number(low: int, high: int) -> Expected:
 
 
 def three_numbers(low: float, high: float, expected: str = "") -> Expected:
-    """Return the description of a ``Triple`` (by default RGB) of numbers from ``low`` to ``high``."""
+    """Return the description of a ``Triple`` of numbers from ``low`` to ``high``; by default red, green, blue."""
     return Expected(
         expected or f"three numbers from {low:g} to {high:g}: red, green, blue",
         lambda values: all(low <= value <= high for value in values),
@@ -102,7 +103,7 @@ def text(max_length: int, what: str = "text on one line") -> Expected:
 def one_of(*values: str | int) -> Expected:
     """Return the description of values that equal one of ``values``."""
     *others, last = (f'"{value}"' if isinstance(value, str) else f"{value}" for value in values)
-    return Expected(f"{', '.join(others)} or {last}", lambda value: value in values)
+    return Expected(f"{', '.join(others)} or {last}" if others else last, lambda value: value in values)
 
 
 Triple = Annotated[tuple[float, float, float], Strict(False)]
@@ -147,7 +148,7 @@ def _model_at(model: type[BaseModel], location: Sequence[int | str]) -> type[Bas
     for key in location[:-1]:
         if isinstance(key, str):
             annotation = model.model_fields[key].annotation
-            model = next(item for item in (annotation, *get_args(annotation)) if _is_model(item))
+            model = next((item for item in (annotation, *get_args(annotation)) if _is_model(item)), model)
     return model
 
 
@@ -156,7 +157,9 @@ def _is_model(annotation: Any) -> TypeGuard[type[BaseModel]]:
 
 
 def _expectation(model: type[BaseModel], key: int | str) -> str:
-    field = model.model_fields[str(key)]
+    field = model.model_fields.get(str(key))
+    if field is None:  # The table was validated by a validator of the model.
+        return ""
     if _is_model(field.annotation):
         return "a table"
     return next((item.text for item in field.metadata if isinstance(item, Expected)), "")
@@ -164,7 +167,7 @@ def _expectation(model: type[BaseModel], key: int | str) -> str:
 
 def _known_keys(key: str, known: Iterable[str]) -> str:
     close_matches = get_close_matches(key, known, n=1)
-    return close_matches[0] if close_matches else f"only {', '.join(known)}"
+    return close_matches[0] if close_matches else f"one of {', '.join(known)}"
 
 
 def format_location(where: str, *keys: int | str) -> str:
@@ -172,8 +175,8 @@ def format_location(where: str, *keys: int | str) -> str:
     for key in keys:
         if isinstance(key, int):
             where = f"{where} {key + 1}:"
-        else:
-            name = key if key.isprintable() and len(key) <= _MAX_REPR_CHARACTERS else short_repr(key)
+        elif key != _INVALID_KEY:
+            name = key if key and key.isprintable() and len(key) <= _MAX_REPR_CHARACTERS else short_repr(key)
             where += f"{'' if not where else ' ' if where.endswith(':') else '.'}{name}"
     return where.removesuffix(":")
 
@@ -196,11 +199,14 @@ def read_small_file(path: Path, max_bytes: int, expected: str, error_type: type[
         with path.open("rb") as stream:
             content = stream.read(max_bytes + 1)
     except (OSError, ValueError) as error:  # A ValueError is raised if the path contains a null character.
-        code: ProblemCode = "missing" if isinstance(error, FileNotFoundError) else "invalid"
+        code: ProblemCode = "missing" if isinstance(error, FileNotFoundError) else "unreadable"
         found = f"cannot be read: {getattr(error, 'strerror', None) or error}"
         raise error_type.from_problems(path, [Problem(code, "", found, expected)]) from None
     if len(content) > max_bytes:
-        raise error_type.from_problems(path, [Problem("size", "", f"more than {max_bytes} bytes", expected)])
+        found = "the file is larger than any such file"
+        raise error_type.from_problems(
+            path, [Problem("size", "", found, f"{expected} of at most {max_bytes} bytes")]
+        )
     return content
 
 
@@ -211,4 +217,4 @@ def parse_toml(content: bytes) -> tuple[dict[str, Any], list[Problem]]:
     except UnicodeDecodeError as error:
         return {}, [Problem("syntax", "", f"byte {error.start} is not UTF-8", "a TOML file")]
     except (ValueError, RecursionError) as error:
-        return {}, [Problem("syntax", "", f"not a valid TOML file: {error}", "a TOML file")]
+        return {}, [Problem("syntax", "", f"not a valid TOML file: {error}")]

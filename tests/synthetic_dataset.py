@@ -71,7 +71,8 @@ def _config_entry(config: str, records: Sequence[ViewRecord]) -> dict[str, objec
         "ground_truth_digest": digest,
         "key": "",
         "shards": [f"{config}/test.parquet"],
-        "mesh": "",
+        "mesh": "meshes/none.ply",
+        "sheet": "pictures/none.webp",
     }
 
 

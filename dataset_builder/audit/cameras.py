@@ -54,11 +54,11 @@ def rig_spec(config: DatasetConfig) -> RigSpec:
 
 def _spec_from_manifest(config: DatasetConfig, key: str, make_spec: Callable[[Any], _Spec]) -> _Spec:
     try:
-        return make_spec(config.entry[key])
+        return make_spec(config.manifest_entry[key])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DatasetError(
-            f"manifest: the {key} of config {config.name} is {config.entry.get(key)!r}, expected a value that "
-            f"this version writes: {type(error).__name__}: {error}"
+            f"manifest: the {key} of config {config.name} is {config.manifest_entry.get(key)!r}, expected a value "
+            f"that this version writes: {type(error).__name__}: {error}"
         ) from None
 
 
@@ -123,12 +123,12 @@ def checked_aim_point_m(config: DatasetConfig, mesh: Path) -> tuple[Float64[ndar
     has no aim point, or a different one (a problem), the middle of the steel is returned.
     """
     middle_m = mesh_aim_point_m(mesh)
-    if "aim_point_m" not in config.entry:
+    if "aim_point_m" not in config.manifest_entry:
         return middle_m, ()
-    aim_m = np.asarray(config.entry["aim_point_m"], dtype=np.float64)
+    aim_m = np.asarray(config.manifest_entry["aim_point_m"], dtype=np.float64)
     if aim_m.shape != (3,) or not np.abs(aim_m - middle_m).max() <= _AIM_TOLERANCE_M:
         return middle_m, (
-            f"aim_point_m is {config.entry['aim_point_m']}, expected {middle_m.tolist()}, the centre of the steel",
+            f"aim_point_m is {aim_m.tolist()}, expected {middle_m.tolist()}, the centre of the steel",
         )
     return aim_m, ()
 

@@ -99,7 +99,10 @@ def _list_of(expected: str, min_length: int = 1) -> Expected:
 
 
 _UNIT = one_of(*UNITS_M)
-_ROLE = Expected("a name of up to 60 letters", lambda role: role == role.strip() and text(60).accept(role))
+_ROLE = Expected(
+    "a name of up to 60 printable characters, without spaces at its ends",
+    lambda role: role == role.strip() and text(60).accept(role),
+)
 _File = Annotated[str, Expected("a path, relative to this file", lambda path: bool(path) and path.isprintable())]
 _Length = Annotated[float, number(0, expected="a length above 0, up to 1e9, in the file's unit")]
 _Point = Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers from -1e9 to 1e9, [x, y, z]")]
@@ -215,7 +218,7 @@ class SceneToml(StrictModel):
     @classmethod
     def _check_name(cls, name: str, info: ValidationInfo[Collection[str]]) -> str:
         """Check that the name is not reserved; ``info.context`` are the reserved names."""
-        if name in info.context:
+        if name in (info.context or ()):
             raise field_error(f"got {name!r}", f"none of the names {', '.join(info.context)}", "conflict")
         return name
 

@@ -37,7 +37,9 @@ def cameras_json(folder: DatasetFolder, config: DatasetConfig, views: Sequence[C
         "conventions": CONVENTIONS,
         "dataset": {"digest": folder.digest, "version": folder.version},
         "config": config.name,
-        "parameters": {name: value for name, value in config.entry.items() if name not in _NOT_PARAMETERS},
+        "parameters": {
+            name: value for name, value in config.manifest_entry.items() if name not in _NOT_PARAMETERS
+        },
         "licence": LICENCE,
     }
     cameras = [_camera(view, eye, camera) for view in views for eye, camera in view.cameras.items()]

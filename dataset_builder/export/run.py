@@ -19,8 +19,6 @@ from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_f
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
 
-"""Config names that are used as folder names."""
-
 
 @dataclass(frozen=True)
 class ConfigExport:

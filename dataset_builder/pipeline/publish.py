@@ -106,7 +106,9 @@ def check_retained_configs(out: Path, plans: Sequence[ConfigPlan]) -> None:
             continue
         for plan in plans:
             scene = config_parameters(plan.spec)["scene"]
-            if config.scene.name == scene["name"] and config.entry["scene"] != json.loads(json.dumps(scene)):
+            if config.scene.name == scene["name"] and config.manifest_entry["scene"] != json.loads(
+                json.dumps(scene)
+            ):
                 raise InputError(
                     f"{out}: config {name} was built with other parameters of scene {scene['name']!r}; "
                     f"rebuild it too (--config {name} {plan.spec.name}) or choose another folder"
@@ -139,7 +141,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
         "ground_truth_digest": views_digest(records),
         "views": [record.model_dump() for record in records],
     }
-    config = DatasetConfig(**entry, root=str(out), entry=entry)
+    config = DatasetConfig(**entry, root=str(out), manifest_entry=entry)
     _write_manifest(out, {**_published_configs(out), config.name: config})
 
 
@@ -194,7 +196,7 @@ def _write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
         "version": version,
         "protocol": PROTOCOL,
         "ground_truth": {"digest": digest},
-        "configs": {config.name: config.entry for config in ordered},
+        "configs": {config.name: config.manifest_entry for config in ordered},
         "files": {name: file_sha256(out / name) for name in sorted({CARD, BARS_FILE, *_listed_files(ordered)})},
     }
     write_text(out / MANIFEST_FILE, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
@@ -203,7 +205,7 @@ def _write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
 
 def _strip_key(config: DatasetConfig) -> str:
     """Return the key that selects one panel of the strip: assembly kind, or file digest of a user's assembly."""
-    assembly = config.entry["scene"]["assembly"]
+    assembly = config.manifest_entry["scene"]["assembly"]
     return str(assembly.get("sha256", assembly["kind"]))
 
 

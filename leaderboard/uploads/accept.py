@@ -19,6 +19,7 @@ from leaderboard.uploads.multipart import (
     too_large_message,
 )
 from rebar_depth_bench.errors import RebarDepthError
+from rebar_depth_bench.reporting.formatting import counted
 
 UNAVAILABLE_MESSAGE = "the service cannot validate or store archives at the moment; try again later"
 """Detail of the 503 response if the dataset is unreadable, the disk full or the archive storage unavailable."""
@@ -53,8 +54,7 @@ async def _validate_and_store(service: Service, token: TokenModel, received: Rec
     verdict = await service.checker.check(received.path)
     if isinstance(verdict, tuple):
         _LOG.info("upload rejected", token=token.name, problems=len(verdict))
-        plural = "" if len(verdict) == 1 else "s"
-        raise UploadRejectedError(422, f"the archive is invalid: {len(verdict)} problem{plural}", verdict)
+        raise UploadRejectedError(422, f"the archive is invalid: {counted(len(verdict), 'problem')}", verdict)
     submission_id = submissions.new_id()
     upload = Upload(verdict, received.sha256, received.size, service.folder.digest)
     public = service.settings.default_visibility == "always"

@@ -242,33 +242,33 @@ def _validated_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
 class ConfigViews:
     """Views, image size, board and mesh of one config of a dataset folder."""
 
-    entry: DatasetConfig
+    source: DatasetConfig
 
     @property
     def config(self) -> str:
         """Name of the config."""
-        return self.entry.name
+        return self.source.name
 
     @property
     def view_ids(self) -> tuple[str, ...]:
         """Ids of the views, in order."""
-        return self.entry.view_ids
+        return self.source.view_ids
 
     @property
     def grid(self) -> tuple[int, int]:
         """Image size (height, width), pixels."""
-        return self.entry.grid
+        return self.source.grid
 
     @property
     def board(self) -> BoardSpec | None:
         """ArUco board under the assembly, or None."""
-        return self.entry.scene.board
+        return self.source.scene.board
 
     @property
     def mesh(self) -> Path:
         """Path of the scene's PLY mesh, which is ground truth. Raises ``DatasetError`` if it is missing."""
-        return self.entry.file(self.entry.mesh)
+        return self.source.file(self.source.mesh)
 
     def rows(self, *columns: str) -> Iterator[dict[str, Any]]:
         """Yield the decoded ``view_id`` and named columns of each view, in order."""
-        return iterate_rows(self.entry, ("view_id", *columns))
+        return iterate_rows(self.source, ("view_id", *columns))

@@ -4,24 +4,42 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, Strict, StringConstraints, field_validator
+from pydantic import ConfigDict, Field, Strict, StringConstraints, ValidationInfo, field_validator
 
-from rebar_depth_bench.errors import DatasetError, Problem, escape_text
+from rebar_depth_bench.errors import DatasetError, Problem
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.validation import Expected, StrictModel, field_error, format_location, validate_table
+from rebar_depth_bench.validation import (
+    Expected,
+    StrictModel,
+    field_error,
+    format_location,
+    number,
+    one_of,
+    validate_table,
+    whole_number,
+)
 
 MANIFEST_FILE = "manifest.json"
 MANIFEST_FORMAT = "rebar-depth-dataset-1"
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
+# Names become parts of paths, also of files that are written and deleted: no part starts with a dot or a slash.
+_PART = "[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}"
+_LETTERS = 'letters, digits, "_", "." and "-", not starting with a dot'
+_Name = Annotated[str, StringConstraints(pattern=f"^{_PART}$"), Expected(f"a name of {_LETTERS}")]
+_Path = Annotated[
+    str,
+    StringConstraints(pattern=f"^({_PART}/){{0,9}}{_PART}$"),
+    Expected(f"a path in the folder, whose parts are {_LETTERS}"),
+]
+_ViewId = Annotated[str, StringConstraints(pattern=f"^{_PART}/{_PART}$")]
 _Sha256 = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
 _Digest = Annotated[str, StringConstraints(pattern="^sha256:[0-9a-f]{64}$")]
-# Names become parts of paths, also of files that are written and deleted: no name starts with a dot or a slash.
-_Name = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]*$", max_length=200)]
-_Path = Annotated[str, StringConstraints(pattern=r"^(\w[\w.-]*/)*\w[\w.-]*$", max_length=400)]
-_ViewId = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]*/\w[\w.-]*$", max_length=400)]
+_Side = Annotated[int, whole_number(1, 16384)]
+_Length = Annotated[float, number(0, 10)]
 
 
 class ViewRecord(StrictModel):
@@ -34,8 +52,8 @@ class ViewRecord(StrictModel):
     view_id: _ViewId
     left: _Sha256
     right: _Sha256
-    steel_px: int
-    scored_px: int
+    steel_px: Annotated[int, Field(ge=0)]
+    scored_px: Annotated[int, Field(ge=0)]
 
 
 class _ManifestTable(StrictModel):
@@ -50,6 +68,14 @@ class Appearance(_ManifestTable):
     variants: Annotated[tuple[_Name, ...], Strict(False)] = ()
 
 
+class _BoardTable(StrictModel):
+    width_m: _Length
+    height_m: _Length
+    markers: Annotated[int, one_of(6, 12)]
+    marker_side_m: _Length
+    dictionary: _Name
+
+
 class Scene(_ManifestTable):
     """Scene of a config; ``board`` is the ArUco board under the assembly, or None."""
 
@@ -60,17 +86,14 @@ class Scene(_ManifestTable):
     @field_validator("board", mode="before")
     @classmethod
     def _make_board(cls, fields: Any) -> BoardSpec | None:
-        try:
-            return None if fields is None else BoardSpec(**fields)
-        except TypeError as error:
-            raise field_error(escape_text(str(error)), "the fields of a board") from None
+        return None if fields is None else BoardSpec(**_BoardTable.model_validate(fields).model_dump())
 
 
 class Rig(_ManifestTable):
     """Image size of a stereo rig, pixels."""
 
-    width: int
-    height: int
+    width: _Side
+    height: _Side
 
 
 class _Located(_ManifestTable):
@@ -93,7 +116,7 @@ class _Located(_ManifestTable):
 
 
 class DatasetConfig(_Located):
-    """Config of a dataset; ``entry`` is its manifest entry as it was written, with all parameters of the build."""
+    """Config of a dataset; ``manifest_entry`` is its entry as it was written, with all parameters of the build."""
 
     name: _Name
     scene: Scene
@@ -103,8 +126,21 @@ class DatasetConfig(_Located):
     key: str
     shards: Annotated[tuple[_Path, ...], Strict(False)]
     mesh: _Path
-    sheet: _Path = ""
-    entry: dict[str, Any] = Field(repr=False)
+    sheet: _Path
+    manifest_entry: dict[str, Any] = Field(repr=False)
+
+    @field_validator("views")
+    @classmethod
+    def _check_views(cls, views: tuple[ViewRecord, ...], info: ValidationInfo) -> tuple[ViewRecord, ...]:
+        view_ids = [view.view_id for view in views]
+        prefix = f"{info.data.get('name', '')}/"
+        foreign = [view_id for view_id in view_ids if not view_id.startswith(prefix)]
+        if foreign and "name" in info.data:
+            raise field_error(f"got {foreign[0]}", f"view ids that start with {prefix}")
+        repeated = [view_id for view_id, number_of_views in Counter(view_ids).items() if number_of_views > 1]
+        if repeated:
+            raise field_error(f"{repeated[0]} occurs more than once", "each view once", "duplicate")
+        return views
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -145,10 +181,13 @@ class _GroundTruth(_ManifestTable):
     digest: _Digest
 
 
-class _Manifest(_ManifestTable):
-    """Manifest; its configs are validated one by one."""
+class _Format(_ManifestTable):
+    format: Annotated[str, one_of(MANIFEST_FORMAT)]
 
-    format: Annotated[str, Expected(f'"{MANIFEST_FORMAT}"', lambda name: name == MANIFEST_FORMAT)]
+
+class _Manifest(_ManifestTable):
+    """Manifest of the supported format; its configs are validated one by one."""
+
     version: str
     ground_truth: _GroundTruth
     configs: dict[str, dict[str, Any]]
@@ -168,10 +207,11 @@ def open_folder(root: str | Path) -> DatasetFolder:
         problem = Problem("syntax", "", f"cannot be read as JSON: {error}")
         raise DatasetError.from_problems(path, [problem]) from None
     problems: list[Problem] = []
-    head = validate_table(_Manifest, values, problems)
+    supported = validate_table(_Format, values, problems)  # Another format would cause many other problems.
+    head = validate_table(_Manifest, values, problems) if supported else None
     configs = {}
     for name, entry in head.configs.items() if head else ():
-        fields = {**entry, "root": root, "name": name, "entry": entry}
+        fields = {**entry, "root": root, "name": name, "manifest_entry": entry}
         if config := validate_table(DatasetConfig, fields, problems, format_location("configs", name)):
             configs[name] = config
     if head is None or problems:

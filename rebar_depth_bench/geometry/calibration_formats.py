@@ -146,18 +146,18 @@ def _conf_number(
     section: str,
     keys: list[str],
     expected: Expected,
-    default: float = math.nan,
+    default: float | None = None,
 ) -> float:
-    """Return the number of the first of ``keys`` in a section, or else ``default``.
+    """Return the number of the first of ``keys`` in a section, or else ``default`` (NaN if it is None).
 
-    Add a problem if the number is invalid, or if it is missing from an existing section and ``default`` is NaN.
+    Add a problem if the number is invalid, or if it is missing from an existing section and has no default.
     """
     values = sections.get(section, {})
     key = next((key for key in keys if key.lower() in values), None)
     if key is None:
-        if math.isnan(default) and section in sections:
+        if default is None and section in sections:
             problems.append(Problem("missing", f"{section}.{keys[-1]}", "missing", expected.text))
-        return default
+        return math.nan if default is None else default
     raw = values[key.lower()]
     try:
         value = float(raw)
@@ -199,7 +199,7 @@ _ROTATION = Expected(
 )
 
 
-class _LensTable(StrictModel):
+class _LensTable(StrictModel):  # Order matters: validators read the fields above theirs.
     """Table ``[left]`` or ``[right]``; ``info.context`` is the image size."""
 
     K: Annotated[_Matrix, _PINHOLE] | None = None

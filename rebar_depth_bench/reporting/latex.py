@@ -93,7 +93,7 @@ def escape_latex(text: str) -> str:
 
 
 def _template() -> Template:
-    """Return the template of the table; its delimiters do not occur in LaTeX, its filter ``tex`` escapes text."""
+    """Return the template; its delimiters do not occur in the table, and its filter ``tex`` escapes text."""
     loader = PackageLoader("rebar_depth_bench", "reporting")
     latex_environment = environment(loader).overlay("<%", "%>", "<<", ">>", "<#", "#>", autoescape=False)
     latex_environment.filters["tex"] = escape_latex

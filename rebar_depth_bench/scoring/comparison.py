@@ -38,7 +38,7 @@ _ALL_VIEWS_PREFIXES = ("coverage", "within_mm.")
 """Name prefixes of the metrics that every view has, also a view without predictions."""
 
 _HIGHER_IS_BETTER_PREFIXES = (
-    *_ALL_VIEWS_PREFIXES,
+    *("coverage", "within_mm."),
     *(
         f"{alignment}.{name}"
         for alignment in ALIGNMENTS

@@ -115,8 +115,8 @@ def verified_views(
 ) -> Iterator[tuple[str, EyeView, UInt32[ndarray, " n"]]]:
     """Yield id, left eye and flat indices of the scored pixels of every view, verified against the manifest.
 
-    ``task`` is its name in ``progress``. Raises ``DatasetError`` naming a view that is not in the manifest or
-    does not match its digest, or, after the last row, if views of the manifest are missing.
+    ``task`` is its name in ``progress``. Raises ``DatasetError`` naming a view that occurs twice or does not match
+    its digest, or, after the last row, if views of the manifest are missing.
     """
     records = {view.view_id: view for view in config.views}
     total = len(records)
@@ -124,7 +124,7 @@ def verified_views(
     for done, row in enumerate(rows, start=1):
         view_id, left = row["view_id"], eye_from_row(row, "left")
         if view_id not in records:
-            raise DatasetError(f"{config.root}: view {view_id} is not in the manifest")
+            raise DatasetError(f"{config.root}: view {view_id} occurs twice, expected once")
         yield view_id, left, _verified_pixels(left, records.pop(view_id), config.root)
         progress(f"{task} of {config.name}", done, total)
     if records:

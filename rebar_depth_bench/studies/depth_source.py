@@ -12,7 +12,7 @@ from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import Problem, SubmissionError, format_shape
 from rebar_depth_bench.submission import EntryError, ExpectedViews, SubmissionMeta, open_submission
 from rebar_depth_bench.submission.formats import FORMATS, Depth
-from rebar_depth_bench.submission.metadata import METADATA_NAME, parse_metadata
+from rebar_depth_bench.submission.metadata import DEPTH_SCALE, METADATA_NAME, parse_metadata
 
 _FILE_NAME_PATTERN = "<view_id>, or its part after the slash, with one of " + ", ".join(FORMATS)
 
@@ -96,7 +96,7 @@ class FolderDepths(DepthSource):
         images = [file.name for file in self._files.values() if file.suffix == ".png"]
         if images and self._scale is None and not problems:
             expected_scale = f"metres per PNG unit, since {len(images)} files are PNG (first {min(images)})"
-            problems = [Problem("missing", METADATA_NAME, "no depth_scale", expected_scale)]
+            problems = [Problem("missing", DEPTH_SCALE, "missing", expected_scale)]
         if file_problems or problems:
             raise SubmissionError.from_problems(path, [*file_problems, *problems])
 
@@ -110,7 +110,7 @@ class FolderDepths(DepthSource):
             with file.open("rb") as stream:
                 data = stream.read(limit + 1)
         except OSError as error:
-            raise EntryError(Problem("damaged", name, f"it cannot be read: {error.strerror}")) from error
+            raise EntryError(Problem("unreadable", name, f"it cannot be read: {error.strerror}")) from error
         if len(data) > limit and file.suffix != ".npy":  # the .npy header gives a more precise error
             found = f"it has more than {limit} bytes"
             raise EntryError(Problem("size", name, found, f"a map of {format_shape(shape)} (H x W)"))
@@ -158,4 +158,4 @@ def _folder_metadata(path: Path) -> tuple[SubmissionMeta | None, list[Problem]]:
     try:
         return parse_metadata(file.read_bytes())
     except OSError as error:
-        return None, [Problem("damaged", METADATA_NAME, f"it cannot be read: {error.strerror}")]
+        return None, [Problem("unreadable", METADATA_NAME, f"it cannot be read: {error.strerror}")]

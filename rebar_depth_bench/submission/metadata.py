@@ -13,6 +13,8 @@ from rebar_depth_bench.errors import Problem, escape_text
 from rebar_depth_bench.validation import Expected, Flag, StrictModel, text, validate_table
 
 METADATA_NAME = "submission.json"
+DEPTH_SCALE = f"{METADATA_NAME}: depth_scale"
+"""Location of the key that an archive with PNG entries requires."""
 MAX_METADATA_BYTES = 4 * 1024 * 1024
 MAX_METHOD_CHARACTERS = 200
 _MAX_URL_CHARACTERS = 2000
@@ -30,7 +32,12 @@ def is_http_url(url: str) -> bool:
 
 # PostgreSQL cannot store NUL.
 _Description = Annotated[str, Expected("text without NUL", lambda value: "\0" not in value)]
-_HttpUrl = Annotated[str, Expected("an address that starts with http:// or https://", is_http_url)]
+_HttpUrl = Annotated[
+    str,
+    Expected(
+        f"an http:// or https:// address without spaces, at most {_MAX_URL_CHARACTERS} characters", is_http_url
+    ),
+]
 _Scale = Annotated[
     float, Expected("a finite number of metres per unit above 0", lambda value: 0 < value < math.inf)
 ]

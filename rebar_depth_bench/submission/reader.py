@@ -14,7 +14,7 @@ from rebar_depth_bench.errors import EntryError, Problem
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.submission.entries import ExpectedViews, match_entries, max_entry_bytes
 from rebar_depth_bench.submission.formats import FORMATS, Depth
-from rebar_depth_bench.submission.metadata import METADATA_NAME, SubmissionMeta, parse_metadata
+from rebar_depth_bench.submission.metadata import DEPTH_SCALE, SubmissionMeta, parse_metadata
 from rebar_depth_bench.submission.zip_directory import ByteSource, DirectoryError, FileSource, read_directory
 from rebar_depth_bench.submission.zip_entries import CheckedEntry, check_entries, has_unsafe_name, read_data
 
@@ -80,8 +80,7 @@ class SubmissionReader:
         """
         scale = self.meta.depth_scale if self.meta else None
         if scale is None and self._suffix(view_id) == ".png":
-            found = f"{METADATA_NAME} has no depth_scale"
-            raise EntryError(Problem("missing", f"{view_id}.png", found, "metres per PNG unit"))
+            raise EntryError(Problem("missing", DEPTH_SCALE, "missing", f"metres per unit of {view_id}.png"))
         return self._decode(view_id, scale or 1.0)
 
     def problems(self, progress: Progress = silent) -> Iterator[Problem]:
@@ -152,8 +151,9 @@ def _file_problem(path: Path) -> Problem | None:
     try:
         status = path.stat()
     except (OSError, ValueError) as error:
-        reason = "it does not exist" if isinstance(error, FileNotFoundError) else str(error)
-        return Problem("missing", "", f"the file cannot be read: {reason}", expected)
+        if isinstance(error, FileNotFoundError):
+            return Problem("missing", "", "the file does not exist", expected)
+        return Problem("unreadable", "", f"the file cannot be read: {error}", expected)
     if stat.S_ISDIR(status.st_mode):
         return Problem("kind", "", "the path is a directory", expected)
     if not stat.S_ISREG(status.st_mode):
@@ -199,4 +199,4 @@ def _scale_problems(meta: SubmissionMeta | None, views: Mapping[str, CheckedEntr
     if meta is None or meta.depth_scale is not None or not images:
         return []
     because = f"because {len(images)} entries are PNG (first {images[0]})"
-    return [Problem("missing", METADATA_NAME, "depth_scale is missing", f"metres per PNG unit, {because}")]
+    return [Problem("missing", DEPTH_SCALE, "missing", f"metres per PNG unit, {because}")]

@@ -74,6 +74,8 @@ std = [0.2, 58.4, 57.1]
 meaning = "canonical-depth"
 min_m = 3
 max_m = 2
+scale = 1e10
+"" = 1
 """
 CALIBRATION = """
 width = 12
@@ -122,8 +124,13 @@ def rejected_inputs(folder: Path) -> Mapping[str, Callable[[], object]]:
     manifest = json.loads((DATASET / "manifest.json").read_bytes())
     entry = next(iter(manifest["configs"].values()))
     entry["views"][0]["steel_px"] = "many"
+    entry["views"][1]["view_id"] = "../../evil"
+    entry["scene"]["board"]["markers"] = 7
+    entry["mesh"] = "../mesh.ply"
     del entry["rig"]["width"]
     (folder / "manifest.json").write_text(json.dumps(manifest))
+    (folder / "later").mkdir()
+    (folder / "later" / "manifest.json").write_text(json.dumps({"format": "rebar-depth-dataset-9"}))
 
     def submission(name: str) -> None:
         with open_submission(folder / name, EXPECTED) as reader:
@@ -142,6 +149,7 @@ def rejected_inputs(folder: Path) -> Mapping[str, Callable[[], object]]:
         "truncated submission": lambda: submission("truncated.zip"),
         "empty submission": lambda: submission("nothing.zip"),
         "manifest": lambda: open_folder(folder),
+        "manifest of another format": lambda: open_folder(folder / "later"),
         "capture": lambda: open_capture(folder / "capture"),
     }
 

@@ -16,8 +16,8 @@ from leaderboard.web.api.schemas import (
     COMMON_RESPONSES,
     MALFORMED_RESPONSE,
     UNKNOWN_TOKEN_RESPONSE,
+    ErrorResponse,
     Leaderboard,
-    Problem,
     Responses,
     row_schema,
 )
@@ -49,7 +49,7 @@ CSV = "text/csv; charset=utf-8"
 ConfigName = Annotated[str, Query(max_length=100, description="name of the config", examples=["lattice"])]
 _ERROR_RESPONSES: Responses = {
     **UNKNOWN_TOKEN_RESPONSE,
-    404: {"model": Problem, "description": "the dataset has no such config"},
+    404: {"model": ErrorResponse, "description": "the dataset has no such config"},
     **MALFORMED_RESPONSE,
 }
 _CSV_RESPONSE: Responses = {200: {"content": {"text/csv": {"schema": {"type": "string"}}}}}

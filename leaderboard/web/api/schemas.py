@@ -18,7 +18,7 @@ from rebar_depth_bench.errors import ProblemCode
 _ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
 
 
-class Problem(BaseModel):
+class ErrorResponse(BaseModel):
     """Reason why a request is rejected."""
 
     model_config = ConfigDict(json_schema_extra={"example": {"detail": "no such submission"}})
@@ -35,8 +35,8 @@ class ProblemDetail(BaseModel):
     expected: str = Field(description="empty if it is obvious")
 
 
-class Problems(BaseModel):
-    """Problems of a malformed request, or of a rejected upload, which does not count against the quota.
+class RejectedResponse(BaseModel):
+    """RejectedResponse of a malformed request, or of a rejected upload, which does not count against the quota.
 
     Of a rejected upload, the first 20 problems are listed; ``problems`` then ends with the number of the others.
     """
@@ -60,7 +60,7 @@ class Problems(BaseModel):
 
     detail: str
     problems: list[str] = Field(description="the problems as text")
-    problem_details: list[ProblemDetail] = Field(description="the same problems, in the same order")
+    problem_details: list[ProblemDetail] = Field(description="the listed problems, in the same order")
 
 
 class Submission(BaseModel):
@@ -176,11 +176,15 @@ Responses = dict[int | str, dict[str, Any]]
 """OpenAPI ``responses`` by status, as FastAPI expects them."""
 
 DATABASE_UNAVAILABLE_MESSAGE = "the database is unavailable; try again later"
-DATABASE_UNAVAILABLE_RESPONSE: Responses = {503: {"model": Problem, "description": DATABASE_UNAVAILABLE_MESSAGE}}
+DATABASE_UNAVAILABLE_RESPONSE: Responses = {
+    503: {"model": ErrorResponse, "description": DATABASE_UNAVAILABLE_MESSAGE}
+}
 COMMON_RESPONSES: Responses = {
-    429: {"model": Problem, "description": "too many requests"},
+    429: {"model": ErrorResponse, "description": "too many requests"},
     **DATABASE_UNAVAILABLE_RESPONSE,
 }
-MALFORMED_RESPONSE: Responses = {422: {"model": Problems, "description": "the request is malformed"}}
-UNKNOWN_TOKEN_RESPONSE: Responses = {401: {"model": Problem, "description": "the token is unknown"}}
-MISSING_TOKEN_RESPONSE: Responses = {401: {"model": Problem, "description": "the token is missing or unknown"}}
+MALFORMED_RESPONSE: Responses = {422: {"model": RejectedResponse, "description": "the request is malformed"}}
+UNKNOWN_TOKEN_RESPONSE: Responses = {401: {"model": ErrorResponse, "description": "the token is unknown"}}
+MISSING_TOKEN_RESPONSE: Responses = {
+    401: {"model": ErrorResponse, "description": "the token is missing or unknown"}
+}

@@ -21,9 +21,9 @@ from leaderboard.web.api.schemas import (
     MALFORMED_RESPONSE,
     MISSING_TOKEN_RESPONSE,
     UNKNOWN_TOKEN_RESPONSE,
-    Problem,
-    Problems,
+    ErrorResponse,
     Publication,
+    RejectedResponse,
     Responses,
     Submission,
     submission_schema,
@@ -50,17 +50,17 @@ _UPLOAD_REQUEST_BODY = {
 }
 _ERROR_RESPONSES: Responses = {
     **MISSING_TOKEN_RESPONSE,
-    413: {"model": Problem, "description": "the archive is too large"},
-    422: {"model": Problems, "description": "the archive is invalid; it does not count against the quota"},
-    429: {"model": Problem, "description": "too many requests, or the daily quota is used up"},
+    413: {"model": ErrorResponse, "description": "the archive is too large"},
+    422: {"model": RejectedResponse, "description": "the archive is invalid; it does not count against the quota"},
+    429: {"model": ErrorResponse, "description": "too many requests, or the daily quota is used up"},
 }
 _NOT_FOUND_RESPONSES: Responses = {
-    404: {"model": Problem, "description": "no such submission"},
+    404: {"model": ErrorResponse, "description": "no such submission"},
     **MALFORMED_RESPONSE,
 }
 _OWNER_ERROR_RESPONSES: Responses = {
     **MISSING_TOKEN_RESPONSE,
-    403: {"model": Problem, "description": "you are not the owner of this submission"},
+    403: {"model": ErrorResponse, "description": "you are not the owner of this submission"},
     **_NOT_FOUND_RESPONSES,
 }
 _ACCEPTED_RESPONSE: Responses = {
@@ -69,7 +69,7 @@ _ACCEPTED_RESPONSE: Responses = {
         "headers": {"Location": {"description": "URL path of the submission", "schema": {"type": "string"}}},
     }
 }
-_UNREADABLE_RESPONSE: Responses = {400: {"model": Problem, "description": "the body is not valid UTF-8"}}
+_UNREADABLE_RESPONSE: Responses = {400: {"model": ErrorResponse, "description": "the body is not valid UTF-8"}}
 
 
 @router.post(

@@ -52,6 +52,7 @@ from rebar_depth_bench.validation import (
     read_small_file,
     short_repr,
     text,
+    three_numbers,
     validate_table,
     whole_number,
 )
@@ -90,10 +91,11 @@ with a canonical focal length equal to its input width: in 1/z = C W / f, W and 
 _Side = Annotated[int, whole_number(1, MAX_SIDE_PX)]
 _SIZE_KEYS = ("width", "height", "longest_side", "multiple_of")
 _Positive = Annotated[float, number(0)]
+_FOCAL_PX = number(1, 100_000)
 _COLOUR = Expected("three numbers: red, green, blue")
 
 
-class InputSpec(StrictModel):
+class InputSpec(StrictModel):  # Order matters: validators read the fields above theirs.
     """Conversion of an image to the model input: the table ``[input]``.
 
     Sides are in pixels. ``range`` is the value of white before normalisation, also the unit of ``mean``
@@ -133,22 +135,20 @@ class InputSpec(StrictModel):
     def _check_colour(cls, values: Triple, info: ValidationInfo) -> Triple:
         """Check the bounds, which catch values given for the other range, a common mistake."""
         white = info.data.get("range")
-        low, high = (white or 1) / 255 if info.field_name == "std" else 0, white or 255
-        if not all(low <= value <= high for value in values):
-            raise field_error(
-                f"got {short_repr(list(values))}", f"three numbers from {low:g} to {high:g}: red, green, blue"
-            )
+        bounds = three_numbers((white or 1) / 255 if info.field_name == "std" else 0, white or 255)
+        if not bounds.accept(values):
+            raise field_error(f"got {short_repr(list(values))}", bounds.text)
         return values
 
 
-class OutputSpec(StrictModel):
+class OutputSpec(StrictModel):  # Order matters: validators read the fields above theirs.
     """Conversion of the model output to depth: the table ``[output]``.
 
     ``scale`` is in metres per unit of a non-canonical output, ``min_m`` and ``max_m`` are in metres.
     """
 
     meaning: Annotated[str, one_of(*OUTPUT_MEANINGS)]
-    focal_canonical_px: Annotated[float, number(1, 100_000)] | None = Field(default=None, validate_default=True)
+    focal_canonical_px: Annotated[float, _FOCAL_PX] | None = Field(default=None, validate_default=True)
     scale: _Positive = 1.0
     max_m: _Positive = math.inf
     min_m: _Positive = 0.0
@@ -168,7 +168,7 @@ class OutputSpec(StrictModel):
         meaning = info.data.get("meaning")
         if meaning is not None and OUTPUT_MEANINGS[meaning].canonical != (focal_px is not None):
             if focal_px is None:
-                raise field_error("missing", f'a number from 1 to 100000 for meaning "{meaning}"', "missing")
+                raise field_error("missing", f'{_FOCAL_PX.text} for meaning "{meaning}"', "missing")
             raise field_error(f"got {focal_px:g}", f'none: meaning "{meaning}" does not use it', "conflict")
         return focal_px
 
@@ -188,7 +188,7 @@ class OutputSpec(StrictModel):
 
 
 class OnnxSpec(StrictModel):
-    """TOML file of an ONNX method; ``name`` defaults to the name of the file, ``path`` is the ONNX file."""
+    """TOML file of an ONNX method; ``name`` is by default the file's, ``model`` the path of the ONNX file."""
 
     model: Annotated[str, text(1000, "the ONNX file's path, relative to this file")]
     name: Annotated[str, text(MAX_METHOD_CHARACTERS)] = ""

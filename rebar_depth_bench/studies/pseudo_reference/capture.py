@@ -90,7 +90,7 @@ def open_capture(path: str | os.PathLike[str]) -> Capture:
     if left:
         width, height = sizes[min(left.values())]
         problems += [
-            Problem("size", _entry(file), f"is {size[0]} x {size[1]}", f"{width} x {height} as the first")
+            Problem("invalid", _entry(file), f"is {size[0]} x {size[1]}", f"{width} x {height} as the first")
             for file, size in sizes.items()
             if size != (width, height) and all(size)
         ]

@@ -10,13 +10,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 
 from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
-from rebar_depth_bench.errors import InputError, printable, problem_summary
+from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.ground_truth import verified_views
@@ -232,9 +232,13 @@ def _label_sources(sources: Sequence[DepthSource], views: ExpectedViews) -> dict
 
 def _raise_problems(outcomes: Sequence[FrameOutcome], sources: Mapping[str, DepthSource]) -> None:
     """Raise ``InputError`` with the problems of all entries, each prefixed by its archive or folder, if any."""
-    problems = [problem for outcome in outcomes for problem in outcome.problems]
+    problems = [
+        replace(problem, where=f"{sources[label].path}: {problem.where}")
+        for outcome in outcomes
+        for label, problem in outcome.problems
+    ]
     if problems:
-        raise InputError(problem_summary([f"{sources[label].path}: {problem}" for label, problem in problems]))
+        raise InputError.from_problems("depth maps", problems)
 
 
 def _depth_references(outcomes: Sequence[FrameOutcome], pseudo: Mapping[str, DepthSource]) -> list[DepthReference]:

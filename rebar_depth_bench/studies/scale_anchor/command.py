@@ -152,9 +152,10 @@ def run_anchor_study(
 
 
 def _check_arguments(given_scale: float, counts: Sequence[int], draws: int, seed: int) -> None:
-    checks = [
+    checks: list[tuple[str, object, bool, str]] = [
         ("--baseline-scale", given_scale, 0 < given_scale < math.inf, "a finite number above 0"),
-        *(("--num-anchor-views", k, k >= 1, "1 or more") for k in counts or [0]),
+        *(("--num-anchor-views", k, k >= 1, "1 or more") for k in counts),
+        *([] if counts else [("--num-anchor-views", "no number", False, "one or more")]),
         ("--draws", draws, 1 <= draws <= MAX_DRAWS, f"1 to {MAX_DRAWS}"),
         ("--seed", seed, 0 <= seed < 2**31, f"0 to {2**31 - 1}"),
     ]

@@ -152,6 +152,9 @@ def manifest(tiny_root: Path) -> Any:
     return json.loads((tiny_root / "manifest.json").read_text())
 
 
+BOARD = "configs.lattice.scene.board"
+
+
 def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
     (folder / "manifest.json").write_text(json.dumps(manifest))
     with pytest.raises(rdb.DatasetError) as caught:
@@ -166,7 +169,7 @@ def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
         (lambda manifest, _: manifest.update(format="other"), "invalid", "format"),
         (lambda manifest, _: manifest.update(configs=[]), "invalid", "configs"),
         (lambda manifest, _: manifest["files"].update(x=None), "invalid", "files.x"),
-        (lambda manifest, _: manifest["files"].update({"../x": "0" * 64}), "invalid", "files.../x.[key]"),
+        (lambda manifest, _: manifest["files"].update({"../x": "0" * 64}), "invalid", "files.../x"),
         (lambda manifest, _: manifest["ground_truth"].update(digest="sha256:"), "invalid", "ground_truth.digest"),
         (lambda _, config: config.pop("views"), "missing", "configs.lattice.views"),
         (lambda _, config: config["views"][0].pop("left"), "missing", "configs.lattice.views 1: left"),
@@ -175,7 +178,7 @@ def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
         (
             lambda _, config: config["scene"]["board"].update({"\ud800": 1}),
             "invalid",
-            "configs.lattice.scene.board",
+            BOARD,
         ),
         (lambda _, config: config["scene"].update(board=7), "invalid", "configs.lattice.scene.board"),
         (lambda _, config: config["scene"].pop("board"), "missing", "configs.lattice.scene.board"),
@@ -185,6 +188,17 @@ def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
             for name in ("/../../../Documents", "../x", "/tmp/x", "a/../b", "a//b", "a\n", ".hidden", "a\\b")
         ),
         (lambda _, config: config.update(shards=["../x.parquet"]), "invalid", "configs.lattice.shards 1"),
+        (lambda _, config: config["scene"]["board"].update(x=1), "unknown", BOARD + ".x"),
+        (lambda _, config: config["scene"]["board"].update(markers="six"), "invalid", BOARD + ".markers"),
+        (lambda _, config: config["scene"]["board"].update(width_m=float("nan")), "invalid", BOARD + ".width_m"),
+        (lambda _, config: config["rig"].update(width=-5), "invalid", "configs.lattice.rig.width"),
+        (lambda _, config: config["views"].append(config["views"][0]), "duplicate", "configs.lattice.views"),
+        (lambda _, config: config["views"][0].update(view_id="pile/0000"), "invalid", "configs.lattice.views"),
+        (
+            lambda _, config: config["views"][0].update(scored_px=-1),
+            "invalid",
+            "configs.lattice.views 1: scored_px",
+        ),
         (lambda _, config: config["views"][1].update(left="x"), "invalid", "configs.lattice.views 2: left"),
         *(
             (

@@ -73,7 +73,7 @@ def test_invalid_conf_is_rejected(tmp_path: Path, old: str, new: str, location: 
         (b"\xff\xfe[\x00L\x00", "syntax", "can't decode byte 0xff in position 0"),
         (b"[STEREO]\nBaseline=120\n", "missing", "the file has [STEREO], expected one of [LEFT_CAM_2K]"),
         (b"[DEFAULT]\nfx=1\n", "missing", "the file has [DEFAULT], expected"),
-        (b"; " + b"x" * 1_000_001, "size", "more than 1000000 bytes"),
+        (b"; " + b"x" * 1_000_001, "size", "at most 1000000 bytes"),
     ],
 )
 def test_file_that_is_no_calibration_is_rejected(tmp_path: Path, content: bytes, code: str, words: str) -> None:
@@ -86,8 +86,8 @@ def test_file_that_is_no_calibration_is_rejected(tmp_path: Path, content: bytes,
     ("name", "code", "words"),
     [
         ("none.conf", "missing", "cannot be read: No such file"),
-        ("folder.conf", "invalid", "cannot be read: Is a directory"),
-        ("nul\0.conf", "invalid", "cannot be read: embedded null"),
+        ("folder.conf", "unreadable", "cannot be read: Is a directory"),
+        ("nul\0.conf", "unreadable", "cannot be read: embedded null"),
         ("a.yaml", "invalid", "the file suffix is '.yaml', expected .conf or .toml"),
     ],
 )

@@ -61,8 +61,8 @@ INVALID_EDITS = [
     ("range = 255", "range = 255\nstd = [0.229, 0.224, 0.225]", "invalid input.std", "from 1 to 255"),
     ("range = 255", "range = 255\nmean = [1, 2]", "invalid input.mean", "got [1, 2], expected three numbers"),
     ("range = 255", "range = 255\nstd = [1, 2, nan]", "invalid input.std", "nan]"),
-    ("range = 255", "range = 255\nstd = [0, 0, 0]", "invalid input.std", ""),
-    ("range = 255", "range = 255\nlayout = 'NHWC'", "unknown input.layout", "expected only width"),
+    ("range = 255", "range = 255\nstd = [0, 0, 0]", "invalid input.std", "expected three numbers from 1 to 255"),
+    ("range = 255", "range = 255\nlayout = 'NHWC'", "unknown input.layout", "expected one of width"),
     ("'depth'", "'disparity'", "invalid output.meaning", 'expected "depth", "inverse-depth", "canon'),
     ("'depth'", "'canonical-depth'", "missing output.focal_canonical_px", "expected a number from 1 to 100000"),
     ("'depth'", "'depth'\nfocal_canonical_px = 1000", "conflict output.focal_canonical_px", 'meaning "depth"'),
@@ -70,7 +70,12 @@ INVALID_EDITS = [
     ("'depth'", "'depth'\nscale = inf", "invalid output.scale", "got inf"),
     ("'depth'", "'depth'\nscale = '1'", "invalid output.scale", "got '1'"),
     ("'depth'", "'depth'\nmin_m = 3\nmax_m = 2", "conflict output.min_m", "got 3, expected less than max_m, 2"),
-    ("'depth'", "'depth'\nname = 'y'\nindex = 0", "conflict output.index", ""),
+    (
+        "'depth'",
+        "'depth'\nname = 'y'\nindex = 0",
+        "conflict output.index",
+        "got name and index, expected one of them",
+    ),
     ("'depth'", "'depth'\nindex = -1", "invalid output.index", "got -1, expected a whole number from 0"),
     ("'depth'", "'depth'\nat_input_size = 1", "invalid output.at_input_size", "got 1, expected true or false"),
     ("'depth'", "'depth'\nresize = 'area'", "invalid output.resize", 'expected "nearest" or "bilinear"'),
@@ -140,7 +145,7 @@ def test_example_in_docstring_is_valid(tmp_path: Path) -> None:
             "cannot be read: No such file or directory, expected a TOML file that describes an ONNX model",
         ),
         (b"\xff\xfe", "syntax", "byte 0 is not UTF-8"),
-        (b"#" * (1 << 21), "size", "more than 1048576 bytes"),
+        (b"#" * (1 << 21), "size", "at most 1048576 bytes"),
         (b"\x00", "syntax", "not a valid TOML file"),
     ],
 )
@@ -155,7 +160,7 @@ def test_unreadable_file_raises_with_reason(content: bytes | None, code: str, wo
     path.mkdir()
     with pytest.raises(MethodError) as caught:
         find_method(str(path))
-    assert located(caught.value.problems) == ["invalid "]
+    assert located(caught.value.problems) == ["unreadable "]
 
 
 VALUES = st.recursive(

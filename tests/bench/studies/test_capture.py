@@ -84,7 +84,7 @@ def delete_all_images(root: Path) -> None:
     ("damage", "beginnings"),
     [
         (delete_right_image, ["missing left/000001.png: has no right/000001"]),
-        (resize_right_image, ["size right/000001.png: is 32 x 18, expected 64 x 36"]),
+        (resize_right_image, ["invalid right/000001.png: is 32 x 18, expected 64 x 36"]),
         (corrupt_left_image, ["damaged left/000001.png: is not a readable image"]),
         (rename_with_space, ["name left/view one.png: ", "name right/view one.png: "]),
         (duplicate_name, ["duplicate left/000001.png: "]),
@@ -174,7 +174,7 @@ def test_folder_and_archive_are_read_alike(tmp_path: Path) -> None:
         ({}, "missing", ""),
         ({"c.npy": b""}, "missing", ""),
         ({"a.npy": b"", "a.npz": b""}, "duplicate", "walk/a"),
-        ({"a.png": b""}, "missing", "submission.json"),
+        ({"a.png": b""}, "missing", "submission.json: depth_scale"),
         ({"a.npy": b"", "submission.json": b"{"}, "syntax", "submission.json"),
         ({"a.npy": b"", "submission.json": b'{"method": 1}'}, "invalid", "submission.json: method"),
     ],

@@ -235,7 +235,7 @@ def test_file_that_is_no_zip_is_one_problem(check: Check, content: bytes, code: 
 def test_path_that_is_no_file_is_one_problem(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     paths: list[Path | str] = [tmp_path / "a.zip", tmp_path, tmp_path / "pipe", "a\0b"]
-    codes = ["missing", "kind", "kind", "missing"]
+    codes = ["missing", "kind", "kind", "unreadable"]
     assert [located(check_archive(path, EXPECTED)) for path in paths] == [[(code, "")] for code in codes]
 
 

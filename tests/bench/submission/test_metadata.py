@@ -92,5 +92,5 @@ def test_png_without_depth_scale_is_one_problem(check: Check) -> None:
     units = (DEPTH * 1000).astype("u2")
     views = [Record(f"lattice/000{index}.png".encode(), png(units)) for index in range(2)]
     (problem,) = check([Record(b"submission.json", b'{"method": "m"}'), *views])
-    assert (problem.code, problem.where) == ("missing", "submission.json")
+    assert (problem.code, problem.where) == ("missing", "submission.json: depth_scale")
     assert "2 entries are PNG (first lattice/0000.png)" in problem.expected

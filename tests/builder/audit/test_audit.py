@@ -71,7 +71,7 @@ def test_wrong_ground_truth_digest_is_reported(copy: Path) -> None:
     manifest["ground_truth"]["digest"] = "sha256:" + "0" * 64
     (copy / "manifest.json").write_text(json.dumps(manifest))
     assert (
-        "the ground-truth digest is sha256:00, expected sha256:"
+        f"the ground-truth digest is sha256:{'0' * 64}, expected sha256:"
         in failed_checks(copy)["digests of the manifest"][0]
     )
 
