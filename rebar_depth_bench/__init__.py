@@ -9,15 +9,25 @@ if TYPE_CHECKING:
     from rebar_depth_bench.data.bars import bars
     from rebar_depth_bench.data.dataset import load
     from rebar_depth_bench.data.torch_loader import torch_loader
-    from rebar_depth_bench.errors import DatasetError, InputError, MethodError, RebarDepthError, SubmissionError
+    from rebar_depth_bench.errors import (
+        CalibrationError,
+        DatasetError,
+        InputError,
+        MethodError,
+        Problem,
+        RebarDepthError,
+        SubmissionError,
+    )
     from rebar_depth_bench.scoring.result import Result, Table, ViewScore
     from rebar_depth_bench.scoring.score import score
     from rebar_depth_bench.submission import SubmissionWriter
 
 __all__ = [
+    "CalibrationError",
     "DatasetError",
     "InputError",
     "MethodError",
+    "Problem",
     "RebarDepthError",
     "Result",
     "SubmissionError",

@@ -268,7 +268,7 @@ def _conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
         yield Problem("missing", "unit", "missing", _UNIT.text)
     sources = [key for key in SOURCES if key in values]
     if len(sources) != 1:
-        found = f"found {' and '.join(sources) or 'none of them'}"
+        found = f"found {' and '.join(sources) or 'no bars'}"
         expected = "exactly one of [[bar]] tables, mesh and ifc"
         yield Problem("conflict" if sources else "missing", "", found, expected)
     match values.get("cameras"):

@@ -158,6 +158,9 @@ def load_undecoded(
     from datasets.exceptions import DatasetsError
 
     selected_columns = _validated_columns(columns)
+    if config.local is not None:
+        for shard in config.shards:
+            config.file(shard)  # ``datasets`` loads the shards that it finds, without an error for the others.
     try:
         loaded = datasets.load_dataset(config.root, config.name, split=SPLIT, streaming=streaming)
     except (DatasetsError, OSError, pa.ArrowException) as error:
@@ -232,6 +235,8 @@ def _decoder(column: str) -> Callable[[Any], Any]:
 def _validated_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
     if columns is None:
         return COLUMNS
+    if isinstance(columns, str):
+        raise DatasetError(f"columns is {columns!r}, expected a list of column names")
     unknown = [name for name in columns if name not in COLUMNS]
     if unknown:
         raise DatasetError(f"no column {', '.join(map(repr, unknown))}, expected some of {', '.join(COLUMNS)}")

@@ -121,12 +121,14 @@ def predict(
     only the missing ones. ``submission.json`` records the seconds per view and, for multi-view methods, their
     notes on each config. Returns the preparation report of each config that a multi-view method prepared.
 
-    Raises ``DatasetError`` for an unknown folder or config, and ``MethodError`` if the method cannot run or
-    returns invalid values.
+    Raises ``DatasetError`` for an unknown folder or config, ``InputError`` if ``archive`` is a folder, and
+    ``MethodError`` if the method cannot run or returns invalid values.
     """
     folder = open_folder(root)
     chosen = [folder.config(name) for name in dict.fromkeys(configs or folder.configs)]
     target = Path(archive)
+    if target.is_dir():
+        raise InputError(f"{target}: is a folder, expected the name of the archive to write")
     key = {
         "method": vars(method.info),
         "dataset": {config.name: [config.key, config.ground_truth_digest] for config in chosen},

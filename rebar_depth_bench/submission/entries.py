@@ -107,7 +107,7 @@ def _unknown_entry_problems(unknown_entries: Sequence[str], expected: ExpectedVi
         if not _is_macos_metadata(name):
             yield _unknown_entry_problem(name, expected)
     if macos:
-        found = f"{len(macos)} entries made by macOS were found"
+        found = f"entries made by macOS were found ({len(macos)})"
         yield Problem("unknown", escape_text(macos[0]), found, f"none; {_ZIP_HINT}")
 
 

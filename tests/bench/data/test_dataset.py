@@ -248,3 +248,17 @@ def test_view_id_of_shard_that_manifest_lacks_is_rejected(tiny_root: Path, tmp_p
     pq.write_table(pa.Table.from_pylist(rows, table.schema), shard)
     with pytest.raises(rdb.DatasetError, match=r"view \.\./\.\./\.\./x/evil is not in the manifest"):
         list(iterate_rows(open_folder(copy).config("lattice-orbit"), ["view_id", "left_K"]))
+
+
+@pytest.mark.parametrize("streaming", [True, False])
+def test_load_with_missing_shard_raises_dataset_error(tiny_root: Path, tmp_path: Path, streaming: bool) -> None:
+    copy = shutil.copytree(tiny_root, tmp_path / "copy", ignore=shutil.ignore_patterns(".rebar-cache"))
+    next(copy.glob("lattice/test-00000-*.parquet")).unlink()
+    load: Any = rdb.load
+    with pytest.raises(rdb.DatasetError, match="has no lattice/test-00000"):
+        load(copy, "lattice", streaming=streaming)
+
+
+def test_columns_given_as_text_are_rejected(tiny_root: Path) -> None:
+    with pytest.raises(rdb.DatasetError, match="columns is 'left_rgb', expected a list"):
+        rdb.load(tiny_root, "lattice", columns="left_rgb")

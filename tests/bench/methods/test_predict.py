@@ -18,7 +18,7 @@ import pytest
 
 from rebar_depth_bench import score
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.errors import InputError, MethodError
 from rebar_depth_bench.methods import (
     METHODS,
     ConfigViews,
@@ -363,3 +363,9 @@ def test_exception_in_check_is_reported(tiny_root: Path, tmp_path: Path) -> None
 def test_columns_given_as_string_raise_type_error() -> None:
     with pytest.raises(TypeError, match="columns is the text 'left_rgb', expected a tuple of names"):
         MethodInfo("mine", "a test", "left_rgb", False, "here", "MIT")  # type: ignore[arg-type]
+
+
+def test_folder_as_archive_is_rejected_before_prediction(tiny_root: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is a folder, expected the name of the archive"):
+        predict(find_method("truth"), tiny_root, tmp_path, configs=["lattice-orbit"])
+    assert list(tmp_path.iterdir()) == []
