@@ -140,7 +140,7 @@ def test_invalid_patch_is_rejected_as_documented(
 
 def test_models_have_examples_and_operations_descriptions(server: Server) -> None:
     document: dict[str, Any] = httpx2.get(f"{server.url}/openapi.json").json()
-    for name in ("Problem", "Problems", "Submission", "Publication"):
+    for name in ("ErrorResponse", "RejectedResponse", "Submission", "Publication"):
         assert document["components"]["schemas"][name]["example"]
     operations = [operation for path in document["paths"].values() for operation in path.values()]
     assert all(operation["description"] for operation in operations)
