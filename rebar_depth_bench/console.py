@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.progress import TimeRemainingColumn as Remaining
 
-from rebar_depth_bench.errors import InputError, RebarDepthError
+from rebar_depth_bench.errors import InputError, RebarDepthError, printable, terminal_text
 
 EXIT_DONE, EXIT_OTHER, EXIT_INPUT = 0, 1, 2
 """Exit codes: success, any other error, invalid input."""
@@ -28,7 +28,7 @@ class ProgressBars:
         self._bars: dict[str, TaskID] = {}
         self._lines: dict[str, int] = {}
         self._progress = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
@@ -46,6 +46,7 @@ class ProgressBars:
 
     def update(self, name: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` steps of the task ``name`` are finished."""
+        name = printable(name)
         if not self._console.is_terminal:
             self._print_line(name, done, total)
             return
@@ -102,7 +103,7 @@ def run_command(command: Callable[[], None], interrupted: str = "interrupted") -
     try:
         command()
     except RebarDepthError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {terminal_text(str(error))}", file=sys.stderr)
         return EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -120,6 +120,8 @@ def problem_summary(problems: Sequence[Problem | str]) -> str:
 
 
 _MAX_TEXT_CHARACTERS = 120
+_MAX_LINES = 100
+_MAX_LINE_CHARACTERS = 2000
 
 
 def escape_text(text: str) -> str:
@@ -135,6 +137,21 @@ def printable(text: str, limit: int = 200) -> str:
     """
     clean = "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text[: limit + 1])
     return clean if len(clean) <= limit else clean[: limit - 1] + "…"
+
+
+def terminal_text(message: str) -> str:
+    """Return a message of several lines for a terminal: escape sequences are shown, long lines truncated.
+
+    Messages quote files and servers, whose control characters could otherwise change what a terminal displays.
+    """
+    lines = message.split("\n")
+    shown = [line if line.isprintable() else _escape_controls(line) for line in lines[:_MAX_LINES]]
+    shown = [line if len(line) <= _MAX_LINE_CHARACTERS else f"{line[:_MAX_LINE_CHARACTERS]}..." for line in shown]
+    return "\n".join([*shown, *(["..."] if len(lines) > _MAX_LINES else [])])
+
+
+def _escape_controls(line: str) -> str:
+    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in line)
 
 
 def exception_summary(error: Exception) -> str:

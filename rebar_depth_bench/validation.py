@@ -11,17 +11,15 @@ valid value::
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from pathlib import Path
 from typing import Annotated, Any, TypeGuard, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, Strict, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
-from rebar_depth_bench.errors import InputError, Problem, ProblemCode
+from rebar_depth_bench.errors import Problem, ProblemCode
 
 Model = TypeVar("Model", bound=BaseModel)
 _MAX_REPR_CHARACTERS = 60
@@ -188,33 +186,3 @@ def short_repr(value: object) -> str:
     except (ValueError, RecursionError):  # Huge integers and deep nesting have no repr.
         return f"a huge {type(value).__name__}"
     return line if len(line) <= _MAX_REPR_CHARACTERS else f"{line[:_MAX_REPR_CHARACTERS]} ..."
-
-
-def read_small_file(path: Path, max_bytes: int, expected: str, error_type: type[InputError]) -> bytes:
-    """Return the content of a file that is ``expected``, for example "a TOML file".
-
-    Raises ``error_type`` if the file cannot be read or has more than ``max_bytes`` bytes.
-    """
-    try:
-        with path.open("rb") as stream:
-            content = stream.read(max_bytes + 1)
-    except (OSError, ValueError) as error:  # A ValueError is raised if the path contains a null character.
-        code: ProblemCode = "missing" if isinstance(error, FileNotFoundError) else "unreadable"
-        found = f"cannot be read: {getattr(error, 'strerror', None) or error}"
-        raise error_type.from_problems(path, [Problem(code, "", found, expected)]) from None
-    if len(content) > max_bytes:
-        found = "the file is larger than any such file"
-        raise error_type.from_problems(
-            path, [Problem("size", "", found, f"{expected} of at most {max_bytes} bytes")]
-        )
-    return content
-
-
-def parse_toml(content: bytes) -> tuple[dict[str, Any], list[Problem]]:
-    """Return the content of a TOML file, or an empty table and the problem of the content."""
-    try:
-        return tomllib.loads(content.decode("utf-8-sig")), []
-    except UnicodeDecodeError as error:
-        return {}, [Problem("syntax", "", f"byte {error.start} is not UTF-8", "a TOML file")]
-    except (ValueError, RecursionError) as error:
-        return {}, [Problem("syntax", "", f"not a valid TOML file: {error}")]

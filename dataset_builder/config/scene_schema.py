@@ -36,6 +36,7 @@ from dataset_builder.config.specs import DomeSpec, RigSpec, RingSpec
 from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS
 from dataset_builder.scene.variants import VARIANTS
 from rebar_depth_bench.errors import InputError, Problem
+from rebar_depth_bench.reading import parse_toml
 from rebar_depth_bench.validation import (
     Expected,
     Flag,
@@ -44,7 +45,6 @@ from rebar_depth_bench.validation import (
     field_error,
     number,
     one_of,
-    parse_toml,
     short_repr,
     text,
     three_numbers,

@@ -12,6 +12,7 @@ from pydantic import ConfigDict, Field, Strict, StringConstraints, ValidationInf
 
 from rebar_depth_bench.errors import DatasetError, Problem
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
+from rebar_depth_bench.paths import NAME_PATTERN, PATH_PATTERN, path_below
 from rebar_depth_bench.validation import (
     Expected,
     StrictModel,
@@ -26,16 +27,14 @@ from rebar_depth_bench.validation import (
 MANIFEST_FILE = "manifest.json"
 MANIFEST_FORMAT = "rebar-depth-dataset-1"
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
-# Names become parts of paths, also of files that are written and deleted: no part starts with a dot or a slash.
-_PART = "[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}"
 _LETTERS = 'letters, digits, "_", "." and "-", not starting with a dot'
-_Name = Annotated[str, StringConstraints(pattern=f"^{_PART}$"), Expected(f"a name of {_LETTERS}")]
+_Name = Annotated[str, StringConstraints(pattern=f"^{NAME_PATTERN}$"), Expected(f"a name of {_LETTERS}")]
 _Path = Annotated[
     str,
-    StringConstraints(pattern=f"^({_PART}/){{0,9}}{_PART}$"),
+    StringConstraints(pattern=f"^{PATH_PATTERN}$"),
     Expected(f"a path in the folder, whose parts are {_LETTERS}"),
 ]
-_ViewId = Annotated[str, StringConstraints(pattern=f"^{_PART}/{_PART}$")]
+_ViewId = Annotated[str, StringConstraints(pattern=f"^{NAME_PATTERN}/{NAME_PATTERN}$")]
 _Sha256 = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
 _Digest = Annotated[str, StringConstraints(pattern="^sha256:[0-9a-f]{64}$")]
 _Side = Annotated[int, whole_number(1, 16384)]
@@ -230,7 +229,7 @@ def _manifest_path(root: str) -> Path:
 
 def _local_path(root: str, name: str) -> Path:
     if Path(root).is_dir():
-        path = Path(root) / name
+        path = path_below(Path(root), name)
         if not path.is_file():
             raise DatasetError(f"{root}: has no {name}, expected a complete dataset folder written by rebar-build")
         return path

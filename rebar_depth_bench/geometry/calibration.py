@@ -8,10 +8,8 @@ from pathlib import Path
 from rebar_depth_bench.errors import CalibrationError, Problem
 from rebar_depth_bench.geometry.calibration_formats import read_conf, read_toml
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration, check_invertible, scale_calibration
-from rebar_depth_bench.validation import read_small_file
-
-MAX_FILE_BYTES = 1_000_000
-"""Size limit of a calibration file, bytes; real ones have a few kilobytes."""
+from rebar_depth_bench.limits import TOML_BYTES
+from rebar_depth_bench.reading import read_file
 
 Parser = Callable[[bytes, int, int, list[Problem]], StereoCalibration | None]
 PARSERS: Mapping[str, Parser] = {".conf": read_conf, ".toml": read_toml}
@@ -57,7 +55,7 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
     if parser is None:
         problem = Problem("invalid", "", f"the file suffix is {path.suffix!r}", " or ".join(PARSERS))
         raise CalibrationError.from_problems(path, [problem])
-    content = read_small_file(path, MAX_FILE_BYTES, "a calibration file", CalibrationError)
+    content = read_file(path, TOML_BYTES, "a calibration file", CalibrationError)
     problems: list[Problem] = []
     calibration = parser(content, width, height, problems)
     if calibration is not None:

@@ -18,6 +18,7 @@ from pydantic import Field, Strict, ValidationInfo, field_validator
 from rebar_depth_bench.errors import Problem, escape_text
 from rebar_depth_bench.geometry.cameras import rotation_vector
 from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
+from rebar_depth_bench.reading import parse_toml
 from rebar_depth_bench.validation import (
     Expected,
     StrictModel,
@@ -25,7 +26,6 @@ from rebar_depth_bench.validation import (
     field_error,
     format_location,
     number,
-    parse_toml,
     short_repr,
     validate_table,
     whole_number,

@@ -39,6 +39,8 @@ from typing import Annotated
 from pydantic import Field, ValidationInfo, field_validator
 
 from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.limits import TOML_BYTES
+from rebar_depth_bench.reading import parse_toml, read_file
 from rebar_depth_bench.submission.metadata import MAX_METHOD_CHARACTERS
 from rebar_depth_bench.validation import (
     Expected,
@@ -48,8 +50,6 @@ from rebar_depth_bench.validation import (
     field_error,
     number,
     one_of,
-    parse_toml,
-    read_small_file,
     short_repr,
     text,
     three_numbers,
@@ -58,7 +58,6 @@ from rebar_depth_bench.validation import (
 )
 
 MAX_SIDE_PX = 8192
-MAX_TOML_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -215,7 +214,7 @@ def read_onnx_toml(path: Path) -> OnnxSpec:
     unknown or invalid, or if the model file does not exist.
     """
     expected = "a TOML file that describes an ONNX model"
-    values, problems = parse_toml(read_small_file(path, MAX_TOML_BYTES, expected, MethodError))
+    values, problems = parse_toml(read_file(path, TOML_BYTES, expected, MethodError))
     spec = None if problems else validate_table(OnnxSpec, {"name": path.stem, **values}, problems, "", path.parent)
     if spec is None:
         raise MethodError.from_problems(path, problems)

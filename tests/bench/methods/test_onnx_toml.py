@@ -81,7 +81,7 @@ INVALID_EDITS = [
     ("'depth'", "'depth'\nresize = 'area'", "invalid output.resize", 'expected "nearest" or "bilinear"'),
     ("range = 255", f"range = {'9' * 4000}", "invalid input.range", "got 9999"),
     ("range = 255", f"range = {'9' * 5000}", "syntax ", "not a valid TOML file"),
-    ("range = 255", f"range = {'[' * 5000}", "syntax ", "not a valid TOML file"),
+    ("range = 255", f"range = {'[' * 5000}", "size ", "nested too deep"),
     ("range = 255", "range = 255\nrange = 1", "syntax ", "not a valid TOML file: Cannot overwrite a value"),
 ]
 

@@ -113,7 +113,7 @@ INVALID_SCENES = [
     (MM + BAR.replace("[100, 0, 50]", "[1e300, 0, 5]"), "invalid bar 1: points 2"),
     (MM + BAR.replace(", [100, 0, 50]", ""), "invalid bar 1: points"),
     ("unit = ", "syntax"),
-    ("x = " + "[" * 5000, "syntax"),
+    ("x = " + "[" * 5000, "size"),
     ("x = " + "9" * 5000, "syntax"),
     ("a = 1\na = 2\n", "syntax"),
     ("\x00", "syntax"),

@@ -1,0 +1,65 @@
+"""Limits on the size, time and memory of files and answers from outside.
+
+Each limit has a default, which an environment variable ``REBAR_MAX_<NAME>`` replaces. ``SECURITY.md`` lists them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+
+from rebar_depth_bench.errors import InputError, escape_text
+
+_MIB, _GIB = 1 << 20, 1 << 30
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """Largest accepted value of a quantity; ``name`` ends with its unit, ``description`` says what is limited."""
+
+    name: str
+    default: int
+    description: str
+
+    @property
+    def variable(self) -> str:
+        """Name of the environment variable that replaces the default."""
+        return f"REBAR_MAX_{self.name.upper()}"
+
+    def value(self) -> int:
+        """Return the limit in force. Raises ``InputError`` if the variable is not a whole number from 1."""
+        text = os.environ.get(self.variable)
+        if text is None:
+            return self.default
+        if not re.fullmatch(r"[1-9][0-9]{0,17}", text):
+            raise InputError(f"{self.variable} is {escape_text(text)}, expected a whole number from 1")
+        return int(text)
+
+
+JSON_BYTES = Limit("json_bytes", 64 * _MIB, "a JSON file or answer: manifest, result, export record")
+TOML_BYTES = Limit("toml_bytes", _MIB, "a scene, calibration or model description, and any other small text file")
+TABLE_BYTES = Limit("table_bytes", _GIB, "the decoded size of `bars.parquet`")
+CELL_BYTES = Limit("cell_bytes", 256 * _MIB, "an encoded image or depth map of a dataset row")
+IMAGE_PIXELS = Limit("image_pixels", 100_000_000, "an image of a capture or of KITTI, before it is decoded")
+MESH_BYTES = Limit("mesh_bytes", _GIB, "a PLY, STL, OBJ or glTF file")
+IFC_BYTES = Limit("ifc_bytes", _GIB, "an IFC file")
+IFC_SECONDS = Limit("ifc_seconds", 1800, "the processor time for reading an IFC file")
+IFC_MEMORY_BYTES = Limit("ifc_memory_bytes", 8 * _GIB, "the memory of the process that reads an IFC file")
+CACHE_BYTES = Limit(
+    "cache_bytes", 20 * _GIB, "the cache of ground truth; the least recently used entries go first"
+)
+
+LIMITS = (
+    JSON_BYTES,
+    TOML_BYTES,
+    TABLE_BYTES,
+    CELL_BYTES,
+    IMAGE_PIXELS,
+    MESH_BYTES,
+    IFC_BYTES,
+    IFC_SECONDS,
+    IFC_MEMORY_BYTES,
+    CACHE_BYTES,
+)
+"""All limits that an environment variable can raise, in the order of the documentation."""

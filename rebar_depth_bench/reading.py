@@ -1,0 +1,138 @@
+"""Reading of files from outside: regular files within a size limit, strict JSON and TOML.
+
+Symbolic links to regular files are followed, since a snapshot of the Hub consists of links; pipes, devices and
+folders are refused without blocking.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import stat
+import tomllib
+from pathlib import Path
+from typing import Any, BinaryIO, NoReturn
+
+from rebar_depth_bench.errors import InputError, Problem, ProblemCode, escape_text
+from rebar_depth_bench.limits import Limit
+
+MAX_NESTING = 64
+"""Largest number of JSON or TOML containers inside each other."""
+_MAX_KEY_COST = 10_000_000
+"""Largest sum over the lines of a TOML file of the squared number of dots; tomllib needs about 10 ns for each."""
+_DECIMAL_NUMBER = re.compile(rb"(?<![\w.\"'-])[-+]?\d+\.\d+(?=[\s,\]}eE]|$)")
+_KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file, or a link to one, for reading in binary mode.
+
+    Raises ``OSError``, whose ``strerror`` can be shown to users, for anything else.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    except ValueError as error:  # The path contains a null character.
+        raise OSError(errno.EINVAL, str(error)) from None
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        found = _KINDS.get(stat.S_IFMT(mode), "a device")
+        raise OSError(errno.EINVAL, f"it is {found}, not a regular file")
+    return os.fdopen(descriptor, "rb")
+
+
+def read_file(path: Path, limit: Limit, expected: str, error_type: type[InputError]) -> bytes:
+    """Return the content of a regular file that is ``expected``, for example "a TOML file".
+
+    Raises ``error_type`` if the file cannot be read or has more bytes than ``limit``.
+    """
+    max_bytes = limit.value()
+    try:
+        with open_regular(path) as stream:
+            content = stream.read(max_bytes + 1)
+    except OSError as error:
+        code: ProblemCode = "missing" if isinstance(error, FileNotFoundError) else "unreadable"
+        problem = Problem(code, "", f"cannot be read: {error.strerror or error}", expected)
+        raise error_type.from_problems(path, [problem]) from None
+    if len(content) > max_bytes:
+        raised = f"{expected} of at most {max_bytes} bytes; {limit.variable} raises the limit"
+        problem = Problem("size", "", "the file is too large", raised)
+        raise error_type.from_problems(path, [problem])
+    return content
+
+
+def parse_json(content: bytes, where: str = "") -> tuple[Any, list[Problem]]:
+    """Return the value of a JSON text, or None and its problem.
+
+    Stricter than ``json``: the text is UTF-8, no object has a key twice, numbers are finite, strings can be
+    encoded, and at most ``MAX_NESTING`` containers are inside each other. ``where`` is the location in problems.
+    """
+    try:
+        value = json.loads(content.decode(), object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
+        # json.loads accepts numbers like 1e999 and lone surrogates, which cannot be written as JSON again.
+        json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
+    except UnicodeDecodeError as error:
+        return None, [Problem("syntax", where, f"byte {error.start} is not UTF-8", "UTF-8 text")]
+    except RecursionError:
+        return None, [_nesting_problem(where)]
+    except _DuplicateKeyError as error:
+        return None, [Problem("duplicate", where, f"the key {error} occurs twice", "each key once")]
+    except ValueError as error:
+        found = f"the text is not valid JSON ({escape_text(str(error))})"
+        return None, [Problem("syntax", where, found, "JSON")]
+    if isinstance(value, dict | list) and _nesting_exceeds(value, MAX_NESTING):
+        return None, [_nesting_problem(where)]
+    return value, []
+
+
+def parse_toml(content: bytes) -> tuple[dict[str, Any], list[Problem]]:
+    """Return the content of a TOML file, or an empty table and the problem of the content."""
+    lines = _DECIMAL_NUMBER.sub(b"", content).splitlines()
+    if sum(line.count(b".") ** 2 for line in lines) > _MAX_KEY_COST:
+        return {}, [Problem("size", "", "the keys have too many parts", "a few parts")]
+    try:
+        values = tomllib.loads(content.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        return {}, [Problem("syntax", "", f"byte {error.start} is not UTF-8", "a TOML file")]
+    except RecursionError:
+        return {}, [_nesting_problem("")]
+    except ValueError as error:
+        return {}, [Problem("syntax", "", f"not a valid TOML file: {escape_text(str(error))}")]
+    return ({}, [_nesting_problem("")]) if _nesting_exceeds(values, MAX_NESTING) else (values, [])
+
+
+class _DuplicateKeyError(ValueError):
+    """Key that occurs twice in an object."""
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        seen: set[str] = set()
+        duplicate = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        raise _DuplicateKeyError(escape_text(duplicate))
+    return table
+
+
+def _refuse_constant(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is not JSON")
+
+
+def _nesting_problem(where: str) -> Problem:
+    return Problem("size", where, "the values are nested too deep", f"at most {MAX_NESTING} levels")
+
+
+def _nesting_exceeds(value: Any, levels: int) -> bool:
+    containers = [value]
+    for _ in range(levels):
+        children = [
+            child
+            for container in containers
+            for child in (container.values() if isinstance(container, dict) else container)
+        ]
+        containers = [child for child in children if isinstance(child, dict | list)]
+        if not containers:
+            return False
+    return True

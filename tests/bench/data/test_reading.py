@@ -1,0 +1,163 @@
+"""Strict JSON and TOML, regular files only, and names that stay in their folder."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from pathlib import Path
+
+import pytest
+
+from rebar_depth_bench import limits
+from rebar_depth_bench.errors import InputError, terminal_text
+from rebar_depth_bench.paths import check_no_links, path_below, remove_file, remove_folder
+from rebar_depth_bench.reading import MAX_NESTING, open_regular, parse_json, parse_toml, read_file
+
+
+@pytest.mark.parametrize(
+    ("content", "code"),
+    [
+        (b'{"a": 1, "a": 2}', "duplicate"),
+        (b'{"x": [{"a": 1, "b": {}, "a": 1}]}', "duplicate"),
+        (b"[1e999]", "syntax"),
+        (b"[NaN]", "syntax"),
+        (b"[-Infinity]", "syntax"),
+        (b'["\\ud800"]', "syntax"),
+        (b'"\xff"', "syntax"),
+        (b"\xef\xbb\xbf{}", "syntax"),
+        (b"1" * 4400, "syntax"),
+        (b"", "syntax"),
+        (b'{"a": 1} x', "syntax"),
+        (b"[" * 100_000, "size"),
+        (b"[" * (MAX_NESTING + 1) + b"]" * (MAX_NESTING + 1), "size"),
+        (b'{"a":' * 500 + b"1" + b"}" * 500, "size"),
+    ],
+)
+def test_unclear_or_hostile_json_is_refused(content: bytes, code: str) -> None:
+    value, [problem] = parse_json(content, "here")
+    assert (value, problem.code, problem.where) == (None, code, "here")
+    assert str(problem).isprintable()
+
+
+def test_json_at_the_nesting_limit_is_read() -> None:
+    value, problems = parse_json(b"[" * MAX_NESTING + b"]" * MAX_NESTING)
+    assert isinstance(value, list)
+    assert problems == []
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        ".".join(["a"] * 30_000) + " = 1",
+        '"=".a.' * 10_000 + "a = 1",
+        "1.1 . " * 20_000 + "1 = 1",
+        "[" + ".".join(["a"] * 30_000) + "]",
+        "x = {" + ".".join(["a"] * 30_000) + " = 1}",
+        "x = " + "[" * 100_000,
+        "x = " + "{a = " * 100 + "1" + "}" * 100,
+    ],
+)
+def test_toml_that_takes_tomllib_seconds_is_refused_at_once(content: str) -> None:
+    start = time.process_time()
+    values, [problem] = parse_toml(content.encode())
+    assert (values, problem.code) == ({}, "size")
+    assert time.process_time() - start < 1
+
+
+def test_long_lists_of_numbers_are_sound_toml() -> None:
+    values, problems = parse_toml(b"a = [" + b"-1.25, " * 50_000 + b"]")
+    assert problems == []
+    assert values == {"a": [-1.25] * 50_000}
+
+
+def test_only_regular_files_and_links_to_them_are_opened(tmp_path: Path) -> None:
+    file, link, pipe = tmp_path / "file", tmp_path / "link", tmp_path / "pipe"
+    file.write_bytes(b"content")
+    link.symlink_to(file)
+    os.mkfifo(pipe)
+    for path in (file, link):
+        with open_regular(path) as stream:
+            assert stream.read() == b"content"
+    for path in (pipe, tmp_path, Path("/dev/zero"), tmp_path / "missing", Path("a\0b")):
+        with pytest.raises(OSError, match=r"."):
+            open_regular(path)
+        with pytest.raises(InputError) as raised:
+            read_file(path, limits.TOML_BYTES, "a TOML file", InputError)
+        assert raised.value.problems[0].code == ("missing" if path.name == "missing" else "unreadable")
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(tmp_path / "socket"))
+        with pytest.raises(OSError, match=r"."):
+            open_regular(tmp_path / "socket")
+
+
+def test_variable_raises_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(b"12345")
+    monkeypatch.setenv("REBAR_MAX_TOML_BYTES", "4")
+    with pytest.raises(InputError) as raised:
+        read_file(file, limits.TOML_BYTES, "a TOML file", InputError)
+    assert raised.value.problems[0].code == "size"
+    assert "REBAR_MAX_TOML_BYTES" in str(raised.value)
+    monkeypatch.setenv("REBAR_MAX_TOML_BYTES", "5")
+    assert read_file(file, limits.TOML_BYTES, "a TOML file", InputError) == b"12345"
+    for text in ("", "0", "-1", "1e3", "x", "9" * 30):
+        monkeypatch.setenv("REBAR_MAX_TOML_BYTES", text)
+        with pytest.raises(InputError):
+            limits.TOML_BYTES.value()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        ".",
+        "..",
+        "../x",
+        "a/../x",
+        "/x",
+        "a//b",
+        "a/",
+        ".x",
+        "a/.x",
+        "a\\b",
+        "a\0",
+        "a\n",
+        "é",
+        "a" * 201,
+        "a/" * 10 + "a",
+    ],
+)
+def test_name_that_is_no_path_below_a_folder_is_refused(name: str) -> None:
+    with pytest.raises(InputError):
+        path_below(Path("/root"), name)
+
+
+def test_names_become_paths_below_a_folder() -> None:
+    assert path_below(Path("/root"), "lattice/0000") == Path("/root/lattice/0000")
+    assert path_below(Path("/root"), "pier-2/test-00000-of-00001.parquet").parts[-2] == "pier-2"
+
+
+def test_links_are_never_written_through_or_deleted(tmp_path: Path) -> None:
+    outside, root = tmp_path / "outside", tmp_path / "root"
+    outside.mkdir()
+    root.mkdir()
+    (outside / "file").write_bytes(b"kept")
+    (root / "folder").symlink_to(outside)
+    (root / "file").symlink_to(outside / "file")
+    for name in ("folder/file", "folder", "file"):
+        with pytest.raises(InputError):
+            check_no_links(root, name)
+    remove_file(root / "file")
+    remove_folder(root / "folder")
+    assert (outside / "file").read_bytes() == b"kept"
+    assert sorted(path.name for path in root.iterdir()) == ["file", "folder"]
+    check_no_links(root, "other/file")
+
+
+def test_terminal_text_shows_escape_sequences_and_truncates() -> None:
+    shown = terminal_text("one\x1b[2J\u202e\n" + "x" * 10_000 + "\n" * 1000)
+    assert "\x1b" not in shown
+    assert "\\x1b[2J\\u202e" in shown
+    assert len(shown) < 3000
+    assert terminal_text("a: 2 problems\n  - é") == "a: 2 problems\n  - é"
