@@ -16,6 +16,7 @@ from dataset_builder.scene.variants import VARIANTS
 from leaderboard.cli import argument_parser as board_parser
 from leaderboard.settings import Settings
 from rebar_depth_bench.cli.main import argument_parser as bench_parser
+from rebar_depth_bench.limits import LIMITS, Limit
 from rebar_depth_bench.methods import find_method, own_methods
 from tests.bench.methods.predictors import load_predictor
 
@@ -23,6 +24,7 @@ PAGES = [
     Path("README.md"),
     Path("CONTRIBUTING.md"),
     Path("ARCHITECTURE.md"),
+    Path("SECURITY.md"),
     Path("cards/BENCHMARK.md"),
     Path("deploy/README.md"),
 ]
@@ -99,3 +101,16 @@ def test_documented_make_targets_exist() -> None:
     targets = set(re.findall(r"^([a-z-]+):.*##", Path("Makefile").read_text(), flags=re.MULTILINE))
     shown = {name for page in PAGES for name in re.findall(r"\bmake ([a-z-]+)\b(?:`|\s+#)", page.read_text())}
     assert {"demo", "test"} <= shown <= targets
+
+
+def test_security_lists_every_limit() -> None:
+    rows = re.findall(r"^\| `(REBAR_MAX_\w+)` \| (.*?) \| (.*?) \|$", Path("SECURITY.md").read_text(), re.MULTILINE)
+    assert rows == [(limit.variable, default_text(limit), limit.description) for limit in LIMITS]
+
+
+def default_text(limit: Limit) -> str:
+    """Return the default of a limit as the table shows it: ``64 MiB``, ``1800 s`` or a plain number."""
+    if not limit.name.endswith("_bytes"):
+        return f"{limit.default:,} {limit.name.rpartition('_')[2]}"
+    power = 3 if limit.default % (1 << 30) == 0 else 2
+    return f"{limit.default >> (10 * power)} {('B', 'KiB', 'MiB', 'GiB')[power]}"
