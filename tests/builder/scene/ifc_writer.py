@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from typing import Any
 
+import ifcopenshell
 import numpy as np
 from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage_assembly import CageBar
-from dataset_builder.scene.assemblies.ifc.bars import ifc_bars
-from dataset_builder.scene.assemblies.ifc.model import import_ifcopenshell as package
+from dataset_builder.scene.assemblies.ifc.answer import Answer
+from dataset_builder.scene.ifc_reader.answer import write_answer
 
-ifcopenshell = package()
 Numbers = Sequence[float]
+
+
+def bars_in_process(content: bytes) -> list[CageBar]:
+    """Return the bars of an IFC file, read without the process that ``ifc_bars`` starts."""
+    stream = io.BytesIO()
+    write_answer(content, stream)
+    stream.seek(0)
+    return Answer(stream, "a.ifc").bars()
 
 
 class Ifc:
@@ -71,7 +80,7 @@ class Ifc:
         return self.rooted("IfcReinforcingBar", ObjectPlacement=at, Representation=body, **attributes)
 
     def bars(self) -> list[CageBar]:
-        return ifc_bars(self.file.to_string().encode(), "a.ifc")
+        return bars_in_process(self.file.to_string().encode())
 
     def axis_m(self) -> ndarray:
         [cage_bar] = self.bars()

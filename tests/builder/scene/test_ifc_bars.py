@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
-from dataset_builder.scene.assemblies.ifc import tessellation
-from dataset_builder.scene.assemblies.ifc.bars import ifc_bars
-from dataset_builder.scene.assemblies.ifc.geometry import arc_through, axis_placement
+from dataset_builder.scene.assemblies.ifc.process import ifc_bars
+from dataset_builder.scene.ifc_reader.geometry import arc_through, axis_placement
+from dataset_builder.scene.ifc_reader.model import open_model, world_mesh
 from rebar_depth_bench.data.bars import Bar
-from tests.builder.scene.ifc_writer import Ifc, extruded_circle, ifcopenshell
+from tests.builder.scene.ifc_writer import Ifc, bars_in_process, extruded_circle
 
 COLUMN = Path("examples/column.ifc")
 
@@ -56,16 +56,14 @@ def test_example_column_script_reproduces_file(tmp_path: Path) -> None:
 def test_example_column_matches_ifcopenshell_geometry() -> None:
     """Check that every vertex of IfcOpenShell's tessellation is one radius away from the axis."""
     content = COLUMN.read_bytes()
-    model = ifcopenshell.file.from_string(content.decode())
-    numbers = [bar.id() for bar in model.by_type("IfcReinforcingBar")]
-    indices = [0, 8, 9]  # a vertical bar and stirrups in both orientations
-    meshes = tessellation.tessellate(content, "a", [numbers[k] for k in indices])
-    bars = [ifc_bars(content, "a")[k].bar for k in indices]
-    for mesh, bar in zip(meshes, bars, strict=True):
-        assert not isinstance(mesh, str)
-        distance_m = distance_to_axis_m(mesh.vertices_m, bar)
+    model = open_model(content)
+    numbers = [entity.id() for entity in model.by_type("IfcReinforcingBar")]
+    bars = [cage_bar.bar for cage_bar in bars_in_process(content)]
+    for k in (0, 8, 9):  # a vertical bar and stirrups in both orientations
+        distance_m = distance_to_axis_m(np.array(world_mesh(model, numbers[k])[0]).reshape(-1, 3), bars[k])
         # A chord of 6 degrees lies 17 um inside its arc of 12.5 mm.
-        np.testing.assert_allclose(distance_m[distance_m > bar.diameter_m / 4], bar.diameter_m / 2, atol=2e-5)
+        radius_m = bars[k].diameter_m / 2
+        np.testing.assert_allclose(distance_m[distance_m > radius_m / 2], radius_m, atol=2e-5)
 
 
 def distance_to_axis_m(points_m: ndarray, bar: Bar) -> ndarray:
@@ -246,7 +244,7 @@ def test_extruded_bars_are_tessellated_and_fitted() -> None:
     ifc.bar(
         extruded_circle(ifc), extruded_circle(ifc, 6.0, x=50.0), at=ifc.at((100, 200, 300), (1, 0, 0), (0, 0, 1))
     )
-    swept, first, second = ifc.bars()
+    swept, first, second = ifc_bars(ifc.file.to_string().encode(), "a.ifc")
     assert (swept.bar.role, first.bar.role, second.bar.role) == ("bar", "imported", "imported")
     np.testing.assert_allclose(first.bar.axis_m, [(0.1, 0.2, 0.3), (0.6, 0.2, 0.3)], atol=1e-4)
     np.testing.assert_allclose(second.bar.axis_m, [(0.1, 0.2, 0.35), (0.6, 0.2, 0.35)], atol=1e-4)

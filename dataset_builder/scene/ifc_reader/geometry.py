@@ -201,17 +201,23 @@ def _drop_repeated_points(points: Float64[ndarray, "n 3"]) -> Float64[ndarray, "
     return distinct
 
 
-def placement_matrix(placement: Any, depth: int = 0) -> Float64[ndarray, "4 4"]:
+def placement_matrix(
+    placement: Any, known: dict[int, Float64[ndarray, "4 4"]], depth: int = 0
+) -> Float64[ndarray, "4 4"]:
     """Return ``world_from_object`` of an IfcLocalPlacement; None is the world frame.
 
+    ``known`` holds matrices by instance number and is added to, since objects share the placements of storeys.
     Raises ``ValueError`` if a placement has another class or the nesting is too deep.
     """
     if placement is None:
         return np.eye(4)
     if depth > MAX_PLACEMENT_DEPTH or not placement.is_a("IfcLocalPlacement"):
         raise ValueError(f"the placement is a {placement.is_a()} or is circular")
-    parent = placement_matrix(placement.PlacementRelTo, depth + 1)
-    return np.asarray(parent @ axis_placement(placement.RelativePlacement))
+    number = placement.id()
+    if number not in known:
+        parent = placement_matrix(placement.PlacementRelTo, known, depth + 1)
+        known[number] = parent @ axis_placement(placement.RelativePlacement)
+    return known[number]
 
 
 def mapped_matrix(item: Any) -> tuple[Float64[ndarray, "4 4"], float]:

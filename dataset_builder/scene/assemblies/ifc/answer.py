@@ -1,0 +1,189 @@
+"""Answer of the process that reads an IFC file, validated, as the bars of a cage.
+
+The process has read content from a stranger, so its answer is data like any other file: one JSON line per record,
+followed by the arrays that it announces (see ``scene.ifc_reader.answer``).
+"""
+
+from __future__ import annotations
+
+from typing import IO, Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+from pydantic import Field, TypeAdapter, ValidationError
+
+from dataset_builder.scene.assemblies.cage_assembly import CageBar
+from dataset_builder.scene.assemblies.mesh_file import estimate_bar
+from dataset_builder.scene.assemblies.mesh_import import connected_components
+from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS, Mesh, axis_of
+from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.reading import parse_json
+from rebar_depth_bench.validation import StrictModel
+
+MAX_ARRAY_BYTES = 1 << 30
+"""Largest size of all arrays of an answer: more than ``MAX_TRIANGLES`` of a cage."""
+
+_MAX_LINE_BYTES = 20_000
+_Label = Annotated[str, Field(min_length=1, max_length=200)]
+_Message = Annotated[str, Field(max_length=1000)]
+
+
+class _BarRecord(StrictModel):
+    """Bar with an axis of ``points`` points (float64, world, metres), which follow."""
+
+    kind: Literal["bar"]
+    label: _Label
+    role: Annotated[str, Field(min_length=1, max_length=60)]
+    diameter_m: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    points: Annotated[int, Field(ge=2)]
+
+
+class _SurfaceRecord(StrictModel):
+    """Tessellated object; its vertices (float64, world, metres) and triangles (int32) follow."""
+
+    kind: Literal["surface"]
+    label: _Label
+    vertices: Annotated[int, Field(ge=3)]
+    faces: Annotated[int, Field(ge=1)]
+
+
+class _StepRecord(StrictModel):
+    """Object that is tessellated next, and why it has no axis."""
+
+    kind: Literal["step"]
+    label: _Label
+    reason: _Message
+
+
+class _FailureRecord(StrictModel):
+    """Reason for which reading ended."""
+
+    kind: Literal["failure"]
+    cause: Literal["file", "memory", "package", "shape"]
+    message: _Message
+
+
+class _EndRecord(StrictModel):
+    """End of a complete answer, with its number of bars and surfaces."""
+
+    kind: Literal["end"]
+    shapes: int
+
+
+_Record = _BarRecord | _SurfaceRecord | _StepRecord | _FailureRecord | _EndRecord
+_RECORD: TypeAdapter[_Record] = TypeAdapter(Annotated[_Record, Field(discriminator="kind")])
+
+
+class AnswerError(Exception):
+    """Answer that is incomplete (``ended``) or not valid; the message is the reason."""
+
+    def __init__(self, reason: str, ended: bool = False) -> None:
+        super().__init__(reason)
+        self.ended = ended
+
+
+class OutOfMemoryError(Exception):
+    """Answer that says that the process had not enough memory."""
+
+
+class Answer:
+    """Records of an answer; ``step`` is the last object that was to be tessellated, or None."""
+
+    def __init__(self, stream: IO[bytes], where: str) -> None:
+        self._stream, self._where = stream, where
+        self._bytes_left = MAX_ARRAY_BYTES
+        self.step: _StepRecord | None = None
+
+    def bars(self) -> list[CageBar]:
+        """Return the bars, with ids from 1 in the order of the answer.
+
+        Raises ``MeshError`` if the process refused the file or a surface is not a bar, ``OutOfMemoryError`` if it
+        ran out of memory, and ``AnswerError`` if the answer is not complete and valid.
+        """
+        bars: list[CageBar] = []
+        shapes = 0
+        while True:
+            record = self._record()
+            match record:
+                case _BarRecord():
+                    bars.append(self._swept_bar(len(bars) + 1, record))
+                case _SurfaceRecord():
+                    bars += self._surface_bars(len(bars) + 1, record)
+                case _StepRecord():
+                    self.step = record
+                    continue
+                case _FailureRecord():
+                    raise self._failure(record)
+                case _EndRecord():
+                    if record.shapes != shapes:
+                        raise AnswerError(f"{shapes} shapes, expected {record.shapes}")
+                    return bars
+            shapes += 1
+            if len(bars) > MAX_BARS:
+                raise MeshError(f"{self._where}: more than {MAX_BARS} bars found, expected at most {MAX_BARS}")
+
+    def no_shape_error(self, problem: str) -> MeshError:
+        """Return the error of the object that was tessellated when ``problem`` occurred."""
+        label, reason = ("a bar", "") if self.step is None else (self.step.label, self.step.reason)
+        return MeshError(
+            f"{self._where}: {label} has no readable shape: {reason}; tessellation: {problem}; "
+            "expected an IfcSweptDiskSolid along lines and arcs, or another solid"
+        )
+
+    def _failure(self, record: _FailureRecord) -> Exception:
+        if record.cause == "memory":
+            return OutOfMemoryError()
+        if record.cause == "shape":
+            return self.no_shape_error(record.message)
+        return MeshError(f"{self._where}: {record.message}")
+
+    def _record(self) -> _Record:
+        line = self._stream.readline(_MAX_LINE_BYTES)
+        if not line.endswith(b"\n"):
+            raise AnswerError("the line of a record is not complete", ended=len(line) < _MAX_LINE_BYTES)
+        value, problems = parse_json(line)
+        if problems:
+            raise AnswerError(str(problems[0]))
+        try:
+            return _RECORD.validate_python(value)
+        except ValidationError as error:
+            raise AnswerError(f"{error.error_count()} invalid values in a record") from None
+
+    def _array(self, rows: int, dtype: str) -> ndarray:
+        """Return an array of ``rows`` x 3 values, which are finite."""
+        size = rows * 3 * np.dtype(dtype).itemsize
+        self._bytes_left -= size
+        if self._bytes_left < 0:
+            raise AnswerError(f"arrays of more than {MAX_ARRAY_BYTES} bytes")
+        content = self._stream.read(size)
+        if len(content) < size:
+            raise AnswerError("an array is not complete", ended=True)
+        values = np.frombuffer(content, dtype).reshape(rows, 3)
+        if not np.isfinite(values).all():
+            raise AnswerError("an array has values that are not finite")
+        return values
+
+    def _swept_bar(self, bar_id: int, record: _BarRecord) -> CageBar:
+        axis_m: Float64[ndarray, "n 3"] = np.round(self._array(record.points, "<f8"), METRE_DECIMALS)
+        diameter_m = round(record.diameter_m, METRE_DECIMALS)
+        return CageBar(_bar_label(bar_id, record.label), Bar(bar_id, record.role, diameter_m, axis_of(axis_m)))
+
+    def _surface_bars(self, bar_id: int, record: _SurfaceRecord) -> list[CageBar]:
+        """Return the connected surfaces of an object as bars with a straight axis (``estimate_bar``)."""
+        vertices_m, faces = self._array(record.vertices, "<f8"), self._array(record.faces, "<i4")
+        if faces.min() < 0 or faces.max() >= record.vertices:
+            raise AnswerError("a triangle refers to a vertex that does not exist")
+        bars = []
+        for number, part in enumerate(connected_components(Mesh(vertices_m, faces)), start=bar_id):
+            label = _bar_label(number, record.label)
+            try:
+                bars.append(CageBar(label, estimate_bar(number, part), mesh=part))
+            except ValueError as error:
+                raise MeshError(f"{self._where}: {label}: is not a solid ({error}), expected a bar") from error
+        return bars
+
+
+def _bar_label(bar_id: int, label: str) -> str:
+    return f"bar {bar_id}, {label}"

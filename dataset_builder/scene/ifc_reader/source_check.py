@@ -1,0 +1,228 @@
+"""Check that instances of an IFC model are as written in the file, and as its schema requires.
+
+ifcopenshell turns an attribute that it cannot parse, and a reference to an instance that it could not read, into
+null or drops it from a list. So each instance that a bar depends on is written again and compared with its text.
+The types of its attributes and the dimensions of its points are checked too, since the geometry kernel replaces
+missing coordinates by zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from textwrap import shorten
+from typing import Any
+
+from ifcopenshell import entity_instance, ifcopenshell_wrapper
+
+from dataset_builder.scene.ifc_reader.step_text import StepText, class_name, same_tokens, split_arguments
+from rebar_depth_bench.errors import MeshError, escape_text
+
+_types: Any = ifcopenshell_wrapper
+Entity = Any
+"""An ``ifcopenshell.entity_instance``, with the attributes of its IFC class."""
+
+_UNUSED = {
+    *("ContextOfItems", "Dimensions", "ProfileName", "RepresentationType", "SelfIntersect", "TagList"),
+    "Transition",
+}
+"""Attributes without influence on the shape of a bar, which are neither checked nor followed."""
+
+_MAY_BE_NULL = {"BarRole", "EndParam", "GlobalId", "PredefinedType", "StartParam", "UnitsInContext"}
+"""Attributes that a version of IFC requires, that exporters leave out, and that the reader can do without."""
+
+_DIMENSION: dict[str, int | None] = {
+    **dict.fromkeys(["IfcAxis2Placement2D", "IfcCartesianTransformationOperator2D", "IfcCartesianPointList2D"], 2),
+    **dict.fromkeys(["IfcCartesianTransformationOperator3D", "IfcCartesianTransformationOperator3DnonUniform"], 3),
+    **dict.fromkeys(["IfcAxis1Placement", "IfcAxis2Placement3D", "IfcCartesianPointList3D", "IfcPolyLoop"], 3),
+    **dict.fromkeys(["IfcExtrudedAreaSolid", "IfcRevolvedAreaSolid", "IfcVertexPoint"], 3),
+    **dict.fromkeys(["IfcPolyline", "IfcIndexedPolyCurve", "IfcLine", "IfcVector", "IfcTrimmedCurve"]),
+    **dict.fromkeys(["IfcCircle", "IfcEllipse", "IfcCompositeCurve", "IfcCompositeCurveSegment"]),
+    **dict.fromkeys(["IfcBSplineCurveWithKnots", "IfcRationalBSplineCurveWithKnots", "IfcSweptDiskSolid"]),
+    **dict.fromkeys(["IfcSweptDiskSolidPolygonal"]),
+}
+"""Dimension of the points below instances of a class; None: that of its first point."""
+
+_PYTHON_TYPES: dict[str, tuple[type, ...]] = {
+    "string": (str,),
+    "binary": (str,),
+    "integer": (int,),
+    "real": (int, float),  # Some exporters write 5 in place of 5.
+    "number": (int, float),
+    "boolean": (bool,),
+    "logical": (bool, str),
+}
+
+
+@dataclass(frozen=True)
+class _Attribute:
+    """Attribute of a class: position, name, type as text, and whether a value is valid; None: any value."""
+
+    index: int
+    name: str
+    kind: str
+    accepts: Callable[[Any], bool] | None
+
+
+class SourceCheck:
+    """Comparison of a model's instances with the text of its file. Every method raises ``MeshError``."""
+
+    def __init__(self, schema: Any, step: StepText) -> None:
+        self._schema, self._step = schema, step
+        self._attributes: dict[str, list[_Attribute]] = {}
+        self._seen: set[int] = set()
+        self._dimensions: dict[int, frozenset[int]] = {}
+
+    def attributes(self, entity: Entity, *names: str) -> list[Entity]:
+        """Check the attributes ``names`` of an instance, or all; return the instances that they refer to.
+
+        A class may lack some of the names.
+        """
+        attributes = self._class_attributes(entity.is_a())
+        used = [attribute for attribute in attributes if not names or attribute.name in names]
+        source, written = self._step.instance(entity.id()), entity.to_string(True).partition("=")[2]
+        if source != written:
+            self._compare(entity, used, source, written)
+        references: list[Entity] = []
+        for attribute in used:
+            if attribute.accepts is None:
+                continue
+            value = entity.get_argument(attribute.index)
+            if not attribute.accepts(value):
+                found = "null" if value is None else escape_text(shorten(str(value), 60))
+                raise MeshError(f"{_where(entity, attribute)} is {found}, expected {shorten(attribute.kind, 80)}")
+            references += _references(value)
+        return references
+
+    def tree(self, root: Entity) -> None:
+        """Check an instance and all instances that it refers to, directly or through others, each once."""
+        stack: list[tuple[Entity, list[Entity] | None]] = [(root, None)]
+        while stack:
+            entity, references = stack.pop()
+            if references is not None:
+                self._dimensions[entity.id()] = self._dimensions_below(entity, references)
+            elif entity.id() not in self._seen:
+                self._seen.add(entity.id())
+                references = self.attributes(entity)
+                stack.append((entity, references))  # It is completed after the instances below it.
+                stack += [(reference, None) for reference in references]
+
+    def _dimensions_below(self, entity: Entity, references: list[Entity]) -> frozenset[int]:
+        """Return the numbers of coordinates of the points and directions that define an instance.
+
+        The set is empty for classes whose points are in several spaces.
+        """
+        name = entity.is_a()
+        if name in ("IfcCartesianPoint", "IfcDirection"):
+            size = len(entity.get_argument(0))
+            if size not in (2, 3):
+                raise MeshError(f"#{entity.id()} ({name}) has {size} coordinates, expected 2 or 3")
+            return frozenset((size,))
+        if name not in _DIMENSION:
+            return frozenset()
+        sizes: frozenset[int] = frozenset().union(
+            *(self._dimensions.get(reference.id(), ()) for reference in references)
+        )
+        expected = _DIMENSION[name]
+        if len(sizes) > 1 or (expected and sizes - {expected}):
+            found = " and ".join(map(str, sorted(sizes)))
+            raise MeshError(
+                f"#{entity.id()} ({name}) refers to points of {found} coordinates, "
+                f"expected {expected or 'one kind'}"
+            )
+        return frozenset((expected,)) if expected else sizes
+
+    def _compare(self, entity: Entity, used: list[_Attribute], source: str, written: str) -> None:
+        """Raise ``MeshError`` if used attributes of an instance differ between its text and what was read."""
+        given, read = split_arguments(source) or [], split_arguments(written) or []
+        attributes = self._class_attributes(entity.is_a())
+        # Lists of points have the attribute TagList in IFC4x3 only; exporters mix the versions up.
+        if entity.is_a() in ("IfcCartesianPointList2D", "IfcCartesianPointList3D"):
+            given, read = given[:1], read[:1]
+        if class_name(source) != class_name(written) or not given or len(given) != len(read):
+            raise MeshError(
+                f"#{entity.id()} is {escape_text(source)}, expected {len(attributes)} readable attributes of "
+                f"{entity.is_a()}"
+            )
+        for attribute in used:
+            if attribute.accepts and not same_tokens(given[attribute.index], read[attribute.index]):
+                found = escape_text("".join(given[attribute.index]))
+                raise MeshError(
+                    f"{_where(entity, attribute)} is {found}, which cannot be read, "
+                    f"expected {shorten(attribute.kind, 80)}"
+                )
+
+    def _class_attributes(self, name: str) -> list[_Attribute]:
+        """Return the attributes of a class."""
+        if name not in self._attributes:
+            entity = self._schema.declaration_by_name(name).as_entity()
+            self._attributes[name] = [
+                self._attribute(index, declared, derived)
+                for index, (declared, derived) in enumerate(
+                    zip(entity.all_attributes(), entity.derived(), strict=True)
+                )
+            ]
+        return self._attributes[name]
+
+    def _attribute(self, index: int, declared: Any, derived: bool) -> _Attribute:
+        kind, name = declared.type_of_attribute(), str(declared.name())
+        accepts = None if derived or name in _UNUSED else _predicate(kind)
+        if accepts and (declared.optional() or name in _MAY_BE_NULL):
+            accepts = _or_null(accepts)
+        return _Attribute(index, name, str(kind), accepts)
+
+
+def _where(entity: Entity, attribute: _Attribute) -> str:
+    return f"#{entity.id()} ({entity.is_a()}): {attribute.name}"
+
+
+def _references(value: Any) -> Iterator[Entity]:
+    """Yield the numbered instances in an attribute's value."""
+    if isinstance(value, entity_instance):
+        if value.id():
+            yield value
+    elif isinstance(value, tuple):
+        for item in value:
+            yield from _references(item)
+
+
+def _or_null(accepts: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: value is None or accepts(value)
+
+
+def _predicate(kind: Any) -> Callable[[Any], bool]:
+    """Return the function that tells whether a value is of an attribute's type."""
+    while isinstance(kind, _types.named_type | _types.type_declaration):
+        kind = kind.declared_type()
+    if isinstance(kind, _types.aggregation_type):
+        accepts, low, high = _predicate(kind.type_of_element()), kind.bound1(), kind.bound2()
+        return lambda value: (
+            isinstance(value, tuple) and low <= len(value) and (high < 0 or len(value) <= high)
+            and all(map(accepts, value))
+        )  # fmt: skip
+    if isinstance(kind, _types.simple_type):
+        types = _PYTHON_TYPES[kind.declared_type()]
+        return lambda value: isinstance(value, types) and (bool in types or not isinstance(value, bool))
+    if isinstance(kind, _types.enumeration_type):
+        return lambda value: isinstance(value, str)
+    if isinstance(kind, _types.select_type):
+        members = dict(_select_members(kind))
+        return lambda value: (
+            isinstance(value, entity_instance) and value.is_a() in members and members[value.is_a()](value)
+        )
+    name = kind.name()
+    return lambda value: isinstance(value, entity_instance) and value.is_a(name)
+
+
+def _select_members(kind: Any) -> Iterator[tuple[str, Callable[[Any], bool]]]:
+    """Yield the names of a select type's classes and value types, each with a test of its instances."""
+    if isinstance(kind, _types.select_type):
+        for member in kind.select_list():
+            yield from _select_members(member)
+    elif isinstance(kind, _types.entity):
+        yield kind.name(), lambda _: True
+        for subtype in kind.subtypes():
+            yield from _select_members(subtype)
+    else:
+        accepts = _predicate(kind)
+        yield kind.name(), lambda value: accepts(value.get_argument(0))
