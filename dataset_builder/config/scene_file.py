@@ -6,6 +6,8 @@ The keys of the TOML file are documented in ``scene_schema``. An IFC model uses 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,8 +21,10 @@ from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assem
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec
 from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
 from dataset_builder.scene.model import Assembly
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import InputError, MeshError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
+from rebar_depth_bench.limits import TOML_BYTES
+from rebar_depth_bench.reading import read_file
 
 RESERVED_NAMES = (*CONFIGS, *SWEEPS, "meshes", "pictures", "scenes")
 """Names that a user scene cannot have: names of configs and of other entries of the dataset folder."""
@@ -59,8 +63,9 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     scene_toml = _read_scene(path)
     name = path.stem if scene_toml.name is None else scene_toml.name
     _check_name(name, path)
-    assembly_spec = _assembly_spec(scene_toml, path)
-    assembly = make_assembly(assembly_spec)
+    with _scene_and_key_named(scene_toml, path):
+        assembly_spec = _assembly_spec(scene_toml, path)
+        assembly = make_assembly(assembly_spec)
     trajectory = scene_toml.trajectory or default_dome(assembly)
     scene = SceneSpec(name, assembly_spec, None, scene_toml.environment or "laboratory")
     config = ConfigSpec(name, scene, trajectory)
@@ -104,11 +109,7 @@ def _read_scene(path: Path) -> SceneToml:
         return SceneToml.model_construct(ifc=path.name)
     if suffix != ".toml":
         raise InputError(f"{path}: unsupported scene file type {suffix!r}, expected .toml or .ifc")
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: the scene file cannot be read: {error.strerror or error}") from error
-    return read_scene_toml(content, str(path), RESERVED_NAMES)
+    return read_scene_toml(read_file(path, TOML_BYTES, "a scene file", InputError), str(path), RESERVED_NAMES)
 
 
 def _check_name(name: str, path: Path) -> None:
@@ -124,6 +125,20 @@ def _assembly_spec(scene_toml: SceneToml, path: Path) -> AssemblySpec:
     if scene_toml.mesh is not None:
         return mesh_file_spec(str(path.parent / scene_toml.mesh), scene_toml.unit_m)
     return cage_file_spec(str(path if scene_toml.ifc is None else path.parent / scene_toml.ifc))
+
+
+@contextmanager
+def _scene_and_key_named(scene_toml: SceneToml, path: Path) -> Iterator[None]:
+    """Add the scene file and its key to the errors of a file that it names."""
+    key = "mesh" if scene_toml.mesh is not None else "ifc"
+    try:
+        yield
+    except MeshError as error:
+        if path.suffix.lower() != ".toml" or scene_toml.bar:
+            raise
+        named = type(error)(f"{path}: {key}: {error}")
+        named.problems = error.problems
+        raise named from error
 
 
 def _camera_distance_m(assembly: Assembly, config: ConfigSpec) -> float:

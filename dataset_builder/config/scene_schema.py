@@ -28,6 +28,7 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import count
+from pathlib import PurePosixPath
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Strict, ValidationInfo, field_validator
@@ -98,12 +99,18 @@ def _list_of(expected: str, min_length: int = 1) -> Expected:
     return Expected(expected, lambda values: min_length <= len(values) <= 10_000)
 
 
+def _is_below(path: str) -> bool:
+    """Return whether a relative path stays in its folder: a scene file names no other files of the machine."""
+    parts = PurePosixPath(path).parts
+    return bool(parts) and path.isprintable() and ".." not in parts and not path.startswith(("/", "~"))
+
+
 _UNIT = one_of(*UNITS_M)
 _ROLE = Expected(
     "a name of up to 60 printable characters, without spaces at its ends",
     lambda role: role == role.strip() and text(60).accept(role),
 )
-_File = Annotated[str, Expected("a path, relative to this file", lambda path: bool(path) and path.isprintable())]
+_File = Annotated[str, Expected("the path of a file in the folder of this file, or below it", _is_below)]
 _Length = Annotated[float, number(0, expected="a length above 0, up to 1e9, in the file's unit")]
 _Point = Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers from -1e9 to 1e9, [x, y, z]")]
 _Distance = Annotated[float, number(0, expected="a distance above 0, up to 1e9"), AfterValidator(_check_distance)]

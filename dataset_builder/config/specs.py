@@ -15,6 +15,8 @@ from pathlib import Path
 from rebar_depth_bench.errors import MeshError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration
+from rebar_depth_bench.limits import IFC_BYTES, MESH_BYTES, TOML_BYTES
+from rebar_depth_bench.reading import read_file
 
 
 @dataclass(frozen=True)
@@ -76,18 +78,19 @@ class PinnedFile:
         return content
 
 
+_LIMITS = {".toml": TOML_BYTES, ".ifc": IFC_BYTES}
+"""Limits of the files of an assembly by suffix; those of meshes have ``MESH_BYTES``."""
+
+
 def read_assembly_file(path: str | os.PathLike[str], kind: str, suffixes: Collection[str]) -> bytes:
     """Return the bytes of a user's file; ``kind`` is ``mesh`` or ``cage``.
 
-    Raises ``MeshError`` if its suffix is not one of ``suffixes`` or it cannot be read.
+    Raises ``MeshError`` if its suffix is not one of ``suffixes``, it cannot be read or it is too large.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in suffixes:
         raise MeshError(f"{path}: unsupported {kind} file type {suffix!r}, expected {', '.join(suffixes)}")
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise MeshError(f"{path}: the {kind} file cannot be read: {error.strerror or error}") from error
+    return read_file(Path(path), _LIMITS.get(suffix, MESH_BYTES), f"a {kind} file", MeshError)
 
 
 @dataclass(frozen=True)

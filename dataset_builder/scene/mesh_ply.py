@@ -16,6 +16,8 @@ from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.limits import MESH_BYTES
+from rebar_depth_bench.reading import read_file
 
 COMMENT = (
     "comment rebar-depth-bench mesh: world frame, right-handed, z up, board at z = 0;"
@@ -79,11 +81,7 @@ def read_mesh_ply(path: str | os.PathLike[str]) -> MeshArrays:
 
     Raises ``DatasetError`` if the file cannot be read or differs from this layout in any way.
     """
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise DatasetError(f"{path}: the mesh cannot be read: {error.strerror or error}") from error
-    return parse_mesh_ply(content, str(path))
+    return parse_mesh_ply(read_file(Path(path), MESH_BYTES, "the mesh of a scene", DatasetError), str(path))
 
 
 def has_mesh_ply_header(content: bytes) -> bool:

@@ -1,4 +1,4 @@
-"""Cage files as assemblies: bars from a scene TOML (``config.scene_schema``) or an IFC model (``ifc.bars``).
+"""Cage files as assemblies: bars from a scene TOML (``config.scene_schema``) or an IFC model (``ifc.process``).
 
 Nothing is moved: the file's frame is the world frame, z up, with board or ground at z = 0.
 """
@@ -15,7 +15,7 @@ import numpy as np
 from dataset_builder.config.scene_schema import TomlBar, read_scene_toml
 from dataset_builder.config.specs import CageFileSpec, read_assembly_file
 from dataset_builder.scene.assemblies.cage_assembly import CageBar, cage_assembly, raise_problems
-from dataset_builder.scene.assemblies.ifc.bars import ifc_bars
+from dataset_builder.scene.assemblies.ifc.process import ifc_bars
 from dataset_builder.scene.model import Assembly, axis_of
 from dataset_builder.scene.shapes.bending import bent_line_m, mandrel_diameter_m
 from rebar_depth_bench.data.bars import Bar

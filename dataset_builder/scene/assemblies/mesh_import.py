@@ -2,8 +2,8 @@
 
 - The dataset's own PLY layout (``dataset_builder.scene.mesh_ply``) is used unchanged: the faces with one
   ``bar_id`` form a part with that id; faces with id 0 (board, table) are left out.
-- Every other file is read by trimesh. If it holds several glTF nodes or OBJ objects (``o``), each is a part.
-  Parts are numbered from 1 in the order of their names, with numbers within names compared by value ("bar2"
+- Every other file is read by ``mesh_formats``. If it holds several glTF nodes or OBJ objects (``o``), each is a
+  part. Parts are numbered from 1 in the order of their names, with numbers within names compared by value ("bar2"
   before "bar10"). An unnamed node is named by its index, and trimesh appends "_1", "_2", ... to a repeated
   node name.
 - A file with one object (any STL or PLY) is split into connected components after vertices closer than 10 nm
@@ -25,7 +25,7 @@ import logging
 import re
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import shorten
@@ -34,9 +34,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Integer
 from numpy import ndarray
-from numpy.typing import ArrayLike
 
 from dataset_builder.config.specs import MeshFileSpec
+from dataset_builder.scene.assemblies.mesh_formats.gltf import check_gltf
+from dataset_builder.scene.assemblies.mesh_formats.obj import read_obj
+from dataset_builder.scene.assemblies.mesh_formats.parsing import MalformedMeshError, Surface, check_surface
+from dataset_builder.scene.assemblies.mesh_formats.ply import read_ply
+from dataset_builder.scene.assemblies.mesh_formats.stl import read_stl
 from dataset_builder.scene.mesh_ply import has_mesh_ply_header, parse_mesh_ply
 from dataset_builder.scene.model import MAX_BARS, NOT_STEEL, Mesh
 from rebar_depth_bench.errors import DatasetError, MeshError
@@ -50,25 +54,6 @@ SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 MIN_EXTENT_M = 0.001
 MAX_EXTENT_M = 100.0
 """Exclusive bounds of the largest side of an assembly, metres; beyond them its unit is wrong."""
-
-_UNSUPPORTED_GLTF = (
-    rb'"sparse"\s*:|EXT_mesh_gpu_instancing|KHR_mesh_quantization|KHR_draco_mesh_compression|EXT_meshopt',
-    "the file has sparse, instanced, quantised or compressed meshes, expected plain meshes",
-)
-_UNSUPPORTED_CONTENT = {
-    ".glb": _UNSUPPORTED_GLTF,
-    ".gltf": _UNSUPPORTED_GLTF,
-    ".obj": (
-        rb"(?m)^f[ \t][^\n#]*-",
-        "the file has relative (negative) vertex indices, expected absolute indices",
-    ),
-    ".ply": (
-        rb"(?m)\Aply\r?\n(?:(?!end_header)[^\n]*\n)*property \w+ bar_id\s*$",
-        "the file has the property bar_id, but not this dataset's PLY layout; without bar_id, connected "
-        "components are numbered as bars",
-    ),
-}
-"""Content that trimesh would misread silently, by suffix: a search pattern and the text of the error."""
 
 # A handler on trimesh's logger keeps its messages, including tracebacks, off stderr.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -104,45 +89,39 @@ def _dataset_ply_parts(content: bytes, spec: MeshFileSpec) -> dict[int, Mesh]:
 
 
 def _read_objects(content: bytes, spec: MeshFileSpec) -> list[Mesh]:
-    """Return the objects of any other file that have triangles (metres, z up), ordered by name."""
+    """Return the objects of any other file (metres, z up), ordered by name, without empty ones."""
     suffix = Path(spec.path).suffix.lower()
-    if suffix == ".stl":
-        return [_mesh_in_metres(*_stl_triangles(content), spec)]
-    pattern, problem = _UNSUPPORTED_CONTENT[suffix]
-    if re.search(pattern, content):
-        raise MeshError(f"{spec.path}: {problem}")
+    match suffix:
+        case ".stl":
+            surfaces: Mapping[str, Surface] = {"": read_stl(content)}
+        case ".ply":
+            surfaces = {"": read_ply(content)}
+        case ".obj":
+            surfaces = read_obj(content)
+        case _:
+            check_gltf(content, suffix == ".glb")
+            surfaces = _gltf_surfaces(content, suffix[1:])
+    return [
+        Mesh(surfaces[name][0] * spec.unit_m, surfaces[name][1].astype(np.int32))
+        for name in sorted(surfaces, key=_natural_sort_key)
+        if len(surfaces[name][1])
+    ]
+
+
+def _gltf_surfaces(content: bytes, file_type: str) -> dict[str, Surface]:
+    """Return the surface of each node by its name, z up; the primitives of a node are joined."""
     import trimesh
 
     scene = trimesh.load_scene(
-        io.BytesIO(content),
-        file_type=suffix[1:],
-        resolver=_NoSiblingFiles(),
-        process=False,
-        skip_materials=True,
-        group_material=False,
-        split_objects=True,
+        io.BytesIO(content), file_type=file_type, resolver={}, process=False, skip_materials=True
     )
     bodies = defaultdict(list)
     for body in scene.dump():
         if isinstance(body, trimesh.Trimesh) and len(body.faces):
-            bodies[_object_name(scene, body)].append((body.vertices, body.faces))
-    # The primitives of one object are joined into one mesh.
-    joined = [
-        trimesh.util.append_faces(*zip(*bodies[name], strict=True))
-        for name in sorted(bodies, key=_natural_sort_key)
-    ]
-    return [_mesh_in_metres(vertices, faces, spec) for vertices, faces in joined]
-
-
-def _stl_triangles(content: bytes) -> tuple[ndarray, ndarray]:
-    """Return the corners (n, 3) of all solids, in order, and faces (n / 3, 3) of consecutive corners."""
-    import trimesh
-
-    # load_scene repairs files with several solids, which would drop corners that are not finite.
-    loaded = trimesh.exchange.stl.load_stl(io.BytesIO(content))
-    solids = loaded["geometry"].values() if "geometry" in loaded else [loaded]
-    corners = np.concatenate([np.empty((0, 3)), *(solid["vertices"] for solid in solids)])
-    return corners, np.arange(len(corners)).reshape(-1, 3)
+            surface = check_surface((np.asarray(body.vertices), np.asarray(body.faces, np.int64)), str, str)
+            bodies[_object_name(scene, body)].append(surface)
+    joined = {name: trimesh.util.append_faces(*zip(*parts, strict=True)) for name, parts in bodies.items()}
+    return {name: (vertices[:, [0, 2, 1]] * [1, -1, 1], faces) for name, (vertices, faces) in joined.items()}
 
 
 def _object_name(scene: trimesh.Scene, body: trimesh.Trimesh) -> str:
@@ -157,26 +136,6 @@ def _object_name(scene: trimesh.Scene, body: trimesh.Trimesh) -> str:
 def _natural_sort_key(name: str) -> tuple[list[str | int], str]:
     """Return a sort key that compares numbers within names by value."""
     return [int(text) if index % 2 else text for index, text in enumerate(re.split(r"(\d+)", name))], name
-
-
-def _mesh_in_metres(vertices: ArrayLike, faces: ArrayLike, spec: MeshFileSpec) -> Mesh:
-    """Return a mesh in metres, z up, from a file's vertices and faces.
-
-    Raises ``MeshError`` if a coordinate is not finite or a face refers to a vertex that does not exist.
-    """
-    points = np.asarray(vertices, np.float64).reshape(-1, 3)
-    corners = np.asarray(faces, np.int64).reshape(-1, 3)
-    non_finite = points[~np.isfinite(points).all(axis=1)]
-    if len(non_finite):
-        raise MeshError(f"{spec.path}: a vertex is {non_finite[0].tolist()}, expected finite coordinates")
-    if corners.size and not (corners.min() >= 0 and corners.max() < len(points)):
-        raise MeshError(
-            f"{spec.path}: triangles refer to vertices {corners.min()} to {corners.max()}, expected 0 to "
-            f"{len(points) - 1}"
-        )
-    if Path(spec.path).suffix.lower() in {".glb", ".gltf"}:
-        points = points[:, [0, 2, 1]] * [1, -1, 1]
-    return Mesh(points * spec.unit_m, corners.astype(np.int32))
 
 
 def connected_components(mesh: Mesh) -> list[Mesh]:
@@ -234,24 +193,19 @@ def _check_extent(meshes: Iterable[Mesh], spec: MeshFileSpec) -> None:
         )
 
 
-class _NoSiblingFiles(dict[str, bytes]):
-    """A trimesh resolver that refuses files beside the mesh file, since ``spec.sha256`` does not cover them."""
-
-    def __missing__(self, name: str) -> bytes:
-        raise FileNotFoundError(f"the file refers to {name!r}, expected a single self-contained file such as .glb")
-
-
 @contextmanager
 def _loader_errors_as_mesh_errors(where: str) -> Iterator[None]:
     """Convert any exception that a damaged or hostile file causes in the loader to a one-line ``MeshError``."""
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
-            # NumPy emits this warning if it stops reading text at a malformed number.
-            warnings.filterwarnings("error", "string or file could not be read to its end")
             yield
     except MeshError:
         raise
+    except MalformedMeshError as error:
+        rejected = MeshError(f"{where}: {error.problem}")
+        rejected.problems = (error.problem,)
+        raise rejected from None
     except DatasetError as error:
         raise MeshError(str(error)) from error
     except Exception as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -185,6 +186,43 @@ def test_mesh_and_ifc_paths_are_relative_to_scene_file(tmp_path: Path) -> None:
     config = scene_config(write_scene(tmp_path, 'ifc = "parts/b.ifc"\n'))
     assert isinstance(config.scene.assembly, CageFileSpec)
     assert (config.name, len(make_assembly(config.scene.assembly).bars)) == ("my-beam", 13)
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../a.ply", "parts/../../a.ply", "~/a.ply", "a\\u001bb.ply", "."])
+@pytest.mark.parametrize("key", ["mesh", "ifc"])
+def test_files_outside_the_folder_of_the_scene_are_not_opened(tmp_path: Path, key: str, name: str) -> None:
+    (tmp_path / "a.ply").write_text("secret")
+    (tmp_path / "scene").mkdir()
+    with pytest.raises(InputError) as caught:
+        scene_config(write_scene(tmp_path / "scene", f'{MM}{key} = "{name}"\n'))
+    assert [(problem.code, problem.where) for problem in caught.value.problems] == [("invalid", key)]
+    assert "in the folder of this file" in str(caught.value)
+    assert "secret" not in str(caught.value)
+
+
+def test_errors_of_named_files_name_scene_and_key(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path, MM + 'mesh = "a.stl"\n')
+    os.mkfifo(tmp_path / "a.stl")
+    with pytest.raises(MeshError, match=f"^{scene}: mesh: {tmp_path}/a.stl: 1 problem\n  - .* it is a named pipe"):
+        scene_config(scene)
+    (tmp_path / "a.stl").unlink()
+    (tmp_path / "a.stl").write_bytes(bytes(200))
+    with pytest.raises(MeshError, match=f"^{scene}: mesh: {tmp_path}/a.stl: truncated or damaged") as caught:
+        scene_config(scene)
+    assert [problem.code for problem in caught.value.problems] == ["damaged"]
+
+
+def test_scene_files_are_regular_files_within_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    (tmp_path / "zero.toml").symlink_to("/dev/zero")
+    for name, words in (("pipe.toml", "it is a named pipe"), ("zero.toml", "it is a device")):
+        with pytest.raises(InputError, match=f"{name}: 1 problem\n.*{words}"):
+            scene_config(tmp_path / name)
+    with pytest.raises(InputError, match="the keys have too many parts"):
+        scene_config(write_scene(tmp_path, MM + "a." * 30_000 + "a = 1\n"))
+    monkeypatch.setenv("REBAR_MAX_TOML_BYTES", "20")
+    with pytest.raises(InputError, match="REBAR_MAX_TOML_BYTES raises the limit"):
+        scene_config(write_scene(tmp_path, MM + BAR))
 
 
 def test_changed_file_content_is_rejected(tmp_path: Path) -> None:

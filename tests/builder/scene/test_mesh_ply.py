@@ -167,9 +167,9 @@ def test_random_damage_raises_only_dataset_error(small_file: bytes, position: in
 
 
 def test_unreadable_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"gone\.ply: the mesh cannot be read: No such file"):
+    with pytest.raises(DatasetError, match=r"gone\.ply: 1 problem\n  - cannot be read: No such file"):
         read_mesh_ply(tmp_path / "gone.ply")
-    with pytest.raises(DatasetError, match="Is a directory"):
+    with pytest.raises(DatasetError, match="it is a folder, not a regular file"):
         read_mesh_ply(tmp_path)
 
 
