@@ -5,12 +5,19 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
-from rebar_depth_bench.atomic_io import TEMPORARY_PATTERN, exclusive_lock, write_text
+from pydantic import Strict
+
+from dataset_builder.export.images import EXPORT_FILES
+from rebar_depth_bench.atomic_io import exclusive_lock, temporary_target, write_text
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.limits import JSON_BYTES
+from rebar_depth_bench.paths import check_no_links, remove_file
+from rebar_depth_bench.reading import parse_json, read_file
+from rebar_depth_bench.validation import StrictModel, one_of, validate_table
 
 MARKER = "export.json"
 """File in the target folder that identifies an export."""
@@ -18,16 +25,23 @@ MARKER = "export.json"
 FORMAT = "rebar-depth-export-1"
 """Format version of ``MARKER``."""
 
-_PARTIAL_MARKER = f".{MARKER}.*.tmp"
-"""Temporary file of an interrupted first write of ``MARKER``."""
+_FOLDERS = (".", "sparse/0", *sorted({file.folder for file in EXPORT_FILES.values()}))
+"""Folders of a config that the export writes to."""
 
 
-@dataclass(frozen=True)
-class _ExportedConfig:
+class _ExportedConfig(StrictModel):
     """Content of the target for one config: the key of its build and the ids of its views."""
 
     key: str
-    views: tuple[str, ...]
+    views: Annotated[tuple[str, ...], Strict(False)]
+
+
+class _Marker(StrictModel):
+    """Content of ``MARKER``."""
+
+    format: Annotated[str, one_of(FORMAT)]
+    dataset: str
+    configs: dict[str, _ExportedConfig]
 
 
 @contextmanager
@@ -37,9 +51,10 @@ def export_target(to: Path, folder: DatasetFolder, wanted: Mapping[str, Sequence
     Context manager; the lock is held until it exits. ``export.json`` in the folder records the dataset and, for
     each config, its build and its views. Temporary files left by a killed export are removed. Raises
     ``InputError`` if the folder contains anything else, another dataset, another build or views that are not
-    wanted now, or if another export holds the lock.
+    wanted now, a link in place of a folder that the export writes to, or if another export holds the lock.
     """
     _check_target(to, folder)
+    check_no_links(to, *(f"{name}/{part}" for name in wanted for part in _FOLDERS))
     try:
         to.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -50,12 +65,19 @@ def export_target(to: Path, folder: DatasetFolder, wanted: Mapping[str, Sequence
         except BlockingIOError:
             raise InputError(f"{to}: another export is using this folder") from None
         exported = _merged_configs(to, folder, wanted)
-        for temporary in to.rglob(TEMPORARY_PATTERN):
-            temporary.unlink()
-        configs = {name: asdict(entry) for name, entry in exported.items()}
-        marker = {"format": FORMAT, "dataset": folder.digest, "configs": configs}
-        write_text(to / MARKER, json.dumps(marker) + "\n")
+        for part in (to, *(to / name / part for name in wanted for part in _FOLDERS)):
+            _remove_temporary_files(part, MARKER if part == to else None)
+        marker = _Marker(format=FORMAT, dataset=folder.digest, configs=exported)
+        write_text(to / MARKER, json.dumps(marker.model_dump()) + "\n")
         yield
+
+
+def _remove_temporary_files(folder: Path, only_of: str | None) -> None:
+    """Delete the temporary files in a folder, which need not exist: all, or those of the file ``only_of``."""
+    for path in list(folder.iterdir()) if folder.is_dir() else ():
+        target = temporary_target(path.name)
+        if target is not None and only_of in (None, target):
+            remove_file(path)
 
 
 def _check_target(to: Path, folder: DatasetFolder) -> None:
@@ -66,7 +88,7 @@ def _check_target(to: Path, folder: DatasetFolder) -> None:
     if to.resolve().is_relative_to(root):
         raise InputError(f"{to}: is inside the dataset folder {folder.root}, expected a folder outside it")
     if to.is_dir() and not (to / MARKER).is_file():
-        foreign = sorted(path.name for path in to.iterdir() if not path.match(_PARTIAL_MARKER))
+        foreign = sorted(path.name for path in to.iterdir() if temporary_target(path.name) != MARKER)
         if foreign:
             raise InputError(
                 f"{to}: is not empty (it contains {foreign[0]}) and has no {MARKER}, "
@@ -78,7 +100,9 @@ def _merged_configs(
     to: Path, folder: DatasetFolder, wanted: Mapping[str, Sequence[str]]
 ) -> dict[str, _ExportedConfig]:
     """Return the configs in ``to`` after the export: earlier ones remain, wanted ones are added or extended."""
-    configs = {name: _ExportedConfig(folder.config(name).key, tuple(views)) for name, views in wanted.items()}
+    configs = {
+        name: _ExportedConfig(key=folder.config(name).key, views=tuple(views)) for name, views in wanted.items()
+    }
     earlier = _read_marker(to / MARKER, folder) if (to / MARKER).is_file() else {}
     for name in earlier.keys() & configs.keys():
         _check_same_build(to, name, earlier[name], configs[name])
@@ -90,23 +114,16 @@ def _read_marker(path: Path, folder: DatasetFolder) -> dict[str, _ExportedConfig
 
     Raises ``InputError`` if the file is invalid, has another format or names another dataset.
     """
-    try:
-        marker = json.loads(path.read_bytes())
-        format_name, dataset = marker["format"], marker["dataset"]
-        exported = {
-            name: _ExportedConfig(str(entry["key"]), tuple(entry["views"]))
-            for name, entry in marker["configs"].items()
-        }
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: is not a readable export record: {error!r}") from None
-    if format_name != FORMAT:
-        raise InputError(f"{path}: format is {format_name!r}, expected {FORMAT!r}")
-    if dataset != folder.digest:
+    values, problems = parse_json(read_file(path, JSON_BYTES, "the record of an export", InputError))
+    marker = None if problems else validate_table(_Marker, values, problems)
+    if marker is None:
+        raise InputError.from_problems(path, problems)
+    if marker.dataset != folder.digest:
         raise InputError(
-            f"{path.parent}: contains an export of dataset {dataset}, expected {folder.digest} "
+            f"{path.parent}: contains an export of dataset {marker.dataset}, expected {folder.digest} "
             f"as in {folder.root}; choose another folder"
         )
-    return exported
+    return marker.configs
 
 
 def _check_same_build(to: Path, name: str, earlier: _ExportedConfig, wanted: _ExportedConfig) -> None:

@@ -6,7 +6,9 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rebar_depth_bench.data.dataset import EYES, decode_row, iterate_undecoded
+from rebar_depth_bench.data.columns import EYES
+from rebar_depth_bench.data.dataset import iterate_undecoded
+from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.eye_view import camera_from_row, eye_from_row, truth_columns
 from rebar_depth_bench.data.manifest import DatasetConfig, ViewRecord
 from rebar_depth_bench.errors import DatasetError
@@ -32,6 +34,7 @@ class CameraView:
 class StoredView:
     """One row of a dataset folder, its images still encoded."""
 
+    config: DatasetConfig
     view: CameraView
     record: ViewRecord
     row: Mapping[str, Any]
@@ -42,10 +45,7 @@ class StoredView:
         Raises ``DatasetError``, naming the view, if an image cannot be decoded or the digest of the ground truth
         differs from the manifest.
         """
-        try:
-            decoded = decode_row(self.row)
-        except (OSError, ValueError) as error:
-            raise DatasetError(f"view {self.record.view_id}: an image cannot be decoded: {error}") from error
+        decoded = RowDecoder.of(self.config).row(self.row)
         for eye, expected in (("left", self.record.left), ("right", self.record.right)):
             digest = eye_from_row(decoded, eye).digest()
             if digest != expected:
@@ -64,12 +64,16 @@ def stored_views(config: DatasetConfig, wanted: Collection[str]) -> Iterator[Sto
     records = {record.view_id: record for record in config.views}
     missing = set(wanted)
     for row in iterate_undecoded(config, _COLUMNS):
-        view_id = row["view_id"]
-        if view_id not in records:
-            raise DatasetError(f"{config.root}: view {view_id} is not in the manifest")
-        if view_id in missing:
-            missing.remove(view_id)
-            cameras = {eye: camera_from_row(row, eye, config.grid) for eye in EYES}
-            yield StoredView(CameraView(view_id, float(row["baseline_m"]), cameras), records[view_id], row)
+        if row["view_id"] in missing:
+            missing.remove(row["view_id"])
+            yield StoredView(config, _camera_view(row, config), records[row["view_id"]], row)
     if missing:
         raise DatasetError(f"{config.root}: {config.name} lacks {len(missing)} views, among them {min(missing)}")
+
+
+def _camera_view(row: Mapping[str, Any], config: DatasetConfig) -> CameraView:
+    try:
+        cameras = {eye: camera_from_row(row, eye, config.grid) for eye in EYES}
+        return CameraView(row["view_id"], float(row["baseline_m"]), cameras)
+    except (TypeError, ValueError) as error:
+        raise DatasetError(f"{config.root}: view {row['view_id']}: a camera is damaged: {error}") from error

@@ -107,7 +107,7 @@ class BlenderProcesses:
             if self._closed:
                 raise RenderProcessError("the build is ending; no further render process is started")
             process = subprocess.Popen(
-                [sys.executable, "-m", "dataset_builder.blender", str(log)],
+                [sys.executable, "-P", "-m", "dataset_builder.blender", str(log)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 start_new_session=True,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import threading
 from collections import defaultdict
 from collections.abc import Sequence
@@ -12,17 +11,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.pipeline.folder import check_folder, remove_build_folder, remove_stagings
 from dataset_builder.pipeline.local_renderer import Renderer, local_processes
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, plan_config
 from dataset_builder.pipeline.publish import (
     build_lock,
-    check_folder,
-    check_retained_configs,
     is_published,
     publish_config,
     remove_leftovers,
     repair_metadata,
 )
+from dataset_builder.pipeline.retained import check_retained_configs
 from dataset_builder.pipeline.work_units import accept_result, remaining_units
 from dataset_builder.scene.assemblies import check_fits
 from rebar_depth_bench.progress import Progress, silent
@@ -58,15 +57,15 @@ def build(
     plans = [plan_config(spec, request.views, out) for spec in request.config_specs()]
     for plan in plans:  # Report an unusable mesh file before anything is written.
         check_fits(plan.assembly, plan.spec)
-    check_folder(out)
+    check_folder(out, plans)
     with build_lock(out / BUILD_FOLDER):
         try:
-            remove_leftovers(out)
             check_retained_configs(out, plans)
+            remove_leftovers(out)
             with nullcontext(cluster) if cluster else local_processes(workers, threads) as renderer:
                 return _build_plans(plans, out, renderer, progress)
         finally:
-            _remove_build_folder(out / BUILD_FOLDER)
+            remove_build_folder(out / BUILD_FOLDER)
 
 
 def _build_plans(plans: Sequence[ConfigPlan], out: Path, renderer: Renderer, progress: Progress) -> BuildSummary:
@@ -79,8 +78,7 @@ def _build_plans(plans: Sequence[ConfigPlan], out: Path, renderer: Renderer, pro
             _render(plan, renderer, progress, summary)
             publish_config(out, plan)
             summary.built.append(plan.spec.name)
-        for staging in plan.all_stagings():
-            shutil.rmtree(staging, ignore_errors=True)
+        remove_stagings(plan)
     return summary
 
 
@@ -118,9 +116,3 @@ def _render(plan: ConfigPlan, renderer: Renderer, progress: Progress, summary: B
     finally:
         for future in unit_of_future:
             future.cancel()
-
-
-def _remove_build_folder(folder: Path) -> None:
-    """Remove the build folder unless it contains staging folders of unfinished configs."""
-    if not any(path.is_dir() for path in folder.iterdir()):
-        shutil.rmtree(folder)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
+from jaxtyping import UInt8
+from numpy import ndarray
 from PIL import Image, ImageDraw
 
 from dataset_builder.config.trajectories import subset
 from rebar_depth_bench.atomic_io import write_bytes
+from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.shards import rows_at
 
 TILE_PX = (320, 180)
 """Width and height of a tile, pixels."""
@@ -21,53 +24,47 @@ SHEET_VIEWS = 12
 STRIP_PANEL_PX = (640, 360)
 """Width and height of a panel of the strip, pixels."""
 _BACKGROUND = (24, 24, 24)
+_SHOWN_COLUMNS = ("view_id", "left_rgb", "left_preview")
 
 
-def write_contact_sheet(root: Path, shards: Sequence[str], target: Path) -> None:
-    """Write a WebP of up to ``SHEET_VIEWS`` views spread evenly over a config: colour above the depth preview."""
-    rows = _read_rows(root, shards, subset(_count_rows(root, shards), SHEET_VIEWS))
+def write_contact_sheet(config: DatasetConfig, target: Path) -> None:
+    """Write a WebP of up to ``SHEET_VIEWS`` views spread evenly over a config: colour above the depth preview.
+
+    Raises ``DatasetError`` if a shard is damaged.
+    """
+    positions = subset(len(config.views), SHEET_VIEWS)
     width, height = TILE_PX
-    lines = -(-len(rows) // COLUMNS)
-    sheet = Image.new("RGB", (width * min(COLUMNS, len(rows)), 2 * height * lines), _BACKGROUND)
-    for n, row in enumerate(rows):
+    lines = -(-len(positions) // COLUMNS)
+    sheet = Image.new("RGB", (width * min(COLUMNS, len(positions)), 2 * height * lines), _BACKGROUND)
+    for n, row in enumerate(_decoded_rows(config, positions)):
         left, top = n % COLUMNS * width, n // COLUMNS * 2 * height
-        sheet.paste(
-            _with_label(_letterboxed(row["left_rgb"], TILE_PX), row["view_id"].partition("/")[2]), (left, top)
-        )
+        label = row["view_id"].partition("/")[2]
+        sheet.paste(_with_label(_letterboxed(row["left_rgb"], TILE_PX), label), (left, top))
         sheet.paste(_letterboxed(row["left_preview"], TILE_PX), (left, top + height))
     _save_webp(sheet, target)
 
 
-def write_scenes_strip(root: Path, configs: Sequence[DatasetConfig], target: Path) -> None:
-    """Write a WebP with one colour view per config: the view with the median steel pixels."""
+def write_scenes_strip(configs: Sequence[DatasetConfig], target: Path) -> None:
+    """Write a WebP with one colour view per config: the view with the median steel pixels.
+
+    Raises ``DatasetError`` if a shard is damaged.
+    """
     strip = Image.new("RGB", (STRIP_PANEL_PX[0] * len(configs), STRIP_PANEL_PX[1]), _BACKGROUND)
     for n, config in enumerate(configs):
         by_steel = sorted(range(len(config.views)), key=lambda index: config.views[index].steel_px)
-        [row] = _read_rows(root, config.shards, [by_steel[len(by_steel) // 2]])
+        [row] = _decoded_rows(config, [by_steel[len(by_steel) // 2]])
         strip.paste(_letterboxed(row["left_rgb"], STRIP_PANEL_PX), (n * STRIP_PANEL_PX[0], 0))
     _save_webp(strip, target)
 
 
-def _count_rows(root: Path, shards: Sequence[str]) -> int:
-    return sum(pq.read_metadata(root / shard).num_rows for shard in shards)
+def _decoded_rows(config: DatasetConfig, positions: Sequence[int]) -> Iterator[dict[str, Any]]:
+    """Yield view id, colour and depth preview of the rows at ``positions``, counted over all shards."""
+    return map(RowDecoder.of(config).row, rows_at(config, _SHOWN_COLUMNS, positions))
 
 
-def _read_rows(root: Path, shards: Sequence[str], indices: Sequence[int]) -> list[dict[str, Any]]:
-    """Return view id, colour and depth preview of the rows ``indices``, counted over all shards of a config."""
-    rows, first = [], 0
-    for shard in shards:
-        file = pq.ParquetFile(root / shard)
-        local_indices = [index - first for index in indices if first <= index < first + file.metadata.num_rows]
-        for index in local_indices:  # One row group holds one view.
-            table = file.read_row_group(index, columns=["view_id", "left_rgb", "left_preview"])
-            rows += table.to_pylist()
-        first += file.metadata.num_rows
-    return rows
-
-
-def _letterboxed(cell: Mapping[str, Any], size: tuple[int, int]) -> Image.Image:
-    """Return the image of an Image cell, scaled to fit ``size`` (width, height) and padded to that size."""
-    picture = Image.open(io.BytesIO(cell["bytes"])).convert("RGB")
+def _letterboxed(rgb: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> Image.Image:
+    """Return an image, scaled to fit ``size`` (width, height) and padded to that size."""
+    picture = Image.fromarray(rgb)
     scale = min(size[0] / picture.width, size[1] / picture.height)
     resized = picture.resize(
         (max(1, round(picture.width * scale)), max(1, round(picture.height * scale))), Image.Resampling.LANCZOS

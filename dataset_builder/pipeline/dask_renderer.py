@@ -24,7 +24,7 @@ import distributed
 from distributed.comm import get_address_host_port
 from distributed.scheduler import KilledWorker
 
-from dataset_builder.config.specs import ConfigSpec, PinnedFile
+from dataset_builder.config.specs import ConfigSpec, PinnedFile, read_assembly_file
 from dataset_builder.pipeline.blender_process import BlenderProcesses
 from dataset_builder.pipeline.local_renderer import OnViewDone, render_unit
 from dataset_builder.pipeline.plan import generator_versions
@@ -67,7 +67,8 @@ class ClusterRenderer:
             with warnings.catch_warnings():
                 # The file must be sent through the scheduler; it is sent only once.
                 warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
-                content = spec.check(Path(spec.path).read_bytes())
+                suffix = Path(spec.path).suffix.lower()
+                content = spec.check(read_assembly_file(spec.path, "assembly", [suffix]))
                 self.files[spec.sha256] = self.client.submit(bytes, content, key=key, pure=False)
         return self.files[spec.sha256]
 

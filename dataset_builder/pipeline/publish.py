@@ -9,18 +9,28 @@ of a folder do not match its manifest, a build was interrupted in between, and t
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from cards import dataset_card
-from dataset_builder.config.catalog import CONFIGS
+from dataset_builder.config.catalog import CONFIGS, view_id
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.pipeline.contact_sheet import write_contact_sheet, write_scenes_strip
-from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, config_parameters, generator_versions
+from dataset_builder.pipeline.folder import (
+    CARD,
+    LOCK,
+    MESHES,
+    PICTURES,
+    SHARD_DIGEST_CHARACTERS,
+    remove_temporary_files,
+    remove_unlisted_files,
+)
+from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
+from dataset_builder.pipeline.retained import entry_problems, published_configs
 from dataset_builder.pipeline.shards import pack_shard, read_staged_record, split_into_shards
 from dataset_builder.scene.assemblies import aim_point_m
-from rebar_depth_bench.atomic_io import TEMPORARY_PATTERN, exclusive_lock, write_bytes, write_text
+from rebar_depth_bench.atomic_io import exclusive_lock, write_bytes, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest, views_digest
 from rebar_depth_bench.data.manifest import (
@@ -34,14 +44,8 @@ from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.version import software_version
 
-MESHES = "meshes"
-CARD = "README.md"
-PICTURES = "pictures"
 STRIP = f"{PICTURES}/scenes.webp"
 """Strip with one view of each kind of assembly."""
-_SHARDS = "*/test-*-of-*.parquet"
-_DIGEST_CHARACTERS = 12
-LOCK = "lock"
 
 
 @contextmanager
@@ -68,7 +72,9 @@ def is_published(out: Path, plan: ConfigPlan) -> bool:
         return False
     folder = open_folder(out)
     config = folder.config_by_name.get(plan.spec.name)
-    return config is not None and config.key == plan.key and _files_match(folder, (*config.shards, config.mesh))
+    if config is None or config.key != plan.key or any(entry_problems(config)):
+        return False
+    return _files_match(folder, (*config.shards, config.mesh))
 
 
 def repair_metadata(out: Path, plan: ConfigPlan) -> None:
@@ -76,7 +82,7 @@ def repair_metadata(out: Path, plan: ConfigPlan) -> None:
     folder = open_folder(out)
     config = folder.config(plan.spec.name)
     if not _files_match(folder, (BARS_FILE, CARD, STRIP, config.sheet)):
-        write_contact_sheet(out, config.shards, out / _sheet_name(plan))
+        write_contact_sheet(config, out / config.sheet)
         _write_bars(out, plan)
         _write_manifest(out, folder.config_by_name)
 
@@ -86,48 +92,14 @@ def _files_match(folder: DatasetFolder, names: Iterable[str]) -> bool:
     return all(path.is_file() and file_sha256(path) == folder.files.get(name) for name, path in paths.items())
 
 
-def check_folder(out: Path) -> None:
-    """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder: no other files are ever changed."""
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: is a file, expected a folder")
-    if (out / MANIFEST_FILE).is_file():
-        open_folder(out)
-    elif out.is_dir() and any(out.iterdir()) and not (out / BUILD_FOLDER / LOCK).is_file():
-        raise InputError(
-            f"{out}: is not empty and has no {MANIFEST_FILE}, expected a new folder or a dataset folder"
-        )
-
-
-def check_retained_configs(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    """Raise ``InputError`` if a config that is not being built lacks a file, or if its scene is being changed."""
-    planned = {plan.spec.name for plan in plans}
-    for name, config in _published_configs(out).items():
-        if name in planned:
-            continue
-        for plan in plans:
-            scene = config_parameters(plan.spec)["scene"]
-            if config.scene.name == scene["name"] and config.manifest_entry["scene"] != json.loads(
-                json.dumps(scene)
-            ):
-                raise InputError(
-                    f"{out}: config {name} was built with other parameters of scene {scene['name']!r}; "
-                    f"rebuild it too (--config {name} {plan.spec.name}) or choose another folder"
-                )
-        missing_files = [file for file in (*config.shards, config.mesh) if not (out / file).is_file()]
-        if missing_files:
-            raise InputError(
-                f"{out}: {missing_files[0]} of config {name} is missing; rebuild this config too: --config {name}"
-            )
-
-
 def publish_config(out: Path, plan: ConfigPlan) -> None:
     """Publish a completely staged config in the folder and remove the files it replaces."""
+    records = [
+        read_staged_record(plan.staging.row(index), view_id(plan.spec.name, index)) for index in plan.indices
+    ]
     shards = _publish_shards(out, plan)
     mesh = f"{MESHES}/{plan.spec.scene.name}.ply"
     write_bytes(out / mesh, plan.staging.mesh.read_bytes())
-    write_contact_sheet(out, shards, out / _sheet_name(plan))
-    _write_bars(out, plan)
-    records = [read_staged_record(plan.staging.row(index)) for index in plan.indices]
     entry = {
         **config_parameters(plan.spec),
         "key": plan.key,
@@ -135,14 +107,16 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
         "protocol_views": len(camera_offsets_m(plan.spec.protocol)),
         "generator": generator_versions(),
         "mesh": mesh,
-        "sheet": _sheet_name(plan),
+        "sheet": f"{PICTURES}/{plan.spec.name}.webp",
         "shards": shards,
         "bytes": sum((out / name).stat().st_size for name in shards),
         "ground_truth_digest": views_digest(records),
         "views": [record.model_dump() for record in records],
     }
     config = DatasetConfig(**entry, root=str(out), manifest_entry=entry)
-    _write_manifest(out, {**_published_configs(out), config.name: config})
+    write_contact_sheet(config, out / config.sheet)
+    _write_bars(out, plan)
+    _write_manifest(out, {**published_configs(out), config.name: config})
 
 
 def _write_bars(out: Path, plan: ConfigPlan) -> None:
@@ -151,17 +125,10 @@ def _write_bars(out: Path, plan: ConfigPlan) -> None:
     write_bars(path, {**published, scene.name: plan.assembly.bars})
 
 
-def _sheet_name(plan: ConfigPlan) -> str:
-    return f"{PICTURES}/{plan.spec.name}.webp"
-
-
 def remove_leftovers(out: Path) -> None:
     """Remove the files left by an interrupted build: temporary files and files not listed in the manifest."""
-    _remove_unlisted_files(out, _published_configs(out).values())
-    configs = {path.parent for path in out.glob(_SHARDS)}
-    for folder in (out, out / MESHES, out / PICTURES, *configs, *(out / name for name in CONFIGS)):
-        for temporary in folder.glob(TEMPORARY_PATTERN):
-            temporary.unlink()
+    remove_unlisted_files(out, _listed_files(published_configs(out).values()))
+    remove_temporary_files(out)
 
 
 def _publish_shards(out: Path, plan: ConfigPlan) -> list[str]:
@@ -170,7 +137,7 @@ def _publish_shards(out: Path, plan: ConfigPlan) -> list[str]:
     packed_paths = [plan.staging.shard(shard) for shard in range(len(shard_indices))]
     for target, indices in zip(packed_paths, shard_indices, strict=True):
         pack_shard([plan.staging.row(index) for index in indices], target)
-    digest = parameters_digest([file_sha256(path) for path in packed_paths])[:_DIGEST_CHARACTERS]
+    digest = parameters_digest([file_sha256(path) for path in packed_paths])[:SHARD_DIGEST_CHARACTERS]
     names = [
         f"{plan.spec.name}/test-{shard:05d}-of-{len(shard_indices):05d}-{digest}.parquet"
         for shard in range(len(shard_indices))
@@ -187,9 +154,9 @@ def _write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
     version, digest = software_version(), views_digest(view for config in ordered for view in config.views)
     for config in ordered:
         if not (out / config.sheet).is_file():
-            write_contact_sheet(out, config.shards, out / config.sheet)
+            write_contact_sheet(config, out / config.sheet)
     by_scene = {_strip_key(config): config for config in reversed(ordered)}
-    write_scenes_strip(out, list(reversed(by_scene.values())), out / STRIP)
+    write_scenes_strip(list(reversed(by_scene.values())), out / STRIP)
     write_text(out / CARD, dataset_card(version, digest, ordered))
     manifest = {
         "format": MANIFEST_FORMAT,
@@ -200,7 +167,7 @@ def _write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
         "files": {name: file_sha256(out / name) for name in sorted({CARD, BARS_FILE, *_listed_files(ordered)})},
     }
     write_text(out / MANIFEST_FILE, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
-    _remove_unlisted_files(out, ordered)
+    remove_unlisted_files(out, _listed_files(ordered))
 
 
 def _strip_key(config: DatasetConfig) -> str:
@@ -211,15 +178,3 @@ def _strip_key(config: DatasetConfig) -> str:
 
 def _listed_files(configs: Iterable[DatasetConfig]) -> set[str]:
     return {STRIP, *(name for config in configs for name in (*config.shards, config.mesh, config.sheet))}
-
-
-def _remove_unlisted_files(out: Path, configs: Iterable[DatasetConfig]) -> None:
-    listed_files = _listed_files(configs)
-    for path in [*out.glob(_SHARDS), *(out / MESHES).glob("*.ply"), *(out / PICTURES).glob("*.webp")]:
-        if path.relative_to(out).as_posix() not in listed_files:
-            path.unlink()
-
-
-def _published_configs(out: Path) -> Mapping[str, DatasetConfig]:
-    """Return the configs of the folder by name, none if it has no manifest yet."""
-    return open_folder(out).config_by_name if (out / MANIFEST_FILE).is_file() else {}

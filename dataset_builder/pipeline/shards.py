@@ -9,7 +9,8 @@ depend on the number of workers or attempts.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,16 @@ import pyarrow.parquet as pq
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
-from rebar_depth_bench.data.dataset import ROW_SCHEMA, features
+from rebar_depth_bench.data.columns import ROW_SCHEMA, features
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeView
 from rebar_depth_bench.data.manifest import ViewRecord
+from rebar_depth_bench.data.parquet import open_parquet
+from rebar_depth_bench.data.shards import rows_table
+from rebar_depth_bench.errors import InputError, Problem, escape_text
+from rebar_depth_bench.reading import open_regular, parse_json
 from rebar_depth_bench.reporting.colormap import depth_preview
 from rebar_depth_bench.scoring.protocol import scored_pixels
+from rebar_depth_bench.validation import validate_table
 
 VIEWS_PER_SHARD = 8
 _RECORD_KEY = b"rebar_view_record"
@@ -68,17 +74,54 @@ def stage_row(path: Path, row: pa.Table, record: ViewRecord) -> None:
         pq.write_table(row.replace_schema_metadata(metadata), temporary, **_PARQUET)
 
 
-def read_staged_record(path: Path) -> ViewRecord:
-    """Return the manifest record stored in a staged row."""
-    return ViewRecord(**json.loads(pq.read_schema(path).metadata[_RECORD_KEY]))
+def read_staged_record(path: Path, view_id: str) -> ViewRecord:
+    """Return the manifest record stored in the staged row of a view.
+
+    Raises ``InputError`` if the file is damaged or holds another view.
+    """
+    with _open_staged_row(path) as file:
+        metadata = file.schema_arrow.metadata or {}
+    values, problems = parse_json(metadata.get(_RECORD_KEY, b""), "record")
+    record = None if problems else validate_table(ViewRecord, values, problems, "record")
+    if record is not None and record.view_id == view_id:
+        return record
+    raise _damaged_row(path, problems[0] if problems else Problem("conflict", "record", "another view", view_id))
+
+
+def _damaged_row(path: Path, problem: Problem) -> InputError:
+    expected = "a row of an interrupted build; delete the file to render the view again"
+    return InputError.from_problems(path, [problem, Problem("invalid", "", "not usable", expected)])
 
 
 def pack_shard(rows: Sequence[Path], target: Path) -> None:
-    """Write the staged ``rows`` as one Parquet shard with one row group per view, to keep streaming cheap."""
-    schema = pq.read_schema(rows[0]).with_metadata(features().arrow_schema.metadata)
+    """Write the staged ``rows`` as one Parquet shard with one row group per view, to keep streaming cheap.
+
+    Raises ``InputError`` if a row is damaged.
+    """
+    tables = (_read_staged_row(path) for path in rows)
+    first = next(tables)
+    schema = first.schema.with_metadata(features().arrow_schema.metadata)
     with atomic_replace(target) as temporary, pq.ParquetWriter(temporary, schema, **_PARQUET) as writer:
-        for path in rows:
-            writer.write_table(pq.read_table(path).replace_schema_metadata(schema.metadata))
+        for table in (first, *tables):
+            writer.write_table(table.replace_schema_metadata(schema.metadata))
+
+
+def _read_staged_row(path: Path) -> pa.Table:
+    with _open_staged_row(path) as file:
+        table = file.read()
+    if not table.schema.equals(ROW_SCHEMA) or table.num_rows != 1:
+        raise _damaged_row(path, Problem("invalid", "", f"{table.num_rows} rows of other columns", "one row"))
+    return table
+
+
+@contextmanager
+def _open_staged_row(path: Path) -> Iterator[pq.ParquetFile]:
+    """Yield the staged row of a view. Raises ``InputError`` if the file is damaged or no such row."""
+    try:
+        with open_regular(path) as stream, open_parquet(stream, rows_table(ROW_SCHEMA.names, 1)) as (file, _):
+            yield file
+    except (OSError, ValueError) as error:
+        raise _damaged_row(path, Problem("damaged", "", f"no Parquet file: {escape_text(str(error))}")) from None
 
 
 @dataclass(frozen=True, eq=False)

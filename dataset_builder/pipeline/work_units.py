@@ -12,6 +12,7 @@ first result; the mesh itself, tens of megabytes, is returned only by the one un
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,8 @@ from dataset_builder.pipeline.shards import Staging, split_into_shards
 from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError, InputError
+from rebar_depth_bench.limits import TOML_BYTES
+from rebar_depth_bench.reading import read_file
 
 _MESH_DIGEST = "mesh.sha256"
 
@@ -151,10 +154,17 @@ def _row_problems(unit: WorkUnit, result: UnitResult, staging: Staging) -> Itera
 
 
 def _known_mesh_sha256(staging: Staging) -> str | None:
-    """Return the digest of the mesh that the staged rows were cast against, or None if there is none yet."""
-    if _mesh_digest_path(staging).is_file():
-        return _mesh_digest_path(staging).read_text()
-    return file_sha256(staging.mesh) if staging.mesh.is_file() else None
+    """Return the digest of the mesh that the staged rows were cast against, or None if there is none yet.
+
+    Raises ``InputError`` if the file of the digest holds anything else.
+    """
+    path = _mesh_digest_path(staging)
+    if not path.is_file():
+        return file_sha256(staging.mesh) if staging.mesh.is_file() else None
+    content = read_file(path, TOML_BYTES, "a digest", InputError)
+    if not re.fullmatch(rb"[0-9a-f]{64}", content):
+        raise InputError(f"{path}: is not a digest, expected 64 hexadecimal digits; delete {staging.root}")
+    return content.decode()
 
 
 def _mesh_digest_path(staging: Staging) -> Path:

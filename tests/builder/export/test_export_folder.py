@@ -15,6 +15,7 @@ import pytest
 
 from dataset_builder.export import ExportSummary, export
 from rebar_depth_bench.errors import DatasetError, InputError
+from tests.damage import change_manifest
 
 SMALL_CONFIG = ("lattice-orbit",)
 """Config with two views, quick to export."""
@@ -49,7 +50,9 @@ def test_killed_export_resumes_to_same_bytes(tiny_root: Path, exported: Path, tm
     to = tmp_path / "export"
     process = run_export(tiny_root, to, "os.kill(os.getpid(), signal.SIGKILL)")
     assert process.returncode == -signal.SIGKILL, process.stderr
-    (to / "lattice-orbit/depth/.0075_left.exr.abc.tmp").write_bytes(b"half")  # as left by a kill while writing
+    (to / "lattice-orbit/depth/.0075_left.exr.abcd_123.tmp").write_bytes(
+        b"half"
+    )  # as left by a kill while writing
     (to / "lattice-orbit/bars/0025_right.png").unlink()
     (summary,) = export(tiny_root, to, SMALL_CONFIG).configs
     assert (summary.kept, summary.written) == (IMAGES_PER_VIEW - 1, IMAGES_PER_VIEW + 1)
@@ -118,7 +121,7 @@ def test_foreign_folder_is_rejected_and_unchanged(tiny_root: Path, tmp_path: Pat
 
 
 def test_folder_with_only_partial_record_counts_as_empty(tiny_root: Path, tmp_path: Path) -> None:
-    (tmp_path / ".export.json.abc.tmp").write_bytes(b"{")  # as left by a kill at the start
+    (tmp_path / ".export.json.abcd_123.tmp").write_bytes(b"{")  # as left by a kill at the start
     export(tiny_root, tmp_path, SMALL_CONFIG, views=1)
     assert not list(tmp_path.glob("*.tmp"))
 
@@ -145,7 +148,7 @@ def test_export_of_other_dataset_is_rejected(tiny_root: Path, exported: Path, tm
     other_format = write_edited_record(
         exported, tmp_path / "future", lambda marker: marker.update(format="rebar-depth-export-9")
     )
-    with pytest.raises(InputError, match="format is 'rebar-depth-export-9', expected 'rebar-depth-export-1'"):
+    with pytest.raises(InputError, match=r"format: got 'rebar-depth-export-9', expected .rebar-depth-export-1."):
         export(tiny_root, other_format)
     assert all(set(content(to)) == {MARKER} for to in (other_dataset, other_build, other_format))
 
@@ -157,7 +160,7 @@ def test_export_of_other_dataset_is_rejected(tiny_root: Path, exported: Path, tm
 def test_damaged_record_is_rejected(tiny_root: Path, exported: Path, tmp_path: Path, text: str) -> None:
     digest = json.loads((exported / MARKER).read_text())["dataset"]
     (tmp_path / MARKER).write_text(text.replace("DIGEST", digest))
-    with pytest.raises(InputError, match="is not a readable export record"):
+    with pytest.raises(InputError, match=r"export\.json: [13] problem"):
         export(tiny_root, tmp_path)
 
 
@@ -190,17 +193,47 @@ def test_concurrent_export_to_same_folder_is_rejected(tiny_root: Path, tmp_path:
 
 def test_data_contradicting_manifest_is_not_exported(tiny_root: Path, tmp_path: Path) -> None:
     root = shutil.copytree(tiny_root, tmp_path / "root")
-    manifest = json.loads((root / "manifest.json").read_text())
-    manifest["configs"]["lattice-orbit"]["views"][1]["right"] = "0" * 64
-    (root / "manifest.json").write_text(json.dumps(manifest))
+    change_manifest(root, lambda _, config: config["views"][1].update(right="0" * 64), "lattice-orbit")
+    content = (root / "manifest.json").read_text()
+    manifest = json.loads(content)
     with pytest.raises(DatasetError, match="lattice-orbit/0075: the right ground truth has digest"):
         export(root, tmp_path / "x", SMALL_CONFIG)
     manifest["configs"]["../../x"] = manifest["configs"]["lattice"]
     (root / "manifest.json").write_text(json.dumps(manifest))
     with pytest.raises(DatasetError, match="expected a name of letters"):
         export(root, tmp_path / "y", ["../../x"])
-    manifest["configs"].pop("../../x")
-    (root / "manifest.json").write_text(json.dumps(manifest))
+    (root / "manifest.json").write_text(content)
     (root / "bars.parquet").write_bytes(b"no parquet")
     with pytest.raises(DatasetError, match=r"bars.parquet: cannot be read"):
         export(root, tmp_path / "y", SMALL_CONFIG)
+
+
+@pytest.mark.parametrize("link", ["lattice-orbit", "lattice-orbit/images", "lattice-orbit/sparse"])
+def test_links_out_of_target_are_rejected_before_any_change(
+    tiny_root: Path, exported: Path, tmp_path: Path, link: str
+) -> None:
+    to, outside = tmp_path / "to", tmp_path / "outside"
+    shutil.copytree(exported, to)
+    shutil.move(to / link, outside)
+    (outside / ".image.png.abcd_123.tmp").write_text("mine")
+    (to / link).symlink_to(outside)
+    before = content(tmp_path)
+    with pytest.raises(InputError, match=f"{link}: is a symbolic link"):
+        export(tiny_root, to, SMALL_CONFIG)
+    assert content(tmp_path) == before
+
+
+def test_only_temporary_files_of_exports_are_deleted(tiny_root: Path, exported: Path, tmp_path: Path) -> None:
+    to = tmp_path / "to"
+    shutil.copytree(exported, to)
+    own = [".export.json.abcd_123.tmp", "lattice-orbit/bars/.0025_right.png.abcd_123.tmp"]
+    others = [".thesis.tmp", ".thesis.tex.abcd_123.tmp", "notes/.thesis.tex.abcd_123.tmp", "lattice-orbit/.a.tmp"]
+    for name in (*own, *others):
+        (to / name).parent.mkdir(exist_ok=True)
+        (to / name).write_text("")
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked/.a.png.abcd_123.tmp").write_text("")
+    (to / "elsewhere").symlink_to(tmp_path / "linked")
+    export(tiny_root, to, SMALL_CONFIG)
+    assert set(content(to)) == {*content(exported), *others}
+    assert (tmp_path / "linked/.a.png.abcd_123.tmp").exists()

@@ -1,0 +1,89 @@
+"""Files and folders of a dataset folder that a build owns: their names, checks for links, and removal.
+
+A build may continue in a folder from another machine. It writes and deletes nothing outside the folder: folders
+that it changes are no links, and it deletes regular files whose names are its own, but no others.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+
+from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan
+from rebar_depth_bench.atomic_io import temporary_target
+from rebar_depth_bench.data.bars import BARS_FILE
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.paths import check_no_links, remove_file, remove_folder
+
+MESHES = "meshes"
+PICTURES = "pictures"
+CARD = "README.md"
+LOCK = "lock"
+SHARD_DIGEST_CHARACTERS = 12
+
+_NAME = "[a-z0-9][a-z0-9-]{0,199}"
+_OWN_NAMES = {MESHES: re.compile(rf"{_NAME}\.ply"), PICTURES: re.compile(rf"{_NAME}\.webp")}
+"""Names of the files in the folders that all configs share."""
+SHARD_NAME = re.compile(rf"test-\d{{5}}-of-\d{{5}}-[0-9a-f]{{{SHARD_DIGEST_CHARACTERS}}}\.parquet")
+"""Names of the files in the folder of a config."""
+
+
+def check_folder(out: Path, plans: Sequence[ConfigPlan]) -> None:
+    """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder that the plans can be built in.
+
+    No other files are ever changed. Folders that the build changes, its lock and staged files may not be links.
+    """
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file, expected a folder")
+    check_no_links(out, f"{BUILD_FOLDER}/{LOCK}", MESHES, PICTURES, *(plan.spec.name for plan in plans))
+    for staging in (staging for plan in plans for staging in plan.all_stagings()):
+        check_no_links(out, os.path.relpath(staging, out))
+        for folder, folders, files in os.walk(staging):
+            check_no_links(Path(folder), *folders, *files)
+    if (out / MANIFEST_FILE).is_file():
+        open_folder(out)
+    elif out.is_dir() and any(out.iterdir()) and not (out / BUILD_FOLDER / LOCK).is_file():
+        raise InputError(
+            f"{out}: is not empty and has no {MANIFEST_FILE}, expected a new folder or a dataset folder"
+        )
+
+
+def remove_unlisted_files(out: Path, listed: Collection[str]) -> None:
+    """Delete the shards, meshes and pictures whose paths in ``out`` are not ``listed``."""
+    for folder, own_name in _own_folders(out):
+        for path in list(folder.iterdir()):
+            if own_name.fullmatch(path.name) and path.relative_to(out).as_posix() not in listed:
+                remove_file(path)
+
+
+def remove_temporary_files(out: Path) -> None:
+    """Delete the temporary files that a killed build left."""
+    top_names = re.compile("|".join(map(re.escape, (MANIFEST_FILE, BARS_FILE, CARD))))
+    for folder, own_name in [(out, top_names), *_own_folders(out)]:
+        for path in list(folder.iterdir()):
+            target = temporary_target(path.name)
+            if target is not None and own_name.fullmatch(target):
+                remove_file(path)
+
+
+def remove_stagings(plan: ConfigPlan) -> None:
+    """Delete all staging folders of a config."""
+    for staging in plan.all_stagings():
+        remove_folder(staging)
+
+
+def remove_build_folder(folder: Path) -> None:
+    """Delete the build folder unless it contains anything but its lock, such as unfinished configs."""
+    if {path.name for path in folder.iterdir()} <= {LOCK}:
+        remove_file(folder / LOCK)
+        folder.rmdir()
+
+
+def _own_folders(out: Path) -> Iterator[tuple[Path, re.Pattern[str]]]:
+    """Yield the folders in ``out`` that are no links, with the pattern of the names that are a build's own."""
+    for folder in sorted(out.iterdir()):
+        if re.fullmatch(_NAME, folder.name) and folder.is_dir() and not folder.is_symlink():
+            yield folder, _OWN_NAMES.get(folder.name, SHARD_NAME)

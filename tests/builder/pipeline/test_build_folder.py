@@ -1,0 +1,228 @@
+"""Dataset folders from other machines: a build changes nothing outside them and no file that is not its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from dataset_builder.cli import main
+from dataset_builder.config.catalog import CONFIGS, BuildRequest
+from dataset_builder.pipeline.build import build
+from dataset_builder.pipeline.contact_sheet import write_contact_sheet
+from dataset_builder.pipeline.folder import check_folder
+from dataset_builder.pipeline.plan import ConfigPlan, plan_config
+from dataset_builder.pipeline.publish import is_published, remove_leftovers
+from dataset_builder.pipeline.retained import check_retained_configs
+from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_record
+from dataset_builder.pipeline.work_units import remaining_units
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.errors import DatasetError, InputError
+from tests.commands import run_in_process
+
+REQUEST = BuildRequest(configs=("pile",), views=1, width=16, height=16, samples=1)
+OWN_LOOKING = ("mine.ply", "mine.webp", "test-00000-of-00001-0123456789ab.parquet", ".a.ply.abcd_123.tmp", "0.log")
+STAGING = ".rebar-build/{key}"
+
+
+@pytest.fixture
+def root(tiny_root: Path, tmp_path: Path) -> Path:
+    """Return a copy of the sample dataset."""
+    return Path(shutil.copytree(tiny_root, tmp_path / "dataset"))
+
+
+def tree(folder: Path) -> dict[str, bytes | str]:
+    """Return the content of every file, and the target of every link, below a folder."""
+    return {
+        path.relative_to(folder).as_posix(): str(path.readlink()) if path.is_symlink() else path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_symlink() or path.is_file()
+    }
+
+
+def small_plan(root: Path) -> ConfigPlan:
+    [spec] = REQUEST.config_specs()
+    return plan_config(spec, REQUEST.views, root)
+
+
+def edited(root: Path, change: Callable[[dict[str, Any]], object], config: str = "lattice") -> None:
+    """Change the manifest entry of a config."""
+    manifest = json.loads((root / "manifest.json").read_text())
+    change(manifest["configs"][config])
+    (root / "manifest.json").write_text(json.dumps(manifest))
+
+
+@pytest.mark.parametrize(
+    "link",
+    [
+        ".rebar-build",
+        "meshes",
+        "pictures",
+        "pile",
+        STAGING,
+        f"{STAGING}/rows",
+        f"{STAGING}/logs",
+        f"{STAGING}/shards",
+    ],
+)
+def test_linked_folders_are_rejected_before_any_change(root: Path, tmp_path: Path, link: str) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    for name in OWN_LOOKING:
+        (outside / name).write_text("mine")
+    path = root / link.format(key=small_plan(root).staging.root.name)
+    shutil.rmtree(path, ignore_errors=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.symlink_to(outside)
+    before = tree(tmp_path)
+    with pytest.raises(InputError, match=f"{path}: is a symbolic link"):
+        build(REQUEST, root)
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("link", [".rebar-build/lock", f"{STAGING}/logs/shard-00000.log", f"{STAGING}/mesh.ply"])
+def test_linked_files_of_the_build_folder_are_rejected(root: Path, tmp_path: Path, link: str) -> None:
+    path = root / link.format(key=small_plan(root).staging.root.name)
+    path.parent.mkdir(parents=True)
+    path.symlink_to(tmp_path / "outside")
+    with pytest.raises(InputError, match=f"{path}: is a symbolic link"):
+        build(REQUEST, root)
+    assert not (tmp_path / "outside").exists()
+
+
+def test_command_reports_link_in_one_line(root: Path, tmp_path: Path) -> None:
+    shutil.rmtree(root / "meshes")
+    (root / "meshes").symlink_to(tmp_path)
+    process = run_in_process(main, "--out", root, "--config", "pile", "--views", "1")
+    assert (process.returncode, process.stdout) == (2, "")
+    assert process.stderr.strip() == (
+        f"error: {root}/meshes: is a symbolic link, expected a file or folder that can be replaced"
+    )
+
+
+def test_root_itself_may_be_a_link(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(root)
+    check_folder(tmp_path / "link", [small_plan(tmp_path / "link")])
+
+
+def test_only_leftovers_of_builds_are_deleted(root: Path, tmp_path: Path) -> None:
+    before = tree(root)
+    own = [
+        "lattice/test-00000-of-00009-0123456789ab.parquet",
+        "gone/test-00000-of-00009-0123456789ab.parquet",
+        "lattice/.test-00000-of-00009-0123456789ab.parquet.abcd_123.tmp",
+        "meshes/old-scene.ply",
+        "meshes/.lattice.ply.abcd_123.tmp",
+        "pictures/old.webp",
+        ".manifest.json.abcd_123.tmp",
+    ]
+    others = [
+        ".draft.tmp",
+        ".draft.tex.abcd_123.tmp",
+        "meshes/notes.txt",
+        "meshes/My Cage.ply",
+        "lattice/test-0-of-1.parquet",
+        "notes/test-0-of-1.parquet",
+        ".git/test-00000-of-00009-0123456789ab.parquet",
+        "pictures/.figure.tmp",
+    ]
+    for name in (*own, *others):
+        (root / name).parent.mkdir(exist_ok=True)
+        (root / name).write_text("")
+    (tmp_path / "outside").mkdir()
+    shutil.copy(root / own[0], tmp_path / "outside")
+    (root / "linked").symlink_to(tmp_path / "outside")
+    (root / "meshes/linked.ply").symlink_to(root / "README.md")
+    (root / "meshes/folder.ply").mkdir()
+    remove_leftovers(root)
+    assert tree(root).keys() - before.keys() == {*others, "linked", "meshes/linked.ply"}
+    assert tree(root).items() >= before.items()
+    assert [path.name for path in (tmp_path / "outside").iterdir()] == [Path(own[0]).name]
+    assert (root / "meshes/folder.ply").is_dir()
+
+
+@pytest.mark.parametrize(
+    ("change", "place"),
+    [
+        (lambda entry: entry.update(sheet="notes/lattice.webp"), "sheet"),
+        (lambda entry: entry.update(sheet="pictures/scenes.webp"), "sheet"),
+        (lambda entry: entry.update(mesh="README.md"), "mesh"),
+        (lambda entry: entry.update(shards=["manifest.json"]), "shards"),
+        (lambda entry: entry.pop("bytes"), "bytes"),
+        (lambda entry: entry["scene"].update(assembly=[]), "scene.assembly"),
+        (lambda entry: entry["scene"]["assembly"].update(path="a\x1b[2Jb"), "scene.assembly.path"),
+        (lambda entry: entry["rig"].update(grid="other"), "rig.grid"),
+        (lambda entry: entry.update(protocol={"kind": "dome", "radii_m": []}), "protocol.radii_m"),
+        (lambda entry: entry["colour"].update(samples="1"), "colour.samples"),
+    ],
+)
+def test_entries_of_kept_configs_are_checked(
+    root: Path, change: Callable[[dict[str, Any]], object], place: str
+) -> None:
+    check_retained_configs(root, [small_plan(root)])
+    configs = ("lattice", "lattice-orbit")  # They have one scene.
+    for config in configs:
+        edited(root, change, config)
+    with pytest.raises(DatasetError) as caught:
+        check_retained_configs(root, [small_plan(root)])
+    assert [problem.where for problem in caught.value.problems] == [f"configs.{name}.{place}" for name in configs]
+
+
+def test_config_with_other_file_names_is_not_up_to_date(root: Path) -> None:
+    plan = plan_config(CONFIGS["lattice"](), 9, root)
+    edited(root, lambda entry: entry.update(key=plan.key))
+    assert is_published(root, plan)
+    edited(root, lambda entry: entry.update(sheet="pictures/other.webp"))
+    assert not is_published(root, plan)
+
+
+@pytest.mark.parametrize("content", [b"", b"PAR1" * 9, None, b"{}"])
+def test_damaged_staged_rows_are_named(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "0000.parquet"
+    if content is None:
+        pq.write_table(pa.table({"a": [1]}), path)
+    elif content == b"{}":
+        pq.write_table(pa.table({"a": [1]}).replace_schema_metadata({b"rebar_view_record": content}), path)
+    else:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=f"^{path}: .*problem"):
+        read_staged_record(path, "lattice/0000")
+    with pytest.raises(InputError, match=f"^{path}: .*problem"):
+        pack_shard([path], tmp_path / "shard.parquet")
+    assert [item.name for item in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff" * 64, b"0" * 63, b"0" * 64 + b"\n", b"0" * (1 << 21)])
+def test_damaged_mesh_digest_is_named(tmp_path: Path, content: bytes) -> None:
+    plan = small_plan(tmp_path)
+    plan.staging.root.mkdir(parents=True)
+    (plan.staging.root / "mesh.sha256").write_bytes(content)
+    with pytest.raises(InputError, match=r"mesh\.sha256: "):
+        remaining_units(plan)
+
+
+def test_staged_pipes_are_rendered_again(tmp_path: Path) -> None:
+    staging = Staging(small_plan(tmp_path).staging.root)
+    staging.row(0).parent.mkdir(parents=True)
+    for path in (staging.row(0), staging.mesh, staging.root / "mesh.sha256"):
+        os.mkfifo(path)
+    [unit] = remaining_units(small_plan(tmp_path))
+    assert unit.with_mesh
+    assert unit.indices
+
+
+@pytest.mark.parametrize("kept_bytes", [0, 4, 1000, -9])
+def test_damaged_shards_of_kept_configs_are_reported(root: Path, kept_bytes: int) -> None:
+    shard = next(root.glob("lattice-orbit/*.parquet"))
+    shard.write_bytes(shard.read_bytes()[:kept_bytes])
+    config = open_folder(root).config("lattice-orbit")
+    with pytest.raises(DatasetError, match=f"lattice-orbit cannot be read: {shard.relative_to(root)}"):
+        write_contact_sheet(config, root / "a.webp")
+    assert not (root / "a.webp").exists()
