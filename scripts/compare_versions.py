@@ -128,6 +128,7 @@ def digests(work: Path) -> dict[str, str]:
     found = {}
     for path in sorted(work.rglob("*")):
         name = path.relative_to(work).as_posix()
+        # Earlier versions cached ground truth in the dataset folder.
         skipped = (
             name.startswith(("hf/", "cache/", "service/state")) or ".rebar-cache" in name or name == "log.txt"
         )

@@ -1,158 +1,154 @@
-"""Disk cache of per-view arrays, written and read one view at a time.
-
-A cache is a folder with one file of raw values per array, in which the values of all views are concatenated, and
-an index ``views.json`` with the views' ids, the offset of each view's values, their CRC-32 and metadata. The
-folder is created atomically.
-"""
+"""Cache of per-view arrays in the user's cache folder: opened, filled and repaired."""
 
 from __future__ import annotations
 
-import json
-import shutil
+import errno
+import os
+import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack
-from dataclasses import dataclass
+import threading
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy import ndarray
-from zlib_ng import zlib_ng
-
-from rebar_depth_bench.atomic_io import fsync_path
-from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.submission.zip_directory import FileSource
-
-_INDEX_FILE = "views.json"
-_KEYS = ("view_ids", "starts", "checksums", "notes")
-
-
-@dataclass(frozen=True, eq=False)
-class ViewArrays:
-    """Cached data of one view: named 1-D arrays of equal length, and small JSON-serialisable metadata."""
-
-    view_id: str
-    arrays: Mapping[str, ndarray]
-    metadata: Any
+from rebar_depth_bench.data.cache_entry import (
+    DAMAGE,
+    CacheContent,
+    Entry,
+    ViewArrays,
+    read_entry,
+    write_entry,
+)
+from rebar_depth_bench.data.cache_folder import (
+    UNFINISHED_SUFFIX,
+    CacheFolderError,
+    cache_folder,
+    limit_size,
+    temporary_folder,
+)
+from rebar_depth_bench.errors import DatasetError, terminal_text
+from rebar_depth_bench.limits import CACHE_BYTES
 
 
-@dataclass(frozen=True, eq=False)
 class ArrayCache:
-    """Open cache: the index of all views in order, and the files their values are read from on demand.
+    """Views of an entry, in the order of its content; a damaged entry is written again, with a warning."""
 
-    View ``i`` occupies the values ``starts[i]`` to ``starts[i + 1]`` of each file. Files stay open, so that a
-    reader is not affected by another process that deletes or replaces the folder.
-    """
-
-    path: Path
-    dtypes: Mapping[str, type]
-    view_ids: tuple[str, ...]
-    starts: tuple[int, ...]
-    checksums: tuple[int, ...]
-    metadata: tuple[Any, ...]
-    sources: Mapping[str, FileSource]
+    def __init__(self, content: CacheContent, entry: Entry) -> None:
+        self._content, self._entry, self._lock = content, entry, threading.Lock()
 
     def __len__(self) -> int:
         return len(self.view_ids)
 
-    def view(self, index: int) -> ViewArrays:
-        """Read the view at position ``index`` as read-only arrays; thread-safe.
+    @property
+    def view_ids(self) -> tuple[str, ...]:
+        """Ids of the views, in order."""
+        return self._content.view_ids
 
-        Raises ``DatasetError`` if the values do not match their checksum.
+    @property
+    def numbers(self) -> tuple[tuple[float, ...], ...]:
+        """Numbers of each view, in order."""
+        entry = self._entry
+        return tuple(entry.index.numbers[entry.positions[view_id]] for view_id in self.view_ids)
+
+    def view(self, position: int) -> ViewArrays:
+        """Read the view at ``position`` as read-only arrays; thread-safe.
+
+        Raises ``DatasetError`` if the entry is damaged and cannot be written again.
         """
-        start, end = self.starts[index], self.starts[index + 1]
-        arrays: dict[str, ndarray] = {}
-        for name, dtype in self.dtypes.items():
-            size = np.dtype(dtype).itemsize
-            arrays[name] = np.frombuffer(self.sources[name].read_at(start * size, (end - start) * size), dtype)
-        if _checksum(arrays.values()) != self.checksums[index]:
-            raise DatasetError(
-                f"{self.path}: the cached values of {self.view_ids[index]} are damaged; delete this folder, it "
-                "will be filled again"
-            )
-        return ViewArrays(self.view_ids[index], arrays, self.metadata[index])
-
-
-def open_cache(
-    path: Path, dtypes: Mapping[str, type], fill: Callable[[], Iterator[ViewArrays]], *, stale_pattern: str
-) -> ArrayCache:
-    """Open the cache at ``path``; if it is missing or damaged, write it from the views that ``fill`` yields.
-
-    ``stale_pattern`` is a glob pattern of folder names next to ``path``; matching folders are deleted when a new
-    cache is written. At most one view is held in memory. Raises ``DatasetError`` if the cache cannot be written.
-    """
-    for is_retry in (False, True):  # Retry once: another process may have just created the cache.
+        entry, view_id = self._entry, self.view_ids[position]
         try:
-            return _read(path, dtypes)
-        except (OSError, ValueError, LookupError, TypeError):
-            if is_retry:
-                shutil.rmtree(path, ignore_errors=True)  # The folder is missing or damaged.
+            return entry.view(view_id)
+        except DAMAGE as error:
+            damage = error
+        with self._lock:  # The first of several threads writes the entry.
+            if self._entry is entry:
+                _warn_of_damage(entry.path, damage)
+                self._entry = _open(self._content, anew=True)
+        try:
+            return self._entry.view(view_id)
+        except DAMAGE as error:
+            message = f"{self._entry.path}: the cache is damaged again after it was written: {_reason(error)}"
+            raise DatasetError(message) from None
+
+
+def open_cache(content: CacheContent) -> ArrayCache:
+    """Open the entry of ``content``; if it is missing or damaged, it is written first, one view at a time.
+
+    If the user's cache folder cannot be used, the entry is kept in a temporary folder until this process ends.
+    Raises ``DatasetError`` if it cannot be written there either.
+    """
+    return ArrayCache(content, _open(content))
+
+
+def _open(content: CacheContent, *, anew: bool = False) -> Entry:
+    """Return the entry of ``content``, written first if it is missing or damaged, or if ``anew`` is set."""
+    CACHE_BYTES.value()  # An invalid variable is reported before the work.
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=".filling-", dir=path.parent))
+        return _open_in(cache_folder(), content, anew)
+    except CacheFolderError as error:
+        reason = str(error)
     except OSError as error:
-        raise _write_error(path, error) from None
+        reason = f"{error.filename or cache_folder()}: {_reason(error)}"
+    _warn_once(f"ground truth is cached for this run only, in a temporary folder: {reason}")
     try:
-        _write(temporary, dtypes, fill())
-        for stale in path.parent.glob(stale_pattern):
-            if stale != path:
-                shutil.rmtree(stale, ignore_errors=True)
-        _move_into_place(temporary, path)
-        return _read(path, dtypes)
+        return _open_in(temporary_folder(), content, anew)
     except OSError as error:
-        raise _write_error(path, error) from None
+        raise DatasetError(f"ground truth cannot be cached: {_reason(error)}") from None
+
+
+def _open_in(folder: Path, content: CacheContent, anew: bool) -> Entry:
+    """Return an entry as ``_open`` does. Raises ``OSError`` if it cannot be written to ``folder``."""
+    path = folder / content.file_name
+    if not anew and os.path.lexists(path):
+        try:
+            entry = read_entry(path, path, content)
+        except FileNotFoundError:  # Another process has just deleted it.
+            pass
+        except DAMAGE as error:
+            _warn_of_damage(path, error)
+        else:
+            with suppress(OSError):
+                os.utime(path)
+            return entry
+    return _write(path, content)
+
+
+def _write(path: Path, content: CacheContent) -> Entry:
+    """Write an entry and return it open. It appears complete or not at all, without locks between processes."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    prefix = f"{path.name}."
+    descriptor, name = tempfile.mkstemp(prefix=prefix, suffix=UNFINISHED_SUFFIX, dir=path.parent)
+    unfinished = Path(name)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            write_entry(file, content)
+        try:
+            entry = read_entry(unfinished, path, content)
+        except (EOFError, ValueError) as error:
+            raise OSError(errno.EIO, f"the written file is damaged: {_reason(error)}", path) from None
+        unfinished.replace(path)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        unfinished.unlink(missing_ok=True)
+    limit_size(path.parent)
+    if not path.exists():
+        limit = f"at most {CACHE_BYTES.value()} bytes ({CACHE_BYTES.variable})"
+        _warn_once(f"{path}: {entry.source.size} bytes are not kept, expected a cache of {limit}")
+    return entry
 
 
-def _move_into_place(temporary: Path, path: Path) -> None:
-    try:
-        temporary.rename(path)
-    except OSError:
-        if not path.is_dir():  # Otherwise another process created the same cache first.
-            raise
+def _reason(error: Exception) -> str:
+    return f"{getattr(error, 'strerror', None) or error}".partition("\n")[0]
 
 
-def _write_error(path: Path, error: OSError) -> DatasetError:
-    return DatasetError(f"{path}: the cache of ground truth cannot be written: {error.strerror or error}")
+def _warn_of_damage(path: Path, error: Exception) -> None:
+    _warn(f"{path}: the cache is damaged and is written again: {_reason(error)}")
 
 
-def _read(path: Path, dtypes: Mapping[str, type]) -> ArrayCache:
-    index = json.loads((path / _INDEX_FILE).read_text())
-    view_ids, starts, checksums, metadata = (tuple(index[key]) for key in _KEYS)
-    if not len(starts) - 1 == len(view_ids) == len(checksums) == len(metadata):
-        raise ValueError(f"{path}: the outline is inconsistent")
-    sources = {name: FileSource(path / name) for name in dtypes}
-    for name, dtype in dtypes.items():
-        size_bytes, expected_bytes = sources[name].size, starts[-1] * np.dtype(dtype).itemsize
-        if size_bytes != expected_bytes:
-            raise ValueError(f"{path / name}: {size_bytes} bytes, expected {expected_bytes}")
-    return ArrayCache(path, dtypes, view_ids, starts, checksums, metadata, sources)
+@cache
+def _warn_once(message: str) -> None:
+    _warn(message)
 
 
-def _write(folder: Path, dtypes: Mapping[str, type], views: Iterator[ViewArrays]) -> None:
-    view_ids, starts, checksums, metadata = [], [0], [], []
-    with ExitStack() as stack:
-        files = {name: stack.enter_context((folder / name).open("wb")) for name in dtypes}
-        for view in views:
-            arrays: list[ndarray] = [
-                np.ascontiguousarray(view.arrays[name], dtype) for name, dtype in dtypes.items()
-            ]
-            for file, array in zip(files.values(), arrays, strict=True):
-                file.write(array.data)
-            view_ids.append(view.view_id)
-            starts.append(starts[-1] + len(arrays[0]))
-            checksums.append(_checksum(arrays))
-            metadata.append(view.metadata)
-    index = dict(zip(_KEYS, (view_ids, starts, checksums, metadata), strict=True))
-    (folder / _INDEX_FILE).write_text(json.dumps(index))
-    for path in (*folder.iterdir(), folder):
-        fsync_path(path)
-
-
-def _checksum(arrays: Iterable[ndarray]) -> int:
-    checksum = 0
-    for array in arrays:
-        checksum = zlib_ng.crc32(array.view(np.uint8).data, checksum)
-    return checksum
+def _warn(message: str) -> None:
+    sys.stderr.write(f"warning: {terminal_text(message)}\n")  # In one call, so that threads do not mix lines.
+    sys.stderr.flush()

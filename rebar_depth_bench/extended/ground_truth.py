@@ -1,28 +1,29 @@
-"""Ground truth of the extended measures: computed once from a config's rows and cached beside the dataset."""
+"""Ground truth of the extended measures: computed once from a config's rows and kept in the user's cache."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.data.array_cache import ArrayCache, ViewArrays, open_cache
+from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
+from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
 from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeView
+from rebar_depth_bench.data.eye_view import EyeView
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.extended.depth_layers import other_layers
 from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_segments, cage_truth
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.geometry.cameras import pixel_rays
+from rebar_depth_bench.geometry.cameras import Camera, pixel_rays
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.scoring.ground_truth import cache_name_pattern, cache_path, verified_views
+from rebar_depth_bench.scoring.ground_truth import are_pixels_inside, cache_inputs, scored_counts, verified_views
 
 _DTYPES: Mapping[str, type] = {
     "index": np.uint32,
@@ -39,6 +40,11 @@ _DTYPES: Mapping[str, type] = {
 Rays = Float64[ndarray, "hw 2"]
 """x/z and y/z of each pixel's ray, row by row."""
 
+Lens = tuple[float, ...]
+"""K, row by row, and distortion of a camera."""
+
+_LENS_NUMBERS, _CAMERA_NUMBERS = 9 + 5, 9 + 5 + 16
+
 
 @dataclass(frozen=True, eq=False)
 class ConfigSteelTruth:
@@ -52,7 +58,7 @@ class ConfigSteelTruth:
     width: int
     cage: CageTruth
     diameter_m: Float64[ndarray, " ids"]
-    rays: Mapping[str, Rays]
+    rays: Mapping[Lens, Rays]
     cache: ArrayCache
 
     def __len__(self) -> int:
@@ -62,15 +68,15 @@ class ConfigSteelTruth:
     def view(self, position: int) -> SteelTruth:
         """Return the view at ``position`` in protocol order."""
         view = self.cache.view(position)
-        arrays, metadata = view.arrays, view.metadata
+        lens, pose = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
         return SteelTruth(
             view_id=view.view_id,
             height=self.height,
             width=self.width,
-            K=np.array(metadata["K"]),
-            cam_from_world=np.array(metadata["cam_from_world"]),
-            rays=self.rays[_lens_key(metadata)][arrays["index"]],
-            **arrays,
+            K=np.array(lens[:9]).reshape(3, 3),
+            cam_from_world=np.array(pose).reshape(4, 4),
+            rays=self.rays[lens][view.arrays["index"]],
+            **view.arrays,
         )
 
 
@@ -84,33 +90,42 @@ def load_steel_truth(config: DatasetConfig, progress: Progress = silent) -> Conf
     if bars is None:
         raise DatasetError(f"{bars_path}: has no bars for scene {config.scene.name!r} of config {config.name}")
     cage = cage_truth(bars)
-    diameter_m = np.full(max((bar.bar_id for bar in bars), default=0) + 1, np.nan)
+    diameter_m = np.full(np.iinfo(np.uint16).max + 1, np.nan)  # Images may show ids that the table lacks.
     diameter_m[[bar.bar_id for bar in bars]] = [bar.diameter_m for bar in bars]
-    cache = open_cache(
-        cache_path(config, EXTENDED_PROTOCOL, file_sha256(bars_path)),
-        _DTYPES,
-        lambda: _view_arrays(config, cage, diameter_m, progress),
-        stale_pattern=cache_name_pattern(config.name, EXTENDED_PROTOCOL),
-    )
     height, width = config.grid
-    lenses = {_lens_key(metadata): metadata for metadata in cache.metadata}
-    rays = {lens: _rays(metadata, height, width) for lens, metadata in lenses.items()}
+    scored_px = scored_counts(config)
+
+    def is_sound(view: ViewArrays) -> bool:
+        has_camera = len(view.numbers) == _CAMERA_NUMBERS and all(map(math.isfinite, view.numbers))
+        has_counts = np.count_nonzero(view.arrays["interior"]) == scored_px[view.view_id]
+        return has_camera and has_counts and are_pixels_inside(view, config)
+
+    content = CacheContent(
+        source=config.root,
+        inputs=cache_inputs(config, EXTENDED_PROTOCOL, file_sha256(bars_path)),
+        dtypes=_DTYPES,
+        view_ids=tuple(scored_px),
+        extract=lambda: _view_arrays(config, cage, diameter_m, progress),
+        is_sound=is_sound,
+    )
+    cache = open_cache(content)
+    rays = {lens: _rays(lens, height, width) for lens in {numbers[:_LENS_NUMBERS] for numbers in cache.numbers}}
     return ConfigSteelTruth(height, width, cage, diameter_m, rays, cache)
 
 
 def _view_arrays(
     config: DatasetConfig, cage: CageTruth, diameter_m: Float64[ndarray, " ids"], progress: Progress
 ) -> Iterator[ViewArrays]:
-    """Yield the cached arrays of every view with scored pixels, with K, distortion and pose as metadata."""
-    rays: dict[str, Rays] = {}
+    """Yield the cached arrays of every view with scored pixels, with the numbers of K, distortion and pose."""
+    rays: dict[Lens, Rays] = {}
     for view_id, left, scored in verified_views(config, progress, "bars in the views"):
         if not len(scored):
             continue
-        metadata = {kind: getattr(left.camera, kind).tolist() for kind in CAMERA_KINDS}
-        if _lens_key(metadata) not in rays:
-            rays[_lens_key(metadata)] = _rays(metadata, *left.depth_m.shape)
-        arrays = _steel_arrays(left, scored, rays[_lens_key(metadata)], cage, diameter_m)
-        yield ViewArrays(view_id, arrays, metadata)
+        lens = _lens(left.camera)
+        if lens not in rays:
+            rays[lens] = _rays(lens, *left.depth_m.shape)
+        arrays = _steel_arrays(left, scored, rays[lens], cage, diameter_m)
+        yield ViewArrays(view_id, arrays, (*lens, *left.camera.cam_from_world.ravel().tolist()))
 
 
 def _steel_arrays(
@@ -156,12 +171,11 @@ def dilate_mask(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     return grown
 
 
-def _lens_key(metadata: Mapping[str, Any]) -> str:
-    """Return a key that is equal for views with the same K and distortion."""
-    return repr((metadata["K"], metadata["distortion"]))
+def _lens(camera: Camera) -> Lens:
+    return (*camera.K.ravel().tolist(), *camera.distortion.tolist())
 
 
-def _rays(metadata: Mapping[str, Any], height: int, width: int) -> Rays:
+def _rays(lens: Lens, height: int, width: int) -> Rays:
     """Return x/z and y/z of every pixel's ray, row by row, lens distortion undone."""
-    rays = pixel_rays(np.array(metadata["K"]), width, height, np.array(metadata["distortion"]))
+    rays = pixel_rays(np.array(lens[:9]).reshape(3, 3), width, height, np.array(lens[9:]))
     return np.ascontiguousarray(rays[..., :2].reshape(-1, 2))
