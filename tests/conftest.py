@@ -176,6 +176,13 @@ def tiny_masks(tiny_root: Path) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture
+def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Give the test a ground-truth cache of its own, and return its folder, which does not exist yet."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+    return tmp_path / "caches" / "rebar-depth-bench"
+
+
+@pytest.fixture
 def archive_of(tmp_path: Path) -> Callable[..., Path]:
     """Write predictions, by view id, as a submission archive."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ import pyarrow.parquet as pq
 
 from dataset_builder.pipeline.shards import View, encode_view
 from rebar_depth_bench import SubmissionWriter
+from rebar_depth_bench.data.digests import views_digest
 from rebar_depth_bench.data.eye_view import EyeView
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, ViewRecord
 from rebar_depth_bench.geometry.cameras import Camera
@@ -33,7 +33,7 @@ def write_dataset(root: Path, configs: Sequence[str], views: int) -> None:
     )
     (root / "README.md").write_text(f"---\nconfigs:\n{config_yaml}---\n")
     entries = {config: _config_entry(config, config_records) for config, config_records in records.items()}
-    digest = _digest([entry["ground_truth_digest"] for entry in entries.values()])
+    digest = views_digest(record for config_records in records.values() for record in config_records)
     manifest = {
         "format": MANIFEST_FORMAT,
         "version": "0.0.0",
@@ -63,21 +63,16 @@ def _write_config(folder: Path, config: str, views: int) -> list[ViewRecord]:
 
 
 def _config_entry(config: str, records: Sequence[ViewRecord]) -> dict[str, object]:
-    digest = _digest([record.left for record in records])
     return {
         "scene": {"name": config, "board": None},
         "rig": {"height": HEIGHT, "width": WIDTH},
         "views": [record.model_dump() for record in records],
-        "ground_truth_digest": digest,
+        "ground_truth_digest": views_digest(records),
         "key": "",
         "shards": [f"{config}/test.parquet"],
         "mesh": "meshes/none.ply",
         "sheet": "pictures/none.webp",
     }
-
-
-def _digest(parts: Sequence[object]) -> str:
-    return f"sha256:{hashlib.sha256(' '.join(map(str, parts)).encode()).hexdigest()}"
 
 
 def _view_id(config: str, index: int) -> str:

@@ -27,7 +27,7 @@ from dataset_builder.config.trajectories import poses, subset
 from dataset_builder.scene.assemblies import aim_point_m
 from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
-from rebar_depth_bench.data.dataset import EYES
+from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import DatasetError

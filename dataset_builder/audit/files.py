@@ -1,4 +1,4 @@
-"""File and row checks of the audit: SHA-256 and digests, array types, masks, bar ids and pixel counts."""
+"""File and row checks of the audit: SHA-256, masks, bar ids and pixel counts."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ import numpy as np
 
 from dataset_builder.audit.report import Check
 from dataset_builder.pipeline.plan import BUILD_FOLDER
-from rebar_depth_bench.data.dataset import EYES
-from rebar_depth_bench.data.digests import file_sha256, views_digest
+from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, ViewRecord
+from rebar_depth_bench.data.manifest import DatasetFolder, ViewRecord
+from rebar_depth_bench.data.verification import file_problems
+from rebar_depth_bench.progress import Progress
 from rebar_depth_bench.scoring.protocol import scored_pixels
 
 
-def check_files(folder: DatasetFolder, root: Path) -> Check:
+def check_files(folder: DatasetFolder, root: Path, progress: Progress) -> Check:
     """Check that every file of the manifest exists with its SHA-256, and that the folder has no other file."""
-    problems = [problem for name, sha256 in folder.files.items() if (problem := _file_problem(root, name, sha256))]
-    unlisted = sorted(_existing_files(root) - set(folder.files) - {MANIFEST_FILE})
-    problems += [f"{name}: is not in the manifest" for name in unlisted]
+    problems = [str(problem) for problem in file_problems(folder, progress)]
     if (root / BUILD_FOLDER).exists():
         problems.append(
             f"{BUILD_FOLDER}: the folder contains an unfinished build; run rebar-build again or remove it"
@@ -29,64 +28,8 @@ def check_files(folder: DatasetFolder, root: Path) -> Check:
     return Check("files against the manifest", f"{len(folder.files)} files", "all SHA-256 equal", tuple(problems))
 
 
-def check_digests(folder: DatasetFolder) -> Check:
-    """Check the ground-truth digest of the dataset and of each config against the digests of the views."""
-    configs = folder.config_by_name.values()
-    problems = [
-        f"{config.name}: ground_truth_digest is {config.ground_truth_digest}, expected {digest}"
-        for config in configs
-        if config.ground_truth_digest != (digest := views_digest(config.views))
-    ]
-    expected = views_digest(view for config in configs for view in config.views)
-    if folder.digest != expected:
-        problems.append(f"the ground-truth digest is {folder.digest}, expected {expected}")
-    return Check("digests of the manifest", folder.digest[:23], "equal to the views'", tuple(problems))
-
-
-def _file_problem(root: Path, name: str, sha256: str) -> str | None:
-    path = root / name
-    if not path.is_file():
-        return f"{name}: is missing"
-    actual_sha256 = file_sha256(path)
-    return None if actual_sha256 == sha256 else f"{name}: SHA-256 is {actual_sha256[:16]}, expected {sha256[:16]}"
-
-
-def _existing_files(root: Path) -> set[str]:
-    """Return the relative POSIX paths of the folder's files.
-
-    The scoring cache and other hidden files and folders at the top level are left out.
-    """
-    names = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
-    return {name for name in names if not name.startswith(".")}
-
-
-_IMAGES: Mapping[str, tuple[str, tuple[int, ...]]] = {
-    "rgb": ("uint8", (3,)),
-    "depth": ("float32", ()),
-    "mask": ("bool", ()),
-    "bars": ("uint16", ()),
-}
-_MATRICES: Mapping[str, tuple[int, ...]] = {"K": (3, 3), "distortion": (5,), "cam_from_world": (4, 4)}
-
-
-def array_problems(row: Mapping[str, Any], grid: tuple[int, int]) -> Iterator[str]:
-    """Yield the faults that make a decoded row unusable: wrong dtypes or shapes, non-finite or negative values."""
-    for eye in EYES:
-        for kind, (dtype, extra) in _IMAGES.items():
-            array, expected = row[f"{eye}_{kind}"], (*grid, *extra)
-            if array.shape != expected or array.dtype != dtype:
-                yield f"{eye} {kind} is {array.dtype} {array.shape}, expected {dtype} {expected}"
-        depth_m = row[f"{eye}_depth"]
-        if not np.isfinite(depth_m).all() or (depth_m < 0).any():
-            yield f"{eye} depth has non-finite or negative values"
-        for kind, shape in _MATRICES.items():
-            matrix = row[f"{eye}_{kind}"]
-            if matrix.shape != shape or not np.isfinite(matrix).all():
-                yield f"{eye}_{kind} is not an array of finite numbers of shape {shape}"
-
-
 def row_problems(row: Mapping[str, Any], record: ViewRecord, bar_ids: set[int]) -> Iterator[str]:
-    """Yield the problems of a row with well-formed arrays: masks, bar ids, differences from the manifest."""
+    """Yield the problems of a decoded row: masks, bar ids, differences from the manifest."""
     eyes = {name: eye_from_row(row, name) for name in EYES}
     for name, eye in eyes.items():
         for problem in _ground_truth_problems(eye, bar_ids):

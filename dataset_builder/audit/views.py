@@ -14,7 +14,7 @@ from numpy import ndarray
 from dataset_builder.scene.model import ESTIMATED_ROLE
 from dataset_builder.scene.variants import LIGHT_SLOT, PROPS_SLOT, variants_of_slot
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.data.dataset import EYES
+from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
 from rebar_depth_bench.console import ProgressBars, add_archive, add_data
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import SubmissionError
@@ -16,13 +17,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     add_archive(parser)
     add_data(parser)
+    add_expect_digest(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Check an archive; raise ``SubmissionError`` with all of its problems."""
-    expected = open_folder(options.data).expected_views()
+    folder = open_folder(options.data, expect_digest=options.expect_digest)
     with ProgressBars() as bars:
-        problems = check_archive(options.archive, expected, bars.update)
+        problems = check_archive(options.archive, folder.expected_views(), bars.update)
+    print_verified(folder)
     if problems:
         raise SubmissionError.from_problems(options.archive, problems)
     print(f"{options.archive}: no problem found")

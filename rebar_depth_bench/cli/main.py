@@ -6,7 +6,7 @@ import argparse
 import os
 from collections.abc import Mapping, Sequence
 
-from rebar_depth_bench.cli import check, compare, demo, methods, predict, score, submit, table
+from rebar_depth_bench.cli import cache, check, compare, demo, methods, predict, score, submit, table, verify
 from rebar_depth_bench.console import Command, add_commands, check_outputs, replace_renamed_options, run_command
 from rebar_depth_bench.studies.registry import STUDIES
 from rebar_depth_bench.version import software_version
@@ -16,9 +16,11 @@ COMMANDS: Mapping[str, Command] = {
     "compare": compare,
     "table": table,
     "check": check,
+    "verify": verify,
     "methods": methods,
     "predict": predict,
     "submit": submit,
+    "cache": cache,
     "demo": demo,
 }
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from rebar_depth_bench.console import ProgressBars, add_data
+from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
+from rebar_depth_bench.console import ProgressBars, add_data, add_seconds, print_notice
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods import METHODS, find_method
+from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S
 from rebar_depth_bench.methods.registry import FROM_FOLDER
 from rebar_depth_bench.methods.runner import predict
 
@@ -24,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(interrupted="interrupted; run the same command again to resume")
     parser.add_argument("method", metavar="METHOD", help=names)
     add_data(parser)
+    add_expect_digest(parser)
     parser.add_argument(
         "--out", required=True, type=Path, metavar="ARCHIVE", help="submission archive (zip) to write"
     )
@@ -34,6 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="configs to predict (default: all in the folder)",
     )
+    limit = (
+        "time limit on an ONNX model for each view, and for opening it; onnxruntime stops between two operators "
+        "of the model. Other methods have no limit"
+    )
+    add_seconds(parser, "--view-timeout", VIEW_TIMEOUT_S, limit)
 
 
 def format_note(value: object) -> str:
@@ -47,12 +55,21 @@ def format_note(value: object) -> str:
 
 def run(options: argparse.Namespace) -> None:
     """Predict into an archive; print the method's notes to standard error and the archive's path."""
-    method = find_method(options.method)
+    method = find_method(options.method, view_timeout_s=options.view_timeout)
+    folder = open_folder(options.data, expect_digest=options.expect_digest)
     info = method.info
-    print(f"{info.name}: {info.summary}; from {info.source}; licence {info.licence}", file=sys.stderr)
+    print_notice(f"{info.name}: {info.summary}; from {info.source}; licence {info.licence}")
+    print_verified(folder)
     with ProgressBars() as bars:
-        prepared = predict(method, options.data, options.out, configs=options.config, progress=bars.update)
+        prepared = predict(
+            method,
+            options.data,
+            options.out,
+            configs=options.config,
+            expect_digest=folder.digest,
+            progress=bars.update,
+        )
     for config, preparation in prepared.items():
         for key, value in preparation.notes.items():
-            print(f"{config}: {key.replace('_', ' ')}: {format_note(value)}", file=sys.stderr)
+            print_notice(f"{config}: {key.replace('_', ' ')}: {format_note(value)}")
     print(options.out)

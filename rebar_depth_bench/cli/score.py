@@ -8,6 +8,7 @@ from dataclasses import replace
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_bytes, write_text
+from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
 from rebar_depth_bench.console import ProgressBars, add_archive, add_data, add_output_file, add_workers
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.evaluate import score_extended
@@ -25,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     add_archive(parser)
     add_data(parser)
+    add_expect_digest(parser)
     add_output_file(parser, "--json", "write the result as JSON")
     add_output_file(parser, "--html", "write a self-contained report")
     parser.add_argument(
@@ -48,12 +50,14 @@ def run(options: argparse.Namespace) -> None:
     """Score an archive, write the requested files and print the tables."""
     if options.html_views < 0:
         raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
-    with open_evaluation(options.archive, options.data) as evaluation:
+    with open_evaluation(options.archive, options.data, expect_digest=options.expect_digest) as evaluation:
         with ProgressBars() as bars:
             result = score_evaluation(evaluation, workers=options.workers, progress=bars.update)
             if options.extended or options.extended_csv:
                 extended = score_extended(result, evaluation, workers=options.workers, progress=bars.update)
                 result = replace(result, extended=extended)
+        names = ", ".join(config.name for config in evaluation.configs)
+        print_verified(evaluation.folder, f"ground truth of {names} verified when its cache was filled")
         if options.html:
             write_report(result, evaluation, options.html, views_shown=options.html_views)
     if options.json:

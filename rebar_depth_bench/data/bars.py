@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,12 +16,18 @@ import pyarrow.parquet as pq
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.data.parquet import Table, open_parquet, read_rows
+from rebar_depth_bench.errors import DatasetError, escape_text
+from rebar_depth_bench.limits import TABLE_BYTES
+from rebar_depth_bench.paths import NAME_PATTERN
+from rebar_depth_bench.reading import open_regular
+from rebar_depth_bench.validation import short_repr
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 BARS_FILE = "bars.parquet"
+_CONTROL_CHARACTER = r"[\x00-\x1f\x7f-\x9f]"
 BARS_SCHEMA = pa.schema(
     [
         ("scene", pa.string()),
@@ -54,19 +61,24 @@ class Bar:
 def read_bars(path: Path) -> dict[str, tuple[Bar, ...]]:
     """Read a ``bars.parquet`` and return the bars of each scene, keyed by scene name, in the order of the file.
 
-    Raises ``DatasetError`` if the file is missing, is not such a table, or holds an invalid bar or a repeated id.
+    Raises ``DatasetError`` if the file is missing, is not such a table, is larger than ``TABLE_BYTES``, or holds
+    an invalid bar or a repeated id.
     """
-    try:
-        rows = pq.read_table(path, schema=BARS_SCHEMA).to_pylist()
-    except (OSError, pa.ArrowException) as error:
-        raise DatasetError(f"{path}: cannot be read as a table of bars: {error}") from error
+    max_bytes = TABLE_BYTES.value()
+    table = Table(BARS_SCHEMA, max_bytes // 64, max_bytes, max_values={"axis": max_bytes})
     scenes: dict[str, dict[int, Bar]] = {}
-    for row in rows:
-        bar = _bar_from_row(path, row)
-        bars = scenes.setdefault(row["scene"], {})
-        if bar.bar_id in bars:
-            raise DatasetError(f"{path}: scene {row['scene']!r} has bar {bar.bar_id} twice, expected each id once")
-        bars[bar.bar_id] = bar
+    try:
+        with open_regular(path) as stream, open_parquet(stream, table) as (file, _):
+            for row in read_rows(file, BARS_SCHEMA, batch_rows=1000):
+                bar = _bar_from_row(path, row)
+                if scenes.setdefault(row["scene"], {}).setdefault(bar.bar_id, bar) is not bar:
+                    where = f"scene {short_repr(row['scene'])}"
+                    raise DatasetError(f"{path}: {where} has bar {bar.bar_id} twice, expected each id once")
+    except DatasetError:
+        raise
+    except Exception as error:  # pyarrow raises many types, which depend on the damage.
+        reason = escape_text(str(error) or type(error).__name__)
+        raise DatasetError(f"{path}: cannot be read as a table of bars: {reason}") from error
     return {scene: tuple(bars.values()) for scene, bars in scenes.items()}
 
 
@@ -105,10 +117,14 @@ def write_bars(path: Path, scenes: Mapping[str, tuple[Bar, ...]]) -> None:
 
 def _bar_from_row(path: Path, row: Mapping[str, Any]) -> Bar:
     """Convert a row to a ``Bar``; raise ``DatasetError`` if a value is missing or invalid."""
-    where = f"{path}: bar {row['bar_id']} of scene {row['scene']!r}"
+    where = f"{path}: bar {row['bar_id']} of scene {short_repr(row['scene'])}"
     empty = [name for name in BARS_SCHEMA.names if row[name] is None]
     if empty or any(point is None for point in row["axis"]):
         raise DatasetError(f"{where} has no {', '.join(empty) or 'complete axis'}")
+    if not re.fullmatch(NAME_PATTERN, row["scene"]):
+        raise DatasetError(f"{where}: the name of the scene is invalid, expected {NAME_PATTERN}")
+    if re.search(_CONTROL_CHARACTER, row["role"]):
+        raise DatasetError(f"{where}: role is {escape_text(row['role'])}, expected no control characters")
     if row["bar_id"] < 1:
         raise DatasetError(f"{where}: bar_id is {row['bar_id']}, expected 1 or more (0 means no steel)")
     if not 0 < row["diameter_m"] < math.inf:
@@ -117,5 +133,5 @@ def _bar_from_row(path: Path, row: Mapping[str, Any]) -> Bar:
     if len(axis_m) < 2 or not all(
         value is not None and math.isfinite(value) for point in axis_m for value in point
     ):
-        raise DatasetError(f"{where}: axis is {axis_m}, expected two or more finite points")
+        raise DatasetError(f"{where}: axis is {short_repr(axis_m)}, expected two or more finite points")
     return Bar(row["bar_id"], row["role"], row["diameter_m"], axis_m)

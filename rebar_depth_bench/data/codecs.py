@@ -6,15 +6,32 @@ The formats were chosen by measurements on rendered views (``benchmarks/codecs.p
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 from numpy import ndarray
 from PIL import Image
+from PIL.ImageFile import ImageFile
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
+from PIL.TiffImagePlugin import TiffImageFile
+from PIL.WebPImagePlugin import WebPImageFile
+
+from rebar_depth_bench.limits import CELL_BYTES
 
 _TIFF_PREDICTOR, _FLOATING_POINT = 317, 3
-_TIFF_ROWS_PER_STRIP = 278
+_TIFF_ROWS_PER_STRIP, _TIFF_TILE_WIDTH = 278, 322
+# Image.open would print a warning for a large image before its size can be compared.
+_PLUGINS: Mapping[bytes, type[ImageFile]] = {
+    b"II": TiffImageFile,
+    b"MM": TiffImageFile,
+    b"\x89PNG": PngImageFile,
+    b"RIFF": WebPImageFile,
+    b"\xff\xd8": JpegImageFile,
+}
+"""Reader of an image by the first bytes of its content."""
 
 
 def encode_depth(depth_m: Float32[ndarray, "h w"]) -> bytes:
@@ -22,12 +39,6 @@ def encode_depth(depth_m: Float32[ndarray, "h w"]) -> bytes:
     tags = {_TIFF_PREDICTOR: _FLOATING_POINT, _TIFF_ROWS_PER_STRIP: depth_m.shape[0]}
     image = Image.fromarray(np.ascontiguousarray(depth_m, dtype=np.float32))
     return _encode_image(image, "TIFF", compression="zstd", tiffinfo=tags)
-
-
-def decode_depth(content: bytes) -> Float32[ndarray, "h w"]:
-    """Decode planar depth: float32, metres, 0.0 where there is no surface."""
-    with Image.open(io.BytesIO(content)) as image:
-        return np.asarray(image, dtype=np.float32)
 
 
 def encode_rgb(rgb: UInt8[ndarray, "h w 3"]) -> bytes:
@@ -52,22 +63,54 @@ def encode_palette(indices: UInt8[ndarray, "h w"], palette: bytes) -> bytes:
     return _encode_image(image, "PNG")
 
 
-def decode_rgb(content: bytes) -> UInt8[ndarray, "h w 3"]:
-    """Decode an 8-bit RGB image."""
-    with Image.open(io.BytesIO(content)) as image:
+def decode_depth(content: bytes, grid: tuple[int, int]) -> Float32[ndarray, "h w"]:
+    """Decode planar depth of ``grid`` (height, width): float32, metres, 0.0 where there is no surface."""
+    with _open_image(content, grid, ("TIFF",), ("F",)) as image:
+        depth_m = np.asarray(image, dtype=np.float32)
+    if not (depth_m.min() >= 0 and depth_m.max() < np.inf):
+        raise ValueError("it holds negative or non-finite values, expected depth from 0")
+    return depth_m
+
+
+def decode_rgb(content: bytes, grid: tuple[int, int]) -> UInt8[ndarray, "h w 3"]:
+    """Decode an 8-bit colour image of ``grid`` (height, width)."""
+    with _open_image(content, grid, ("WEBP", "PNG", "JPEG", "TIFF"), ("RGB", "RGBA", "P", "L")) as image:
         return np.asarray(image.convert("RGB") if image.mode != "RGB" else image)
 
 
-def decode_mask(content: bytes) -> Bool[ndarray, "h w"]:
-    """Decode a 1-bit mask."""
-    with Image.open(io.BytesIO(content)) as image:
+def decode_mask(content: bytes, grid: tuple[int, int]) -> Bool[ndarray, "h w"]:
+    """Decode a 1-bit mask of ``grid`` (height, width)."""
+    with _open_image(content, grid, ("PNG",), ("1", "L")) as image:
         return np.asarray(image, dtype=bool)
 
 
-def decode_bars(content: bytes) -> UInt16[ndarray, "h w"]:
-    """Decode 16-bit bar ids."""
-    with Image.open(io.BytesIO(content)) as image:
+def decode_bars(content: bytes, grid: tuple[int, int]) -> UInt16[ndarray, "h w"]:
+    """Decode 16-bit bar ids of ``grid`` (height, width)."""
+    with _open_image(content, grid, ("PNG",), ("I;16", "I", "L")) as image:
         return np.asarray(image, dtype=np.uint16)
+
+
+def _open_image(
+    content: bytes, grid: tuple[int, int], formats: tuple[str, ...], modes: tuple[str, ...]
+) -> ImageFile:
+    """Return an image that is not decoded yet, after checking its format, mode and size.
+
+    Raises ``ValueError`` or an error of Pillow, which has no base class, for other content.
+    """
+    if len(content) > CELL_BYTES.value():
+        raise ValueError(f"it has {len(content)} bytes, expected {CELL_BYTES.allowed()}")
+    plugin = next((plugin for start, plugin in _PLUGINS.items() if content.startswith(start)), None)
+    if plugin is None or plugin.format not in formats:
+        raise ValueError(f"it starts with {content[:4]!r}, expected {' or '.join(formats)}")
+    image = plugin(io.BytesIO(content))
+    height, width = grid
+    if image.size != (width, height):
+        raise ValueError(f"its size is {image.size[0]} x {image.size[1]}, expected {width} x {height}")
+    if image.mode not in modes:
+        raise ValueError(f"its mode is {image.mode}, expected {' or '.join(modes)}")
+    if isinstance(image, TiffImageFile) and _TIFF_TILE_WIDTH in image.tag_v2:
+        raise ValueError("it is a TIFF of tiles, whose size is not that of the image, expected strips")
+    return image
 
 
 def _encode_image(image: Image.Image, image_format: str, **options: Any) -> bytes:

@@ -6,16 +6,23 @@ import hashlib
 import json
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rebar_depth_bench.data.manifest import ViewRecord
+from rebar_depth_bench.reading import open_regular
+
+if TYPE_CHECKING:
+    from rebar_depth_bench.data.manifest import ViewRecord
 
 _CHUNK_BYTES = 1 << 20
 
 
 def file_sha256(path: Path) -> str:
-    """Return the hex SHA-256 of a file, read in chunks of 1 MiB."""
+    """Return the hex SHA-256 of a regular file, read in chunks of 1 MiB.
+
+    Raises ``OSError`` if the file is missing or not a regular file.
+    """
     digest = hashlib.sha256()
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         while chunk := stream.read(_CHUNK_BYTES):
             digest.update(chunk)
     return digest.hexdigest()

@@ -8,13 +8,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8, UInt16
+from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 from numpy import ndarray
 
 from rebar_depth_bench.geometry.cameras import Camera
 
 CAMERA_KINDS = ("K", "distortion", "cam_from_world")
-"""Kinds of the dataset's columns that describe a camera (see ``dataset.column_kind``)."""
+"""Kinds of the dataset's columns that describe a camera (see ``columns.column_kind``)."""
+_CAMERA_SHAPES = dict(zip(CAMERA_KINDS, ((3, 3), (5,), (4, 4)), strict=True))
+_MAX_ROTATION_ERROR = 1e-6
+"""Largest deviation of a rotation times its transpose from the identity matrix."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +66,30 @@ def eye_from_row(row: Mapping[str, Any], eye: str) -> EyeView:
 
 
 def camera_from_row(row: Mapping[str, Any], eye: str, grid: tuple[int, int]) -> Camera:
-    """Return the camera of one eye of a row, decoded or not; ``grid`` is its image size (height, width)."""
-    K, distortion, cam_from_world = (np.asarray(row[f"{eye}_{kind}"], np.float64) for kind in CAMERA_KINDS)
+    """Return the camera of one eye of a row, decoded or not; ``grid`` is its image size (height, width).
+
+    Raises ``ValueError`` for arrays that ``camera_array`` rejects.
+    """
+    K, distortion, cam_from_world = (camera_array(kind, row[f"{eye}_{kind}"]) for kind in CAMERA_KINDS)
     height, width = grid
     return Camera(K, distortion, cam_from_world, width, height)
+
+
+def camera_array(kind: str, cell: Any) -> Float64[ndarray, ...]:
+    """Return a cell of one of ``CAMERA_KINDS`` as an array; arrays are returned unchanged.
+
+    Raises ``ValueError`` unless it holds finite numbers of the kind's shape; a pose has to be rigid.
+    """
+    if isinstance(cell, ndarray):
+        return cell
+    array = np.array(cell, dtype=np.float64)
+    if array.shape != _CAMERA_SHAPES[kind] or not np.isfinite(array).all():
+        raise ValueError(
+            f"it has the shape {array.shape}, expected finite numbers of shape {_CAMERA_SHAPES[kind]}"
+        )
+    if kind == "cam_from_world":
+        rotation = array[:3, :3]
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if not (error < _MAX_ROTATION_ERROR and np.linalg.det(rotation) > 0 and (array[3] == (0, 0, 0, 1)).all()):
+            raise ValueError("it is no rigid pose: a rotation, a translation and the last row 0 0 0 1")
+    return array

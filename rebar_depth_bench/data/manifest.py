@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, Strict, StringConstraints, ValidationInfo, field_validator
 
-from rebar_depth_bench.errors import DatasetError, Problem
+from rebar_depth_bench.data.digests import views_digest
+from rebar_depth_bench.data.location import Located, local_path
+from rebar_depth_bench.errors import DatasetError, InputError, Problem, escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.paths import NAME_PATTERN, PATH_PATTERN, path_below
+from rebar_depth_bench.limits import JSON_BYTES
+from rebar_depth_bench.paths import NAME_PATTERN, PATH_PATTERN
+from rebar_depth_bench.reading import parse_json, read_file
 from rebar_depth_bench.validation import (
     Expected,
     StrictModel,
@@ -20,13 +24,14 @@ from rebar_depth_bench.validation import (
     format_location,
     number,
     one_of,
+    text,
     validate_table,
     whole_number,
 )
 
 MANIFEST_FILE = "manifest.json"
 MANIFEST_FORMAT = "rebar-depth-dataset-1"
-_HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
+_DIGEST_PATTERN = "sha256:[0-9a-f]{64}"
 _LETTERS = 'letters, digits, "_", "." and "-", not starting with a dot'
 _Name = Annotated[str, StringConstraints(pattern=f"^{NAME_PATTERN}$"), Expected(f"a name of {_LETTERS}")]
 _Path = Annotated[
@@ -35,8 +40,9 @@ _Path = Annotated[
     Expected(f"a path in the folder, whose parts are {_LETTERS}"),
 ]
 _ViewId = Annotated[str, StringConstraints(pattern=f"^{NAME_PATTERN}/{NAME_PATTERN}$")]
+# Views have no ``Expected``, which is called from pydantic: a folder has thousands.
 _Sha256 = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
-_Digest = Annotated[str, StringConstraints(pattern="^sha256:[0-9a-f]{64}$")]
+_Digest = Annotated[str, StringConstraints(pattern=f"^{_DIGEST_PATTERN}$"), Expected("sha256: and 64 hex digits")]
 _Side = Annotated[int, whole_number(1, 16384)]
 _Length = Annotated[float, number(0, 10)]
 
@@ -95,26 +101,7 @@ class Rig(_ManifestTable):
     height: _Side
 
 
-class _Located(_ManifestTable):
-    """Dataset, or part of one; ``root`` is a folder path or a Hub repository id."""
-
-    root: str
-
-    @property
-    def local(self) -> Path | None:
-        """Path of a local dataset folder, or None for a Hub repository."""
-        path = Path(self.root)
-        return path if path.is_dir() else None
-
-    def file(self, name: str) -> Path:
-        """Return the local path of a file of the dataset, downloaded first if the dataset is a Hub repository.
-
-        Raises ``DatasetError`` if the file is missing or cannot be downloaded.
-        """
-        return _local_path(self.root, name)
-
-
-class DatasetConfig(_Located):
+class DatasetConfig(Located):
     """Config of a dataset; ``manifest_entry`` is its entry as it was written, with all parameters of the build."""
 
     name: _Name
@@ -122,7 +109,8 @@ class DatasetConfig(_Located):
     rig: Rig
     views: Annotated[tuple[ViewRecord, ...], Strict(False)]
     ground_truth_digest: _Digest
-    key: str
+    protocol_views: Annotated[int, whole_number(1, 1_000_000)] = 0
+    key: Annotated[str, StringConstraints(max_length=200)]
     shards: Annotated[tuple[_Path, ...], Strict(False)]
     mesh: _Path
     sheet: _Path
@@ -131,15 +119,42 @@ class DatasetConfig(_Located):
     @field_validator("views")
     @classmethod
     def _check_views(cls, views: tuple[ViewRecord, ...], info: ValidationInfo) -> tuple[ViewRecord, ...]:
-        view_ids = [view.view_id for view in views]
-        prefix = f"{info.data.get('name', '')}/"
-        foreign = [view_id for view_id in view_ids if not view_id.startswith(prefix)]
-        if foreign and "name" in info.data:
-            raise field_error(f"got {foreign[0]}", f"view ids that start with {prefix}")
-        repeated = [view_id for view_id, number_of_views in Counter(view_ids).items() if number_of_views > 1]
-        if repeated:
-            raise field_error(f"{repeated[0]} occurs more than once", "each view once", "duplicate")
+        _check_unique([view.view_id for view in views], "view")
+        name, rig = info.data.get("name"), info.data.get("rig")
+        for view in views:
+            if name is not None and not view.view_id.startswith(f"{name}/"):
+                raise field_error(f"got {view.view_id}", f"view ids that start with {name}/")
+            if rig is not None and not view.scored_px <= view.steel_px <= rig.width * rig.height:
+                raise field_error(
+                    f"{view.view_id} has {view.scored_px} scored and {view.steel_px} steel pixels",
+                    f"no more scored than steel pixels, and at most {rig.width * rig.height}",
+                )
         return views
+
+    @field_validator("ground_truth_digest")
+    @classmethod
+    def _check_digest(cls, digest: str, info: ValidationInfo) -> str:
+        if "views" in info.data and digest != (expected := views_digest(info.data["views"])):
+            raise field_error(f"got {digest}", f"the digest of the views, {expected}", "conflict")
+        return digest
+
+    @field_validator("protocol_views")
+    @classmethod
+    def _check_protocol_views(cls, protocol_views: int, info: ValidationInfo) -> int:
+        view_ids = [view.view_id for view in info.data.get("views", ())]
+        indices = [int(index) for view_id in view_ids if (index := view_id.rpartition("/")[2]).isdecimal()]
+        least = max(len(view_ids), 1 + max(indices, default=-1))
+        if protocol_views < least:
+            raise field_error(
+                f"got {protocol_views}", f"at least {least}: views and their largest index", "conflict"
+            )
+        return protocol_views
+
+    @field_validator("shards")
+    @classmethod
+    def _check_shards(cls, shards: tuple[str, ...]) -> tuple[str, ...]:
+        _check_unique(shards, "shard")
+        return shards
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -152,7 +167,7 @@ class DatasetConfig(_Located):
         return tuple(view.view_id for view in self.views)
 
 
-class DatasetFolder(_Located):
+class DatasetFolder(Located):
     """Dataset with a validated manifest; ``files`` are the hex SHA-256 digests of its files, by path."""
 
     version: str
@@ -187,59 +202,76 @@ class _Format(_ManifestTable):
 class _Manifest(_ManifestTable):
     """Manifest of the supported format; its configs are validated one by one."""
 
-    version: str
+    version: Annotated[str, text(100)]
+    protocol: Annotated[str, one_of("rebar-1")] = "rebar-1"
     ground_truth: _GroundTruth
-    configs: dict[str, dict[str, Any]]
+    configs: Annotated[dict[str, dict[str, Any]], Expected("a table of one or more configs", bool)]
     files: dict[_Path, _Sha256]
 
 
-def open_folder(root: str | Path) -> DatasetFolder:
+def open_folder(root: str | Path, *, expect_digest: str | None = None) -> DatasetFolder:
     """Open a dataset folder or Hub dataset repository.
 
-    Raises ``DatasetError`` if ``root`` is neither, or with all problems of its manifest if that is invalid.
+    Raises ``DatasetError`` if ``root`` is neither, or with all problems of its manifest if that is invalid, and if
+    the dataset's digest is not ``expect_digest``.
     """
+    if expect_digest is not None and not re.fullmatch(_DIGEST_PATTERN, expect_digest):
+        raise InputError(
+            f"the expected digest is {escape_text(expect_digest)}, expected sha256: and 64 hex digits"
+        )
     root = str(root)
-    path = _manifest_path(root)
-    try:
-        values = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
-        problem = Problem("syntax", "", f"cannot be read as JSON: {error}")
-        raise DatasetError.from_problems(path, [problem]) from None
-    problems: list[Problem] = []
-    supported = validate_table(_Format, values, problems)  # Another format would cause many other problems.
+    path = local_path(root, MANIFEST_FILE)
+    values, problems = parse_json(read_file(path, JSON_BYTES, "the manifest of a dataset", DatasetError))
+    # Another format would cause many other problems.
+    supported = not problems and validate_table(_Format, values, problems)
     head = validate_table(_Manifest, values, problems) if supported else None
-    configs = {}
-    for name, entry in head.configs.items() if head else ():
-        fields = {**entry, "root": root, "name": name, "manifest_entry": entry}
-        if config := validate_table(DatasetConfig, fields, problems, format_location("configs", name)):
-            configs[name] = config
+    place = {"root": root, "commit": "" if Path(root).is_dir() else path.parent.name}
+    configs = _read_configs(values.get("configs"), place, problems) if supported else {}
+    if head is not None and not problems:
+        digest = views_digest(view for config in configs.values() for view in config.views)
+        if head.ground_truth.digest != digest:
+            found, expected = f"got {head.ground_truth.digest}", f"the digest of all views, {digest}"
+            problems.append(Problem("conflict", "ground_truth.digest", found, expected))
     if head is None or problems:
         raise DatasetError.from_problems(path, problems)
-    return DatasetFolder(
-        root=root, version=head.version, digest=head.ground_truth.digest, files=head.files, config_by_name=configs
-    )
+    digest = head.ground_truth.digest
+    if expect_digest not in (None, digest):
+        raise DatasetError(f"{root}: the dataset has the digest {digest}, expected {expect_digest}")
+    return DatasetFolder(**place, version=head.version, digest=digest, files=head.files, config_by_name=configs)
 
 
-def _manifest_path(root: str) -> Path:
-    folder = Path(root)
-    if not folder.is_dir() and (folder.exists() or not _HUB_ID.fullmatch(root)):
-        raise DatasetError(f"{root}: no such folder, expected a dataset folder or a Hub repository id")
-    return _local_path(root, MANIFEST_FILE)
+def _read_configs(entries: object, place: dict[str, str], problems: list[Problem]) -> dict[str, DatasetConfig]:
+    """Return the valid configs of a manifest, and append the problems of the others."""
+    configs: dict[str, DatasetConfig] = {}
+    for name, entry in entries.items() if isinstance(entries, dict) else ():
+        if not isinstance(entry, dict):  # A problem of the whole manifest.
+            continue
+        where = format_location("configs", name)
+        if entry.get("name", name) != name:
+            found, expected = f"got {escape_text(str(entry['name']))}", f"{escape_text(name)}, the config's key"
+            problems.append(Problem("conflict", format_location(where, "name"), found, expected))
+        fields = {**entry, **place, "name": name, "manifest_entry": entry}
+        if config := validate_table(DatasetConfig, fields, problems, where):
+            configs[name] = config
+    problems += _scene_problems(configs.values())
+    return configs
 
 
-def _local_path(root: str, name: str) -> Path:
-    if Path(root).is_dir():
-        path = path_below(Path(root), name)
-        if not path.is_file():
-            raise DatasetError(f"{root}: has no {name}, expected a complete dataset folder written by rebar-build")
-        return path
-    # Imported on use: it takes a fifth of a second, which local folders do not need.
-    from huggingface_hub import hf_hub_download
-    from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError, LocalEntryNotFoundError
+def _scene_problems(configs: Iterable[DatasetConfig]) -> Iterator[Problem]:
+    """Yield a problem for each config whose scene differs from an earlier one of the same name."""
+    first: dict[str, DatasetConfig] = {}
+    for config in configs:
+        other = first.setdefault(config.scene.name, config)
+        if (config.scene, config.mesh) != (other.scene, other.mesh):
+            where = format_location("configs", config.name, "scene")
+            found = f"scene {config.scene.name} has another board, mesh or appearance than in {other.name}"
+            yield Problem("conflict", where, found, "one scene for each name")
 
-    try:
-        return Path(hf_hub_download(root, name, repo_type="dataset"))
-    except (EntryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError) as error:
-        raise DatasetError(
-            f"{root}: not a local folder, and its {name} cannot be downloaded from the Hub: {error}"
-        ) from None
+
+def _check_unique(names: Sequence[str], what: str) -> None:
+    """Raise the error of a field unless it has one or more names, each once."""
+    if not names:
+        raise field_error("got none", f"one {what} or more")
+    name, occurrences = Counter(names).most_common(1)[0]
+    if occurrences > 1:
+        raise field_error(f"{name} occurs more than once", f"each {what} once", "duplicate")

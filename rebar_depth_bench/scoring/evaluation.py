@@ -47,13 +47,15 @@ class Evaluation:
 
 
 @contextmanager
-def open_evaluation(archive: str | os.PathLike[str], root: str | Path) -> Iterator[Evaluation]:
+def open_evaluation(
+    archive: str | os.PathLike[str], root: str | Path, *, expect_digest: str | None = None
+) -> Iterator[Evaluation]:
     """Open an archive and a dataset folder or Hub repository, and close the archive when the block ends.
 
     Raises ``SubmissionError`` with all problems, also those of single entries, if the structure of the archive is
-    invalid, and ``DatasetError`` if the dataset folder is.
+    invalid, and ``DatasetError`` if the dataset folder is, or if its digest is not ``expect_digest``.
     """
-    folder = open_folder(root)
+    folder = open_folder(root, expect_digest=expect_digest)
     with open_submission(archive, folder.expected_views()) as submission:
         if submission.meta is None or submission.structure_problems:
             raise SubmissionError.from_problems(archive, list(submission.problems()))

@@ -29,6 +29,7 @@ def score(
     root: str | Path,
     *,
     workers: int | None = None,
+    expect_digest: str | None = None,
     progress: Progress = silent,
 ) -> Result:
     """Score an archive against a dataset folder or Hub repository.
@@ -37,9 +38,9 @@ def score(
     views are in memory at a time. The result does not depend on the number of workers.
 
     Raises ``SubmissionError`` with all problems if any part of the archive is invalid, and ``DatasetError`` if the
-    dataset folder is invalid.
+    dataset folder is invalid or its digest is not ``expect_digest``.
     """
-    with open_evaluation(archive, root) as evaluation:
+    with open_evaluation(archive, root, expect_digest=expect_digest) as evaluation:
         return score_evaluation(evaluation, workers=workers, progress=progress)
 
 

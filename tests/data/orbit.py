@@ -48,7 +48,11 @@ class StoredImages:
             eyes = {}
             for name, camera in rig_cameras(config.rig, left_poses[index]).items():
                 shape = (camera.height, camera.width, 3)
-                rgb = decode_rgb(_image(index).read_bytes()) if name == "left" else np.zeros(shape, np.uint8)
+                rgb = (
+                    decode_rgb(_image(index).read_bytes(), shape[:2])
+                    if name == "left"
+                    else np.zeros(shape, np.uint8)
+                )
                 eyes[name] = replace(caster.cast(camera), rgb=rgb)
             row, record = encode_view(
                 View(view_id(config.name, index), eyes["left"], eyes["right"], config.rig.baseline_m)

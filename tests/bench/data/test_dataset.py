@@ -16,7 +16,8 @@ import pytest
 import torch
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.dataset import features, iterate_rows
+from rebar_depth_bench.data.columns import features
+from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import ideal_K, right_camera_pose
@@ -137,7 +138,7 @@ def test_loading_columns_writes_no_further_cache_file(tiny_root: Path) -> None:
 @pytest.mark.parametrize("damage", ["truncated", "missing"])
 def test_damaged_shard_raises_dataset_error(tiny_root: Path, tmp_path: Path, damage: str) -> None:
     copy = tmp_path / "dataset"
-    shutil.copytree(tiny_root, copy, ignore=shutil.ignore_patterns(".rebar-cache"))
+    shutil.copytree(tiny_root, copy)
     for shard in copy.glob("lattice/*.parquet"):
         if damage == "missing":
             shard.unlink()
@@ -153,6 +154,8 @@ def manifest(tiny_root: Path) -> Any:
 
 
 BOARD = "configs.lattice.scene.board"
+PROTOCOL_VIEWS = "configs.lattice.protocol_views"
+ZEROS = "sha256:" + "0" * 64
 
 
 def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
@@ -175,11 +178,7 @@ def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
         (lambda _, config: config["views"][0].pop("left"), "missing", "configs.lattice.views 1: left"),
         (lambda _, config: config["views"][1].update(x=3), "unknown", "configs.lattice.views 2: x"),
         (lambda _, config: config["rig"].update(height="90"), "invalid", "configs.lattice.rig.height"),
-        (
-            lambda _, config: config["scene"]["board"].update({"\ud800": 1}),
-            "invalid",
-            BOARD,
-        ),
+        (lambda _, config: config["scene"]["board"].update({"\ud800": 1}), "syntax", ""),
         (lambda _, config: config["scene"].update(board=7), "invalid", "configs.lattice.scene.board"),
         (lambda _, config: config["scene"].pop("board"), "missing", "configs.lattice.scene.board"),
         *(
@@ -190,7 +189,37 @@ def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
         (lambda _, config: config.update(shards=["../x.parquet"]), "invalid", "configs.lattice.shards 1"),
         (lambda _, config: config["scene"]["board"].update(x=1), "unknown", BOARD + ".x"),
         (lambda _, config: config["scene"]["board"].update(markers="six"), "invalid", BOARD + ".markers"),
-        (lambda _, config: config["scene"]["board"].update(width_m=float("nan")), "invalid", BOARD + ".width_m"),
+        (lambda _, config: config["scene"]["board"].update(width_m=float("nan")), "syntax", ""),
+        (lambda manifest, _: manifest.update(configs={}), "invalid", "configs"),
+        (lambda manifest, _: manifest.update(version="1\x1b[2J"), "invalid", "version"),
+        (lambda manifest, _: manifest.update(protocol="rebar-0"), "invalid", "protocol"),
+        (lambda manifest, _: manifest["ground_truth"].update(digest=ZEROS), "conflict", "ground_truth.digest"),
+        (
+            lambda _, config: config.update(ground_truth_digest=ZEROS),
+            "conflict",
+            "configs.lattice.ground_truth_digest",
+        ),
+        (lambda _, config: config.update(name="pile"), "conflict", "configs.lattice.name"),
+        (lambda _, config: config.update(shards=[]), "invalid", "configs.lattice.shards"),
+        (lambda _, config: config["shards"].append(config["shards"][0]), "duplicate", "configs.lattice.shards"),
+        (lambda _, config: config.update(views=[]), "invalid", "configs.lattice.views"),
+        (lambda _, config: config.update(mesh="meshes/other.ply"), "conflict", "configs.lattice-orbit.scene"),
+        *(
+            (lambda _, config, views=views: config.update(protocol_views=views), code, PROTOCOL_VIEWS)
+            for views, code in (
+                (8, "conflict"),
+                (476, "conflict"),
+                (-1, "invalid"),
+                ("504", "invalid"),
+                (504.5, "invalid"),
+            )
+        ),
+        (
+            lambda _, config: config["views"][0].update(steel_px=1 << 20, scored_px=1 << 20),
+            "invalid",
+            "configs.lattice.views",
+        ),
+        (lambda _, config: config["views"][0].update(steel_px=1, scored_px=2), "invalid", "configs.lattice.views"),
         (lambda _, config: config["rig"].update(width=-5), "invalid", "configs.lattice.rig.width"),
         (lambda _, config: config["views"].append(config["views"][0]), "duplicate", "configs.lattice.views"),
         (lambda _, config: config["views"][0].update(view_id="pile/0000"), "invalid", "configs.lattice.views"),
@@ -217,23 +246,38 @@ def test_damaged_manifest_raises_dataset_error(
     assert manifest_problems(tmp_path, manifest) == [(code, where)]
 
 
-def test_problems_of_all_configs_are_listed(manifest: Any, tmp_path: Path) -> None:
+def test_problems_of_head_and_all_configs_are_listed(manifest: Any, tmp_path: Path) -> None:
+    del manifest["version"]
     for entry in manifest["configs"].values():
         entry["shards"] = "test.parquet"
-    expected = [("invalid", f"configs.{name}.shards") for name in ("lattice", "lattice-orbit")]
+    expected = [("missing", "version")] + [
+        ("invalid", f"configs.{name}.shards") for name in ("lattice", "lattice-orbit")
+    ]
     assert manifest_problems(tmp_path, manifest) == expected
 
 
-def test_manifest_that_is_not_json_is_rejected(tmp_path: Path) -> None:
-    for content in (b"", b"\xff\xfe\x00", b"[" * 100_000, b"1" * 5000):
-        (tmp_path / "manifest.json").write_bytes(content)
-        with pytest.raises(rdb.DatasetError, match="cannot be read as JSON"):
-            open_folder(tmp_path)
+@pytest.mark.parametrize(
+    ("content", "code"),
+    [
+        (b"", "syntax"),
+        (b"\xff\xfe\x00", "syntax"),
+        (b"1" * 5000, "syntax"),
+        (b"[" * 100_000, "size"),
+        (b'{"format": "a", "format": "b"}', "duplicate"),
+        (b" " * (65 << 20), "size"),
+    ],
+)
+def test_manifest_that_is_not_json_is_rejected(tmp_path: Path, content: bytes, code: str) -> None:
+    (tmp_path / "manifest.json").write_bytes(content)
+    with pytest.raises(rdb.DatasetError) as caught:
+        open_folder(tmp_path)
+    assert [problem.code for problem in caught.value.problems] == [code]
 
 
 def test_board_is_read_from_manifest(manifest: Any, tmp_path: Path) -> None:
-    manifest["configs"]["lattice"]["scene"]["board"]["markers"] = 12
-    manifest["configs"]["lattice-orbit"]["scene"]["board"] = None
+    for entry, markers in zip(manifest["configs"].values(), (12, None), strict=True):
+        entry["scene"]["name"] += str(markers)
+        entry["scene"]["board"] = None if markers is None else entry["scene"]["board"] | {"markers": markers}
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     folder = open_folder(tmp_path)
     assert folder.config("lattice").scene.board == BoardSpec(markers=12)
@@ -241,7 +285,7 @@ def test_board_is_read_from_manifest(manifest: Any, tmp_path: Path) -> None:
 
 
 def test_view_id_of_shard_that_manifest_lacks_is_rejected(tiny_root: Path, tmp_path: Path) -> None:
-    copy = shutil.copytree(tiny_root, tmp_path / "copy", ignore=shutil.ignore_patterns(".rebar-cache"))
+    copy = shutil.copytree(tiny_root, tmp_path / "copy")
     shard = next(copy.glob("lattice-orbit/*.parquet"))
     table = pq.read_table(shard)
     rows = [row | {"view_id": "../../../x/evil"} for row in table.to_pylist()]
@@ -252,7 +296,7 @@ def test_view_id_of_shard_that_manifest_lacks_is_rejected(tiny_root: Path, tmp_p
 
 @pytest.mark.parametrize("streaming", [True, False])
 def test_load_with_missing_shard_raises_dataset_error(tiny_root: Path, tmp_path: Path, streaming: bool) -> None:
-    copy = shutil.copytree(tiny_root, tmp_path / "copy", ignore=shutil.ignore_patterns(".rebar-cache"))
+    copy = shutil.copytree(tiny_root, tmp_path / "copy")
     next(copy.glob("lattice/test-00000-*.parquet")).unlink()
     load: Any = rdb.load
     with pytest.raises(rdb.DatasetError, match="has no lattice/test-00000"):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rebar_depth_bench.data.dataset import COLUMNS, ROW_SCHEMA, features, iterate_undecoded, load_undecoded
+from rebar_depth_bench.data.columns import COLUMNS, ROW_SCHEMA, features
+from rebar_depth_bench.data.dataset import iterate_undecoded, load_undecoded
 from rebar_depth_bench.data.manifest import open_folder
 
 

@@ -17,11 +17,10 @@ import pytest
 
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
-from dataset_builder.audit.files import array_problems, row_problems
+from dataset_builder.audit.files import row_problems
 from dataset_builder.audit.run import VIEW_CHECKS
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.scoring.ground_truth import CACHE_FOLDER
 
 Row = dict[str, Any]
 
@@ -29,7 +28,7 @@ Row = dict[str, Any]
 @pytest.fixture
 def copy(tiny_root: Path, tmp_path: Path) -> Path:
     target = tmp_path / "dataset"
-    shutil.copytree(tiny_root, target, ignore=shutil.ignore_patterns(CACHE_FOLDER))
+    shutil.copytree(tiny_root, target)
     return target
 
 
@@ -45,7 +44,7 @@ def test_correct_dataset_passes_with_measured_values(tiny_root: Path) -> None:
     process = subprocess.run(command, capture_output=True, text=True, check=False, env={"COLUMNS": "160"})
     assert process.returncode == 0, process.stdout + process.stderr
     assert "FAILED" not in process.stdout
-    assert process.stdout.count(" ok ") == 2 + 2 * (3 + len(VIEW_CHECKS))
+    assert process.stdout.count(" ok ") == 1 + 2 * (3 + len(VIEW_CHECKS))
     assert "2 views: median 0.0" in process.stdout  # micrometre agreement with Cycles
 
 
@@ -65,48 +64,8 @@ def test_changed_missing_and_extra_files_are_reported(copy: Path) -> None:
     assert "lattice/extra.txt: is not in the manifest" in problems
 
 
-@pytest.mark.slow
-def test_wrong_ground_truth_digest_is_reported(copy: Path) -> None:
-    manifest = json.loads((copy / "manifest.json").read_text())
-    manifest["ground_truth"]["digest"] = "sha256:" + "0" * 64
-    (copy / "manifest.json").write_text(json.dumps(manifest))
-    assert (
-        f"the ground-truth digest is sha256:{'0' * 64}, expected sha256:"
-        in failed_checks(copy)["digests of the manifest"][0]
-    )
-
-
 def with_cells(row: Row, **cells: Any) -> Row:
     return {**row, **cells}
-
-
-@pytest.mark.parametrize(
-    ("damage", "words"),
-    [
-        (lambda row: {"left_depth": row["left_depth"].astype(np.float64)}, "left depth is float64"),
-        (
-            lambda row: {"right_rgb": row["right_rgb"][:-1]},
-            "right rgb is uint8 (89, 160, 3), expected uint8 (90, 160, 3)",
-        ),
-        (lambda row: {"left_depth": -row["left_depth"]}, "left depth has non-finite or negative values"),
-        (
-            lambda row: {"right_depth": row["right_depth"] + np.float32(np.nan)},
-            "right depth has non-finite or negative values",
-        ),
-        (lambda row: {"left_K": row["left_K"][:2]}, "left_K is not an array of finite numbers of shape (3, 3)"),
-        (
-            lambda row: {"right_distortion": row["right_distortion"] + np.inf},
-            "right_distortion is not an array of finite numbers of shape (5,)",
-        ),
-    ],
-)
-def test_malformed_arrays_are_reported(
-    tiny_root: Path, row: Row, damage: Callable[[Row], Row], words: str
-) -> None:
-    grid = open_folder(tiny_root).config("lattice").grid
-    assert list(array_problems(row, grid)) == []
-    problems = list(array_problems(with_cells(row, **damage(row)), grid))
-    assert any(words in problem for problem in problems), problems
 
 
 @pytest.mark.parametrize(

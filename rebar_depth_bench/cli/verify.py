@@ -1,0 +1,38 @@
+"""The ``rebar-bench verify`` command."""
+
+from __future__ import annotations
+
+import argparse
+
+from rebar_depth_bench.cli.dataset_options import add_expect_digest
+from rebar_depth_bench.console import ProgressBars
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.verification import file_problems, truth_problems
+from rebar_depth_bench.errors import DatasetError
+
+SUMMARY = "compare every file, view and digest of a dataset with its manifest"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    parser.add_argument("root", metavar="ROOT", help="dataset folder or Hub repository id (ORG/NAME@REVISION)")
+    parser.add_argument(
+        "--files-only",
+        action="store_true",
+        help="compare the SHA-256 of the files, and do not decode the views to compare their ground truth",
+    )
+    add_expect_digest(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Verify a dataset; raise ``DatasetError`` with all of its problems."""
+    folder = open_folder(options.root, expect_digest=options.expect_digest)
+    with ProgressBars() as bars:
+        problems = list(file_problems(folder, bars.update))
+        if not problems and not options.files_only:  # Views of damaged files cannot be compared.
+            for config in folder.config_by_name.values():
+                problems += truth_problems(config, bars.update)
+    if problems:
+        raise DatasetError.from_problems(options.root, problems)
+    views = "" if options.files_only else f", {len(folder.expected_views())} views"
+    print(f"{options.root}: no problem found in {len(folder.files)} files{views}; dataset {folder.digest}")

@@ -1,0 +1,72 @@
+"""Decoding of a row's cells to NumPy arrays of the shapes of its config."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+from rebar_depth_bench.data import codecs
+from rebar_depth_bench.data.columns import column_kind
+from rebar_depth_bench.data.eye_view import CAMERA_KINDS, camera_array
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.errors import DatasetError, escape_text
+
+_IMAGE_DECODERS: Mapping[str, Callable[[bytes, tuple[int, int]], Any]] = {
+    "rgb": codecs.decode_rgb,
+    "mask": codecs.decode_mask,
+    "bars": codecs.decode_bars,
+    "preview": codecs.decode_rgb,
+}
+
+
+@dataclass(frozen=True)
+class RowDecoder:
+    """Decoder of the rows of a config; it is small and can be pickled for worker processes.
+
+    ``grid`` is the image size (height, width) that every cell must have.
+    """
+
+    root: str
+    config: str
+    grid: tuple[int, int]
+    view_ids: tuple[str, ...]
+
+    @classmethod
+    def of(cls, config: DatasetConfig) -> Self:
+        """Return the decoder of a config."""
+        return cls(config.root, config.name, config.grid, config.view_ids)
+
+    def row(self, row: Mapping[str, Any]) -> dict[str, Any]:
+        """Decode the cells of a row. Raises ``DatasetError`` naming view and column if a cell is damaged."""
+        view = str(row.get("view_id", f"a view of {self.config}"))
+        return {name: self._decode(name, cell, view) for name, cell in row.items()}
+
+    def batch(self, batch: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
+        """Decode a dict of columns, the format that ``datasets`` passes to a transform, as ``row`` does."""
+        rows = [self.row(dict(zip(batch, cells, strict=True))) for cells in zip(*batch.values(), strict=True)]
+        return {name: [row[name] for row in rows] for name in batch}
+
+    def _decode(self, column: str, cell: Any, view: str) -> Any:
+        try:
+            return self._decode_kind(column_kind(column), cell)
+        except Exception as error:  # Pillow raises many types, which depend on the damage.
+            reason = escape_text(str(error) or type(error).__name__)
+            raise DatasetError(
+                f"{self.root}: view {escape_text(view)}: {column} is damaged: {reason}; "
+                f"rebar-bench verify {self.root} lists damaged files"
+            ) from error
+
+    def _decode_kind(self, kind: str, cell: Any) -> Any:
+        if kind in _IMAGE_DECODERS:
+            return _IMAGE_DECODERS[kind](cell["bytes"], self.grid)
+        if kind == "depth":
+            return codecs.decode_depth(cell, self.grid)
+        if kind in CAMERA_KINDS:
+            return camera_array(kind, cell)
+        if kind == "view_id" and cell not in self.view_ids:
+            raise ValueError("it is not in the manifest")
+        if kind == "baseline_m" and not (isinstance(cell, float) and math.isfinite(cell)):
+            raise ValueError(f"got {cell}, expected a length in metres")
+        return cell

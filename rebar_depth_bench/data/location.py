@@ -1,0 +1,110 @@
+"""Places of datasets: a local folder, or a Hub repository at one commit, and the files in them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import BinaryIO, cast
+
+from pydantic import ConfigDict
+
+from rebar_depth_bench.errors import DatasetError, InputError, escape_text
+from rebar_depth_bench.paths import PATH_PATTERN, path_below
+from rebar_depth_bench.reading import open_regular
+from rebar_depth_bench.validation import StrictModel
+
+_HUB_NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,95}"
+_HUB_ROOT_PATTERN = re.compile(rf"(?P<repository>{_HUB_NAME}/{_HUB_NAME})(@(?P<revision>{PATH_PATTERN}))?")
+
+
+class Located(StrictModel):
+    """Dataset, or part of one.
+
+    ``root`` is a folder path, or the id of a Hub repository with an optional ``@REVISION`` (branch, tag or
+    commit); ``commit`` is the revision of the Hub that files are read from, empty for a local folder.
+    """
+
+    model_config = ConfigDict(extra="ignore")
+
+    root: str
+    commit: str = ""
+
+    @property
+    def local(self) -> Path | None:
+        """Path of a local dataset folder, or None for a Hub repository."""
+        path = Path(self.root)
+        return path if path.is_dir() else None
+
+    def file(self, name: str) -> Path:
+        """Return the local path of a file of the dataset, downloaded first if the dataset is a Hub repository.
+
+        Raises ``DatasetError`` if the file is missing, not a regular file, or cannot be downloaded.
+        """
+        return local_path(self.root, name, self.commit)
+
+    def open(self, name: str) -> BinaryIO:
+        """Open a file of the dataset for reading; a file of the Hub that is not cached is read in ranges.
+
+        Raises ``DatasetError`` as ``file`` does.
+        """
+        if self.local is not None:
+            return open_regular(self.file(name))
+        from huggingface_hub import HfFileSystem, try_to_load_from_cache
+
+        repository, _ = _hub_root(self.root)
+        cached = try_to_load_from_cache(repository, name, repo_type="dataset", revision=self.commit)
+        if isinstance(cached, str):
+            return open_regular(Path(cached))
+        try:
+            return cast(BinaryIO, HfFileSystem().open(f"datasets/{repository}@{self.commit}/{name}"))
+        except Exception as error:  # The errors of the HTTP client have no base class in the Hub's package.
+            raise _download_error(self.root, name, error) from None
+
+
+def _hub_root(root: str) -> tuple[str, str | None]:
+    """Return the repository and the revision (None: the main branch) of a Hub root.
+
+    Raises ``DatasetError`` if the root is no such text.
+    """
+    match = _HUB_ROOT_PATTERN.fullmatch(root)
+    if match is None:
+        raise DatasetError(
+            f"{escape_text(root)}: no such folder, expected a dataset folder or a Hub repository id, ORG/NAME or "
+            "ORG/NAME@REVISION"
+        )
+    return match["repository"], match["revision"]
+
+
+def local_path(root: str, name: str, commit: str = "") -> Path:
+    """Return the local path of a regular file below ``root``; ``commit`` replaces the revision of a Hub root.
+
+    Raises ``DatasetError`` if ``root`` is neither a folder nor a Hub root, or as ``Located.file`` does.
+    """
+    folder = Path(root)
+    if folder.exists() and not folder.is_dir():
+        raise DatasetError(f"{root}: is a file, no such folder")
+    path = path_below(folder, name) if folder.is_dir() else _download(root, name, commit)
+    try:
+        open_regular(path).close()
+    except FileNotFoundError:
+        raise DatasetError(
+            f"{root}: has no {name}, expected a complete dataset folder written by rebar-build"
+        ) from None
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from None
+    return path
+
+
+def _download(root: str, name: str, commit: str) -> Path:
+    # Imported on use: it takes a fifth of a second, which local folders do not need.
+    from huggingface_hub import hf_hub_download
+
+    repository, revision = _hub_root(root)
+    try:
+        return Path(hf_hub_download(repository, name, repo_type="dataset", revision=commit or revision))
+    except Exception as error:  # The errors of the HTTP client have no base class in the Hub's package.
+        raise _download_error(root, name, error) from None
+
+
+def _download_error(root: str, name: str, error: Exception) -> InputError:
+    return DatasetError(f"{root}: not a local folder, and its {name} cannot be downloaded from the Hub: {error}")

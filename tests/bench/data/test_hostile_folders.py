@@ -1,0 +1,314 @@
+"""Damaged and hostile dataset folders: each is refused with a ``DatasetError``, in little time and memory."""
+
+from __future__ import annotations
+
+import io
+import os
+import resource
+import struct
+import subprocess
+import sys
+import time
+import tracemalloc
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+import rebar_depth_bench as rdb
+from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.data.bars import BARS_SCHEMA, read_bars
+from rebar_depth_bench.data.codecs import encode_depth, encode_mask
+from rebar_depth_bench.data.columns import COLUMNS
+from rebar_depth_bench.data.dataset import iterate_rows
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.limits import CELL_BYTES, TABLE_BYTES
+from tests.commands import run_in_process
+from tests.damage import change_manifest, change_rows, copy_dataset, first_shard
+
+Rows = list[dict[str, Any]]
+CONFIG = "lattice-orbit"
+GRID = (90, 160)
+
+
+@pytest.fixture
+def copy(tiny_root: Path, tmp_path: Path) -> Path:
+    return copy_dataset(tiny_root, tmp_path / "dataset")
+
+
+def read_all(root: Path) -> Rows:
+    return list(iterate_rows(open_folder(root).config(CONFIG), COLUMNS))
+
+
+def refusal(root: Path) -> str:
+    """Return the message with which a config is refused by the iterator and by both ways to load it."""
+    with pytest.raises(rdb.DatasetError) as raised:
+        read_all(root)
+    for streaming in (False, True):
+        with pytest.raises(rdb.DatasetError):
+            list(rdb.load(root, CONFIG, streaming=streaming))
+    return str(raised.value)
+
+
+def png(array: np.ndarray) -> dict[str, Any]:
+    stream = io.BytesIO()
+    Image.fromarray(array).save(stream, "PNG")
+    return {"bytes": stream.getvalue(), "path": None}
+
+
+def tiff(array: np.ndarray, **options: Any) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(array).save(stream, "TIFF", **options)
+    return stream.getvalue()
+
+
+IDENTITY = np.eye(4).tolist()
+TURNED = [[0.0, 2.0, 0.0, 0.0], *IDENTITY[1:]]
+MIRRORED = [[-1.0, 0.0, 0.0, 0.0], *IDENTITY[1:]]
+
+
+@pytest.mark.parametrize(
+    ("column", "cell"),
+    [
+        ("left_depth", b""),
+        ("left_depth", None),
+        ("left_depth", b"II*\0" + b"\xff" * 100),
+        ("left_depth", encode_depth(np.ones((90, 161), np.float32))),
+        ("left_depth", tiff(np.ones(GRID, np.uint8))),
+        ("left_depth", tiff(np.ones(GRID, np.int32))),
+        ("left_depth", encode_depth(np.full(GRID, np.inf, np.float32))),
+        ("left_depth", encode_depth(np.full(GRID, np.nan, np.float32))),
+        ("left_depth", encode_depth(np.full(GRID, -1, np.float32))),
+        ("right_depth", encode_depth(np.ones(GRID, np.float32))[:-20]),
+        ("left_mask", {"bytes": encode_mask(np.ones((180, 160), bool)), "path": None}),
+        ("left_mask", {"bytes": None, "path": "/etc/hostname"}),
+        ("left_mask", None),
+        ("left_bars", png(np.ones((90, 160, 3), np.uint8))),
+        ("left_rgb", {"bytes": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 160 90\n", "path": None}),
+        ("right_rgb", png(np.ones((91, 160, 3), np.uint8))),
+        ("left_preview", {"bytes": b"RIFF\x00\x00\x00\x00WEBPVP8X", "path": None}),
+        ("left_K", [[np.nan] * 3] * 3),
+        ("right_distortion", [0.0, np.inf, 0.0, 0.0, 0.0]),
+        ("left_cam_from_world", TURNED),
+        ("left_cam_from_world", MIRRORED),
+        ("left_cam_from_world", [*IDENTITY[:3], [0.0, 0.0, 1.0, 1.0]]),
+        ("baseline_m", np.nan),
+        ("baseline_m", None),
+    ],
+)
+def test_damaged_cell_names_view_and_column(copy: Path, column: str, cell: Any) -> None:
+    change_rows(first_shard(copy), lambda rows: rows[1].update({column: cell}))
+    message = refusal(copy)
+    assert f"view {CONFIG}/0075: {column} is damaged" in message
+    assert f"rebar-bench verify {copy}" in message
+
+
+def test_cell_above_the_limit_is_refused(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CELL_BYTES.variable, "10000")
+    with pytest.raises(rdb.DatasetError, match=CELL_BYTES.variable):
+        read_all(copy)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("column", ["left_depth", "left_mask"])
+def test_large_image_is_refused_before_it_is_decoded(copy: Path, column: str) -> None:
+    """Refuse an image of 12,000 x 12,000 in a few kilobytes; decoded, it takes 576 MB as depth."""
+    cells: dict[str, Callable[[], Any]] = {
+        "left_depth": lambda: encode_depth(np.zeros((12_000, 12_000), np.float32)),
+        "left_mask": lambda: {"bytes": encode_mask(np.zeros((12_000, 12_000), bool)), "path": None},
+    }
+    cell = cells[column]()
+    change_rows(first_shard(copy), lambda rows: rows[0].update({column: cell}))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    tracemalloc.start()
+    with pytest.raises(rdb.DatasetError, match=f"{CONFIG}/0025: {column} is damaged"):
+        read_all(copy)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 30e6
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100e3  # kilobytes
+
+
+def test_tiff_of_tiles_is_refused(copy: Path) -> None:
+    """Refuse tiles, which may be larger than the image and are decoded as a whole."""
+    tags = {256: 160, 257: 90, 258: 32, 259: 1, 262: 1, 277: 1, 322: 16384, 323: 16384, 324: 8, 325: 4, 339: 3}
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+    depth = b"II*\0" + struct.pack("<IIH", 12, 0, len(tags)) + entries + bytes(4)
+    change_rows(first_shard(copy), lambda rows: rows[0].update(left_depth=depth))
+    assert "left_depth is damaged" in refusal(copy)
+
+
+def write_table(shard: Path, change: Callable[[pa.Table], pa.Table], **options: Any) -> None:
+    pq.write_table(change(pq.read_table(shard)), shard, **options)
+
+
+def with_column(table: pa.Table, name: str, column: pa.Array) -> pa.Table:
+    return table.set_column(table.schema.get_field_index(name), name, column)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda table: table.drop_columns(["left_mask"]), "0 columns left_mask"),
+        (lambda table: with_column(table, "left_depth", pa.array([1, 2])), "column left_depth is int64"),
+        (lambda table: with_column(table, "left_K", pa.array([[1.0], [2.0]])), "ListType can only be casted"),
+        (
+            lambda table: with_column(table, "left_K", pa.array([[[1.0] * 100_000]] * 2)),
+            "column left_K has 200000 values, expected at most 18",
+        ),
+        (lambda table: pa.concat_tables([table, table]), "4 rows, expected at most 2"),
+        (lambda table: table.slice(0, 1), r"lacks 1 views, among them lattice-orbit/0075"),
+        (lambda table: table.take([0, 0]), "view lattice-orbit/0025 occurs twice"),
+    ],
+)
+def test_shard_of_other_schema_or_rows_is_refused(
+    copy: Path, change: Callable[[pa.Table], pa.Table], said: str
+) -> None:
+    write_table(first_shard(copy), change)
+    with pytest.raises(rdb.DatasetError, match=said):
+        read_all(copy)
+
+
+def test_compression_that_expands_a_thousandfold_is_refused(copy: Path) -> None:
+    write_table(first_shard(copy), lambda table: table, compression="zstd")
+    assert "compressed otherwise than expected: none or snappy" in refusal(copy)
+
+
+def test_view_ids_of_rows_are_those_of_the_manifest(copy: Path) -> None:
+    """Refuse the rows of a renamed config, which would score as an empty table."""
+
+    def rename(manifest: Any, config: Any) -> None:
+        manifest["configs"]["other"] = manifest["configs"].pop("lattice-orbit")
+        config["name"] = "other"
+        for view in config["views"]:
+            view["view_id"] = view["view_id"].replace("lattice-orbit", "other")
+
+    change_manifest(copy, rename, CONFIG)
+    with pytest.raises(rdb.DatasetError, match="view lattice-orbit/0025 is not in the manifest"):
+        list(iterate_rows(open_folder(copy).config("other"), ["left_K"]))
+    with pytest.raises(rdb.DatasetError, match="view_id is damaged: it is not in the manifest"):
+        list(rdb.load(copy, "other", columns=["view_id"]))
+
+
+def test_shards_truncated_or_changed_anywhere_never_raise_another_error(copy: Path) -> None:
+    shard = first_shard(copy)
+    content, folder, rng = shard.read_bytes(), open_folder(copy), np.random.default_rng(0)
+    footer_bytes = int.from_bytes(content[-8:-4], "little")
+    accepted = 0  # Changes of metadata that nothing depends on.
+    for count, position in enumerate(rng.integers(len(content) - footer_bytes - 8, len(content), 200)):
+        changed = bytearray(content)
+        changed[position] ^= rng.integers(1, 256)
+        shard.write_bytes(changed if count % 4 else content[:position])
+        with suppress(rdb.DatasetError):
+            list(iterate_rows(folder.config(CONFIG), ["view_id", "left_K", "left_mask"]))
+            accepted += 1
+    assert accepted < 100
+
+
+def test_pipes_in_place_of_files_do_not_hang(copy: Path) -> None:
+    shard = first_shard(copy).relative_to(copy).as_posix()
+    names = ("README.md", "bars.parquet", "meshes/lattice.ply", "pictures/scenes.webp", shard)
+    for name in names:
+        replace_with_pipe(copy / name)
+    finished = run_in_process(main, "verify", copy)
+    assert finished.returncode == 2
+    assert all(f"{name}: cannot be read: it is a named pipe" in finished.stderr for name in names)
+    assert "named pipe" in refusal(copy)
+    with pytest.raises(rdb.DatasetError, match="named pipe"):
+        read_bars(copy / "bars.parquet")
+    replace_with_pipe(copy / "manifest.json")
+    with pytest.raises(rdb.DatasetError, match="named pipe"):
+        open_folder(copy)
+
+
+def replace_with_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def test_shards_that_are_links_are_read(copy: Path, tmp_path: Path) -> None:
+    """Read a snapshot of the Hub, which consists of links."""
+    shard = first_shard(copy)
+    blob = shard.rename(tmp_path / "blob")
+    shard.symlink_to(blob)
+    assert len(read_all(copy)) == 2
+    assert len(rdb.load(copy, CONFIG)) == 2
+
+
+ALIAS_BOMB = "---\na0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]\n" for level in range(1, 8)
+)
+OUTSIDE = "---\nconfigs:\n- config_name: lattice-orbit\n  data_files:\n  - split: test\n    path: /etc/*\n---\n"
+
+
+@pytest.mark.parametrize("card", [ALIAS_BOMB + "---\n", OUTSIDE, "---\nx: [\n---\n", "---\nconfigs: 7\n---\n"])
+def test_load_never_reads_the_card(copy: Path, card: str) -> None:
+    (copy / "README.md").write_text(card)
+    rdb.load(copy, CONFIG)
+    start = time.process_time()
+    for streaming in (False, True):
+        loaded = rdb.load(copy, CONFIG, streaming=streaming, columns=["view_id"])
+        assert [row["view_id"] for row in loaded] == ["lattice-orbit/0025", "lattice-orbit/0075"]
+    assert time.process_time() - start < 1
+
+
+def test_rebuilt_shard_is_noticed_by_the_cache(copy: Path) -> None:
+    first = rdb.load(copy, CONFIG)[0]["baseline_m"]
+    change_rows(first_shard(copy), lambda rows: [row.update(baseline_m=first + 1) for row in rows])
+    assert rdb.load(copy, CONFIG)[0]["baseline_m"] == first + 1
+    assert rdb.load(copy, CONFIG).info.config_name == CONFIG
+
+
+def test_folder_whose_name_is_a_pattern_is_loaded(tiny_root: Path, tmp_path: Path) -> None:
+    root = copy_dataset(tiny_root, tmp_path / "[a] *" / ".hidden")
+    assert len(rdb.load(root, CONFIG)) == 2
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "said"),
+    [
+        ([{"scene": "../x"}], {}, "name of the scene"),
+        ([{"scene": "a\x1b[2J"}], {}, "name of the scene"),
+        ([{"role": "a\x1b[2J"}], {}, "role is"),
+        ([{"axis": [[0.0, 0.0, 0.0]] * 100_000}], {}, "decoded bytes"),
+        ([{"bar_id": index} for index in range(1, 20_000)], {}, "rows, expected at most"),
+        ([{}], {"compression": "gzip"}, "compressed otherwise"),
+    ],
+)
+def test_bars_are_checked_before_they_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: Rows, options: Any, said: str
+) -> None:
+    monkeypatch.setenv(TABLE_BYTES.variable, "1000000")
+    axis = [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    bar = {"scene": "pier", "bar_id": 1, "role": "tie", "diameter_m": 0.016, "axis": axis}
+    table = pa.Table.from_pylist([bar | row for row in rows], schema=BARS_SCHEMA)
+    pq.write_table(table, tmp_path / "bars.parquet", **options)
+    with pytest.raises(rdb.DatasetError, match=said):
+        read_bars(tmp_path / "bars.parquet")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("streaming", ["False", "True"])
+def test_hostile_folder_is_refused_within_a_gigabyte(copy: Path, streaming: str) -> None:
+    depth = encode_depth(np.zeros((12_000, 12_000), np.float32))
+    change_rows(first_shard(copy), lambda rows: rows[0].update(left_depth=depth))
+    (copy / "README.md").write_text(ALIAS_BOMB + "---\n")
+    code = f"""
+import rebar_depth_bench as rdb, resource, sys
+loaded = rdb.load(sys.argv[1], "{CONFIG}", streaming={streaming})
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    list(loaded)
+except rdb.DatasetError as error:
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+    command = [sys.executable, "-c", code, str(copy)]
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert finished.returncode == 0, finished.stderr
+    assert int(finished.stdout) < 100_000  # kilobytes
