@@ -31,6 +31,7 @@ from rebar_depth_bench.methods.monocular.metric3d import METRIC3D, cached_metric
 from rebar_depth_bench.methods.monocular.unidepth import UNIDEPTH, UNIDEPTH_MODEL
 from rebar_depth_bench.methods.multiview import COLMAP_ANCHORED, COLMAP_ARUCO, SWEEP_ANCHORED, SWEEP_ARUCO
 from rebar_depth_bench.methods.onnx.model import onnx_method
+from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S
 from rebar_depth_bench.methods.stereo.foundation_stereo import FOUNDATION_STEREO, foundation_stereo_method
 from rebar_depth_bench.methods.stereo.sgbm import SGBM, SGBM_FILLED
 
@@ -69,8 +70,10 @@ The commit or digest of the weights (and code) becomes part of the summary. List
 """
 
 
-def find_method(name: str) -> AnyMethod:
+def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S) -> AnyMethod:
     """Return the method of a name; the module docstring lists the accepted forms.
+
+    ``view_timeout_s`` limits the inference of a view by an ONNX model.
 
     For ``FROM_HUB`` and ``hf:`` names, the files that identify the weights are downloaded if they are not cached.
 
@@ -88,7 +91,7 @@ def find_method(name: str) -> AnyMethod:
             raise MethodError(f"{path}: has no {attribute}, expected the name of a method in it")
         return _with_file_digest(Path(path), _require_method(name, getattr(module, attribute)))
     if name.endswith(".toml"):
-        return onnx_method(Path(name))
+        return onnx_method(Path(name), view_timeout_s)
     if name in FROM_HUB:
         return FROM_HUB[name]()
     if name in METHODS:

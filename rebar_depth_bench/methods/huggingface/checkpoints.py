@@ -5,7 +5,6 @@ Downloads from the Hub are always announced on standard error.
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ from typing import Any
 from rebar_depth_bench.data.digests import files_digest
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.monocular.hub import hub_download, local_copy_hint, snapshot
+from rebar_depth_bench.methods.monocular.third_party import read_json_object
 
 CONFIG, PREPROCESSOR = "config.json", "preprocessor_config.json"
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
@@ -48,7 +48,7 @@ def find_checkpoint(name_or_path: str) -> Checkpoint:
     """
     folder = Path(name_or_path).expanduser()
     if name_or_path and folder.is_dir():
-        config = _read_json_object(folder / CONFIG)
+        config = _read_settings(folder / CONFIG)
         return Checkpoint(folder.resolve().name, folder, None, _weights_digest(folder), config)
     if not _REPOSITORY.fullmatch(name_or_path):
         raise MethodError(
@@ -56,9 +56,7 @@ def find_checkpoint(name_or_path: str) -> Checkpoint:
             f"{CONFIG} or ORG/NAME"
         )
     folder = snapshot(name_or_path, CONFIG, _local_copy_hint(name_or_path))
-    return Checkpoint(
-        name_or_path, folder, name_or_path, f"commit {folder.name}", _read_json_object(folder / CONFIG)
-    )
+    return Checkpoint(name_or_path, folder, name_or_path, f"commit {folder.name}", _read_settings(folder / CONFIG))
 
 
 def ensure_weights(checkpoint: Checkpoint) -> None:
@@ -79,7 +77,7 @@ def read_preprocessor_config(checkpoint: Checkpoint) -> dict[str, Any]:
 
     There are no default values: at an input size other than that of training, a network silently performs worse.
     """
-    return _read_json_object(checkpoint.folder / PREPROCESSOR)
+    return _read_settings(checkpoint.folder / PREPROCESSOR)
 
 
 def _weight_files(folder: Path) -> list[Path]:
@@ -93,19 +91,12 @@ def _weights_digest(folder: Path) -> str:
     return f"sha256:{files_digest(path for path in files if path.is_file())}"
 
 
-def _read_json_object(path: Path) -> dict[str, Any]:
-    """Return the content of a JSON file. Raises ``MethodError`` if it is missing, unreadable or not an object."""
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+def _read_settings(path: Path) -> dict[str, Any]:
+    if not path.exists():
         raise MethodError(
             f"{path.parent}: no {path.name}, expected a checkpoint folder as written by save_pretrained"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise MethodError(f"{path}: cannot be read: {error}") from None
-    if not isinstance(value, dict):
-        raise MethodError(f"{path}: is {type(value).__name__}, expected a JSON object")
-    return value
+        )
+    return read_json_object(path)
 
 
 def _fetch_weights(repository: str, commit: str) -> None:

@@ -19,6 +19,7 @@ from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.validation import short_repr
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -56,8 +57,9 @@ def _dpt(config: Mapping[str, Any]) -> OutputKind:
 
     Checkpoints on DINOv2 are the metric heads that its authors trained on NYU and KITTI.
     """
-    backbone = config.get("backbone_config") or {}
-    return OutputKind.METRES if backbone.get("model_type") == "dinov2" else OutputKind.INVERSE
+    backbone = config.get("backbone_config")
+    is_dinov2 = isinstance(backbone, dict) and backbone.get("model_type") == "dinov2"
+    return OutputKind.METRES if is_dinov2 else OutputKind.INVERSE
 
 
 FAMILIES: Mapping[str, ModelFamily] = {
@@ -84,7 +86,9 @@ def family_of(config: Mapping[str, Any], where: str) -> ModelFamily:
     if isinstance(model_type, str) and model_type in FAMILIES:
         return FAMILIES[model_type]
     reason = f" ({_UNSUPPORTED[model_type]})" if isinstance(model_type, str) and model_type in _UNSUPPORTED else ""
-    raise MethodError(f"{where}: model_type is {model_type!r}{reason}, expected one of {', '.join(FAMILIES)}")
+    raise MethodError(
+        f"{where}: model_type is {short_repr(model_type)}{reason}, expected one of {', '.join(FAMILIES)}"
+    )
 
 
 def network_output_to_depth_m(

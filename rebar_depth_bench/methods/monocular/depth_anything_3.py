@@ -10,7 +10,6 @@ not be downloaded.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,9 +26,11 @@ from rebar_depth_bench.methods.monocular.third_party import (
     check_weights_loaded,
     import_package,
     import_torch,
+    read_json_object,
     safetensors_names,
     translate_errors,
 )
+from rebar_depth_bench.validation import short_repr
 
 NAME, REPOSITORY = "depth-anything-3", "depth-anything/DA3METRIC-LARGE"
 PRESET = "da3metric-large"
@@ -89,14 +90,11 @@ def _resize_to_left_grid(
 
 def check_preset(folder: Path) -> None:
     """Raise ``MethodError`` if ``config.json`` in a folder belongs to another model of the family."""
-    try:
-        preset = json.loads((folder / CONFIG).read_text(encoding="utf-8")).get("model_name")
-    except (OSError, ValueError, AttributeError) as error:
-        raise MethodError(f"{folder / CONFIG}: cannot be read as a JSON object: {error}") from None
+    preset = read_json_object(folder / CONFIG).get("model_name")
     if preset != PRESET:
         raise MethodError(
-            f"{NAME}:{folder}: config.json names model {preset!r}, expected {PRESET!r}: only its output can be "
-            "converted to metres with the focal length"
+            f"{NAME}:{folder}: config.json names model {short_repr(preset)}, expected {PRESET!r}: only its output "
+            "can be converted to metres with the focal length"
         )
 
 

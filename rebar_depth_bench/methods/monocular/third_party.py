@@ -14,8 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from rebar_depth_bench.data.digests import files_digest
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.errors import MethodError, Problem
+from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.methods.base import MethodInfo
+from rebar_depth_bench.reading import parse_json, read_file
+from rebar_depth_bench.validation import short_repr
 
 MIN_LOADED_FRACTION = 0.99
 """Smallest fraction of a network's parameters that a checkpoint must contain; an unused token may be missing."""
@@ -40,6 +43,16 @@ def check_folder(folder: Path, name: str, required_files: Sequence[str]) -> None
     for file in required_files:
         if not (folder / file).is_file():
             raise MethodError(f"{name}:{folder}: no {file} in it, expected {' and '.join(required_files)}")
+
+
+def read_json_object(path: Path) -> dict[str, Any]:
+    """Return the content of a model's JSON file. Raises ``MethodError`` if it cannot be read or is no object."""
+    value, problems = parse_json(read_file(path, JSON_BYTES, "a JSON file", MethodError))
+    if not problems and not isinstance(value, dict):
+        problems = [Problem("invalid", "", f"got {short_repr(value)}", "a JSON object")]
+    if problems:
+        raise MethodError.from_problems(path, problems)
+    return dict(value)
 
 
 def import_package(module: str, method: str, install: str) -> Any:

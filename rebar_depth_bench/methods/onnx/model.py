@@ -21,7 +21,8 @@ from PIL import Image
 from rebar_depth_bench.data.digests import files_digest
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.onnx.session import OnnxSession, open_session
+from rebar_depth_bench.methods.onnx.external_data import external_files
+from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S, OnnxSession, open_session
 from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, InputSpec, OnnxSpec, OutputSpec, read_onnx_toml
 
 
@@ -168,13 +169,14 @@ TRIAL_SIZE_PX = (1280, 720)
 _DIGEST_CHARACTERS = 16
 
 
-def onnx_method(path: Path) -> Method:
+def onnx_method(path: Path, view_timeout_s: float = VIEW_TIMEOUT_S) -> Method:
     """Return the method that a TOML file describes; onnxruntime is imported when it is loaded.
 
     ``info.source`` ends with a digest of the TOML file, the model and the model's external data, so that a resumed
-    run does not reuse predictions of another model or other settings.
+    run does not reuse predictions of another model or other settings. ``view_timeout_s`` limits the inference of a
+    view.
 
-    Raises ``MethodError`` listing all problems of the file.
+    Raises ``MethodError`` listing all problems of the file, or those of the model's external data.
     """
     spec = read_onnx_toml(path)
     model, meaning = Path(spec.model), OUTPUT_MEANINGS[spec.output.meaning]
@@ -186,7 +188,7 @@ def onnx_method(path: Path) -> Method:
         source=f"{spec.source or model.name} (sha256:{_model_digest(path, model)})",
         licence=spec.licence,
     )
-    return Method(info, lambda: _load(spec))
+    return Method(info, lambda: _load(spec, view_timeout_s))
 
 
 def output_to_depth_m(
@@ -210,22 +212,20 @@ def output_to_depth_m(
     return np.where(valid, single, np.float32(np.nan))
 
 
-def _load(spec: OnnxSpec) -> Predictor:
-    session = open_session(Path(spec.model), spec.input, spec.output)
+def _load(spec: OnnxSpec, view_timeout_s: float) -> Predictor:
+    session = open_session(Path(spec.model), spec.input, spec.output, view_timeout_s)
     width, height = TRIAL_SIZE_PX
     # The output shape of a model with dynamic sizes is only known after a run.
-    session.run(
-        input_tensor(
-            spec.input, place_image(spec.input, width, height), np.zeros((height, width, 3), dtype=np.uint8)
-        )
-    )
+    black = np.zeros((height, width, 3), dtype=np.uint8)
+    session.run(input_tensor(spec.input, place_image(spec.input, width, height), black), "a black trial image")
     return lambda row: _predict(spec, session, row)
 
 
 def _predict(spec: OnnxSpec, session: OnnxSession, row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
     height, width, _ = row["left_rgb"].shape
     placement = place_image(spec.input, width, height)
-    values = session.run(input_tensor(spec.input, placement, row["left_rgb"]))
+    tensor = input_tensor(spec.input, placement, row["left_rgb"])
+    values = session.run(tensor, row.get("view_id", "the image"))
     canonical = OUTPUT_MEANINGS[spec.output.meaning].canonical
     fx_at_input_px = row["left_K"][0, 0] * placement.across.scale if canonical else np.nan
     # Invalid values become NaN before resampling, so that they are not interpolated with neighbours.
@@ -240,14 +240,9 @@ def _predict(spec: OnnxSpec, session: OnnxSession, row: Mapping[str, Any]) -> Fl
 
 
 def _model_digest(path: Path, model: Path) -> str:
-    """Return the digest of the TOML file, the model and its external data.
-
-    External data are the files beside the model whose names start with its name.
-    """
+    """Return the digest of the TOML file, the model and its external data."""
+    files = (path, model, *external_files(model))
     try:
-        model_files = sorted(
-            file for file in model.parent.iterdir() if file.name.startswith(model.name) and file.is_file()
-        )
-        return files_digest((path, *model_files))[:_DIGEST_CHARACTERS]
+        return files_digest(files)[:_DIGEST_CHARACTERS]
     except OSError as error:
         raise MethodError(f"{error.filename}: cannot be read: {error.strerror}") from None

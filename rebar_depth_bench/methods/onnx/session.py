@@ -15,7 +15,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from rebar_depth_bench.deadline import DeadlineError, call_within
 from rebar_depth_bench.errors import MethodError, Problem
+from rebar_depth_bench.limits import ONNX_MEMORY_BYTES
 from rebar_depth_bench.methods.onnx.spec import InputSpec, OutputSpec
 
 PROVIDERS = ("CUDAExecutionProvider", "CPUExecutionProvider")
@@ -25,15 +27,19 @@ _FLOAT_DTYPES: Mapping[str, type] = {
     "tensor(float16)": np.float16,
     "tensor(double)": np.float64,
 }
-_LOG_ERRORS_ONLY = 3
+_LOG_ERRORS_ONLY, _LOG_NOTHING = 3, 4
+VIEW_TIMEOUT_S = 600.0
+"""Default time limit on the inference of a view, seconds."""
 _MAX_ERROR_CHARACTERS = 300
+_OUT_OF_MEMORY = "Available memory of"
+"""Part of onnxruntime's message if its memory arena cannot grow any further."""
 
 
 @dataclass(frozen=True)
 class OnnxSession:
     """Open model with one RGB image as input; ``where`` is the file name for error messages.
 
-    ``at_input_size`` is True if the output must have the size of the input.
+    ``at_input_size`` is True if the output must have the size of the input. ``timeout_s`` limits each inference.
     """
 
     session: Any
@@ -42,15 +48,18 @@ class OnnxSession:
     input_dtype: type
     output_name: str
     at_input_size: bool
+    timeout_s: float
 
-    def run(self, tensor: Float64[ndarray, "1 3 h w"]) -> Float64[ndarray, "out_h out_w"]:
-        """Return the output map for one normalised image.
+    def run(self, tensor: Float64[ndarray, "1 3 h w"], view: str) -> Float64[ndarray, "out_h out_w"]:
+        """Return the output map for one normalised image; ``view`` names it in error messages.
 
-        Raises ``MethodError`` if the model fails, or if the output is not a single map or, with
-        ``at_input_size``, not of the input's size.
+        Raises ``MethodError`` if the model fails or exceeds the time limit, or if the output is not a single map
+        or, with ``at_input_size``, not of the input's size.
         """
         try:
-            [output] = self.session.run([self.output_name], {self.input_name: tensor.astype(self.input_dtype)})
+            output = self._infer(tensor.astype(self.input_dtype))
+        except DeadlineError:
+            raise MethodError(f"{self.where}: {view}: {_exceeded(self.timeout_s)}") from None
         except Exception as error:  # The exceptions of onnxruntime have no common base.
             size = " x ".join(map(str, tensor.shape))
             raise MethodError(f"{self.where}: fails on an input of {size}: {_error_text(error)}") from None
@@ -67,11 +76,25 @@ class OnnxSession:
             )
         return np.asarray(output, np.float64).reshape(shape[-2:])
 
+    def _infer(self, tensor: Any) -> Any:
+        """Return the output for an input tensor; onnxruntime stops at the time limit, between two operators."""
+        import onnxruntime
 
-def open_session(path: Path, input_spec: InputSpec, output_spec: OutputSpec) -> OnnxSession:
+        options = onnxruntime.RunOptions()
+        options.log_severity_level = _LOG_NOTHING
+        [output] = call_within(
+            self.timeout_s,
+            lambda: self.session.run([self.output_name], {self.input_name: tensor}, options),
+            lambda: setattr(options, "terminate", True),
+        )
+        return output
+
+
+def open_session(path: Path, input_spec: InputSpec, output_spec: OutputSpec, timeout_s: float) -> OnnxSession:
     """Open a model and check that its input and output match the TOML file.
 
-    Raises ``MethodError`` if onnxruntime is missing or cannot open the file, or if input or output do not match.
+    ``timeout_s`` limits opening, where onnxruntime computes constants, and each inference. Raises ``MethodError``
+    if onnxruntime is missing or cannot open the file, or if input or output do not match.
     """
     try:
         import onnxruntime
@@ -84,11 +107,18 @@ def open_session(path: Path, input_spec: InputSpec, output_spec: OutputSpec) -> 
     options.log_severity_level = _LOG_ERRORS_ONLY
     # Without a number, it pins threads to processors and prints an error for each that the process may not use.
     options.intra_op_num_threads = len(os.sched_getaffinity(0))
+    _limit_memory(onnxruntime, options)
     available = onnxruntime.get_available_providers()
+    providers = [name for name in PROVIDERS if name in available]
     try:
-        session = onnxruntime.InferenceSession(
-            str(path), options, providers=[name for name in PROVIDERS if name in available]
+        session = call_within(
+            timeout_s,
+            lambda: onnxruntime.InferenceSession(str(path), options, providers=providers),
+            # Versions before 1.21 do not have it.
+            lambda: getattr(options, "set_load_cancellation_flag", bool)(True),
         )
+    except DeadlineError:
+        raise MethodError(f"{path}: opening the model {_exceeded(timeout_s)}") from None
     except Exception as error:
         raise MethodError(f"{path}: onnxruntime cannot open this model: {_error_text(error)}") from None
     inputs, outputs = session.get_inputs(), session.get_outputs()
@@ -97,8 +127,28 @@ def open_session(path: Path, input_spec: InputSpec, output_spec: OutputSpec) -> 
     if problems or output is None:
         raise MethodError.from_problems(path, problems)
     return OnnxSession(
-        session, str(path), inputs[0].name, _FLOAT_DTYPES[inputs[0].type], output.name, output_spec.at_input_size
+        session,
+        str(path),
+        inputs[0].name,
+        _FLOAT_DTYPES[inputs[0].type],
+        output.name,
+        output_spec.at_input_size,
+        timeout_s,
     )
+
+
+def _limit_memory(onnxruntime: Any, options: Any) -> None:
+    """Give sessions a common CPU memory arena that cannot grow past the limit or the machine's memory."""
+    max_bytes = min(ONNX_MEMORY_BYTES.value(), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    arena, default = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, onnxruntime.OrtMemType.DEFAULT
+    onnxruntime.create_and_register_allocator(
+        onnxruntime.OrtMemoryInfo("Cpu", arena, 0, default), onnxruntime.OrtArenaCfg(max_bytes, -1, -1, -1)
+    )
+    options.add_session_config_entry("session.use_env_allocators", "1")
+
+
+def _exceeded(timeout_s: float) -> str:
+    return f"takes longer than the limit of {timeout_s:g} s, which --view-timeout changes"
 
 
 def _input_problems(inputs: Sequence[Any], spec: InputSpec) -> list[Problem]:
@@ -160,4 +210,5 @@ def _select_output(outputs: Sequence[Any], name_or_index: str | int | None, prob
 def _error_text(error: Exception) -> str:
     """Return the message of an exception on one line, truncated."""
     message = " ".join(str(error).split())
-    return message if len(message) <= _MAX_ERROR_CHARACTERS else f"{message[:_MAX_ERROR_CHARACTERS]} ..."
+    hint = f"; {ONNX_MEMORY_BYTES.variable} raises the limit" if _OUT_OF_MEMORY in message else ""
+    return f"{message[:_MAX_ERROR_CHARACTERS]}{' ...' if len(message) > _MAX_ERROR_CHARACTERS else ''}{hint}"

@@ -2,7 +2,7 @@
 
 ::
 
-    model = "model.onnx"            # relative to this file; external data must be beside the model
+    model = "model.onnx"            # relative to this file; external data must be in the folder of the model
     licence = "BSD-2-Clause"        # licence of the weights; required
     name = "my-model"               # optional (default: name of this file), as are summary and source
 
@@ -202,7 +202,7 @@ class OnnxSpec(StrictModel):
     def _find_model(cls, name: str, info: ValidationInfo[Path]) -> str:
         """Return the path of the ONNX file; ``info.context`` is the folder of the TOML file."""
         path = info.context / name
-        if not _is_file(path):
+        if not is_file(path):
             raise field_error(f"no such file: {path}", "the ONNX file", "missing")
         return str(path)
 
@@ -221,7 +221,8 @@ def read_onnx_toml(path: Path) -> OnnxSpec:
     return spec
 
 
-def _is_file(path: Path) -> bool:
+def is_file(path: Path) -> bool:
+    """Return whether ``path`` is a regular file or a link to one."""
     try:
         return path.is_file()
     except OSError:  # The name is too long for the file system.

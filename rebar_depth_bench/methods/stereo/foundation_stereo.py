@@ -21,7 +21,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.errors import MethodError, exception_summary
+from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.monocular.conversions import crop_margins, margins_to_multiple, padded
 from rebar_depth_bench.methods.monocular.third_party import (
@@ -34,6 +35,7 @@ from rebar_depth_bench.methods.monocular.third_party import (
     with_weights_digest,
 )
 from rebar_depth_bench.methods.stereo.disparity import STEREO_COLUMNS, stereo_depth_m
+from rebar_depth_bench.reading import MAX_NESTING, read_file
 
 NAME = "foundation-stereo"
 CODE_FILE, SETTINGS_FILE, CHECKPOINT_FILE = "core/foundation_stereo.py", "cfg.yaml", "model_best_bp2.pth"
@@ -105,7 +107,7 @@ def load_predictor(installation: Installation) -> Predictor:
         translate_errors(NAME, torch, f"{installation.weights} cannot be loaded"),
         on_sys_path(installation.clone),
     ):
-        settings = _Settings(yaml.safe_load((installation.weights / SETTINGS_FILE).read_text(encoding="utf-8")))
+        settings = _read_settings(yaml, installation.weights / SETTINGS_FILE)
         settings.setdefault("vit_size", "vitl")
         code = importlib.import_module("core.foundation_stereo")
         _check_module_origin(code, installation.clone)
@@ -130,6 +132,30 @@ def load_predictor(installation: Installation) -> Predictor:
         return np.asarray(crop_margins(padded_px, margins), np.float32)
 
     return lambda row: stereo_depth_m(row, match)
+
+
+def _read_settings(yaml: Any, path: Path) -> _Settings:
+    """Return the content of a YAML file. Raises ``MethodError`` if it is no plain mapping.
+
+    Aliases let a small file grow without bounds; the settings of the network have none.
+    """
+    text = read_file(path, TOML_BYTES, "a YAML file", MethodError)
+    starts = (yaml.FlowSequenceStartToken, yaml.FlowMappingStartToken, yaml.BlockMappingStartToken)
+    ends = (yaml.FlowSequenceEndToken, yaml.FlowMappingEndToken, yaml.BlockEndToken)
+    depth = 0
+    try:
+        for token in yaml.scan(text):
+            depth += isinstance(token, (*starts, yaml.BlockSequenceStartToken)) - isinstance(token, ends)
+            if isinstance(token, yaml.AliasToken) or depth > MAX_NESTING:
+                raise MethodError(
+                    f"{path}: has an alias or more than {MAX_NESTING} levels, expected plain settings"
+                )
+        values = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError) as error:
+        raise MethodError(f"{path}: cannot be read as YAML: {exception_summary(error)}") from None
+    if not isinstance(values, dict):
+        raise MethodError(f"{path}: is {type(values).__name__}, expected a mapping")
+    return _Settings(values)
 
 
 def _possible_downloads(torch: Any) -> list[str]:

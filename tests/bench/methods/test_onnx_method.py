@@ -255,10 +255,10 @@ def test_method_info_and_coverage_of_its_digest(tmp_path: Path) -> None:
     assert (info.name, info.licence, info.columns, info.uses_intrinsics) == ("tiny", "MIT", ("left_rgb",), False)
     assert "metres" in info.summary
     assert info.source.startswith("a paper (sha256:")
-    (tmp_path / "model.onnx_data").write_bytes(b"weights")
-    with_data = find_method(str(path)).info.source
     write_toml(tmp_path, PLAIN_INPUT + "\nstd = [2, 2, 2]", top_level="source = 'a paper'")
-    assert len({info.source, with_data, find_method(str(path)).info.source}) == 3
+    other_settings = find_method(str(path)).info.source
+    write_mixer_model(tmp_path, offset=2)
+    assert len({info.source, other_settings, find_method(str(path)).info.source}) == 3
 
 
 @pytest.mark.slow

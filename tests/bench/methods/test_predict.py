@@ -191,6 +191,25 @@ def test_entry_point_methods_are_listed(
     assert "cannot be" in listed
 
 
+def test_listed_text_of_packages_is_plain(
+    user_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site = tmp_path / "site"
+    info = site / "odd-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: odd\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[rebar_depth_bench.methods]\nodd = odd_code:METHOD\nbad = bad_code:X")
+    code = user_file.read_text().replace('"a test"', r'"[red]a\x1b[2J[/]"').replace('"here"', '"[/nothing]"')
+    (site / "odd_code.py").write_text(code)
+    (site / "bad_code.py").write_text("raise ImportError('pip install x[onnx] [/end]')")
+    monkeypatch.syspath_prepend(str(site))
+    monkeypatch.setenv("COLUMNS", "300")
+    assert main(["methods"]) == 0
+    listed = capsys.readouterr().out
+    assert all(words in listed for words in (r"[red]a\x1b[2J[/]", "[/nothing]", "pip install x[onnx] [/end]"))
+    assert "\x1b" not in listed
+
+
 def test_ground_truth_controls_score_as_expected(tiny_root: Path, tmp_path: Path) -> None:
     tables = {}
     for name in ("truth", "noisy-truth"):

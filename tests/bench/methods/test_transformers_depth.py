@@ -244,7 +244,7 @@ def drop_tensor(folder: Path) -> None:
     ("spoil", "words"),
     [
         (delete_file("config.json"), "no config.json, expected a checkpoint folder"),
-        (break_config, "config.json: cannot be read"),
+        (break_config, "config.json: 1 problem\n  - the text is not valid JSON"),
         (
             set_unsupported_type,
             "model_type is 'bert', expected one of depth_anything, depth_pro, dpt, glpn, zoedepth",
