@@ -1,40 +1,57 @@
-"""HTTP client of a leaderboard: upload an archive, wait until it is scored, fetch the result."""
+"""HTTP client of a leaderboard: upload an archive, wait until it is scored, fetch the result.
+
+The token is sent to the leaderboard only: redirects are not followed. Answers are limited in size and in time.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
-from pydantic import TypeAdapter, ValidationError
-
-from rebar_depth_bench.errors import InputError, Problem, RebarDepthError, SubmissionError
+from rebar_depth_bench.deadline import DeadlineError, call_until
+from rebar_depth_bench.errors import InputError, escape_text
+from rebar_depth_bench.leaderboard_answers import (
+    SUBMISSION_ID,
+    AnswerError,
+    Response,
+    ServiceError,
+    Submission,
+    TokenInfo,
+    detail,
+    server_text,
+)
+from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.reading import open_regular
 
-_PROBLEMS = TypeAdapter(tuple[Problem, ...])
 POLL_INTERVAL_S = 2.0
 """Time between two status requests, seconds."""
 MAX_FAILED_POLLS = 30
 """Number of consecutive failed status requests that ``LeaderboardClient.wait`` tolerates."""
+WAIT_S = 3600.0
+"""Default time limit of ``LeaderboardClient.wait``, seconds."""
+REQUEST_TIMEOUT_S, RESULT_TIMEOUT_S = 60.0, 600.0
+"""Time limits of a request, and of the download of a result, seconds."""
 UPLOAD_TIMEOUT_S = 3600.0
-"""Read timeout, seconds; the service responds to an upload only after it has checked the archive."""
-
-
-class ServiceError(RebarDepthError):
-    """Leaderboard that cannot be reached or returns an unexpected response."""
+"""Time limit from the last byte of an upload to the end of the response, seconds: the archive is checked first."""
 
 
 class LeaderboardClient:
     """Client for the leaderboard at ``url`` that authenticates with ``token``; a context manager."""
 
     def __init__(self, url: str, token: str) -> None:
-        """Open an HTTP client; raise ``InputError`` if ``httpx2`` is not installed."""
+        """Open an HTTP client; raise ``InputError`` if ``httpx2`` is not installed or the token is not ASCII."""
+        if not token.isascii() or not token.isprintable():
+            raise InputError("the token has other characters than printable ASCII, expected it as it was issued")
         self._http = _httpx()
         self._url = url.rstrip("/")
-        timeout = self._http.Timeout(30.0, read=UPLOAD_TIMEOUT_S)
-        self._client = self._http.Client(headers={"Authorization": f"Bearer {token}"}, timeout=timeout)
+        self._token = token
+        self._client = self._new_client()
 
     def __enter__(self) -> Self:
         return self
@@ -42,128 +59,168 @@ class LeaderboardClient:
     def __exit__(self, *_: object) -> None:
         self._client.close()
 
-    def submit(self, archive: Path, progress: Progress = silent) -> dict[str, Any]:
-        """Upload an archive and return the accepted submission, a dict with ``id``, ``status`` and ``url``.
+    def submit(self, archive: Path, progress: Progress = silent) -> Submission:
+        """Upload an archive and return the accepted submission, with the SHA-256 of what was sent.
 
         Raises ``SubmissionError`` with every problem of a rejected archive, ``InputError`` for an invalid token,
         an exhausted quota, an archive that is too large or a file that cannot be read, and ``ServiceError`` if
-        the service cannot be reached.
+        the service cannot be reached or its answer is not valid.
         """
-        max_bytes = self.token()["max_upload_bytes"]
+        max_bytes = self.token().max_upload_bytes
         try:
-            total = archive.stat().st_size
-            if total > max_bytes:
-                raise InputError(f"{archive}: has {total} bytes, expected at most {max_bytes}")
-            with archive.open("rb") as stream:
-                upload = _ProgressReader(stream.read, lambda done: progress("uploading", done, total))
-                response = self._call(
-                    "POST", "submissions", files={"archive": (archive.name, upload, "application/zip")}
-                )
+            with open_regular(archive) as stream:
+                total = os.fstat(stream.fileno()).st_size
+                if total > max_bytes:
+                    raise InputError(f"{archive}: has {total} bytes, expected at most {max_bytes}")
+                upload = _Upload(stream, lambda done: progress("uploading", done, total))
+                files = {"archive": (archive.name, upload, "application/zip")}
+                response = self._call("POST", "submissions", upload.deadline, files=files)
         except OSError as error:
             raise InputError(f"{archive}: cannot be read: {error.strerror or error}") from None
-        if response.status_code == 422:
-            content = _json_object(response)
-            raise _rejection(archive, content)
-        return self._checked(response, 202, "id")
+        if response.status == 422:
+            raise response.rejection(archive)
+        accepted = response.answer(Submission, 202, 200)
+        if accepted.archive_sha256 not in (None, upload.sha256()):
+            raise AnswerError(f"{self._url}: the service received another archive than was sent")
+        return accepted.model_copy(update={"archive_sha256": upload.sha256()})
 
-    def token(self) -> dict[str, Any]:
-        """Return the token's ``name``, ``quota``, ``quota_left`` and the limits of the service.
+    def token(self) -> TokenInfo:
+        """Return the token's name, its quota and the size limit of the service.
 
         Raises ``InputError`` for an unknown token or a wrong URL, ``ServiceError`` if the service does not answer.
         """
-        return self._checked(self._call("GET", "token"), 200, "max_upload_bytes")
+        return self._call("GET", "token", _deadline(REQUEST_TIMEOUT_S)).answer(TokenInfo, 200)
 
-    def wait(self, submission_id: str, progress: Progress = silent) -> dict[str, Any]:
+    def wait(self, submission_id: str, progress: Progress = silent, limit_s: float = WAIT_S) -> Submission:
         """Poll until the submission is scored or failed, and return it.
 
-        Raises ``ServiceError`` after more than ``MAX_FAILED_POLLS`` consecutive failed requests, and
-        ``InputError`` if the service rejects the token or the id.
+        Raises ``ServiceError`` after ``limit_s`` seconds, after more than ``MAX_FAILED_POLLS`` consecutive failed
+        requests and for an answer that is not valid, such as an unknown status, and ``InputError`` if the service
+        rejects the token or the id.
         """
-        failed_polls = 0
-        while True:
+        end = time.monotonic() + limit_s
+        failed_polls, status = 0, "not scored"
+        while (remaining_s := end - time.monotonic()) > 0:
             try:
-                response = self._call("GET", f"submissions/{submission_id}")
-                if response.status_code == 429:
-                    raise ServiceError(f"{self._url}: {_json_object(response).get('detail', 'too many requests')}")
-                submission = self._checked(response, 200, "id")
-                failed_polls = 0
+                submission = self._poll(submission_id, min(remaining_s, REQUEST_TIMEOUT_S))
+            except AnswerError:
+                raise
             except ServiceError:
                 failed_polls += 1
                 if failed_polls > MAX_FAILED_POLLS:
                     raise
-                submission = {"status": "no response, retrying"}
-            if submission["status"] in ("scored", "failed"):
-                progress(submission["status"], 1, 1)
-                return submission
-            progress(submission["status"], 0, 1)
-            time.sleep(POLL_INTERVAL_S)
+                progress("no response, retrying", 0, 1)
+            else:
+                failed_polls, status = 0, submission.status
+                has_ended = status in ("scored", "failed")
+                progress(status, int(has_ended), 1)
+                if has_ended:
+                    return submission
+            time.sleep(min(POLL_INTERVAL_S, max(end - time.monotonic(), 0)))
+        page = f"{self._url}/submissions/{submission_id}"
+        raise ServiceError(f"{page}: the submission is still {status} after {limit_s:g} s of waiting")
 
-    def result(self, submission_id: str) -> bytes:
+    def result(self, submission_id: str, archive_sha256: str | None = None) -> bytes:
         """Return the result JSON, byte-identical to the output of ``rebar-bench score --json``.
 
-        Raises ``ServiceError`` if the response status is not 200.
+        Raises ``ServiceError`` if the response status is not 200 or the body is no result, or that of another
+        archive than the one with ``archive_sha256``.
         """
-        response = self._call("GET", f"submissions/{submission_id}/result.json")
-        if response.status_code != 200:
+        path = f"submissions/{_checked_id(submission_id)}/result.json"
+        response = self._call("GET", path, _deadline(RESULT_TIMEOUT_S))
+        if response.status != 200:
             raise ServiceError(
-                f"{self._url}: the response status for the result is {response.status_code}, expected 200"
+                f"{self._url}: the response status for the result is {response.status}, expected 200"
             )
-        content: bytes = response.content
-        return content
+        response.result(archive_sha256)
+        return response.body
 
-    def _call(self, method: str, path: str, **content: Any) -> Any:
+    def _poll(self, submission_id: str, limit_s: float) -> Submission:
+        response = self._call("GET", f"submissions/{_checked_id(submission_id)}", _deadline(limit_s))
+        if response.status == 429:
+            raise ServiceError(f"{self._url}: {detail(response.content(), 'too many requests')}")
+        submission = response.answer(Submission, 200)
+        if submission.id != submission_id:
+            raise AnswerError(
+                f"{self._url}: the answer is on submission {submission.id}, expected {submission_id}"
+            )
+        return submission
+
+    def _call(self, method: str, path: str, end: Callable[[], float], **content: Any) -> Response:
+        """Return the response to a request, which must be complete before the time ``end()``."""
+        client = self._client
         try:
-            return self._client.request(method, f"{self._url}/api/v1/{path}", **content)
+            return call_until(end, lambda: self._exchange(client, method, path, content), self._abandon)
+        except DeadlineError:
+            raise ServiceError(f"{self._url}: no complete response within the time limit") from None
         except (self._http.InvalidURL, self._http.UnsupportedProtocol) as error:
             raise InputError(f"{self._url!r}: is not a valid URL, expected http://HOST:PORT: {error}") from None
         except self._http.HTTPError as error:
-            raise ServiceError(f"{self._url}: no response: {error or type(error).__name__}") from None
+            found = server_text(str(error)) or type(error).__name__
+            raise ServiceError(f"{self._url}: no response: {found}") from None
 
-    def _checked(self, response: Any, status: int, key: str) -> dict[str, Any]:
-        """Return the JSON object of a response with ``status`` that has ``key``; raise its error otherwise."""
-        content = _json_object(response)
-        if response.status_code == status and key in content:
-            return content
-        detail = content.get("detail", f"the response status is {response.status_code}, expected {status}")
-        error_type = InputError if 400 <= response.status_code < 500 else ServiceError
-        raise error_type(f"{self._url}: {detail}")
+    def _exchange(self, client: Any, method: str, path: str, content: dict[str, Any]) -> Response:
+        max_bytes, body = JSON_BYTES.value(), bytearray()
+        with client.stream(method, f"{self._url}/api/v1/{path}", **content) as response:
+            for chunk in response.iter_raw():
+                body += chunk
+                if len(body) > max_bytes:
+                    expected = JSON_BYTES.allowed("bytes")
+                    raise AnswerError(f"{self._url}: the response is too large, expected {expected}")
+            return Response(self._url, response.status_code, bytes(body))
+
+    def _new_client(self) -> Any:
+        # A compressed body could be far larger than what is received.
+        headers = {"Authorization": f"Bearer {self._token}", "Accept-Encoding": "identity"}
+        timeout = self._http.Timeout(30.0, read=UPLOAD_TIMEOUT_S)
+        return self._http.Client(headers=headers, timeout=timeout, follow_redirects=False)
+
+    def _abandon(self) -> None:
+        """Close the connections, so that a request that takes too long ends in its thread."""
+        client, self._client = self._client, self._new_client()
+        client.close()
 
 
-class _ProgressReader:
-    """File-like object that reports the number of bytes read so far.
+class _Upload:
+    """File-like object that reports the number of bytes read so far and computes their SHA-256.
 
     It has no ``fileno``, so that the HTTP client reads it in chunks.
     """
 
-    def __init__(self, read: Callable[[int], bytes], on_read: Callable[[int], None]) -> None:
-        self._read, self._on_read, self._bytes_read = read, on_read, 0
+    def __init__(self, stream: BinaryIO, on_read: Callable[[int], None]) -> None:
+        self._stream, self._on_read, self._bytes_read = stream, on_read, 0
+        self._digest, self._last_read = hashlib.sha256(), time.monotonic()
 
     def read(self, size: int = -1) -> bytes:
         """Read up to ``size`` bytes and report the total."""
-        data = self._read(size)
+        data = self._stream.read(size)
+        self._digest.update(data)
+        self._last_read = time.monotonic()
         self._bytes_read += len(data)
         self._on_read(self._bytes_read)
         return data
 
+    def sha256(self) -> str:
+        """Return the hex SHA-256 of the bytes read so far."""
+        return self._digest.hexdigest()
 
-def _rejection(archive: Path, content: Mapping[str, Any]) -> SubmissionError:
-    """Return the error of a rejected archive, with the lines of the service and its ``problem_details``."""
-    lines = "".join(f"\n  - {line}" for line in content.get("problems", ()))
-    error = SubmissionError(f"{archive}: {content.get('detail', 'rejected')}{lines}")
-    try:
-        error.problems = _PROBLEMS.validate_python(content.get("problem_details", ()))
-    except ValidationError:  # Another version of the service.
-        error.problems = ()
-    return error
+    def deadline(self) -> float:
+        """Return the time by which the next chunk must be read or the response be complete."""
+        return self._last_read + UPLOAD_TIMEOUT_S
 
 
-def _json_object(response: Any) -> dict[str, Any]:
-    """Return the JSON object of a response, or an empty dict if the body is not one (such as a proxy's page)."""
-    try:
-        content = response.json()
-    except ValueError:
-        return {}
-    return content if isinstance(content, dict) else {}
+def _deadline(limit_s: float) -> Callable[[], float]:
+    end = time.monotonic() + limit_s
+    return lambda: end
+
+
+def _checked_id(submission_id: str) -> str:
+    """Return an id that can be part of a URL; raise ``InputError`` for any other text."""
+    if not SUBMISSION_ID.accept(submission_id):
+        raise InputError(
+            f"{escape_text(submission_id)} is not the id of a submission, expected {SUBMISSION_ID.text}"
+        )
+    return submission_id
 
 
 def _httpx() -> ModuleType:

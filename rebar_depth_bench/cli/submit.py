@@ -11,15 +11,17 @@ from pathlib import Path
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_bytes
-from rebar_depth_bench.console import ProgressBars, add_archive, add_output_file
+from rebar_depth_bench.console import ProgressBars, add_archive, add_output_file, add_seconds
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.leaderboard_client import LeaderboardClient
+from rebar_depth_bench.leaderboard_answers import server_lines
+from rebar_depth_bench.leaderboard_client import WAIT_S, LeaderboardClient
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.result_io import read_result
 
 SUMMARY = "upload an archive to a leaderboard, wait for its score and print the table"
 TOKEN_VARIABLE = "REBAR_LEADERBOARD_TOKEN"
 """Environment variable that holds the token."""
+_MAX_TOKEN_CHARACTERS = 10_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,7 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help=f"file with the token (default: the environment variable {TOKEN_VARIABLE}, or a prompt)",
     )
-    parser.add_argument("--no-wait", action="store_true", help="do not wait until the submission is scored")
+    waiting = parser.add_mutually_exclusive_group()
+    waiting.add_argument("--no-wait", action="store_true", help="do not wait until the submission is scored")
+    add_seconds(waiting, "--wait", WAIT_S, "time limit on waiting until the submission is scored")
     add_output_file(parser, "--json", "write the result as JSON")
 
 
@@ -44,18 +48,19 @@ def run(options: argparse.Namespace) -> None:
         )
     with LeaderboardClient(options.url, _read_token(options.token_file)) as leaderboard, ProgressBars() as bars:
         accepted = leaderboard.submit(Path(options.archive), bars.update)
-        print(accepted["url"], file=sys.stderr, flush=True)
+        print(accepted.url, file=sys.stderr, flush=True)
         if options.no_wait:
-            print(accepted["id"])
+            print(accepted.id)
             return
         try:
-            submission = leaderboard.wait(accepted["id"], bars.update)
+            submission = leaderboard.wait(accepted.id, bars.update, options.wait)
         except KeyboardInterrupt:
             print("the submission is accepted and will be scored; its URL is printed above", file=sys.stderr)
             raise
-        if submission["status"] == "failed":
-            raise InputError(f"{options.archive}: scoring failed: {submission['reason']}")
-        result = leaderboard.result(accepted["id"])
+        if submission.status == "failed":
+            reason = server_lines(submission.reason or "the service gives no reason")
+            raise InputError(f"{options.archive}: scoring failed: {reason}")
+        result = leaderboard.result(accepted.id, accepted.archive_sha256)
     if options.json:
         write_bytes(options.json, result)
     print_table(read_result(result, options.url), Console())
@@ -69,9 +74,13 @@ def _read_token(file: Path | None) -> str:
     """
     if file is not None:
         try:
-            return file.read_text(encoding="utf-8").strip()
+            with file.open(encoding="utf-8") as stream:  # It may be a pipe of the user's own.
+                token = stream.read(_MAX_TOKEN_CHARACTERS).strip()
         except (OSError, ValueError) as error:
             raise InputError(f"{file}: cannot be read: {error}") from None
+        if not token.isprintable():
+            raise InputError(f"{file}: has characters that are not printable, expected a token on one line")
+        return token
     token = os.environ.get(TOKEN_VARIABLE) or (getpass.getpass("token: ") if sys.stdin.isatty() else "")
     if not token:
         raise InputError(f"no token: set {TOKEN_VARIABLE}, or give --token-file FILE")

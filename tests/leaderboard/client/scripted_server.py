@@ -1,0 +1,91 @@
+"""TCP server that gives prepared answers to the requests of the leaderboard's client."""
+
+from __future__ import annotations
+
+import json
+import socketserver
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from io import BufferedIOBase
+
+Send = Callable[[BufferedIOBase], None]
+"""Function that writes an answer to a connection."""
+ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
+
+
+@dataclass
+class ScriptedServer:
+    """Running server: its URL, answers by endpoint (token, submit, status, result), and heads of the requests.
+
+    The last answer of an endpoint is repeated.
+    """
+
+    url: str
+    answers: dict[str, list[bytes | Send]] = field(default_factory=dict)
+    requests: list[tuple[str, str]] = field(default_factory=list)
+
+    def endpoints(self) -> list[str]:
+        """Return the endpoints that were asked, in order."""
+        return [endpoint for endpoint, _ in self.requests]
+
+
+def answer(
+    content: object, status: int = 200, headers: Mapping[str, str] | None = None, reason: str = "Answer"
+) -> bytes:
+    """Return a complete HTTP response; content other than bytes becomes JSON."""
+    body = content if isinstance(content, bytes) else json.dumps(content).encode()
+    lines = {"Content-Length": str(len(body)), "Connection": "close", **(headers or {})}
+    head = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
+    return f"HTTP/1.1 {status} {reason}\r\n{head}\r\n".encode() + body
+
+
+@contextmanager
+def scripted_server() -> Iterator[ScriptedServer]:
+    """Run a server until the block ends."""
+    script = ScriptedServer("")
+
+    class Handler(socketserver.StreamRequestHandler):
+        def handle(self) -> None:
+            head = b""
+            while not head.endswith(b"\r\n\r\n") and (line := self.rfile.readline()):
+                head += line
+            if not head:
+                return
+            if b"chunked" in head.lower():
+                while size := int(self.rfile.readline(), 16):
+                    self.rfile.read(size + 2)
+                self.rfile.readline()
+            endpoint = _endpoint(head)
+            script.requests.append((endpoint, head.decode("latin-1")))
+            answers = script.answers[endpoint]
+            response = answers.pop(0) if len(answers) > 1 else answers[0]
+            with suppress(OSError):  # The client may close the connection at any time.
+                if callable(response):
+                    response(self.wfile)
+                else:
+                    self.wfile.write(response)
+
+    class Server(socketserver.ThreadingTCPServer):
+        daemon_threads = True
+        allow_reuse_address = True
+
+    with Server(("127.0.0.1", 0), Handler) as server:
+        script.url = f"http://127.0.0.1:{server.server_address[1]}"
+        thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
+        thread.start()
+        try:
+            yield script
+        finally:
+            server.shutdown()
+            thread.join(10)
+
+
+def _endpoint(head: bytes) -> str:
+    method, path = head.split(b" ", 2)[:2]
+    if path.endswith(b"/token"):
+        return "token"
+    if method == b"POST":
+        return "submit"
+    return "result" if path.endswith(b"/result.json") else "status"
