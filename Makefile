@@ -21,8 +21,9 @@ quick: env-dev ## Format, lint, types, import contracts, and the fast tests that
 test: system-packages env-dev ## Everything that CI runs: quick, and real renders, servers, databases and browser
 	scripts/check.sh $(BIN) test
 
-nightly: system-packages env-dev ## Everything, with the long stress tests
+nightly: system-packages env-dev ## Everything, with the long stress tests and 10,000 damaged inputs
 	scripts/check.sh $(BIN) nightly
+	$(BIN)/python -m tests.fuzz --cases 10000 --log fuzz.jsonl
 
 format: env-dev ## Format the code and apply the linter's safe fixes
 	$(BIN)/ruff format .
