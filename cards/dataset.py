@@ -9,7 +9,7 @@ import numpy as np
 from huggingface_hub import DatasetCardData
 
 from cards.templates import render
-from rebar_depth_bench.data.dataset import COLUMN_DESCRIPTIONS, column_kind, features
+from rebar_depth_bench.data.columns import COLUMN_DESCRIPTIONS, column_kind, features
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import tomllib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +15,10 @@ from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError
 
 from rebar_depth_bench.console import warn_deprecated
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import InputError, Problem
+from rebar_depth_bench.limits import TOML_BYTES
+from rebar_depth_bench.reading import parse_toml, read_file
+from rebar_depth_bench.validation import format_location, short_repr
 
 GIB = 1 << 30
 
@@ -118,24 +119,33 @@ def read_settings(file: Path | None, overrides: dict[str, Any]) -> Settings:
 
     Raises ``InputError``, naming every invalid setting, and if ``file`` cannot be read as TOML.
     """
+    file_values = {} if file is None else _read_file(file)
     try:
-        file_values = {} if file is None else tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: cannot be read as TOML: {error}") from None
-    try:
-        return Settings(**{**_renamed_from_environment(), **_with_new_names(file_values), **overrides})
+        return Settings(**{**_renamed_from_environment(), **file_values, **overrides})
     except ValidationError as error:
         raise InputError("settings: " + "; ".join(_format_error(details) for details in error.errors())) from None
 
 
-def _with_new_names(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a TOML file with renamed settings under their new names, with a warning for each."""
-    renamed = {}
-    for name, value in values.items():
-        if name in RENAMED_SETTINGS:
-            warn_deprecated(f"setting {name}", RENAMED_SETTINGS[name])
-        renamed[RENAMED_SETTINGS.get(name, name)] = value
-    return renamed
+def _read_file(file: Path) -> dict[str, Any]:
+    """Return the values of a TOML file with renamed settings under their new names, with a warning for each.
+
+    Unknown names are refused here, because ``BaseSettings`` has parameters that are no settings (``_env_file``).
+    """
+    content, problems = parse_toml(read_file(file, TOML_BYTES, "a TOML file with settings", InputError))
+    values: dict[str, Any] = {}
+    for name, value in content.items():
+        new_name = RENAMED_SETTINGS.get(name, name)
+        place = format_location("", name)
+        if new_name not in Settings.model_fields:
+            problems.append(Problem("unknown", place, "there is no such setting"))
+        elif new_name in values:
+            problems.append(Problem("duplicate", place, f"{new_name} is given twice", "one of its names"))
+        elif new_name != name:
+            warn_deprecated(f"setting {name}", new_name)
+        values[new_name] = value
+    if problems:
+        raise InputError.from_problems(file, problems)
+    return values
 
 
 def _renamed_from_environment() -> dict[str, str]:
@@ -158,7 +168,7 @@ def _format_error(error: ErrorDetails) -> str:
     name = ".".join(map(str, error["loc"]))
     if error["type"] == "missing":
         return f"{name}: is not given, expected {Settings.model_fields[name].description}"
-    if error["type"] == "extra_forbidden":
-        return f"{name}: there is no such setting"
     message = error["msg"].removeprefix("Value error, ")
-    return f"{name}: {message}" + ("" if error["loc"][0] in _SECRET_SETTINGS else f", got {error['input']!r}")
+    return f"{name}: {message}" + (
+        "" if error["loc"][0] in _SECRET_SETTINGS else f", got {short_repr(error['input'])}"
+    )

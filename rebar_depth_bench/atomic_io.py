@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,8 +12,16 @@ from pathlib import Path
 
 from rebar_depth_bench.errors import InputError
 
-TEMPORARY_PATTERN = ".*.tmp"
-"""Names of temporary files that killed processes leave."""
+_TEMPORARY_NAME = re.compile(r"\.(.+)\.[a-z0-9_]{8}\.tmp")
+
+
+def temporary_target(name: str) -> str | None:
+    """Return the name of the file that a temporary file of this name was to replace, or None for other names.
+
+    Killed processes leave such files.
+    """
+    match = _TEMPORARY_NAME.fullmatch(name)
+    return match[1] if match else None
 
 
 @contextmanager
@@ -20,10 +29,13 @@ def atomic_replace(target: Path) -> Iterator[Path]:
     """Yield a temporary path in the target's folder; on a clean exit, flush it and rename it to ``target``.
 
     Missing parent folders are created. On an exception the temporary file is removed and an existing ``target`` is
-    left unchanged. Raises ``InputError`` if ``target`` is a folder or its folder cannot be written.
+    left unchanged. Raises ``InputError`` if ``target`` is a folder, a device or a pipe, or its folder cannot be
+    written.
     """
     if target.is_dir():
         raise InputError(f"{target}: is a folder, expected the name of a file to write")
+    if target.exists() and not target.is_file():  # Renaming would replace a device such as /dev/null.
+        raise InputError(f"{target}: is a device or a pipe, expected the name of a file to write")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent)

@@ -20,6 +20,10 @@ EXIT_DONE, EXIT_OTHER, EXIT_INPUT = 0, 1, 2
 """Exit codes: success, any other error, invalid input."""
 
 
+MAX_SECONDS = 1e6
+"""Longest duration that an option accepts, seconds; Python cannot wait for more than some 1e10."""
+
+
 class ProgressBars:
     """Progress bars on standard error, one per task; plain lines if standard error is not a terminal."""
 
@@ -59,7 +63,8 @@ class ProgressBars:
         tenth = done * 10 // max(total, 1)
         if self._lines.get(name) != tenth:
             self._lines[name] = tenth
-            print(f"{name}: {done} of {total}", file=sys.stderr, flush=True)
+            sys.stderr.write(f"{name}: {done} of {total}\n")  # In one call: several threads may write lines.
+            sys.stderr.flush()
 
 
 class Command(Protocol):
@@ -103,7 +108,7 @@ def run_command(command: Callable[[], None], interrupted: str = "interrupted") -
     try:
         command()
     except RebarDepthError as error:
-        print(f"error: {terminal_text(str(error))}", file=sys.stderr)
+        print_notice(f"error: {error}")
         return EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -140,6 +145,29 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
 def add_output_file(parser: argparse.ArgumentParser, option: str, summary: str) -> None:
     """Add ``option``, the path of a file to write."""
     parser.add_argument(option, type=Path, metavar="FILE", help=summary)
+
+
+def add_seconds(container: argparse._ActionsContainer, option: str, default: float, summary: str) -> None:
+    """Add ``option``, a duration in seconds, to a parser or a group of options."""
+    container.add_argument(
+        option,
+        type=_positive_seconds,
+        default=default,
+        metavar="SECONDS",
+        help=f"{summary} (default: {default:g})",
+    )
+
+
+def _positive_seconds(text: str) -> float:
+    seconds = float(text)
+    if not 0 < seconds <= MAX_SECONDS:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0, up to {MAX_SECONDS:g}")
+    return seconds
+
+
+def print_notice(text: str) -> None:
+    """Print text to standard error; control characters of names in it are shown as escapes."""
+    print(terminal_text(text), file=sys.stderr)
 
 
 def warn_deprecated(old: str, new: str) -> None:

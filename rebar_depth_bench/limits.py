@@ -36,6 +36,10 @@ class Limit:
             raise InputError(f"{self.variable} is {escape_text(text)}, expected a whole number from 1")
         return int(text)
 
+    def allowed(self, unit: str = "") -> str:
+        """Return the largest accepted value in ``unit``, and the variable that raises it, for messages."""
+        return f"at most {self.value()}{' ' if unit else ''}{unit}; {self.variable} raises the limit"
+
 
 JSON_BYTES = Limit("json_bytes", 64 * _MIB, "a JSON file or answer: manifest, result, export record")
 TOML_BYTES = Limit("toml_bytes", _MIB, "a scene, calibration or model description, and any other small text file")
@@ -46,6 +50,9 @@ MESH_BYTES = Limit("mesh_bytes", _GIB, "a PLY, STL, OBJ or glTF file")
 IFC_BYTES = Limit("ifc_bytes", _GIB, "an IFC file")
 IFC_SECONDS = Limit("ifc_seconds", 1800, "the processor time for reading an IFC file")
 IFC_MEMORY_BYTES = Limit("ifc_memory_bytes", 8 * _GIB, "the memory of the process that reads an IFC file")
+ONNX_MEMORY_BYTES = Limit(
+    "onnx_memory_bytes", 64 * _GIB, "the CPU memory of ONNX models, at most that of the machine"
+)
 CACHE_BYTES = Limit(
     "cache_bytes", 20 * _GIB, "the cache of ground truth; the least recently used entries go first"
 )
@@ -60,6 +67,7 @@ LIMITS = (
     IFC_BYTES,
     IFC_SECONDS,
     IFC_MEMORY_BYTES,
+    ONNX_MEMORY_BYTES,
     CACHE_BYTES,
 )
 """All limits that an environment variable can raise, in the order of the documentation."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import re
 import stat
@@ -23,6 +24,7 @@ MAX_NESTING = 64
 _MAX_KEY_COST = 10_000_000
 """Largest sum over the lines of a TOML file of the squared number of dots; tomllib needs about 10 ns for each."""
 _DECIMAL_NUMBER = re.compile(rb"(?<![\w.\"'-])[-+]?\d+\.\d+(?=[\s,\]}eE]|$)")
+_NUMBER = re.compile(r"[-+]?([0-9]++(\.[0-9]*+)?|\.[0-9]++)([eE][-+]?[0-9]++)?")
 _KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}
 
 
@@ -51,14 +53,13 @@ def read_file(path: Path, limit: Limit, expected: str, error_type: type[InputErr
     max_bytes = limit.value()
     try:
         with open_regular(path) as stream:
-            content = stream.read(max_bytes + 1)
+            content = stream.read(min(max_bytes, os.fstat(stream.fileno()).st_size) + 1)
     except OSError as error:
         code: ProblemCode = "missing" if isinstance(error, FileNotFoundError) else "unreadable"
         problem = Problem(code, "", f"cannot be read: {error.strerror or error}", expected)
         raise error_type.from_problems(path, [problem]) from None
     if len(content) > max_bytes:
-        raised = f"{expected} of at most {max_bytes} bytes; {limit.variable} raises the limit"
-        problem = Problem("size", "", "the file is too large", raised)
+        problem = Problem("size", "", "the file is too large", f"{expected} of {limit.allowed('bytes')}")
         raise error_type.from_problems(path, [problem])
     return content
 
@@ -101,6 +102,14 @@ def parse_toml(content: bytes) -> tuple[dict[str, Any], list[Problem]]:
     except ValueError as error:
         return {}, [Problem("syntax", "", f"not a valid TOML file: {escape_text(str(error))}")]
     return ({}, [_nesting_problem("")]) if _nesting_exceeds(values, MAX_NESTING) else (values, [])
+
+
+def parse_number(text: str) -> float:
+    """Return a decimal number such as ``-1.5e-3``; NaN for any other text, infinity on overflow.
+
+    Stricter than ``float``, which also reads ``1_0``, ``nan`` and digits of other scripts.
+    """
+    return float(text) if _NUMBER.fullmatch(text) else math.nan
 
 
 class _DuplicateKeyError(ValueError):

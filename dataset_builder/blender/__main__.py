@@ -22,7 +22,7 @@ def main() -> int:
     ``InputError`` and ``BuildError`` are reported as events; other exceptions are raised.
     """
     report = _redirect_output(sys.argv[1])
-    task = pickle.load(sys.stdin.buffer)
+    task = pickle.load(sys.stdin.buffer)  # noqa: S301 -- The parent process is this program.
     _exit_with_parent(sys.stdin.buffer)
     try:
         _runner_for(task)(task, report)

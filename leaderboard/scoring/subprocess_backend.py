@@ -47,7 +47,7 @@ def make_subprocess_backend(settings: Settings, spool: Path) -> ScoringBackend:
 
 
 def _run_sandbox(task: ScoringTask, settings: Settings, should_continue: Callable[[], bool]) -> Outcome | None:
-    command = [sys.executable, "-m", "leaderboard.scoring.sandbox"]
+    command = [sys.executable, "-P", "-m", "leaderboard.scoring.sandbox"]
     with (Path(task.out) / OUTPUT_FILE).open("wb") as output:
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=output)
     assert process.stdin is not None

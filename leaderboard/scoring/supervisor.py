@@ -56,7 +56,7 @@ class WorkerSupervisor:
                 worker.wait()
 
     def _start(self) -> subprocess.Popen[bytes] | None:
-        command = [sys.executable, "-m", "leaderboard.scoring", str(os.getpid())]
+        command = [sys.executable, "-P", "-m", "leaderboard.scoring", str(os.getpid())]
         try:
             worker = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
         except OSError as error:  # Out of memory or processes: try again later.

@@ -61,7 +61,7 @@ def run_demo(out: Path, views: int) -> None:
 def _build_dataset(data: Path, views: int) -> None:
     if find_spec("dataset_builder") is None or find_spec("bpy") is None:
         raise InputError("the demo renders with Blender: pip install 'rebar-depth-bench[build]'")
-    command = ["-m", "dataset_builder", "--out", str(data), "--config", DEMO_CONFIG, "--views", str(views)]
+    command = ["-P", "-m", "dataset_builder", "--out", str(data), "--config", DEMO_CONFIG, "--views", str(views)]
     command += ["--samples", str(DEMO_SAMPLES)]
     finished = subprocess.run([sys.executable, *command], stdout=sys.stderr, check=False)
     if finished.returncode == EXIT_INPUT:

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, all_methods
+from rebar_depth_bench.reporting.tables import plain_text
 
 SUMMARY = "list the available methods"
 _ALL_VIEWS_NOTE = "reads all views of a config before it predicts any"
@@ -31,15 +32,15 @@ def run(_: argparse.Namespace) -> None:
     table.add_column("source, licence", overflow="fold", ratio=2)
     for name, method in all_methods().items():
         if isinstance(method, MethodError):
-            table.add_row(name, f"cannot be used: {method}", "", "")
+            table.add_row(plain_text(name), plain_text(f"cannot be used: {method}"), "", "")
             continue
         info = method.info
         label = f"{name} †" if info.uses_ground_truth else name
         table.add_row(
-            label,
+            plain_text(label),
             _summary_and_notes(method),
-            _format_columns(info.columns),
-            f"{info.source}\nlicence: {info.licence}",
+            plain_text(_format_columns(info.columns)),
+            plain_text(f"{info.source}\nlicence: {info.licence}"),
         )
     Console().print(table)
     Console().print("† uses ground truth; results are not comparable to a real method")
@@ -48,7 +49,7 @@ def run(_: argparse.Namespace) -> None:
 def _summary_and_notes(method: AnyMethod) -> Text:
     """Return the summary, followed by dimmed notes on separate lines."""
     notes = (*((_ALL_VIEWS_NOTE,) if isinstance(method, MultiViewMethod) else ()), method.info.untested_note)
-    lines = [Text(method.info.summary), *(Text(f"({line})", style="dim") for line in notes if line)]
+    lines = [plain_text(method.info.summary), *(plain_text(f"({line})", style="dim") for line in notes if line)]
     return Text("\n").join(lines)
 
 

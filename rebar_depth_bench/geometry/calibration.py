@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from rebar_depth_bench.errors import CalibrationError, Problem
-from rebar_depth_bench.geometry.calibration_formats import read_conf, read_toml
+from rebar_depth_bench.geometry.calibration_formats import SIDES_PX, read_conf, read_toml
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration, check_invertible, scale_calibration
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import read_file
@@ -48,7 +48,7 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
         translation_m = [-0.119978, 0.0, 0.0]
 
     Raises ``CalibrationError`` with all problems of the file; also if a distortion model cannot be inverted over
-    the whole image.
+    the whole image, and if the requested size is not 16 to 16384 pixels each.
     """
     path = Path(path)
     parser = PARSERS.get(path.suffix.lower())
@@ -57,6 +57,10 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
         raise CalibrationError.from_problems(path, [problem])
     content = read_file(path, TOML_BYTES, "a calibration file", CalibrationError)
     problems: list[Problem] = []
+    if width not in SIDES_PX or height not in SIDES_PX:
+        expected = f"{SIDES_PX[0]} to {SIDES_PX[-1]} pixels each"
+        problem = Problem("invalid", "", f"it is requested for images of {width} x {height}", expected)
+        raise CalibrationError.from_problems(path, [problem])
     calibration = parser(content, width, height, problems)
     if calibration is not None:
         _check_rig(calibration, problems)

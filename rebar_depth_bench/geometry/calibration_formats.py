@@ -6,8 +6,8 @@ file to the list ``problems``.
 
 from __future__ import annotations
 
-import configparser
 import math
+import re
 from collections.abc import Mapping
 from functools import partial
 from typing import Annotated
@@ -15,10 +15,10 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, Strict, ValidationInfo, field_validator
 
-from rebar_depth_bench.errors import Problem, escape_text
+from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem, escape_text
 from rebar_depth_bench.geometry.cameras import rotation_vector
 from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
-from rebar_depth_bench.reading import parse_toml
+from rebar_depth_bench.reading import parse_number, parse_toml
 from rebar_depth_bench.validation import (
     Expected,
     StrictModel,
@@ -31,7 +31,8 @@ from rebar_depth_bench.validation import (
     whole_number,
 )
 
-_SIDES_PX = range(16, 16385)
+SIDES_PX = range(16, 16385)
+"""Accepted widths and heights of images, pixels."""
 MIN_PRINCIPAL_POINT = -0.5
 """Smallest coordinate of a principal point, pixels: the left edge of the first pixel, whose centre is at 0."""
 ROTATION_TOLERANCE = 1e-6
@@ -65,6 +66,8 @@ STEREOLABS_GRIDS: Mapping[str, tuple[int, int]] = {
 """Image sizes (width, height) of Stereolabs cameras, pixels, by section suffix."""
 
 Sections = Mapping[str, Mapping[str, str]]
+_COMMENT = re.compile(r"(?:^|\s)[;#]")
+_SEPARATOR = re.compile("[=:]")
 
 
 def read_conf(content: bytes, width: int, height: int, problems: list[Problem]) -> StereoCalibration | None:
@@ -100,24 +103,32 @@ def read_conf(content: bytes, width: int, height: int, problems: list[Problem]) 
 
 def _read_sections(content: bytes, problems: list[Problem]) -> Sections:
     """Return the sections, names in upper and keys in lower case, without the comments after ``;`` and ``#``."""
-    parser = configparser.ConfigParser(
-        interpolation=None,
-        comment_prefixes=(";", "#"),
-        inline_comment_prefixes=(";", "#"),
-        default_section="",  # No section provides defaults for the others.
-        empty_lines_in_values=False,
-    )
     try:
-        parser.read_string(content.decode("utf-8-sig"), "the file")
-    except (UnicodeDecodeError, configparser.Error) as error:
-        problems.append(Problem("syntax", "", f"not a valid INI file: {' '.join(str(error).split())}"))
+        lines = content.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        problems.append(Problem("syntax", "", f"byte {error.start} is not UTF-8", "an INI file"))
         return {}
-    sections: dict[str, Mapping[str, str]] = {}
-    for name in parser.sections():
-        upper_name = name.strip().upper()
-        if upper_name in sections:
-            problems.append(Problem("duplicate", format_location("", upper_name), "the section occurs twice"))
-        sections[upper_name] = dict(parser.items(name))
+    sections: dict[str, dict[str, str]] = {}
+    section = ""
+    for line_number, line in enumerate(lines, start=1):
+        if len(problems) == MAX_PROBLEMS_SHOWN:
+            break
+        text = _COMMENT.split(line, maxsplit=1)[0].strip()
+        key, *value = (part.strip() for part in _SEPARATOR.split(text, maxsplit=1))
+        if text.startswith("[") and text.endswith("]"):
+            section = text[1:-1].strip().upper()
+            if section in sections:
+                place = format_location("", section)
+                problems.append(Problem("duplicate", place, f"line {line_number}: the section occurs twice"))
+            sections.setdefault(section, {})
+        elif key and value and section:
+            if key.lower() in sections[section]:
+                place = format_location("", section, key)
+                problems.append(Problem("duplicate", place, f"line {line_number}: the key occurs twice"))
+            sections[section][key.lower()] = value[0]
+        elif text:
+            expected = "[SECTION] or key = value" if section else "a [SECTION]"
+            problems.append(Problem("syntax", "", f"line {line_number} is {short_repr(text)}", expected))
     return sections
 
 
@@ -159,10 +170,7 @@ def _conf_number(
             problems.append(Problem("missing", f"{section}.{keys[-1]}", "missing", expected.text))
         return math.nan if default is None else default
     raw = values[key.lower()]
-    try:
-        value = float(raw)
-    except ValueError:
-        value = math.nan
+    value = parse_number(raw)
     if not expected.accept(value):
         problems.append(Problem("invalid", f"{section}.{key}", f"got {short_repr(raw)}", expected.text))
     return value
@@ -171,7 +179,7 @@ def _conf_number(
 _Matrix = Annotated[tuple[Triple, Triple, Triple], Strict(False)]
 _Offset = Annotated[float, _OFFSET_M]
 _Pixels = Annotated[float, Expected("a number of pixels")]
-_Side = Annotated[int, whole_number(_SIDES_PX[0], _SIDES_PX[-1])]
+_Side = Annotated[int, whole_number(SIDES_PX[0], SIDES_PX[-1])]
 _PINHOLE_ENTRIES: Mapping[str, tuple[int, int]] = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 _PINHOLE = Expected(
     "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", lambda K: (K[0][1], K[1][0], *K[2]) == (0, 0, 0, 0, 1)
@@ -282,7 +290,7 @@ def read_toml(content: bytes, width: int, height: int, problems: list[Problem]) 
     problems += syntax_problems
     sides_px = {"width": width, "height": height}
     values = {**sides_px, **document}
-    context = {key: values[key] if values[key] in _SIDES_PX else side_px for key, side_px in sides_px.items()}
+    context = {key: values[key] if values[key] in SIDES_PX else side_px for key, side_px in sides_px.items()}
     table = None if problems else validate_table(_CalibrationTable, values, problems, context=context)
     if table is None:
         return None

@@ -247,6 +247,8 @@ def fold_radius(distortion: Float[ndarray, 5]) -> float:
     Returns infinity if it grows everywhere.
     """
     k1, k2, _, _, k3 = (float(term) for term in distortion)
-    roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])  # in r^2, of d/dr r (1 + k1 r^2 + k2 r^4 + k3 r^6)
+    terms = np.array([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])  # in r^2, of d/dr r (1 + k1 r^2 + k2 r^4 + k3 r^6)
+    terms[np.abs(terms) < 1e-100] = 0.0  # np.roots divides by the first term that is not zero.
+    roots = np.roots(terms)
     squares = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
     return float(np.sqrt(squares.min(initial=np.inf)))

@@ -13,12 +13,11 @@ from dataclasses import replace
 from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
-from rich.text import Text
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.published import load_published, paper_scene, published_rows
-from rebar_depth_bench.reporting.tables import frame_csv
+from rebar_depth_bench.reporting.tables import frame_csv, plain_text
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_VIEWS
 from rebar_depth_bench.scoring.comparison import Comparison, Difference
 from rebar_depth_bench.scoring.frames import differences_frame
@@ -46,15 +45,15 @@ NUMBER_TITLES: Mapping[str, tuple[str, int, float]] = _titles()
 def print_comparison(comparison: Comparison, console: Console) -> None:
     """Print a table per config: both submissions, their paired difference, its interval and the verdict."""
     first, other = (printable(archive.method) for archive in comparison.provenance.archives)
-    console.print(Text(f"B: {other}, against A: {first}", style="bold"))
-    console.print(Text(_provenance(comparison), style="dim"))
+    console.print(plain_text(f"B: {other}, against A: {first}", style="bold"))
+    console.print(plain_text(_provenance(comparison), style="dim"))
     for config, rows in comparison.configs.items():
         console.print()
-        console.print(Text(f"{printable(config)}, {_views_note(rows)}", style="italic"))
+        console.print(plain_text(f"{printable(config)}, {_views_note(rows)}", style="italic"))
         console.print(_comparison_table(rows))
     console.print()
     console.print(
-        Text(
+        plain_text(
             "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
             f"({BLOCK_VIEWS} steps of the protocol); none with fewer than {MIN_VIEWS} views. B is called better "
             "or worse if the interval excludes zero, which happens by chance in about one of twenty comparisons. "
@@ -97,7 +96,7 @@ def _comparison_table(rows: Sequence[Difference]) -> RichTable:
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("B is")
     for row in rows:
-        table.add_row(*map(Text, _comparison_cells(row)))
+        table.add_row(*map(plain_text, _comparison_cells(row)))
     return table
 
 
@@ -148,21 +147,25 @@ def print_paper_table(results: Sequence[Result], console: Console, *, published:
     digest = formatting.short_digest(first.dataset_digest)
     version = printable(first.dataset_version)
     console.print(
-        Text(f"protocol {PROTOCOL}, dataset {version} ({digest}), software {software_version()}", style="dim")
+        plain_text(
+            f"protocol {PROTOCOL}, dataset {version} ({digest}), software {software_version()}", style="dim"
+        )
     )
     for config in dict.fromkeys(name for result in results for name in result.tables):
         rows = [(result.method, result.tables[config]) for result in results if config in result.tables]
         scene = paper_scene(config) if published else None
         views = rows[0][1].views
         console.print()
-        console.print(Text(f"{printable(config)}, {formatting.counted(views, 'view')}", style="italic"))
+        console.print(plain_text(f"{printable(config)}, {formatting.counted(views, 'view')}", style="italic"))
         console.print(_paper_table(sorted(rows, key=lambda row: _paper_table_sort_key(row[1])), scene))
     console.print()
-    console.print(Text("RMSE, AbsRel: native (no alignment). AbsRel_s: scaled (oracle median scale per view)."))
-    console.print(Text("s: median over views of median(z)/median(p). ‡: not ranked."))
+    console.print(
+        plain_text("RMSE, AbsRel: native (no alignment). AbsRel_s: scaled (oracle median scale per view).")
+    )
+    console.print(plain_text("s: median over views of median(z)/median(p). ‡: not ranked."))
     if published:
         mark = load_published().parts["synthetic"].mark
-        console.print(Text(f"The paper's rows: {mark}. †: median-anchored."))
+        console.print(plain_text(f"The paper's rows: {mark}. †: median-anchored."))
 
 
 def _paper_table(rows: Sequence[tuple[str, Table]], scene: str | None) -> RichTable:
@@ -172,14 +175,14 @@ def _paper_table(rows: Sequence[tuple[str, Table]], scene: str | None) -> RichTa
         grid.add_column(head, justify="right", no_wrap=True)
     for method, table in rows:
         grid.add_row(
-            Text(printable(method, 40) + ("" if table.ranked else " ‡")),
-            *map(Text, formatting.paper_cells(table)),
+            plain_text(printable(method, 40) + ("" if table.ranked else " ‡")),
+            *map(plain_text, formatting.paper_cells(table)),
         )
     if scene is not None:
         grid.add_section()
         for row in published_rows(scene):
             mark = " †" if row.median_anchored else ""
-            grid.add_row(Text(f"paper: {row.method}{mark}"), *map(Text, row.cells), style="dim")
+            grid.add_row(plain_text(f"paper: {row.method}{mark}"), *map(plain_text, row.cells), style="dim")
     return grid
 
 

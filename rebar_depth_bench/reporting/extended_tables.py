@@ -9,7 +9,6 @@ from rich import box
 from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table as RichTable
-from rich.text import Text
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
@@ -17,7 +16,7 @@ from rebar_depth_bench.extended.inspection.measures import MISS_MM
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.tables import frame_csv
+from rebar_depth_bench.reporting.tables import frame_csv, plain_text
 from rebar_depth_bench.scoring.bootstrap import Interval
 from rebar_depth_bench.scoring.result import Result
 
@@ -41,7 +40,7 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
     wide = console.width >= _MIN_WIDTH_WITH_INTERVALS
     for config, table in extended.tables.items():
         console.print()
-        console.print(Text(f"{printable(config)}, {EXTENDED_PROTOCOL}, {table.views} views", style="bold"))
+        console.print(plain_text(f"{printable(config)}, {EXTENDED_PROTOCOL}, {table.views} views", style="bold"))
         grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
         grid.add_column("", overflow="fold")  # Long names are wrapped; numbers are never truncated.
         for heading in ("native", "95 %", "scaled", "95 %") if wide else ("native", "scaled"):
@@ -53,26 +52,27 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
             ]
             if known_rows:
                 grid.add_section()
-                grid.add_row(Text(family.title, style="italic"))
+                grid.add_row(plain_text(family.title, style="italic"))
             for measure, texts in known_rows:
                 grid.add_row(
-                    Padding(measure_heading(measure), (0, 0, 0, 2)), *map(Text, texts if wide else texts[::2])
+                    Padding(measure_heading(measure), (0, 0, 0, 2)),
+                    *map(plain_text, texts if wide else texts[::2]),
                 )
         console.print(grid)
     numbers = [(measure, estimate) for _, _, measure, estimate in extended.estimates()]
     if any(is_miss(estimate, measure) for measure, estimate in numbers):
-        console.print(Text(f"{MISSED}: not found, recorded as {MISS_MM:g} mm in CSV and JSON."))
+        console.print(plain_text(f"{MISSED}: not found, recorded as {MISS_MM:g} mm in CSV and JSON."))
     if any(estimate.value is None and estimate.samples for _, estimate in numbers):
-        console.print(Text(f"{UNDEFINED}: 5 % or more were not found, so the capability is undefined."))
+        console.print(plain_text(f"{UNDEFINED}: 5 % or more were not found, so the capability is undefined."))
     if not wide:
         console.print(
-            Text(
+            plain_text(
                 "Intervals: in CSV, JSON and the report, and in terminals with at least "
                 f"{_MIN_WIDTH_WITH_INTERVALS} columns."
             )
         )
     note = "A single number in the first column is independent of scale or uses its own alignment."
-    console.print(Text(f"{note} Definitions: cards/BENCHMARK.md."))
+    console.print(plain_text(f"{note} Definitions: cards/BENCHMARK.md."))
 
 
 def measure_heading(measure: Measure) -> str:

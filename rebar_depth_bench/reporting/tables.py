@@ -16,7 +16,7 @@ from rich.segment import Segments
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from rebar_depth_bench.errors import printable
+from rebar_depth_bench.errors import printable, terminal_text
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.scoring.frames import tables_frame
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
@@ -119,7 +119,12 @@ def _provenance(result: Result) -> str:
 
 def _print_line(console: Console, line: str, style: str = "") -> None:
     """Print plain text, wrapped at words, without markup or highlighting of numbers."""
-    console.print(Text(line, style=style))
+    console.print(plain_text(line, style))
+
+
+def plain_text(text: str, style: str = "") -> Text:
+    """Return text for the terminal, without markup; control characters of names in it are shown as escapes."""
+    return Text(terminal_text(text), style=style)
 
 
 def print_unwrapped(console: Console, table: RichTable) -> None:
@@ -160,7 +165,7 @@ def _rich_table(tables: Mapping[str, Table], groups: Sequence[_ColumnGroup]) -> 
         table.add_column(_header(head, lines), justify="right", no_wrap=True)
     for name, config_table in tables.items():
         cells = [cell for group in groups for cell in group.cells(config_table)]
-        table.add_row(*map(Text, [printable(name), *cells]))
+        table.add_row(*map(plain_text, [printable(name), *cells]))
     return table
 
 

@@ -1,80 +1,249 @@
-"""Parser of result JSON."""
+"""Parser of result JSON.
+
+The models ignore unknown keys, because results of later versions have more of them.
+"""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any, Self
 
-from rebar_depth_bench.errors import InputError
+from pydantic import BeforeValidator, ConfigDict, FailFast, Field, Strict, model_validator
+
+from rebar_depth_bench.errors import InputError, Problem
+from rebar_depth_bench.limits import JSON_BYTES
+from rebar_depth_bench.reading import parse_json
 from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.result import VIEW_METRICS, Result, Table, ViewScore
+from rebar_depth_bench.submission.entries import config_of
+from rebar_depth_bench.validation import Expected, StrictModel, field_error, text, validate_table
 
 
 def read_result(data: bytes, where: str) -> Result:
     """Return the result in ``data`` without extended measures; ``where`` names the source in error messages.
 
-    Raises ``InputError`` if ``data`` is not a result of the current protocol.
+    Raises ``InputError`` with all problems if ``data`` is not a result of the current protocol.
     """
-    try:
-        document = json.loads(data)
-        if document["protocol"] != PROTOCOL:
-            raise InputError(f"{where}: the protocol is {document['protocol']!r}, expected {PROTOCOL!r}")
-        return Result(
-            method=document["submission"]["method"],
-            submission_sha256=document["submission"]["sha256"],
-            dataset_digest=document["dataset"]["digest"],
-            dataset_version=document["dataset"]["version"],
-            software_version=document["software"]["version"],
-            tables={config: read_table(table) for config, table in document["tables"].items()},
-            views=[_read_view(view) for view in document["views"]],
-        )
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{where}: is not a rebar-bench result: {type(error).__name__}: {error}") from None
+    if len(data) > JSON_BYTES.value():
+        problem = Problem("size", "", f"the result has {len(data)} bytes", JSON_BYTES.allowed())
+        raise InputError.from_problems(where, [problem])
+    document, problems = parse_json(data)
+    content = None if problems else validate_table(_ResultJson, document, problems)
+    if content is None:
+        raise InputError.from_problems(f"{where}: is not a rebar-bench result of protocol {PROTOCOL}", problems)
+    return Result(
+        method=content.submission.method,
+        submission_sha256=content.submission.sha256,
+        dataset_digest=content.dataset.digest,
+        dataset_version=content.dataset.version,
+        software_version=content.software.version,
+        tables={config: table.content() for config, table in content.tables.items()},
+        views=[view.content() for view in content.views],
+    )
 
 
 def read_table(table: Mapping[str, Any]) -> Table:
-    """Return the table of a config from its JSON object."""
-    return Table(
-        views=table["views"],
-        views_scored=table["views_scored"],
-        coverage=table["coverage"],
-        ranked=table["ranked"],
-        native=_read_metrics(table["native"], table["views_scored"] > 0),
-        scaled=_read_metrics(table["scaled"], table["views_scored"] > 0),
-        scale_median=table["scale_median"],
-        within_mm=_read_within_mm(table["within_mm"]),
-        intervals={name: _read_interval(table.get("ci95", {}), name) for name in VIEW_METRICS},
-    )
+    """Return the table of a config from its JSON object. Raises ``InputError`` if it is invalid."""
+    problems: list[Problem] = []
+    content = validate_table(_TableJson, table, problems)
+    if content is None:
+        raise InputError.from_problems("the table of a result", problems)
+    return content.content()
 
 
-def _read_view(view: Mapping[str, Any]) -> ViewScore:
-    predicted = view["coverage"] > 0
-    return ViewScore(
-        view_id=view["view_id"],
-        scored_px=view["scored_px"],
-        coverage=view["coverage"],
-        scale=view["scale"],
-        native=_read_metrics(view["native"], predicted),
-        scaled=_read_metrics(view["scaled"], predicted),
-        within_mm=_read_within_mm(view["within_mm"]),
-    )
+class _StoredModel(StrictModel):
+    """Base class of the objects of a result."""
+
+    model_config = ConfigDict(extra="ignore")
 
 
-def _read_metrics(values: Mapping[str, float | None], predicted: bool) -> DepthMetrics | None:
-    """Return the metrics, or None without predictions; with predictions, null denotes an overflow (``inf``)."""
-    if not predicted:
+_NAME_CHARACTERS = 300
+_MAX_ENTRIES = 5000
+"""Largest number of entries of a JSON object whose keys are names."""
+_Name = Annotated[str, text(_NAME_CHARACTERS)]
+# Constraints of pydantic's core are checked without Python code: the leaderboard reads a table for each row.
+_Count = Annotated[int, Field(ge=0, lt=1 << 53)]
+_Share = Annotated[float, Field(ge=0, le=1)]
+_Size = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_Bound = Annotated[float, Field(allow_inf_nan=False)] | None
+_Interval = Annotated[tuple[_Bound, _Bound], Strict(False)] | None
+_TOLERANCES = {str(tolerance_mm): tolerance_mm for tolerance_mm in WITHIN_MM}
+_VIEW_METRIC_KEYS = [(name, *name.partition(".")[::2]) for name in VIEW_METRICS]
+
+
+def _check_length(table: object) -> object:
+    """Return ``table``; raise the error of a field if it has so many entries that their errors take minutes."""
+    if isinstance(table, dict) and len(table) > _MAX_ENTRIES:
+        raise field_error(f"got {len(table)} entries", f"at most {_MAX_ENTRIES}", "size")
+    return table
+
+
+_LENGTH = BeforeValidator(_check_length)
+_Intervals = Annotated[dict[str, _Interval], _LENGTH]
+
+
+def _has_tolerances(within_mm: Mapping[str, object]) -> bool:
+    return within_mm.keys() >= _TOLERANCES.keys()
+
+
+_WITHIN = Expected(f"a share for each of {', '.join(_TOLERANCES)} mm", _has_tolerances)
+
+
+class _MetricsJson(_StoredModel):
+    """Metrics of a view or table; null where a metric overflowed, or all of them without predictions."""
+
+    abs_rel: _Size | None
+    rmse_cm: _Size | None
+    mae_cm: _Size | None
+    delta1: _Share | None
+
+    def content(self) -> DepthMetrics:
+        """Return the metrics; null is an overflow (``inf``)."""
+        values = (self.abs_rel, self.rmse_cm, self.mae_cm, self.delta1)
+        return DepthMetrics(*[math.inf if value is None else value for value in values])
+
+
+class _AlignedJson(_StoredModel):
+    """Metrics of both alignments, which may be null without predictions."""
+
+    coverage: _Share | None
+    native: _MetricsJson | None
+    scaled: _MetricsJson | None
+
+    @property
+    def is_predicted(self) -> bool:
+        """Whether there is a prediction."""
+        raise NotImplementedError
+
+    @model_validator(mode="after")
+    def _check_metrics(self) -> Self:
+        if self.is_predicted and (self.native is None or self.scaled is None):
+            raise field_error("native or scaled is null", "metrics where there is a prediction", "conflict")
+        return self
+
+    def metrics(self, values: _MetricsJson | None) -> DepthMetrics | None:
+        """Return metrics, None without predictions."""
+        return values.content() if self.is_predicted and values is not None else None
+
+
+class _IntervalsJson(_StoredModel):
+    """95 % intervals, nested like the metrics; a missing interval is undefined."""
+
+    coverage: _Interval = None
+    native: _Intervals = Field(default={})
+    scaled: _Intervals = Field(default={})
+    scale_median: _Interval = None
+    within_mm: _Intervals = Field(default={})
+
+    def content(self) -> dict[str, tuple[float, float] | None]:
+        """Return the interval of each of ``VIEW_METRICS``."""
+        values = vars(self)
+        return {
+            name: _defined(values[group].get(key) if key else values[group])
+            for name, group, key in _VIEW_METRIC_KEYS
+        }
+
+
+def _defined(interval: tuple[float | None, float | None] | None) -> tuple[float, float] | None:
+    if interval is None or interval[0] is None or interval[1] is None:
         return None
-    return DepthMetrics(**{name: math.inf if value is None else value for name, value in values.items()})
+    return interval[0], interval[1]
 
 
-def _read_within_mm(within_mm: Mapping[str, Any]) -> dict[int, Any]:
-    return {int(tolerance_mm): share for tolerance_mm, share in within_mm.items()}
+class _TableJson(_AlignedJson):
+    """Table of a config."""
+
+    views: _Count
+    views_scored: _Count
+    ranked: bool
+    scale_median: _Size | None
+    within_mm: Annotated[dict[str, _Share | None], _WITHIN, _LENGTH]
+    ci95: _IntervalsJson = _IntervalsJson()
+
+    @property
+    def is_predicted(self) -> bool:
+        """Whether a view has a prediction."""
+        return self.views_scored > 0
+
+    def content(self) -> Table:
+        """Return the table."""
+        return Table(
+            views=self.views,
+            views_scored=self.views_scored,
+            coverage=self.coverage,
+            ranked=self.ranked,
+            native=self.metrics(self.native),
+            scaled=self.metrics(self.scaled),
+            scale_median=self.scale_median,
+            within_mm={tolerance_mm: self.within_mm[key] for key, tolerance_mm in _TOLERANCES.items()},
+            intervals=self.ci95.content(),
+        )
 
 
-def _read_interval(nested: Mapping[str, Any], name: str) -> tuple[float, float] | None:
-    group, _, key = name.rpartition(".")
-    bounds = (nested.get(group, {}) if group else nested).get(key)
-    return None if bounds is None or None in bounds else (bounds[0], bounds[1])
+class _ViewJson(_AlignedJson):
+    """Scores of a view."""
+
+    view_id: _Name
+    scored_px: _Count
+    coverage: _Share
+    scale: _Size | None
+    within_mm: Annotated[dict[str, _Share], _WITHIN, _LENGTH]
+
+    @property
+    def is_predicted(self) -> bool:
+        """Whether the view has a prediction."""
+        return self.coverage > 0
+
+    def content(self) -> ViewScore:
+        """Return the view's scores."""
+        return ViewScore(
+            view_id=self.view_id,
+            scored_px=self.scored_px,
+            coverage=self.coverage,
+            scale=self.scale,
+            native=self.metrics(self.native),
+            scaled=self.metrics(self.scaled),
+            within_mm={tolerance_mm: self.within_mm[key] for key, tolerance_mm in _TOLERANCES.items()},
+        )
+
+
+class _DatasetJson(_StoredModel):
+    """Identity of the dataset."""
+
+    digest: Annotated[str, Field(pattern="^sha256:[0-9a-f]{64}$")]
+    version: _Name
+
+
+class _SubmissionJson(_StoredModel):
+    """Identity of the submission."""
+
+    method: _Name
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+
+class _SoftwareJson(_StoredModel):
+    """Version of the software that scored."""
+
+    version: _Name
+
+
+class _ResultJson(_StoredModel):
+    """Content of a result file."""
+
+    protocol: Annotated[str, Expected(f'"{PROTOCOL}"', lambda protocol: protocol == PROTOCOL)]
+    dataset: _DatasetJson
+    submission: _SubmissionJson
+    software: _SoftwareJson
+    tables: Annotated[dict[_Name, _TableJson], _LENGTH]
+    views: Annotated[list[_ViewJson], FailFast()]
+
+    @model_validator(mode="after")
+    def _check_views(self) -> Self:
+        view_ids = [view.view_id for view in self.views]
+        if len(set(view_ids)) < len(view_ids):
+            raise field_error("views: a view_id occurs twice", "each view once", "duplicate")
+        if not {config_of(view_id) for view_id in view_ids} <= self.tables.keys():
+            raise field_error("views: a view belongs to no config of the tables", "views of these", "conflict")
+        return self

@@ -18,7 +18,6 @@ from numpy import ndarray
 from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
-from rich.text import Text
 
 from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.console import add_output_file
@@ -27,7 +26,7 @@ from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.reporting.html.study_page import PageTable, StudyPage, render_study
-from rebar_depth_bench.reporting.tables import frame_csv, print_unwrapped
+from rebar_depth_bench.reporting.tables import frame_csv, plain_text, print_unwrapped
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.ground_truth import ViewTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
@@ -71,24 +70,24 @@ def print_page(page: StudyPage, console: Console) -> None:
 
     Numbers are never truncated: on a narrow console, lines become longer than the console.
     """
-    console.print(Text(page.title, style="bold"))
-    console.print(Text("; ".join(f"{label}: {value}" for label, value in page.stamps), style="dim"))
+    console.print(plain_text(page.title, style="bold"))
+    console.print(plain_text("; ".join(f"{label}: {value}" for label, value in page.stamps), style="dim"))
     for table in page.tables:
         console.print()
-        console.print(Text(table.caption, style="italic"))
+        console.print(plain_text(table.caption, style="italic"))
         print_unwrapped(console, _rich_table(table))
     console.print()
     for note in page.notes:
-        console.print(Text(note))
+        console.print(plain_text(note))
 
 
 def _rich_table(table: PageTable) -> RichTable:
     rich_table = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
     for index, (name, unit) in enumerate(table.heads):
         justify: Any = "left" if index == 0 else "right"
-        rich_table.add_column(Text(f"{name}\n{unit}"), justify=justify, no_wrap=True)
+        rich_table.add_column(plain_text(f"{name}\n{unit}"), justify=justify, no_wrap=True)
     for row in table.rows:
-        rich_table.add_row(*(Text(cell) for cell in row))
+        rich_table.add_row(*(plain_text(cell) for cell in row))
     return rich_table
 
 

@@ -9,10 +9,11 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.errors import Problem, SubmissionError, format_shape
+from rebar_depth_bench.errors import Problem, SubmissionError, format_shape, printable
+from rebar_depth_bench.reading import open_regular
 from rebar_depth_bench.submission import EntryError, ExpectedViews, SubmissionMeta, open_submission
 from rebar_depth_bench.submission.formats import FORMATS, Depth
-from rebar_depth_bench.submission.metadata import DEPTH_SCALE, METADATA_NAME, parse_metadata
+from rebar_depth_bench.submission.metadata import DEPTH_SCALE, MAX_METADATA_BYTES, METADATA_NAME, parse_metadata
 
 _FILE_NAME_PATTERN = "<view_id>, or its part after the slash, with one of " + ", ".join(FORMATS)
 
@@ -91,7 +92,7 @@ class FolderDepths(DepthSource):
         self._files, file_problems = _find_files(path, expected)
         meta, problems = _folder_metadata(path)
         self._scale = png_scale if meta is None or meta.depth_scale is None else meta.depth_scale
-        self.method = path.resolve().name if meta is None else meta.method
+        self.method = printable(path.resolve().name) if meta is None else meta.method
         self.view_ids = tuple(sorted(self._files))
         images = [file.name for file in self._files.values() if file.suffix == ".png"]
         if images and self._scale is None and not problems:
@@ -107,7 +108,7 @@ class FolderDepths(DepthSource):
         file_format = FORMATS[file.suffix]
         limit = file_format.max_bytes(shape)
         try:
-            with file.open("rb") as stream:
+            with open_regular(file) as stream:
                 data = stream.read(limit + 1)
         except OSError as error:
             raise EntryError(Problem("unreadable", name, f"it cannot be read: {error.strerror}")) from error
@@ -138,13 +139,18 @@ def _find_files(path: Path, expected: ExpectedViews) -> tuple[dict[str, Path], l
     files_by_view: dict[str, list[Path]] = {}
     for file in sorted(path.glob("*")) + sorted(path.glob("*/*")):
         view_id = by_stem.get(file.relative_to(path).as_posix())
-        if view_id is not None and file.is_file():
+        if view_id is not None:
             files_by_view.setdefault(view_id, []).append(file)
     problems = []
     for view_id, files in files_by_view.items():
         if len(files) > 1:
             listed = ", ".join(file.name for file in files[:4])
             problems.append(Problem("duplicate", view_id, f"{len(files)} files were found ({listed})", "one"))
+        problems += [
+            Problem("kind", file.relative_to(path).as_posix(), "it is no file", "a regular file or a link to one")
+            for file in files
+            if not file.is_file()
+        ]
     if not files_by_view:
         pattern = f"{_FILE_NAME_PATTERN}, such as {next(iter(expected))}.npy"
         problems = [Problem("missing", "", "no depth file of any view was found", pattern)]
@@ -153,9 +159,10 @@ def _find_files(path: Path, expected: ExpectedViews) -> tuple[dict[str, Path], l
 
 def _folder_metadata(path: Path) -> tuple[SubmissionMeta | None, list[Problem]]:
     file = path / METADATA_NAME
-    if not file.exists():
+    if not os.path.lexists(file):
         return None, []
     try:
-        return parse_metadata(file.read_bytes())
+        with open_regular(file) as stream:
+            return parse_metadata(stream.read(MAX_METADATA_BYTES + 1))
     except OSError as error:
         return None, [Problem("unreadable", METADATA_NAME, f"it cannot be read: {error.strerror}")]

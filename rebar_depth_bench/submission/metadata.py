@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 from urllib.parse import urlsplit
 
 from pydantic import ConfigDict
 
-from rebar_depth_bench.errors import Problem, escape_text
+from rebar_depth_bench.errors import Problem
+from rebar_depth_bench.reading import parse_json
 from rebar_depth_bench.validation import Expected, Flag, StrictModel, text, validate_table
 
 METADATA_NAME = "submission.json"
@@ -64,26 +64,12 @@ class SubmissionMeta(StrictModel):
 def parse_metadata(data: bytes) -> tuple[SubmissionMeta | None, list[Problem]]:
     """Return the validated content of ``submission.json``, or None and all its problems; null means absent."""
     if len(data) > MAX_METADATA_BYTES:
-        found = f"the size is {len(data)} bytes"
-        return None, [Problem("size", METADATA_NAME, found, f"at most {MAX_METADATA_BYTES}")]
-    try:
-        values = json.loads(data.decode("utf-8"), parse_constant=_reject_constant)
-        # json.loads accepts numbers like 1e999 and lone surrogates, which cannot be written as JSON again.
-        json.dumps(values, allow_nan=False, ensure_ascii=False).encode("utf-8")
-    except UnicodeDecodeError as error:
-        return None, [Problem("syntax", METADATA_NAME, f"byte {error.start} is not UTF-8", "UTF-8 text")]
-    except RecursionError:
-        return None, [Problem("syntax", METADATA_NAME, "the JSON is nested too deep", "a flat object")]
-    except ValueError as error:
-        found = f"the text is not valid JSON ({escape_text(str(error))})"
-        return None, [Problem("syntax", METADATA_NAME, found, "a JSON object")]
+        return None, [Problem("size", METADATA_NAME, "it is too large", f"at most {MAX_METADATA_BYTES} bytes")]
+    values, problems = parse_json(data, METADATA_NAME)
+    if problems:
+        return None, problems
     if not isinstance(values, dict):
         expected = 'an object like {"method": "name"}'
         return None, [Problem("invalid", METADATA_NAME, "the JSON is not an object", expected)]
-    problems: list[Problem] = []
     present = {key: value for key, value in values.items() if value is not None}
     return validate_table(SubmissionMeta, present, problems, f"{METADATA_NAME}:"), problems
-
-
-def _reject_constant(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is not JSON")

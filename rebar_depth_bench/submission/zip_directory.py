@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Protocol
 
 from rebar_depth_bench.errors import EntryError, Problem
+from rebar_depth_bench.reading import open_regular
 
 # For smaller reads, pread is cheaper than a mapping and its page faults.
 _MIN_MAPPED_BYTES = 64 * 1024
@@ -43,11 +44,13 @@ class FileSource:
 
     Every large read maps its own range, and the mapping is released with the last view on it, so the resident
     memory is that of the views in use, independent of the file size. The file must not be truncated while a view
-    exists (the operating system would terminate the process with SIGBUS).
+    exists (the operating system would terminate the process with SIGBUS). Raises ``OSError`` for a pipe, device or
+    folder.
     """
 
     def __init__(self, path: Path) -> None:
-        self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        with open_regular(path) as stream:
+            self._fd = os.dup(stream.fileno())
         self._close = weakref.finalize(self, os.close, self._fd)
         self.size = os.fstat(self._fd).st_size
 

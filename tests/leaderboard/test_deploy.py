@@ -16,6 +16,7 @@ from leaderboard.cli import argument_parser
 from leaderboard.settings import Settings
 
 ROOT = Path(__file__).parents[2]
+DATA_VOLUME = "${DATASET:?set the dataset folder}:/data:ro"
 COMPOSE, CONTAINERFILE = ROOT / "deploy/compose.yaml", ROOT / "deploy/Containerfile"
 README = (ROOT / "deploy/README.md").read_text()
 PREFIX = "REBAR_LEADERBOARD_"
@@ -110,8 +111,9 @@ def test_ports_volumes_and_database_are_consistent(compose: dict[str, Any]) -> N
     assert f"127.0.0.1:{port}/healthz" in CONTAINERFILE.read_text()
     assert services["scorer"]["ports"] == [], "scorers beside the web server cannot have its port"
     for name in ("web", "scorer"):
-        mounted = {volume.rsplit(":", 1)[1] for volume in services[name]["volumes"]}
+        mounted = {volume.removesuffix(":ro").rsplit(":", 1)[1] for volume in services[name]["volumes"]}
         assert mounted == {"/state", "/data"}
+        assert [volume for volume in services[name]["volumes"] if volume.endswith(":ro")] == [DATA_VOLUME]
     declared = set(compose["volumes"])
     used = {volume.split(":")[0] for service in services.values() for volume in service["volumes"]}
     assert declared == {name for name in used if name.isidentifier()}

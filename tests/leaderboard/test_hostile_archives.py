@@ -72,7 +72,7 @@ def attack(
     repetitions: Repetitions,
 ) -> Iterator[AttackResult]:
     folder = tmp_path_factory.mktemp("siege")
-    config_truth(open_folder(tiny_root).config("lattice-orbit"))  # Scoring writes this cache beside the dataset.
+    config_truth(open_folder(tiny_root).config("lattice-orbit"))  # The attack finds the cache complete.
     state = folder / "state"
     for name in ("cwd", "home", "tmp", "forbidden"):
         (folder / name).mkdir()

@@ -10,7 +10,7 @@ import yaml
 import rebar_depth_bench as rdb
 from cards import benchmark_card, dataset_card
 from cards.dataset import column_rows
-from rebar_depth_bench.data.dataset import features
+from rebar_depth_bench.data.columns import features
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods import own_methods
 

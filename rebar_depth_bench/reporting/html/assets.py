@@ -29,7 +29,7 @@ def inline_script(*names: str) -> InlineScript:
     text = "\n" + "".join(folder.joinpath(name).read_text(encoding="utf-8") for name in names)
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
     policy = f"default-src 'none'; script-src 'sha256-{digest}'; img-src data:; style-src 'unsafe-inline'"
-    return InlineScript(Markup(text), policy)
+    return InlineScript(Markup(text), policy)  # noqa: S704 -- Scripts of this package.
 
 
 def environment(*loaders: BaseLoader) -> Environment:

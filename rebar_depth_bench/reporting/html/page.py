@@ -16,7 +16,8 @@ from typing import Any
 from markupsafe import Markup
 
 from rebar_depth_bench.atomic_io import write_text
-from rebar_depth_bench.data.dataset import decode_row, iterate_undecoded
+from rebar_depth_bench.data.dataset import iterate_undecoded
+from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import score_charts
@@ -172,12 +173,14 @@ def write_report(result: Result, evaluation: Evaluation, target: Path, *, views_
 
 def iter_view_panels(chosen: Mapping[str, list[ViewScore]], evaluation: Evaluation) -> Iterator[ViewPanels]:
     """Yield the arrays of the chosen views (by config), one view at a time; other rows are not decoded."""
-    for config, views in chosen.items():
+    for name, views in chosen.items():
         scores = {view.view_id: view for view in views}
         if scores:
-            for row in iterate_undecoded(evaluation.folder.config(config), _COLUMNS):
-                if row["view_id"] in scores:
-                    yield _panels(scores[row["view_id"]], decode_row(row), evaluation.submission)
+            config = evaluation.folder.config(name)
+            decoder = RowDecoder.of(config)
+            for row in iterate_undecoded(config, _COLUMNS):
+                if score := scores.get(row["view_id"]):
+                    yield _panels(score, decoder.row(row), evaluation.submission)
 
 
 def _panels(score: ViewScore, row: Mapping[str, Any], submission: SubmissionReader) -> ViewPanels:

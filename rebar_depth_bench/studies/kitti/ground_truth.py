@@ -1,4 +1,4 @@
-"""Reader of KITTI's calibration and ground-truth depth.
+"""Reader of KITTI's ground-truth depth.
 
 Two kinds of ground truth are supported:
 
@@ -8,15 +8,10 @@ Two kinds of ground truth are supported:
   et al., "Sparsity Invariant CNNs", 3DV 2017), below ``ROOT``, ``ROOT/train``, ``ROOT/val``, or ``train`` or
   ``val`` inside ``ROOT/data_depth_annotated``; 16-bit PNG in metres times 256, in which pixels without depth
   are 0; available for 652 images of the Eigen split.
-
-Laser points are projected into the rectified colour images as in Geiger et al., "Vision meets Robotics: The KITTI
-Dataset", IJRR 2013, equation 8: ``y = P_rect_i  R_rect_00  T_velo_to_cam  x`` in homogeneous coordinates.
 """
 
 from __future__ import annotations
 
-import math
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,74 +21,13 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.errors import DatasetError, Problem, format_shape
+from rebar_depth_bench.reading import open_regular
+from rebar_depth_bench.studies.image_header import read_image_shape
+from rebar_depth_bench.studies.kitti.calibration import MAX_SIDE_PX, KittiCamera, read_camera
 from rebar_depth_bench.studies.kitti.metrics import KittiImage
 from rebar_depth_bench.submission import EntryError
 from rebar_depth_bench.submission.image_formats import decode_png, max_png_bytes
-
-CAM_TO_CAM, VELO_TO_CAM = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt"
-_MAX_SIDE_PX = 8192
-
-
-@dataclass(frozen=True, eq=False)
-class KittiCamera:
-    """Rectified colour camera: image size and projection from the laser scanner's frame.
-
-    ``(u d, v d, d) = image_from_velo @ (x, y, z, 1)``, where (x, y, z) is a laser point in the scanner's frame and
-    d its planar depth in the camera, both in metres. ``project_scan`` defines the conversion of (u, v) to pixel
-    indices.
-    """
-
-    width: int
-    height: int
-    image_from_velo: Float64[ndarray, "3 4"]
-
-
-def read_camera(day_folder: Path, camera: int) -> KittiCamera:
-    """Return colour camera 2 or 3, read from the two calibration files in the folder of a day.
-
-    Raises ``DatasetError`` naming the file and the key if the key is missing or does not have the expected count
-    of finite numbers.
-    """
-    cam = _read_calibration_file(day_folder / CAM_TO_CAM)
-    velo = _read_calibration_file(day_folder / VELO_TO_CAM)
-    size = _parse_numbers(cam, day_folder / CAM_TO_CAM, f"S_rect_{camera:02d}", 2)
-    projection = _parse_numbers(cam, day_folder / CAM_TO_CAM, f"P_rect_{camera:02d}", 12).reshape(3, 4)
-    rectification, cam_from_velo = np.eye(4), np.eye(4)
-    rectification[:3, :3] = _parse_numbers(cam, day_folder / CAM_TO_CAM, "R_rect_00", 9).reshape(3, 3)
-    cam_from_velo[:3, :3] = _parse_numbers(velo, day_folder / VELO_TO_CAM, "R", 9).reshape(3, 3)
-    cam_from_velo[:3, 3] = _parse_numbers(velo, day_folder / VELO_TO_CAM, "T", 3)
-    width, height = (int(side) for side in size)
-    if not (0 < width <= _MAX_SIDE_PX and 0 < height <= _MAX_SIDE_PX):
-        raise DatasetError(
-            f"{day_folder / CAM_TO_CAM}: S_rect_{camera:02d} is {width} x {height}, "
-            f"expected 1 to {_MAX_SIDE_PX} each"
-        )
-    return KittiCamera(width, height, projection @ rectification @ cam_from_velo)
-
-
-def _read_calibration_file(path: Path) -> dict[str, str]:
-    try:
-        text = path.read_text(encoding="ascii")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "is not ASCII text"
-        raise DatasetError(f"{path}: cannot be read: {reason}, expected KITTI's calibration of the day") from None
-    pairs = (line.partition(":") for line in text.splitlines())
-    return {key.strip(): value.strip() for key, colon, value in pairs if colon}
-
-
-def _parse_numbers(values: dict[str, str], path: Path, key: str, count: int) -> Float64[ndarray, " n"]:
-    if key not in values:
-        raise DatasetError(f"{path}: has no {key}, expected {count} numbers under that key")
-    parts = values[key].split()
-    try:
-        numbers = [float(part) for part in parts]
-    except ValueError:
-        numbers = [math.nan]
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise DatasetError(f"{path}: {key} is {values[key][:120]!r}, expected {count} finite numbers")
-    return np.array(numbers)
-
 
 GroundTruthKind = Literal["raw", "improved"]
 """A single projected laser scan, or the improved depth map of several scans."""
@@ -106,6 +40,8 @@ PNG_SCALE = 1 / 256
 _IMPROVED_FOLDERS = (".", "train", "val", "data_depth_annotated/train", "data_depth_annotated/val")
 _POINT_BYTES = 16
 _MAX_SCAN_BYTES = 64_000_000
+_MAX_DISTANCE_M = 10_000
+"""Largest magnitude of a laser point's coordinate, far beyond the range of a scanner."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +71,7 @@ def find_truth(
     cameras: dict[tuple[str, int], KittiCamera] = {}
     for image in images:
         path = _raw_path(root, image) if kind == "raw" else _improved_path(root, image)
-        if not path.is_file():
+        if not path.exists():
             missing.append(image.name)
         elif kind == "improved":
             truths.append(TruthFile(image, path, _png_shape(path), None))
@@ -163,16 +99,21 @@ def read_truth(file: TruthFile, lidar_depth: LidarDepthConvention = "camera") ->
 def read_scan(path: Path) -> Float32[ndarray, "n 4"]:
     """Return a laser scan with the columns x forward, y left, z up (metres) and reflectance.
 
-    Raises ``DatasetError`` if the file cannot be read, has an invalid size or contains non-finite coordinates.
+    Raises ``DatasetError`` if the file cannot be read, has an invalid size or contains a coordinate that is not
+    finite or beyond any scanner's range.
     """
     data = _read_limited(path, _MAX_SCAN_BYTES)
     if not data or len(data) % _POINT_BYTES:
-        raise DatasetError(
-            f"{path}: has {len(data)} bytes, expected a multiple of {_POINT_BYTES} (float32 x y z reflectance)"
-        )
+        expected = f"a multiple of {_POINT_BYTES} (float32 x y z reflectance)"
+        problem = Problem("size", "", f"it has {len(data)} bytes", expected)
+        raise DatasetError.from_problems(path, [problem])
     points = np.frombuffer(data, "<f4").reshape(-1, 4)
-    if not np.isfinite(points[:, :3]).all():
-        raise DatasetError(f"{path}: holds a coordinate that is not finite, expected metres")
+    near = np.abs(points[:, :3]).max(axis=1) <= _MAX_DISTANCE_M  # False for NaN.
+    if not near.all():
+        index = int(np.argmin(near))
+        found = f"the coordinates are {points[index, :3].tolist()}"
+        problem = Problem("invalid", f"point {index + 1}", found, f"metres, up to {_MAX_DISTANCE_M}")
+        raise DatasetError.from_problems(path, [problem])
     return points
 
 
@@ -190,8 +131,8 @@ def project_scan(
     searching for the nearest point, their code merges the first and last columns of the image; this function does
     not. The Garg and Eigen crops exclude both columns.
     """
-    ahead = points[points[:, 0] >= 0].astype(np.float64)
-    homogeneous = np.concatenate([ahead[:, :3], np.ones((len(ahead), 1))], axis=1)
+    ahead = points[points[:, 0] >= 0, :3].astype(np.float64)
+    homogeneous = np.concatenate([ahead, np.ones((len(ahead), 1))], axis=1)
     projected: Float64[ndarray, "n 3"] = homogeneous @ camera.image_from_velo.T
     front = projected[:, 2] > 0
     ahead, projected = ahead[front], projected[front]
@@ -208,32 +149,33 @@ def project_scan(
 def _improved_depth(file: TruthFile) -> Float32[ndarray, "h w"]:
     data = _read_limited(file.path, max_png_bytes(file.shape))
     try:
-        return decode_png(str(file.path), memoryview(data), file.shape, PNG_SCALE).astype(np.float32)
+        return decode_png("", memoryview(data), file.shape, PNG_SCALE).astype(np.float32)
     except EntryError as error:
-        raise DatasetError(str(error)) from None
+        raise DatasetError.from_problems(file.path, error.problems) from None
 
 
 def _png_shape(path: Path) -> tuple[int, int]:
-    """Return (H, W) from the header of a PNG. Raises ``DatasetError`` if it is not a valid PNG header."""
+    """Return (H, W) from the header of a PNG. Raises ``DatasetError`` if it is not that of a KITTI depth map."""
     try:
-        with path.open("rb") as stream:
-            head = stream.read(24)
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from None
-    width, height = struct.unpack(">2I", head[16:24]) if len(head) == 24 and head[12:16] == b"IHDR" else (0, 0)
-    if not (0 < width <= _MAX_SIDE_PX and 0 < height <= _MAX_SIDE_PX):
-        raise DatasetError(f"{path}: is {height} x {width} pixels, expected a PNG of 1 to {_MAX_SIDE_PX} each")
-    return height, width
+        shape = read_image_shape(path)
+    except EntryError as error:
+        raise DatasetError.from_problems(path, error.problems) from None
+    if max(shape) > MAX_SIDE_PX:
+        problem = Problem("size", "", f"the image is {format_shape(shape)} (H x W)", f"up to {MAX_SIDE_PX} each")
+        raise DatasetError.from_problems(path, [problem])
+    return shape
 
 
 def _read_limited(path: Path, limit: int) -> bytes:
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             data = stream.read(limit + 1)
     except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from None
+        problem = Problem("unreadable", "", f"cannot be read: {error.strerror}")
+        raise DatasetError.from_problems(path, [problem]) from None
     if len(data) > limit:
-        raise DatasetError(f"{path}: is larger than {limit} bytes, expected a KITTI file")
+        problem = Problem("size", "", f"it has more than {limit} bytes", "a KITTI file")
+        raise DatasetError.from_problems(path, [problem])
     return data
 
 
@@ -247,4 +189,4 @@ def _improved_path(root: Path, image: KittiImage) -> Path:
         Path(image.drive) / "proj_depth" / "groundtruth" / f"image_{image.camera:02d}" / f"{image.frame}.png"
     )
     candidates = [root / folder / relative_path for folder in _IMPROVED_FOLDERS]
-    return next((path for path in candidates if path.is_file()), root / "train" / relative_path)
+    return next((path for path in candidates if path.exists()), root / "train" / relative_path)

@@ -15,14 +15,14 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from PIL import Image, UnidentifiedImageError
-
-from rebar_depth_bench.errors import InputError, Problem, escape_text
+from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.geometry.calibration import read_calibration
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration, calibrated_baseline_m
+from rebar_depth_bench.studies.image_header import read_image_shape
 
 CAPTURE_LAYOUT = "left/<name>.png|jpg, right/<name>.png|jpg, calibration.conf|toml"
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -86,19 +86,13 @@ def open_capture(path: str | os.PathLike[str]) -> Capture:
     for files, other, other_eye in ((left, right, "right"), (right, left, "left")):
         unpaired = sorted(files.keys() - other.keys())
         problems += [Problem("missing", _entry(files[stem]), f"has no {other_eye}/{stem}") for stem in unpaired]
-    sizes = {file: _image_size(file, problems) for files in (left, right) for file in files.values()}
-    if left:
-        width, height = sizes[min(left.values())]
-        problems += [
-            Problem("invalid", _entry(file), f"is {size[0]} x {size[1]}", f"{width} x {height} as the first")
-            for file, size in sizes.items()
-            if size != (width, height) and all(size)
-        ]
-    elif not problems:
+    shape = _common_shape([*left.values(), *right.values()], problems)
+    if shape is None and not problems:
         problems.append(Problem("missing", "left/", "has no images"))
-    if problems:
+    if shape is None or problems:
         raise InputError.from_problems(f"{root}: expected a capture ({CAPTURE_LAYOUT})", problems)
     view_ids = tuple(f"{name}/{stem}" for stem in sorted(left))
+    height, width = shape
     return Capture(root, view_ids, height, width, _read_calibration(root, width, height))
 
 
@@ -112,9 +106,12 @@ def _image_files(folder: Path, problems: list[Problem]) -> dict[str, Path]:
     if not folder.is_dir():
         problems.append(Problem("missing", f"{folder.name}/", "no such folder"))
         return {}
+    if not os.access(folder, os.R_OK | os.X_OK):
+        problems.append(Problem("unreadable", f"{folder.name}/", "the folder cannot be read"))
+        return {}
     files: dict[str, Path] = {}
     for file in sorted(folder.iterdir()):
-        if file.suffix.lower() not in _IMAGE_SUFFIXES or not file.is_file():
+        if file.suffix.lower() not in _IMAGE_SUFFIXES or file.is_dir():
             continue
         if file.stem in files:
             problems.append(Problem("duplicate", _entry(file), "the name occurs twice", "one image per view"))
@@ -124,14 +121,20 @@ def _image_files(folder: Path, problems: list[Problem]) -> dict[str, Path]:
     return files
 
 
-def _image_size(file: Path, problems: list[Problem]) -> tuple[int, int]:
-    """Return (width, height) from the image header; if unreadable, return zeros and append to ``problems``."""
-    try:
-        with Image.open(file) as image:
-            return image.size
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        problems.append(Problem("damaged", _entry(file), f"is not a readable image ({type(error).__name__})"))
-        return 0, 0
+def _common_shape(images: Sequence[Path], problems: list[Problem]) -> tuple[int, int] | None:
+    """Return (height, width) of the first readable image; add a problem for each of another size or unreadable."""
+    shape: tuple[int, int] | None = None
+    for file in images:
+        try:
+            height, width = read_image_shape(file)
+        except EntryError as error:
+            problems += [replace(problem, where=_entry(file)) for problem in error.problems]
+            continue
+        shape = shape or (height, width)
+        if (height, width) != shape:
+            expected = f"{shape[1]} x {shape[0]} as the first"
+            problems.append(Problem("invalid", _entry(file), f"is {width} x {height}", expected))
+    return shape
 
 
 def _read_calibration(root: Path, width: int, height: int) -> StereoCalibration:

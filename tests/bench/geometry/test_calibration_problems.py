@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
@@ -34,14 +35,17 @@ INVALID_CONF = [
     ("fx=700.5", "fx=1e999", "invalid LEFT_CAM_HD.fx", "got '1e999'"),
     ("fx=700.5", "fx=-700.5", "invalid LEFT_CAM_HD.fx", "got '-700.5'"),
     ("fx=700.5\n", "", "missing LEFT_CAM_HD.fx", "expected a number from 1 to 100000 pixels"),
-    ("fx=700.5", "fx=700.5\nFX=700", "syntax ", "already exists"),
+    ("fx=700.5", "fx=700.5\nFX=700", "duplicate LEFT_CAM_HD.FX", "line 3: the key occurs twice"),
+    ("fx=700.5", "fx=7_00.5", "invalid LEFT_CAM_HD.fx", "got '7_00.5'"),
+    ("fx=700.5", "fx=٧٠٠", "invalid LEFT_CAM_HD.fx", ""),
+    ("fx=700.5", "fx=700.5\n\x1b[2J=1\n\x1b[2J=1", r"duplicate LEFT_CAM_HD.'\x1b[2J'", "line 4"),
     ("k1=-0.16", "k1=%(k2)s", "invalid RIGHT_CAM_HD.k1", "got '%(k2)s', expected a number from -1000"),
     ("k1=-0.17\n", "", "missing LEFT_CAM_HD.k1", ""),
     ("cx=640.25", "cx=1290", "invalid LEFT_CAM_HD.cx", "expected a number from -0.5 to 1279.5 pixels"),
     ("cy=359.75", "cy=-1", "invalid RIGHT_CAM_HD.cy", "expected a number from -0.5 to 719.5 pixels"),
     ("[RIGHT_CAM_HD]", "[RIGHT_CAM_VGA]", "missing RIGHT_CAM_HD", ""),
     ("[STEREO]", "[MONO]", "missing STEREO", ""),
-    ("[STEREO]", "[LEFT_CAM_HD]", "syntax ", "section 'LEFT_CAM_HD' already exists"),
+    ("[STEREO]", "[LEFT_CAM_HD]", "duplicate LEFT_CAM_HD", "line 23: the section occurs twice"),
     ("[STEREO]", "[left_cam_hd]", "duplicate LEFT_CAM_HD", ""),
     ("Baseline=120.5", "Baseline=0.1205", "invalid STEREO.Baseline", "from 1 to 10000 millimetres"),
     ("Baseline=120.5", "Baseline=-120.5", "invalid STEREO.Baseline", ""),
@@ -49,8 +53,8 @@ INVALID_CONF = [
     ("CV_HD=0.006", "CV_VGA=0.006", "missing STEREO.CV", "expected a number from -0.5 to 0.5 radians"),
     ("RX_HD=-0.001", "RX_HD=-5", "invalid STEREO.RX_HD", ""),
     ("TY=0.25", "TY=1e6", "invalid STEREO.TY", "millimetres"),
-    ("[LEFT_CAM_HD]\n", "", "syntax ", "File contains no section headers"),
-    ("fx=700.5", "fx 700.5 ", "syntax ", "parsing errors"),
+    ("[LEFT_CAM_HD]\n", "", "syntax ", "line 1 is 'fx=700.5', expected a [SECTION]"),
+    ("fx=700.5", "fx 700.5 ", "syntax ", "line 2 is 'fx 700.5', expected [SECTION] or key = value"),
     ("TY=0.25", "TY=-100", "conflict stereo", "at (0.1205, -0.1, -0.00075) m from the left one"),
     ("k1=-0.17", "k1=-0.9", "conflict left", FOLDS_BACK),
     ("k2=0.02", "k2=-30", "conflict right", FOLDS_BACK),
@@ -69,8 +73,8 @@ def test_invalid_conf_is_rejected(tmp_path: Path, old: str, new: str, location: 
     ("content", "code", "words"),
     [
         (b"", "missing", "the file has no section, expected one of"),
-        (b"\x00" * 100, "syntax", "not a valid INI file"),
-        (b"\xff\xfe[\x00L\x00", "syntax", "can't decode byte 0xff in position 0"),
+        (b"\x00" * 100, "syntax", "line 1 is '\\x00"),
+        (b"\xff\xfe[\x00L\x00", "syntax", "byte 0 is not UTF-8"),
         (b"[STEREO]\nBaseline=120\n", "missing", "the file has [STEREO], expected one of [LEFT_CAM_2K]"),
         (b"[DEFAULT]\nfx=1\n", "missing", "the file has [DEFAULT], expected"),
         (b"; " + b"x" * (1 << 20), "size", "at most 1048576 bytes"),
@@ -97,6 +101,39 @@ def test_unreadable_path_raises_calibration_error(tmp_path: Path, name: str, cod
         read_calibration(tmp_path / name, 1280, 720)
     assert locations(caught.value.problems) == [(code, "")]
     assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "9" * 1_000_000 + "x",
+        " " * 1_000_000 + "x",
+        "[" + " " * 1_000_000 + "x",
+        "a " * 500_000,
+        "[a]\n" * 200_000,
+        "[a]\n" + "b=1\n" * 200_000,
+        CONF.replace("700.5", "9" * 1_000_000 + "x"),
+        CONF.replace("700.5", "1e" + "9" * 1_000_000),
+    ],
+)
+def test_large_files_are_rejected_quickly(tmp_path: Path, text: str) -> None:
+    start = time.process_time()
+    problems = reported_problems(tmp_path, text)
+    assert time.process_time() - start < 2
+    assert all(len(str(problem)) < 300 for problem in problems)
+
+
+def test_negligible_distortion_reads_as_written(tmp_path: Path) -> None:
+    calibration = write_and_read(tmp_path, TOML.replace("-0.002, 0.0001]", "-0.002, 1e-320]"), "rig.toml")
+    assert calibration.left.distortion[4] == 1e-320
+
+
+@pytest.mark.parametrize("size", [(0, 0), (1280, 0), (-1, 720), (15, 15), (1280, 16385)])
+@pytest.mark.parametrize(("name", "text"), [("SN1.conf", CONF), ("rig.toml", TOML)])
+def test_impossible_image_size_is_rejected(tmp_path: Path, name: str, text: str, size: tuple[int, int]) -> None:
+    with pytest.raises(CalibrationError, match="expected 16 to 16384 pixels each") as caught:
+        write_and_read(tmp_path, text, name, size)
+    assert locations(caught.value.problems) == [("invalid", "")]
 
 
 def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
