@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from rebar_depth_bench import limits
+from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.errors import InputError, terminal_text
 from rebar_depth_bench.paths import check_no_links, path_below, remove_file, remove_folder
 from rebar_depth_bench.reading import MAX_NESTING, open_regular, parse_json, parse_toml, read_file
@@ -161,3 +162,15 @@ def test_terminal_text_shows_escape_sequences_and_truncates() -> None:
     assert "\\x1b[2J\\u202e" in shown
     assert len(shown) < 3000
     assert terminal_text("a: 2 problems\n  - é") == "a: 2 problems\n  - é"
+
+
+def test_output_never_replaces_a_device_or_a_pipe(tmp_path: Path) -> None:
+    """As root, a rename over ``/dev/null`` replaced the device by a file."""
+    pipe, link = tmp_path / "pipe", tmp_path / "link"
+    os.mkfifo(pipe)
+    link.symlink_to("/dev/null")
+    for target in (pipe, link):
+        with pytest.raises(InputError):
+            write_text(target, "content")
+    assert pipe.is_fifo()
+    assert link.is_symlink()
