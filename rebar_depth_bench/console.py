@@ -6,6 +6,7 @@ import argparse
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -106,7 +107,9 @@ def run_command(command: Callable[[], None], interrupted: str = "interrupted") -
     on Ctrl-C.
     """
     try:
-        command()
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module=r"PIL\.")  # Errors name the image and its file.
+            command()
     except RebarDepthError as error:
         print_notice(f"error: {error}")
         return EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER

@@ -97,6 +97,8 @@ def _open_image(
 
     Raises ``ValueError`` or an error of Pillow, which has no base class, for other content.
     """
+    if not isinstance(content, bytes):
+        raise ValueError("the cell holds no bytes")
     if len(content) > CELL_BYTES.value():
         raise ValueError(f"it has {len(content)} bytes, expected {CELL_BYTES.allowed()}")
     plugin = next((plugin for start, plugin in _PLUGINS.items() if content.startswith(start)), None)

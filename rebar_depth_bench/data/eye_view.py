@@ -83,10 +83,10 @@ def camera_array(kind: str, cell: Any) -> Float64[ndarray, ...]:
     if isinstance(cell, ndarray):
         return cell
     array = np.array(cell, dtype=np.float64)
-    if array.shape != _CAMERA_SHAPES[kind] or not np.isfinite(array).all():
-        raise ValueError(
-            f"it has the shape {array.shape}, expected finite numbers of shape {_CAMERA_SHAPES[kind]}"
-        )
+    if array.shape != _CAMERA_SHAPES[kind]:
+        raise ValueError(f"it has the shape {array.shape}, expected {_CAMERA_SHAPES[kind]}")
+    if not np.isfinite(array).all():
+        raise ValueError("it has values that are not finite, expected finite numbers")
     if kind == "cam_from_world":
         rotation = array[:3, :3]
         error = np.abs(rotation @ rotation.T - np.eye(3)).max()

@@ -101,6 +101,19 @@ class Rig(_ManifestTable):
     height: _Side
 
 
+class Trajectory(_ManifestTable):
+    """Cameras of a config: shells, rings of a shell, and azimuths of a ring."""
+
+    radii_m: Annotated[tuple[float, ...], Strict(False)] = (0.0,)
+    elevations_deg: Annotated[tuple[float, ...], Strict(False)] = (0.0,)
+    azimuths: Annotated[int, whole_number(1, 1_000_000)]
+
+    @property
+    def views(self) -> int:
+        """Number of views of the full trajectory."""
+        return len(self.radii_m) * len(self.elevations_deg) * self.azimuths
+
+
 class DatasetConfig(Located):
     """Config of a dataset; ``manifest_entry`` is its entry as it was written, with all parameters of the build."""
 
@@ -109,6 +122,7 @@ class DatasetConfig(Located):
     rig: Rig
     views: Annotated[tuple[ViewRecord, ...], Strict(False)]
     ground_truth_digest: _Digest
+    protocol: Trajectory | None = None
     protocol_views: Annotated[int, whole_number(1, 1_000_000)] = 0
     key: Annotated[str, StringConstraints(max_length=200)]
     shards: Annotated[tuple[_Path, ...], Strict(False)]
@@ -148,6 +162,9 @@ class DatasetConfig(Located):
             raise field_error(
                 f"got {protocol_views}", f"at least {least}: views and their largest index", "conflict"
             )
+        trajectory = info.data.get("protocol")
+        if trajectory is not None and protocol_views != trajectory.views:
+            raise field_error(f"got {protocol_views}", f"the trajectory's {trajectory.views} views", "conflict")
         return protocol_views
 
     @field_validator("shards")

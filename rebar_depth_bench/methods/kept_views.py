@@ -20,6 +20,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import atomic_replace, write_text
+from rebar_depth_bench.console import print_notice
 from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.paths import NAME_PATTERN, path_below, remove_folder
@@ -70,6 +71,8 @@ class KeptViews:
                     raise InputError(f"{foreign}, expected a folder with predictions of an interrupted run only")
                 if _is_key(path / _KEY_FILE, key_json):
                     return cls(path)
+                views = sum(1 for _ in path.glob("*/*.npz"))
+                print_notice(f"starting over: {path} holds {views} views of another method, dataset or version")
                 remove_folder(path)
             path.mkdir(parents=True)
         except OSError as error:

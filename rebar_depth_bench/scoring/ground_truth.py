@@ -145,6 +145,7 @@ def _verified_pixels(left: EyeView, record: ViewRecord, config: DatasetConfig) -
     if digest != record.left or len(pixels) != record.scored_px:
         raise DatasetError(
             f"{config.root}: view {record.view_id}: ground truth has digest {digest[:16]} and {len(pixels)} "
-            f"scored pixels, the manifest has {record.left[:16]} and {record.scored_px}"
+            f"scored pixels, the manifest has {record.left[:16]} and {record.scored_px}; "
+            f"rebar-bench verify {config.root} lists damaged files"
         )
     return pixels

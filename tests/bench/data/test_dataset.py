@@ -209,6 +209,7 @@ def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
             for views, code in (
                 (8, "conflict"),
                 (476, "conflict"),
+                (505, "conflict"),
                 (-1, "invalid"),
                 ("504", "invalid"),
                 (504.5, "invalid"),

@@ -174,10 +174,11 @@ def test_damaged_report_is_made_again(
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[" * 100_000, b"\xff", b"x" * 100])
 def test_run_with_damaged_key_starts_over(
-    content: bytes, interrupted: Path, tiny_root: Path, tmp_path: Path
+    content: bytes, interrupted: Path, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (interrupted / "key.json").write_bytes(content)
     assert predict_orbit(tiny_root, tmp_path)[1:] == ["prepare lattice-orbit False", *orbit_view_ids(tiny_root)]
+    assert f"starting over: {interrupted}" in capsys.readouterr().err
 
 
 def place_text(path: Path) -> None:
