@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,24 +15,11 @@ from jaxtyping import Bool, Float32, UInt8, UInt16
 from numpy import ndarray
 from PIL import Image
 from PIL.ImageFile import ImageFile
-from PIL.JpegImagePlugin import JpegImageFile
-from PIL.PngImagePlugin import PngImageFile
-from PIL.TiffImagePlugin import TiffImageFile
-from PIL.WebPImagePlugin import WebPImageFile
 
 from rebar_depth_bench.limits import CELL_BYTES
 
 _TIFF_PREDICTOR, _FLOATING_POINT = 317, 3
 _TIFF_ROWS_PER_STRIP, _TIFF_TILE_WIDTH = 278, 322
-# Image.open would print a warning for a large image before its size can be compared.
-_PLUGINS: Mapping[bytes, type[ImageFile]] = {
-    b"II": TiffImageFile,
-    b"MM": TiffImageFile,
-    b"\x89PNG": PngImageFile,
-    b"RIFF": WebPImageFile,
-    b"\xff\xd8": JpegImageFile,
-}
-"""Reader of an image by the first bytes of its content."""
 
 
 def encode_depth(depth_m: Float32[ndarray, "h w"]) -> bytes:
@@ -101,7 +89,7 @@ def _open_image(
         raise ValueError("the cell holds no bytes")
     if len(content) > CELL_BYTES.value():
         raise ValueError(f"it has {len(content)} bytes, expected {CELL_BYTES.allowed()}")
-    plugin = next((plugin for start, plugin in _PLUGINS.items() if content.startswith(start)), None)
+    plugin = next((plugin for start, plugin in _plugins().items() if content.startswith(start)), None)
     if plugin is None or plugin.format not in formats:
         raise ValueError(f"it starts with {content[:4]!r}, expected {' or '.join(formats)}")
     image = plugin(io.BytesIO(content))
@@ -110,9 +98,25 @@ def _open_image(
         raise ValueError(f"its size is {image.size[0]} x {image.size[1]}, expected {width} x {height}")
     if image.mode not in modes:
         raise ValueError(f"its mode is {image.mode}, expected {' or '.join(modes)}")
-    if isinstance(image, TiffImageFile) and _TIFF_TILE_WIDTH in image.tag_v2:
+    if _TIFF_TILE_WIDTH in getattr(image, "tag_v2", ()):
         raise ValueError("it is a TIFF of tiles, whose size is not that of the image, expected strips")
     return image
+
+
+@cache
+def _plugins() -> Mapping[bytes, type[ImageFile]]:
+    """Return Pillow's reader of an image by the first bytes of its content.
+
+    ``Image.open`` would warn of a large image before its size can be compared. The readers are imported on use,
+    which scoring with a filled cache does not need.
+    """
+    from PIL.JpegImagePlugin import JpegImageFile
+    from PIL.PngImagePlugin import PngImageFile
+    from PIL.TiffImagePlugin import TiffImageFile
+    from PIL.WebPImagePlugin import WebPImageFile
+
+    tiff, png, webp, jpeg = TiffImageFile, PngImageFile, WebPImageFile, JpegImageFile
+    return {b"II": tiff, b"MM": tiff, b"\x89PNG": png, b"RIFF": webp, b"\xff\xd8": jpeg}
 
 
 def _encode_image(image: Image.Image, image_format: str, **options: Any) -> bytes:
