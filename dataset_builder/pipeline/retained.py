@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, Strict
+from pydantic import Field
 
 from dataset_builder.config.rigs import GRIDS
 from dataset_builder.pipeline.folder import MESHES, PICTURES, SHARD_NAME
@@ -48,7 +48,6 @@ class _Rig(_Table):
 class _Protocol(_Table):
     kind: Annotated[str, one_of("dome", "ring", "sweep")]
     radius_m: _Distance = 1.0
-    radii_m: Annotated[tuple[_Distance, ...], Strict(False), Field(min_length=1)] = (1.0,)
 
 
 class _Entry(_Table):

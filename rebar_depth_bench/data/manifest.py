@@ -45,6 +45,7 @@ _Sha256 = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
 _Digest = Annotated[str, StringConstraints(pattern=f"^{_DIGEST_PATTERN}$"), Expected("sha256: and 64 hex digits")]
 _Side = Annotated[int, whole_number(1, 16384)]
 _Length = Annotated[float, number(0, 10)]
+_Distance = Annotated[float, number(0)]
 
 
 class ViewRecord(StrictModel):
@@ -104,8 +105,8 @@ class Rig(_ManifestTable):
 class Trajectory(_ManifestTable):
     """Cameras of a config: shells, rings of a shell, and azimuths of a ring."""
 
-    radii_m: Annotated[tuple[float, ...], Strict(False)] = (0.0,)
-    elevations_deg: Annotated[tuple[float, ...], Strict(False)] = (0.0,)
+    radii_m: Annotated[tuple[_Distance, ...], Strict(False), Field(min_length=1)] = (1.0,)
+    elevations_deg: Annotated[tuple[float, ...], Strict(False), Field(min_length=1)] = (0.0,)
     azimuths: Annotated[int, whole_number(1, 1_000_000)]
 
     @property

@@ -159,7 +159,7 @@ def test_only_leftovers_of_builds_are_deleted(root: Path, tmp_path: Path) -> Non
         (lambda entry: entry["scene"].update(assembly=[]), "scene.assembly"),
         (lambda entry: entry["scene"]["assembly"].update(path="a\x1b[2Jb"), "scene.assembly.path"),
         (lambda entry: entry["rig"].update(grid="other"), "rig.grid"),
-        (lambda entry: entry.update(protocol={"kind": "dome", "radii_m": []}), "protocol.radii_m"),
+        (lambda entry: entry["protocol"].update(radii_m=[]), "protocol.radii_m"),
         (lambda entry: entry["colour"].update(samples="1"), "colour.samples"),
     ],
 )
