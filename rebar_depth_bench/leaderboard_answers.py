@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from rebar_depth_bench.errors import (
     MAX_PROBLEMS_SHOWN,
@@ -26,11 +26,11 @@ from rebar_depth_bench.errors import (
 from rebar_depth_bench.reading import parse_json
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.result_io import read_result
-from rebar_depth_bench.validation import Expected, one_of, text, validate_table, whole_number
+from rebar_depth_bench.validation import Expected, StrictModel, one_of, text, validate_table, whole_number
 
 _MAX_INTEGER = 2**63 - 1
 _MAX_LINE_CHARACTERS = 500
-_PROBLEMS = TypeAdapter(tuple[Problem, ...])
+_PROBLEMS = TypeAdapter(tuple[Problem, ...], config=ConfigDict(defer_build=True))
 
 
 class ServiceError(RebarDepthError):
@@ -49,10 +49,8 @@ SUBMISSION_ID = _matches("[A-Za-z0-9_-]{1,100}", "an id of letters, digits, _ an
 """Description of an id, which becomes part of URLs."""
 
 
-class _Answer(BaseModel):
+class _Answer(StrictModel, extra="ignore"):
     """Base class of answers: types are strict, and keys of newer services are ignored."""
-
-    model_config = ConfigDict(extra="ignore", strict=True, frozen=True)
 
 
 class TokenInfo(_Answer):

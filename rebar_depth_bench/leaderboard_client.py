@@ -118,7 +118,10 @@ class LeaderboardClient:
                     return submission
             time.sleep(min(POLL_INTERVAL_S, max(end - time.monotonic(), 0)))
         page = f"{self._url}/submissions/{submission_id}"
-        raise ServiceError(f"{page}: the submission is still {status} after {limit_s:g} s of waiting")
+        raise ServiceError(
+            f"{page}: the submission is still {status} after {limit_s:g} s of waiting; this page shows its result "
+            "once it is scored"
+        )
 
     def result(self, submission_id: str, archive_sha256: str | None = None) -> bytes:
         """Return the result JSON, byte-identical to the output of ``rebar-bench score --json``.

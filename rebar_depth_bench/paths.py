@@ -16,8 +16,12 @@ from rebar_depth_bench.errors import InputError, escape_text
 
 NAME_PATTERN = "[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}"
 """Regular expression of a name, which is one part of a path: it cannot be hidden, ``..`` or empty."""
+NAME_LETTERS = 'letters, digits, "_", "." and "-", not starting with a dot'
+"""Description of ``NAME_PATTERN`` for messages."""
 PATH_PATTERN = f"({NAME_PATTERN}/){{0,9}}{NAME_PATTERN}"
 """Regular expression of up to ten names that are joined by ``/``."""
+VIEW_ID_PATTERN = f"{NAME_PATTERN}/{NAME_PATTERN}"
+"""Regular expression of a view id, ``<config>/<index>``."""
 
 
 def path_below(folder: Path, name: str) -> Path:
@@ -26,9 +30,8 @@ def path_below(folder: Path, name: str) -> Path:
     Raises ``InputError`` for any other text, such as an absolute path or one with ``..``.
     """
     if not re.fullmatch(PATH_PATTERN, name):
-        expected = 'letters, digits, "_", "." and "-" in each part, not starting with a dot'
         raise InputError(
-            f"{folder}: {escape_text(name)} is not the path of a file in this folder, expected {expected}"
+            f"{folder}: {escape_text(name)} is not a path in this folder, expected names of {NAME_LETTERS}"
         )
     return folder / name
 
@@ -43,7 +46,9 @@ def check_no_links(folder: Path, *names: str) -> None:
         for part in Path(name).parts:
             path = path / part
             if path.is_symlink():
-                raise InputError(f"{path}: is a symbolic link, expected a file or folder that can be replaced")
+                raise InputError(
+                    f"{path}: is a symbolic link, expected a file or folder (links are not followed here)"
+                )
 
 
 def remove_file(path: Path) -> None:

@@ -34,7 +34,7 @@ _TYPES = {"model_type": "a table", "dict_type": "a table", "tuple_type": "a list
 class StrictModel(BaseModel):
     """Base class of schemas; unknown keys and conversions between types (``"3"`` or true to 1) are rejected."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, defer_build=True)
 
 
 @dataclass(frozen=True)

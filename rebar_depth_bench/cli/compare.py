@@ -8,6 +8,7 @@ import json
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_text
+from rebar_depth_bench.cli.dataset_options import add_expect_digest
 from rebar_depth_bench.console import ProgressBars, add_data, add_output_file, add_workers
 from rebar_depth_bench.reporting.comparison_tables import comparison_csv, print_comparison
 from rebar_depth_bench.scoring.comparison import compare
@@ -21,6 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("first", metavar="A", help="the archive that the others are compared with")
     parser.add_argument("others", metavar="B", nargs="+", help="one or more archives")
     add_data(parser)
+    add_expect_digest(parser)
     add_output_file(parser, "--json", "write the differences as JSON")
     add_output_file(parser, "--csv", "write the differences as CSV")
     add_workers(parser)
@@ -30,7 +32,13 @@ def run(options: argparse.Namespace) -> None:
     """Score all archives, compare each with the first, and write and print the differences."""
     with ProgressBars() as bars:
         first, *others = (
-            score(archive, options.data, workers=options.workers, progress=bars.update)
+            score(
+                archive,
+                options.data,
+                workers=options.workers,
+                expect_digest=options.expect_digest,
+                progress=bars.update,
+            )
             for archive in (options.first, *options.others)
         )
     comparisons = [compare(first, other) for other in others]

@@ -13,7 +13,7 @@ def add_expect_digest(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--expect-digest",
         metavar="DIGEST",
-        help="refuse any other dataset than that of this ground-truth digest, sha256:...",
+        help="refuse any other dataset than that with this ground-truth digest (sha256:...)",
     )
 
 

@@ -57,7 +57,9 @@ def run(options: argparse.Namespace) -> None:
                 extended = score_extended(result, evaluation, workers=options.workers, progress=bars.update)
                 result = replace(result, extended=extended)
         names = ", ".join(config.name for config in evaluation.configs)
-        print_verified(evaluation.folder, f"views of {names} verified when their ground truth entered the cache")
+        print_verified(
+            evaluation.folder, f"views of {names} verified when their ground truth was stored in the cache"
+        )
         if options.html:
             write_report(result, evaluation, options.html, views_shown=options.html_views)
     if options.json:

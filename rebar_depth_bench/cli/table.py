@@ -7,6 +7,7 @@ import argparse
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_text
+from rebar_depth_bench.cli.dataset_options import add_expect_digest
 from rebar_depth_bench.console import ProgressBars, add_data, add_output_file, add_workers
 from rebar_depth_bench.reporting.comparison_tables import disambiguate_method_names, print_paper_table
 from rebar_depth_bench.reporting.latex import latex_table
@@ -22,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "archives", metavar="ARCHIVE", nargs="+", help="submission archives (zip), one table row per archive"
     )
     add_data(parser)
+    add_expect_digest(parser)
     add_output_file(parser, "--latex", "write the table as LaTeX (booktabs)")
     add_output_file(parser, "--csv", "write all tables as CSV")
     parser.add_argument("--intervals", action="store_true", help="include the 95 %% intervals in the LaTeX table")
@@ -33,7 +35,13 @@ def run(options: argparse.Namespace) -> None:
     """Score all archives, write the requested files and print the table."""
     with ProgressBars() as bars:
         results = [
-            score(archive, options.data, workers=options.workers, progress=bars.update)
+            score(
+                archive,
+                options.data,
+                workers=options.workers,
+                expect_digest=options.expect_digest,
+                progress=bars.update,
+            )
             for archive in options.archives
         ]
     results = disambiguate_method_names(results)

@@ -19,7 +19,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.parquet import Table, open_parquet, read_rows
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.limits import TABLE_BYTES
-from rebar_depth_bench.paths import NAME_PATTERN
+from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN
 from rebar_depth_bench.reading import open_regular
 from rebar_depth_bench.validation import short_repr
 
@@ -122,7 +122,7 @@ def _bar_from_row(path: Path, row: Mapping[str, Any]) -> Bar:
     if empty or any(point is None for point in row["axis"]):
         raise DatasetError(f"{where} has no {', '.join(empty) or 'complete axis'}")
     if not re.fullmatch(NAME_PATTERN, row["scene"]):
-        raise DatasetError(f"{where}: the name of the scene is invalid, expected {NAME_PATTERN}")
+        raise DatasetError(f"{where}: the name of the scene is invalid, expected {NAME_LETTERS}")
     if re.search(_CONTROL_CHARACTER, row["role"]):
         raise DatasetError(f"{where}: role is {escape_text(row['role'])}, expected no control characters")
     if row["bar_id"] < 1:

@@ -15,7 +15,7 @@ from rebar_depth_bench.data.location import Located, local_path
 from rebar_depth_bench.errors import DatasetError, InputError, Problem, escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.limits import JSON_BYTES
-from rebar_depth_bench.paths import NAME_PATTERN, PATH_PATTERN
+from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN, PATH_PATTERN, VIEW_ID_PATTERN
 from rebar_depth_bench.reading import parse_json, read_file
 from rebar_depth_bench.validation import (
     Expected,
@@ -32,14 +32,13 @@ from rebar_depth_bench.validation import (
 MANIFEST_FILE = "manifest.json"
 MANIFEST_FORMAT = "rebar-depth-dataset-1"
 _DIGEST_PATTERN = "sha256:[0-9a-f]{64}"
-_LETTERS = 'letters, digits, "_", "." and "-", not starting with a dot'
-_Name = Annotated[str, StringConstraints(pattern=f"^{NAME_PATTERN}$"), Expected(f"a name of {_LETTERS}")]
+_Name = Annotated[str, StringConstraints(pattern=f"^{NAME_PATTERN}$"), Expected(f"a name of {NAME_LETTERS}")]
 _Path = Annotated[
     str,
     StringConstraints(pattern=f"^{PATH_PATTERN}$"),
-    Expected(f"a path in the folder, whose parts are {_LETTERS}"),
+    Expected(f"a path in the folder, whose parts are {NAME_LETTERS}"),
 ]
-_ViewId = Annotated[str, StringConstraints(pattern=f"^{NAME_PATTERN}/{NAME_PATTERN}$")]
+_ViewId = Annotated[str, StringConstraints(pattern=f"^{VIEW_ID_PATTERN}$")]
 # Views have no ``Expected``, which is called from pydantic: a folder has thousands.
 _Sha256 = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
 _Digest = Annotated[str, StringConstraints(pattern=f"^{_DIGEST_PATTERN}$"), Expected("sha256: and 64 hex digits")]

@@ -88,7 +88,7 @@ def _check_schema(found: pa.Schema, expected: pa.Schema) -> None:
     for column in expected:
         occurrences = found.names.count(column.name)
         if occurrences != 1:
-            raise ParquetError(f"the file has {occurrences} columns {column.name}, expected one")
+            raise ParquetError(f"the file has {occurrences or 'no'} columns named {column.name}, expected one")
         found_type = found.field(column.name).type
         try:
             pa.array([], found_type).cast(column.type)

@@ -110,8 +110,9 @@ def _usable_views(views: KeptViews, configs: Sequence[DatasetConfig]) -> set[str
     if usable:
         print_notice(f"resuming: {len(usable)} views are in {views.path}; delete it to start over")
     if errors := [error for _, damaged in checked for error in damaged]:
-        found = f"{len(errors)} kept predictions cannot be used, their views are predicted again"
-        print_notice(f"{found}: {_on_one_line(errors[0])}")
+        print_notice(
+            f"kept predictions that cannot be used are made again ({len(errors)}): {_on_one_line(errors[0])}"
+        )
     return usable
 
 

@@ -17,11 +17,11 @@ import numpy as np
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.errors import InputError, Problem, escape_text
+from rebar_depth_bench.paths import VIEW_ID_PATTERN
 from rebar_depth_bench.submission.metadata import METADATA_NAME, SubmissionMeta
 from rebar_depth_bench.submission.numpy_formats import Depth
 from rebar_depth_bench.validation import validate_table
 
-_VIEW_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}/[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _UNIX_MODE = 0o100644
 # Zip readers skip this extra field. It aligns the array values to 64 bytes in the file, so that they can be used
@@ -84,7 +84,7 @@ class SubmissionWriter:
         """
         if self._zip is None:
             raise InputError(f"{self.path}: the writer is not open, expected add() inside its 'with' block")
-        if not isinstance(view_id, str) or not _VIEW_ID.fullmatch(view_id):
+        if not isinstance(view_id, str) or not re.fullmatch(VIEW_ID_PATTERN, view_id):
             raise InputError(
                 f"view_id is {escape_text(str(view_id))}, expected '<config>/<number>' like 'lattice/0000'"
             )

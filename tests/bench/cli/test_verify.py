@@ -85,6 +85,8 @@ def test_other_dataset_than_expected_is_refused(
         ["score", archive, "--data", tiny_root, "--json", out],
         ["check", archive, "--data", tiny_root],
         ["predict", "constant", "--data", tiny_root, "--out", out, "--config", "lattice-orbit"],
+        ["table", archive, "--data", tiny_root, "--csv", out],
+        ["compare", archive, archive, "--data", tiny_root, "--csv", out],
         ["verify", tiny_root, "--files-only"],
     ]
     other = "sha256:" + "0" * 64
@@ -100,7 +102,7 @@ def test_other_dataset_than_expected_is_refused(
         notes = [
             line for line in finished.stderr.splitlines() if line.startswith(f"dataset {digest} of {tiny_root}: ")
         ]
-        assert len(notes) == (command[0] != "verify")
+        assert len(notes) == (command[0] in ("score", "check", "predict"))
     with pytest.raises(rdb.DatasetError, match=f"expected {other}"):
         rdb.score(archive, tiny_root, expect_digest=other)
     assert rdb.score(archive, tiny_root, expect_digest=digest).dataset_digest == digest

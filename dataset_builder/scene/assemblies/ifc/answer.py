@@ -149,7 +149,7 @@ class Answer:
         try:
             return _RECORD.validate_python(value)
         except ValidationError as error:
-            raise AnswerError(f"{error.error_count()} invalid values in a record") from None
+            raise AnswerError(f"{error.error_count()} invalid values in a record, expected none") from None
 
     def _array(self, rows: int, dtype: str) -> ndarray:
         """Return an array of ``rows`` x 3 values, which are finite."""
