@@ -85,7 +85,7 @@ def _torch_numbers(p: torch.Tensor, z: torch.Tensor) -> list[float]:
 
 def extended_rows(root: str, config: str, submission: SubmissionReader) -> list[tuple[str, str]]:
     """Return the milliseconds per view of each measure family, native and scaled together, and their sum."""
-    steel = load_steel_truth(open_folder(root).config(config))
+    steel = load_steel_truth(open_folder(root), config)
     views = []
     for index in range(len(steel)):
         truth = steel.view(index)

@@ -36,7 +36,7 @@ def main(root: str, *configs: str) -> None:
     measures = measures_by_alignment()
     score_rows, error_rows = [], []
     for config in configs or folder.configs:
-        steel = load_steel_truth(folder.config(config))
+        steel = load_steel_truth(folder, config)
         depth_m = {row["view_id"]: row["left_depth"] for row in rdb.load(root, config, columns=COLUMNS)}
         truths = [steel.view(index) for index in range(len(steel))]
         views = [

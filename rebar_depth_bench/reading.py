@@ -53,12 +53,14 @@ def read_file(path: Path, limit: Limit, expected: str, error_type: type[InputErr
     max_bytes = limit.value()
     try:
         with open_regular(path) as stream:
-            content = stream.read(min(max_bytes, os.fstat(stream.fileno()).st_size) + 1)
+            size = os.fstat(stream.fileno()).st_size
+            # A larger file is not read at all; the buffer of ``read`` is as large as its argument.
+            content = b"" if size > max_bytes else stream.read(size)
     except OSError as error:
         code: ProblemCode = "missing" if isinstance(error, FileNotFoundError) else "unreadable"
         problem = Problem(code, "", f"cannot be read: {error.strerror or error}", expected)
         raise error_type.from_problems(path, [problem]) from None
-    if len(content) > max_bytes:
+    if size > max_bytes:
         problem = Problem("size", "", "the file is too large", f"{expected} of {limit.allowed('bytes')}")
         raise error_type.from_problems(path, [problem])
     return content

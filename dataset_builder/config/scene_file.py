@@ -85,7 +85,10 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
             f"{path}: cameras are {camera_radius_m:.4g} m from the world's origin, expected at most "
             f"{OUTDOORS_CAMERA_RADIUS_M} m: is the unit right, and is the cage at the origin?"
         )
-    check_fits(assembly, config)
+    try:
+        check_fits(assembly, config)
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from None
     markers = _DEFAULT_MARKERS[environment] if scene_toml.board is None else scene_toml.board
     board = BoardSpec(markers=markers) if markers else None
     return replace(config, scene=replace(scene, environment=environment, board=board))

@@ -58,8 +58,8 @@ def export(
     folder = _local_folder(root)
     chosen = [folder.config(name) for name in dict.fromkeys(configs or folder.configs)]
     wanted = {config.name: _select_view_ids(config, views) for config in chosen}
-    bars_file = Path(folder.root) / BARS_FILE
-    bars = read_bars(bars_file) if bars_file.is_file() else {}
+    has_bars = BARS_FILE in folder.files
+    bars = read_bars(folder.verified_file(BARS_FILE)) if has_bars else {}
     target = Path(to)
     try:
         with export_target(target, folder, wanted):

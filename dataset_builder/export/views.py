@@ -50,8 +50,8 @@ class StoredView:
             digest = eye_from_row(decoded, eye).digest()
             if digest != expected:
                 raise DatasetError(
-                    f"view {self.record.view_id}: the {eye} ground truth has digest {digest[:16]}, "
-                    f"expected {expected[:16]} as in the manifest"
+                    f"{self.config.root}: view {self.record.view_id}: the {eye} ground truth has digest "
+                    f"{digest[:16]}, expected {expected[:16]} as in the manifest"
                 )
         return decoded
 

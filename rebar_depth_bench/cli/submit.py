@@ -78,8 +78,9 @@ def _read_token(file: Path | None) -> str:
                 token = stream.read(_MAX_TOKEN_CHARACTERS).strip()
         except (OSError, ValueError) as error:
             raise InputError(f"{file}: cannot be read: {error}") from None
-        if not token.isprintable():
-            raise InputError(f"{file}: has characters that are not printable, expected a token on one line")
+        if not token or not token.isprintable():
+            found = "has characters that are not printable" if token else "is empty"
+            raise InputError(f"{file}: {found}, expected a token on one line")
         return token
     token = os.environ.get(TOKEN_VARIABLE) or (getpass.getpass("token: ") if sys.stdin.isatty() else "")
     if not token:

@@ -92,7 +92,7 @@ def bars(root: str | Path) -> DataFrame:
 
     rows = [
         (scene, bar.bar_id, bar.role, bar.diameter_m, bar.length_m, np.array(bar.axis_m))
-        for scene, scene_bars in read_bars(open_folder(root).file(BARS_FILE)).items()
+        for scene, scene_bars in read_bars(open_folder(root).verified_file(BARS_FILE)).items()
         for bar in scene_bars
     ]
     return pd.DataFrame(rows, columns=["scene", "bar_id", "role", "diameter_m", "length_m", "axis_m"])

@@ -89,7 +89,8 @@ def camera_array(kind: str, cell: Any) -> Float64[ndarray, ...]:
         raise ValueError("it has values that are not finite, expected finite numbers")
     if kind == "cam_from_world":
         rotation = array[:3, :3]
-        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.abs(rotation @ rotation.T - np.eye(3)).max()
         if not (error < _MAX_ROTATION_ERROR and np.linalg.det(rotation) > 0 and (array[3] == (0, 0, 0, 1)).all()):
             raise ValueError("it is no rigid pose: a rotation, a translation and the last row 0 0 0 1")
     return array

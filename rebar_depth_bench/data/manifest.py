@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, Strict, StringConstraints, ValidationInfo, field_validator
 
-from rebar_depth_bench.data.digests import views_digest
+from rebar_depth_bench.data.digests import file_sha256, views_digest
 from rebar_depth_bench.data.location import Located, local_path
 from rebar_depth_bench.errors import DatasetError, InputError, Problem, escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
@@ -202,6 +202,20 @@ class DatasetFolder(Located):
         if name not in self.config_by_name:
             raise DatasetError(f"{self.root}: no config {name!r}, expected one of {', '.join(self.configs)}")
         return self.config_by_name[name]
+
+    def verified_file(self, name: str) -> Path:
+        """Return the local path of a file after comparing its SHA-256 with the manifest.
+
+        Raises ``DatasetError`` if the file cannot be read or differs.
+        """
+        path = self.file(name)
+        found, expected = file_sha256(path), self.files.get(name)
+        if found != expected:
+            raise DatasetError(
+                f"{path}: the SHA-256 is {found[:16]}, expected {(expected or 'one')[:16]} as in the manifest; "
+                f"rebar-bench verify {self.root} lists damaged files"
+            )
+        return path
 
     def expected_views(self) -> dict[str, tuple[int, int]]:
         """Return the (height, width) of every view of every config, keyed by view id."""

@@ -138,7 +138,7 @@ def score_extended(
     tables: dict[str, ExtendedTable] = {}
     views: list[ViewNumbers] = []
     for config in result.tables:
-        steel = load_steel_truth(evaluation.folder.config(config), progress)
+        steel = load_steel_truth(evaluation.folder, config, progress)
         work = partial(_view, evaluation.submission, steel, scales)
         task = f"extended measures of {config}"
         config_views = map_with_progress(work, range(len(steel)), workers, progress, task, len(steel))

@@ -13,9 +13,8 @@ from numpy import ndarray
 from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
-from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.data.eye_view import EyeView
-from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.extended.depth_layers import other_layers
 from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_segments, cage_truth
@@ -80,12 +79,12 @@ class ConfigSteelTruth:
         )
 
 
-def load_steel_truth(config: DatasetConfig, progress: Progress = silent) -> ConfigSteelTruth:
-    """Return a config's ground truth for extended measures, from the cache or else computed from the dataset.
+def load_steel_truth(folder: DatasetFolder, name: str, progress: Progress = silent) -> ConfigSteelTruth:
+    """Return the ground truth of the config ``name`` for extended measures, from the cache or else computed.
 
-    Raises ``DatasetError`` if the bars of the scene are missing or a view contradicts the manifest.
+    Raises ``DatasetError`` if the bars of the scene are missing, or if the bars or a view contradict the manifest.
     """
-    bars_path = config.file(BARS_FILE)
+    config, bars_path = folder.config(name), folder.verified_file(BARS_FILE)
     bars = read_bars(bars_path).get(config.scene.name)
     if bars is None:
         raise DatasetError(f"{bars_path}: has no bars for scene {config.scene.name!r} of config {config.name}")
@@ -102,7 +101,7 @@ def load_steel_truth(config: DatasetConfig, progress: Progress = silent) -> Conf
 
     content = CacheContent(
         source=config.root,
-        inputs=cache_inputs(config, EXTENDED_PROTOCOL, file_sha256(bars_path)),
+        inputs=cache_inputs(config, EXTENDED_PROTOCOL, folder.files[BARS_FILE]),
         dtypes=_DTYPES,
         view_ids=tuple(scored_px),
         extract=lambda: _view_arrays(config, cage, diameter_m, progress),

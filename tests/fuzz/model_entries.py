@@ -150,9 +150,11 @@ def _answering_server(folder: Path) -> Iterator[str]:
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Answers, folder)) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-        thread.join()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 def _submit(workspace: Workspace) -> None:
@@ -208,7 +210,9 @@ MODEL_ENTRIES = (
         statuses=(EXIT_DONE, EXIT_OTHER, EXIT_INPUT),
         names=("http://127.0.0.1",),
     ),
-    EntryPoint("submit: token file", 2, _write_answers, _submit, (f"{CASE}/my.token",)),
+    EntryPoint(  # A token may come from the user's own pipe, which is waited for.
+        "submit: token file", 2, _write_answers, _submit, (f"{CASE}/my.token",), special_files=False
+    ),
     EntryPoint(
         "leaderboard settings",
         4,

@@ -96,6 +96,15 @@ def test_missing_or_unknown_token_exits_2(
     assert "Traceback" not in process.stderr
 
 
+@pytest.mark.parametrize("content", ["", " \n", "\x1b[2J"])
+def test_token_file_without_a_token_exits_2(tmp_path: Path, content: str) -> None:
+    token = tmp_path / "token"
+    token.write_text(content)
+    process = run("submit", tmp_path / "a.zip", "--url", "http://127.0.0.1:9", "--token-file", token)
+    assert process.returncode == 2
+    assert f"{token}: " in process.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("url", "status"),

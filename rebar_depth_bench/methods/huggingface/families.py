@@ -78,7 +78,7 @@ _UNSUPPORTED: Mapping[str, str] = {
 
 
 def family_of(config: Mapping[str, Any], where: str) -> ModelFamily:
-    """Return the family of a checkpoint's ``config.json``; ``where`` names the checkpoint in the error message.
+    """Return the family of a checkpoint's ``config.json``; ``where`` is the file in the error message.
 
     Raises ``MethodError`` if the model type is not supported.
     """

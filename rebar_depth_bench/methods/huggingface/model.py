@@ -41,7 +41,7 @@ def hf_method(name_or_path: str) -> Method:
     Raises ``MethodError`` if there is no such checkpoint or its model type is not supported.
     """
     checkpoint = find_checkpoint(name_or_path)
-    family = family_of(checkpoint.config, checkpoint.name)
+    family = family_of(checkpoint.config, str(checkpoint.folder / "config.json"))
     output = family.output(checkpoint.config)
     info = MethodInfo(
         name=f"{HF_PREFIX}{checkpoint.name}",
@@ -59,7 +59,7 @@ def load_predictor(checkpoint: Checkpoint) -> Predictor:
 
     Raises ``MethodError`` if torch, ``transformers`` or weights are missing, or if the weights are incomplete.
     """
-    family = family_of(checkpoint.config, checkpoint.name)
+    family = family_of(checkpoint.config, str(checkpoint.folder / "config.json"))
     torch, transformers = _import_packages()
     ensure_weights(checkpoint)
     from rebar_depth_bench.methods.huggingface.families import PROCESSING_FACTORIES

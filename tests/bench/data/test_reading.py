@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import time
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,19 @@ from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.errors import InputError, terminal_text
 from rebar_depth_bench.paths import check_no_links, path_below, remove_file, remove_folder
 from rebar_depth_bench.reading import MAX_NESTING, open_regular, parse_json, parse_toml, read_file
+
+
+def test_file_above_the_limit_is_not_read(tmp_path: Path) -> None:
+    large = tmp_path / "large.json"
+    with large.open("wb") as stream:
+        stream.truncate(limits.JSON_BYTES.value() + 1)  # Sparse: it occupies no space.
+    tracemalloc.start()
+    with pytest.raises(InputError) as caught:
+        read_file(large, limits.JSON_BYTES, "a manifest", InputError)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert [problem.code for problem in caught.value.problems] == ["size"]
+    assert peak_bytes < 1 << 20
 
 
 @pytest.mark.parametrize(

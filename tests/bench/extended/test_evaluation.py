@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from rich.console import Console
 
 from rebar_depth_bench import DatasetError, score
 from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.data.bars import bars, read_bars, write_bars
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.evaluate import (
     MEASURE_FAMILIES,
@@ -114,7 +117,7 @@ def test_result_is_identical_for_any_number_of_workers(
 
 
 def test_steel_truth_matches_dataset_folder(tiny_root: Path, tiny_truth: Depths, tiny_masks: Depths) -> None:
-    steel = load_steel_truth(open_folder(tiny_root).config("lattice"))
+    steel = load_steel_truth(open_folder(tiny_root), "lattice")
     assert len(steel) == len(tiny_truth)
     for number in range(len(steel)):
         view = steel.view(number)
@@ -178,6 +181,26 @@ def test_folder_without_bars_raises_dataset_error(
         ),
     ):
         score_extended(result, evaluation)
+
+
+def test_damaged_bars_are_refused(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
+) -> None:
+    """Check that bars which contradict the manifest are not used, since they would change the measures."""
+    copy = tmp_path / "copy"
+    shutil.copytree(tiny_root, copy)
+    archive = archive_of(tiny_truth)
+    result = score(archive, copy)
+    scenes = read_bars(copy / "bars.parquet")
+    scene, (bar, *others) = next(iter(scenes.items()))
+    write_bars(copy / "bars.parquet", {**scenes, scene: (replace(bar, diameter_m=2 * bar.diameter_m), *others)})
+    with (
+        open_evaluation(archive, copy) as evaluation,
+        pytest.raises(DatasetError, match=r"bars\.parquet: the SHA-256 is"),
+    ):
+        score_extended(result, evaluation)
+    with pytest.raises(DatasetError, match=r"bars\.parquet: the SHA-256 is"):
+        bars(copy)
 
 
 @pytest.mark.slow

@@ -245,7 +245,7 @@ def test_measures_have_samples_and_unique_names() -> None:
 
 
 def test_rendered_truth_is_perfect_up_to_ribs(tiny_root: Path) -> None:
-    steel = load_steel_truth(open_folder(tiny_root).config("lattice"))
+    steel = load_steel_truth(open_folder(tiny_root), "lattice")
     offsets_mm, detected = [], []
     for number in range(len(steel)):
         truth = steel.view(number)

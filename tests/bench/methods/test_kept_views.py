@@ -135,7 +135,7 @@ def test_float_types_can_be_read_again(dtype: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("view_id", ["../x", "a/../../x", "/x", "a/b\0", "a/.hidden", "", "a//b"])
 def test_view_id_cannot_leave_the_folder(view_id: str, tmp_path: Path) -> None:
     views = KeptViews.open(tmp_path / "folder" / "views", {})
-    with pytest.raises(InputError, match="is not the path of a file in this folder"):
+    with pytest.raises(InputError, match="is not a path in this folder"):
         views.put(view_id, np.ones((2, 3)), 0.0)
     assert {path.name for path in tmp_path.rglob("*")} == {"folder", "views", "key.json"}
 

@@ -19,6 +19,7 @@ from rebar_depth_bench import DatasetError, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import read_bars, write_bars
 from rebar_depth_bench.data.codecs import decode_depth, encode_depth
+from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.data.eye_view import EyeView
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
@@ -150,7 +151,7 @@ def test_linked_cache_in_dataset_folder_is_not_followed(copy: Path, archive: Pat
     (copy / ".rebar-cache").symlink_to(outside)
     before, listing = tree(tmp_path / "dataset"), sorted(outside.rglob("*"))
     score(archive, copy)
-    load_steel_truth(open_folder(copy).config(CONFIG))
+    load_steel_truth(open_folder(copy), CONFIG)
     assert tree(copy) == before
     assert sorted(outside.rglob("*")) == listing
 
@@ -160,11 +161,13 @@ def test_digest_in_manifest_is_no_path(tiny_root: Path, tmp_path: Path, empty_ca
     documents = tmp_path / "Documents"
     documents.mkdir()
     (documents / "letter.txt").write_text("precious")
-    config = open_folder(tiny_root).config(CONFIG)
-    hostile = config.model_copy(update={"ground_truth_digest": "/../../../Documents", "name": "../../Documents"})
+    folder = open_folder(tiny_root)
+    hostile = folder.config(CONFIG).model_copy(
+        update={"ground_truth_digest": "/../../../Documents", "name": "../../Documents"}
+    )
     for _ in range(2):  # The second run deleted the folder.
         config_truth(hostile)
-        load_steel_truth(hostile)
+        load_steel_truth(folder.model_copy(update={"config_by_name": {CONFIG: hostile}}), CONFIG)
     assert tree(documents) == {"letter.txt": b"precious"}
     assert len([*empty_cache.iterdir()]) == 2
     assert {path.name for path in tmp_path.iterdir()} == {"Documents", "caches"}
@@ -182,7 +185,7 @@ def test_other_views_have_an_entry_of_their_own(tiny_root: Path, copy: Path, emp
 def test_dataset_folder_is_not_written(copy: Path, archive: Path) -> None:
     before = tree(copy)
     score(archive, copy)
-    load_steel_truth(open_folder(copy).config(CONFIG))
+    load_steel_truth(open_folder(copy), CONFIG)
     assert tree(copy) == before
 
 
@@ -237,7 +240,9 @@ def change_depth(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None
 def test_images_may_show_bars_that_the_table_lacks(copy: Path) -> None:
     bars = read_bars(copy / "bars.parquet")
     write_bars(copy / "bars.parquet", {scene: of_scene[: len(of_scene) // 2] for scene, of_scene in bars.items()})
-    steel = load_steel_truth(open_folder(copy).config(CONFIG))
+    sha256 = file_sha256(copy / "bars.parquet")
+    change_manifest(copy, lambda manifest, _: manifest["files"].update({"bars.parquet": sha256}), CONFIG)
+    steel = load_steel_truth(open_folder(copy), CONFIG)
     truth = steel.view(0)
     assert np.isnan(steel.diameter_m[truth.bar_id]).any()
 

@@ -204,7 +204,7 @@ def test_data_contradicting_manifest_is_not_exported(tiny_root: Path, tmp_path: 
         export(root, tmp_path / "y", ["../../x"])
     (root / "manifest.json").write_text(content)
     (root / "bars.parquet").write_bytes(b"no parquet")
-    with pytest.raises(DatasetError, match=r"bars.parquet: cannot be read"):
+    with pytest.raises(DatasetError, match=r"bars.parquet: the SHA-256 is"):
         export(root, tmp_path / "y", SMALL_CONFIG)
 
 
