@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 
 from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
@@ -42,6 +43,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "of the model. Other methods have no limit"
     )
     add_seconds(parser, "--view-timeout", VIEW_TIMEOUT_S, limit)
+    parser.add_argument(
+        "--nearest-distance",
+        type=_positive_metres,
+        metavar="METRES",
+        help="distance of the nearest surface, known before the capture, from which foundation-stereo:FOLDER "
+        "chooses its mode (default: from half of the image width). One measured in the scored depth, masks, "
+        "meshes or poses makes the submission a user of ground truth",
+    )
+
+
+def _positive_metres(text: str) -> float:
+    metres = float(text)
+    if not 0 < metres < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a distance above 0 m")
+    return metres
 
 
 def format_note(value: object) -> str:
@@ -55,7 +71,7 @@ def format_note(value: object) -> str:
 
 def run(options: argparse.Namespace) -> None:
     """Predict into an archive; print the method's notes to standard error and the archive's path."""
-    method = find_method(options.method, view_timeout_s=options.view_timeout)
+    method = find_method(options.method, view_timeout_s=options.view_timeout, nearest_m=options.nearest_distance)
     folder = open_folder(options.data, expect_digest=options.expect_digest)
     info = method.info
     print_notice(f"{info.name}: {info.summary}; from {info.source}; licence {info.licence}")

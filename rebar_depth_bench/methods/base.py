@@ -42,10 +42,15 @@ class MethodInfo:
 
 @dataclass(frozen=True)
 class Method:
-    """Single-view method; ``load()`` returns the predictor or raises ``MethodError`` if parts are missing."""
+    """Single-view method; ``load()`` returns the predictor or raises ``MethodError`` if parts are missing.
+
+    ``notes(row)``, if given, returns notes on a config as plain JSON values from its first row, for example
+    settings that depend on the rig; they are written into submissions.
+    """
 
     info: MethodInfo
     load: Callable[[], Predictor]
+    notes: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None
 
 
 @dataclass(frozen=True)

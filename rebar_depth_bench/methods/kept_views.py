@@ -39,9 +39,9 @@ _MAX_ITEM_BYTES = 8
 
 
 class PreparationReport(StrictModel):
-    """Notes of a multi-view method on preparing one config (plain JSON values), and the duration in seconds.
+    """Notes of a method on one config (plain JSON values), and the seconds of a multi-view method's preparation.
 
-    ``seconds`` is None if an interrupted run had already done part of the work.
+    ``seconds`` is None if an interrupted run had already done part of the work, and for single-view methods.
     """
 
     notes: Annotated[dict[str, Any], Expected("a table of notes")]

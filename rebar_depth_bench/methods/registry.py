@@ -70,18 +70,24 @@ The commit or digest of the weights (and code) becomes part of the summary. List
 """
 
 
-def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S) -> AnyMethod:
+def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m: float | None = None) -> AnyMethod:
     """Return the method of a name; the module docstring lists the accepted forms.
 
-    ``view_timeout_s`` limits the inference of a view by an ONNX model.
+    ``view_timeout_s`` limits the inference of a view by an ONNX model. ``nearest_m`` declares the distance of the
+    nearest surface, metres, to FoundationStereo.
 
     For ``FROM_HUB`` and ``hf:`` names, the files that identify the weights are downloaded if they are not cached.
 
-    Raises ``MethodError`` if the name is unknown, or if a file or package cannot be imported or holds no method.
+    Raises ``MethodError`` if the name is unknown, if a file or package cannot be imported or holds no method, or
+    if ``nearest_m`` is given to another method.
     """
+    method_name, _, folder = name.partition(":")
+    if nearest_m is not None:
+        if method_name != FOUNDATION_STEREO.info.name or not folder:
+            raise MethodError(f"{name}: has no nearest distance, expected {FOUNDATION_STEREO.info.name}:FOLDER")
+        return foundation_stereo_method(Path(folder).expanduser(), nearest_m)
     if name.startswith(HF_PREFIX):
         return hf_method(name.removeprefix(HF_PREFIX))
-    method_name, _, folder = name.partition(":")
     if folder and method_name in FROM_FOLDER:
         return FROM_FOLDER[method_name](Path(folder).expanduser())
     path, colon, attribute = name.rpartition(":")

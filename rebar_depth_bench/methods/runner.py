@@ -10,7 +10,7 @@ import json
 import platform
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -43,8 +43,8 @@ def predict(
     """Predict every view of the named configs (default: all) and write the archive atomically.
 
     Each view is stored beside the archive until all are predicted: after an interruption, the same call predicts
-    only the missing ones. ``submission.json`` records the seconds per view and, for multi-view methods, their
-    notes on each config. Returns the preparation report of each config that a multi-view method prepared.
+    only the missing ones. ``submission.json`` records the seconds per view and the method's notes on each config.
+    Returns the report of each config that a multi-view method prepared or on which the method has notes.
 
     Raises ``DatasetError`` for an unknown folder or config or another digest than ``expect_digest``,
     ``InputError`` if ``archive`` is a folder or the folder beside it holds anything but kept predictions, and
@@ -61,6 +61,7 @@ def predict(
                 method.check(ConfigViews(config))
     # Loading comes first so that its errors occur before anything is written.
     loaded = _load_method(method) if isinstance(method, Method) else None
+    noted = {config.name: report for config in chosen if (report := _first_row_report(method, config))}
     views = KeptViews.open(target.with_name(f".{target.name}.views"), _run_key(method, chosen))
     usable = _usable_views(views, chosen)
     for config in chosen:
@@ -70,7 +71,8 @@ def predict(
             continue
         predictor = loaded or _prepare_method(method, ConfigViews(config), views, is_prepared, progress)
         _predict_config(method, predictor, config, views, done, progress)
-    reports = {config.name: report for config in chosen if (report := views.get_preparation(config.name))}
+    prepared = {config.name: report for config in chosen if (report := views.get_preparation(config.name))}
+    reports = noted | prepared
     _write_archive(method, target, views, chosen, reports)
     views.remove()
     return reports
@@ -156,15 +158,26 @@ def _wrap_errors(what: str) -> Iterator[None]:
         raise MethodError(f"{what}: raised {type(error).__name__}: {error} ({where})") from error
 
 
-def _check_notes(method: AnyMethod, config: ConfigViews, prepared: Prepared) -> None:
-    """Raise ``MethodError`` unless all notes are plain JSON values."""
-    for key, value in prepared.notes.items():
+def _first_row_report(method: AnyMethod, config: DatasetConfig) -> PreparationReport | None:
+    """Return the report with a single-view method's notes on a config, None if it makes none."""
+    if not isinstance(method, Method) or method.notes is None:
+        return None
+    row = next(_remaining_rows(method, config, set()))
+    with _wrap_errors(f"{method.info.name}: {config.name}: notes"):
+        notes = method.notes(row)
+    return PreparationReport(notes=_plain_notes(method, config.name, notes), seconds=None)
+
+
+def _plain_notes(method: AnyMethod, config: str, notes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return notes as they are read from JSON. Raises ``MethodError`` unless all are plain JSON values."""
+    for key, value in notes.items():
         try:
             json.dumps({key: value}, allow_nan=False)
         except (TypeError, ValueError) as error:
             raise MethodError(
-                f"{method.info.name}: {config.config}: the note {key!r} is not a plain JSON value: {error}"
+                f"{method.info.name}: {config}: the note {key!r} is not a plain JSON value: {error}"
             ) from None
+    return dict(json.loads(json.dumps(dict(notes))))
 
 
 def _prepare_method(
@@ -179,10 +192,9 @@ def _prepare_method(
         prepared = method.prepare(config, work, progress)
     if not isinstance(prepared, Prepared):
         raise MethodError(f"{method.info.name}: prepare returned {type(prepared).__name__}, expected a Prepared")
-    _check_notes(method, config, prepared)
+    notes = _plain_notes(method, config.config, prepared.notes)
     if not is_prepared:
         seconds = round(time.perf_counter() - start, 1) if started_from_scratch else None
-        notes = json.loads(json.dumps(dict(prepared.notes)))
         views.put_preparation(config.config, PreparationReport(notes=notes, seconds=seconds))
     return prepared.predict
 
@@ -222,7 +234,7 @@ def _write_archive(
         "python": platform.python_version(),
         "machine": platform.machine(),
     }
-    if reports:
+    if reports and isinstance(method, MultiViewMethod):
         runtime["preparing"] = {config: report.seconds for config, report in reports.items()}
     with SubmissionWriter(
         archive,

@@ -18,11 +18,9 @@ from numpy import ndarray
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.stereo.disparity import STEREO_COLUMNS, stereo_depth_m
+from rebar_depth_bench.methods.stereo.disparity import SEARCH_SHARE_OF_WIDTH, STEREO_COLUMNS, stereo_depth_m
 
 BLOCK_PX = 3
-SEARCH_SHARE_OF_WIDTH = 0.5
-"""Search range of disparities as a fraction of the image width; for the ideal rig: all distances from 0.13 m."""
 SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 96, 600
 """Smoothness penalties P1 and P2 per pixel of a block.
 
@@ -50,7 +48,7 @@ def _loader(*, check_consistency: bool) -> Callable[[], Predictor]:
                 f"sgbm needs OpenCV with ximgproc ({error}): pip install 'rebar-depth-bench[methods]'"
             ) from None
         return lambda row: stereo_depth_m(
-            row, lambda left, right: _disparity_px(cv2, left, right, check_consistency)
+            row, lambda images: _disparity_px(cv2, images.left_rgb, images.right_rgb, check_consistency)
         )
 
     return load

@@ -94,6 +94,51 @@ FOUNDATION_STEREO = """
             assert image1.shape[2] % 32 == image1.shape[3] % 32 == 0
             assert iters == 32 and test_mode and image1.max() > 1
             return self.gain * image1[:, :1]
+
+        def run_hierachical(self, image1, image2, iters=12, test_mode=False, low_memory=False, small_ratio=0.5):
+            assert small_ratio == 0.5
+            return self.forward(image1, image2, iters, test_mode=test_mode)
+"""
+
+STEREO_MATCHER = """
+    import torch
+    import torch.nn.functional as F
+
+    class FoundationStereo(torch.nn.Module):
+        def __init__(self, args):
+            super().__init__()
+            self.gain = torch.nn.Parameter(torch.zeros(()))
+            self.volume_px = args.max_disp
+
+        def forward(self, image1, image2, iters=12, flow_init=None, test_mode=False, init_disp=None):
+            assert image1.shape == image2.shape and image1.shape[2] % 32 == image1.shape[3] % 32 == 0
+            assert iters == 32 and test_mode
+            if init_disp is None:
+                start, steps = torch.zeros_like(image1[:, :1]), range(self.volume_px)
+            else:
+                start, steps = init_disp.round(), range(-4, 5)
+            columns = torch.arange(image1.shape[3]).expand_as(start)
+            best, disparity = torch.full_like(start, torch.inf), torch.zeros_like(start)
+            for step in steps:
+                match = (columns - start - step).clamp(0, image1.shape[3] - 1).long()
+                seen = image2.gather(3, match.expand_as(image2))
+                cost = F.avg_pool2d((image1 - seen).abs().mean(1, keepdim=True), 9, 1, 4)
+                disparity = torch.where(cost < best, start + step, disparity)
+                best = torch.minimum(cost, best)
+            return disparity
+
+        def run_hierachical(self, image1, image2, iters=12, test_mode=False, low_memory=False, small_ratio=0.5):
+            height, width = image1.shape[2:]
+            pair = [F.interpolate(image, scale_factor=small_ratio, mode="bilinear") for image in (image1, image2)]
+            rows, columns = pair[0].shape[2:]
+            smaller = [F.pad(image, (0, -columns % 32, 0, -rows % 32), mode="replicate") for image in pair]
+            first = self.forward(*smaller, iters, test_mode=True)[:, :, :rows, :columns]
+            first = F.interpolate(first, size=(height, width), mode="bilinear") / small_ratio
+            return self.forward(image1, image2, iters, test_mode=test_mode, init_disp=first)
+"""
+"""Code of a stand-in for FoundationStereo that finds disparities below ``max_disp`` by block matching.
+
+It stands in for the modes of the original: a second pass searches near the result of the first.
 """
 
 
@@ -114,12 +159,12 @@ def da3_weights(folder: Path, model_name: str = "da3metric-large", **weights: fl
     return _write_hub_folder(folder, {"model_name": model_name}, weights)
 
 
-def stereo_clone(folder: Path, **weights: float) -> Path:
+def stereo_clone(folder: Path, *, code: str = FOUNDATION_STEREO, max_disp: object = 416, **weights: float) -> Path:
     """Write a clone of FoundationStereo with its weights folder 23-51-11, and return the folder."""
-    _write(folder / "core" / "foundation_stereo.py", FOUNDATION_STEREO)
+    _write(folder / "core" / "foundation_stereo.py", code)
     trained = folder / "pretrained_models" / "23-51-11"
     trained.mkdir(parents=True)
-    (trained / "cfg.yaml").write_text("max_disp: 416\nhidden_dims: [128, 128, 128]\n")
+    (trained / "cfg.yaml").write_text(f"max_disp: {max_disp}\nhidden_dims: [128, 128, 128]\n")
     _pickle(trained / "model_best_bp2.pth", "model", weights)
     return folder
 
