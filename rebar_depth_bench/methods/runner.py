@@ -164,8 +164,8 @@ def _first_row_report(method: AnyMethod, config: DatasetConfig) -> PreparationRe
         return None
     row = next(_remaining_rows(method, config, set()))
     with _wrap_errors(f"{method.info.name}: {config.name}: notes"):
-        notes = method.notes(row)
-    return PreparationReport(notes=_plain_notes(method, config.name, notes), seconds=None)
+        notes = _plain_notes(method, config.name, method.notes(row))
+    return PreparationReport(notes=notes, seconds=None)
 
 
 def _plain_notes(method: AnyMethod, config: str, notes: Mapping[str, Any]) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from rebar_depth_bench.errors import InputError, MethodError
 from rebar_depth_bench.methods import (
     METHODS,
     ConfigViews,
+    Method,
     MethodInfo,
     MultiViewMethod,
     Prepared,
@@ -359,6 +360,25 @@ def test_error_in_user_code_names_its_location(
     assert f"error: wrong: {words}" in stderr
     assert "Traceback" not in stderr
     assert "raised" not in words or f"({path}:" in stderr
+
+
+@pytest.mark.parametrize(
+    ("notes", "words"),
+    [
+        (lambda row: {"bad": row["left_K"]}, "lattice: the note 'bad' is not a plain JSON value"),
+        (lambda _: None, "lattice: notes: raised AttributeError"),
+        (lambda row: {"fx": row["right_K"]}, "lattice: notes: raised KeyError: 'right_K'"),
+    ],
+)
+def test_notes_of_single_view_method_are_checked_first(
+    notes: Any, words: str, tiny_root: Path, tmp_path: Path
+) -> None:
+    """The notes function receives the method's columns; nothing is predicted or written if it fails."""
+    info = MethodInfo("one", "a test", ("left_K",), True, "here", "MIT")
+    method = Method(info, load=lambda: lambda _: pytest.fail("predicted"), notes=notes)
+    with pytest.raises(MethodError, match=f"one: {re.escape(words)}"):
+        predict(method, tiny_root, tmp_path / "one.zip")
+    assert not list(tmp_path.iterdir())
 
 
 def test_notes_that_are_not_json_raise(tiny_root: Path, tmp_path: Path) -> None:
