@@ -15,7 +15,7 @@ from pathlib import Path
 
 from benchmarks.timing import machine_description, print_markdown
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
-from dataset_builder.config.trajectories import camera_offsets_m
+from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD
 
@@ -89,7 +89,7 @@ def _full_set_estimate(runs: dict[str, Run]) -> str:
     missing = sorted({spec.scene.assembly.kind for spec in specs} - set(seconds_per_view))
     if missing:
         return f"no estimate for the full set: {', '.join(missing)} not measured"
-    views = {spec.name: len(camera_offsets_m(spec.protocol)) for spec in specs}
+    views = {spec.name: view_count(spec.protocol) for spec in specs}
     hours = sum(views[spec.name] * seconds_per_view[spec.scene.assembly.kind] for spec in specs) / 3600
     return f"the full set, {len(specs)} configs of {sum(views.values())} views: {hours:.0f} hours on this machine"
 

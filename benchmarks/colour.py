@@ -51,7 +51,7 @@ def main(config: str = "lattice", views: str = "1") -> None:
     assembly = make_assembly(spec.scene.assembly)
     build_scene(assembly, spec.scene)
     caster = RayCaster(evaluated_world_mesh())
-    all_poses = poses(spec.protocol, aim_point_m(assembly), rig)
+    all_poses = poses(spec.protocol, aim_point_m(assembly), rig, assembly.bars)
     selected = [rig_cameras(rig, all_poses[index])["left"] for index in subset(len(all_poses), int(views))]
     masks = [caster.cast(camera).mask for camera in selected]
 

@@ -75,7 +75,7 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
         mesh = evaluated_world_mesh()
         _stage_mesh(mesh, staging.mesh, unit.mesh_sha256)
         caster = RayCaster(mesh)
-        left_poses = poses(config.protocol, aim_point_m(assembly), config.rig)
+        left_poses = poses(config.protocol, aim_point_m(assembly), config.rig, assembly.bars)
         rays_cam = {eye: camera.rays() for eye, camera in rig_cameras(config.rig, np.eye(4)).items()}
     report({"seconds": watch.take()})
     with tempfile.TemporaryDirectory(dir=staging.root) as scratch:

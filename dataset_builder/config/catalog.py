@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from dataset_builder.config.rigs import zed_rig
 from dataset_builder.config.specs import (
+    NEAREST_STEEL,
     AppearanceSpec,
     AssemblySpec,
     ColourSpec,
@@ -47,8 +48,12 @@ PIER_DOME = DomeSpec(
     radii_m=(8.0, 11.0, 13.0, 14.5, 15.5, 16.25, 17.0),
     elevations_deg=(-7.5, -1.0, 7.0, 17.0, 29.0, 44.0),
     azimuths=12,
+    distance_to=NEAREST_STEEL,
 )
-"""The 504 views of the paper at 8-17 m, at the heights of a person, a mast and a drone."""
+"""The 504 views of the paper at 8-17 m from the nearest steel, at the heights of a person, a mast and a drone.
+
+Steel covers 5.2 % of the frame on average, from 11 % on the nearest shell to 3.1 % on the farthest.
+"""
 LATTICE_RING = RingSpec(radius_m=0.325, elevation_deg=35.0, azimuths=100)
 
 
@@ -81,10 +86,13 @@ CONFIGS: Mapping[str, Callable[[], ConfigSpec]] = {
     "lattice-zed": lambda: ConfigSpec("lattice-zed", _lattice_scene(), LATTICE_DOME, zed_rig()),
     "lattice-zed-raw": lambda: ConfigSpec("lattice-zed-raw", _lattice_scene(), LATTICE_DOME, zed_rig(grid="raw")),
     "lattice-12": lambda: ConfigSpec("lattice-12", _lattice_scene(12, "lattice-12"), LATTICE_DOME),
+    "lattice-zed-12": lambda: ConfigSpec(
+        "lattice-zed-12", _lattice_scene(12, "lattice-12"), LATTICE_DOME, zed_rig()
+    ),
     "pile": lambda: ConfigSpec("pile", _pile_scene(), PILE_DOME),
     "pier": lambda: ConfigSpec("pier", _pier_scene(), PIER_DOME),
 }
-"""Factories of the seven standard configs, which are built by default."""
+"""Factories of the eight standard configs, which are built by default."""
 
 SWEEPS: Mapping[str, Callable[[], ConfigSpec]] = {
     "lattice-distance": lambda: ConfigSpec("lattice-distance", _lattice_scene(), geometric_sweep(0.22, 1.6, 40.0)),

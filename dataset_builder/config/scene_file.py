@@ -147,7 +147,8 @@ def _scene_and_key_named(scene_toml: SceneToml, path: Path) -> Iterator[None]:
 def _camera_distance_m(assembly: Assembly, config: ConfigSpec) -> float:
     """Return the largest horizontal distance of a left camera from the world origin, metres."""
     aim_m = aim_point_m(assembly)
-    return max(float(np.linalg.norm((aim_m + offset)[:2])) for offset in camera_offsets_m(config.protocol))
+    offsets_m = camera_offsets_m(config.protocol, aim_m, assembly.bars)
+    return max(float(np.linalg.norm((aim_m + offset_m)[:2])) for offset_m in offsets_m)
 
 
 def _laboratory_misfit(assembly: Assembly, camera_radius_m: float) -> str | None:

@@ -136,16 +136,23 @@ class SceneSpec:
     seed: int = 0
 
 
+CENTRE, NEAREST_STEEL = "centre", "nearest steel"
+"""Values of ``DomeSpec.distance_to``."""
+
+
 @dataclass(frozen=True)
 class DomeSpec:
     """Truncated-sphere dome of views: shells x elevation rings x azimuths.
 
-    The left camera is at ``radii_m`` from the target.
+    ``distance_to`` states what ``radii_m`` are the distances to, always from the centre of the left camera:
+    ``centre`` is the target, the middle of the assembly; ``nearest steel`` is the nearest point of any bar's
+    surface, in any direction. In both cases elevations and azimuths are the directions from the target.
     """
 
     radii_m: tuple[float, ...]
     elevations_deg: tuple[float, ...]
     azimuths: int
+    distance_to: str = CENTRE
     kind: str = "dome"
 
 

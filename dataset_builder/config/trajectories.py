@@ -2,50 +2,99 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import cos, radians, sin
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import DistanceSweepSpec, RigSpec, RingSpec, TrajectorySpec
+from dataset_builder.config.specs import (
+    NEAREST_STEEL,
+    DistanceSweepSpec,
+    DomeSpec,
+    RigSpec,
+    RingSpec,
+    TrajectorySpec,
+)
+from dataset_builder.scene.steel_distance import radii_at_steel_distance_m
+from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.geometry.cameras import look_at, rigid
 
 GOLDEN_TURN_DEG = 360.0 * (5**0.5 - 1) / 2
 """Azimuth offset between successive rings of a dome, degrees (golden angle): no two rings share azimuths."""
 
+_RADIUS_DECIMALS = 3
+"""Rounding of distances that are solved for, metres: to the millimetre, so that they are equal on every machine."""
+
+
+class _Station(NamedTuple):
+    """Place of the left camera in spherical coordinates round the target."""
+
+    radius_m: float
+    elevation_deg: float
+    azimuth_deg: float
+
 
 def poses(
-    trajectory: TrajectorySpec, target_m: Float64[ndarray, 3], rig: RigSpec
+    trajectory: TrajectorySpec, target_m: Float64[ndarray, 3], rig: RigSpec, bars: Sequence[Bar] = ()
 ) -> list[Float64[ndarray, "4 4"]]:
-    """Return ``cam_from_world`` of the left camera for every view of the full trajectory, in order."""
+    """Return ``cam_from_world`` of the left camera for every view of the full trajectory, in order.
+
+    Arguments and errors are those of ``camera_offsets_m``.
+    """
     return [
         look_at_with_rig(target_m + direction, target_m, rig.baseline_m)
-        for direction in camera_offsets_m(trajectory)
+        for direction in camera_offsets_m(trajectory, target_m, bars)
     ]
 
 
-def camera_offsets_m(trajectory: TrajectorySpec) -> list[Float64[ndarray, 3]]:
+def camera_offsets_m(
+    trajectory: TrajectorySpec, target_m: Float64[ndarray, 3], bars: Sequence[Bar]
+) -> list[Float64[ndarray, 3]]:
     """Return the centre of the left camera relative to the target for every view, metres, world axes.
+
+    ``bars`` are those of the assembly round the target. Only a dome whose ``distance_to`` is ``NEAREST_STEEL``
+    needs them: it keeps the directions of its rings and azimuths, and the distance of a camera from the target is
+    the one at which the nearest point of any bar's surface is a shell's radius away from the left camera, to half
+    a millimetre. Raises ``ValueError`` if no bars are given, or for a radius that is too small for the bars.
 
     The views of a dome are ordered by shell, then ring, then azimuth, so that consecutive views are close to each
     other. The views of a sweep are ordered by distance, then azimuth; the first azimuth is half a step off the
     x axis, so that square cages are not seen face-on.
     """
+    stations = _stations(trajectory)
+    if isinstance(trajectory, DomeSpec) and trajectory.distance_to == NEAREST_STEEL:
+        directions = np.array([_spherical(1.0, *angles) for _, *angles in stations])
+        distances_m = np.array([station.radius_m for station in stations])
+        radii_m = radii_at_steel_distance_m(target_m, directions, distances_m, bars)
+        rounded_m = np.round(radii_m, _RADIUS_DECIMALS).tolist()
+        stations = [_Station(radius_m, *angles) for radius_m, (_, *angles) in zip(rounded_m, stations, strict=True)]
+    return [_spherical(*station) for station in stations]
+
+
+def view_count(trajectory: TrajectorySpec) -> int:
+    """Return the number of views of the full trajectory."""
+    return len(_stations(trajectory))
+
+
+def _stations(trajectory: TrajectorySpec) -> list[_Station]:
+    """Return the stations of the views in order, with the radii of the trajectory."""
     if isinstance(trajectory, RingSpec):
         return [
-            _spherical(trajectory.radius_m, trajectory.elevation_deg, 360.0 * k / trajectory.azimuths)
+            _Station(trajectory.radius_m, trajectory.elevation_deg, 360.0 * k / trajectory.azimuths)
             for k in range(trajectory.azimuths)
         ]
     if isinstance(trajectory, DistanceSweepSpec):
         return [
-            _spherical(radius_m, trajectory.elevation_deg, 360.0 * (k + 0.5) / trajectory.azimuths)
+            _Station(radius_m, trajectory.elevation_deg, 360.0 * (k + 0.5) / trajectory.azimuths)
             for radius_m in trajectory.radii_m
             for k in range(trajectory.azimuths)
         ]
     rings = [(radius_m, elevation) for radius_m in trajectory.radii_m for elevation in trajectory.elevations_deg]
     return [
-        _spherical(radius_m, elevation, GOLDEN_TURN_DEG * ring + 360.0 * k / trajectory.azimuths)
+        _Station(radius_m, elevation, GOLDEN_TURN_DEG * ring + 360.0 * k / trajectory.azimuths)
         for ring, (radius_m, elevation) in enumerate(rings)
         for k in range(trajectory.azimuths)
     ]

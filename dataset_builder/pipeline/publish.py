@@ -15,7 +15,7 @@ from pathlib import Path
 
 from cards import dataset_card
 from dataset_builder.config.catalog import CONFIGS, view_id
-from dataset_builder.config.trajectories import camera_offsets_m
+from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.contact_sheet import write_contact_sheet, write_scenes_strip
 from dataset_builder.pipeline.folder import (
     CARD,
@@ -104,7 +104,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
         **config_parameters(plan.spec),
         "key": plan.key,
         "aim_point_m": aim_point_m(plan.assembly).tolist(),
-        "protocol_views": len(camera_offsets_m(plan.spec.protocol)),
+        "protocol_views": view_count(plan.spec.protocol),
         "generator": generator_versions(),
         "mesh": mesh,
         "sheet": f"{PICTURES}/{plan.spec.name}.webp",

@@ -58,7 +58,7 @@ def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
     Raises ``MeshError`` if it reaches more than 1 mm below z = 0 or as far as the nearest camera, and
     ``InputError`` if the screen of the variant ``shadows`` would be among the cameras.
     """
-    vertices_m = assembly.vertices_m
+    vertices_m, aim_m = assembly.vertices_m, aim_point_m(assembly)
     lowest = min(assembly.parts, key=lambda part: float(part.mesh.vertices_m[:, 2].min()))
     lowest_m = float(lowest.mesh.vertices_m[:, 2].min())
     if lowest_m < -_BOARD_TOLERANCE_M:
@@ -66,21 +66,21 @@ def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
             f"{config.name}: {lowest.name} extends down to z = {lowest_m:.4g} m, including its ribs, expected 0 "
             "or above (the board or the ground is at z = 0)"
         )
-    reach_m = float(np.linalg.norm(vertices_m - aim_point_m(assembly), axis=1).max())
-    nearest_m = min(float(np.linalg.norm(offset)) for offset in camera_offsets_m(config.protocol))
+    reach_m = float(np.linalg.norm(vertices_m - aim_m, axis=1).max())
+    camera_distances_m = np.linalg.norm(camera_offsets_m(config.protocol, aim_m, assembly.bars), axis=1)
+    nearest_m = float(camera_distances_m.min())
     if reach_m >= nearest_m:
         raise MeshError(
             f"the assembly extends {reach_m:.4g} m from its centre, expected less than {nearest_m:.4g} m, "
             f"the distance of the nearest camera of {config.name}: is the unit right?"
         )
-    _check_shadow_screen(vertices_m, config)
+    _check_shadow_screen(vertices_m, float(camera_distances_m.max()), config)
 
 
-def _check_shadow_screen(vertices_m: Float64[ndarray, "n 3"], config: ConfigSpec) -> None:
+def _check_shadow_screen(vertices_m: Float64[ndarray, "n 3"], farthest_m: float, config: ConfigSpec) -> None:
     """Raise ``InputError`` if the screen of the variant ``shadows`` would be among the cameras."""
     if SHADOWS not in config.scene.appearance.variants:
         return
-    farthest_m = max(float(np.linalg.norm(offset)) for offset in camera_offsets_m(config.protocol))
     right_eye_m = float(np.hypot(farthest_m, config.rig.baseline_m))
     screen_m = SCREEN_DISTANCE * float(np.linalg.norm(np.ptp(vertices_m, axis=0))) / 2
     if right_eye_m >= screen_m:
