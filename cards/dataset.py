@@ -10,7 +10,8 @@ from huggingface_hub import DatasetCardData
 
 from cards.templates import render
 from rebar_depth_bench.data.columns import COLUMN_DESCRIPTIONS, column_kind, features
-from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.manifest import CENTRE, NEAREST_STEEL, DatasetConfig
+from rebar_depth_bench.reporting.formatting import DASH
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 if TYPE_CHECKING:
@@ -23,6 +24,18 @@ _OPTICS_TEXTS = {
     "rectified": "factory-calibrated lenses, on the grid that OpenCV's stereoRectify makes of the pair; "
     "depth along the rectified axis",
 }
+STEEL_DEPTH: Mapping[tuple[str, str], str] = {
+    **dict.fromkeys([("lattice", CENTRE), ("lattice-12", CENTRE), ("lattice-zed-raw", CENTRE)], "0.13-0.49 m"),
+    **dict.fromkeys([("lattice-zed", CENTRE), ("lattice-zed-12", CENTRE)], "0.13-0.50 m"),
+    ("lattice-orbit", CENTRE): "0.24-0.39 m",
+    ("pile", CENTRE): "0.32-1.05 m",
+    ("pier", NEAREST_STEEL): "7.4-26.2 m",
+    ("lattice-distance", CENTRE): "0.13-1.64 m",
+    ("pile-distance", CENTRE): "0.34-2.33 m",
+    ("pier-distance", CENTRE): "1.7-20.4 m",
+}
+"""Depth of the steel in the left camera over the full trajectory of a standard config, by its name and
+``distance_to``, as printed by ``python -m benchmarks.steel_coverage CONFIG``."""
 _SIZE_CATEGORIES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 
 
@@ -116,6 +129,7 @@ def _config_row(config: DatasetConfig) -> dict[str, Any]:
         "steel_source": _steel_source(entry["scene"]["assembly"]),
         "grid": f"{rig.width} x {rig.height}",
         "distance": _distance(entry["protocol"]),
+        "steel_depth": _steel_depth(config),
         "steel": f"{100 * np.mean(steel) / (rig.width * rig.height):.1f} %",
         "kept": f"{100 * np.mean(scored[with_steel] / steel[with_steel]):.0f} %" if with_steel.any() else "none",
         "out_of_protocol": int(np.count_nonzero(scored == 0)),
@@ -133,4 +147,13 @@ def _steel_source(assembly: Mapping[str, Any]) -> str:
 def _distance(protocol: Mapping[str, Any]) -> str:
     if protocol["kind"] == "ring":
         return f"{protocol['radius_m']:g} m"
-    return f"{min(protocol['radii_m']):g}-{max(protocol['radii_m']):g} m"
+    to_steel = ", nearest steel" if protocol.get("distance_to") == NEAREST_STEEL else ""
+    return f"{min(protocol['radii_m']):g}-{max(protocol['radii_m']):g} m{to_steel}"
+
+
+def _steel_depth(config: DatasetConfig) -> str:
+    """Return the range of steel depth of a standard config; a dash for other assemblies and trajectories."""
+    entry = config.manifest_entry
+    known = "path" not in entry["scene"]["assembly"]
+    distance_to = entry["protocol"].get("distance_to", CENTRE)
+    return STEEL_DEPTH.get((config.name, distance_to), DASH) if known else DASH

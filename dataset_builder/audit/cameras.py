@@ -27,6 +27,7 @@ from dataset_builder.config.trajectories import poses, subset
 from dataset_builder.scene.assemblies import aim_point_m
 from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
+from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS
 from rebar_depth_bench.data.manifest import DatasetConfig
@@ -133,20 +134,26 @@ def checked_aim_point_m(config: DatasetConfig, mesh: Path) -> tuple[Float64[ndar
     return aim_m, ()
 
 
-def expected_views(config: DatasetConfig, aim_m: Float64[ndarray, " 3"]) -> list[ExpectedView]:
-    """Return the expected views of a config in order, from its manifest entry and the aim point (world metres).
+def expected_views(
+    config: DatasetConfig, aim_m: Float64[ndarray, " 3"], bars: Sequence[Bar] = ()
+) -> list[ExpectedView]:
+    """Return the expected views of a config in order.
+
+    They follow from its manifest entry, the aim point (world metres), and the bars of its scene if the trajectory
+    is measured from the nearest steel.
 
     Raises ``DatasetError`` if the manifest's trajectory or rig is not one that this version writes.
     """
     rig = rig_spec(config)
-    left_poses = poses(trajectory_spec(config), aim_m, rig)
+    trajectory = trajectory_spec(config)
     try:
+        left_poses = poses(trajectory, aim_m, rig, bars)
         return [
             ExpectedView(view_id(config.name, index), rig_cameras(rig, left_poses[index]), rig.baseline_m)
             for index in subset(len(left_poses), len(config.views))
         ]
     except ValueError as error:
-        raise DatasetError(f"manifest: the rig of config {config.name} is invalid: {error}") from None
+        raise DatasetError(f"manifest: the protocol or rig of config {config.name} is invalid: {error}") from None
 
 
 def view_list_problems(config: DatasetConfig, views: Sequence[ExpectedView]) -> Iterator[str]:

@@ -85,7 +85,7 @@ def _config_checks(config: DatasetConfig, root: Path, depth_views: int, progress
     steel = read_bars(root / BARS_FILE)[config.scene.name]
     audited = AuditedConfig(name, config.scene.appearance.variants, steel, config.scene.board)
     aim_m, aim_problems = checked_aim_point_m(config, mesh)
-    expected = expected_views(config, aim_m)
+    expected = expected_views(config, aim_m, steel)
     accumulator = _AuditAccumulator(config, audited, expected, depth_views)
     for row in iterate_rows(config, [column for column in COLUMNS if column not in _NOT_AUDITED]):
         accumulator.add(row)

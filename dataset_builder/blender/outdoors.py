@@ -1,8 +1,9 @@
 """Outdoor environment: the building site round a pier with footing slab, ground and objects beyond the cameras.
 
-World frame, metres. The slab's top is z = 0 and the ground lies below it. The steel stands on the origin and
-cameras are up to 17 m from it. Except for slab and ground, all objects are at least ``CLEAR_M`` from the origin
-in plan, and none is steel reinforcement. A ring of trees encloses the site; the sky above is not a surface.
+World frame, metres. The slab's top is z = 0 and the ground lies below it. The steel stands on the origin and the
+pier's cameras are up to 20.4 m from it in plan. Except for slab and ground, all objects are at least ``CLEAR_M``
+from the origin in plan, and none is steel reinforcement. A ring of trees encloses the site; the sky above is not a
+surface.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from dataset_builder.scene.shapes.solids import (
     transformed,
 )
 
-CLEAR_M = 19.0
-_CORRUGATION_PITCH_M = 0.28
+CLEAR_M = 21.0
 """Least distance in plan of objects from the origin."""
+
+_CORRUGATION_PITCH_M = 0.28
 
 SLAB_HALF_M = 3.2
 GROUND_M = -0.12

@@ -42,7 +42,7 @@ LABORATORY_CAMERA_RADIUS_M = 1.6
 Objects lie on the bench beyond the first, furniture stands beyond the second.
 """
 
-OUTDOORS_CAMERA_RADIUS_M = 19.0
+OUTDOORS_CAMERA_RADIUS_M = 20.5
 """Maximum horizontal distance of cameras from the world origin outdoors, metres: the ground is clear within it."""
 
 _DEFAULT_MARKERS = {"laboratory": 6, "outdoors": 0}

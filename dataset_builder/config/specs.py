@@ -12,6 +12,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from rebar_depth_bench.data.manifest import CENTRE
 from rebar_depth_bench.errors import MeshError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration
@@ -134,10 +135,6 @@ class SceneSpec:
     environment: str = "laboratory"
     appearance: AppearanceSpec = field(default_factory=AppearanceSpec)
     seed: int = 0
-
-
-CENTRE, NEAREST_STEEL = "centre", "nearest steel"
-"""Values of ``DomeSpec.distance_to``."""
 
 
 @dataclass(frozen=True)

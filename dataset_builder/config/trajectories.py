@@ -11,7 +11,6 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.config.specs import (
-    NEAREST_STEEL,
     DistanceSweepSpec,
     DomeSpec,
     RigSpec,
@@ -20,6 +19,7 @@ from dataset_builder.config.specs import (
 )
 from dataset_builder.scene.steel_distance import radii_at_steel_distance_m
 from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.data.manifest import NEAREST_STEEL
 from rebar_depth_bench.geometry.cameras import look_at, rigid
 
 GOLDEN_TURN_DEG = 360.0 * (5**0.5 - 1) / 2
@@ -70,7 +70,9 @@ def camera_offsets_m(
         distances_m = np.array([station.radius_m for station in stations])
         radii_m = radii_at_steel_distance_m(target_m, directions, distances_m, bars)
         rounded_m = np.round(radii_m, _RADIUS_DECIMALS).tolist()
-        stations = [_Station(radius_m, *angles) for radius_m, (_, *angles) in zip(rounded_m, stations, strict=True)]
+        stations = [
+            _Station(radius_m, *angles) for radius_m, (_, *angles) in zip(rounded_m, stations, strict=True)
+        ]
     return [_spherical(*station) for station in stations]
 
 

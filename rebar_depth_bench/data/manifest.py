@@ -31,6 +31,8 @@ from rebar_depth_bench.validation import (
 
 MANIFEST_FILE = "manifest.json"
 MANIFEST_FORMAT = "rebar-depth-dataset-1"
+CENTRE, NEAREST_STEEL = "centre", "nearest steel"
+"""Values of ``Trajectory.distance_to``."""
 _DIGEST_PATTERN = "sha256:[0-9a-f]{64}"
 _Name = Annotated[str, StringConstraints(pattern=f"^{NAME_PATTERN}$"), Expected(f"a name of {NAME_LETTERS}")]
 _Path = Annotated[
@@ -102,11 +104,16 @@ class Rig(_ManifestTable):
 
 
 class Trajectory(_ManifestTable):
-    """Cameras of a config: shells, rings of a shell, and azimuths of a ring."""
+    """Cameras of a config: shells, rings of a shell, and azimuths of a ring.
+
+    ``radii_m`` are distances from the left camera to ``distance_to``: the centre of the assembly, as in all
+    folders without this key, or the nearest point of any bar's surface.
+    """
 
     radii_m: Annotated[tuple[_Distance, ...], Strict(False), Field(min_length=1)] = (1.0,)
     elevations_deg: Annotated[tuple[float, ...], Strict(False), Field(min_length=1)] = (0.0,)
     azimuths: Annotated[int, whole_number(1, 1_000_000)]
+    distance_to: Annotated[str, one_of(CENTRE, NEAREST_STEEL)] = CENTRE
 
     @property
     def views(self) -> int:

@@ -64,6 +64,17 @@ class PublishedKitti:
 
 
 @dataclass(frozen=True)
+class PublishedAnchor:
+    """Scale-anchor numbers of section III.C: deviation of the mean scale of one known-depth view from that of the
+    ArUco markers (per cent), and RMSE (centimetres) at the scale of 6 and of 12 markers.
+    """
+
+    one_view_scale_within_percent: str
+    rmse_cm_6_markers: str
+    rmse_cm_12_markers: str
+
+
+@dataclass(frozen=True)
 class PublishedPart:
     """Source of one part of the numbers: place in the paper, protocol, and the mark shown with the numbers."""
 
@@ -77,7 +88,7 @@ class PublishedNumbers:
     """Published numbers that are shown beside results.
 
     The keys of ``parts`` are ``synthetic`` (``scenes``, Table I), ``physical`` (``references``, Table II),
-    ``kitti`` and ``anchor``, whose numbers (section III.C) are only in ``published.json``.
+    ``kitti`` and ``anchor``.
     """
 
     title: str
@@ -85,6 +96,7 @@ class PublishedNumbers:
     scenes: Mapping[str, PublishedScene]
     references: Mapping[str, PublishedReference]
     kitti: tuple[PublishedKitti, ...]
+    anchor: PublishedAnchor
 
 
 _TABLE_I_CONFIGS: Mapping[str, str] = {"lattice": "lattice", "pile": "pile", "pier": "pier"}
@@ -103,6 +115,7 @@ def load_published() -> PublishedNumbers:
         "scenes": content["synthetic"]["scenes"],
         "references": content["physical"]["references"],
         "kitti": content["kitti"]["figures"],
+        "anchor": content["anchor"],
     }
     return TypeAdapter(PublishedNumbers).validate_python(values)
 

@@ -139,6 +139,7 @@ def run_anchor_study(
     return AnchorStudy(
         provenance=provenance,
         config=name,
+        markers=None if chosen.scene.board is None else chosen.scene.board.markers,
         seed=seed,
         views=len(truths),
         views_without_prediction=tuple(view.view_id for view in view_ratios if view.ratio is None),

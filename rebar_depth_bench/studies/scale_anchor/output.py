@@ -22,6 +22,7 @@ from rebar_depth_bench.reporting.charts.lines import (
     log_axis,
 )
 from rebar_depth_bench.reporting.html.study_page import Columns, PageFigure, PageTable, StudyPage, page_table
+from rebar_depth_bench.reporting.published import load_published
 from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE
 from rebar_depth_bench.studies.scale_anchor.study import AnchorRow, AnchorStudy, Spread
@@ -38,6 +39,7 @@ def to_json(study: AnchorStudy) -> dict[str, Any]:
         "study": "anchor",
         **study.provenance.to_dict(),
         "config": study.config,
+        "markers": study.markers,
         "seed": study.seed,
         "views": study.views,
         "views_without_prediction": list(study.views_without_prediction),
@@ -88,7 +90,7 @@ def to_page(study: AnchorStudy) -> StudyPage:
         lead=_lead(study),
         stamps=study.provenance.lines(),
         figures=(_change_figure(study), _scale_figure(study)),
-        tables=(_table(study),),
+        tables=(_table(study), _published_table(study)),
         notes=_notes(study),
     )
 
@@ -173,6 +175,26 @@ def _table(study: AnchorStudy) -> PageTable:
         ("RMSE change", "cm, range", lambda row: _format_range(row.rmse_cm_change, 4)),
     )
     return page_table(caption, columns, study.rows)
+
+
+def _published_table(study: AnchorStudy) -> PageTable:
+    """Return the paper's numbers beside those of the study; the RMSE is in the row of the scene's markers."""
+    published = load_published()
+    part, anchor = published.parts["anchor"], published.anchor
+    rmse_cm = {study.markers: formatting.number(study.given.rmse_cm, 2)}
+    one_view = [_format_signed(row.deviation_percent.mean, 2) for row in study.rows if row.k == 1]
+    archive = f"{printable(study.provenance.archives[0].method)} on {printable(study.config)}"
+    heads = (("number", ""), ("paper", ""), (archive, formatting.counted(study.views, "view")))
+    rows = [
+        (
+            "mean scale from 1 view against the given one, %",
+            f"within {anchor.one_view_scale_within_percent}",
+            *(one_view or [formatting.DASH]),
+        ),
+        ("RMSE at the given scale, 6 markers, cm", anchor.rmse_cm_6_markers, rmse_cm.get(6, formatting.DASH)),
+        ("RMSE at the given scale, 12 markers, cm", anchor.rmse_cm_12_markers, rmse_cm.get(12, formatting.DASH)),
+    ]
+    return PageTable(f"Published, {part.place}, {part.protocol}: {part.mark}", heads, rows)
 
 
 def _notes(study: AnchorStudy) -> list[str]:

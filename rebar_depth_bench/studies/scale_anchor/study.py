@@ -80,6 +80,7 @@ class AnchorRow:
 class AnchorStudy:
     """Result of the scale-anchor study of one config.
 
+    ``markers`` is the number of ArUco markers on the board of its scene, None without a board.
     ``given`` and ``all_views`` are the errors at the given scale and at the median ratio of all views. ``draws``
     has for each k of ``rows`` the errors at each drawn scale. ``skipped_counts`` are the requested k that exceed
     the number of views with a prediction.
@@ -87,6 +88,7 @@ class AnchorStudy:
 
     provenance: Provenance
     config: str
+    markers: int | None
     seed: int
     views: int
     views_without_prediction: tuple[str, ...]

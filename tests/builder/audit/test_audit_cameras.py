@@ -64,7 +64,7 @@ def test_damaged_rig_is_rejected(entry: dict[str, Any]) -> None:
 def test_rig_with_unknown_grid_is_rejected() -> None:
     rig = asdict(replace(RIGS["raw"], grid="fish"))
     config = manifest_config(["c/0000"], rig=rig, protocol=asdict(RING))
-    with pytest.raises(DatasetError, match=r"the rig of config c is invalid: .*fish"):
+    with pytest.raises(DatasetError, match=r"the protocol or rig of config c is invalid: .*fish"):
         expected_views(config, AIM_M)
 
 
