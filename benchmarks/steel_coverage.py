@@ -2,9 +2,9 @@
 
 python -m benchmarks.steel_coverage [CONFIG ...]
 
-Every view of the full trajectory is cast at 160 x 90 against the steel alone, without rendering. Depths are those of
-the left camera. The distance to the nearest steel is that from the left camera to the nearest bar, in any direction.
-The defaults are the configs with the three domes.
+Every view of the full trajectory is cast at 160 x 90 against the steel alone, without rendering. Depths are those
+of the left camera. The distance to the nearest steel is that from the left camera to the nearest bar, in any
+direction. The defaults are the configs with the three domes.
 """
 
 from __future__ import annotations
@@ -33,8 +33,7 @@ def main(*configs: str) -> None:
     rows = []
     for spec in BuildRequest(configs or ("lattice", "pile", "pier"), None, *GRID).config_specs():
         radii_m, views = measure_views(spec)
-        for radius_m in np.unique(radii_m):
-            rows.append((spec.name, f"{radius_m:g}", *_summary(views[radii_m == radius_m])))
+        rows += [(spec.name, f"{m:g}", *_summary(views[radii_m == m])) for m in np.unique(radii_m)]
         rows.append((spec.name, "all", *_summary(views)))
     print_markdown(HEADS, rows)
 
@@ -42,8 +41,8 @@ def main(*configs: str) -> None:
 def measure_views(spec: ConfigSpec) -> tuple[np.ndarray, np.ndarray]:
     """Return the radius of each view, and for each view five numbers, metres and shares of the frame.
 
-    They are the distance to the nearest steel, the least and largest depth of steel in the left camera (NaN without
-    steel), and the share of steel in the left and in the right frame.
+    They are the distance to the nearest steel, the least and largest depth of steel in the left camera (NaN
+    without steel), and the share of steel in the left and in the right frame.
     """
     assembly = make_assembly(spec.scene.assembly)
     left_poses = poses(spec.protocol, aim_point_m(assembly), spec.rig, assembly.bars)

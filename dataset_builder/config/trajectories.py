@@ -26,7 +26,7 @@ GOLDEN_TURN_DEG = 360.0 * (5**0.5 - 1) / 2
 """Azimuth offset between successive rings of a dome, degrees (golden angle): no two rings share azimuths."""
 
 _RADIUS_DECIMALS = 3
-"""Rounding of distances that are solved for, metres: to the millimetre, so that they are equal on every machine."""
+"""Rounding of solved distances in metres: to the millimetre, so that they are equal on every machine."""
 
 
 class _Station(NamedTuple):

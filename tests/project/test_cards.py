@@ -5,13 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import yaml
 
 import rebar_depth_bench as rdb
+from benchmarks.steel_coverage import GRID, measure_views
 from cards import benchmark_card, dataset_card
-from cards.dataset import column_rows
+from cards.dataset import STEEL_DEPTH, column_rows
+from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.config.specs import DomeSpec
 from rebar_depth_bench.data.columns import features
-from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.manifest import NEAREST_STEEL, open_folder
 from rebar_depth_bench.methods import own_methods
 
 
@@ -56,3 +60,35 @@ def test_dataset_card_is_rendered_from_manifest(tiny_root: Path) -> None:
     folder = open_folder(tiny_root)
     card = dataset_card(folder.version, folder.digest, list(folder.config_by_name.values()))
     assert card == (tiny_root / "README.md").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["lattice", "pile", "pier"])
+def test_steel_depths_on_card_are_those_measured(name: str) -> None:
+    [spec] = BuildRequest((name,), None, *GRID).config_specs()
+    _, views = measure_views(spec)
+    low_m, high_m = views[:, 1].min(), views[:, 2].max()
+    decimals = 1 if high_m > 10 else 2
+    assert isinstance(spec.protocol, DomeSpec)
+    assert STEEL_DEPTH[name, spec.protocol.distance_to] == f"{low_m:.{decimals}f}-{high_m:.{decimals}f} m"
+
+
+def test_card_states_what_distances_are_to(tiny_root: Path) -> None:
+    folder = open_folder(tiny_root)
+    lattice = folder.config("lattice")
+    entry = lattice.manifest_entry
+    pier = lattice.model_copy(
+        update={
+            "name": "pier",
+            "manifest_entry": {**entry, "protocol": {**entry["protocol"], "distance_to": NEAREST_STEEL}},
+        }
+    )
+    older = lattice.model_copy(update={"name": "pier"})
+    rows = {
+        kind: next(
+            line for line in dataset_card("1.0.0", "d", [config]).splitlines() if line.startswith("| `pier`")
+        )
+        for kind, config in (("pier", pier), ("older", older))
+    }
+    assert "| 0.22-0.43 m, nearest steel | 7.4-26.2 m |" in rows["pier"]
+    assert "| 0.22-0.43 m | – |" in rows["older"]

@@ -216,6 +216,11 @@ def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
             )
         ),
         (
+            lambda _, config: config["protocol"].update(distance_to="steel"),
+            "invalid",
+            "configs.lattice.protocol.distance_to",
+        ),
+        (
             lambda _, config: config["views"][0].update(steel_px=1 << 20, scored_px=1 << 20),
             "invalid",
             "configs.lattice.views",

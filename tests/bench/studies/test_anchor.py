@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -162,6 +163,28 @@ def test_command_output_is_deterministic(
     printed = capsys.readouterr()
     assert "one scale for the whole archive, from k views of known depth" in printed.out
     assert "errors of lattice: 9 of 9" in printed.err
+
+
+@pytest.mark.parametrize(("counts", "markers"), [((1, 3), 6), ((2,), 6), ((1,), 12), ((1,), None)])
+def test_published_numbers_are_beside_those_of_study(
+    counts: tuple[int, ...],
+    markers: int | None,
+    noisy: Depths,
+    tiny_root: Path,
+    archive_of: Archive,
+) -> None:
+    study = run_anchor_study(archive_of(noisy), tiny_root, counts=counts, draws=2)
+    assert study.markers == 6
+    study = replace(study, markers=markers)
+    published = to_page(study).tables[-1]
+    assert "Sec. III.C" in published.caption
+    assert "measured on the authors' renders" in published.caption
+    assert [row[1] for row in published.rows] == ["within 0.15", "1.60", "1.69"]
+    rmse_cm = f"{study.given.rmse_cm:.2f}"
+    one_view = f"{study.rows[0].deviation_percent.mean:+.2f}" if 1 in counts else "–"
+    expected = {6: [rmse_cm, "–"], 12: ["–", rmse_cm], None: ["–", "–"]}[markers]
+    assert [row[2] for row in published.rows] == [one_view, *expected]
+    assert "test on lattice" in published.heads[2][0]
 
 
 def test_every_study_has_help() -> None:

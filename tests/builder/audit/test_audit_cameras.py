@@ -26,14 +26,17 @@ from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import DomeSpec, RingSpec
 from dataset_builder.config.trajectories import poses
 from dataset_builder.scene.mesh_ply import write_mesh_ply
+from dataset_builder.scene.steel_distance import Cylinders
+from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.manifest import DatasetConfig, ViewRecord, open_folder
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.geometry.cameras import Camera, right_camera_pose
+from rebar_depth_bench.geometry.cameras import Camera, camera_centre, right_camera_pose
 from tests.builder.audit.audit_scene import RIGS
 
 Row = dict[str, Any]
 AIM_M = np.array([0.0, 0.0, 0.05])
 RING = RingSpec(0.4, 40.0, 6)
+DOME = DomeSpec((0.2, 0.3), (10.0, 20.0), 5)
 
 
 def manifest_config(view_ids: Sequence[str] = (), **entry: Any) -> DatasetConfig:
@@ -48,9 +51,25 @@ def test_rig_is_read_from_manifest(name: str) -> None:
     assert rig_spec(manifest_config(rig=asdict(RIGS[name]))) == RIGS[name]
 
 
-@pytest.mark.parametrize("protocol", [RING, DomeSpec((0.2, 0.3), (10.0, 20.0), 5)])
+@pytest.mark.parametrize("protocol", [RING, DOME, replace(DOME, distance_to="nearest steel")])
 def test_trajectory_is_read_from_manifest(protocol: RingSpec | DomeSpec) -> None:
     assert trajectory_spec(manifest_config(protocol=asdict(protocol))) == protocol
+
+
+def test_dome_of_older_folder_is_measured_to_centre() -> None:
+    older = {key: value for key, value in asdict(DOME).items() if key != "distance_to"}
+    assert trajectory_spec(manifest_config(protocol=older)) == DOME
+
+
+def test_dome_measured_to_steel_needs_bars_of_its_scene() -> None:
+    protocol = asdict(replace(DOME, distance_to="nearest steel"))
+    config = manifest_config(["c/0000"], rig=asdict(RIGS["ideal"]), protocol=protocol)
+    with pytest.raises(DatasetError, match="the protocol or rig of config c is invalid: there are no bars"):
+        expected_views(config, AIM_M)
+    bar = Bar(1, "bar", 0.02, ((0.0, 0.0, 0.0), (0.0, 0.0, 0.1)))
+    [view] = expected_views(config, AIM_M, [bar])
+    centre_m = camera_centre(view.cameras["left"].cam_from_world)
+    assert Cylinders.from_bars([bar]).distance_m(centre_m[None])[0] == pytest.approx(0.3, abs=0.00051)
 
 
 @pytest.mark.parametrize(

@@ -220,7 +220,7 @@ def test_no_camera_is_inside_a_prop(kind: str, protocol: Any) -> None:
     centres_m = np.array(
         [
             camera_centre(camera.cam_from_world)
-            for pose in poses(protocol, aim_m, rig)
+            for pose in poses(protocol, aim_m, rig, ASSEMBLIES[kind][0].bars)
             for camera in rig_cameras(rig, pose).values()
         ]
     )

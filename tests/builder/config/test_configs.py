@@ -16,19 +16,20 @@ from PIL import Image
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
-from dataset_builder.config.specs import RigSpec, RingSpec
-from dataset_builder.config.trajectories import camera_offsets_m
+from dataset_builder.config.specs import DomeSpec, RigSpec, RingSpec
+from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.contact_sheet import STRIP_PANEL_PX, TILE_PX
 from dataset_builder.scene.assemblies import check_fits, make_assembly
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import ideal_K
 from rebar_depth_bench.scoring.score import score
 from tests.building import TINY, RunBuild
 from tests.requirements import Repetitions
 
 VIEWS = {"lattice": 504, "lattice-orbit": 100, "lattice-zed": 504, "lattice-zed-raw": 504, "lattice-12": 504}
-VIEWS |= {"pile": 504, "pier": 504}
+VIEWS |= {"lattice-zed-12": 504, "pile": 504, "pier": 504}
 GRID = ("--width", "240", "--height", "135", "--samples", "1")
 
 
@@ -49,20 +50,26 @@ def manifest(full_root: Path) -> dict[str, Any]:
 
 
 def test_config_registry_matches_contract() -> None:
-    assert {name: len(camera_offsets_m(make().protocol)) for name, make in CONFIGS.items()} == VIEWS
-    distances_m = {
-        name: [float(np.linalg.norm(offset)) for offset in camera_offsets_m(CONFIGS[name]().protocol)]
-        for name in VIEWS
-    }
+    specs = {name: make() for name, make in CONFIGS.items()}
+    assert {name: view_count(spec.protocol) for name, spec in specs.items()} == VIEWS
     assert {
-        name: (round(min(radii_m), 6), round(max(radii_m), 6))
-        for name, radii_m in distances_m.items()
-        if len(radii_m) == 504
+        name: (min(spec.protocol.radii_m), max(spec.protocol.radii_m), spec.protocol.distance_to)
+        for name, spec in specs.items()
+        if isinstance(spec.protocol, DomeSpec)
     } == {
-        **dict.fromkeys(("lattice", "lattice-zed", "lattice-zed-raw", "lattice-12"), (0.22, 0.43)),
-        "pile": (0.50, 0.90),
-        "pier": (8.0, 17.0),
+        **dict.fromkeys(
+            (name for name in VIEWS if name.startswith("lattice") and name != "lattice-orbit"),
+            (0.22, 0.43, "centre"),
+        ),
+        "pile": (0.50, 0.90, "centre"),
+        "pier": (8.0, 17.0, "nearest steel"),
     }
+
+
+def test_lattice_zed_12_is_lattice_zed_with_12_markers() -> None:
+    zed, markers_12, both = (CONFIGS[name]() for name in ("lattice-zed", "lattice-12", "lattice-zed-12"))
+    assert (both.scene, both.protocol, both.rig) == (markers_12.scene, zed.protocol, zed.rig)
+    assert both.scene == replace(zed.scene, name="lattice-12", board=BoardSpec(markers=12))
 
 
 def test_datasets_library_loads_every_config(full_root: Path) -> None:
@@ -89,7 +96,7 @@ def test_every_config_has_its_scene_and_optics(full_root: Path) -> None:
     raw, rectified = rows["lattice-zed-raw"], rows["lattice-zed"]
     assert raw["baseline_m"] == rectified["baseline_m"] == pytest.approx(0.119978, abs=1e-9)
     assert (rows["pier"]["left_depth"] == 0).any()  # The sky has no depth.
-    assert 5 < np.median(rows["pier"]["left_depth"][rows["pier"]["left_mask"]]) < 20
+    assert rows["pier"]["left_depth"][rows["pier"]["left_mask"]].min() > 7.4
 
 
 def test_audit_passes_on_all_configs(full_root: Path, repetitions: Repetitions) -> None:

@@ -19,7 +19,7 @@ from dataset_builder.config.catalog import LATTICE_DOME
 from dataset_builder.config.scene_file import NEAREST_RADIUS_PER_REACH, scene_config
 from dataset_builder.config.scene_schema import read_scene_toml
 from dataset_builder.config.specs import CageFileSpec, DomeSpec, LatticeSpec, MeshFileSpec, RingSpec
-from dataset_builder.config.trajectories import camera_offsets_m
+from dataset_builder.config.trajectories import view_count
 from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
 from dataset_builder.scene.assemblies.cage_assembly import MAX_RIBS_PER_ROW, CageBar, cage_assembly
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
@@ -63,7 +63,7 @@ def test_examples_are_above_board_without_touching_bars(name: str) -> None:
         assert trees[a].query(lines[b])[0].min() > radii_m[a] + radii_m[b] + 2e-4
     assert (config.name, config.scene.name) == (name.split(".")[0],) * 2
     assert (config.scene.environment, config.scene.board) == ("laboratory", BoardSpec(markers=6))
-    assert len(camera_offsets_m(config.protocol)) == 504
+    assert view_count(config.protocol) == 504
 
 
 def test_bars_have_specified_geometry(tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_default_dome_fits_any_cage(
     content = f"{MM}[[bar]]\ndiameter = 10\nribs = false\npoints = {points}\n"
     config = scene_config(write_scene(tmp_path_factory.mktemp("dome"), content))
     check_fits(make_assembly(config.scene.assembly), config)
-    assert len(camera_offsets_m(config.protocol)) == 504
+    assert view_count(config.protocol) == 504
 
 
 def test_cameras_board_and_environment_are_applied(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ def test_sweep_has_scene_of_dome_config(config: ConfigSpec) -> None:
 
 
 def test_sweep_has_12_distances_and_8_directions(config: ConfigSpec) -> None:
-    offsets = np.array(camera_offsets_m(config.protocol)).reshape(12, 8, 3)
+    offsets = np.array(camera_offsets_m(config.protocol, np.zeros(3), ())).reshape(12, 8, 3)
     radii_m = np.linalg.norm(offsets, axis=2)
     assert np.ptp(radii_m, axis=1).max() < 1e-9
     assert (radii_m[0, 0], radii_m[-1, 0]) == pytest.approx(DISTANCE_RANGES_M[config.name])
@@ -67,7 +67,8 @@ def test_cameras_are_inside_environment(config: ConfigSpec) -> None:
     max_radius_m = {"laboratory": LABORATORY_CAMERA_RADIUS_M, "outdoors": OUTDOORS_CAMERA_RADIUS_M}[
         config.scene.environment
     ]
-    centres_m = aim_point_m(assembly) + np.array(camera_offsets_m(config.protocol))
+    aim_m = aim_point_m(assembly)
+    centres_m = aim_m + np.array(camera_offsets_m(config.protocol, aim_m, assembly.bars))
     assert np.linalg.norm(centres_m[:, :2], axis=1).max() <= max_radius_m
     assert centres_m[:, 2].min() > 0.1
 
