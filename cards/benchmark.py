@@ -17,20 +17,28 @@ from rebar_depth_bench.extended.inspection.tolerances import PROFILES
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, own_methods
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_VIEWS, RESAMPLES
-from rebar_depth_bench.scoring.protocol import DELTA1_RATIO, MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
+from rebar_depth_bench.scoring.protocol import DELTA1_RATIO, MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
+from rebar_depth_bench.scoring.rounding import SIGNIFICANT_DIGITS
+from rebar_depth_bench.submission import INPUTS
 
 REFERENCE_RESULTS = Path(__file__).parent / "reference.json"
 """JSON file of the reference results, written by ``python -m benchmarks.reference``."""
 
 
 def reference_context() -> dict[str, Any]:
-    """Return the template variables of the reference results: command, subset, and formatted rows by config."""
+    """Return the template variables of the reference results: command, subset, protocol, and rows by config."""
     document = json.loads(REFERENCE_RESULTS.read_text())
     tables: dict[str, list[dict[str, str]]] = {}
     for method, result in document["results"].items():
         for config, table in result["tables"].items():
             tables.setdefault(config, []).append(_reference_row(method, result, config, table))
-    return {"command": document["command"], "subset": document["subset"], "reference": tables}
+    [protocol] = {result["protocol"] for result in document["results"].values()}
+    return {
+        "command": document["command"],
+        "subset": document["subset"],
+        "reference_protocol": protocol,
+        "reference": tables,
+    }
 
 
 def _reference_row(
@@ -43,7 +51,6 @@ def _reference_row(
         "method": method,
         "mark": " †" if own_methods()[method].info.uses_ground_truth else "",
         "coverage": _percent(table["coverage"]),
-        "ranked": "yes" if table["ranked"] else "no",
         "abs_rel": _number(native.get("abs_rel"), 4) + interval,
         "rmse": _number(native.get("rmse_cm"), 2, " cm"),
         "scaled": _number(scaled.get("abs_rel"), 4),
@@ -78,7 +85,9 @@ def benchmark_card() -> str:
         "benchmark_card.md.j2",
         protocol=PROTOCOL,
         delta1_ratio=DELTA1_RATIO,
-        min_ranked_coverage=MIN_RANKED_COVERAGE,
+        min_comparable_coverage=MIN_COMPARABLE_COVERAGE,
+        significant_digits=SIGNIFICANT_DIGITS,
+        inputs=[f"`{name}`" for name in INPUTS],
         within_mm=WITHIN_MM,
         methods=[_method_row(method) for method in own_methods().values()],
         **reference_context(),

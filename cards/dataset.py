@@ -136,8 +136,18 @@ def _config_row(config: DatasetConfig) -> dict[str, Any]:
         "sheet": config.sheet,
         "variants": config.scene.appearance.variants,
         "optics": _OPTICS_TEXTS[entry["rig"]["grid"]],
+        "constant": _reference(config, "constant"),
+        "one_pixel": _reference(config, "one_pixel"),
         "megabytes": f"{entry['bytes'] / 1e6:.1f}",
     }
+
+
+def _reference(config: DatasetConfig, name: str) -> str:
+    """Return AbsRel and RMSE of a reference; a dash if the manifest has none."""
+    errors = getattr(config.reference, name, None)
+    if errors is None or errors.abs_rel is None or errors.rmse_cm is None:
+        return DASH
+    return f"{errors.abs_rel:.4f}, {errors.rmse_cm:.2f} cm"
 
 
 def _steel_source(assembly: Mapping[str, Any]) -> str:

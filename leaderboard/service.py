@@ -45,8 +45,9 @@ class Service:
 def open_service(settings: Settings) -> Iterator[Service]:
     """Open the service: migrate the database, remove orphaned archives and create the validation pool.
 
-    Raises ``InputError`` if the dataset, the database or the archive storage is unusable, and if the leaderboard
-    has submissions of another dataset, unless the setting ``rescore`` is on.
+    Submissions whose result is of another protocol are scored again if their archive is kept. Raises
+    ``InputError`` if the dataset, the database or the archive storage is unusable, and if the leaderboard has
+    submissions of another dataset, unless the setting ``rescore`` is on.
     """
     folder = open_folder(settings.data)
     with work_dir(settings.spool) as spool, closing(Database(settings.database_url)) as database:
@@ -54,6 +55,8 @@ def open_service(settings: Settings) -> Iterator[Service]:
         database.migrate()
         remove_orphan_archives(database, archives)
         _check_dataset_unchanged(folder, database, settings.rescore)
+        if requeued := jobs.requeue_other_protocols(database, archives.ids()):
+            _LOG.info("results of another protocol; submissions requeued", submissions=requeued)
         with ArchiveChecker(settings.data, settings.score_memory) as checker:
             yield Service(settings, folder, database, archives, spool, checker, ServiceMetrics())
 

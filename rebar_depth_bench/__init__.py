@@ -18,8 +18,9 @@ if TYPE_CHECKING:
         RebarDepthError,
         SubmissionError,
     )
-    from rebar_depth_bench.scoring.result import Result, Table, ViewScore
+    from rebar_depth_bench.scoring.result import Result, Table
     from rebar_depth_bench.scoring.score import score
+    from rebar_depth_bench.scoring.view_score import ViewScore
     from rebar_depth_bench.submission import SubmissionWriter
 
 __all__ = [

@@ -66,7 +66,7 @@ def lidar_method(name: str, spec: ScannerSpec, what: str) -> MultiViewMethod:
     )
     # The digest distinguishes scanners of the same name with different parameters.
     source = f"this project, scanner {_digest(spec)}"
-    info = MethodInfo(name, summary, _COLUMNS, True, source, "Apache-2.0", uses_ground_truth=True)
+    info = MethodInfo(name, summary, _COLUMNS, True, source, "Apache-2.0", uses_ground_truth=True, inputs="lidar")
     return MultiViewMethod(info, prepare, check)
 
 

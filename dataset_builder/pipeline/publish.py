@@ -12,6 +12,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 from cards import dataset_card
 from dataset_builder.config.catalog import CONFIGS, view_id
@@ -41,6 +42,7 @@ from rebar_depth_bench.data.manifest import (
     open_folder,
 )
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.scoring.ground_truth import reference_errors
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.version import software_version
 
@@ -100,7 +102,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
     shards = _publish_shards(out, plan)
     mesh = f"{MESHES}/{plan.spec.scene.name}.ply"
     write_bytes(out / mesh, plan.staging.mesh.read_bytes())
-    entry = {
+    entry: dict[str, Any] = {
         **config_parameters(plan.spec),
         "key": plan.key,
         "aim_point_m": aim_point_m(plan.assembly).tolist(),
@@ -113,6 +115,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
         "ground_truth_digest": views_digest(records),
         "views": [record.model_dump() for record in records],
     }
+    entry["reference"] = reference_errors(DatasetConfig(**entry, root=str(out), manifest_entry=entry)).to_dict()
     config = DatasetConfig(**entry, root=str(out), manifest_entry=entry)
     write_contact_sheet(config, out / config.sheet)
     _write_bars(out, plan)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,6 +20,7 @@ from sqlalchemy.orm import Session
 from leaderboard.db.engine import Database
 from leaderboard.db.models import ErrorMapModel, LeaderboardRowModel, ResultModel, SubmissionModel
 from leaderboard.db.submissions import FAILED, QUEUED, SCORED, SCORING
+from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 MAX_ATTEMPTS = 5
 """Number of leases after which a submission fails if no worker finished it.
@@ -103,7 +104,7 @@ def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome
         if result is not None:
             for table in (ErrorMapModel, LeaderboardRowModel, ResultModel):
                 session.execute(delete(table).where(table.submission_id == submission_id))
-            session.add(ResultModel(submission_id=submission_id, json=outcome.result))
+            session.add(ResultModel(submission_id=submission_id, json=outcome.result, protocol=result["protocol"]))
             session.add_all(_leaderboard_rows(submission_id, result["tables"]))
         for view_id, webp in outcome.error_maps.items():
             session.add(ErrorMapModel(submission_id=submission_id, view_id=view_id, webp=webp))
@@ -123,6 +124,23 @@ def requeue_stale_submissions(database: Database, dataset_digest: str) -> None:
         session.execute(update(SubmissionModel).where(_is_stale(dataset_digest)).values(**values))
 
 
+def requeue_other_protocols(database: Database, archive_ids: Collection[str]) -> int:
+    """Requeue the scored submissions whose result is of another protocol; return their number.
+
+    ``archive_ids`` are those of the submissions whose archive is kept; the results of others stay.
+    """
+    query = (
+        select(SubmissionModel)
+        .join(ResultModel, ResultModel.submission_id == SubmissionModel.id)
+        .where(SubmissionModel.status == SCORED, ResultModel.protocol != PROTOCOL)
+    )
+    with database.write() as session:
+        requeued = [record for record in session.scalars(query) if record.id in archive_ids]
+        for record in requeued:
+            record.status, record.attempts, record.finished_at = QUEUED, 0, None
+        return len(requeued)
+
+
 def _is_stale(dataset_digest: str) -> ColumnElement[bool]:
     is_active = SubmissionModel.status.in_((QUEUED, SCORING, SCORED))
     return and_(is_active, SubmissionModel.dataset_digest != dataset_digest)
@@ -134,7 +152,7 @@ def _leaderboard_rows(submission_id: str, tables: Mapping[str, Any]) -> list[Lea
             submission_id=submission_id,
             config=config,
             ranked=table["ranked"],
-            abs_rel=(table["native"] or {}).get("abs_rel"),
+            rank_error=table["rank_error"],
             json=json.dumps(table),
         )
         for config, table in tables.items()

@@ -5,6 +5,8 @@ from __future__ import annotations
 from sqlalchemy import BigInteger, Boolean, Float, ForeignKey, Index, Integer, LargeBinary, String, Text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
+from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL
+
 
 class Base(DeclarativeBase):
     """Declarative base class of the models."""
@@ -36,6 +38,8 @@ class SubmissionModel(Base):
     description: Mapped[str | None] = mapped_column(Text)
     url: Mapped[str | None] = mapped_column(Text)
     uses_intrinsics: Mapped[bool | None] = mapped_column(Boolean)
+    inputs: Mapped[str | None] = mapped_column(String(20))
+    uses_ground_truth: Mapped[bool | None] = mapped_column(Boolean)
     archive_sha256: Mapped[str] = mapped_column(String(64))
     archive_bytes: Mapped[int] = mapped_column(BigInteger)
     status: Mapped[str] = mapped_column(String(10))
@@ -50,12 +54,13 @@ class SubmissionModel(Base):
 
 
 class ResultModel(Base):
-    """The result JSON of a scored submission, byte-identical to the output of the command line."""
+    """The result JSON of a scored submission, byte-identical to that of the command line, and its protocol."""
 
     __tablename__ = "results"
 
     submission_id: Mapped[str] = mapped_column(ForeignKey("submissions.id"), primary_key=True)
     json: Mapped[bytes] = mapped_column(LargeBinary)
+    protocol: Mapped[str] = mapped_column(String(20), server_default=OLD_PROTOCOL)
 
 
 class LeaderboardRowModel(Base):
@@ -66,7 +71,7 @@ class LeaderboardRowModel(Base):
     submission_id: Mapped[str] = mapped_column(ForeignKey("submissions.id"), primary_key=True)
     config: Mapped[str] = mapped_column(String(100), primary_key=True)
     ranked: Mapped[bool] = mapped_column(Boolean)
-    abs_rel: Mapped[float | None] = mapped_column(Float)
+    rank_error: Mapped[float | None] = mapped_column(Float)
     json: Mapped[str] = mapped_column(Text)
 
 

@@ -5,31 +5,37 @@ The queries select columns instead of ORM objects, so that a page with hundreds 
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import and_, false, func, or_, select
+from sqlalchemy import false, func, select
 from sqlalchemy.orm import aliased
 
 from leaderboard.db.engine import Database
-from leaderboard.db.models import ErrorMapModel, LeaderboardRowModel, SubmissionModel, TokenModel
+from leaderboard.db.models import ErrorMapModel, LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
 from leaderboard.db.submissions import QUEUED, SCORED
+from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL, PROTOCOL
 
 
 @dataclass(frozen=True)
 class LeaderboardEntry:
     """A submission's row of one config; ``rank`` is None if the row is not ranked.
 
+    ``class_rank`` is the rank among the submissions that declare the same ``inputs``, None without a declaration.
     ``table_json`` is the JSON text of the config's table in the result.
     """
 
     rank: int | None
+    class_rank: int | None
     submission_id: str
     config: str
     method: str
     submitter: str
     url: str | None
     uses_intrinsics: bool | None
+    inputs: str | None
+    uses_ground_truth: bool | None
     created_at: float
     finished_at: float | None
     public: bool
@@ -38,18 +44,21 @@ class LeaderboardEntry:
 
 _COLUMNS = (
     LeaderboardRowModel.ranked,
+    LeaderboardRowModel.rank_error,
     SubmissionModel.id,
     LeaderboardRowModel.config,
     SubmissionModel.method,
     TokenModel.name,
     SubmissionModel.url,
     SubmissionModel.uses_intrinsics,
+    SubmissionModel.inputs,
+    SubmissionModel.uses_ground_truth,
     SubmissionModel.created_at,
     SubmissionModel.finished_at,
     SubmissionModel.public,
     LeaderboardRowModel.json,
 )
-"""Columns selected for a ``LeaderboardEntry``: whether it is ranked, then its fields after ``rank``."""
+"""Columns selected for a ``LeaderboardEntry``: whether it is ranked, its rank error, then its other fields."""
 
 _IDS = func.aggregate_strings(LeaderboardRowModel.submission_id, " ")
 
@@ -87,31 +96,60 @@ def ranking_version(rows: Sequence[LeaderboardEntry]) -> RankingVersion:
 def leaderboard_entries(
     database: Database, config: str, viewer: TokenModel | None = None
 ) -> list[LeaderboardEntry]:
-    """Return the public rows of a config and those of ``viewer``.
+    """Return the public rows of a config and those of ``viewer``, of results that this version can read.
 
-    Ranked rows come first, by native AbsRel, then unranked ones; ties are ordered by age, oldest first. A row that
-    is not public has no rank and does not affect the ranks of others.
+    Ranked rows come first, by rank error, then unranked ones; ties are ordered by age, oldest first, and share a
+    rank. A row that is not public has no rank and does not affect the ranks of others.
     """
     own = false() if viewer is None else SubmissionModel.token_id == viewer.id
     query = (
         select(*_COLUMNS)
         .join(SubmissionModel, SubmissionModel.id == LeaderboardRowModel.submission_id)
         .join(TokenModel, TokenModel.id == SubmissionModel.token_id)
+        .join(ResultModel, ResultModel.submission_id == SubmissionModel.id)
         .where(
-            LeaderboardRowModel.config == config, SubmissionModel.status == SCORED, SubmissionModel.public | own
+            LeaderboardRowModel.config == config,
+            SubmissionModel.status == SCORED,
+            SubmissionModel.public | own,
+            ResultModel.protocol.in_((PROTOCOL, OLD_PROTOCOL)),
         )
         .order_by(
-            LeaderboardRowModel.ranked.desc(), LeaderboardRowModel.abs_rel.nulls_last(), SubmissionModel.created_at
+            LeaderboardRowModel.ranked.desc(),
+            LeaderboardRowModel.rank_error.nulls_last(),
+            SubmissionModel.created_at,
         )
     )
     with database.read() as session:
         rows = session.execute(query).all()
-    entries, rank = [], 0
+    overall, by_inputs = _RankCounter(), defaultdict[str, _RankCounter](_RankCounter)
+    entries = []
     for row in rows:
         has_rank = row.ranked and row.public
-        rank += has_rank
-        entries.append(LeaderboardEntry(rank if has_rank else None, *row[1:]))
+        rank = overall.next(row.rank_error) if has_rank else None
+        class_rank = by_inputs[row.inputs].next(row.rank_error) if has_rank and row.inputs else None
+        entries.append(LeaderboardEntry(rank, class_rank, *tuple(row)[2:]))
     return entries
+
+
+def entries_of_class(entries: Sequence[LeaderboardEntry], inputs: str | None) -> list[LeaderboardEntry]:
+    """Return the rows that declare ``inputs``, all rows for None; their ranks are kept."""
+    return [entry for entry in entries if inputs is None or entry.inputs == inputs]
+
+
+@dataclass
+class _RankCounter:
+    """Counter of rows by ascending error, in which equal errors share a rank."""
+
+    rows: int = 0
+    rank: int = 0
+    error: float | None = None
+
+    def next(self, error: float) -> int:
+        """Return the rank of the next row."""
+        self.rows += 1
+        if error != self.error:
+            self.rank, self.error = self.rows, error
+        return self.rank
 
 
 def error_map_views(database: Database, submission_id: str) -> list[str]:
@@ -145,10 +183,6 @@ def ranks(database: Database, submission: SubmissionModel) -> dict[str, int]:
         aliased(LeaderboardRowModel),
         aliased(SubmissionModel),
     )
-    ahead = or_(
-        other_row.abs_rel < own_row.abs_rel,
-        and_(other_row.abs_rel == own_row.abs_rel, other_submission.created_at < submission.created_at),
-    )
     better = (
         select(func.count())
         .select_from(other_row)
@@ -158,7 +192,7 @@ def ranks(database: Database, submission: SubmissionModel) -> dict[str, int]:
             other_row.ranked,
             other_submission.status == SCORED,
             other_submission.public,
-            ahead,
+            other_row.rank_error < own_row.rank_error,
         )
         .scalar_subquery()
     )

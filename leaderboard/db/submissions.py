@@ -63,6 +63,8 @@ def accept(
             description=upload.meta.description,
             url=upload.meta.url,
             uses_intrinsics=upload.meta.uses_intrinsics,
+            inputs=upload.meta.inputs,
+            uses_ground_truth=upload.meta.uses_ground_truth,
             archive_sha256=upload.sha256,
             archive_bytes=upload.size,
             status=QUEUED,

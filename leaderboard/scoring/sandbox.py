@@ -30,8 +30,9 @@ from rebar_depth_bench.errors import DatasetError, RebarDepthError, SubmissionEr
 from rebar_depth_bench.reporting.html.page import iter_view_panels
 from rebar_depth_bench.reporting.html.view_images import error_webp
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
-from rebar_depth_bench.scoring.result import Result, sort_key_worst_first
+from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.view_score import sort_key_worst_first
 from rebar_depth_bench.submission import config_of
 
 

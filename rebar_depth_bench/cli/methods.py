@@ -11,6 +11,7 @@ from rich.text import Text
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, all_methods
+from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.reporting.tables import plain_text
 
 SUMMARY = "list the available methods"
@@ -39,11 +40,11 @@ def run(_: argparse.Namespace) -> None:
         table.add_row(
             plain_text(label),
             _summary_and_notes(method),
-            plain_text(_format_columns(info.columns)),
+            plain_text(f"{_format_columns(info.columns)}\ninputs: {input_class(method) or '-'}"),
             plain_text(f"{info.source}\nlicence: {info.licence}"),
         )
     Console().print(table)
-    Console().print("† uses ground truth; results are not comparable to a real method")
+    Console().print("† uses ground truth; its submissions are not ranked")
 
 
 def _summary_and_notes(method: AnyMethod) -> Text:

@@ -121,8 +121,25 @@ class Trajectory(_ManifestTable):
         return len(self.radii_m) * len(self.elevations_deg) * self.azimuths
 
 
+class ReferenceRecord(_ManifestTable):
+    """AbsRel and RMSE (cm) of a reference, means over the views; None where undefined."""
+
+    abs_rel: _Distance | None
+    rmse_cm: _Distance | None
+
+
+class References(_ManifestTable):
+    """Reference errors of a config, as in the tables of results."""
+
+    constant: ReferenceRecord
+    one_pixel: ReferenceRecord
+
+
 class DatasetConfig(Located):
-    """Config of a dataset; ``manifest_entry`` is its entry as it was written, with all parameters of the build."""
+    """Config of a dataset; ``manifest_entry`` is its entry as it was written, with all parameters of the build.
+
+    ``reference`` is None in folders of earlier versions.
+    """
 
     name: _Name
     scene: Scene
@@ -135,6 +152,7 @@ class DatasetConfig(Located):
     shards: Annotated[tuple[_Path, ...], Strict(False)]
     mesh: _Path
     sheet: _Path
+    reference: References | None = None
     manifest_entry: dict[str, Any] = Field(repr=False)
 
     @field_validator("views")
@@ -241,7 +259,7 @@ class _Manifest(_ManifestTable):
     """Manifest of the supported format; its configs are validated one by one."""
 
     version: Annotated[str, text(100)]
-    protocol: Annotated[str, one_of("rebar-1")] = "rebar-1"
+    protocol: Annotated[str, one_of("rebar-1", "rebar-2")] = "rebar-1"
     ground_truth: _GroundTruth
     configs: Annotated[dict[str, dict[str, Any]], Expected("a table of one or more configs", bool)]
     files: dict[_Path, _Sha256]

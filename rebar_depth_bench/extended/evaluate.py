@@ -29,7 +29,8 @@ from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
-from rebar_depth_bench.scoring.result import Result, protocol_indices
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.view_score import protocol_indices
 from rebar_depth_bench.submission import SubmissionReader
 
 ONCE, NATIVE, SCALED = "once", "native", "scaled"

@@ -22,8 +22,9 @@ class MethodInfo:
     """Description of a method, shown in listings and written into submissions.
 
     ``columns`` are the dataset columns that the predictor reads. ``uses_ground_truth`` is True if the method reads
-    ground truth, so that its numbers do not describe an instrument. ``untested_note`` states which part was never
-    run by the authors because weights or hardware were not available; empty if everything was tested.
+    ground truth, so that its submissions are not ranked. ``untested_note`` states which part was never run by the
+    authors because weights or hardware were not available; empty if everything was tested. ``inputs`` is the input
+    class, one of ``INPUTS``; without it, ``input_class`` derives the class from the columns.
     """
 
     name: str
@@ -34,6 +35,7 @@ class MethodInfo:
     licence: str
     uses_ground_truth: bool = False
     untested_note: str = ""
+    inputs: str | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.columns, str):  # Catches a one-element tuple written without its comma.
@@ -79,3 +81,21 @@ class MultiViewMethod:
 
 
 AnyMethod = Method | MultiViewMethod
+
+
+def input_class(method: AnyMethod) -> str | None:
+    """Return the input class that submissions of a method declare, None if it reads no image.
+
+    A multi-view method has the class ``multi-view``, and a method that reads the right image ``stereo``. Another
+    method has ``rgb+K`` if it uses intrinsics, else ``rgb``.
+    """
+    info = method.info
+    if info.inputs is not None:
+        return info.inputs
+    if isinstance(method, MultiViewMethod):
+        return "multi-view"
+    if "right_rgb" in info.columns:
+        return "stereo"
+    if "left_rgb" in info.columns:
+        return "rgb+K" if info.uses_intrinsics else "rgb"
+    return None

@@ -25,6 +25,7 @@ from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.errors import InputError, MethodError, RebarDepthError
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
+from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
@@ -240,7 +241,8 @@ def _write_archive(
         archive,
         method=info.name,
         description=info.summary,
-        uses_intrinsics=info.uses_intrinsics,
+        inputs=input_class(method),
+        uses_ground_truth=info.uses_ground_truth,
         runtime=runtime,
         notes={config: report.notes for config, report in reports.items()} or None,
     ) as writer:

@@ -16,20 +16,28 @@ from rich.table import Table as RichTable
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.published import load_published, paper_scene, published_rows
+from rebar_depth_bench.reporting.published import (
+    OTHER_OPTICS_MARK,
+    OTHER_OPTICS_NOTE,
+    load_published,
+    published_rows,
+)
 from rebar_depth_bench.reporting.tables import frame_csv, plain_text
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_VIEWS
 from rebar_depth_bench.scoring.comparison import Comparison, Difference
 from rebar_depth_bench.scoring.frames import differences_frame
 from rebar_depth_bench.scoring.metrics import METRICS
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
-from rebar_depth_bench.scoring.result import SCALE_MEDIAN, Result, Table
+from rebar_depth_bench.scoring.published_match import PublishedMatch
+from rebar_depth_bench.scoring.result import Result, Table
+from rebar_depth_bench.scoring.rounding import rounded
+from rebar_depth_bench.scoring.view_score import SCALE_MEDIAN
 from rebar_depth_bench.version import software_version
 
 
 def _titles() -> dict[str, tuple[str, int, float]]:
     """Return title, number of decimals and display factor by name of the number."""
-    titles = {"coverage": ("coverage, % ↑", 1, 100.0)}
+    titles = {"coverage": ("coverage, % ↑", 1, 100.0), "rank_error": ("rank error ↓", 4, 1.0)}
     for alignment in ("native", "scaled"):
         for (name, info), (title, unit, better) in zip(METRICS.items(), formatting.METRIC_HEADS, strict=True):
             head = f"{alignment} {title}{f', {unit}' if unit else ''} {better}"
@@ -57,8 +65,8 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
             "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
             f"({BLOCK_VIEWS} steps of the protocol); none with fewer than {MIN_VIEWS} views. B is called better "
             "or worse if the interval excludes zero, which happens by chance in about one of twenty comparisons. "
-            "Errors of a submission that is not ranked (coverage below 95 %, or a view without prediction) are "
-            "not judged."
+            "Errors of valid predictions are not compared if either submission has a coverage below 95 %, a view "
+            "without prediction or an overflow; the rank error counts every scored pixel."
         )
     )
 
@@ -120,7 +128,7 @@ def _signed(value: float | None, decimals: int, factor: float) -> str:
     return f"+{text}" if value is not None and value > 0 and text != formatting.DASH else text
 
 
-_HEADS = ("RMSE, cm ↓", "AbsRel ↓", "AbsRel_s ↓", "s")
+_HEADS = ("rank err. ↓", "RMSE cm ↓", "AbsRel ↓", "AbsRel_s ↓", "s")
 
 
 def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
@@ -138,7 +146,9 @@ def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
 
 
 def print_paper_table(results: Sequence[Result], console: Console, *, published: bool) -> None:
-    """Print a table per config: one row per result, sorted by native AbsRel, with unranked rows last.
+    """Print a table per config: one row per result, sorted by rank error, then the rows that are not ranked.
+
+    The reference errors of the config follow.
 
     ``results`` must not be empty and must belong to one dataset. With ``published``, the paper's rows of the same
     scene follow; they are marked and not compared with the results.
@@ -152,39 +162,48 @@ def print_paper_table(results: Sequence[Result], console: Console, *, published:
         )
     )
     for config in dict.fromkeys(name for result in results for name in result.tables):
-        rows = [(result.method, result.tables[config]) for result in results if config in result.tables]
-        scene = paper_scene(config) if published else None
+        rows = [(result, result.tables[config]) for result in results if config in result.tables]
+        match = rows[0][1].published if published else None
         views = rows[0][1].views
         console.print()
         console.print(plain_text(f"{printable(config)}, {formatting.counted(views, 'view')}", style="italic"))
-        console.print(_paper_table(sorted(rows, key=lambda row: _paper_table_sort_key(row[1])), scene))
+        console.print(_paper_table(sorted(rows, key=lambda row: _paper_table_sort_key(row[1])), match))
     console.print()
     console.print(
         plain_text("RMSE, AbsRel: native (no alignment). AbsRel_s: scaled (oracle median scale per view).")
     )
-    console.print(plain_text("s: median over views of median(z)/median(p). ‡: not ranked."))
-    if published:
+    console.print(
+        plain_text(
+            "s: median over views of median(z)/median(p). ‡: not ranked (declares the use of ground truth). "
+            "?: use of ground truth not declared."
+        )
+    )
+    console.print(plain_text(f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE}"))
+    if published and any(table.published for result in results for table in result.tables.values()):
         mark = load_published().parts["synthetic"].mark
-        console.print(plain_text(f"The paper's rows: {mark}. †: median-anchored."))
+        console.print(plain_text(f"The paper's rows: {mark}. †: median-anchored. {OTHER_OPTICS_NOTE}"))
 
 
-def _paper_table(rows: Sequence[tuple[str, Table]], scene: str | None) -> RichTable:
+def _paper_table(rows: Sequence[tuple[Result, Table]], match: PublishedMatch | None) -> RichTable:
     grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     grid.add_column("", overflow="fold")  # Long names are wrapped; numbers are never truncated.
     for head in _HEADS:
         grid.add_column(head, justify="right", no_wrap=True)
-    for method, table in rows:
+    for result, table in rows:
         grid.add_row(
-            plain_text(printable(method, 40) + ("" if table.ranked else " ‡")),
+            plain_text(printable(result.method, 40) + formatting.rank_mark(result.declared, table)),
+            plain_text(formatting.rank_error_cell(table.rank_error)),
             *map(plain_text, formatting.paper_cells(table)),
         )
-    if scene is not None:
+    for title, cells in formatting.paper_reference_rows(rows[0][1].reference):
+        grid.add_row(plain_text(f"reference: {title}"), "", *map(plain_text, cells), style="dim")
+    if match is not None:
         grid.add_section()
-        for row in published_rows(scene):
-            mark = " †" if row.median_anchored else ""
-            grid.add_row(plain_text(f"paper: {row.method}{mark}"), *map(plain_text, row.cells), style="dim")
+        for row in published_rows(match.scene):
+            mark = (" †" if row.median_anchored else "") + ("" if match.same_optics else f" {OTHER_OPTICS_MARK}")
+            grid.add_row(plain_text(f"paper: {row.method}{mark}"), "", *map(plain_text, row.cells), style="dim")
     return grid
 
 
 def _paper_table_sort_key(table: Table) -> tuple[bool, float]:
-    return not table.ranked, float("inf") if table.native is None else table.native.abs_rel
+    return not table.ranked, rounded(table.rank_error) or 0.0

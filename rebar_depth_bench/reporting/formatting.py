@@ -7,8 +7,10 @@ from collections.abc import Iterable, Mapping
 from decimal import ROUND_DOWN, Decimal
 
 from rebar_depth_bench.scoring.metrics import METRICS, DepthMetrics
-from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, WITHIN_MM
+from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, OLD_PROTOCOL, WITHIN_MM
+from rebar_depth_bench.scoring.reference import Reference
 from rebar_depth_bench.scoring.result import Table
+from rebar_depth_bench.submission.metadata import Declaration
 
 DASH = "–"
 """Text of an undefined number, which is null in the JSON."""
@@ -18,6 +20,15 @@ DASH_NOTE = f"{DASH}: undefined, because no pixel has a prediction or a number o
 NATIVE_TITLE = "native (no alignment)"
 SCALED_TITLE = "scaled (oracle median scale per view, s = median(z)/median(p))"
 WITHIN_TITLE = "within t mm (native): share of all scored pixels with |p - z| <= t"
+
+RANK_ERROR_NOTE = "Rank error: mean over all scored pixels of |p - z| / max(p, z), 1 without a valid prediction."
+
+CONSTANT_TITLE = "constant"
+ONE_PIXEL_TITLE = "one pixel"
+REFERENCE_NOTE = (
+    f"References, from ground truth alone: {CONSTANT_TITLE}, a constant after scaling, for scaled errors; "
+    f"{ONE_PIXEL_TITLE}, exact depth shifted by one pixel, for native errors."
+)
 
 INTERVAL_NOTE = (
     "Small figures: 95 % interval, block bootstrap over views (other views of the same scene, not other scenes)."
@@ -52,6 +63,28 @@ def coverage_percent(share: float | None) -> str:
     if share is None:
         return DASH
     return str((Decimal(repr(share)) * 100).quantize(Decimal("0.1"), rounding=ROUND_DOWN))
+
+
+def rank_error_cell(rank_error: float | None) -> str:
+    """Return a rank error with four decimals."""
+    return number(rank_error, 4)
+
+
+def inputs_text(declared: Declaration) -> str:
+    """Return the input class that a submission declares."""
+    return declared.inputs or "not declared"
+
+
+def ground_truth_text(declared: Declaration) -> str:
+    """Return what a submission declares about its use of ground truth."""
+    if declared.uses_ground_truth is None:
+        return "use not declared"
+    return "used, as declared" if declared.uses_ground_truth else "not used, as declared"
+
+
+def declaration_text(declared: Declaration) -> str:
+    """Return a submission's declaration in one line."""
+    return f"declared inputs: {declared.inputs or 'none'}; ground truth: {ground_truth_text(declared)}"
 
 
 def metric_cell(metrics: DepthMetrics | None, name: str) -> str:
@@ -114,9 +147,30 @@ def short_digest(digest: str, digits: int = 12) -> str:
     return f"{algorithm}{colon}{value[:digits]}"
 
 
-def unranked_reasons(table: Table) -> list[str]:
-    """Return the reasons why a config's row is not ranked; empty for a ranked row."""
+def table_notes(table: Table) -> list[str]:
+    """Return sentences on a row that is not ranked or not comparable, and on its errors beside the references."""
+    notes = []
+    if reason := unranked_reason(table):
+        notes.append(f"Not ranked: {reason}.")
+    if reasons := incomparable_reasons(table):
+        notes.append(f"Errors of valid predictions are not compared with those of others: {'; '.join(reasons)}.")
+    return notes + reference_findings(table)
+
+
+def unranked_reason(table: Table) -> str:
+    """Return the reason why a config's row is not ranked; empty for a ranked row."""
     if table.ranked:
+        return ""
+    if table.views == 0:
+        return "no views"
+    if table.rank_error is None:
+        return f"a result of {OLD_PROTOCOL}, which has no rank error"
+    return "the submission declares that it uses ground truth"
+
+
+def incomparable_reasons(table: Table) -> list[str]:
+    """Return the reasons why the errors of a row are not compared with those of others; empty if they are."""
+    if table.is_comparable:
         return []
     reasons = []
     if table.views == 0:
@@ -124,11 +178,63 @@ def unranked_reasons(table: Table) -> list[str]:
     missing = table.views - table.views_scored
     if missing:
         reasons.append(f"{missing} of {counted(table.views, 'view')} without any prediction")
-    if table.coverage is not None and table.coverage < MIN_RANKED_COVERAGE:
-        reasons.append(f"coverage {coverage_percent(table.coverage)} % is below {MIN_RANKED_COVERAGE * 100:.0f} %")
-    if any(_overflowed(metrics) for metrics in (table.native, table.scaled)):
+    if table.coverage is not None and table.coverage < MIN_COMPARABLE_COVERAGE:
+        minimum = f"{MIN_COMPARABLE_COVERAGE * 100:.0f} %"
+        reasons.append(f"coverage {coverage_percent(table.coverage)} % is below {minimum}")
+    if any(metrics is not None and not metrics.is_finite for metrics in (table.native, table.scaled)):
         reasons.append("a number overflowed")
-    return reasons or ["not ranked by the scorer"]
+    return reasons
+
+
+def reference_rows(reference: Reference) -> list[tuple[str, list[str], list[str]]]:
+    """Return name, native and scaled cells (as ``metric_cells``, empty if they do not apply) of each reference."""
+    empty = [""] * len(METRICS)
+    rows = []
+    if reference.constant_abs_rel is not None:
+        values = {"abs_rel": reference.constant_abs_rel, "rmse_cm": reference.constant_rmse_cm}
+        rows.append((CONSTANT_TITLE, empty, _reference_cells(values)))
+    if reference.one_pixel_abs_rel is not None:
+        values = {"abs_rel": reference.one_pixel_abs_rel, "rmse_cm": reference.one_pixel_rmse_cm}
+        rows.append((ONE_PIXEL_TITLE, _reference_cells(values), empty))
+    return rows
+
+
+def paper_reference_rows(reference: Reference) -> list[tuple[str, list[str]]]:
+    """Return name and cells of each reference in the columns of ``paper_cells``, empty where they do not apply."""
+    abs_rel, rmse_cm = list(METRICS).index("abs_rel"), list(METRICS).index("rmse_cm")
+    return [
+        (name, [native[rmse_cm], native[abs_rel], scaled[abs_rel], ""])
+        for name, native, scaled in reference_rows(reference)
+    ]
+
+
+def rank_mark(declared: Declaration, table: Table) -> str:
+    """Return the mark of a row that is not ranked (‡) or whose use of ground truth is not declared (?)."""
+    if not table.ranked:
+        return " ‡"
+    return " ?" if declared.uses_ground_truth is None else ""
+
+
+def reference_findings(table: Table) -> list[str]:
+    """Return a sentence on each error of a table that its reference errors put into perspective."""
+    findings, reference = [], table.reference
+    if table.native and reference.one_pixel_abs_rel and table.native.abs_rel < reference.one_pixel_abs_rel:
+        findings.append(
+            f"The native AbsRel {metric_cell(table.native, 'abs_rel')} is below that of exact depth shifted by "
+            f"one pixel ({number(reference.one_pixel_abs_rel, METRICS['abs_rel'].decimals)}): it is smaller than "
+            "the differences between neighbouring pixels."
+        )
+    if table.scaled and reference.constant_abs_rel and table.scaled.abs_rel > reference.constant_abs_rel:
+        findings.append(
+            f"The scaled AbsRel {metric_cell(table.scaled, 'abs_rel')} is above that of a constant "
+            f"({number(reference.constant_abs_rel, METRICS['abs_rel'].decimals)}): a plane at one depth describes "
+            "the shape better."
+        )
+    return findings
+
+
+def _reference_cells(values: Mapping[str, float | None]) -> list[str]:
+    return [number(values[name], info.decimals) if name in values else "" for name, info in METRICS.items()]
 
 
 def has_dash(rows: Iterable[Iterable[str]]) -> bool:
@@ -144,7 +250,3 @@ def plural(noun: str, count: int) -> str:
 def counted(count: int, noun: str) -> str:
     """Return the count and the noun, such as ``1 view`` or ``3 views``."""
     return f"{count} {plural(noun, count)}"
-
-
-def _overflowed(metrics: DepthMetrics | None) -> bool:
-    return metrics is not None and not all(math.isfinite(value) for value in vars(metrics).values())

@@ -1,4 +1,4 @@
-r"""LaTeX table of results in the layout of the paper's Table I: RMSE, AbsRel, AbsRel_s and s of each config.
+r"""LaTeX table of results: rank error, and RMSE, AbsRel, AbsRel_s and s as in the paper's Table I, by config.
 
 The output of the template ``table.tex.j2`` requires only ``\usepackage{booktabs}``. Non-Latin letters require
 XeLaTeX or LuaLaTeX.
@@ -8,23 +8,26 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from jinja2 import PackageLoader, Template
 
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
-from rebar_depth_bench.reporting.published import PublishedRow, load_published, paper_scene, published_rows
-from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, PROTOCOL
+from rebar_depth_bench.reporting.published import PublishedRow, load_published, published_rows
+from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.published_match import PublishedMatch
 from rebar_depth_bench.scoring.result import Result, Table
+from rebar_depth_bench.scoring.rounding import rounded
 
 CONFIGS_PER_BLOCK = 3
 """Number of configs side by side, as in the paper; further configs follow in blocks below."""
 
-_COLUMNS = 4
+_COLUMNS = 5
 _MISSING = "--"
 _UNRANKED_MARK = r"$^{\ddagger}$"
+_OTHER_OPTICS_MARK = r"$^{\S}$"
 _ANCHORED_MARK = r"$^{\dagger}$"
 _LATEX_ESCAPES = {
     "\\": r"\textbackslash{}",
@@ -62,25 +65,31 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
     configs = list(views)
     configs_per_block = 1 if intervals else CONFIGS_PER_BLOCK
     blocks = [configs[start : start + configs_per_block] for start in range(0, len(configs), configs_per_block)]
-    paper_rows = [row for config in configs for row in _paper_rows(config)] if published else []
+    tables = {config: table for result in results for config, table in result.tables.items()}
+    matches = {config: tables[config].published if published else None for config in configs}
+    paper_rows = [row for match in matches.values() for row in _paper_rows(match)]
     return _template().render(
         protocol=PROTOCOL,
+        columns=_COLUMNS,
         version=results[0].dataset_version,
         digest=formatting.short_digest(results[0].dataset_digest, 16),
         view_counts=[f"{escape_latex(config)} {formatting.counted(views[config], 'view')}" for config in configs],
         unranked=any(not table.ranked for result in results for table in result.tables.values()),
+        undeclared=any(result.declared.uses_ground_truth is None for result in results),
         unranked_mark=_UNRANKED_MARK,
-        min_coverage_percent=f"{MIN_RANKED_COVERAGE * 100:.0f}",
         intervals=intervals,
         anchored=any(row.median_anchored for row in paper_rows),
         anchored_mark=_ANCHORED_MARK,
         published=bool(paper_rows),
+        other_optics=any(match is not None and not match.same_optics for match in matches.values()),
+        other_optics_mark=_OTHER_OPTICS_MARK,
         paper=load_published(),
         blocks=[
             {
-                "titles": [_config_title(config) for config in block],
+                "titles": [_config_title(config, tables[config].published) for config in block],
                 "rows": _result_rows(results, block, intervals),
-                "published_rows": _published_rows(block) if published else [],
+                "reference_rows": _reference_rows(results, block),
+                "published_rows": _published_rows({config: matches[config] for config in block}),
             }
             for block in blocks
         ],
@@ -100,29 +109,48 @@ def _template() -> Template:
     return latex_environment.get_template("table.tex.j2")
 
 
-def _config_title(config: str) -> str:
+def _config_title(config: str, match: PublishedMatch | None) -> str:
     """Return a config's heading, with the working distance for a scene of the paper's Table I."""
-    scenes = load_published().scenes
-    if config not in scenes:
-        return escape_latex(config)
-    return f"{escape_latex(config)} ({scenes[config].distance.replace('–', '--')})"
+    scene = load_published().scenes.get(match.scene) if match else None
+    return escape_latex(config) + (f" ({scene.distance.replace('–', '--')})" if scene else "")
 
 
 def _result_rows(results: Sequence[Result], configs: Sequence[str], intervals: bool) -> list[list[str]]:
     """Return the rows of a block, each a name and four cells for each config."""
     best = {config: _best_texts([result.tables.get(config) for result in results]) for config in configs}
+    shown = [result for result in results if any(name in result.tables for name in configs)]
     return [
         [
-            escape_latex(result.method),
+            escape_latex(result.method) + ("" if result.declared.uses_ground_truth is not None else "$^{?}$"),
             *(cell for name in configs for cell in _cells(result.tables.get(name), best[name], intervals)),
         ]
-        for result in results
-        if any(name in result.tables for name in configs)
+        for result in sorted(shown, key=lambda result: _sort_key(result.tables.get(configs[0])))
+    ]
+
+
+def _sort_key(table: Table | None) -> tuple[bool, bool, float]:
+    """Return the sort key of a row by the block's first config: ranked rows by rank error, the others last."""
+    if table is None:
+        return True, True, 0.0
+    return False, not table.ranked, rounded(table.rank_error) or 0.0
+
+
+def _reference_rows(results: Sequence[Result], configs: Sequence[str]) -> list[list[str]]:
+    """Return the rows of reference errors of a block, each a name and the cells of each config."""
+    rows_by_config = {}
+    for config in configs:
+        references = [result.tables[config].reference for result in results if config in result.tables]
+        rows_by_config[config] = dict(formatting.paper_reference_rows(references[0]))
+    names = dict.fromkeys(name for rows in rows_by_config.values() for name in rows)
+    empty = [""] * (_COLUMNS - 1)
+    return [
+        [name, *(cell for rows in rows_by_config.values() for cell in ("", *rows.get(name, empty)))]
+        for name in names
     ]
 
 
 def _cells(table: Table | None, best: Sequence[str | None], intervals: bool) -> list[str]:
-    """Return a config's four cells; ``best`` holds the formatted best number of each column, or None."""
+    """Return a config's cells; ``best`` holds the formatted best number of each column, or None."""
     if table is None:
         return [_MISSING] * _COLUMNS
     cells = []
@@ -134,38 +162,50 @@ def _cells(table: Table | None, best: Sequence[str | None], intervals: bool) -> 
 
 
 def _number_texts(table: Table) -> list[str]:
-    return [_MISSING if text == formatting.DASH else text for text in formatting.paper_cells(table)]
+    texts = [formatting.rank_error_cell(table.rank_error), *formatting.paper_cells(table)]
+    return [_MISSING if text == formatting.DASH else text for text in texts]
 
 
 def _interval_texts(table: Table) -> list[str]:
     native, scaled = (formatting.metric_interval_cells(table.intervals, kind) for kind in ("native", "scaled"))
     scale = formatting.interval_cell(table.intervals.get("scale_median"), 3)
-    return [text.replace(" – ", ", ") for text in (native[1], native[0], scaled[0], scale)]
+    rank_error = formatting.interval_cell(table.intervals.get("rank_error"), 4)
+    return [text.replace(" – ", ", ") for text in (rank_error, native[1], native[0], scaled[0], scale)]
 
 
 def _best_texts(tables: Iterable[Table | None]) -> list[str | None]:
-    """Return the formatted lowest RMSE, AbsRel and AbsRel_s of the ranked tables, and None for s.
+    """Return the formatted lowest rank error, RMSE, AbsRel and AbsRel_s of the ranked tables, and None for s.
 
-    All are None if fewer than two tables are ranked.
+    All are None if fewer than two tables are ranked, and all but the first if not all of these are comparable.
     """
-    ranked = [(_errors(table), _number_texts(table)) for table in tables if table is not None and table.ranked]
+    ranked = [table for table in tables if table is not None and table.ranked]
     if len(ranked) < 2:
         return [None] * _COLUMNS
-    return [*(min(ranked, key=lambda row: row[0][column])[1][column] for column in range(3)), None]
+    columns = 4 if all(table.is_comparable for table in ranked) else 1
+    best = [
+        _number_texts(min(ranked, key=lambda table: _errors(table)[column]))[column] for column in range(columns)
+    ]
+    return [*best, *[None] * (_COLUMNS - columns)]
 
 
-def _errors(table: Table) -> tuple[float, float, float]:
-    """Return RMSE and AbsRel, native, and AbsRel after the oracle scale; infinity where there is none."""
+def _errors(table: Table) -> tuple[float, float, float, float]:
+    """Return rank error, RMSE and AbsRel, native, and AbsRel after the oracle scale; infinity where undefined."""
+    rank_error = math.inf if table.rank_error is None else table.rank_error
     rmse_cm, abs_rel = (table.native.rmse_cm, table.native.abs_rel) if table.native else (math.inf, math.inf)
-    return rmse_cm, abs_rel, table.scaled.abs_rel if table.scaled else math.inf
+    return rank_error, rmse_cm, abs_rel, table.scaled.abs_rel if table.scaled else math.inf
 
 
-def _paper_rows(config: str) -> tuple[PublishedRow, ...]:
-    return published_rows(paper_scene(config) or "")
+def _paper_rows(match: PublishedMatch | None) -> tuple[PublishedRow, ...]:
+    return published_rows(match.scene) if match else ()
 
 
-def _published_rows(configs: Sequence[str]) -> list[list[str]]:
-    by_config = {config: {row.method: _published_cells(row) for row in _paper_rows(config)} for config in configs}
+def _published_rows(matches: Mapping[str, PublishedMatch | None]) -> list[list[str]]:
+    by_config = {
+        config: {
+            row.method: _published_cells(row, match is None or match.same_optics) for row in _paper_rows(match)
+        }
+        for config, match in matches.items()
+    }
     methods = dict.fromkeys(method for rows in by_config.values() for method in rows)
     missing = [_MISSING] * _COLUMNS
     return [
@@ -174,6 +214,7 @@ def _published_rows(configs: Sequence[str]) -> list[list[str]]:
     ]
 
 
-def _published_cells(row: PublishedRow) -> list[str]:
+def _published_cells(row: PublishedRow, same_optics: bool) -> list[str]:
     rmse_cm, *others = row.cells
-    return [rmse_cm + (_ANCHORED_MARK if row.median_anchored else ""), *others]
+    marks = (_ANCHORED_MARK if row.median_anchored else "") + ("" if same_optics else _OTHER_OPTICS_MARK)
+    return ["", rmse_cm + marks, *others]

@@ -99,11 +99,10 @@ class PublishedNumbers:
     anchor: PublishedAnchor
 
 
-_TABLE_I_CONFIGS: Mapping[str, str] = {"lattice": "lattice", "pile": "pile", "pier": "pier"}
-"""Scene of Table I by config.
-
-Configs with other trajectories, optics, appearance variants or user scenes show other images and are not listed.
-"""
+OTHER_OPTICS_MARK = "§"
+OTHER_OPTICS_NOTE = (
+    f"{OTHER_OPTICS_MARK}: the paper measured this scene with the same cameras' positions but other optics."
+)
 
 
 def load_published() -> PublishedNumbers:
@@ -124,8 +123,3 @@ def published_rows(scene: str) -> tuple[PublishedRow, ...]:
     """Return the rows of Table I of ``lattice``, ``pile`` or ``pier`` in order; empty for other scenes."""
     scenes = load_published().scenes
     return scenes[scene].rows if scene in scenes else ()
-
-
-def paper_scene(config: str) -> str | None:
-    """Return the scene of Table I that a config shows under the paper's cameras, None for other configs."""
-    return _TABLE_I_CONFIGS.get(config)

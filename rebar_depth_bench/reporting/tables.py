@@ -19,7 +19,7 @@ from rich.text import Text
 from rebar_depth_bench.errors import printable, terminal_text
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.scoring.frames import tables_frame
-from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
+from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Result, Table
 
 if TYPE_CHECKING:
@@ -44,11 +44,11 @@ class _ColumnGroup:
 _METRIC_HEADS = [f"{name} {better}\n{unit}" for name, unit, better in formatting.METRIC_HEADS]
 _BASE = _ColumnGroup(
     "",
-    ["views\nscored\n/all", "cover-\nage ↑\n%", "ranked\n"],
+    ["views\nscored\n/all", "cover-\nage ↑\n%", "rank\nerror ↓\n"],
     lambda table: [
         f"{table.views_scored}/{table.views}",
         formatting.coverage_percent(table.coverage),
-        "yes" if table.ranked else "no",
+        formatting.rank_error_cell(table.rank_error) + ("" if table.ranked else "‡"),
     ],
 )
 _NATIVE = _ColumnGroup(
@@ -75,12 +75,13 @@ _LAYOUTS = (
 
 
 def print_table(result: Result, console: Console) -> None:
-    """Print one row per config to ``console``: one table if it fits, else the same columns in two or three tables.
+    """Print one row per config, followed by its reference errors: in one table if it fits, else in two or three.
 
     Numbers are never truncated: a console narrower than the narrowest layout gets longer lines.
     """
     _print_line(console, _headline(result), style="bold")
     _print_line(console, _provenance(result), style="dim")
+    _print_line(console, formatting.declaration_text(result.declared), style="dim")
     for groups in _fitting_layout(result.tables, console):
         console.print()
         for group in groups:
@@ -106,7 +107,7 @@ def results_csv(results: Sequence[Result]) -> str:
 
 
 def _headline(result: Result) -> str:
-    return f"{printable(result.method)}, protocol {PROTOCOL}"
+    return f"{printable(result.method)}, protocol {result.protocol}"
 
 
 def _provenance(result: Result) -> str:
@@ -139,10 +140,10 @@ def _print_notes(result: Result, console: Console) -> None:
     _print_line(
         console, "Means over views; s: median over views. z: truth, p: prediction. ↓ lower, ↑ higher is better."
     )
+    _print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE} ‡: not ranked.")
     for name, table in result.tables.items():
-        reasons = formatting.unranked_reasons(table)
-        if reasons:
-            _print_line(console, f"{printable(name)}: not ranked: {'; '.join(reasons)}.", style="yellow")
+        for note in formatting.table_notes(table):
+            _print_line(console, f"{printable(name)}: {note}", style="yellow")
     [all_groups] = _LAYOUTS[0]
     if formatting.has_dash(group.cells(table) for group in all_groups for table in result.tables.values()):
         _print_line(console, formatting.DASH_NOTE)
@@ -166,6 +167,16 @@ def _rich_table(tables: Mapping[str, Table], groups: Sequence[_ColumnGroup]) -> 
     for name, config_table in tables.items():
         cells = [cell for group in groups for cell in group.cells(config_table)]
         table.add_row(*map(plain_text, [printable(name), *cells]))
+        for title, native, scaled in formatting.reference_rows(config_table.reference):
+            errors = {_NATIVE.title: native, _SCALED.title: scaled}
+            filled = [errors.get(group.title, []) for group in groups]
+            if any(map(any, filled)):
+                cells = [
+                    cell
+                    for group, texts in zip(groups, filled, strict=True)
+                    for cell in [*texts, *[""] * (len(group.heads) - len(texts))]
+                ]
+                table.add_row(*map(plain_text, [f"  {title}", *cells]), style="dim")
     return table
 
 

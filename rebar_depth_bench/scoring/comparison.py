@@ -18,23 +18,23 @@ from rebar_depth_bench.scoring.frames import ALIGNMENTS, differences_frame
 from rebar_depth_bench.scoring.metrics import METRICS
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
-from rebar_depth_bench.scoring.result import (
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
+from rebar_depth_bench.scoring.view_score import (
     SCALE_MEDIAN,
     VIEW_METRICS,
-    Result,
     ViewScore,
     bootstrap_estimates,
     protocol_indices,
 )
-from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
 from rebar_depth_bench.submission import config_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-Verdict = Literal["better", "worse", "equal", "undecided", "not ranked", ""]
+Verdict = Literal["better", "worse", "equal", "undecided", "no verdict", ""]
 
-_ALL_VIEWS_PREFIXES = ("coverage", "within_mm.")
+_ALL_VIEWS_PREFIXES = ("coverage", "rank_error", "within_mm.")
 """Name prefixes of the metrics that every view has, also a view without predictions."""
 
 _HIGHER_IS_BETTER_PREFIXES = (
@@ -54,9 +54,9 @@ class Difference:
     """Metric of two submissions on the same views, and the difference ``other - first`` with its 95 % interval.
 
     ``verdict`` rates the other submission: "better" or "worse" if the interval excludes zero; "equal" if the
-    interval is [0, 0]; "undecided" if the interval contains zero or is None; "not ranked" for error metrics if
-    either submission is not ranked, since errors over a freely chosen subset of the pixels are not comparable; ""
-    for the scale factor, where neither direction is better.
+    interval is [0, 0]; "undecided" if the interval contains zero or is None; "no verdict" for errors of valid
+    predictions if either submission has less than ``MIN_COMPARABLE_COVERAGE``, since errors over freely chosen
+    pixels are not comparable; "" for the scale factor, where neither direction is better.
     """
 
     name: str
@@ -114,12 +114,12 @@ def compare(first: Result, other: Result) -> Comparison:
 
 def _config_differences(first: Result, other: Result, config: str) -> list[Difference]:
     differences = _differences(_views_by_id(first, config), _views_by_id(other, config))
-    if first.tables[config].ranked and other.tables[config].ranked:
+    if first.tables[config].is_comparable and other.tables[config].is_comparable:
         return differences
     return [
         difference
         if difference.name == SCALE_MEDIAN or difference.name.startswith(_ALL_VIEWS_PREFIXES)
-        else replace(difference, verdict="not ranked")
+        else replace(difference, verdict="no verdict")
         for difference in differences
     ]
 

@@ -13,7 +13,8 @@ from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
-from rebar_depth_bench.submission import SubmissionReader, config_of, open_submission
+from rebar_depth_bench.submission import Declaration, SubmissionReader, config_of, open_submission
+from rebar_depth_bench.submission.metadata import NOT_DECLARED
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,11 @@ class Evaluation:
     def method(self) -> str:
         """Name of the method."""
         return self.submission.meta.method if self.submission.meta else ""
+
+    @property
+    def declared(self) -> Declaration:
+        """What the submission declares about its inputs and its use of ground truth."""
+        return self.submission.meta.declaration if self.submission.meta else NOT_DECLARED
 
     @property
     def configs(self) -> tuple[DatasetConfig, ...]:

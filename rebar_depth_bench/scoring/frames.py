@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
+from rebar_depth_bench.scoring.reference import NO_REFERENCE
 from rebar_depth_bench.scoring.rounding import rounded
 from rebar_depth_bench.submission import config_of
 
@@ -19,20 +20,27 @@ if TYPE_CHECKING:
 ALIGNMENTS = ("native", "scaled")
 METRIC_COLUMNS: Mapping[str, str] = {
     "coverage": "coverage",
+    "rank_error": "rank_error",
     **{f"{alignment}.{name}": f"{alignment}_{name}" for alignment in ALIGNMENTS for name in METRIC_NAMES},
     "scale_median": "scale_median",
     **{f"within_mm.{tolerance}": f"within_{tolerance}mm" for tolerance in WITHIN_MM},
 }
 """Column names of the metrics with an interval, by their names in ``VIEW_METRICS``."""
 
+REFERENCE_COLUMNS = tuple(
+    f"{reference}_{name}" for reference in ("constant", "one_pixel") for name in ("abs_rel", "rmse_cm")
+)
+"""Column names of the reference errors of a config."""
+
 TABLE_COLUMNS = (
     *("views", "views_scored", "coverage", "ranked"),
     *(column for column in METRIC_COLUMNS.values() if column != "coverage"),
+    *REFERENCE_COLUMNS,
 )
 """Column names of the numbers of a config's table, without intervals."""
 
 _TABLE_FRAME_COLUMNS = (
-    *("protocol", "method", "config", *TABLE_COLUMNS),
+    *("protocol", "method", "inputs", "uses_ground_truth", "config", *TABLE_COLUMNS),
     *(f"{column}_{end}" for column in METRIC_COLUMNS.values() for end in ("low", "high")),
     *("dataset_digest", "dataset_version", "submission_sha256", "software_version"),
 )
@@ -43,13 +51,19 @@ _DIFFERENCE_COLUMNS = (
 
 
 def table_values(table: Mapping[str, Any]) -> list[Any]:
-    """Return a config's numbers in the order of ``TABLE_COLUMNS``, from its table in the result's JSON."""
+    """Return a config's numbers in the order of ``TABLE_COLUMNS``, from its table in the result's JSON.
+
+    Tables of the previous protocol have no rank error and no reference errors.
+    """
+    reference = table.get("reference") or NO_REFERENCE.to_dict()
     return [
         *(table[key] for key in ("views", "views_scored", "coverage", "ranked")),
+        table.get("rank_error"),
         *table["native"].values(),
         *table["scaled"].values(),
         table["scale_median"],
         *table["within_mm"].values(),
+        *(error for errors in reference.values() for error in errors.values()),
     ]
 
 
@@ -83,7 +97,9 @@ def tables_frame(documents: Sequence[Mapping[str, Any]]) -> DataFrame:
     """
     rows = [
         (
-            *(document["protocol"], document["submission"]["method"], config),
+            document["protocol"],
+            *(document["submission"][key] for key in ("method", "inputs", "uses_ground_truth")),
+            config,
             *table_values(table),
             *_interval_bounds(table["ci95"]),
             *(document["dataset"]["digest"], document["dataset"]["version"]),
@@ -100,7 +116,7 @@ def views_frame(document: Mapping[str, Any]) -> DataFrame:
     rows = [
         {
             "config": config_of(view["view_id"]),
-            **{key: view[key] for key in ("view_id", "scored_px", "coverage", "scale")},
+            **{key: view[key] for key in ("view_id", "scored_px", "coverage", "rank_error", "scale")},
             **{f"{alignment}_{name}": view[alignment][name] for alignment in ALIGNMENTS for name in METRIC_NAMES},
             **{f"within_{tolerance}mm": share for tolerance, share in view["within_mm"].items()},
         }

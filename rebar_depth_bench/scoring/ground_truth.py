@@ -24,6 +24,13 @@ from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.metrics import median
 from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels
+from rebar_depth_bench.scoring.reference import (
+    REFERENCE_NUMBERS,
+    Reference,
+    mean_reference,
+    reference_of_numbers,
+    view_reference,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +61,12 @@ class ConfigTruth:
     @property
     def medians_m(self) -> tuple[float, ...]:
         """Median ground-truth depth of the scored pixels of each view, metres."""
-        return tuple(median_m for (median_m,) in self.cache.numbers)
+        return tuple(median_m for median_m, *_ in self.cache.numbers)
+
+    @property
+    def reference(self) -> Reference:
+        """Means over the views of the reference errors."""
+        return mean_reference(reference_of_numbers(numbers) for _, *numbers in self.cache.numbers)
 
     def __len__(self) -> int:
         return len(self.cache)
@@ -65,7 +77,8 @@ class ConfigTruth:
     def view(self, position: int) -> ViewTruth:
         """Return the view at ``position`` in protocol order."""
         view = self.cache.view(position)
-        return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], *view.numbers)
+        median_m, *_ = view.numbers
+        return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], median_m)
 
 
 def config_truth(config: DatasetConfig, progress: Progress = silent) -> ConfigTruth:
@@ -77,7 +90,9 @@ def config_truth(config: DatasetConfig, progress: Progress = silent) -> ConfigTr
     scored_px = scored_counts(config)
 
     def is_sound(view: ViewArrays) -> bool:
-        has_counts = len(view.arrays["index"]) == scored_px[view.view_id] and len(view.numbers) == 1
+        has_counts = (
+            len(view.arrays["index"]) == scored_px[view.view_id] and len(view.numbers) == 1 + REFERENCE_NUMBERS
+        )
         return has_counts and are_pixels_inside(view, config)
 
     content = CacheContent(
@@ -89,6 +104,14 @@ def config_truth(config: DatasetConfig, progress: Progress = silent) -> ConfigTr
         is_sound=is_sound,
     )
     return ConfigTruth(open_cache(content))
+
+
+def reference_errors(config: DatasetConfig) -> Reference:
+    """Return the reference errors of a config, computed from its rows without the cache.
+
+    Raises ``DatasetError`` as ``config_truth``.
+    """
+    return mean_reference(reference_of_numbers(view.numbers[1:]) for view in _extract_views(config, silent))
 
 
 def cache_inputs(config: DatasetConfig, protocol: str, extra_digest: str = "") -> dict[str, Any]:
@@ -137,7 +160,10 @@ def _extract_views(config: DatasetConfig, progress: Progress) -> Iterator[ViewAr
     for view_id, left, pixels in verified_views(config, progress, "ground truth"):
         if len(pixels):
             depth_m = left.depth_m.ravel()[pixels]
-            yield ViewArrays(view_id, {"index": pixels, "depth_m": depth_m}, (median(depth_m),))
+            median_m = median(depth_m)
+            reference = view_reference(left.depth_m, pixels, median_m)
+            numbers = (median_m, *reference.to_numbers())
+            yield ViewArrays(view_id, {"index": pixels, "depth_m": depth_m}, numbers)
 
 
 def _verified_pixels(left: EyeView, record: ViewRecord, config: DatasetConfig) -> UInt32[ndarray, " n"]:

@@ -1,4 +1,4 @@
-"""Depth metrics of protocol ``rebar-1``: pure functions on the scored pixels of one view, in float64 metres.
+"""Depth metrics of protocol ``rebar-2``: pure functions on the scored pixels of one view, in float64 metres.
 
 ``z_m`` is the ground-truth depth and ``p_m`` the predicted depth on the same pixels, both of length n >= 1, finite
 and > 0.
@@ -34,6 +34,11 @@ class DepthMetrics:
     rmse_cm: float
     mae_cm: float
     delta1: float
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether no error overflowed."""
+        return all(math.isfinite(value) for value in vars(self).values())
 
 
 @dataclass(frozen=True)
@@ -86,6 +91,27 @@ def metrics_at_scales(
     return [error_sums.metrics(len(z_m)) for error_sums in sums], sums[0].within_mm
 
 
+def rank_error(p_m: Float[ndarray, " n"], z_m: Float[ndarray, " n"], valid: Bool[ndarray, " n"]) -> float:
+    """Return the mean over all n scored pixels of |p - z| / max(p, z) where ``valid``, else of 1; in [0, 1].
+
+    The term of a valid prediction, 1 - min(p/z, z/p), is at most 1, so that removing a prediction never lowers the
+    mean. The terms are added in pixel order: a sum in a fixed order never decreases when a term increases, not
+    even by rounding.
+    """
+    total, buffer = 0.0, np.empty(_CHUNK_PX + 1)
+    with np.errstate(under="ignore"):
+        for start in range(0, len(z_m), _CHUNK_PX):
+            chunk = slice(start, start + _CHUNK_PX)
+            is_valid, z = valid[chunk], z_m[chunk].astype(np.float64)
+            p = np.where(is_valid, p_m[chunk], 0.0).astype(np.float64)
+            terms = buffer[: len(z) + 1]
+            terms[0] = total
+            # A prediction of 0, which stands for an invalid one, has the error z / z = 1.
+            np.divide(np.abs(p - z), np.maximum(p, z), out=terms[1:])
+            total = float(np.add.accumulate(terms, out=terms)[-1])
+    return total / len(z_m)
+
+
 def median_scale(p_m: Float[ndarray, " n"], z_median_m: float) -> float:
     """Return the ground-truth scale s = median(z) / median(p), with medians as in ``median``.
 
@@ -107,6 +133,18 @@ def median(values: Float[ndarray, " n"]) -> float:
     positions = [rank - below for rank in ranks]
     low, high = np.partition(candidates, positions)[positions].astype(np.float64)
     return float(low if low == high else low + (high - low) / 2)
+
+
+def mean(values: Sequence[float]) -> float | None:
+    """Return the correctly rounded mean; None for no values, ``inf`` for non-finite values or on overflow."""
+    if not values:
+        return None
+    if not all(math.isfinite(value) for value in values):
+        return math.inf
+    try:
+        return math.fsum(values) / len(values)
+    except OverflowError:
+        return math.inf
 
 
 def is_valid_prediction(p_m: Float[ndarray, " n"]) -> Bool[ndarray, " n"]:

@@ -1,4 +1,4 @@
-"""Protocol ``rebar-1``: scored pixels of a view and constants of the ranking.
+"""Protocol ``rebar-2``: scored pixels of a view and constants of its metrics.
 
 A change of any rule or number in this module requires a new protocol name.
 """
@@ -9,8 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt32
 from numpy import ndarray
 
-PROTOCOL = "rebar-1"
+PROTOCOL = "rebar-2"
 """Name of the scoring protocol."""
+
+OLD_PROTOCOL = "rebar-1"
+"""Name of the previous protocol, whose results can be read: the same metrics without ``rank_error``."""
 
 WITHIN_MM = (3, 5, 10, 20)
 """Tolerances in millimetres for the share of scored pixels within a given absolute error."""
@@ -18,8 +21,11 @@ WITHIN_MM = (3, 5, 10, 20)
 DELTA1_RATIO = 1.25
 """``delta1`` counts pixels whose ratio max(p/z, z/p) is strictly below this."""
 
-MIN_RANKED_COVERAGE = 0.95
-"""Smallest mean coverage of a ranked config; a config with less is listed but not ranked."""
+MIN_COMPARABLE_COVERAGE = 0.95
+"""Smallest mean coverage of a config whose errors on valid predictions are compared with those of others.
+
+The ranking needs no such limit, because ``rank_error`` counts every scored pixel.
+"""
 
 
 def interior(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:

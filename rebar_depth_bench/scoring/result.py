@@ -1,81 +1,43 @@
-"""Score results: per view, per config, and as JSON."""
+"""Results of scoring: tables by config, and the JSON of a result."""
 
 from __future__ import annotations
 
 import json
-import math
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from statistics import median
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-from jaxtyping import Float64
-from numpy import ndarray
-
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample
+from rebar_depth_bench.scoring.bootstrap import Interval
 from rebar_depth_bench.scoring.frames import tables_frame, views_frame
-from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics
-from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
+from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics, mean
+from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
+from rebar_depth_bench.scoring.published_match import PublishedMatch
+from rebar_depth_bench.scoring.reference import NO_REFERENCE, Reference
 from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
+from rebar_depth_bench.scoring.view_score import VIEW_METRICS, ViewScore, view_intervals
+from rebar_depth_bench.submission.metadata import NOT_DECLARED, Declaration
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
     from rebar_depth_bench.extended.result import ExtendedResult
 
-SCALE_MEDIAN = "scale_median"
-"""Key of the median over views of the scale factor in ``VIEW_METRICS``."""
-
-_VIEW_INDEX = re.compile("[0-9]{4}")
 _MAX_CONFIGS_SHOWN = 10
 _NOTEBOOK_COLUMNS = (
-    *("config", "views", "views_scored", "coverage", "ranked"),
+    *("config", "views", "views_scored", "coverage", "ranked", "rank_error"),
     *("native_abs_rel", "native_rmse_cm", "scaled_abs_rel", "scaled_rmse_cm", "scale_median"),
 )
-
-
-@dataclass(frozen=True)
-class ViewScore:
-    """Metrics of one view; ``scale``, ``native`` and ``scaled`` are None without valid predictions."""
-
-    view_id: str
-    scored_px: int
-    coverage: float
-    scale: float | None
-    native: DepthMetrics | None
-    scaled: DepthMetrics | None
-    within_mm: Mapping[int, float]
-
-
-def _metric_getter(alignment: str, name: str) -> Callable[[ViewScore], float | None]:
-    return lambda view: getattr(getattr(view, alignment), name, None)
-
-
-def _within_getter(tolerance_mm: int) -> Callable[[ViewScore], float | None]:
-    return lambda view: view.within_mm[tolerance_mm]
-
-
-VIEW_METRICS: Mapping[str, Callable[[ViewScore], float | None]] = {
-    "coverage": lambda view: view.coverage,
-    **{
-        f"{alignment}.{name}": _metric_getter(alignment, name)
-        for alignment in ("native", "scaled")
-        for name in METRIC_NAMES
-    },
-    SCALE_MEDIAN: lambda view: view.scale,
-    **{f"within_mm.{tolerance_mm}": _within_getter(tolerance_mm) for tolerance_mm in WITHIN_MM},
-}
-"""Functions that return a view's value of each table metric, by metric name; None where the view has no value."""
 
 
 @dataclass(frozen=True)
 class Table:
     """Metrics of one config: means over its views, and the median of their scale factors.
 
+    ``rank_error`` is None in results of the previous protocol; ``reference`` are the config's reference errors,
+    and ``published`` is the scene of the paper's Table I that it shows, if any.
     ``intervals`` has the 95 % block bootstrap interval of each of ``VIEW_METRICS``, None where it is undefined.
     """
 
@@ -83,16 +45,33 @@ class Table:
     views_scored: int
     coverage: float | None
     ranked: bool
+    rank_error: float | None
     native: DepthMetrics | None
     scaled: DepthMetrics | None
     scale_median: float | None
     within_mm: Mapping[int, float | None]
+    reference: Reference = NO_REFERENCE
+    published: PublishedMatch | None = None
     intervals: Mapping[str, Interval | None] = field(default_factory=dict)
+
+    @property
+    def is_comparable(self) -> bool:
+        """Whether the errors of valid predictions can be compared with those of other submissions.
+
+        Every view needs a prediction, the coverage must be at least ``MIN_COMPARABLE_COVERAGE``, and no metric may
+        be infinite. Otherwise, missing or enormous predictions could improve the comparison.
+        """
+        is_complete = 0 < self.views == self.views_scored
+        is_finite = all(metrics is not None and metrics.is_finite for metrics in (self.native, self.scaled))
+        return is_complete and is_finite and (self.coverage or 0.0) >= MIN_COMPARABLE_COVERAGE
 
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """Result of scoring one submission, with the digests and versions of its inputs."""
+    """Result of scoring one submission, with the digests and versions of its inputs.
+
+    ``protocol`` is another than ``PROTOCOL`` only if the result was read from a file of the previous protocol.
+    """
 
     method: str
     submission_sha256: str
@@ -102,14 +81,20 @@ class Result:
     tables: Mapping[str, Table]
     views: Sequence[ViewScore]
     extended: ExtendedResult | None = None
+    declared: Declaration = NOT_DECLARED
+    protocol: str = PROTOCOL
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a JSON-compatible object; extended measures, if computed, are its last entry."""
         extended = {} if self.extended is None else {"extended": self.extended.to_dict()}
         return {
-            "protocol": PROTOCOL,
+            "protocol": self.protocol,
             "dataset": {"digest": self.dataset_digest, "version": self.dataset_version},
-            "submission": {"method": self.method, "sha256": self.submission_sha256},
+            "submission": {
+                "method": self.method,
+                "sha256": self.submission_sha256,
+                **self.declared.to_dict(),
+            },
             "software": {"version": self.software_version},
             "tables": {name: _table_dict(table) for name, table in self.tables.items()},
             "views": [_view_dict(view) for view in self.views],
@@ -143,7 +128,7 @@ class Result:
         """Return the method, its provenance and the tables for notebooks."""
         frame = self.to_pandas()[[*_NOTEBOOK_COLUMNS]]
         frame["config"] = frame["config"].map(printable)
-        provenance = f"protocol {PROTOCOL}, dataset {self.dataset_version} ({self.dataset_digest[:19]})"
+        provenance = f"protocol {self.protocol}, dataset {self.dataset_version} ({self.dataset_digest[:19]})"
         head = f"<p><b>{escape(printable(self.method))}</b>, {escape(printable(provenance))}</p>"
         return head + str(frame.to_html(index=False, na_rep="–", float_format="{:.4g}".format, border=0))
 
@@ -152,81 +137,35 @@ class Result:
         return (json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
-def tabulate(views: Sequence[ViewScore]) -> Table:
+def tabulate(
+    views: Sequence[ViewScore],
+    declared: Declaration = NOT_DECLARED,
+    reference: Reference = NO_REFERENCE,
+    published: PublishedMatch | None = None,
+) -> Table:
     """Return the table of a config from the scores of its scored views.
 
-    A config with an infinite metric (a prediction so large that its square overflows) is not ranked, and the
-    metric is written as null: an overflow must not improve the rank.
+    A config without views is not ranked, and neither is a submission that declares the use of ground truth. An
+    infinite metric (of a prediction so large that its square overflows) is written as null; the rank error is
+    always finite.
     """
     predicted = [view for view in views if view.native is not None]
     native = _mean_metrics([view.native for view in predicted if view.native])
     scaled = _mean_metrics([view.scaled for view in predicted if view.scaled])
-    coverage = mean([view.coverage for view in views])
-    complete = bool(views) and len(predicted) == len(views)
-    finite = all(_is_finite(metrics) for metrics in (native, scaled))
     return Table(
         views=len(views),
         views_scored=len(predicted),
-        coverage=coverage,
-        ranked=complete and finite and coverage is not None and coverage >= MIN_RANKED_COVERAGE,
+        coverage=mean([view.coverage for view in views]),
+        ranked=bool(views) and not declared.uses_ground_truth,
+        rank_error=mean([view.rank_error for view in views if view.rank_error is not None]),
         native=native,
         scaled=scaled,
         scale_median=median([view.scale for view in predicted if view.scale is not None]) if predicted else None,
         within_mm={t: mean([view.within_mm[t] for view in views]) for t in WITHIN_MM},
+        reference=reference,
+        published=published,
         intervals=view_intervals(views) if views else dict.fromkeys(VIEW_METRICS),
     )
-
-
-def view_intervals(views: Sequence[ViewScore]) -> dict[str, Interval | None]:
-    """Return the 95 % interval of every table metric of the given views."""
-    estimates = bootstrap_estimates(views, resample(protocol_indices([view.view_id for view in views])))
-    return {name: interval(estimates[:, k]) for k, name in enumerate(VIEW_METRICS)}
-
-
-def bootstrap_estimates(views: Sequence[ViewScore], resampling: Resampling) -> Float64[ndarray, "draws k"]:
-    """Return the table's ``VIEW_METRICS`` in each resample of the views; NaN where undefined."""
-    values = view_metric_values(views)
-    draws = resampling.means(values)
-    scale = list(VIEW_METRICS).index(SCALE_MEDIAN)
-    draws[:, scale] = resampling.medians(values[:, scale])
-    return draws
-
-
-def view_metric_values(views: Sequence[ViewScore]) -> Float64[ndarray, "n k"]:
-    """Return the ``VIEW_METRICS`` of each view, one row per view; NaN where it has no value."""
-    rows = [[get(view) for get in VIEW_METRICS.values()] for view in views]
-    return np.array(rows, dtype=np.float64).reshape(len(views), len(VIEW_METRICS))
-
-
-def protocol_indices(view_ids: Sequence[str]) -> list[int]:
-    """Return each view's index in its full camera protocol: the four digits at the end of its view_id.
-
-    If the ids do not all end with four digits, or are not in ascending order, return the positions in the
-    sequence.
-    """
-    suffixes = [view_id.rpartition("/")[2] for view_id in view_ids]
-    if all(_VIEW_INDEX.fullmatch(suffix) for suffix in suffixes) and suffixes == sorted(suffixes):
-        return [int(suffix) for suffix in suffixes]
-    return list(range(len(suffixes)))
-
-
-def sort_key_worst_first(view: ViewScore) -> float:
-    """Return the sort key of a view: native AbsRel, or ``inf`` without predictions or on overflow."""
-    if view.native is None or not math.isfinite(view.native.abs_rel):
-        return math.inf
-    return view.native.abs_rel
-
-
-def mean(values: Sequence[float]) -> float | None:
-    """Return the correctly rounded mean; None for no values, ``inf`` for non-finite values or on overflow."""
-    if not values:
-        return None
-    if not all(math.isfinite(value) for value in values):
-        return math.inf
-    try:
-        return math.fsum(values) / len(values)
-    except OverflowError:
-        return math.inf
 
 
 def _mean_metrics(metrics: Sequence[DepthMetrics]) -> DepthMetrics | None:
@@ -235,15 +174,12 @@ def _mean_metrics(metrics: Sequence[DepthMetrics]) -> DepthMetrics | None:
     return DepthMetrics(**defined) if defined else None
 
 
-def _is_finite(metrics: DepthMetrics | None) -> bool:
-    return metrics is not None and all(math.isfinite(value) for value in vars(metrics).values())
-
-
 def _describe_table(table: Table) -> str:
     if table.native is None or table.scaled is None:
         return "no predictions"
     note = "" if table.ranked else ", not ranked"
-    return f"AbsRel {table.native.abs_rel:.4g} native, {table.scaled.abs_rel:.4g} scaled{note}"
+    error = "" if table.rank_error is None else f"rank error {table.rank_error:.4g}, "
+    return f"{error}AbsRel {table.native.abs_rel:.4g} native, {table.scaled.abs_rel:.4g} scaled{note}"
 
 
 def _metrics_dict(metrics: DepthMetrics | None) -> dict[str, float | None]:
@@ -260,10 +196,13 @@ def _table_dict(table: Table) -> dict[str, Any]:
         "views_scored": table.views_scored,
         "coverage": rounded(table.coverage),
         "ranked": table.ranked,
+        "rank_error": rounded(table.rank_error),
         "native": _metrics_dict(table.native),
         "scaled": _metrics_dict(table.scaled),
         "scale_median": rounded(table.scale_median),
         "within_mm": _within_dict(table.within_mm),
+        "reference": table.reference.to_dict(),
+        "published": None if table.published is None else table.published.to_dict(),
         "ci95": _intervals_dict(table.intervals),
     }
 
@@ -283,6 +222,7 @@ def _view_dict(view: ViewScore) -> dict[str, Any]:
         "view_id": view.view_id,
         "scored_px": view.scored_px,
         "coverage": rounded(view.coverage),
+        "rank_error": rounded(view.rank_error),
         "scale": rounded(view.scale),
         "native": _metrics_dict(view.native),
         "scaled": _metrics_dict(view.scaled),

@@ -15,16 +15,21 @@ from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.reading import parse_json
 from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
-from rebar_depth_bench.scoring.result import VIEW_METRICS, Result, Table, ViewScore
+from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL, PROTOCOL, WITHIN_MM
+from rebar_depth_bench.scoring.published_match import PublishedMatch
+from rebar_depth_bench.scoring.reference import Reference
+from rebar_depth_bench.scoring.result import Result, Table
+from rebar_depth_bench.scoring.view_score import VIEW_METRICS, ViewScore
 from rebar_depth_bench.submission.entries import config_of
-from rebar_depth_bench.validation import Expected, StrictModel, field_error, text, validate_table
+from rebar_depth_bench.submission.metadata import INPUTS, Declaration
+from rebar_depth_bench.validation import Expected, StrictModel, field_error, one_of, text, validate_table
 
 
 def read_result(data: bytes, where: str) -> Result:
     """Return the result in ``data`` without extended measures; ``where`` names the source in error messages.
 
-    Raises ``InputError`` with all problems if ``data`` is not a result of the current protocol.
+    Results of the previous protocol have no rank error and are not ranked. Raises ``InputError`` with all problems
+    if ``data`` is not a result of either protocol.
     """
     if len(data) > JSON_BYTES.value():
         problem = Problem("size", "", f"the result has {len(data)} bytes", JSON_BYTES.allowed())
@@ -32,9 +37,11 @@ def read_result(data: bytes, where: str) -> Result:
     document, problems = parse_json(data)
     content = None if problems else validate_table(_ResultJson, document, problems)
     if content is None:
-        raise InputError.from_problems(f"{where}: is not a rebar-bench result of protocol {PROTOCOL}", problems)
+        raise InputError.from_problems(f"{where}: is not a rebar-bench result", problems)
     return Result(
+        protocol=content.protocol,
         method=content.submission.method,
+        declared=Declaration(content.submission.inputs, content.submission.uses_ground_truth),
         submission_sha256=content.submission.sha256,
         dataset_digest=content.dataset.digest,
         dataset_version=content.dataset.version,
@@ -128,10 +135,37 @@ class _AlignedJson(_StoredModel):
         return values.content() if self.is_predicted and values is not None else None
 
 
+class _ErrorsJson(_StoredModel):
+    """Reference errors of one kind."""
+
+    abs_rel: _Size | None = None
+    rmse_cm: _Size | None = None
+
+
+class _ReferenceJson(_StoredModel):
+    """Reference errors of a config."""
+
+    constant: _ErrorsJson = _ErrorsJson()
+    one_pixel: _ErrorsJson = _ErrorsJson()
+
+    def content(self) -> Reference:
+        """Return the reference errors."""
+        constant, one_pixel = self.constant, self.one_pixel
+        return Reference(constant.abs_rel, constant.rmse_cm, one_pixel.abs_rel, one_pixel.rmse_cm)
+
+
+class _PublishedJson(_StoredModel):
+    """Scene of the paper's Table I."""
+
+    scene: _Name
+    same_optics: bool
+
+
 class _IntervalsJson(_StoredModel):
     """95 % intervals, nested like the metrics; a missing interval is undefined."""
 
     coverage: _Interval = None
+    rank_error: _Interval = None
     native: _Intervals = Field(default={})
     scaled: _Intervals = Field(default={})
     scale_median: _Interval = None
@@ -160,6 +194,9 @@ class _TableJson(_AlignedJson):
     ranked: bool
     scale_median: _Size | None
     within_mm: Annotated[dict[str, _Share | None], _WITHIN, _LENGTH]
+    rank_error: _Share | None = None
+    reference: _ReferenceJson = _ReferenceJson()
+    published: _PublishedJson | None = None
     ci95: _IntervalsJson = _IntervalsJson()
 
     @property
@@ -173,7 +210,10 @@ class _TableJson(_AlignedJson):
             views=self.views,
             views_scored=self.views_scored,
             coverage=self.coverage,
-            ranked=self.ranked,
+            ranked=self.ranked and self.rank_error is not None,
+            rank_error=self.rank_error,
+            reference=self.reference.content(),
+            published=None if self.published is None else PublishedMatch(**vars(self.published)),
             native=self.metrics(self.native),
             scaled=self.metrics(self.scaled),
             scale_median=self.scale_median,
@@ -188,6 +228,7 @@ class _ViewJson(_AlignedJson):
     view_id: _Name
     scored_px: _Count
     coverage: _Share
+    rank_error: _Share | None = None
     scale: _Size | None
     within_mm: Annotated[dict[str, _Share], _WITHIN, _LENGTH]
 
@@ -202,6 +243,7 @@ class _ViewJson(_AlignedJson):
             view_id=self.view_id,
             scored_px=self.scored_px,
             coverage=self.coverage,
+            rank_error=self.rank_error,
             scale=self.scale,
             native=self.metrics(self.native),
             scaled=self.metrics(self.scaled),
@@ -221,6 +263,8 @@ class _SubmissionJson(_StoredModel):
 
     method: _Name
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    inputs: Annotated[str, one_of(*INPUTS)] | None = None
+    uses_ground_truth: bool | None = None
 
 
 class _SoftwareJson(_StoredModel):
@@ -232,7 +276,7 @@ class _SoftwareJson(_StoredModel):
 class _ResultJson(_StoredModel):
     """Content of a result file."""
 
-    protocol: Annotated[str, Expected(f'"{PROTOCOL}"', lambda protocol: protocol == PROTOCOL)]
+    protocol: Annotated[str, one_of(PROTOCOL, OLD_PROTOCOL)]
     dataset: _DatasetJson
     submission: _SubmissionJson
     software: _SoftwareJson
@@ -246,4 +290,8 @@ class _ResultJson(_StoredModel):
             raise field_error("views: a view_id occurs twice", "each view once", "duplicate")
         if not {config_of(view_id) for view_id in view_ids} <= self.tables.keys():
             raise field_error("views: a view belongs to no config of the tables", "views of these", "conflict")
+        errors = [view.rank_error for view in self.views]
+        errors += [table.rank_error for table in self.tables.values() if table.views]
+        if self.protocol == PROTOCOL and None in errors:
+            raise field_error("a view or table has no rank_error", f"one in results of {PROTOCOL}", "missing")
         return self

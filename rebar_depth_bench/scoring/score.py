@@ -1,4 +1,4 @@
-"""Scoring of a submission archive against a dataset folder by protocol ``rebar-1``."""
+"""Scoring of a submission archive against a dataset folder by protocol ``rebar-2``."""
 
 from __future__ import annotations
 
@@ -17,9 +17,17 @@ from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.ground_truth import ConfigTruth, ViewTruth, config_truth
-from rebar_depth_bench.scoring.metrics import is_valid_prediction, median, median_scale, metrics_at_scales
+from rebar_depth_bench.scoring.metrics import (
+    is_valid_prediction,
+    median,
+    median_scale,
+    metrics_at_scales,
+    rank_error,
+)
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.result import Result, ViewScore, tabulate
+from rebar_depth_bench.scoring.published_match import published_match
+from rebar_depth_bench.scoring.result import Result, Table, tabulate
+from rebar_depth_bench.scoring.view_score import ViewScore
 from rebar_depth_bench.submission import EntryError, SubmissionReader
 from rebar_depth_bench.version import software_version
 
@@ -48,15 +56,16 @@ def score_evaluation(evaluation: Evaluation, *, workers: int | None = None, prog
     """Score an open submission as ``score`` does. Raises ``SubmissionError`` if an entry is invalid."""
     with ThreadPoolExecutor(1) as pool:
         sha256 = pool.submit(evaluation.submission.sha256)
-        scores = _score_all(evaluation, workers, progress)
+        tables, views = _score_all(evaluation, workers, progress)
         return Result(
             method=evaluation.method,
+            declared=evaluation.declared,
             submission_sha256=sha256.result(),
             dataset_digest=evaluation.folder.digest,
             dataset_version=evaluation.folder.version,
             software_version=software_version(),
-            tables={config: tabulate(views) for config, views in scores.items()},
-            views=[view for views in scores.values() for view in views],
+            tables=tables,
+            views=views,
         )
 
 
@@ -64,19 +73,23 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
     """Return the metrics of one view's prediction (planar depth, metres) on the view's scored pixels."""
     p_m, z_m, z_median_m = prediction_m.ravel().take(truth.index.astype(np.intp)), truth.depth_m, truth.median_m
     valid = is_valid_prediction(p_m)
+    error = rank_error(p_m, z_m, valid)
     if not valid.all():
         p_m, z_m = p_m[valid], z_m[valid]
         z_median_m = median(z_m) if len(z_m) else 0.0
     scored_px = len(truth.index)
     coverage = len(p_m) / scored_px
     if not len(p_m):
-        return ViewScore(truth.view_id, scored_px, coverage, None, None, None, dict.fromkeys(WITHIN_MM, 0.0))
+        return ViewScore(
+            truth.view_id, scored_px, coverage, error, None, None, None, dict.fromkeys(WITHIN_MM, 0.0)
+        )
     scale = median_scale(p_m, z_median_m)
     (native, scaled), within = metrics_at_scales(p_m, z_m, (1.0, scale), WITHIN_MM)
     return ViewScore(
         view_id=truth.view_id,
         scored_px=scored_px,
         coverage=coverage,
+        rank_error=error,
         scale=scale,
         native=native,
         scaled=scaled,
@@ -84,25 +97,30 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
     )
 
 
-def _score_all(evaluation: Evaluation, workers: int | None, progress: Progress) -> dict[str, list[ViewScore]]:
-    """Return the scores of every view of the archive by config. Raises ``SubmissionError`` with all problems."""
+def _score_all(
+    evaluation: Evaluation, workers: int | None, progress: Progress
+) -> tuple[dict[str, Table], list[ViewScore]]:
+    """Return the tables by config and the scores of all views. Raises ``SubmissionError`` with all problems."""
     submission = evaluation.submission
     unread = set(submission.view_ids)
     problems: list[Problem] = []
-    scores: dict[str, list[ViewScore]] = {}
+    tables: dict[str, Table] = {}
+    views: list[ViewScore] = []
     for config in evaluation.configs:
         truths = config_truth(config, progress)
         work = partial(_score_or_problem, submission, truths)
         scored = map_with_progress(
             work, range(len(truths)), workers, progress, f"scoring {config.name}", len(truths)
         )
-        scores[config.name] = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
+        scores = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
+        tables[config.name] = tabulate(scores, evaluation.declared, truths.reference, published_match(config))
+        views += scores
         problems += [outcome for outcome in scored if isinstance(outcome, Problem)]
         unread.difference_update(truths.view_ids)
     problems += _unscored_view_problems(submission, unread)
     if problems:
         raise SubmissionError.from_problems(submission.path, problems)
-    return scores
+    return tables, views
 
 
 def _score_or_problem(submission: SubmissionReader, truths: ConfigTruth, index: int) -> ViewScore | Problem:

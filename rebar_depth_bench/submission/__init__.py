@@ -2,11 +2,13 @@
 
 from rebar_depth_bench.errors import EntryError
 from rebar_depth_bench.submission.entries import ExpectedViews, config_of
-from rebar_depth_bench.submission.metadata import SubmissionMeta
+from rebar_depth_bench.submission.metadata import INPUTS, Declaration, SubmissionMeta
 from rebar_depth_bench.submission.reader import SubmissionReader, check_archive, open_submission
 from rebar_depth_bench.submission.writer import SubmissionWriter
 
 __all__ = [
+    "INPUTS",
+    "Declaration",
     "EntryError",
     "ExpectedViews",
     "SubmissionMeta",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Annotated, Any
 from urllib.parse import urlsplit
 
@@ -10,7 +11,7 @@ from pydantic import ConfigDict
 
 from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.reading import parse_json
-from rebar_depth_bench.validation import Expected, Flag, StrictModel, text, validate_table
+from rebar_depth_bench.validation import Expected, Flag, StrictModel, one_of, text, validate_table
 
 METADATA_NAME = "submission.json"
 DEPTH_SCALE = f"{METADATA_NAME}: depth_scale"
@@ -44,11 +45,36 @@ _Scale = Annotated[
 _Runtime = Annotated[dict[Any, Any] | str | int | float, Expected("an object, text or a number")]
 
 
+INPUTS = ("rgb", "rgb+K", "stereo", "multi-view", "lidar")
+"""Input classes of methods, within which submissions are ranked too."""
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """What a submission declares about itself; None where it does not.
+
+    ``inputs`` is one of ``INPUTS``. ``uses_ground_truth`` is true if prediction or tuning reads ground truth of
+    the scored config: depth, masks, bars, meshes or camera poses. Neither is verified.
+    """
+
+    inputs: str | None = None
+    uses_ground_truth: bool | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the declaration as a JSON-compatible object."""
+        return {"inputs": self.inputs, "uses_ground_truth": self.uses_ground_truth}
+
+
+NOT_DECLARED = Declaration()
+"""Declaration of a submission that declares nothing."""
+
+
 class SubmissionMeta(StrictModel):
     """Values declared in ``submission.json``; None where a key is absent. Unknown keys are ignored.
 
-    ``depth_scale`` is in metres per unit of a PNG value. ``runtime`` is the author's own report, kept unchanged;
-    nothing is computed from it.
+    ``inputs`` and ``uses_ground_truth`` are those of ``Declaration``; ``uses_intrinsics``, which older archives
+    have, does not set them. ``depth_scale`` is in metres per unit of a PNG value. ``runtime`` is the author's own
+    report, kept unchanged; nothing is computed from it.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -56,9 +82,16 @@ class SubmissionMeta(StrictModel):
     method: Annotated[str, text(MAX_METHOD_CHARACTERS, "a printable name")]
     description: _Description | None = None
     url: _HttpUrl | None = None
+    inputs: Annotated[str, one_of(*INPUTS)] | None = None
+    uses_ground_truth: Flag | None = None
     uses_intrinsics: Flag | None = None
     depth_scale: _Scale | None = None
     runtime: _Runtime | None = None
+
+    @property
+    def declaration(self) -> Declaration:
+        """What the submission declares."""
+        return Declaration(self.inputs, self.uses_ground_truth)
 
 
 def parse_metadata(data: bytes) -> tuple[SubmissionMeta | None, list[Problem]]:

@@ -37,8 +37,9 @@ class SubmissionWriter:
     The archive appears at ``path`` only on a clean exit; after an exception in the block an existing file at
     ``path`` is unchanged. The same predictions give the same bytes. Entries are stored uncompressed, which is
     fastest to read; ``compress=True`` deflates them (about 100 times slower to write, 10 times slower to read, a
-    fifth smaller), and the bytes then also depend on the zlib library in use. ``notes`` is free-form information
-    about the method; no score depends on it.
+    fifth smaller), and the bytes then also depend on the zlib library in use. ``inputs`` and
+    ``uses_ground_truth`` are declared as in ``Declaration``. ``notes`` is free-form information about the method;
+    no score depends on it.
     """
 
     def __init__(
@@ -48,6 +49,8 @@ class SubmissionWriter:
         *,
         description: str | None = None,
         url: str | None = None,
+        inputs: str | None = None,
+        uses_ground_truth: bool | None = None,
         uses_intrinsics: bool | None = None,
         runtime: Mapping[str, object] | None = None,
         notes: Mapping[str, object] | None = None,
@@ -60,6 +63,8 @@ class SubmissionWriter:
             "method": method,
             "description": description,
             "url": url,
+            "inputs": inputs,
+            "uses_ground_truth": uses_ground_truth,
             "uses_intrinsics": uses_intrinsics,
             "runtime": None if runtime is None else dict(runtime),
             "notes": None if notes is None else dict(notes),

@@ -116,9 +116,9 @@ def filled_board(
     """Run a server that scores, with five scored submissions and error maps of two views."""
     archives = {
         "good": write_archive("good", 1.01, url="https://example.org/good", description="plain words"),
-        "near": write_archive("near", 0.8, uses_intrinsics=True),
+        "near": write_archive("near", 0.8, inputs="rgb+K", uses_ground_truth=False),
         "far": write_archive("far", 2.5, configs=("lattice",)),
-        "holes": write_archive("holes", 1.0, 0.3),
+        "holes": write_archive("holes", 1.0, 0.3, inputs="stereo", uses_ground_truth=True),
         "hostile": write_archive(HOSTILE, 1.4, description=DESCRIPTION, url="https://example.org/?a=1&b=<i>"),
     }
     with running_server(root, state, db=db, error_maps=2, quota=100, read_rate_limit="60000/minute") as server:

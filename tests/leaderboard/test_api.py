@@ -105,12 +105,12 @@ def test_result_json_equals_command_line_output(
     assert call(board.server, "GET", f"{API}/{board.ids[kind]}").json()["result"] == json.loads(expected)
 
 
-def test_rows_are_ranked_by_native_abs_rel_if_complete(board: SharedServer) -> None:
+def test_rows_are_ranked_by_rank_error_without_ground_truth(board: SharedServer) -> None:
     entries = rows(board.server)
     ranked = [row for row in entries if row["rank"] is not None]
     assert [row["rank"] for row in ranked] == list(range(1, len(ranked) + 1))
     assert entries[: len(ranked)] == ranked
-    errors = [row["table"]["native"]["abs_rel"] for row in ranked]
+    errors = [row["table"]["rank_error"] for row in ranked]
     assert errors == sorted(errors)
     assert board.ids["good"] == ranked[0]["id"]
     assert board.ids["holes"] in {row["id"] for row in entries if row["rank"] is None}

@@ -95,7 +95,7 @@ def test_column_header_cycles_sort_orders(chromium: Browser, board: SharedServer
         values = (
             page.locator("tbody >> nth=0")
             .locator("tr")
-            .evaluate_all("rows => rows.map(row => Number(row.cells[3].dataset.value))")
+            .evaluate_all("rows => rows.map(row => Number(row.cells[4].dataset.value))")
         )
         by_value = [name for _, name in sorted(zip(values, ranked, strict=True))]
         assert orders == [by_value, by_value[::-1], ranked]

@@ -55,7 +55,7 @@ def database(tmp_path: Path) -> Iterator[Database]:
                     submission_id=f"s{index}",
                     config="lattice",
                     ranked=table["ranked"],
-                    abs_rel=error,
+                    rank_error=error,
                     json=json.dumps(table),
                 )
             )
@@ -104,8 +104,29 @@ def test_queue_position_counts_earlier_submissions(database: Database) -> None:
     assert queue_position(database, make_submission("s0", 1.0)) is None
 
 
+def test_equal_errors_share_a_rank_overall_and_in_their_class(database: Database) -> None:
+    with database.write() as session:
+        for name, error, inputs in (("s0", 0.25, "rgb"), ("s2", 0.25, "stereo"), ("s3", 0.5, "rgb")):
+            row = session.get_one(LeaderboardRowModel, (name, "lattice"))
+            row.rank_error, row.ranked = error, True
+            record = session.get_one(SubmissionModel, name)
+            record.inputs, record.public = inputs, True
+    entries = {entry.submission_id: entry for entry in leaderboard_entries(database, "lattice")}
+    assert (entries["s0"].rank, entries["s2"].rank) == (1, 1)
+    assert entries["s3"].rank is not None
+    assert entries["s3"].rank >= 3
+    assert (entries["s0"].class_rank, entries["s2"].class_rank, entries["s3"].class_rank) == (1, 1, 2)
+    assert {entry.class_rank for entry in entries.values() if entry.inputs is None} == {None}
+    with database.read() as session:
+        records = [session.get_one(SubmissionModel, name) for name in ("s0", "s2", "s3")]
+    assert [ranks(database, record)["lattice"] for record in records] == [1, 1, entries["s3"].rank]
+    shown = make_config_ranking(database, "lattice", Order(), "rgb")
+    assert [line.submission_id for line in shown.lines] == ["s0", "s3"]
+    assert [line.rank for line in shown.lines] == [1, entries["s3"].rank]
+
+
 def test_limited_ranking_shows_first_rows_and_total_count(database: Database) -> None:
-    full, limited = (make_config_ranking(database, "lattice", Order(), max_rows) for max_rows in (None, 2))
+    full, limited = (make_config_ranking(database, "lattice", Order(), None, max_rows) for max_rows in (None, 2))
     assert [line.submission_id for line in limited.lines] == ["s2", "s0"]
     assert (full.row_count, limited.row_count) == (6, 6)
     assert [line.mark for line in full.lines] == ["1", "2", "3", "4", "a", "b"]
@@ -146,7 +167,7 @@ def test_result_json_round_trips() -> None:
     read_back = read_result(original.to_json(), "a result")
     assert read_back.to_json() == original.to_json()
     for config, table in original.tables.items():
-        assert table_row(config, read_back.tables[config]).reasons == table_row(config, table).reasons
+        assert table_row(config, read_back.tables[config]).notes == table_row(config, table).notes
 
 
 def multipart_body(*parts: tuple[str, bytes]) -> bytes:

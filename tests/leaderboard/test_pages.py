@@ -49,13 +49,16 @@ def test_leaderboard_page_shows_ranks_and_marks(board: SharedServer) -> None:
     assert names_in_order(response.text)[-1] == "holes"
     assert "not ranked" in parsed.text
     assert re.search(r"coverage \d\d\.\d % is below 95 %", parsed.text)
-    published = response.text.index("Published, not ranked")
-    assert response.text.index("holes") < published < response.text.index("FoundationStereo")
+    assert "the submission declares that it uses ground truth" in parsed.text
+    assert "use of ground truth not declared" in parsed.text
+    reference = response.text.index('class="rank">reference<')
+    assert response.text.index("holes") < reference
+    assert "FoundationStereo" not in response.text, "the dataset has nine views, the paper's 504"
     assert response.text.count('class="chart"') == 2
     assert "95 % interval, block bootstrap" in parsed.text
     digest = httpx2.get(f"{board.url}/healthz").json()["dataset"]
     assert digest in parsed.text
-    assert "rebar-1" in parsed.text
+    assert "rebar-2" in parsed.text
 
 
 def test_leaderboard_page_shows_values_of_api(board: SharedServer) -> None:
@@ -94,6 +97,17 @@ def test_sort_links_work_without_javascript(board: SharedServer, sort: str, key:
     assert sort_directions == ["descending" if falls else "ascending"]
 
 
+def test_page_and_api_show_one_input_class(board: SharedServer) -> None:
+    for address in (f"{board.url}/?config=lattice&inputs=rgb%2BK", f"{board.url}/?config=lattice&inputs=nonsense"):
+        names = names_in_order(get(address).text)
+        assert (names == ["near"]) == ("rgb" in address)
+    rows = httpx2.get(f"{board.url}/api/v1/leaderboard?config=lattice&inputs=rgb%2BK").json()["rows"]
+    assert [(row["method"], row["inputs"], row["class_rank"]) for row in rows] == [("near", "rgb+K", 1)]
+    text = httpx2.get(f"{board.url}/api/v1/leaderboard.csv?config=lattice&inputs=stereo").text
+    assert [line.split(",")[:2] + line.split(",")[3:4] for line in text.splitlines()[1:]] == [["", "", "holes"]]
+    assert httpx2.get(f"{board.url}/api/v1/leaderboard?config=lattice&inputs=nonsense").status_code == 422
+
+
 def test_unknown_sort_column_sorts_by_rank(board: SharedServer) -> None:
     text = get(f"{board.url}/", params={"config": "lattice", "sort": "'; DROP TABLE"}).text
     assert names_in_order(text) == names_in_order(get(f"{board.url}/?config=lattice").text)
@@ -125,7 +139,7 @@ def test_page_of_scored_submission(board: SharedServer) -> None:
     assert "http-equiv" not in response.text
     assert f"/api/v1/submissions/{board.ids['far']}/result.json" in response.text
     result = httpx2.get(f"{board.url}/api/v1/submissions/{board.ids['far']}/result.json").json()
-    worst = max(result["views"], key=lambda view: view["native"]["abs_rel"])["view_id"]
+    worst = max(result["views"], key=lambda view: view["rank_error"])["view_id"]
     table = response.text[response.text.index("the worst 9 of 9 views") :]
     assert re.findall(r'class="name">(lattice/\d{4})<', table)[0] == worst
     maps = [image for image in parsed.attributes_of("img") if "error-maps" in str(image["src"])]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from typing import Annotated
+from typing import Annotated, Literal
 
 from anyio import to_thread
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 
 from leaderboard.db.models import TokenModel
-from leaderboard.db.rankings import LeaderboardEntry, leaderboard_entries, ranking_version
+from leaderboard.db.rankings import LeaderboardEntry, entries_of_class, leaderboard_entries, ranking_version
 from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, service_of
 from leaderboard.web.api.schemas import (
     COMMON_RESPONSES,
@@ -28,19 +28,20 @@ from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 
 def entries_to_csv(rows: Sequence[LeaderboardEntry]) -> str:
-    """Return rows as CSV: rank, id, method, submitter, config, then the number columns of the command line's CSV.
+    """Return rows as CSV: ranks, id, method, submitter, declarations, config, then the command line's columns.
 
     Undefined numbers are empty cells.
     """
-    header = ["rank", "id", "method", "submitter", "config", *TABLE_COLUMNS]
+    header = ["rank", "class_rank", "id", "method", "submitter", "inputs", "uses_ground_truth", "config"]
     cells = (
         [
-            *(row.rank, row.submission_id, row.method, row.submitter, row.config),
+            *(row.rank, row.class_rank, row.submission_id, row.method, row.submitter),
+            *(row.inputs, row.uses_ground_truth, row.config),
             *table_values(json.loads(row.table_json)),
         ]
         for row in rows
     )
-    return csv_text([header, *cells])
+    return csv_text([[*header, *TABLE_COLUMNS], *cells])
 
 
 router = APIRouter(prefix="/api/v1", tags=["leaderboard"], responses=COMMON_RESPONSES)
@@ -55,8 +56,16 @@ _ERROR_RESPONSES: Responses = {
 _CSV_RESPONSE: Responses = {200: {"content": {"text/csv": {"schema": {"type": "string"}}}}}
 
 
+InputsQuery = Annotated[
+    Literal["rgb", "rgb+K", "stereo", "multi-view", "lidar"] | None,
+    Query(description="only the rows that declare this input class"),
+]
+
+
 @router.get("/leaderboard", response_model=Leaderboard, responses=_ERROR_RESPONSES, openapi_extra=WITHOUT_TOKEN)
-async def leaderboard(config: ConfigName, request: Request, token: OptionalToken) -> Response:
+async def leaderboard(
+    config: ConfigName, request: Request, token: OptionalToken, inputs: InputsQuery = None
+) -> Response:
     """Return the public rows of a config and, with a token, those of its owner."""
     folder = service_of(request).folder
 
@@ -66,7 +75,7 @@ async def leaderboard(config: ConfigName, request: Request, token: OptionalToken
         response = Leaderboard(config=config, protocol=PROTOCOL, dataset=dataset, rows=models)
         return response.model_dump_json().encode()
 
-    return await _leaderboard_response(request, config, token, "application/json", serialise)
+    return await _leaderboard_response(request, config, inputs, token, "application/json", serialise)
 
 
 @router.get(
@@ -75,19 +84,26 @@ async def leaderboard(config: ConfigName, request: Request, token: OptionalToken
     response_class=Response,
     openapi_extra=WITHOUT_TOKEN,
 )
-async def leaderboard_csv(config: ConfigName, request: Request, token: OptionalToken) -> Response:
+async def leaderboard_csv(
+    config: ConfigName, request: Request, token: OptionalToken, inputs: InputsQuery = None
+) -> Response:
     """Return the rows of a config as CSV."""
-    return await _leaderboard_response(request, config, token, CSV, lambda rows: entries_to_csv(rows).encode())
+
+    def serialise(rows: list[LeaderboardEntry]) -> bytes:
+        return entries_to_csv(rows).encode()
+
+    return await _leaderboard_response(request, config, inputs, token, CSV, serialise)
 
 
 async def _leaderboard_response(
     request: Request,
     config: str,
+    inputs: str | None,
     token: TokenModel | None,
     media_type: str,
     serialise: Callable[[list[LeaderboardEntry]], bytes],
 ) -> Response:
-    """Return the serialised rows of ``config``, from the response cache if the request has no token.
+    """Return the serialised rows of ``config`` with declared ``inputs`` (None: all), cached without a token.
 
     Raises status 404 for an unknown config.
     """
@@ -96,12 +112,14 @@ async def _leaderboard_response(
         known = ", ".join(service.folder.configs)
         raise HTTPException(404, f"the dataset has no config {config!r}, expected one of {known}")
     if token is not None:
-        content = await to_thread.run_sync(lambda: serialise(leaderboard_entries(service.database, config, token)))
+        content = await to_thread.run_sync(
+            lambda: serialise(entries_of_class(leaderboard_entries(service.database, config, token), inputs))
+        )
         return Response(content, media_type=media_type, headers={"Cache-Control": NO_STORE})
 
     def make() -> RenderedBody:
         rows = leaderboard_entries(service.database, config)
-        return (media_type, config, ranking_version(rows)), serialise(rows)
+        return (media_type, config, inputs, ranking_version(rows)), serialise(entries_of_class(rows, inputs))
 
-    body = await cached_public_body(request, [config], (media_type, config), make)
+    body = await cached_public_body(request, [config], (media_type, config, inputs), make)
     return conditional_response(request, body, media_type, {"Cache-Control": REVALIDATE})

@@ -117,12 +117,15 @@ class Publication(BaseModel):
 class LeaderboardRow(BaseModel):
     """Leaderboard row; ``table`` is the table of the config in the result JSON."""
 
-    rank: int | None = Field(description="rank by native AbsRel; null if the row is not ranked")
+    rank: int | None = Field(description="rank by rank error, shared by equal errors; null if not ranked")
+    class_rank: int | None = Field(description="rank among the rows with the same declared inputs")
     id: str
     method: str
     submitter: str
     url: str | None
     uses_intrinsics: bool | None
+    inputs: str | None = Field(description="input class, as declared by the submitter")
+    uses_ground_truth: bool | None = Field(description="as declared; such rows are not ranked")
     created_at: datetime
     public: bool
     table: dict[str, Any]
@@ -157,11 +160,14 @@ def row_schema(row: LeaderboardEntry) -> LeaderboardRow:
     """Return the API response for a leaderboard row."""
     return LeaderboardRow(
         rank=row.rank,
+        class_rank=row.class_rank,
         id=row.submission_id,
         method=row.method,
         submitter=row.submitter,
         url=row.url,
         uses_intrinsics=row.uses_intrinsics,
+        inputs=row.inputs,
+        uses_ground_truth=row.uses_ground_truth,
         created_at=_utc_datetime(row.created_at),
         public=row.public,
         table=json.loads(row.table_json),

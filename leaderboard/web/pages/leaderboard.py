@@ -14,13 +14,20 @@ from operator import itemgetter
 from markupsafe import Markup
 
 from leaderboard.db.engine import Database
-from leaderboard.db.rankings import LeaderboardEntry, RankingVersion, leaderboard_entries, ranking_version
+from leaderboard.db.rankings import (
+    LeaderboardEntry,
+    RankingVersion,
+    entries_of_class,
+    leaderboard_entries,
+    ranking_version,
+)
 from leaderboard.web.pages.rendering import DisplayTime, Link, format_time, link
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
+from rebar_depth_bench.reporting.formatting import reference_rows
 from rebar_depth_bench.reporting.html.published import PaperRow, finite_interval, published_row, scatter_points
 from rebar_depth_bench.reporting.html.rows import ScoreRow, table_row
-from rebar_depth_bench.reporting.published import PublishedNumbers, load_published, paper_scene
+from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, PublishedNumbers, load_published
 from rebar_depth_bench.scoring.metrics import METRICS
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Table
@@ -50,11 +57,12 @@ NATIVE = tuple(
 SCALED = tuple(
     Column(f"scaled_{column.name}", column.largest_first, _value("scaled", k)) for k, column in enumerate(NATIVE)
 )
+RANK_ERROR = Column("rank_error", False, lambda row: row.rank_error.value)
 SCALE = Column("scale", False, lambda row: row.scale.value)
 WITHIN = tuple(Column(f"within_{t}mm", True, _value("within", k)) for k, t in enumerate(WITHIN_MM))
 COVERAGE = Column("coverage", True, lambda row: row.coverage.value)
 METHOD = Column("method", False, lambda row: row.name.casefold())
-COLUMNS = {column.name: column for column in (METHOD, *NATIVE, *SCALED, SCALE, *WITHIN, COVERAGE)}
+COLUMNS = {column.name: column for column in (METHOD, RANK_ERROR, *NATIVE, *SCALED, SCALE, *WITHIN, COVERAGE)}
 RANK = "rank"
 
 
@@ -107,9 +115,12 @@ class RankingLine:
     """A submitted row as displayed; ``mark`` labels its point in the plot and is empty if it is not plotted."""
 
     rank: int | None
+    class_rank: int | None
     mark: str
     submission_id: str
     submitter: str
+    inputs: str | None
+    uses_ground_truth: bool | None
     link: Link | None
     when: DisplayTime
     row: ScoreRow
@@ -119,14 +130,18 @@ class RankingLine:
 class ConfigRanking:
     """Table and plot of a config.
 
-    ``version`` is the version of the underlying rows, ``row_count`` their number, ``lines`` the rows shown,
-    ``published`` the rows of the paper, ``distance`` their camera distance and ``plotted`` the number of points.
+    ``version`` is the version of the underlying rows, ``row_count`` the number of those with the declared
+    ``inputs``, ``lines`` the rows shown, ``references`` the rows of reference errors (name, native and scaled
+    cells), ``published`` the rows of the paper, ``distance`` their camera distance and ``plotted`` the number of
+    points.
     """
 
     version: RankingVersion
     config: str
     order: Order
+    inputs: str | None
     row_count: int
+    references: list[tuple[str, list[str], list[str]]]
     lines: list[RankingLine]
     published: list[PaperRow]
     distance: str
@@ -161,21 +176,27 @@ class _FormattedRow:
 
 
 def make_config_ranking(
-    database: Database, config: str, order: Order, max_rows: int | None = None
+    database: Database, config: str, order: Order, inputs: str | None = None, max_rows: int | None = None
 ) -> ConfigRanking:
-    """Return the ranking of a config in the given order, limited to the first ``max_rows`` rows."""
-    rows = leaderboard_entries(database, config)
+    """Return the ranking of a config in the given order, limited to the first ``max_rows`` rows.
+
+    With ``inputs``, only rows of this class are shown.
+    """
+    all_rows = leaderboard_entries(database, config)
+    rows = entries_of_class(all_rows, inputs)
     formatted = [_format_row(row.method, row.table_json) for row in rows]
     marks = _plot_marks(rows, formatted)
     indices = sort_indices([(row.rank, numbers.row) for row, numbers in zip(rows, formatted, strict=True)], order)[
         :max_rows
     ]
-    published, distance = _published(config)
+    published, distance = _published(formatted)
     points = tuple(_plot_point(marks[index], formatted[index]) for index in marks)
     return ConfigRanking(
-        version=ranking_version(rows),
+        version=ranking_version(all_rows),
         config=printable(config),
         order=order,
+        inputs=inputs,
+        references=_references(formatted),
         row_count=len(rows),
         lines=[_ranking_line(rows[index], marks.get(index, ""), formatted[index].row) for index in indices],
         published=published,
@@ -183,6 +204,11 @@ def make_config_ranking(
         chart=_chart(printable(config), points, tuple(scatter_points(published, {}))) if points else None,
         plotted=len(points),
     )
+
+
+def _references(formatted: Sequence[_FormattedRow]) -> list[tuple[str, list[str], list[str]]]:
+    """Return the reference rows, which every table of the current protocol contains."""
+    return next((rows for row in formatted if (rows := reference_rows(row.table.reference))), [])
 
 
 @lru_cache(maxsize=1)
@@ -206,9 +232,12 @@ def _chart(config: str, own: tuple[ScatterPoint, ...], published: tuple[ScatterP
 def _ranking_line(entry: LeaderboardEntry, mark: str, row: ScoreRow) -> RankingLine:
     return RankingLine(
         rank=entry.rank,
+        class_rank=entry.class_rank,
         mark=mark,
         submission_id=entry.submission_id,
         submitter=printable(entry.submitter),
+        inputs=entry.inputs,
+        uses_ground_truth=entry.uses_ground_truth,
         link=link(entry.url),
         when=format_time(entry.created_at),
         row=row,
@@ -238,9 +267,11 @@ def _plot_point(mark: str, numbers: _FormattedRow) -> ScatterPoint:
     return ScatterPoint(mark, numbers.row.name, native, scaled, False, *ends)
 
 
-def _published(config: str) -> tuple[list[PaperRow], str]:
-    scene = published_numbers().scenes.get(paper_scene(config) or "")
-    if scene is None:
+def _published(formatted: Sequence[_FormattedRow]) -> tuple[list[PaperRow], str]:
+    """Return the paper's rows of the scene that the config shows, and their camera distance."""
+    match = next((match for row in formatted if (match := row.table.published)), None)
+    scene = published_numbers().scenes.get(match.scene) if match else None
+    if match is None or scene is None:
         return [], ""
     rows = [published_row(chr(_FIRST_UPPERCASE + k), row) for k, row in enumerate(scene.rows)]
-    return rows, scene.distance
+    return rows, scene.distance if match.same_optics else f"{scene.distance} {OTHER_OPTICS_NOTE}"

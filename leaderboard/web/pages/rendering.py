@@ -18,8 +18,8 @@ from leaderboard.web.pages.static import static_path
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
-from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
-from rebar_depth_bench.submission.metadata import is_http_url
+from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
+from rebar_depth_bench.submission.metadata import INPUTS, is_http_url
 from rebar_depth_bench.version import software_version
 
 
@@ -79,7 +79,8 @@ def _common_context(request: Request, service: Service) -> dict[str, Any]:
         "tolerances": WITHIN_MM,
         "dash_note": formatting.DASH_NOTE,
         "interval_note": formatting.INTERVAL_NOTE,
-        "min_coverage": f"{MIN_RANKED_COVERAGE * 100:.0f}",
+        "reference_note": formatting.REFERENCE_NOTE,
+        "input_classes": INPUTS,
         "plural": formatting.plural,
     }
 

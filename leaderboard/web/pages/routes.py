@@ -32,6 +32,7 @@ from leaderboard.web.pages.leaderboard import (
 from leaderboard.web.pages.rendering import page_content, render, root_path
 from leaderboard.web.pages.submission import submission_context
 from leaderboard.web.pages.submit import how_to_page
+from rebar_depth_bench.submission.metadata import INPUTS
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -44,21 +45,26 @@ _PathPart = Annotated[str, Path(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9
 
 
 @router.get("/", name="board_page")
-async def leaderboard_page(request: Request, config: _NameQuery = None, sort: _NameQuery = None) -> Response:
-    """Return the page with the rankings of all configs, or of ``config`` only, in the order ``sort``."""
+async def leaderboard_page(
+    request: Request, config: _NameQuery = None, sort: _NameQuery = None, inputs: _NameQuery = None
+) -> Response:
+    """Return the page with the rankings of all configs, or of ``config`` only, in the order ``sort``.
+
+    With ``inputs``, only the rows of this input class are shown.
+    """
     service = service_of(request)
     all_configs = service.folder.configs
     if config is not None and config not in all_configs:
         raise HTTPException(404, f"the dataset has no config {config!r}, expected one of {', '.join(all_configs)}")
     configs = all_configs if config is None else (config,)
     max_rows = MAX_OVERVIEW_ROWS if len(configs) > 1 else None
-    order = parse_order(sort)
-    key_prefix = (leaderboard_page, root_path(request), config, order)
+    order, inputs = parse_order(sort), inputs if inputs in INPUTS else None
+    key_prefix = (leaderboard_page, root_path(request), config, order, inputs)
 
     def make() -> RenderedBody:
-        rankings = [make_config_ranking(service.database, name, order, max_rows) for name in configs]
+        rankings = [make_config_ranking(service.database, name, order, inputs, max_rows) for name in configs]
         return (*key_prefix, *(ranking.version for ranking in rankings)), _leaderboard_content(
-            request, all_configs, config, rankings
+            request, all_configs, config, inputs, rankings
         )
 
     body = await cached_public_body(request, configs, key_prefix, make)
@@ -109,7 +115,11 @@ def how_to_submit(request: Request) -> HTMLResponse:
 
 
 def _leaderboard_content(
-    request: Request, all_configs: Sequence[str], chosen: str | None, rankings: Sequence[ConfigRanking]
+    request: Request,
+    all_configs: Sequence[str],
+    chosen: str | None,
+    inputs: str | None,
+    rankings: Sequence[ConfigRanking],
 ) -> bytes:
     published = published_numbers()
     return page_content(
@@ -117,6 +127,7 @@ def _leaderboard_content(
         "board.html.j2",
         configs=all_configs,
         chosen=chosen,
+        inputs=inputs,
         rankings=rankings,
         columns={"native": NATIVE, "scaled": SCALED, "within": WITHIN},
         paper_title=published.title,

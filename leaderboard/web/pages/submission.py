@@ -14,9 +14,10 @@ from leaderboard.db.rankings import error_map_views, queue_position, submitter_n
 from leaderboard.db.submissions import QUEUED, SCORED, SCORING, result_json
 from leaderboard.service import Service
 from leaderboard.web.pages.rendering import clean_text, format_size, format_time, link
-from rebar_depth_bench.errors import printable
+from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.reporting.charts import score_charts
 from rebar_depth_bench.reporting.colormap import ERROR_COLOURS
+from rebar_depth_bench.reporting.formatting import ground_truth_text, inputs_text
 from rebar_depth_bench.reporting.html.page import (
     WORST_SHOWN,
     ConfigViewTables,
@@ -26,9 +27,10 @@ from rebar_depth_bench.reporting.html.page import (
 )
 from rebar_depth_bench.reporting.html.rows import ScoreRow, view_row
 from rebar_depth_bench.reporting.html.view_images import PANEL_WIDTH, colour_bar_uri
-from rebar_depth_bench.scoring.result import Result, ViewScore, sort_key_worst_first
+from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.result_io import read_result
-from rebar_depth_bench.submission import config_of
+from rebar_depth_bench.scoring.view_score import ViewScore, sort_key_worst_first
+from rebar_depth_bench.submission import Declaration, config_of
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,9 @@ class ErrorMap:
     row: ScoreRow
 
 
+_UNREADABLE = "The stored result was written by another version of this software, which must show it."
+
+
 def submission_context(
     service: Service, record: SubmissionModel, full_config: str | None, ranks: Mapping[str, int] | None = None
 ) -> dict[str, Any]:
@@ -49,6 +54,7 @@ def submission_context(
     Of the config ``full_config`` all views are listed, of the others the worst. ``ranks`` are its ranks by config.
     """
     database = service.database
+    declared = Declaration(record.inputs, record.uses_ground_truth)
     return {
         "id": record.id,
         "status": record.status,
@@ -58,7 +64,10 @@ def submission_context(
         "method": printable(record.method),
         "description": clean_text(record.description),
         "link": link(record.url),
-        "intrinsics": record.uses_intrinsics,
+        "declared": [
+            ("Inputs", inputs_text(declared)),
+            ("Ground truth", ground_truth_text(declared)),
+        ],
         "submitter": printable(submitter_name(database, record)),
         "created": format_time(record.created_at),
         "finished": None if record.finished_at is None else format_time(record.finished_at),
@@ -79,11 +88,15 @@ def _result_context(
     data = result_json(service.database, record.id)
     if data is None:  # Deleted since its row was read.
         raise HTTPException(404, "no such submission")
-    result = read_result(data, record.id)
+    try:
+        result = read_result(data, record.id)
+    except InputError:
+        return {"scored": False, "reason": _UNREADABLE, "configs": [], "ranks": {}}
     views = views_by_config(result)
     configs = [_config_views(name, views[name], name == full_config) for name in result.tables]
     return {
         "scored": True,
+        "result_protocol": result.protocol,
         "ranks": ranks,
         "configs": configs,
         "dash_in_views": any(row.has_dash() for config in configs for row in config.worst),

@@ -23,7 +23,8 @@ from rebar_depth_bench.reporting.charts.axes import (
     tick_label,
 )
 from rebar_depth_bench.reporting.formatting import number, scale_cell
-from rebar_depth_bench.scoring.result import Table, ViewScore
+from rebar_depth_bench.scoring.result import Table
+from rebar_depth_bench.scoring.view_score import ViewScore
 
 _LEFT, _RIGHT = 14.0, WIDTH - 14.0
 _ROW_HEIGHT_PX = 50

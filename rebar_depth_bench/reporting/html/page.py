@@ -34,10 +34,11 @@ from rebar_depth_bench.reporting.html.view_browser import (
     views_to_show,
 )
 from rebar_depth_bench.reporting.html.view_images import ViewPanels, colour_bar_uri
-from rebar_depth_bench.reporting.published import load_published
+from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published
 from rebar_depth_bench.scoring.evaluation import Evaluation
-from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE, PROTOCOL, WITHIN_MM
-from rebar_depth_bench.scoring.result import Result, ViewScore, sort_key_worst_first
+from rebar_depth_bench.scoring.protocol import WITHIN_MM
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.view_score import ViewScore, sort_key_worst_first
 from rebar_depth_bench.submission import SubmissionReader, config_of
 
 WORST_SHOWN = 10
@@ -72,13 +73,12 @@ def render_report(result: Result, panels: Iterable[ViewPanels]) -> str:
         .render(
             method=printable(result.method),
             stamps=_provenance(result),
-            protocol=PROTOCOL,
+            protocol=result.protocol,
             script=script.text,
             policy=script.policy,
             metric_heads=formatting.METRIC_HEADS,
             tolerances=WITHIN_MM,
             dash_note=formatting.DASH_NOTE,
-            min_coverage=f"{MIN_RANKED_COVERAGE * 100:.0f}",
             **results_context(result, views),
             **paper_context(result),
             extended=None if result.extended is None else extended_section(result.extended),
@@ -93,6 +93,12 @@ def results_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) ->
     rows = [table_row(name, table) for name, table in result.tables.items()]
     return {
         "rows": rows,
+        "references": [
+            (f"{printable(config)}: {name}", native, scaled)
+            for config, table in result.tables.items()
+            for name, native, scaled in formatting.reference_rows(table.reference)
+        ],
+        "reference_note": formatting.REFERENCE_NOTE,
         "dash_in_results": any(row.has_dash() for row in rows),
         "interval_note": formatting.INTERVAL_NOTE if any(row.has_interval() for row in rows) else "",
         "alignment_chart": score_charts.alignment_chart(result.tables),
@@ -107,6 +113,7 @@ def paper_context(result: Result) -> dict[str, object]:
         "paper_scenes": paper_scenes(result),
         "paper_title": published.title,
         "paper_part": published.parts["synthetic"],
+        "other_optics_note": OTHER_OPTICS_NOTE,
     }
 
 
@@ -128,7 +135,9 @@ def _views_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> 
 
 def _provenance(result: Result) -> list[tuple[str, str]]:
     return [
-        ("Protocol", PROTOCOL),
+        ("Protocol", result.protocol),
+        ("Inputs", formatting.inputs_text(result.declared)),
+        ("Ground truth", formatting.ground_truth_text(result.declared)),
         ("Dataset version", printable(result.dataset_version)),
         ("Dataset digest", printable(result.dataset_digest)),
         ("Archive sha256", printable(result.submission_sha256.removeprefix("sha256:"))),
@@ -161,7 +170,7 @@ _COLUMNS = ("view_id", "left_rgb", "left_depth", "left_mask")
 def write_report(result: Result, evaluation: Evaluation, target: Path, *, views_shown: int = VIEWS_SHOWN) -> None:
     """Write the HTML report of ``result``, the scores of the submission of ``evaluation``.
 
-    Up to ``views_shown`` views of each config are shown with images: the worst by native AbsRel, then evenly
+    Up to ``views_shown`` views of each config are shown with images: the worst by rank error, then evenly
     spaced down to the best. Raises ``InputError`` if ``views_shown`` is negative.
     """
     chosen = {

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
 from rebar_depth_bench.reporting.html.rows import Cell, table_row
-from rebar_depth_bench.reporting.published import PublishedRow, PublishedScene, load_published, paper_scene
+from rebar_depth_bench.reporting.published import OTHER_OPTICS_MARK, PublishedRow, PublishedScene, load_published
 from rebar_depth_bench.scoring.result import Result, Table
 
 _FIRST_LETTER = ord("A")
@@ -35,13 +35,15 @@ class PaperScene:
     distance: str
     chart: Markup
     rows: list[PaperRow]
+    other_optics: bool
 
 
 def paper_scenes(result: Result) -> list[PaperScene]:
     """Return the scenes of Table I for which the result has configs, in the paper's order."""
     tables_by_scene: dict[str, dict[str, Table]] = {}
     for config, table in result.tables.items():
-        tables_by_scene.setdefault(paper_scene(config) or "", {})[config] = table
+        if table.published is not None:
+            tables_by_scene.setdefault(table.published.scene, {})[config] = table
     scenes = load_published().scenes
     return [
         _paper_scene(name, scene, tables_by_scene[name])
@@ -57,7 +59,8 @@ def _paper_scene(name: str, scene: PublishedScene, tables: Mapping[str, Table]) 
     rows += [published_row(*arguments) for arguments in zip(numbers, scene.rows, strict=True)]
     heading = scene.title if scene.title.lower() == name else f"{scene.title} ({name})"
     chart = scatter_chart(f"{heading}: native and scaled AbsRel", scatter_points(rows, tables))
-    return PaperScene(heading, scene.distance, chart, rows)
+    other_optics = any(table.published and not table.published.same_optics for table in tables.values())
+    return PaperScene(heading, scene.distance, chart, rows, other_optics)
 
 
 def _letter_mark(index: int) -> str:
@@ -65,8 +68,9 @@ def _letter_mark(index: int) -> str:
 
 
 def _own_row(mark: str, config: tuple[str, Table]) -> PaperRow:
-    row = table_row(*config)
-    return PaperRow(mark, row.name, False, False, [row.native[1], row.native[0], row.scaled[0], row.scale])
+    row, match = table_row(*config), config[1].published
+    name = row.name if match is None or match.same_optics else f"{row.name} {OTHER_OPTICS_MARK}"
+    return PaperRow(mark, name, False, False, [row.native[1], row.native[0], row.scaled[0], row.scale])
 
 
 def published_row(mark: str, row: PublishedRow) -> PaperRow:

@@ -10,7 +10,8 @@ from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.result import Table, ViewScore
+from rebar_depth_bench.scoring.result import Table
+from rebar_depth_bench.scoring.view_score import ViewScore
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,9 @@ class ScoreRow:
     name: str
     views: Cell
     coverage: Cell
+    rank_error: Cell
     ranked: bool
-    reasons: str
+    notes: list[str]
     native: list[Cell]
     scaled: list[Cell]
     scale: Cell
@@ -38,12 +40,15 @@ class ScoreRow:
 
     def has_dash(self) -> bool:
         """Return whether any number of the row is undefined."""
-        cells = [*self.native, *self.scaled, self.scale, self.coverage, *self.within]
-        return formatting.has_dash([[cell.text for cell in cells]])
+        return formatting.has_dash([[cell.text for cell in self._cells]])
 
     def has_interval(self) -> bool:
         """Return whether any number of the row has an interval."""
-        return any(cell.interval for cell in [*self.native, *self.scaled, self.scale, self.coverage, *self.within])
+        return any(cell.interval for cell in self._cells)
+
+    @property
+    def _cells(self) -> list[Cell]:
+        return [self.rank_error, *self.native, *self.scaled, self.scale, self.coverage, *self.within]
 
 
 def table_row(name: str, table: Table) -> ScoreRow:
@@ -58,8 +63,13 @@ def table_row(name: str, table: Table) -> ScoreRow:
             table.coverage,
             formatting.coverage_interval_cell(intervals.get("coverage")),
         ),
+        rank_error=_cell(
+            formatting.rank_error_cell(table.rank_error),
+            table.rank_error,
+            formatting.interval_cell(intervals.get("rank_error"), 4),
+        ),
         ranked=table.ranked,
-        reasons="; ".join(formatting.unranked_reasons(table)),
+        notes=formatting.table_notes(table),
         native=_metric_cells(table.native, formatting.metric_interval_cells(intervals, "native")),
         scaled=_metric_cells(table.scaled, formatting.metric_interval_cells(intervals, "scaled")),
         scale=_cell(
@@ -80,8 +90,9 @@ def view_row(view: ViewScore) -> ScoreRow:
         name=printable(view.view_id),
         views=Cell(f"{view.scored_px:,}".replace(",", "\N{NARROW NO-BREAK SPACE}"), view.scored_px),
         coverage=_cell(formatting.coverage_percent(view.coverage), view.coverage),
+        rank_error=_cell(formatting.rank_error_cell(view.rank_error), view.rank_error),
         ranked=True,
-        reasons="",
+        notes=[],
         native=_metric_cells(view.native, no_intervals),
         scaled=_metric_cells(view.scaled, no_intervals),
         scale=_cell(formatting.scale_cell(view.scale), view.scale),

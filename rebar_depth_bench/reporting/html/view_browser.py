@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.reporting.html.rows import ScoreRow, view_row
 from rebar_depth_bench.reporting.html.view_images import ViewImages, ViewPanels, view_images
-from rebar_depth_bench.scoring.result import ViewScore, sort_key_worst_first
+from rebar_depth_bench.scoring.view_score import ViewScore, sort_key_worst_first
 from rebar_depth_bench.submission import config_of
 
 VIEWS_SHOWN = 12

@@ -13,8 +13,9 @@ from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.ground_truth import config_truth
-from rebar_depth_bench.scoring.result import Result, protocol_indices
+from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.view_score import protocol_indices
 from rebar_depth_bench.studies.common import add_output_arguments, write_outputs
 from rebar_depth_bench.studies.distance import output
 from rebar_depth_bench.studies.distance.study import (

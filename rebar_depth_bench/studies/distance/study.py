@@ -21,8 +21,9 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS, Interval, interval, resample
+from rebar_depth_bench.scoring.metrics import mean
 from rebar_depth_bench.scoring.provenance import Provenance
-from rebar_depth_bench.scoring.result import ViewScore, mean
+from rebar_depth_bench.scoring.view_score import ViewScore
 
 MIN_DISTANCE_RATIO = 1.05
 """Minimum ratio of the farthest to the nearest view distance for which a slope is fitted."""

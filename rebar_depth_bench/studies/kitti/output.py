@@ -9,7 +9,7 @@ from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.study_page import PageTable, StudyPage
 from rebar_depth_bench.reporting.published import load_published
 from rebar_depth_bench.scoring.frames import make_frame
-from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE
+from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 from rebar_depth_bench.studies.kitti.ground_truth import EXPECTED_IMAGES
 from rebar_depth_bench.studies.kitti.metrics import METRIC_NAMES, KittiMetrics
 from rebar_depth_bench.studies.kitti.result import SCALE_NAME, KittiResult
@@ -150,7 +150,7 @@ def _notes(result: KittiResult) -> list[str]:
         notes.append(
             f"Not comparable: predictions cover {formatting.coverage_percent(table.coverage)} % of the pixels "
             f"and {table.images_scored} of {table.images} images; expected at least "
-            f"{MIN_RANKED_COVERAGE * 100:.0f} % and all images."
+            f"{MIN_COMPARABLE_COVERAGE * 100:.0f} % and all images."
         )
     return notes
 

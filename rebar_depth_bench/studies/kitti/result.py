@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rebar_depth_bench.scoring.bootstrap import Interval, interval, resample
-from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE
+from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 from rebar_depth_bench.scoring.provenance import Provenance
 from rebar_depth_bench.studies.kitti.ground_truth import EXPECTED_IMAGES, GroundTruthKind, LidarDepthConvention
 from rebar_depth_bench.studies.kitti.metrics import METRIC_NAMES, ImageScore, KittiMetrics
@@ -40,8 +40,8 @@ class KittiTable:
     ``images`` counts the images with a scored pixel and ``images_scored`` those of them with a prediction; the
     means and ``scale_median`` are over the latter. ``coverage`` is the mean over all ``images``. ``intervals`` has
     a 95 % block bootstrap interval for each of ``INTERVAL_NAMES``. ``complete`` is true if every image has a
-    prediction and the coverage is at least ``MIN_RANKED_COVERAGE``; otherwise, missing predictions could improve
-    the numbers.
+    prediction and the coverage is at least ``MIN_COMPARABLE_COVERAGE``; otherwise, missing predictions could
+    improve the numbers.
     """
 
     images: int
@@ -105,7 +105,7 @@ def tabulate_images(images: Sequence[ImageScore]) -> KittiTable:
         images=len(images),
         images_scored=len(scored),
         coverage=coverage,
-        complete=len(scored) == len(images) and coverage >= MIN_RANKED_COVERAGE,
+        complete=len(scored) == len(images) and coverage >= MIN_COMPARABLE_COVERAGE,
         native=_mean_metrics([image.native for image in scored if image.native]),
         scaled=_mean_metrics([image.scaled for image in scored if image.scaled]),
         scale_median=median(scales) if scales else None,

@@ -20,8 +20,9 @@ from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.ground_truth import verified_views
+from rebar_depth_bench.scoring.metrics import mean
 from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
-from rebar_depth_bench.scoring.result import mean, tabulate
+from rebar_depth_bench.scoring.result import tabulate
 from rebar_depth_bench.studies.common import add_output_arguments, write_outputs
 from rebar_depth_bench.studies.depth_source import DepthSource, open_depths
 from rebar_depth_bench.studies.pseudo_reference.capture import CAPTURE_LAYOUT, is_capture, open_capture

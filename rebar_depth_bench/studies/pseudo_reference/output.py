@@ -103,7 +103,7 @@ def _score_table(result: PseudoReferenceResult, reference: DepthReference) -> Pa
         ("s", "", lambda row: formatting.scale_cell(row.table.scale_median)),
         ("ratio", "of AbsRel", lambda row: ratio(row, "native")),
         ("ratio_s", "of AbsRel_s", lambda row: ratio(row, "scaled")),
-        ("ranked", "", lambda row: "yes" if row.table.ranked else "no"),
+        ("ranked", "", lambda row: "yes" if row.table.is_comparable else "no"),
     )
     caption = f"Against {printable(reference.name)} ({kind}; {share})"
     return page_table(caption, columns, [row for row in result.rows if row.reference == reference.name])
@@ -179,7 +179,7 @@ def _notes(result: PseudoReferenceResult) -> list[str]:
     else:
         notes.append("No exact depth is available: the references are estimates, and so is every number above.")
     for row in result.rows:
-        reasons = formatting.unranked_reasons(row.table)
+        reasons = formatting.incomparable_reasons(row.table)
         if reasons:
             names = f"{printable(row.method)} against {printable(row.reference)}"
             notes.append(f"{names}: not ranked: {'; '.join(reasons)}.")
@@ -204,7 +204,7 @@ def _csv_row(result: PseudoReferenceResult, row: MethodRow) -> dict[str, Any]:
         "views_scored": table.views_scored,
         "coverage": table.coverage,
         "frame_share": row.frame_share,
-        "ranked": table.ranked,
+        "ranked": table.is_comparable,
         **metrics,
         "scale_median": table.scale_median,
         **{f"{alignment}_ratio": result.ratio(row.method, row.reference, alignment) for alignment in ALIGNMENTS},

@@ -95,7 +95,7 @@ class PseudoReferenceResult:
 
     def ranking(self, reference: str, alignment: Alignment) -> tuple[str, ...]:
         """Return the ranked methods by ascending AbsRel; methods that may not be ranked are left out."""
-        ranked = [row for row in self.rows if row.reference == reference and row.table.ranked]
+        ranked = [row for row in self.rows if row.reference == reference and row.table.is_comparable]
         return tuple(
             row.method for row in sorted(ranked, key=lambda row: table_abs_rel(row.table, alignment) or 0.0)
         )
@@ -159,7 +159,7 @@ def _table_dict(table: Table) -> dict[str, Any]:
         "views": table.views,
         "views_scored": table.views_scored,
         "coverage": table.coverage,
-        "ranked": table.ranked,
+        "ranked": table.is_comparable,
         "native": _metrics_dict(table.native),
         "scaled": _metrics_dict(table.scaled),
         "scale_median": table.scale_median,

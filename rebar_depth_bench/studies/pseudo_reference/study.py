@@ -19,8 +19,8 @@ from numpy import ndarray
 
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.scoring.ground_truth import ViewTruth
-from rebar_depth_bench.scoring.result import ViewScore
 from rebar_depth_bench.scoring.score import score_view
+from rebar_depth_bench.scoring.view_score import ViewScore
 from rebar_depth_bench.studies.depth_source import DepthSource
 from rebar_depth_bench.submission import EntryError
 

@@ -24,7 +24,7 @@ from rebar_depth_bench.reporting.charts.lines import (
 from rebar_depth_bench.reporting.html.study_page import Columns, PageFigure, PageTable, StudyPage, page_table
 from rebar_depth_bench.reporting.published import load_published
 from rebar_depth_bench.scoring.frames import make_frame
-from rebar_depth_bench.scoring.protocol import MIN_RANKED_COVERAGE
+from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 from rebar_depth_bench.studies.scale_anchor.study import AnchorRow, AnchorStudy, Spread
 
 if TYPE_CHECKING:
@@ -213,7 +213,7 @@ def _notes(study: AnchorStudy) -> list[str]:
             f"{len(study.views_without_prediction)} of {study.views} views have no prediction: "
             "they are neither drawn nor scored."
         )
-    if study.coverage < MIN_RANKED_COVERAGE:
+    if study.coverage < MIN_COMPARABLE_COVERAGE:
         notes.append(
             f"Coverage {formatting.coverage_percent(study.coverage)} %: missing predictions have no error here."
         )

@@ -8,17 +8,28 @@ import numpy as np
 
 from rebar_depth_bench.reporting.html.view_images import ViewPanels
 from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.result import Result, ViewScore, tabulate
+from rebar_depth_bench.scoring.published_match import PublishedMatch
+from rebar_depth_bench.scoring.reference import Reference
+from rebar_depth_bench.scoring.result import Result, tabulate
+from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.submission.metadata import Declaration
+
+DECLARED = Declaration("rgb+K", uses_ground_truth=False)
+REFERENCE = Reference(0.0571, 2.21, 0.0062, 0.71)
 
 HOSTILE = '=<script src="//evil.example/x.js">alert(1)</script>[red]\x1b[31m\u202e&amp;'
 
 
 def scored_view(view_id: str, abs_rel: float = 0.75, coverage: float = 1.0, scale: float = 0.625) -> ViewScore:
-    """Return a view score with the given native AbsRel and a distinct value in every other field."""
+    """Return a view score with the given native AbsRel and a distinct value in every other field.
+
+    The rank error grows with the AbsRel: its valid pixels are all predicted too far.
+    """
     return ViewScore(
         view_id=view_id,
         scored_px=43210,
         coverage=coverage,
+        rank_error=1 - coverage / (1 + abs_rel),
         scale=scale,
         native=DepthMetrics(abs_rel=abs_rel, rmse_cm=20.09, mae_cm=18.71, delta1=0.1234),
         scaled=DepthMetrics(abs_rel=0.0613, rmse_cm=1.52, mae_cm=1.17, delta1=0.9876),
@@ -28,20 +39,33 @@ def scored_view(view_id: str, abs_rel: float = 0.75, coverage: float = 1.0, scal
 
 def unpredicted_view(view_id: str) -> ViewScore:
     """Return the score of a view without any prediction."""
-    return ViewScore(view_id, 777, 0.0, None, None, None, {3: 0.0, 5: 0.0, 10: 0.0, 20: 0.0})
+    return ViewScore(view_id, 777, 0.0, 1.0, None, None, None, {3: 0.0, 5: 0.0, 10: 0.0, 20: 0.0})
 
 
 def overflowed_view(view_id: str) -> ViewScore:
     """Return the score of a view whose squared native error overflows to infinity."""
     native = DepthMetrics(abs_rel=1e200, rmse_cm=math.inf, mae_cm=1e202, delta1=0.0)
     view = scored_view(view_id)
-    return ViewScore(view_id, 5, 1.0, 1e-200, native, view.scaled, view.within_mm)
+    return ViewScore(view_id, 5, 1.0, 1.0, 1e-200, native, view.scaled, view.within_mm)
 
 
-def result(*views: ViewScore, method: str = "my model") -> Result:
+def result(
+    *views: ViewScore,
+    method: str = "my model",
+    declared: Declaration = DECLARED,
+    reference: Reference = REFERENCE,
+) -> Result:
     """Return the result of ``views`` with one table per config, in order of appearance."""
     configs = dict.fromkeys(view.view_id.rpartition("/")[0] for view in views)
-    tables = {name: tabulate([view for view in views if view.view_id.startswith(f"{name}/")]) for name in configs}
+    tables = {
+        name: tabulate(
+            [view for view in views if view.view_id.startswith(f"{name}/")],
+            declared,
+            reference,
+            PublishedMatch(name, same_optics=True) if name in ("lattice", "pile", "pier") else None,
+        )
+        for name in configs
+    }
     return Result(
         method=method,
         submission_sha256="0123456789abcdef" * 4,
@@ -50,6 +74,7 @@ def result(*views: ViewScore, method: str = "my model") -> Result:
         software_version="0.1.0",
         tables=tables,
         views=views,
+        declared=declared,
     )
 
 

@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.reporting.latex import escape_latex, latex_table
 from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.submission.metadata import NOT_DECLARED, Declaration
 from tests.bench.reporting.results import HOSTILE, overflowed_view, result, scored_view, unpredicted_view
 
 _COMMANDS = {
     *("begin", "end", "centering", "caption", "label", "setlength", "tabcolsep", "small", "medskip", "tiny"),
     *("toprule", "midrule", "bottomrule", "cmidrule", "multicolumn", "textbf", "emph"),
-    *("downarrow", "dagger", "ddagger", "mathrm", "char"),
+    *("downarrow", "dagger", "ddagger", "mathrm", "char", "max"),
     *(
         "textbackslash",
         "textasciitilde",
@@ -72,15 +73,19 @@ def _two_results() -> list[Result]:
 
 def test_layout_matches_paper() -> None:
     table = _check_latex(latex_table(_two_results(), published=False))
-    assert r" & \multicolumn{4}{c}{lattice (0.22--0.43 m)} & \multicolumn{4}{c}{pier (8--17 m)} \\" in table
-    heads = r"RMSE $\downarrow$ & AbsRel $\downarrow$ & AbsRel$_s$ $\downarrow$ & $s$"
+    assert r" & \multicolumn{5}{c}{lattice (0.22--0.43 m)} & \multicolumn{5}{c}{pier (8--17 m)} \\" in table
+    heads = r"$E$ $\downarrow$ & RMSE $\downarrow$ & AbsRel $\downarrow$ & AbsRel$_s$ $\downarrow$ & $s$"
     assert rf"Method & {heads} & {heads} \\" in table
-    assert r"\cmidrule(lr){2-5} \cmidrule(lr){6-9}" in table
+    assert r"\cmidrule(lr){2-6} \cmidrule(lr){7-11}" in table
     assert (
-        r"my model & \textbf{20.09} & 0.0300 & \textbf{0.0613} & 0.625 & --$^{\ddagger}$ & -- & -- & -- \\"
+        r"my model & 0.0291 & \textbf{20.09} & 0.0300 & \textbf{0.0613} & 0.625 & 1.0000 & -- & -- & -- & -- \\"
         in table
     )
-    assert r"a\_b & \textbf{20.09} & \textbf{0.0200} & \textbf{0.0613} & 0.625 & 20.09" in table
+    best = r"\textbf{0.0196} & \textbf{20.09} & \textbf{0.0200} & \textbf{0.0613} & 0.625"
+    assert rf"a\_b & {best} & \textbf{{0.4286}} & 20.09" in table
+    assert table.index(r"a\_b &") < table.index("my model &") < table.index(r"\emph{constant} & ")
+    assert r"\emph{constant} &  &  &  & 0.0571 &  &  &  &  & 0.0571 &  \\" in table
+    assert r"\emph{one pixel} &  & 0.71 & 0.0062 &  &  &" in table
     assert "Published" not in table
     assert "FoundationStereo" not in table
 
@@ -88,20 +93,34 @@ def test_layout_matches_paper() -> None:
 def test_caption_states_protocol_views_and_alignment() -> None:
     table = latex_table(_two_results(), published=False)
     for stated in (
-        *("protocol rebar-1", "lattice 8 views, pier 1 view.", "dataset 1.2.3 (sha256:fedcba9876543210)"),
+        *("protocol rebar-2", "lattice 8 views, pier 1 view.", "dataset 1.2.3 (sha256:fedcba9876543210)"),
         *("native, without any alignment", r"s = \mathrm{med}(\mathrm{GT})/\mathrm{med}(\mathrm{pred})"),
-        r"$^{\ddagger}$Not ranked (coverage below 95\,\%",
+        r"mean over all scored pixels of $|p - z| / \max(p, z)$",
     ):
         assert stated in table
     assert "dagger" not in latex_table([result(scored_view("lattice/0000"))], published=False)
+
+
+def test_declarations_are_marked() -> None:
+    views = [scored_view(f"lattice/{i:04d}") for i in range(8)]
+    truth = result(*views, method="truth", declared=Declaration("rgb", uses_ground_truth=True))
+    unknown = result(*views, method="unknown", declared=NOT_DECLARED)
+    table = _check_latex(latex_table([truth, unknown], published=False))
+    assert r"truth & 0.4286$^{\ddagger}$ & " in table
+    assert r"unknown$^{?}$ & 0.4286 & " in table
+    assert r"$^{\ddagger}$Not ranked (declares the use of ground truth)" in table
+    assert "$^{?}$Use of ground truth not declared" in table
+    assert "textbf" not in table, "one row is ranked"
 
 
 def test_published_rows_are_verbatim_and_never_bold() -> None:
     results = [dataclasses.replace(entry, method=name) for entry, name in zip(_two_results(), "ab", strict=True)]
     table = _check_latex(latex_table(results, published=True))
     own, _, paper = table.partition(r"\emph{Published, measured on the authors' renders")
-    assert r"Depth Pro & 91.19 & 3.145 & 0.029 & 0.25 & 1151 & 0.901 & 0.179 & 12.17 \\" in paper
-    assert r"COLMAP+ArUco & 1.60 & 0.021 & 0.028 & 1.01 & 206.7$^{\dagger}$ & 0.078 & 0.083 & 0.98 \\" in paper
+    assert r"Depth Pro &  & 91.19 & 3.145 & 0.029 & 0.25 &  & 1151 & 0.901 & 0.179 & 12.17 \\" in paper
+    assert (
+        r"COLMAP+ArUco &  & 1.60 & 0.021 & 0.028 & 1.01 &  & 206.7$^{\dagger}$ & 0.078 & 0.083 & 0.98 \\" in paper
+    )
     assert "1143" in paper
     assert "textbf" not in paper
     assert r"\textbf{20.09}" in own, "although the paper has 1.13"
@@ -114,18 +133,20 @@ def test_no_published_rows_for_scene_not_in_paper() -> None:
     mixed = _check_latex(
         latex_table([result(scored_view("beam_1/0000"), scored_view("pile/0000"))], published=True)
     )
-    assert r"Depth Pro & -- & -- & -- & -- & 15.46 & 0.262 & 0.043 & 0.92 \\" in mixed
+    assert r"Depth Pro & -- & -- & -- & -- & -- &  & 15.46 & 0.262 & 0.043 & 0.92 \\" in mixed
     assert "dagger" not in mixed.split(r"\begin{tabular}")[1]
 
 
-def test_single_or_unranked_results_are_not_bold() -> None:
+def test_single_results_and_incomparable_errors_are_not_bold() -> None:
     assert "textbf" not in latex_table(_two_results()[:1], published=True)
     low = result(*[scored_view(f"lattice/{i:04d}", abs_rel=0.001, coverage=0.5) for i in range(8)], method="gaps")
     table = _check_latex(latex_table([*_two_results(), low], published=False))
     line = next(line for line in table.splitlines() if line.startswith("gaps"))
-    assert "textbf" not in line
-    assert line.startswith(r"gaps & 20.09$^{\ddagger}$ & 0.0010 &")
-    assert r"\textbf{0.0200}" in table
+    assert line.startswith(r"gaps & 0.5005 & 20.09 & 0.0010 &")
+    lattice = [
+        row.split(" & ")[1:6] for row in table.splitlines() if row.startswith(("gaps", "my model", r"a\_b"))
+    ]
+    assert [cell for row in lattice for cell in row if "textbf" in cell] == [r"\textbf{0.0196}"]
 
 
 def test_many_configs_split_into_several_tabulars() -> None:
@@ -185,7 +206,7 @@ def test_escape_latex_known_cases() -> None:
 
 def test_overflowed_values_are_dashes() -> None:
     table = _check_latex(latex_table([result(overflowed_view("pier/0000"))], published=False))
-    assert r"my model & --$^{\ddagger}$ & 1.0e+200 & 0.0613" in table
+    assert r"my model & 1.0000 & -- & 1.0e+200 & 0.0613" in table
 
 
 def test_mixed_datasets_and_no_results_raise() -> None:

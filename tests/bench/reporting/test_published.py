@@ -7,7 +7,7 @@ from importlib.resources import files
 
 import pytest
 
-from rebar_depth_bench.reporting.published import load_published, paper_scene, published_rows
+from rebar_depth_bench.reporting.published import load_published, published_rows
 
 # Table I of the paper, transcribed independently of published.json; columns: lattice, disordered, pier.
 TABLE_1 = """
@@ -71,15 +71,3 @@ def test_parts_state_place_and_origin() -> None:
     renders = "measured on the authors' renders, which are not the renders of this dataset"
     assert published.parts["synthetic"].mark == published.parts["anchor"].mark == renders
     assert all("authors" in part.mark for part in published.parts.values())
-
-
-@pytest.mark.parametrize(
-    ("config", "scene"),
-    [
-        *(("lattice", "lattice"), ("lattice-zed-raw", None), ("pile", "pile"), ("pier-dusk", None)),
-        *(("lattices", None), ("my-lattice", None), ("beam", None), ("", None)),
-    ],
-)
-def test_paper_scene_of_config_name(config: str, scene: str | None) -> None:
-    assert paper_scene(config) == scene
-    assert bool(published_rows(scene or "")) == (scene is not None)

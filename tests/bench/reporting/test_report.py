@@ -39,9 +39,9 @@ def test_page_shows_numbers_provenance_and_alignment() -> None:
     for stated in (
         *("0.7500", "20.09", "18.71", "0.123", "0.0613", "1.52", "1.17", "0.988", "0.625"),
         *("1.2", "4.6", "7.9", "13.6"),
-        *("my model", "rebar-1", "1.2.3", "sha256:" + "fedcba9876543210" * 4, "0123456789abcdef" * 4),
+        *("my model", "rebar-2", "1.2.3", "sha256:" + "fedcba9876543210" * 4, "0123456789abcdef" * 4),
         "Native (no alignment) and scaled (oracle median scale per view, s = median(z)/median(p))",
-        "is not ranked: 1 of 1 view without any prediction; coverage 0.0 % is below 95 %.",
+        "not compared with those of others: 1 of 1 view without any prediction; coverage 0.0 % is below 95 %.",
         "43\N{NARROW NO-BREAK SPACE}210 scored pixels",
     ):
         assert stated in page.text
@@ -132,7 +132,7 @@ def test_overflow_and_zero_errors_render() -> None:
     exact = scored_view("lattice/0001", abs_rel=0.0, scale=1.0)
     shown = result(overflowed_view("pier/0000"), perfect, exact)
     text = Page(render_report(shown, [panels(factor=1e30), panels(factor=math.nan)])).text
-    assert "is not ranked: a number overflowed." in text
+    assert "not compared with those of others: a number overflowed." in text
     assert "no prediction on scored pixels" in text
     assert "off the scale" in text
 

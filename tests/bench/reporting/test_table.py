@@ -53,7 +53,7 @@ ROW_CELLS = {
     "13.6",
     "100.0",
     "2/2",
-    "yes",
+    "0.4286",
 }
 
 
@@ -75,33 +75,33 @@ def test_alignment_protocol_method_and_dataset_are_stated(two_configs: Result, w
     for stated in (
         "native (no alignment)",
         "scaled (oracle median scale per view, s = median(z)/median(p))",
-        "my model, protocol rebar-1",
+        "my model, protocol rebar-2",
         "1.2.3 (sha256:fedcba987654)",
         "cm",
     ):
         assert stated in printed
 
 
-def test_unranked_row_states_reason(two_configs: Result) -> None:
+def test_incomparable_row_states_reason(two_configs: Result) -> None:
     printed = _print_to_text(two_configs, 160)
-    assert (
-        "lattice-zed-raw: not ranked: 1 of 2 views without any prediction; coverage 47.4 % is below 95 %."
-        in printed
-    )
-    assert "lattice: not ranked" not in printed
-    assert {"no", "1/2"} <= set(_row_cells(printed, "lattice-zed-raw"))
+    reasons = "1 of 2 views without any prediction; coverage 47.4 % is below 95 %."
+    assert f"not compared with those of others: {reasons}" in " ".join(printed.split())
+    assert "lattice: Errors" not in printed
+    assert {"0.7286", "1/2"} <= set(_row_cells(printed, "lattice-zed-raw"))
 
 
 def test_overflow_prints_dash_and_footnote_and_unranks() -> None:
     printed = _print_to_text(result(overflowed_view("pier/0000")), 160)
-    assert "pier: not ranked: a number overflowed." in printed
+    assert (
+        "pier: Errors of valid predictions are not compared with those of others: a number overflowed." in printed
+    )
     assert _row_cells(printed, "pier")[3:6] == ["1.0e+200", "–", "1.0e+202"]
     assert formatting.DASH_NOTE in printed
 
 
 def test_config_without_prediction_is_all_dashes() -> None:
     printed = _print_to_text(result(unpredicted_view("pier/0000")), 160)
-    assert _row_cells(printed, "pier") == ["0/1", "0.0", "no", *["–"] * 9, *["0.0"] * 4]
+    assert _row_cells(printed, "pier") == ["0/1", "0.0", "1.0000", *["–"] * 9, *["0.0"] * 4]
 
 
 def test_no_footnote_without_dash() -> None:
@@ -133,7 +133,7 @@ def test_extreme_numbers_use_scientific_notation() -> None:
 
 
 def test_no_views_is_an_unranked_reason() -> None:
-    assert formatting.unranked_reasons(tabulate([])) == ["no views"]
+    assert formatting.unranked_reason(tabulate([])) == "no views"
 
 
 def test_csv_matches_json(two_configs: Result) -> None:
@@ -155,7 +155,7 @@ def test_csv_matches_json(two_configs: Result) -> None:
         assert row["dataset_version"] == "1.2.3"
         assert row["submission_sha256"] == written["submission"]["sha256"]
         assert row["software_version"] == "0.1.0"
-        assert (row["protocol"], row["method"]) == ("rebar-1", "my model")
+        assert (row["protocol"], row["method"]) == ("rebar-2", "my model")
 
 
 def test_csv_nulls_are_empty_and_newlines_are_unix() -> None:

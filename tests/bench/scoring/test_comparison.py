@@ -19,7 +19,8 @@ from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.reporting.comparison_tables import NUMBER_TITLES, comparison_csv, print_comparison
 from rebar_depth_bench.scoring.comparison import Difference, compare
 from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.result import VIEW_METRICS, Result, ViewScore, tabulate
+from rebar_depth_bench.scoring.result import Result, tabulate
+from rebar_depth_bench.scoring.view_score import VIEW_METRICS, ViewScore
 
 
 def result_of(errors: np.ndarray, method: str = "m", config: str = "lattice", digest: str = "sha256:1") -> Result:
@@ -29,7 +30,8 @@ def result_of(errors: np.ndarray, method: str = "m", config: str = "lattice", di
         scale = None if metrics is None else 1.0 + error
         within = dict.fromkeys((3, 5, 10, 20), 0.0 if metrics is None else 1 - error / 2)
         covered = 0.0 if metrics is None else 1.0
-        views.append(ViewScore(f"{config}/{n:04}", 100, covered, scale, metrics, metrics, within))
+        rank_error = 1.0 if metrics is None else error / (1 + error)
+        views.append(ViewScore(f"{config}/{n:04}", 100, covered, rank_error, scale, metrics, metrics, within))
     return Result(method, "ab" * 32, digest, "1", "2", {config: tabulate(views)}, views)
 
 
@@ -54,6 +56,7 @@ def test_paired_difference_below_view_spread_is_decided() -> None:
     assert paired.interval[1] - paired.interval[0] < 0.001
     assert paired.verdict == "worse"
     assert difference(other, first).verdict == "better"
+    assert difference(first, other, "rank_error").verdict == "worse"
     assert difference(first, other, "native.delta1").verdict == "worse"
     assert difference(first, other, "within_mm.5").verdict == "worse"
     assert difference(first, other, "scale_median").verdict == ""
@@ -78,14 +81,15 @@ def test_submission_equals_itself() -> None:
         assert {row.verdict for row in rows} == {"equal", ""}
 
 
-def test_low_coverage_submission_is_not_ranked() -> None:
-    """Compare with predictions on a fifth of the pixels: their errors are smaller, but they are not ranked."""
+def test_errors_at_low_coverage_are_not_comparable() -> None:
+    """Compare with predictions on a fifth of the pixels: only the rank error counts the others."""
     complete, partial = result_of(np.full(20, 0.3)), result_of(np.full(20, 0.1))
-    views = [replace(view, coverage=0.2) for view in partial.views]
+    views = [replace(view, coverage=0.2, rank_error=0.8) for view in partial.views]
     partial = replace(partial, tables={"lattice": tabulate(views)}, views=views)
-    assert not partial.tables["lattice"].ranked
-    assert difference(complete, partial).verdict == "not ranked"
-    assert difference(partial, complete, "scaled.delta1").verdict == "not ranked"
+    assert not partial.tables["lattice"].is_comparable
+    assert difference(complete, partial, "rank_error").verdict == "worse"
+    assert difference(complete, partial).verdict == "no verdict"
+    assert difference(partial, complete, "scaled.delta1").verdict == "no verdict"
     assert difference(complete, partial, "coverage").verdict == "worse"
 
 
@@ -96,8 +100,10 @@ def test_errors_use_common_views_and_shares_use_all_views() -> None:
     first, other = result_of(errors), result_of(holes)
     assert difference(first, other).views == 15
     assert difference(first, other).difference == 0
-    assert difference(first, other).verdict == "not ranked"
+    assert difference(first, other).verdict == "no verdict"
     assert difference(first, other, "coverage").views == 20
+    assert difference(first, other, "rank_error").views == 20
+    assert difference(first, other, "rank_error").verdict == "worse"
     assert difference(first, other, "coverage").verdict == "worse"
     assert difference(first, other, "within_mm.20").verdict == "worse"
 

@@ -18,7 +18,8 @@ from rebar_depth_bench.reporting.extended_tables import extended_csv
 from rebar_depth_bench.reporting.tables import frame_csv, result_csv
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.frames import make_frame
-from rebar_depth_bench.scoring.result import VIEW_METRICS, Result
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.view_score import VIEW_METRICS
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredicted_view
 
@@ -63,7 +64,7 @@ def test_comparison_has_one_row_per_metric(two_configs: Result) -> None:
     comparison = compare(two_configs, two_configs)
     frame = comparison.to_pandas()
     assert frame["number"].tolist() == [*VIEW_METRICS, *VIEW_METRICS]
-    assert set(frame["verdict"]) <= {"equal", "not ranked", "undecided", ""}
+    assert set(frame["verdict"]) <= {"equal", "no verdict", "undecided", ""}
 
 
 def test_integers_with_missing_values_stay_integers() -> None:

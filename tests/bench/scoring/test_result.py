@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -11,7 +12,9 @@ from hypothesis import strategies as st
 
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.result import Result, ViewScore, tabulate
+from rebar_depth_bench.scoring.result import Result, tabulate
+from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.submission import Declaration
 
 
 def view(number: int, value: float | None, coverage: float = 1.0, scale: float = 1.0) -> ViewScore:
@@ -20,6 +23,7 @@ def view(number: int, value: float | None, coverage: float = 1.0, scale: float =
         view_id=f"lattice/{number:04d}",
         scored_px=10,
         coverage=coverage,
+        rank_error=1.0 if value is None else coverage * value / (1 + value) + 1 - coverage,
         scale=None if value is None else scale,
         native=metrics,
         scaled=metrics,
@@ -43,23 +47,31 @@ def test_even_scale_count_averages_middle_two() -> None:
     assert tabulate([view(0, 1.0, scale=1.0), view(1, 1.0, scale=2.0)]).scale_median == 1.5
 
 
-@pytest.mark.parametrize(("coverage", "ranked"), [(0.95, True), (math.nextafter(0.95, 0), False)])
-def test_ranked_at_coverage_threshold(coverage: float, ranked: bool) -> None:
-    assert tabulate([view(0, 1.0, coverage), view(1, 1.0, coverage)]).ranked is ranked
+@pytest.mark.parametrize(("coverage", "comparable"), [(0.95, True), (math.nextafter(0.95, 0), False)])
+def test_errors_are_comparable_from_coverage_threshold(coverage: float, comparable: bool) -> None:
+    table = tabulate([view(0, 1.0, coverage), view(1, 1.0, coverage)])
+    assert (table.is_comparable, table.ranked) == (comparable, True)
 
 
-def test_view_without_prediction_is_not_averaged_nor_ranked() -> None:
+@pytest.mark.parametrize(("uses_ground_truth", "ranked"), [(None, True), (False, True), (True, False)])
+def test_declared_use_of_ground_truth_is_not_ranked(uses_ground_truth: bool | None, ranked: bool) -> None:
+    assert tabulate([view(0, 1.0)], Declaration("rgb", uses_ground_truth)).ranked is ranked
+
+
+def test_view_without_prediction_is_not_averaged_but_counts_in_rank_error() -> None:
     views = [view(n, 1.0) for n in range(99)] + [view(99, None, coverage=0.0)]
     table = tabulate(views)
     assert table.native is not None
-    assert (table.native.abs_rel, table.views_scored, table.views, table.ranked) == (1.0, 99, 100, False)
+    assert (table.native.abs_rel, table.views_scored, table.views) == (1.0, 99, 100)
+    assert (table.ranked, table.is_comparable) == (True, False)
+    assert table.rank_error == pytest.approx((99 * 0.5 + 1) / 100)
     assert table.coverage == pytest.approx(0.99)
 
 
 def test_infinite_view_makes_mean_null() -> None:
-    table = tabulate([view(0, 1.0), view(1, math.inf)])
-    assert table.ranked is False
-    table_json = result_of(view(0, 1.0), view(1, math.inf)).to_dict()["tables"]["lattice"]
+    table = tabulate([view(0, 1.0), replace(view(1, math.inf), rank_error=1.0)])
+    assert (table.ranked, table.is_comparable, table.rank_error) == (True, False, 0.75)
+    table_json = result_of(view(0, 1.0), replace(view(1, math.inf), rank_error=1.0)).to_dict()["tables"]["lattice"]
     assert table_json["native"]["abs_rel"] is None
     assert table_json["native"]["delta1"] == 0.5
 
@@ -69,25 +81,34 @@ def test_no_views_give_null_and_unranked_table() -> None:
     assert table["views"] == 0
     assert table["ranked"] is False
     assert table["native"]["abs_rel"] is None
+    assert table["rank_error"] is None
     assert table["scale_median"] is None
 
 
 def test_json_keys_and_units_match_contract() -> None:
     content = json.loads(result_of(view(0, 0.25)).to_json())
     assert list(content) == ["protocol", "dataset", "submission", "software", "tables", "views"]
-    assert content["protocol"] == "rebar-1"
+    assert content["protocol"] == "rebar-2"
     assert content["dataset"] == {"digest": "sha256:11", "version": "1"}
-    assert content["submission"] == {"method": "m", "sha256": "00"}
+    assert content["submission"] == {
+        "method": "m",
+        "sha256": "00",
+        "inputs": None,
+        "uses_ground_truth": None,
+    }
     table = content["tables"]["lattice"]
     assert list(table) == [
         "views",
         "views_scored",
         "coverage",
         "ranked",
+        "rank_error",
         "native",
         "scaled",
         "scale_median",
         "within_mm",
+        "reference",
+        "published",
         "ci95",
     ]
     assert table["native"] == {"abs_rel": 0.25, "rmse_cm": 0.25, "mae_cm": 0.25, "delta1": 0.5}
@@ -96,6 +117,7 @@ def test_json_keys_and_units_match_contract() -> None:
         "view_id",
         "scored_px",
         "coverage",
+        "rank_error",
         "scale",
         "native",
         "scaled",

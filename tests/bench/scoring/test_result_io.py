@@ -39,11 +39,12 @@ def test_written_result_is_read_unchanged() -> None:
 def test_keys_of_later_versions_are_ignored() -> None:
     document = json.loads(SOUND)
     document["extended"] = {"protocol": "x", "tables": {}}
-    document["submission"] |= {"inputs": "stereo", "uses_ground_truth": False}
-    document["tables"]["lattice"] |= {"rank_error": 0.1, "reference": {"constant": {"abs_rel": 0.057}}}
+    document["submission"] |= {"licence": "MIT"}
+    document["tables"]["lattice"] |= {"single_bar": {"abs_rel": 0.1}}
     document["tables"]["lattice"]["within_mm"]["50"] = 1.0
-    document["tables"]["lattice"]["ci95"] |= {"rank_error": [0.1, 0.2]}
-    document["views"][0] |= {"rank_error": 0.1}
+    document["tables"]["lattice"]["reference"] |= {"two_pixels": {"abs_rel": 0.057}}
+    document["tables"]["lattice"]["ci95"] |= {"single_bar": [0.1, 0.2]}
+    document["views"][0] |= {"single_bar": 0.1}
     del document["tables"]["pile"]["ci95"]
     expected = json.loads(SOUND)["tables"]["lattice"]
     assert json.loads(read_result(json.dumps(document).encode(), "x").to_json())["tables"]["lattice"] == expected
@@ -57,7 +58,7 @@ def test_keys_of_later_versions_are_ignored() -> None:
         (b"[]", "invalid "),
         (b"null", "invalid "),
         (b"[" * 100_000, "size "),
-        (SOUND.replace(b'"rebar-1"', b'{"a":' * 100 + b"1" + b"}" * 100), "size "),
+        (SOUND.replace(b'"rebar-2"', b'{"a":' * 100 + b"1" + b"}" * 100), "size "),
         (SOUND.replace(b": 43210", b": " + b"9" * 4400), "syntax "),
         (SOUND.replace(b": 43210", b": " + b"9" * 4000), "invalid views 1: scored_px"),
         (SOUND.replace(b": 43210", b": " + b"NaN"), "syntax "),
@@ -66,8 +67,8 @@ def test_keys_of_later_versions_are_ignored() -> None:
         (SOUND.replace(b'"method":', b'"method": "a", "method":'), "duplicate "),
         (SOUND.replace(b"my model", b"\\u001b[2J"), "invalid submission.method"),
         (SOUND.replace(b"my model", b"m" * 800_000), "invalid submission.method"),
-        (SOUND.replace(b'"rebar-1"', b'"rebar-9"'), "invalid protocol"),
-        (SOUND.replace(b'"rebar-1"', b"[" + b"1, " * 200_000 + b"1]"), "invalid protocol"),
+        (SOUND.replace(b'"rebar-2"', b'"rebar-9"'), "invalid protocol"),
+        (SOUND.replace(b'"rebar-2"', b"[" + b"1, " * 200_000 + b"1]"), "invalid protocol"),
     ],
 )
 def test_malformed_text_is_refused(content: bytes, location: str) -> None:

@@ -72,7 +72,7 @@ def test_known_scale_and_noise_lie_within_intervals(lab: Path) -> None:
             assert high - low < 0.05 * value
         assert row.frame_share == share
         assert row.table.coverage == 1.0
-        assert row.table.ranked
+        assert row.table.is_comparable
     assert [entry.frame_share for entry in result.references] == [1.0, 0.5]
     agreements = {(entry.reference, entry.against): entry for entry in result.agreements}
     assert agreements["stereo", "colmap"].median_ratio == pytest.approx(STEREO_FACTOR / COLMAP_FACTOR)
@@ -147,7 +147,7 @@ def test_missing_predictions_never_help(lab: Path, tmp_path: Path) -> None:
     assert row.table.coverage == pytest.approx(present)
     assert row.frame_share == pytest.approx(present)
     few = result.row("few", "stereo").table
-    assert (few.views, few.views_scored, few.ranked) == (VIEWS, VIEWS // 2, False)
+    assert (few.views, few.views_scored, few.is_comparable) == (VIEWS, VIEWS // 2, False)
     assert few.coverage is not None
     assert few.coverage < 0.41
     out_of_range = result.row("far", "stereo").table
@@ -161,7 +161,7 @@ def test_depth_range_limits_scored_pixels(lab: Path) -> None:
     inside = ((z_m >= 1) & (z_m <= 2)).mean()
     assert result.references[0].frame_share == pytest.approx(inside, abs=1e-3)
     assert result.row("mono", "stereo").table.coverage is not None
-    assert not result.row("mono", "stereo").table.ranked  # The prediction of 1.6 times 2 m is out of range.
+    assert not result.row("mono", "stereo").table.is_comparable  # The prediction of 1.6 times 2 m is out of range.
 
 
 def test_views_without_reference_are_not_counted(lab: Path, tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_views_without_reference_are_not_counted(lab: Path, tmp_path: Path) -> N
     (reference,) = result.references
     assert (reference.views, reference.views_with, reference.frame_share) == (VIEWS, VIEWS // 2, 0.5)
     row = result.row("mono", "half")
-    assert (row.table.views, row.table.ranked, row.frame_share) == (VIEWS // 2, True, 0.5)
+    assert (row.table.views, row.table.is_comparable, row.frame_share) == (VIEWS // 2, True, 0.5)
 
 
 def test_equal_names_are_made_unique(lab: Path) -> None:

@@ -1,0 +1,100 @@
+"""Scores of views, the metrics of a table as functions of them, and their bootstrap intervals."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample
+from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics
+from rebar_depth_bench.scoring.protocol import WITHIN_MM
+
+SCALE_MEDIAN = "scale_median"
+"""Key of the median over views of the scale factor in ``VIEW_METRICS``."""
+
+_VIEW_INDEX = re.compile("[0-9]{4}")
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """Metrics of one view; ``scale``, ``native`` and ``scaled`` are None without valid predictions.
+
+    ``rank_error`` is None in results of the previous protocol.
+    """
+
+    view_id: str
+    scored_px: int
+    coverage: float
+    rank_error: float | None
+    scale: float | None
+    native: DepthMetrics | None
+    scaled: DepthMetrics | None
+    within_mm: Mapping[int, float]
+
+
+def _metric_getter(alignment: str, name: str) -> Callable[[ViewScore], float | None]:
+    return lambda view: getattr(getattr(view, alignment), name, None)
+
+
+def _within_getter(tolerance_mm: int) -> Callable[[ViewScore], float | None]:
+    return lambda view: view.within_mm[tolerance_mm]
+
+
+VIEW_METRICS: Mapping[str, Callable[[ViewScore], float | None]] = {
+    "coverage": lambda view: view.coverage,
+    "rank_error": lambda view: view.rank_error,
+    **{
+        f"{alignment}.{name}": _metric_getter(alignment, name)
+        for alignment in ("native", "scaled")
+        for name in METRIC_NAMES
+    },
+    SCALE_MEDIAN: lambda view: view.scale,
+    **{f"within_mm.{tolerance_mm}": _within_getter(tolerance_mm) for tolerance_mm in WITHIN_MM},
+}
+"""Functions that return a view's value of each table metric, by metric name; None where the view has no value."""
+
+
+def view_intervals(views: Sequence[ViewScore]) -> dict[str, Interval | None]:
+    """Return the 95 % interval of every table metric of the given views."""
+    estimates = bootstrap_estimates(views, resample(protocol_indices([view.view_id for view in views])))
+    return {name: interval(estimates[:, k]) for k, name in enumerate(VIEW_METRICS)}
+
+
+def bootstrap_estimates(views: Sequence[ViewScore], resampling: Resampling) -> Float64[ndarray, "draws k"]:
+    """Return the table's ``VIEW_METRICS`` in each resample of the views; NaN where undefined."""
+    values = view_metric_values(views)
+    draws = resampling.means(values)
+    scale = list(VIEW_METRICS).index(SCALE_MEDIAN)
+    draws[:, scale] = resampling.medians(values[:, scale])
+    return draws
+
+
+def view_metric_values(views: Sequence[ViewScore]) -> Float64[ndarray, "n k"]:
+    """Return the ``VIEW_METRICS`` of each view, one row per view; NaN where it has no value."""
+    rows = [[get(view) for get in VIEW_METRICS.values()] for view in views]
+    return np.array(rows, dtype=np.float64).reshape(len(views), len(VIEW_METRICS))
+
+
+def protocol_indices(view_ids: Sequence[str]) -> list[int]:
+    """Return each view's index in its full camera protocol: the four digits at the end of its view_id.
+
+    If the ids do not all end with four digits, or are not in ascending order, return the positions in the
+    sequence.
+    """
+    suffixes = [view_id.rpartition("/")[2] for view_id in view_ids]
+    if all(_VIEW_INDEX.fullmatch(suffix) for suffix in suffixes) and suffixes == sorted(suffixes):
+        return [int(suffix) for suffix in suffixes]
+    return list(range(len(suffixes)))
+
+
+def sort_key_worst_first(view: ViewScore) -> float:
+    """Return the sort key of a view: its rank error, or native AbsRel in results of the previous protocol."""
+    if view.rank_error is not None:
+        return view.rank_error
+    return math.inf if view.native is None else view.native.abs_rel

@@ -1,0 +1,68 @@
+"""Configs beside which the paper's rows are shown."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from dataset_builder.config.catalog import CONFIGS
+from dataset_builder.config.specs import ConfigSpec
+from dataset_builder.config.trajectories import view_count
+from dataset_builder.pipeline.plan import config_parameters
+from rebar_depth_bench.data.digests import views_digest
+from rebar_depth_bench.data.manifest import DatasetConfig, ViewRecord
+from rebar_depth_bench.scoring.published_match import PublishedMatch, published_match
+
+
+def config_of_spec(spec: ConfigSpec, views: int | None = None) -> DatasetConfig:
+    """Return the config of a complete build, or of one with fewer ``views``."""
+    count = view_count(spec.protocol)
+    records = [
+        ViewRecord(view_id=f"{spec.name}/{n:04d}", left="0" * 64, right="0" * 64, steel_px=9, scored_px=1)
+        for n in range(views or count)
+    ]
+    entry: dict[str, Any] = {
+        **json.loads(json.dumps(config_parameters(spec))),
+        "key": "k",
+        "protocol_views": count,
+        "mesh": "m.ply",
+        "sheet": "s.webp",
+        "shards": ["x.parquet"],
+        "ground_truth_digest": views_digest(records),
+        "views": [record.model_dump() for record in records],
+    }
+    return DatasetConfig(**entry, root="x", manifest_entry=entry)
+
+
+EXACT = {"lattice-zed": "lattice", "pile": "pile", "pier": "pier"}
+OTHER_OPTICS = {"lattice": "lattice", "lattice-zed-raw": "lattice"}
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_standard_configs(name: str) -> None:
+    expected = None
+    if scene := (EXACT | OTHER_OPTICS).get(name):
+        expected = PublishedMatch(scene, same_optics=name in EXACT)
+    assert published_match(config_of_spec(CONFIGS[name]())) == expected
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda spec: replace(spec, rig=replace(spec.rig, width=640, height=360)),
+        lambda spec: replace(spec, protocol=replace(spec.protocol, azimuths=11)),
+        lambda spec: replace(spec, protocol=replace(spec.protocol, distance_to="centre")),
+        lambda spec: replace(spec, scene=replace(spec.scene, environment="laboratory")),
+        lambda spec: replace(spec, scene=replace(spec.scene, assembly=replace(spec.scene.assembly, levels=44))),
+    ],
+)
+def test_other_conditions_have_no_match(change: Callable[[ConfigSpec], ConfigSpec]) -> None:
+    assert published_match(config_of_spec(change(CONFIGS["pier"]()))) is None
+
+
+def test_incomplete_build_has_no_match() -> None:
+    assert published_match(config_of_spec(CONFIGS["pier"](), views=6)) is None
