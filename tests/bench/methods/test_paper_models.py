@@ -195,7 +195,8 @@ def test_predict_command_runs_paper_model(
     assert (score(archive, tiny_root).tables["lattice-orbit"].coverage or 0) > 0.5
     with zipfile.ZipFile(archive) as entries:
         metadata = json.loads(entries.read("submission.json"))
-    assert metadata["uses_intrinsics"] is METHODS[name].info.uses_intrinsics
+    assert metadata["inputs"] == {"foundation-stereo": "stereo", "unidepth": "rgb"}.get(name, "rgb+K")
+    assert metadata["uses_ground_truth"] is False
     assert metadata["method"] == f"{name}:{'23-51-11' if name == 'foundation-stereo' else 'theirs'}"
     assert re.search(r"as in the paper; weights sha256:[0-9a-f]{64}$", metadata["description"])
     assert "talkative" not in capsys.readouterr().out

@@ -205,7 +205,7 @@ def test_predict_command_runs_hf_folder(
             np.testing.assert_allclose(
                 np.load(entry), FX / (0.5 * W), rtol=1e-6
             )  # fx of the dataset at this image size.
-    assert metadata["uses_intrinsics"] is True
+    assert (metadata["inputs"], metadata["uses_ground_truth"]) == ("rgb+K", False)
     assert metadata["method"] == "hf:pro"
     assert re.search(r"focal length given; weights sha256:[0-9a-f]{64}$", metadata["description"])
 

@@ -103,7 +103,7 @@ def test_command_reports_link_in_one_line(root: Path, tmp_path: Path) -> None:
     process = run_in_process(main, "--out", root, "--config", "pile", "--views", "1")
     assert (process.returncode, process.stdout) == (2, "")
     assert process.stderr.strip() == (
-        f"error: {root}/meshes: is a symbolic link, expected a file or folder that can be replaced"
+        f"error: {root}/meshes: is a symbolic link, expected a file or folder (links are not followed here)"
     )
 
 
