@@ -148,13 +148,13 @@ def short_digest(digest: str, digits: int = 12) -> str:
 
 
 def table_notes(table: Table) -> list[str]:
-    """Return sentences on a row that is not ranked or not comparable, and on its errors beside the references."""
+    """Return sentences on why a row is not ranked, or its errors not compared with those of others."""
     notes = []
     if reason := unranked_reason(table):
         notes.append(f"Not ranked: {reason}.")
     if reasons := incomparable_reasons(table):
         notes.append(f"Errors of valid predictions are not compared with those of others: {'; '.join(reasons)}.")
-    return notes + reference_findings(table)
+    return notes
 
 
 def unranked_reason(table: Table) -> str:

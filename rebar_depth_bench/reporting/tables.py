@@ -142,7 +142,7 @@ def _print_notes(result: Result, console: Console) -> None:
     )
     _print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE} ‡: not ranked.")
     for name, table in result.tables.items():
-        for note in formatting.table_notes(table):
+        for note in (*formatting.table_notes(table), *formatting.reference_findings(table)):
             _print_line(console, f"{printable(name)}: {note}", style="yellow")
     [all_groups] = _LAYOUTS[0]
     if formatting.has_dash(group.cells(table) for group in all_groups for table in result.tables.values()):

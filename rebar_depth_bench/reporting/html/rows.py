@@ -25,7 +25,10 @@ class Cell:
 
 @dataclass(frozen=True)
 class ScoreRow:
-    """Formatted cells of one config or view, for the tables of errors and of coverage."""
+    """Formatted cells of one config or view, for the tables of errors and of coverage.
+
+    ``notes`` say why a row is not ranked or compared, ``findings`` set its errors beside the reference errors.
+    """
 
     name: str
     views: Cell
@@ -33,6 +36,7 @@ class ScoreRow:
     rank_error: Cell
     ranked: bool
     notes: list[str]
+    findings: list[str]
     native: list[Cell]
     scaled: list[Cell]
     scale: Cell
@@ -70,6 +74,7 @@ def table_row(name: str, table: Table) -> ScoreRow:
         ),
         ranked=table.ranked,
         notes=formatting.table_notes(table),
+        findings=formatting.reference_findings(table),
         native=_metric_cells(table.native, formatting.metric_interval_cells(intervals, "native")),
         scaled=_metric_cells(table.scaled, formatting.metric_interval_cells(intervals, "scaled")),
         scale=_cell(
@@ -93,6 +98,7 @@ def view_row(view: ViewScore) -> ScoreRow:
         rank_error=_cell(formatting.rank_error_cell(view.rank_error), view.rank_error),
         ranked=True,
         notes=[],
+        findings=[],
         native=_metric_cells(view.native, no_intervals),
         scaled=_metric_cells(view.scaled, no_intervals),
         scale=_cell(formatting.scale_cell(view.scale), view.scale),
