@@ -22,8 +22,8 @@ from dataset_builder.cli import main as rebar_build
 from rebar_depth_bench import score
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.cli.main import main as rebar_bench
-from rebar_depth_bench.submission import config_of
 from rebar_depth_bench.submission.metadata import METADATA_NAME
+from rebar_depth_bench.view_ids import config_of
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,15 @@ from huggingface_hub import DatasetCardData
 
 from cards.templates import render
 from rebar_depth_bench.data.columns import COLUMN_DESCRIPTIONS, column_kind, features
-from rebar_depth_bench.data.manifest import CENTRE, NEAREST_STEEL, DatasetConfig
+from rebar_depth_bench.data.dataset_config import CENTRE, NEAREST_STEEL, DatasetConfig
+from rebar_depth_bench.data.shards import SCENE_COLUMN, lacks_scene_column
 from rebar_depth_bench.reporting.formatting import DASH
 from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.view_ids import TEST_SPLIT
 
 if TYPE_CHECKING:
-    from datasets import DatasetInfo
+    from datasets import DatasetInfo, Features
 
-SPLIT = "test"
 _OPTICS_TEXTS = {
     "ideal": "",
     "raw": "factory-calibrated lenses, on the distorted grid as the sensor sees it",
@@ -90,7 +91,7 @@ def _card_metadata(version: str, configs: Sequence[DatasetConfig]) -> DatasetCar
     infos = {config.name: _dataset_info(config, version) for config in configs}
     DatasetInfosDict(infos).to_dataset_card_data(card)
     card["configs"] = [
-        {"config_name": config.name, "data_files": [{"split": SPLIT, "path": _shard_pattern(config.shards)}]}
+        {"config_name": config.name, "data_files": [{"split": TEST_SPLIT, "path": _shard_pattern(config.shards)}]}
         for config in configs
     ]
     return card
@@ -100,10 +101,10 @@ def _dataset_info(config: DatasetConfig, version: str) -> DatasetInfo:
     from datasets import DatasetInfo, SplitDict, SplitInfo
 
     size = config.manifest_entry["bytes"]
-    split = SplitInfo(SPLIT, num_examples=len(config.views), num_bytes=size)
+    split = SplitInfo(TEST_SPLIT, num_examples=len(config.views), num_bytes=size)
     return DatasetInfo(
-        features=features(),
-        splits=SplitDict({SPLIT: split}),
+        features=_stored_features(config),
+        splits=SplitDict({TEST_SPLIT: split}),
         config_name=config.name,
         version=version,
         dataset_size=size,
@@ -111,10 +112,18 @@ def _dataset_info(config: DatasetConfig, version: str) -> DatasetInfo:
     )
 
 
+def _stored_features(config: DatasetConfig) -> Features:
+    """Return the features of a config's shards; those of earlier versions have no column ``scene``."""
+    from datasets import Features
+
+    is_old = lacks_scene_column(config)
+    return Features({name: kind for name, kind in features().items() if not is_old or name != SCENE_COLUMN})
+
+
 def _shard_pattern(shards: Iterable[str]) -> str:
     """Return the glob pattern of a config's shards, ``<config>/test-*-<digest>.parquet``."""
     shard = next(iter(shards))
-    return f"{shard.partition('/')[0]}/{SPLIT}-*-{shard.rpartition('-')[2]}"
+    return f"{shard.partition('/')[0]}/{TEST_SPLIT}-*-{shard.rpartition('-')[2]}"
 
 
 def _config_row(config: DatasetConfig) -> dict[str, Any]:

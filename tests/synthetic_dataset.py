@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,14 @@ import pyarrow.parquet as pq
 
 from dataset_builder.pipeline.shards import View, encode_view
 from rebar_depth_bench import SubmissionWriter
-from rebar_depth_bench.data.digests import views_digest
+from rebar_depth_bench.data.bars import BARS_FILE, Bar, write_bars
+from rebar_depth_bench.data.dataset_config import ViewRecord
+from rebar_depth_bench.data.digests import file_sha256, views_digest
 from rebar_depth_bench.data.eye_view import EyeView
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, ViewRecord
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT
 from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.view_ids import config_of
 
 HEIGHT, WIDTH = 90, 160
 BASELINE_M = 0.12
@@ -33,16 +37,50 @@ def write_dataset(root: Path, configs: Sequence[str], views: int) -> None:
     )
     (root / "README.md").write_text(f"---\nconfigs:\n{config_yaml}---\n")
     entries = {config: _config_entry(config, config_records) for config, config_records in records.items()}
-    digest = views_digest(record for config_records in records.values() for record in config_records)
+    _write_manifest(root, entries, [record for config in configs for record in records[config]], {})
+
+
+def _write_manifest(
+    root: Path, entries: Mapping[str, object], records: Sequence[ViewRecord], files: Mapping[str, str]
+) -> None:
     manifest = {
         "format": MANIFEST_FORMAT,
         "version": "0.0.0",
         "protocol": PROTOCOL,
-        "ground_truth": {"digest": digest},
+        "ground_truth": {"digest": views_digest(records)},
         "configs": entries,
-        "files": {},
+        "files": files,
     }
     (root / MANIFEST_FILE).write_text(json.dumps(manifest))
+
+
+def write_split_dataset(root: Path, scenes: Mapping[str, str], views: int) -> None:
+    """Write a dataset folder with the config ``cages``; ``scenes`` are its scenes with their splits.
+
+    Each scene has ``views`` views, a shard, and one bar in ``bars.parquet`` whose diameter in mm is the number of
+    the scene, counted from 1.
+    """
+    (root / "cages").mkdir(parents=True)
+    records: list[ViewRecord] = []
+    entries = []
+    for number, (scene, split) in enumerate(scenes.items(), start=1):
+        ids = [f"cages/{split}-{scene}-{index:04d}" for index in range(views)]
+        encoded = [
+            encode_view(replace(_view(view_id, 10 * number + n), scene=scene)) for n, view_id in enumerate(ids)
+        ]
+        shard = f"cages/{split}-{scene}.parquet"
+        pq.write_table(pa.concat_tables([table for table, _ in encoded]), root / shard, row_group_size=1)
+        records += [record for _, record in encoded]
+        entries.append({"name": scene, "split": split, "board": None, "mesh": f"{scene}.ply", "shards": [shard]})
+    axis_m = ((0.0, 0.0, 0.3), (0.0, 1.0, 0.3))
+    bars = {scene: (Bar(1, "vertical", 0.001 * n, axis_m),) for n, scene in enumerate(scenes, start=1)}
+    write_bars(root / BARS_FILE, bars)
+    entry = {
+        **_config_entry("cages", records),
+        "scenes": entries,
+    }
+    entry = {key: value for key, value in entry.items() if key not in ("scene", "mesh", "shards")}
+    _write_manifest(root, {"cages": entry}, records, {BARS_FILE: file_sha256(root / BARS_FILE)})
 
 
 def write_archive(path: Path, configs: Sequence[str], views: int, method: str, seed: int) -> None:
@@ -57,7 +95,7 @@ def write_archive(path: Path, configs: Sequence[str], views: int, method: str, s
 
 def _write_config(folder: Path, config: str, views: int) -> list[ViewRecord]:
     folder.mkdir(parents=True)
-    encoded = [encode_view(_view(config, index)) for index in range(views)]
+    encoded = [encode_view(_view(_view_id(config, index), index)) for index in range(views)]
     pq.write_table(pa.concat_tables([table for table, _ in encoded]), folder / "test.parquet", row_group_size=1)
     return [record for _, record in encoded]
 
@@ -79,9 +117,9 @@ def _view_id(config: str, index: int) -> str:
     return f"{config}/{index:04d}"
 
 
-def _view(config: str, index: int) -> View:
+def _view(view_id: str, index: int) -> View:
     eye = _eye(index)
-    return View(_view_id(config, index), eye, eye, BASELINE_M)
+    return View(view_id, config_of(view_id), eye, eye, BASELINE_M)
 
 
 def _eye(index: int) -> EyeView:

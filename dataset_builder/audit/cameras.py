@@ -29,8 +29,8 @@ from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import EYES
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS
-from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera, camera_centre
 from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration

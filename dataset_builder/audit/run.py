@@ -28,7 +28,8 @@ from dataset_builder.config.trajectories import subset
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.columns import COLUMNS
 from rebar_depth_bench.data.dataset import iterate_rows
-from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
+from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
 

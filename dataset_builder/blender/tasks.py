@@ -112,7 +112,7 @@ def _render_view(
             rgb = render_colour(camera, _cycles_seed(config, index, eye_index), context.scratch)
         with watch.timing("truth"):
             eyes[eye] = replace(context.caster.cast(camera, context.rays_cam[eye]), rgb=rgb)
-    return View(view_id(config.name, index), eyes["left"], eyes["right"], config.rig.baseline_m)
+    return View(view_id(config.name, index), config.scene.name, eyes["left"], eyes["right"], config.rig.baseline_m)
 
 
 def _cycles_seed(config: ConfigSpec, index: int, eye_index: int) -> int:

@@ -12,7 +12,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rebar_depth_bench.data.manifest import CENTRE
+from rebar_depth_bench.data.dataset_config import CENTRE
 from rebar_depth_bench.errors import MeshError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration

@@ -19,7 +19,7 @@ from dataset_builder.config.specs import (
 )
 from dataset_builder.scene.steel_distance import radii_at_steel_distance_m
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.data.manifest import NEAREST_STEEL
+from rebar_depth_bench.data.dataset_config import NEAREST_STEEL
 from rebar_depth_bench.geometry.cameras import look_at, rigid
 
 GOLDEN_TURN_DEG = 360.0 * (5**0.5 - 1) / 2

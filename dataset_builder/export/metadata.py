@@ -8,7 +8,8 @@ from typing import Any
 from dataset_builder.export.images import EXPORT_FILES
 from dataset_builder.export.nerfstudio import json_lines
 from dataset_builder.export.views import CameraView
-from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
+from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.geometry.cameras import Camera
 
 LICENCE = "CC BY 4.0 (https://creativecommons.org/licenses/by/4.0/)"

@@ -15,7 +15,8 @@ from dataset_builder.export.target import export_target
 from dataset_builder.export.views import CameraView, StoredView, stored_views
 from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
-from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
+from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
 

@@ -8,9 +8,9 @@ from typing import Any
 
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.dataset import iterate_undecoded
+from rebar_depth_bench.data.dataset_config import DatasetConfig, ViewRecord
 from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.eye_view import camera_from_row, eye_from_row, truth_columns
-from rebar_depth_bench.data.manifest import DatasetConfig, ViewRecord
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera
 

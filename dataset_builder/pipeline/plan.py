@@ -14,6 +14,7 @@ from dataset_builder.config.trajectories import subset, view_count
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging
 from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.model import Assembly
+from rebar_depth_bench.data.columns import ROW_SCHEMA
 from rebar_depth_bench.data.digests import parameters_digest
 from rebar_depth_bench.version import software_version
 
@@ -53,7 +54,7 @@ class ConfigPlan:
 def plan_config(spec: ConfigSpec, views: int | None, out: Path) -> ConfigPlan:
     """Return the plan of one config in the dataset folder ``out``; ``views`` limits the number of views."""
     indices = tuple(subset(view_count(spec.protocol), views))
-    key_inputs = [config_parameters(spec), indices, VIEWS_PER_SHARD, generator_versions()]
+    key_inputs = [config_parameters(spec), indices, VIEWS_PER_SHARD, ROW_SCHEMA.names, generator_versions()]
     key = parameters_digest(key_inputs)
     return ConfigPlan(spec, indices, key, Staging(out / BUILD_FOLDER / f"{spec.name}-{key[:_KEY_CHARACTERS]}"))
 

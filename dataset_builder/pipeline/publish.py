@@ -33,14 +33,9 @@ from dataset_builder.pipeline.shards import pack_shard, read_staged_record, spli
 from dataset_builder.scene.assemblies import aim_point_m
 from rebar_depth_bench.atomic_io import exclusive_lock, write_bytes, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest, views_digest
-from rebar_depth_bench.data.manifest import (
-    MANIFEST_FILE,
-    MANIFEST_FORMAT,
-    DatasetConfig,
-    DatasetFolder,
-    open_folder,
-)
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, DatasetFolder, open_folder
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.ground_truth import reference_errors
 from rebar_depth_bench.scoring.protocol import PROTOCOL
@@ -115,8 +110,10 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
         "ground_truth_digest": views_digest(records),
         "views": [record.model_dump() for record in records],
     }
-    entry["reference"] = reference_errors(DatasetConfig(**entry, root=str(out), manifest_entry=entry)).to_dict()
-    config = DatasetConfig(**entry, root=str(out), manifest_entry=entry)
+    name = plan.spec.name
+    without_reference = DatasetConfig(**DatasetConfig.fields_of_entry(name, entry), root=str(out))
+    entry["reference"] = reference_errors(without_reference).to_dict()
+    config = DatasetConfig(**DatasetConfig.fields_of_entry(name, entry), root=str(out))
     write_contact_sheet(config, out / config.sheet)
     _write_bars(out, plan)
     _write_manifest(out, {**published_configs(out), config.name: config})

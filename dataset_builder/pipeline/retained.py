@@ -15,7 +15,8 @@ from pydantic import Field
 from dataset_builder.config.rigs import GRIDS
 from dataset_builder.pipeline.folder import MESHES, PICTURES, SHARD_NAME
 from dataset_builder.pipeline.plan import ConfigPlan, config_parameters
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetConfig, open_folder
+from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.errors import DatasetError, InputError, Problem
 from rebar_depth_bench.validation import StrictModel, format_location, number, one_of, text, validate_table
 

@@ -22,8 +22,8 @@ import pyarrow.parquet as pq
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.columns import ROW_SCHEMA, features
+from rebar_depth_bench.data.dataset_config import ViewRecord
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeView
-from rebar_depth_bench.data.manifest import ViewRecord
 from rebar_depth_bench.data.parquet import open_parquet
 from rebar_depth_bench.data.shards import rows_table
 from rebar_depth_bench.errors import InputError, Problem, escape_text
@@ -126,9 +126,10 @@ def _open_staged_row(path: Path) -> Iterator[pq.ParquetFile]:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Rendered stereo view of a config; both eyes have colour."""
+    """Rendered stereo view of a scene; both eyes have colour."""
 
     view_id: str
+    scene: str
     left: EyeView
     right: EyeView
     baseline_m: float
@@ -136,7 +137,7 @@ class View:
 
 def encode_view(view: View) -> tuple[pa.Table, ViewRecord]:
     """Return a view as a one-row table of ``ROW_SCHEMA``, and its record for the manifest."""
-    cells: dict[str, Any] = {"view_id": view.view_id, "baseline_m": view.baseline_m}
+    cells: dict[str, Any] = {"view_id": view.view_id, "scene": view.scene, "baseline_m": view.baseline_m}
     for name, eye in (("left", view.left), ("right", view.right)):
         cells |= {f"{name}_{kind}": cell for kind, cell in _eye_cells(eye).items()}
     cells["left_preview"] = _image_cell(codecs.encode_palette(*depth_preview(view.left.depth_m)))

@@ -33,7 +33,7 @@ from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.score import score_evaluation
 from rebar_depth_bench.scoring.view_score import sort_key_worst_first
-from rebar_depth_bench.submission import config_of
+from rebar_depth_bench.view_ids import config_of
 
 
 def render_error_maps(evaluation: Evaluation, result: Result, count: int) -> Iterator[tuple[str, bytes]]:

@@ -14,6 +14,7 @@ from leaderboard.scoring.process_limits import limit_process
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.submission import SubmissionMeta, open_submission
+from rebar_depth_bench.view_ids import TEST_SPLIT
 
 POOL_PROCESSES = 2
 CRASHED = Problem("damaged", "", "the archive cannot be read: the process that reads it crashed")
@@ -64,7 +65,7 @@ class ArchiveChecker:
 
 def _check_archive(archive: str, data: str) -> Verdict:
     try:
-        with open_submission(archive, open_folder(data).expected_views()) as submission:
+        with open_submission(archive, open_folder(data).expected_views(TEST_SPLIT)) as submission:
             problems = tuple(submission.problems())
             if submission.meta is None or problems:
                 return problems

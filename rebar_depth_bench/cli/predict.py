@@ -13,6 +13,7 @@ from rebar_depth_bench.methods import METHODS, find_method
 from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S
 from rebar_depth_bench.methods.registry import FROM_FOLDER
 from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
 
 SUMMARY = "run a method on a dataset and write a submission archive"
 
@@ -37,6 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="extend",
         metavar="NAME",
         help="configs to predict (default: all in the folder)",
+    )
+    parser.add_argument(
+        "--split",
+        choices=SPLITS,
+        default=TEST_SPLIT,
+        help="split of the configs that have several (default: %(default)s)",
     )
     limit = (
         "time limit on an ONNX model for each view, and for opening it; onnxruntime stops between two operators "
@@ -82,6 +89,7 @@ def run(options: argparse.Namespace) -> None:
             options.data,
             options.out,
             configs=options.config,
+            split=options.split,
             expect_digest=folder.digest,
             progress=bars.update,
         )

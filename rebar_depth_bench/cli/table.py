@@ -12,6 +12,7 @@ from rebar_depth_bench.console import ProgressBars, add_data, add_output_file, a
 from rebar_depth_bench.reporting.comparison_tables import disambiguate_method_names, print_paper_table
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import results_csv
+from rebar_depth_bench.scoring.comparison import check_same_splits
 from rebar_depth_bench.scoring.score import score
 
 SUMMARY = "print several submissions and the paper's rows in the layout of its Table I"
@@ -44,6 +45,7 @@ def run(options: argparse.Namespace) -> None:
             )
             for archive in options.archives
         ]
+    check_same_splits(results)
     results = disambiguate_method_names(results)
     published = not options.no_published
     if options.latex:

@@ -15,14 +15,13 @@ if TYPE_CHECKING:
 EYES = ("left", "right")
 COLUMNS = (
     "view_id",
+    "scene",
     *(f"{eye}_{kind}" for kind in ("rgb", "depth", "mask", "bars") for eye in EYES),
     "left_preview",
     *(f"{eye}_{kind}" for kind in ("K", "distortion", "cam_from_world") for eye in EYES),
     "baseline_m",
 )
 """Names of the columns, in order."""
-SPLIT = "test"
-"""Split that is loaded."""
 
 
 def features(*, decode_images: bool = True) -> Features:
@@ -34,7 +33,7 @@ def features(*, decode_images: bool = True) -> Features:
 
     image, number = Image(decode=decode_images), Value("float64")
     by_kind = {
-        "view_id": Value("string"),
+        **dict.fromkeys(("view_id", "scene"), Value("string")),
         **dict.fromkeys(("rgb", "mask", "bars", "preview"), image),
         "depth": Value("binary"),
         "K": List(List(number, length=3), length=3),
@@ -46,7 +45,9 @@ def features(*, decode_images: bool = True) -> Features:
 
 
 COLUMN_DESCRIPTIONS: dict[str, str] = {
-    "view_id": "`<config>/<0000>`: the view's index in its full protocol, also when a subset is built",
+    "view_id": "`<config>/<0000>`: the view's index in its full protocol, also when a subset is built; "
+    "`<config>/<split>-<scene>-<0000>` in configs of several scenes",
+    "scene": "name of the scene, as in `bars.parquet` and `meshes/`",
     "rgb": "lossless 8-bit colour, H x W, WebP",
     "depth": "lossless float32 planar depth along the optical axis, metres, 0.0 where there is no surface; "
     'TIFF, which `Image(mode="F")` of `datasets` reads too',
@@ -69,7 +70,7 @@ def column_kind(name: str) -> str:
 
 _IMAGE_CELL = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 _ARROW_TYPES: Mapping[str, pa.DataType] = {
-    "view_id": pa.string(),
+    **dict.fromkeys(("view_id", "scene"), pa.string()),
     **dict.fromkeys(("rgb", "mask", "bars", "preview"), _IMAGE_CELL),
     "depth": pa.binary(),
     "K": pa.list_(pa.list_(pa.float64(), 3), 3),

@@ -9,9 +9,10 @@ from typing import Any, Self
 
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.columns import column_kind
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS, camera_array
-from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import DatasetError, escape_text
+from rebar_depth_bench.validation import short_repr
 
 _IMAGE_DECODERS: Mapping[str, Callable[[bytes, tuple[int, int]], Any]] = {
     "rgb": codecs.decode_rgb,
@@ -25,18 +26,19 @@ _IMAGE_DECODERS: Mapping[str, Callable[[bytes, tuple[int, int]], Any]] = {
 class RowDecoder:
     """Decoder of the rows of a config; it is small and can be pickled for worker processes.
 
-    ``grid`` is the image size (height, width) that every cell must have.
+    ``grid`` is the image size (height, width) that every cell must have, ``scene_by_view`` the name of the
+    scene of each view.
     """
 
     root: str
     config: str
     grid: tuple[int, int]
-    view_ids: tuple[str, ...]
+    scene_by_view: Mapping[str, str]
 
     @classmethod
     def of(cls, config: DatasetConfig) -> Self:
         """Return the decoder of a config."""
-        return cls(config.root, config.name, config.grid, config.view_ids)
+        return cls(config.root, config.name, config.grid, config.scene_by_view)
 
     def row(self, row: Mapping[str, Any]) -> dict[str, Any]:
         """Decode the cells of a row. Raises ``DatasetError`` naming view and column if a cell is damaged."""
@@ -50,7 +52,7 @@ class RowDecoder:
 
     def _decode(self, column: str, cell: Any, view: str) -> Any:
         try:
-            return self._decode_kind(column_kind(column), cell)
+            return self._decode_kind(column_kind(column), cell, view)
         except Exception as error:  # Pillow raises many types, which depend on the damage.
             reason = escape_text(str(error) or type(error).__name__)
             raise DatasetError(
@@ -58,15 +60,17 @@ class RowDecoder:
                 f"rebar-bench verify {self.root} lists damaged files"
             ) from error
 
-    def _decode_kind(self, kind: str, cell: Any) -> Any:
+    def _decode_kind(self, kind: str, cell: Any, view: str) -> Any:
         if kind in _IMAGE_DECODERS:
             return _IMAGE_DECODERS[kind](cell["bytes"], self.grid)
         if kind == "depth":
             return codecs.decode_depth(cell, self.grid)
         if kind in CAMERA_KINDS:
             return camera_array(kind, cell)
-        if kind == "view_id" and cell not in self.view_ids:
+        if kind == "view_id" and cell not in self.scene_by_view:
             raise ValueError("it is not in the manifest")
+        if kind == "scene" and cell != (expected := self.scene_by_view.get(view, cell)):
+            raise ValueError(f"got {short_repr(cell)}, expected {expected} as in the manifest")
         if kind == "baseline_m" and not (isinstance(cell, float) and math.isfinite(cell)):
             raise ValueError(f"got {cell}, expected a length in metres")
         return cell

@@ -23,7 +23,7 @@ _MAX_STRING_BYTES = 1 << 22
 
 @dataclass(frozen=True)
 class Table:
-    """Expected content of a Parquet file; further columns are not read.
+    """Expected content of a Parquet file; further columns are not read, and those of ``optional`` may be absent.
 
     ``max_values`` limits the values of a column on average over the rows (default: 1 per row), and ``max_bytes``
     the decoded size of all columns of ``schema`` together.
@@ -33,6 +33,7 @@ class Table:
     max_rows: int
     max_bytes: int
     max_values: Mapping[str, int] = field(default_factory=dict)
+    optional: frozenset[str] = frozenset()
 
     @property
     def max_footer_bytes(self) -> int:
@@ -69,7 +70,7 @@ def open_parquet(stream: BinaryIO, table: Table) -> Iterator[tuple[pq.ParquetFil
     max_elements = max(len(footer.chunks), 1 << 12)
     limits = {"thrift_string_size_limit": _MAX_STRING_BYTES, "thrift_container_size_limit": max_elements}
     with pq.ParquetFile(stream, **limits) as file:
-        _check_schema(file.schema_arrow, table.schema)
+        _check_schema(file.schema_arrow, table)
         yield file, footer.rows
 
 
@@ -78,15 +79,19 @@ def read_rows(
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of an open file, of which ``batch_rows`` are converted to Python objects at a time.
 
-    ``row_groups`` are the indices of the row groups that are read (default: all).
+    Columns of ``schema`` that the file lacks are left out. ``row_groups`` are the indices of the row groups that
+    are read (default: all).
     """
-    for batch in file.iter_batches(batch_size=batch_rows, row_groups=row_groups, columns=schema.names):
-        yield from batch.select(schema.names).cast(schema).to_pylist()
+    present = pa.schema([column for column in schema if column.name in file.schema_arrow.names])
+    for batch in file.iter_batches(batch_size=batch_rows, row_groups=row_groups, columns=present.names):
+        yield from batch.select(present.names).cast(present).to_pylist()
 
 
-def _check_schema(found: pa.Schema, expected: pa.Schema) -> None:
-    for column in expected:
+def _check_schema(found: pa.Schema, table: Table) -> None:
+    for column in table.schema:
         occurrences = found.names.count(column.name)
+        if not occurrences and column.name in table.optional:
+            continue
         if occurrences != 1:
             raise ParquetError(f"the file has {occurrences or 'no'} columns named {column.name}, expected one")
         found_type = found.field(column.name).type

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -10,13 +10,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from rebar_depth_bench.data.columns import ROW_SCHEMA, column_kind
-from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.parquet import Table, open_parquet, read_rows
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
 from rebar_depth_bench.limits import CELL_BYTES
 
 _VALUES = {"K": 9, "distortion": 5, "cam_from_world": 16}
 """Numbers in a cell, by column kind; the other columns have one value per cell."""
+SCENE_COLUMN = "scene"
 
 
 def check_shards(config: DatasetConfig) -> None:
@@ -25,7 +26,7 @@ def check_shards(config: DatasetConfig) -> None:
     Raises ``DatasetError`` for a missing or damaged shard, and if the manifest has another number of views.
     """
     if config.local is not None:
-        table, rows = rows_table(ROW_SCHEMA.names, len(config.views)), 0
+        table, rows = _shard_table(config, ROW_SCHEMA.names), 0
         for shard in config.shards:
             with _open_shard(config, shard, table) as (_, shard_rows):
                 rows += shard_rows
@@ -62,12 +63,23 @@ def iterate_shards(
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of ``shards``, with the cells of ``columns`` encoded; only one is in memory at a time.
 
-    Raises ``DatasetError`` for a damaged shard.
+    Shards of earlier versions, which have no column ``scene``, are completed. Raises ``DatasetError`` for a
+    damaged shard.
     """
-    table = rows_table(columns, len(config.views))
+    table = _shard_table(config, ("view_id", *columns))
     for shard in shards:
         with _open_shard(config, shard, table) as (file, _):
-            yield from read_rows(file, table.schema)
+            for row in read_rows(file, table.schema):
+                yield _completed_row(config, row, columns)
+
+
+def lacks_scene_column(config: DatasetConfig) -> bool:
+    """Return whether the first shard of a config is of an earlier version, without the column ``scene``.
+
+    Raises ``DatasetError`` as ``check_shards``.
+    """
+    with _open_shard(config, config.shards[0], _shard_table(config, ROW_SCHEMA.names)) as (file, _):
+        return SCENE_COLUMN not in file.schema_arrow.names
 
 
 def rows_at(config: DatasetConfig, columns: Sequence[str], positions: Sequence[int]) -> Iterator[dict[str, Any]]:
@@ -77,11 +89,12 @@ def rows_at(config: DatasetConfig, columns: Sequence[str], positions: Sequence[i
     ``check_shards``.
     """
     check_shards(config)
-    table, first = rows_table(columns, len(config.views)), 0
+    table, first = _shard_table(config, ("view_id", *columns)), 0
     for shard in config.shards:
         with _open_shard(config, shard, table) as (file, rows):
             row_groups = [position - first for position in positions if first <= position < first + rows]
-            yield from read_rows(file, table.schema, row_groups=row_groups)
+            for row in read_rows(file, table.schema, row_groups=row_groups):
+                yield _completed_row(config, row, columns)
         first += rows
 
 
@@ -92,14 +105,26 @@ def damaged_error(config: DatasetConfig, error: Exception, shard: str = "") -> D
     return DatasetError(f"{place}{reason}; rebar-bench verify {config.root} lists damaged files")
 
 
-def rows_table(columns: Sequence[str], max_rows: int) -> Table:
-    """Return the table that a Parquet file with ``columns`` of dataset rows must hold."""
+def rows_table(columns: Sequence[str], max_rows: int, optional: Iterable[str] = ()) -> Table:
+    """Return the table that a Parquet file with ``columns`` of dataset rows must hold; some may be absent."""
     return Table(
         pa.schema([ROW_SCHEMA.field(name) for name in dict.fromkeys(columns)]),
         max_rows=max_rows,
         max_bytes=max_rows * len(columns) * CELL_BYTES.value(),
         max_values={name: _VALUES.get(column_kind(name), 1) for name in columns},
+        optional=frozenset(optional),
     )
+
+
+def _shard_table(config: DatasetConfig, columns: Sequence[str]) -> Table:
+    return rows_table(columns, len(config.views), () if config.has_splits else (SCENE_COLUMN,))
+
+
+def _completed_row(config: DatasetConfig, row: Mapping[str, Any], columns: Sequence[str]) -> dict[str, Any]:
+    """Return the cells of ``columns``; a config of several scenes always has the column ``scene``."""
+    if SCENE_COLUMN in columns and SCENE_COLUMN not in row:
+        row = {**row, SCENE_COLUMN: config.scene.name}
+    return {name: row[name] for name in columns}
 
 
 @contextmanager

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.dataset import iterate_rows
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.data.eye_view import eye_from_row, truth_columns
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetConfig, DatasetFolder
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder
 from rebar_depth_bench.errors import DatasetError, Problem, escape_text
 from rebar_depth_bench.paths import path_below
 from rebar_depth_bench.progress import Progress, silent
@@ -26,7 +27,9 @@ def file_problems(folder: DatasetFolder, progress: Progress = silent) -> Iterato
             yield problem
         progress("files", done, len(folder.files))
     used = {
-        name for config in folder.config_by_name.values() for name in (*config.shards, config.mesh, config.sheet)
+        name
+        for config in folder.config_by_name.values()
+        for name in (*config.shards, *config.meshes, config.sheet)
     }
     for name in sorted(used - set(folder.files)):
         yield Problem("missing", name, "has no SHA-256 in the manifest, which names it", "one for each file")
@@ -41,7 +44,7 @@ def truth_problems(config: DatasetConfig, progress: Progress = silent) -> Iterat
     Raises ``DatasetError`` for damaged shards and rows that are not the views of the manifest.
     """
     records = {record.view_id: record for record in config.views}
-    columns = ("view_id", *(name for eye in EYES for name in truth_columns(eye)))
+    columns = ("view_id", "scene", *(name for eye in EYES for name in truth_columns(eye)))
     for done, row in enumerate(iterate_rows(config, columns), start=1):
         record = records[row["view_id"]]
         for eye, expected in (("left", record.left), ("right", record.right)):

@@ -13,8 +13,9 @@ from numpy import ndarray
 from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import EyeView
-from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
+from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.extended.depth_layers import other_layers
 from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_segments, cage_truth

@@ -21,15 +21,17 @@ from numpy import ndarray
 
 from rebar_depth_bench.console import print_notice
 from rebar_depth_bench.data.dataset import iterate_undecoded
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.decoding import RowDecoder
-from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
-from rebar_depth_bench.errors import InputError, MethodError, RebarDepthError
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.errors import DatasetError, InputError, MethodError, RebarDepthError, escape_text
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
 from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
 from rebar_depth_bench.version import software_version
+from rebar_depth_bench.view_ids import TEST_SPLIT
 
 
 def predict(
@@ -38,52 +40,67 @@ def predict(
     archive: str | Path,
     *,
     configs: Sequence[str] | None = None,
+    split: str = TEST_SPLIT,
     expect_digest: str | None = None,
     progress: Progress = silent,
 ) -> dict[str, PreparationReport]:
-    """Predict every view of the named configs (default: all) and write the archive atomically.
+    """Predict a split of the named configs (default: all that have it), and write the archive atomically.
 
     Each view is stored beside the archive until all are predicted: after an interruption, the same call predicts
     only the missing ones. ``submission.json`` records the seconds per view and the method's notes on each config.
-    Returns the report of each config that a multi-view method prepared or on which the method has notes.
+    Returns the report of each scene that a multi-view method prepared, and of each config on which the method has
+    notes, by ``DatasetConfig.label``.
 
-    Raises ``DatasetError`` for an unknown folder or config or another digest than ``expect_digest``,
+    Raises ``DatasetError`` for an unknown folder, config or split or another digest than ``expect_digest``,
     ``InputError`` if ``archive`` is a folder or the folder beside it holds anything but kept predictions, and
     ``MethodError`` if the method cannot run or returns invalid values.
     """
     folder = open_folder(root, expect_digest=expect_digest)
-    chosen = [folder.config(name) for name in dict.fromkeys(configs or folder.configs)]
+    chosen = _chosen_configs(folder, configs, split)
     target = Path(archive)
     if target.is_dir():
         raise InputError(f"{target}: is a folder, expected the name of the archive to write")
     if isinstance(method, MultiViewMethod):
+        chosen = [scene for config in chosen for scene in config.by_scene()]
         for config in chosen:
-            with _wrap_errors(f"{method.info.name}: {config.name}: check"):
+            with _wrap_errors(f"{method.info.name}: {config.label}: check"):
                 method.check(ConfigViews(config))
     # Loading comes first so that its errors occur before anything is written.
     loaded = _load_method(method) if isinstance(method, Method) else None
-    noted = {config.name: report for config in chosen if (report := _first_row_report(method, config))}
+    noted = {config.label: report for config in chosen if (report := _first_row_report(method, config))}
     views = KeptViews.open(target.with_name(f".{target.name}.views"), _run_key(method, chosen))
     usable = _usable_views(views, chosen)
     for config in chosen:
         done = usable & set(config.view_ids)
-        is_prepared = loaded is not None or _has_preparation(views, config.name)
+        is_prepared = loaded is not None or _has_preparation(views, config.label)
         if len(done) == len(config.views) and is_prepared:
             continue
         predictor = loaded or _prepare_method(method, ConfigViews(config), views, is_prepared, progress)
         _predict_config(method, predictor, config, views, done, progress)
-    prepared = {config.name: report for config in chosen if (report := views.get_preparation(config.name))}
+    prepared = {config.label: report for config in chosen if (report := views.get_preparation(config.label))}
     reports = noted | prepared
     _write_archive(method, target, views, chosen, reports)
     views.remove()
     return reports
 
 
+def _chosen_configs(folder: DatasetFolder, names: Sequence[str] | None, split: str) -> list[DatasetConfig]:
+    """Return the named configs (default: all that have the split), restricted to a split.
+
+    Raises ``DatasetError`` if there is no such config or split.
+    """
+    having_split = [name for name, config in folder.config_by_name.items() if split in config.splits]
+    chosen = [folder.config(name).of_split(split) for name in dict.fromkeys(names or having_split)]
+    if not chosen:
+        raise DatasetError(f"{folder.root}: no config has the split {escape_text(split)}")
+    return chosen
+
+
 def _run_key(method: AnyMethod, configs: Sequence[DatasetConfig]) -> dict[str, Any]:
     """Return everything that determines the predictions."""
     return {
         "method": vars(method.info),
-        "dataset": {config.name: [config.key, config.ground_truth_digest] for config in configs},
+        "dataset": {config.label: [config.key, config.ground_truth_digest] for config in configs},
         "software": software_version(),
     }
 
@@ -103,7 +120,7 @@ def _predict_config(
             prediction = predictor(row)
         depth_m = _validated_depth(method, row["view_id"], prediction, config.grid)
         views.put(row["view_id"], depth_m, time.perf_counter() - start)
-        progress(f"{method.info.name} on {config.name}", count, len(config.views))
+        progress(f"{method.info.name} on {config.label}", count, len(config.views))
 
 
 def _usable_views(views: KeptViews, configs: Sequence[DatasetConfig]) -> set[str]:

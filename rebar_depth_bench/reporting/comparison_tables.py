@@ -164,9 +164,10 @@ def print_paper_table(results: Sequence[Result], console: Console, *, published:
     for config in dict.fromkeys(name for result in results for name in result.tables):
         rows = [(result, result.tables[config]) for result in results if config in result.tables]
         match = rows[0][1].published if published else None
-        views = rows[0][1].views
+        table = rows[0][1]
+        title = formatting.config_title(config, table.split)
         console.print()
-        console.print(plain_text(f"{printable(config)}, {formatting.counted(views, 'view')}", style="italic"))
+        console.print(plain_text(f"{title}, {formatting.counted(table.views, 'view')}", style="italic"))
         console.print(_paper_table(sorted(rows, key=lambda row: _paper_table_sort_key(row[1])), match))
     console.print()
     console.print(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from decimal import ROUND_DOWN, Decimal
 
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.scoring.metrics import METRICS, DepthMetrics
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, OLD_PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.reference import Reference
@@ -245,6 +246,11 @@ def has_dash(rows: Iterable[Iterable[str]]) -> bool:
 def plural(noun: str, count: int) -> str:
     """Return the English noun in the singular or plural for ``count``."""
     return noun if count == 1 else f"{noun}s"
+
+
+def config_title(name: str, split: str | None) -> str:
+    """Return the printable name of a config, with the split of one that has several."""
+    return printable(name) if split is None else f"{printable(name)} ({split})"
 
 
 def counted(count: int, noun: str) -> str:

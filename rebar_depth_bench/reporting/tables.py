@@ -166,7 +166,7 @@ def _rich_table(tables: Mapping[str, Table], groups: Sequence[_ColumnGroup]) -> 
         table.add_column(_header(head, lines), justify="right", no_wrap=True)
     for name, config_table in tables.items():
         cells = [cell for group in groups for cell in group.cells(config_table)]
-        table.add_row(*map(plain_text, [printable(name), *cells]))
+        table.add_row(*map(plain_text, [formatting.config_title(name, config_table.split), *cells]))
         for title, native, scaled in formatting.reference_rows(config_table.reference):
             errors = {_NATIVE.title: native, _SCALED.title: scaled}
             filled = [errors.get(group.title, []) for group in groups]

@@ -27,7 +27,7 @@ from rebar_depth_bench.scoring.view_score import (
     bootstrap_estimates,
     protocol_indices,
 )
-from rebar_depth_bench.submission import config_of
+from rebar_depth_bench.view_ids import config_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -92,8 +92,10 @@ class Comparison:
 def compare(first: Result, other: Result) -> Comparison:
     """Return the differences of ``other`` from ``first``.
 
-    Raises ``InputError`` if they were scored against different ground truth or have no config in common.
+    Raises ``InputError`` if they were scored against different ground truth, have no config in common, or cover
+    different splits of one.
     """
+    check_same_splits([first, other])
     if first.dataset_digest != other.dataset_digest:
         raise InputError(
             f"{other.method} was scored on the dataset {other.dataset_digest}, expected {first.dataset_digest} as "
@@ -110,6 +112,18 @@ def compare(first: Result, other: Result) -> Comparison:
         provenance=Provenance(PROTOCOL, first.dataset_digest, first.dataset_version, archives),
         configs={config: _config_differences(first, other, config) for config in shared},
     )
+
+
+def check_same_splits(results: Sequence[Result]) -> None:
+    """Raise ``InputError`` if two results cover different splits of a config."""
+    first: dict[str, tuple[str, str | None]] = {}
+    for result in results:
+        for name, table in result.tables.items():
+            method, split = first.setdefault(name, (result.method, table.split))
+            if table.split != split:
+                raise InputError(
+                    f"{result.method} covers the split {table.split} of {name}, expected {split} as {method}"
+                )
 
 
 def _config_differences(first: Result, other: Result, config: str) -> list[Difference]:

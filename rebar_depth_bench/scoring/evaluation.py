@@ -8,13 +8,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
+from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
-from rebar_depth_bench.submission import Declaration, SubmissionReader, config_of, open_submission
+from rebar_depth_bench.submission import Declaration, SubmissionReader, open_submission
 from rebar_depth_bench.submission.metadata import NOT_DECLARED
+from rebar_depth_bench.view_ids import TEST_SPLIT, config_of, split_of
 
 
 @dataclass(frozen=True)
@@ -36,9 +38,13 @@ class Evaluation:
 
     @property
     def configs(self) -> tuple[DatasetConfig, ...]:
-        """Configs that the submission contains, in the order of the folder."""
-        present = {config_of(view_id) for view_id in self.submission.view_ids}
-        return tuple(config for name, config in self.folder.config_by_name.items() if name in present)
+        """Configs that the submission contains, in the order of the folder, each restricted to its split."""
+        split_by_config = {config_of(view_id): split_of(view_id) for view_id in self.submission.view_ids}
+        return tuple(
+            config.of_split(split_by_config[name] or TEST_SPLIT) if config.has_splits else config
+            for name, config in self.folder.config_by_name.items()
+            if name in split_by_config
+        )
 
     def check_entries(self, progress: Progress = silent) -> None:
         """Decode every entry. Raises ``SubmissionError`` with all problems."""

@@ -12,7 +12,7 @@ from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.reference import NO_REFERENCE
 from rebar_depth_bench.scoring.rounding import rounded
-from rebar_depth_bench.submission import config_of
+from rebar_depth_bench.view_ids import config_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -18,8 +18,8 @@ from numpy import ndarray
 from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
 from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
 from rebar_depth_bench.data.dataset import iterate_rows
+from rebar_depth_bench.data.dataset_config import DatasetConfig, ViewRecord
 from rebar_depth_bench.data.eye_view import EyeView, eye_from_row, truth_columns
-from rebar_depth_bench.data.manifest import DatasetConfig, ViewRecord
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.metrics import median
@@ -123,7 +123,7 @@ def cache_inputs(config: DatasetConfig, protocol: str, extra_digest: str = "") -
     return {
         "protocol": protocol,
         "config": config.name,
-        "scene": config.scene.name,
+        "scenes": [scene.name for scene in config.scenes],
         "grid": config.grid,
         "views": [view.model_dump() for view in config.views],
         "extra": extra_digest,

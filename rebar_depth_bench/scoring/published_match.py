@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rebar_depth_bench.data.manifest import NEAREST_STEEL, DatasetConfig, Trajectory
+from rebar_depth_bench.data.dataset_config import NEAREST_STEEL, DatasetConfig, Trajectory
 
 _GRID = (720, 1280)
 _IDEAL = ("ideal", 0.12)
@@ -93,10 +93,10 @@ def published_match(config: DatasetConfig) -> PublishedMatch | None:
     Assembly, board, environment, image size and trajectory have to be equal, with all of its views and without
     appearance variants.
     """
-    scene, rig = config.manifest_entry["scene"], config.manifest_entry["rig"]
     is_complete = len(config.views) == config.protocol_views and config.grid == _GRID
-    if not is_complete or config.scene.appearance.variants:
+    if config.has_splits or not is_complete or config.scene.appearance.variants:
         return None
+    scene, rig = config.manifest_entry["scene"], config.manifest_entry["rig"]
     shown = (
         scene.get("assembly"),
         config.scene.board.markers if config.scene.board else 0,

@@ -37,7 +37,8 @@ class Table:
     """Metrics of one config: means over its views, and the median of their scale factors.
 
     ``rank_error`` is None in results of the previous protocol; ``reference`` are the config's reference errors,
-    and ``published`` is the scene of the paper's Table I that it shows, if any.
+    and ``published`` is the scene of the paper's Table I that it shows, if any. ``split`` is None for a config of
+    one scene.
     ``intervals`` has the 95 % block bootstrap interval of each of ``VIEW_METRICS``, None where it is undefined.
     """
 
@@ -52,6 +53,7 @@ class Table:
     within_mm: Mapping[int, float | None]
     reference: Reference = NO_REFERENCE
     published: PublishedMatch | None = None
+    split: str | None = None
     intervals: Mapping[str, Interval | None] = field(default_factory=dict)
 
     @property
@@ -142,6 +144,7 @@ def tabulate(
     declared: Declaration = NOT_DECLARED,
     reference: Reference = NO_REFERENCE,
     published: PublishedMatch | None = None,
+    split: str | None = None,
 ) -> Table:
     """Return the table of a config from the scores of its scored views.
 
@@ -164,6 +167,7 @@ def tabulate(
         within_mm={t: mean([view.within_mm[t] for view in views]) for t in WITHIN_MM},
         reference=reference,
         published=published,
+        split=split,
         intervals=view_intervals(views) if views else dict.fromkeys(VIEW_METRICS),
     )
 
@@ -192,6 +196,7 @@ def _within_dict(within_mm: Mapping[int, float | None] | Mapping[int, float]) ->
 
 def _table_dict(table: Table) -> dict[str, Any]:
     return {
+        **({} if table.split is None else {"split": table.split}),
         "views": table.views,
         "views_scored": table.views_scored,
         "coverage": rounded(table.coverage),

@@ -20,9 +20,9 @@ from rebar_depth_bench.scoring.published_match import PublishedMatch
 from rebar_depth_bench.scoring.reference import Reference
 from rebar_depth_bench.scoring.result import Result, Table
 from rebar_depth_bench.scoring.view_score import VIEW_METRICS, ViewScore
-from rebar_depth_bench.submission.entries import config_of
 from rebar_depth_bench.submission.metadata import INPUTS, Declaration
 from rebar_depth_bench.validation import Expected, StrictModel, field_error, one_of, text, validate_table
+from rebar_depth_bench.view_ids import SPLITS, config_of
 
 
 def read_result(data: bytes, where: str) -> Result:
@@ -197,6 +197,7 @@ class _TableJson(_AlignedJson):
     rank_error: _Share | None = None
     reference: _ReferenceJson = _ReferenceJson()
     published: _PublishedJson | None = None
+    split: Annotated[str, one_of(*SPLITS)] | None = None
     ci95: _IntervalsJson = _IntervalsJson()
 
     @property
@@ -214,6 +215,7 @@ class _TableJson(_AlignedJson):
             rank_error=self.rank_error,
             reference=self.reference.content(),
             published=None if self.published is None else PublishedMatch(**vars(self.published)),
+            split=self.split,
             native=self.metrics(self.native),
             scaled=self.metrics(self.scaled),
             scale_median=self.scale_median,

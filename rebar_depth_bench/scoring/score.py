@@ -113,7 +113,13 @@ def _score_all(
             work, range(len(truths)), workers, progress, f"scoring {config.name}", len(truths)
         )
         scores = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
-        tables[config.name] = tabulate(scores, evaluation.declared, truths.reference, published_match(config))
+        tables[config.name] = tabulate(
+            scores,
+            evaluation.declared,
+            truths.reference,
+            published_match(config),
+            config.scenes[0].split if config.has_splits else None,
+        )
         views += scores
         problems += [outcome for outcome in scored if isinstance(outcome, Problem)]
         unread.difference_update(truths.view_ids)

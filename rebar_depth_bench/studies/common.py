@@ -21,7 +21,7 @@ from rich.table import Table as RichTable
 
 from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.console import add_output_file
-from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent

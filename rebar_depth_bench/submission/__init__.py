@@ -1,7 +1,7 @@
 """Submission archives: writing, validation and reading of predictions."""
 
 from rebar_depth_bench.errors import EntryError
-from rebar_depth_bench.submission.entries import ExpectedViews, config_of
+from rebar_depth_bench.submission.entries import ExpectedViews
 from rebar_depth_bench.submission.metadata import INPUTS, Declaration, SubmissionMeta
 from rebar_depth_bench.submission.reader import SubmissionReader, check_archive, open_submission
 from rebar_depth_bench.submission.writer import SubmissionWriter
@@ -15,6 +15,5 @@ __all__ = [
     "SubmissionReader",
     "SubmissionWriter",
     "check_archive",
-    "config_of",
     "open_submission",
 ]

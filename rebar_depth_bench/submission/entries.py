@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 from rebar_depth_bench.errors import Problem, escape_text
 from rebar_depth_bench.submission.formats import FORMATS
 from rebar_depth_bench.submission.metadata import MAX_METADATA_BYTES, METADATA_NAME
+from rebar_depth_bench.view_ids import config_of, split_of
 
 ExpectedViews = Mapping[str, tuple[int, int]]
-"""Mapping of every view_id (``<config>/<0000>``) of a dataset folder to its (H, W) in pixels."""
+"""Mapping of every view_id of a dataset folder to its (H, W) in pixels."""
 
 _ANY_SUFFIX = f"one of {', '.join(FORMATS)}"
 _ZIP_HINT = "zip with: zip -r submission.zip submission.json <config> -x '*.DS_Store'"
@@ -29,11 +30,6 @@ class MatchedEntries:
     views: Mapping[str, int]
     metadata: int | None
     problems: tuple[Problem, ...]
-
-
-def config_of(view_id: str) -> str:
-    """Return the config of a view: the part of ``view_id`` before the slash."""
-    return view_id.partition("/")[0]
 
 
 def entry_view_id(name: str, expected: ExpectedViews) -> str | None:
@@ -138,14 +134,25 @@ def _duplicate_problems(candidates: Mapping[str, Sequence[int]], names: Sequence
 def _missing_problems(candidates: Mapping[str, Sequence[int]], expected: ExpectedViews) -> Iterator[Problem]:
     if METADATA_NAME not in candidates:
         yield Problem("missing", METADATA_NAME, "missing", '{"method": "name"}')
-    configs = {config_of(view_id) for view_id in candidates if view_id != METADATA_NAME}
-    if not configs:
+    parts = {(config_of(view_id), split_of(view_id)) for view_id in candidates if view_id != METADATA_NAME}
+    if not parts:
         yield Problem("missing", "", "no view was found", f"<view_id> with {_ANY_SUFFIX} of at least one config")
+    for config, splits in _splits_by_config(parts).items():
+        if len(splits) > 1:
+            found = f"the archive has views of the splits {' and '.join(sorted(splits))}"
+            yield Problem("conflict", config, found, "views of one split")
     for view in sorted(expected):
-        config = config_of(view)
-        if config in configs and view not in candidates:
-            because = f"because other views of {config} are included"
+        config, split = config_of(view), split_of(view)
+        if (config, split) in parts and view not in candidates:
+            because = f"because other views of {config if split is None else f'{config}, {split},'} are included"
             yield Problem("missing", view, "missing", f"{_ANY_SUFFIX}, {because}")
+
+
+def _splits_by_config(parts: Iterable[tuple[str, str | None]]) -> dict[str, set[str]]:
+    splits: dict[str, set[str]] = defaultdict(set)
+    for config, split in parts:
+        splits[config].add(split or "")
+    return splits
 
 
 def _is_macos_metadata(name: str) -> bool:

@@ -55,7 +55,13 @@ class StoredImages:
                 )
                 eyes[name] = replace(caster.cast(camera), rgb=rgb)
             row, record = encode_view(
-                View(view_id(config.name, index), eyes["left"], eyes["right"], config.rig.baseline_m)
+                View(
+                    view_id(config.name, index),
+                    config.scene.name,
+                    eyes["left"],
+                    eyes["right"],
+                    config.rig.baseline_m,
+                )
             )
             stage_row(staging.row(index), row, record)
             on_view_done(index)

@@ -15,7 +15,8 @@ from cards.dataset import STEEL_DEPTH, column_rows
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.specs import DomeSpec
 from rebar_depth_bench.data.columns import features
-from rebar_depth_bench.data.manifest import NEAREST_STEEL, open_folder
+from rebar_depth_bench.data.dataset_config import NEAREST_STEEL
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods import own_methods
 
 

@@ -30,7 +30,8 @@ from rebar_depth_bench.reporting.html.view_images import PANEL_WIDTH, colour_bar
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.result_io import read_result
 from rebar_depth_bench.scoring.view_score import ViewScore, sort_key_worst_first
-from rebar_depth_bench.submission import Declaration, config_of
+from rebar_depth_bench.submission import Declaration
+from rebar_depth_bench.view_ids import config_of
 
 
 @dataclass(frozen=True)

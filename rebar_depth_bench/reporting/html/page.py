@@ -39,7 +39,8 @@ from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.view_score import ViewScore, sort_key_worst_first
-from rebar_depth_bench.submission import SubmissionReader, config_of
+from rebar_depth_bench.submission import SubmissionReader
+from rebar_depth_bench.view_ids import config_of
 
 WORST_SHOWN = 10
 """Number of views of a config that are listed openly; the full list is collapsed."""

@@ -60,7 +60,7 @@ def table_row(name: str, table: Table) -> ScoreRow:
     intervals = table.intervals
     within_intervals = [formatting.interval_cell(intervals.get(f"within_mm.{t}"), 1, 100.0) for t in WITHIN_MM]
     return ScoreRow(
-        name=printable(name),
+        name=formatting.config_title(name, table.split),
         views=Cell(f"{table.views_scored}/{table.views}", table.views_scored),
         coverage=_cell(
             formatting.coverage_percent(table.coverage),

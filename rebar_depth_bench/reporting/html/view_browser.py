@@ -9,7 +9,7 @@ from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.reporting.html.rows import ScoreRow, view_row
 from rebar_depth_bench.reporting.html.view_images import ViewImages, ViewPanels, view_images
 from rebar_depth_bench.scoring.view_score import ViewScore, sort_key_worst_first
-from rebar_depth_bench.submission import config_of
+from rebar_depth_bench.view_ids import config_of
 
 VIEWS_SHOWN = 12
 """Default number of views of a config shown with images, about 150 kB each at 1280 x 720."""

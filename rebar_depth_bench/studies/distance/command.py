@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rebar_depth_bench.console import ProgressBars, add_archive, add_data
-from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import open_evaluation

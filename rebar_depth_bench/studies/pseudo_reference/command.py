@@ -15,7 +15,8 @@ from pathlib import Path
 from statistics import median
 
 from rebar_depth_bench.console import ProgressBars, add_workers
-from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
+from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent

@@ -76,7 +76,7 @@ def test_streaming_gives_the_same_rows(tiny_root: Path) -> None:
 @pytest.mark.parametrize("streaming", [False, True])
 @pytest.mark.parametrize("num_workers", [0, 2])
 def test_torch_batch_shapes_and_dtypes(tiny_root: Path, streaming: bool, num_workers: int) -> None:
-    ds = rdb.load(tiny_root, "lattice", streaming=streaming)  # type: ignore[call-overload]
+    ds = rdb.load(tiny_root, "lattice", streaming=streaming)
     loaded_ids: list[str] = []
     for batch in rdb.torch_loader(ds, batch_size=4, num_workers=num_workers):
         count = len(batch["view_id"])

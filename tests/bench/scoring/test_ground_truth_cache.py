@@ -19,9 +19,10 @@ from rebar_depth_bench import DatasetError, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import read_bars, write_bars
 from rebar_depth_bench.data.codecs import decode_depth, encode_depth
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.data.eye_view import EyeView
-from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.progress import silent
 from rebar_depth_bench.scoring.ground_truth import config_truth, verified_views

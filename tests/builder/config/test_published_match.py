@@ -13,8 +13,8 @@ from dataset_builder.config.catalog import CONFIGS
 from dataset_builder.config.specs import ConfigSpec
 from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.plan import config_parameters
+from rebar_depth_bench.data.dataset_config import DatasetConfig, ViewRecord
 from rebar_depth_bench.data.digests import views_digest
-from rebar_depth_bench.data.manifest import DatasetConfig, ViewRecord
 from rebar_depth_bench.scoring.published_match import PublishedMatch, published_match
 
 
@@ -35,7 +35,7 @@ def config_of_spec(spec: ConfigSpec, views: int | None = None) -> DatasetConfig:
         "ground_truth_digest": views_digest(records),
         "views": [record.model_dump() for record in records],
     }
-    return DatasetConfig(**entry, root="x", manifest_entry=entry)
+    return DatasetConfig(**DatasetConfig.fields_of_entry(entry["name"], entry), root="x")
 
 
 EXACT = {"lattice-zed": "lattice", "pile": "pile", "pier": "pier"}

@@ -1,0 +1,280 @@
+"""Configs of several scenes and splits: loading, archives, scoring, and methods that see one scene at a time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import rebar_depth_bench as rdb
+from rebar_depth_bench.data.columns import COLUMNS
+from rebar_depth_bench.data.dataset import ConfigViews, iterate_rows
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
+from rebar_depth_bench.data.verification import truth_problems
+from rebar_depth_bench.errors import DatasetError, InputError, SubmissionError
+from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
+from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.scoring.comparison import compare
+from rebar_depth_bench.scoring.result_io import read_result
+from tests.synthetic_dataset import HEIGHT, WIDTH, write_dataset, write_split_dataset
+
+SCENES = {"a": "train", "b-1": "train", "c": "validation", "d": "test", "e": "test"}
+VIEWS = 3
+SPLIT_VIEWS = {"train": 6, "validation": 3, "test": 6}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes") / "dataset"
+    write_split_dataset(folder, SCENES, VIEWS)
+    return folder
+
+
+def view_ids(split: str) -> list[str]:
+    return [
+        f"cages/{split}-{scene}-{index:04d}"
+        for scene, of_split in SCENES.items()
+        for index in range(VIEWS)
+        if of_split == split
+    ]
+
+
+def write_truth(root: Path, archive: Path, split: str, *, leave_out: int = 0, factor: float = 1.0) -> Path:
+    rows = list(rdb.load(root, "cages", split=split, streaming=True, columns=["view_id", "left_depth"]))
+    with rdb.SubmissionWriter(archive, "truth") as writer:
+        for row in rows[leave_out:]:
+            writer.add(row["view_id"], row["left_depth"] * np.float32(factor))
+    return archive
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+@pytest.mark.parametrize("split", SPLIT_VIEWS)
+def test_load_returns_the_views_of_a_split(root: Path, split: str, streaming: bool) -> None:
+    loaded = rdb.load(root, "cages", split=split, streaming=streaming, columns=["view_id", "scene"])
+    assert str(loaded.split) == split
+    rows = list(loaded)
+    assert [row["view_id"] for row in rows] == view_ids(split)
+    assert all(row["view_id"] == f"cages/{split}-{row['scene']}-{row['view_id'][-4:]}" for row in rows)
+
+
+def test_default_split_is_test(root: Path) -> None:
+    assert [row["view_id"] for row in rdb.load(root, "cages", columns=["view_id"])] == view_ids("test")
+
+
+def test_missing_split_is_refused(root: Path, tmp_path: Path) -> None:
+    write_dataset(tmp_path / "one", ["lattice"], 2)
+    with pytest.raises(DatasetError, match="no split train, expected test"):
+        rdb.load(tmp_path / "one", "lattice", split="train")
+    with pytest.raises(DatasetError, match=r"no split '\\x1b\[m'"):
+        rdb.load(root, "cages", split="\x1b[m")
+
+
+@pytest.mark.parametrize("split", SPLIT_VIEWS)
+def test_truth_of_one_split_is_perfect(root: Path, tmp_path: Path, split: str) -> None:
+    result = rdb.score(write_truth(root, tmp_path / "a.zip", split), root)
+    table = result.tables["cages"]
+    assert (table.split, table.views, table.rank_error) == (split, SPLIT_VIEWS[split], 0.0)
+    assert json.loads(result.to_json())["tables"]["cages"]["split"] == split
+    assert read_result(result.to_json(), "result").to_json() == result.to_json()
+    assert [view.view_id for view in result.views] == view_ids(split)
+
+
+def test_archive_covers_exactly_one_split(root: Path, tmp_path: Path) -> None:
+    with rdb.SubmissionWriter(tmp_path / "both.zip", "both") as writer:
+        for split in ("train", "test"):
+            for view_id in view_ids(split):
+                writer.add(view_id, np.ones((HEIGHT, WIDTH), np.float32))
+    with pytest.raises(SubmissionError) as caught:
+        rdb.score(tmp_path / "both.zip", root)
+    assert [(problem.code, problem.where) for problem in caught.value.problems] == [("conflict", "cages")]
+
+
+def test_split_that_is_present_must_be_complete(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(SubmissionError) as caught:
+        rdb.score(write_truth(root, tmp_path / "a.zip", "test", leave_out=2), root)
+    missing = [("missing", view_id) for view_id in view_ids("test")[:2]]
+    assert [(problem.code, problem.where) for problem in caught.value.problems] == missing
+
+
+def test_results_of_different_splits_are_not_compared(root: Path, tmp_path: Path) -> None:
+    results = [rdb.score(write_truth(root, tmp_path / f"{split}.zip", split), root) for split in ("train", "test")]
+    with pytest.raises(InputError, match="covers the split test of cages, expected train"):
+        compare(*results)
+
+
+INFO = MethodInfo("shifted", "test", ("left_depth", "scene"), False, "here", "none")
+
+
+def multi_view_method(prepared: list[ConfigViews]) -> MultiViewMethod:
+    """Return a method that predicts the mean depth of all views of the scene, and records what it was given."""
+
+    def prepare(views: ConfigViews, work: Path, progress: Any) -> Prepared:
+        prepared.append(views)
+        rows = list(views.rows("left_depth", "scene"))
+        assert {row["scene"] for row in rows} == {views.source.scene.name}
+        assert [row["view_id"] for row in rows] == list(views.view_ids)
+        mean_m = np.mean([row["left_depth"] for row in rows], axis=0).astype(np.float32)
+        return Prepared(lambda _: mean_m, {"scene": views.source.scene.name})
+
+    return MultiViewMethod(INFO, prepare, lambda _: None)
+
+
+def test_multi_view_method_receives_one_scene_at_a_time(root: Path, tmp_path: Path) -> None:
+    prepared: list[ConfigViews] = []
+    reports = predict(multi_view_method(prepared), root, tmp_path / "a.zip", split="train")
+    assert [views.config for views in prepared] == ["cages.train-a", "cages.train-b-1"]
+    assert {label: report.notes for label, report in reports.items()} == {
+        "cages.train-a": {"scene": "a"},
+        "cages.train-b-1": {"scene": "b-1"},
+    }
+    table = rdb.score(tmp_path / "a.zip", root).tables["cages"]
+    assert table.split == "train"
+    assert table.native is not None
+    assert 0 < table.native.mae_cm < 3  # The views of a scene differ by centimetres.
+
+
+def test_interrupted_prediction_of_scenes_resumes(root: Path, tmp_path: Path) -> None:
+    prepared: list[ConfigViews] = []
+    method = multi_view_method(prepared)
+
+    def stop(what: str, done: int, total: int) -> None:
+        if what.endswith("test-e"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        predict(method, root, tmp_path / "a.zip", progress=stop)
+    assert not (tmp_path / "a.zip").exists()
+    predict(method, root, tmp_path / "a.zip")
+    assert [views.config for views in prepared] == ["cages.test-d", "cages.test-e", "cages.test-e"]
+    predict(method, root, tmp_path / "b.zip")
+    assert (tmp_path / "a.zip").read_bytes() != b""
+    assert rdb.score(tmp_path / "a.zip", root).tables == rdb.score(tmp_path / "b.zip", root).tables
+
+
+def test_single_view_method_predicts_the_chosen_split(root: Path, tmp_path: Path) -> None:
+    predict(Method(INFO, lambda: lambda row: row["left_depth"]), root, tmp_path / "a.zip", split="validation")
+    result = rdb.score(tmp_path / "a.zip", root)
+    assert [view.view_id for view in result.views] == view_ids("validation")
+
+
+def test_prediction_of_a_split_that_no_config_has_is_refused(tmp_path: Path) -> None:
+    write_dataset(tmp_path / "one", ["lattice"], 2)
+    method = Method(INFO, lambda: lambda row: row["left_depth"])
+    with pytest.raises(DatasetError, match="no config has the split train"):
+        predict(method, tmp_path / "one", tmp_path / "a.zip", split="train")
+    with pytest.raises(DatasetError, match="lattice has no split train"):
+        predict(method, tmp_path / "one", tmp_path / "a.zip", split="train", configs=["lattice"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one"]
+
+
+def test_what_needs_one_scene_refuses_several(root: Path) -> None:
+    with pytest.raises(DatasetError, match="cages has 5 scenes, expected one"):
+        open_folder(root).config("cages").scene  # noqa: B018
+
+
+def without_scene_column(root: Path) -> None:
+    """Rewrite the shards as an earlier version wrote them."""
+    for shard in root.glob("*/*.parquet"):
+        pq.write_table(pq.read_table(shard).drop_columns(["scene"]), shard, row_group_size=1)
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+@pytest.mark.parametrize("columns", [None, ["scene"], ["view_id"], ["scene", "view_id"]])
+def test_older_folder_without_scene_column_loads(
+    tmp_path: Path, streaming: bool, columns: list[str] | None
+) -> None:
+    write_dataset(tmp_path / "old", ["lattice"], 2)
+    without_scene_column(tmp_path / "old")
+    rows = list(rdb.load(tmp_path / "old", "lattice", streaming=streaming, columns=columns))
+    assert [list(row) for row in rows] == [list(columns or COLUMNS)] * 2
+    assert all(row.get("scene", "lattice") == "lattice" for row in rows)
+    config = open_folder(tmp_path / "old").config("lattice")
+    assert [row["scene"] for row in iterate_rows(config, ["scene"])] == ["lattice"] * 2
+    assert list(truth_problems(config)) == []
+
+
+def test_scene_column_is_required_where_configs_have_several_scenes(tmp_path: Path) -> None:
+    write_split_dataset(tmp_path / "new", SCENES, 1)
+    without_scene_column(tmp_path / "new")
+    with pytest.raises(DatasetError, match="no columns named scene"):
+        rdb.load(tmp_path / "new", "cages")
+
+
+def test_rows_under_another_scene_are_refused(tmp_path: Path) -> None:
+    write_split_dataset(tmp_path / "new", SCENES, 1)
+    shard = tmp_path / "new" / "cages" / "test-d.parquet"
+    table = pq.read_table(shard)
+    position = table.schema.get_field_index("scene")
+    pq.write_table(table.set_column(position, "scene", pa.array(["e"])), shard)
+    for rows in (
+        rdb.load(tmp_path / "new", "cages"),
+        rdb.load(tmp_path / "new", "cages", streaming=True),
+        truth_problems(open_folder(tmp_path / "new").config("cages")),
+    ):
+        with pytest.raises(DatasetError, match="scene is damaged: got 'e', expected d"):
+            list(rows)
+
+
+Entry = dict[str, Any]
+
+
+def swap_split(entry: Entry) -> None:
+    entry["scenes"][3]["split"] = "train"
+
+
+def share_shard(entry: Entry) -> None:
+    entry["scenes"][1]["shards"] = entry["scenes"][0]["shards"]
+
+
+def repeat_scene(entry: Entry) -> None:
+    entry["scenes"][1]["name"] = "a"
+
+
+def unknown_split(entry: Entry) -> None:
+    entry["scenes"][0]["split"] = "hidden"
+
+
+def escaping_mesh(entry: Entry) -> None:
+    entry["scenes"][2]["mesh"] = "../x.ply"
+
+
+def no_scenes(entry: Entry) -> None:
+    entry["scenes"] = []
+
+
+def scenes_that_are_none(entry: Entry) -> None:
+    entry["scenes"] = {"a": 1}
+
+
+def index_without_digits(entry: Entry) -> None:
+    entry["views"][0]["view_id"] = "cages/train-a-x"
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "where"),
+    [
+        (swap_split, "invalid", "configs.cages.views"),
+        (share_shard, "duplicate", "configs.cages.scenes"),
+        (repeat_scene, "duplicate", "configs.cages.scenes"),
+        (unknown_split, "invalid", "configs.cages.scenes 1: split"),
+        (escaping_mesh, "invalid", "configs.cages.scenes 3: mesh"),
+        (no_scenes, "invalid", "configs.cages.scenes"),
+        (scenes_that_are_none, "invalid", "configs.cages.scenes"),
+        (index_without_digits, "invalid", "configs.cages.views"),
+    ],
+)
+def test_invalid_scenes_of_a_manifest(
+    root: Path, tmp_path: Path, change: Callable[[Entry], None], code: str, where: str
+) -> None:
+    manifest = json.loads((root / MANIFEST_FILE).read_text())
+    change(manifest["configs"]["cages"])
+    (tmp_path / MANIFEST_FILE).write_text(json.dumps(manifest))
+    with pytest.raises(DatasetError) as caught:
+        open_folder(tmp_path)
+    assert (code, where) in [(problem.code, problem.where) for problem in caught.value.problems]
