@@ -146,7 +146,7 @@ class DatasetConfig(Located):
 
     name: _Name
     has_splits: bool
-    scenes: Annotated[tuple[Scene, ...], Strict(False), Field(min_length=1)]
+    scenes: Annotated[tuple[Scene, ...], Strict(False)]
     rig: Rig
     views: Annotated[tuple[ViewRecord, ...], Strict(False)]
     ground_truth_digest: Digest

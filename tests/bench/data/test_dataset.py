@@ -103,7 +103,7 @@ def test_torch_batch_equals_row_values(tiny_root: Path) -> None:
 def test_load_errors_name_expected_values(tiny_root: Path, tmp_path: Path) -> None:
     with pytest.raises(rdb.DatasetError, match=r"no config 'lattise', expected one of lattice, lattice-orbit"):
         rdb.load(tiny_root, "lattise")
-    with pytest.raises(rdb.DatasetError, match=r"no column 'depth', expected some of view_id, left_rgb"):
+    with pytest.raises(rdb.DatasetError, match=r"no column 'depth', expected some of view_id, scene, left_rgb"):
         rdb.load(tiny_root, "lattice", columns=["depth"])
     with pytest.raises(
         rdb.DatasetError, match=r"has no manifest.json, expected a complete dataset folder written by rebar-build"
