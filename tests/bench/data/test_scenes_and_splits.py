@@ -22,7 +22,7 @@ from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, 
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result_io import read_result
-from tests.synthetic_dataset import HEIGHT, WIDTH, write_dataset, write_split_dataset
+from tests.synthetic_dataset import HEIGHT, WIDTH, drop_scene_column, write_dataset, write_split_dataset
 
 SCENES = {"a": "train", "b-1": "train", "c": "validation", "d": "test", "e": "test"}
 VIEWS = 3
@@ -178,19 +178,13 @@ def test_what_needs_one_scene_refuses_several(root: Path) -> None:
         open_folder(root).config("cages").scene  # noqa: B018
 
 
-def without_scene_column(root: Path) -> None:
-    """Rewrite the shards as an earlier version wrote them."""
-    for shard in root.glob("*/*.parquet"):
-        pq.write_table(pq.read_table(shard).drop_columns(["scene"]), shard, row_group_size=1)
-
-
 @pytest.mark.parametrize("streaming", [False, True])
 @pytest.mark.parametrize("columns", [None, ["scene"], ["view_id"], ["scene", "view_id"]])
 def test_older_folder_without_scene_column_loads(
     tmp_path: Path, streaming: bool, columns: list[str] | None
 ) -> None:
     write_dataset(tmp_path / "old", ["lattice"], 2)
-    without_scene_column(tmp_path / "old")
+    drop_scene_column(tmp_path / "old" / "lattice")
     rows = list(rdb.load(tmp_path / "old", "lattice", streaming=streaming, columns=columns))
     assert [list(row) for row in rows] == [list(columns or COLUMNS)] * 2
     assert all(row.get("scene", "lattice") == "lattice" for row in rows)
@@ -201,7 +195,7 @@ def test_older_folder_without_scene_column_loads(
 
 def test_scene_column_is_required_where_configs_have_several_scenes(tmp_path: Path) -> None:
     write_split_dataset(tmp_path / "new", SCENES, 1)
-    without_scene_column(tmp_path / "new")
+    drop_scene_column(tmp_path / "new" / "cages")
     with pytest.raises(DatasetError, match="no columns named scene"):
         rdb.load(tmp_path / "new", "cages")
 
