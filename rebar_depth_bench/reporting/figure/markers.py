@@ -58,7 +58,7 @@ STROKES: tuple[tuple[tuple[Point, ...], ...], ...] = (
 def archive_marker(index: int, count: int, *, hollow: bool) -> tuple[Path, ...]:
     """Return the marker of the archive number ``index`` of ``count``.
 
-    Shapes repeat after eight archives with a dot inside, and after sixteen with a bar. Later markers, which are
+    Shapes repeat after eight archives with a bar inside, and after sixteen with a dot. Later markers, which are
     drawn over earlier ones, are smaller, so that equal points show all of theirs.
     """
     radius = RADIUS * (1.15 - 0.3 * index / max(count - 1, 3))
@@ -68,7 +68,7 @@ def archive_marker(index: int, count: int, *, hollow: bool) -> tuple[Path, ...]:
     outline = Path(
         shape, colour if hollow else PAPER, 1.1 if hollow else 0.5, PAPER if hollow else colour, closed=True
     )
-    variant: Literal["dot", "bar"] | None = (None, "dot", "bar")[index // len(SHAPES) % 3]
+    variant: Literal["dot", "bar"] | None = (None, "bar", "dot")[index // len(SHAPES) % 3]
     if variant == "dot":
         return outline, Path(_scaled(_CIRCLE, 0.4 * radius), None, 0, inside, closed=True)
     if variant == "bar":

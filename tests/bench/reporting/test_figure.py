@@ -76,9 +76,10 @@ def axes(svg: ElementTree.Element) -> tuple[Callable[[float], float], Callable[[
             anchor = str(text.get("text-anchor"))
             at = float(text.get("x", "")) if anchor == "middle" else float(text.get("y", "")) - 0.36 * 6.2
             ticks[anchor].append((math.log(float(content)), at))
-    fits = [np.polyfit(*zip(*ticks[anchor], strict=True), 1) for anchor in ("middle", "end")]
-    x, y = (lambda value, fit=fit: float(np.polyval(fit, math.log(value))) for fit in fits)
-    return x, y
+    (x_slope, x_zero), (y_slope, y_zero) = (
+        np.polyfit([value for value, _ in found], [at for _, at in found], 1) for found in ticks.values()
+    )
+    return lambda native: x_zero + x_slope * math.log(native), lambda scaled: y_zero + y_slope * math.log(scaled)
 
 
 def test_points_and_references_are_where_the_tick_labels_say() -> None:
