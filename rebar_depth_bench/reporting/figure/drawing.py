@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -100,9 +99,3 @@ def shortened(text: str, size: float, width: float) -> str:
         if text_width(short, size) <= width:
             return short
     return "…"
-
-
-def bounds(points: Sequence[Point]) -> tuple[float, float, float, float]:
-    """Return the smallest x and y, and the largest x and y."""
-    xs, ys = zip(*points, strict=True)
-    return min(xs), min(ys), max(xs), max(ys)
