@@ -19,6 +19,7 @@ from rebar_depth_bench.view_ids import TEST_SPLIT
 if TYPE_CHECKING:
     from datasets import DatasetInfo, Features
 
+PRETTY_NAME = "Industrial rebar metric depth"
 _OPTICS_TEXTS = {
     "ideal": "",
     "raw": "factory-calibrated lenses, on the distorted grid as the sensor sees it",
@@ -83,7 +84,7 @@ def _card_metadata(version: str, configs: Sequence[DatasetConfig]) -> DatasetCar
     views = sum(len(config.views) for config in configs)
     card = DatasetCardData(
         license="cc-by-4.0",
-        pretty_name="Industrial rebar metric depth",
+        pretty_name=PRETTY_NAME,
         task_categories=["depth-estimation"],
         tags=["depth", "stereo", "construction", "rebar", "synthetic"],
         size_categories=[next((name for limit, name in _SIZE_CATEGORIES if views < limit), "100K<n<1M")],

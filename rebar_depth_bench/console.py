@@ -122,7 +122,7 @@ def run_command(command: Callable[[], None], interrupted: str = "interrupted") -
     return EXIT_DONE
 
 
-OUTPUT_OPTIONS = ("out", "json", "csv", "html", "latex", "extended_csv")
+OUTPUT_OPTIONS = ("out", "json", "csv", "html", "latex", "extended_csv", "figure", "eval_results")
 """Names (argparse dest) of the options that are output paths."""
 INPUT_FILE_OPTIONS = ("archive", "archives", "first", "others", "method", "token_file")
 """Names of the options that are files to read; a method may be ``FILE.py:NAME`` or ``FILE.toml``."""

@@ -1,9 +1,10 @@
 """Publishing of staged configs into the dataset folder, and the lock that allows one build per folder.
 
 Files are written in an order that can be repaired after an interruption at any point: first the shards, whose
-names contain the digest of their content; then mesh, contact sheet and bars; then the other pictures and the card;
-the manifest last. Files that the new manifest does not list are removed afterwards. If the card, bars or pictures
-of a folder do not match its manifest, a build was interrupted in between, and the next build repairs them.
+names contain the digest of their content; then mesh, contact sheet and bars; then the other pictures, the card and
+``eval.yaml``; the manifest last. Files that the new manifest does not list are removed afterwards. If the card,
+``eval.yaml``, bars or pictures of a folder do not match its manifest, a build was interrupted in between or an
+earlier version built it, and the next build repairs them.
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from cards import dataset_card
+from cards import benchmark_tasks, dataset_card
 from dataset_builder.config.catalog import CONFIGS, view_id
 from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.contact_sheet import write_contact_sheet, write_scenes_strip
 from dataset_builder.pipeline.folder import (
     CARD,
+    EVAL_FILE,
     LOCK,
     MESHES,
     PICTURES,
@@ -75,10 +77,10 @@ def is_published(out: Path, plan: ConfigPlan) -> bool:
 
 
 def repair_metadata(out: Path, plan: ConfigPlan) -> None:
-    """Rewrite bars, card, pictures and manifest if any of them does not match the manifest."""
+    """Rewrite bars, card, ``eval.yaml``, pictures and manifest if any of them does not match the manifest."""
     folder = open_folder(out)
     config = folder.config(plan.spec.name)
-    if not _files_match(folder, (BARS_FILE, CARD, STRIP, config.sheet)):
+    if not _files_match(folder, (BARS_FILE, CARD, EVAL_FILE, STRIP, config.sheet)):
         write_contact_sheet(config, out / config.sheet)
         _write_bars(out, plan)
         _write_manifest(out, folder.config_by_name)
@@ -158,13 +160,15 @@ def _write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
     by_scene = {_strip_key(config): config for config in reversed(ordered)}
     write_scenes_strip(list(reversed(by_scene.values())), out / STRIP)
     write_text(out / CARD, dataset_card(version, digest, ordered))
+    write_text(out / EVAL_FILE, benchmark_tasks([config.name for config in ordered]))
+    metadata = {CARD, EVAL_FILE, BARS_FILE}
     manifest = {
         "format": MANIFEST_FORMAT,
         "version": version,
         "protocol": PROTOCOL,
         "ground_truth": {"digest": digest},
         "configs": {config.name: config.manifest_entry for config in ordered},
-        "files": {name: file_sha256(out / name) for name in sorted({CARD, BARS_FILE, *_listed_files(ordered)})},
+        "files": {name: file_sha256(out / name) for name in sorted(metadata | _listed_files(ordered))},
     }
     write_text(out / MANIFEST_FILE, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
     remove_unlisted_files(out, _listed_files(ordered))

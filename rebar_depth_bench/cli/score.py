@@ -9,9 +9,17 @@ from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
-from rebar_depth_bench.console import ProgressBars, add_archive, add_data, add_output_file, add_workers
+from rebar_depth_bench.console import (
+    ProgressBars,
+    add_archive,
+    add_data,
+    add_output_file,
+    add_workers,
+    print_notice,
+)
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.evaluate import score_extended
+from rebar_depth_bench.reporting.eval_results import check_hub_id, eval_results
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.html.view_browser import VIEWS_SHOWN
@@ -43,6 +51,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also compute boundary, point cloud, layer, per-bar inspection and alignment measures",
     )
     add_output_file(parser, "--extended-csv", "write the extended measures as CSV (implies --extended)")
+    add_output_file(
+        parser, "--eval-results", "write the rank errors as .eval_results YAML of the Hugging Face Hub"
+    )
+    parser.add_argument("--hub-id", metavar="ID", help="id of the dataset on the Hub, for --eval-results")
     add_workers(parser)
 
 
@@ -50,18 +62,25 @@ def run(options: argparse.Namespace) -> None:
     """Score an archive, write the requested files and print the tables."""
     if options.html_views < 0:
         raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
+    hub_id = check_hub_id(options.hub_id) if options.eval_results else ""
     with open_evaluation(options.archive, options.data, expect_digest=options.expect_digest) as evaluation:
         with ProgressBars() as bars:
             result = score_evaluation(evaluation, workers=options.workers, progress=bars.update)
             if options.extended or options.extended_csv:
                 extended = score_extended(result, evaluation, workers=options.workers, progress=bars.update)
                 result = replace(result, extended=extended)
+        if options.eval_results:  # Before any file is written: it fails if no config is ranked.
+            entries, notes = eval_results(result, evaluation.folder, hub_id)
         names = ", ".join(config.name for config in evaluation.configs)
         print_verified(
             evaluation.folder, f"views of {names} verified when their ground truth was stored in the cache"
         )
         if options.html:
             write_report(result, evaluation, options.html, views_shown=options.html_views)
+    if options.eval_results:
+        write_text(options.eval_results, entries)
+        for note in notes:
+            print_notice(note)
     if options.json:
         write_bytes(options.json, result.to_json())
     if options.csv:

@@ -8,8 +8,9 @@ from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.cli.dataset_options import add_expect_digest
-from rebar_depth_bench.console import ProgressBars, add_data, add_output_file, add_workers
+from rebar_depth_bench.console import ProgressBars, add_data, add_output_file, add_workers, print_notice
 from rebar_depth_bench.reporting.comparison_tables import disambiguate_method_names, print_paper_table
+from rebar_depth_bench.reporting.figure.write import check_figure_path, write_figure
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import results_csv
 from rebar_depth_bench.scoring.comparison import check_same_splits
@@ -27,13 +28,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_expect_digest(parser)
     add_output_file(parser, "--latex", "write the table as LaTeX (booktabs)")
     add_output_file(parser, "--csv", "write all tables as CSV")
+    add_output_file(parser, "--figure", "draw native against scaled AbsRel of all configs (.svg or .png)")
     parser.add_argument("--intervals", action="store_true", help="include the 95 %% intervals in the LaTeX table")
-    parser.add_argument("--no-published", action="store_true", help="omit the paper's own rows")
+    parser.add_argument("--no-published", action="store_true", help="omit the paper's own rows and points")
     add_workers(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Score all archives, write the requested files and print the table."""
+    if options.figure:
+        check_figure_path(options.figure)
     with ProgressBars() as bars:
         results = [
             score(
@@ -52,4 +56,7 @@ def run(options: argparse.Namespace) -> None:
         write_text(options.latex, latex_table(results, published=published, intervals=options.intervals))
     if options.csv:
         write_text(options.csv, results_csv(results))
+    if options.figure:
+        for note in write_figure(results, options.figure, published=published):
+            print_notice(note)
     print_paper_table(results, Console(), published=published)

@@ -35,6 +35,11 @@ class Located(StrictModel):
         path = Path(self.root)
         return path if path.is_dir() else None
 
+    @property
+    def repository(self) -> str:
+        """Id of the Hub repository, or empty for a local dataset folder."""
+        return "" if self.local is not None else _hub_root(self.root)[0]
+
     def file(self, name: str) -> Path:
         """Return the local path of a file of the dataset, downloaded first if the dataset is a Hub repository.
 
@@ -51,12 +56,11 @@ class Located(StrictModel):
             return open_regular(self.file(name))
         from huggingface_hub import HfFileSystem, try_to_load_from_cache
 
-        repository, _ = _hub_root(self.root)
-        cached = try_to_load_from_cache(repository, name, repo_type="dataset", revision=self.commit)
+        cached = try_to_load_from_cache(self.repository, name, repo_type="dataset", revision=self.commit)
         if isinstance(cached, str):
             return open_regular(Path(cached))
         try:
-            return cast(BinaryIO, HfFileSystem().open(f"datasets/{repository}@{self.commit}/{name}"))
+            return cast(BinaryIO, HfFileSystem().open(f"datasets/{self.repository}@{self.commit}/{name}"))
         except Exception as error:  # The errors of the HTTP client have no base class in the Hub's package.
             raise _download_error(self.root, name, error) from None
 

@@ -29,7 +29,10 @@ CONFIG = "lattice-orbit"
 ROOT = f"{CASE}/root"
 SHARDS = f"{ROOT}/{CONFIG}/*.parquet"
 METADATA = (f"{ROOT}/manifest.json", f"{ROOT}/README.md", f"{ROOT}/bars.parquet")
-OPTIONAL_OUTPUTS = ("--html", "r.html", "--csv", "r.csv", "--extended-csv", "e.csv", "--html-views", "1")
+OPTIONAL_OUTPUTS = (
+    *("--html", "r.html", "--csv", "r.csv", "--extended-csv", "e.csv", "--html-views", "1"),
+    *("--eval-results", "h.yaml", "--hub-id", "org/rebar"),
+)
 
 
 def write_dataset(workspace: Workspace) -> None:
@@ -132,6 +135,7 @@ _DATASET_FILES = (
     "manifest.json",
     "README.md",
     "bars.parquet",
+    "eval.yaml",
     "pictures/*.webp",
     "meshes/*.ply",
     "*/test-*.parquet",

@@ -12,7 +12,7 @@ from datasets import load_dataset
 
 import rebar_depth_bench as rdb
 from benchmarks.steel_coverage import GRID, measure_views
-from cards import benchmark_card, dataset_card
+from cards import benchmark_card, benchmark_tasks, dataset_card
 from cards.dataset import STEEL_DEPTH, column_rows
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.specs import DomeSpec
@@ -110,3 +110,14 @@ def test_card_states_what_distances_are_to(tiny_root: Path) -> None:
     }
     assert "| 0.22-0.43 m, nearest steel | 7.4-26.2 m |" in rows["pier"]
     assert "| 0.22-0.43 m | – |" in rows["older"]
+
+
+def test_benchmark_tasks_are_the_configs_of_the_folder(tiny_root: Path) -> None:
+    text = (tiny_root / "eval.yaml").read_text()
+    assert text == benchmark_tasks(open_folder(tiny_root).config_by_name)
+    content = yaml.safe_load(text)
+    assert content["tasks"] == [
+        {"id": name, "config": name, "split": "test"} for name in ("lattice", "lattice-orbit")
+    ]
+    assert set(content) == {"name", "description", "evaluation_framework", "tasks"}
+    assert "rank_error of protocol rebar-2: from 0 to 1, lower is better" in content["description"]

@@ -15,6 +15,8 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
+import yaml
+from huggingface_hub import parse_eval_result_entries
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.manifest import open_folder
@@ -26,12 +28,18 @@ import rebar_depth_bench as rdb
 from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.cli.main import main
-root = sys.argv[1]
+root, work = sys.argv[1:]
 folder = open_folder(root)
 print(folder.commit, len(list(iterate_rows(folder.config("lattice-orbit"), ["left_mask"]))))
 print(len(list(rdb.load(root, "lattice-orbit", streaming=True, columns=["view_id"]))))
 print(len(rdb.load(root, "lattice-orbit", columns=["view_id"])))
-sys.exit(main(["verify", root, "--files-only"]))
+if main(["verify", root, "--files-only"]):
+    sys.exit(1)
+with rdb.SubmissionWriter(f"{work}/a.zip", "mine") as writer:
+    for row in iterate_rows(folder.config("lattice-orbit"), ["view_id", "left_depth"]):
+        writer.add(row["view_id"], row["left_depth"])
+outputs = ["--eval-results", f"{work}/results.yaml", "--hub-id", "org/data"]
+sys.exit(main(["score", f"{work}/a.zip", "--data", root, *outputs]))
 """
 
 
@@ -117,7 +125,7 @@ def hub(tiny_root: Path) -> Iterator[tuple[str, list[str]]]:
 def run_script(root: str, home: Path, endpoint: str) -> subprocess.CompletedProcess[str]:
     settings = {"HF_HOME": str(home), "HF_ENDPOINT": endpoint, "HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_XET": "1"}
     quiet = {"HF_HUB_DISABLE_PROGRESS_BARS": "1", "HF_HUB_DISABLE_TELEMETRY": "1", "NO_PROXY": "127.0.0.1"}
-    command = [sys.executable, "-c", SCRIPT, root]
+    command = [sys.executable, "-c", SCRIPT, root, str(home.parent)]
     environment = os.environ | settings | quiet
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
 
@@ -133,7 +141,9 @@ def test_revision_selects_the_commit_of_all_files(
     commit = COMMITS.get(revision[1:] or "main", revision[1:])
     lines = finished.stdout.splitlines()
     assert lines[:3] == [f"{commit} 2", "2", "2"]
-    assert "no problem found in 9 files" in lines[3]
+    assert "no problem found in 10 files" in lines[3]
+    [entry] = parse_eval_result_entries(yaml.safe_load((tmp_path / "results.yaml").read_text()))
+    assert (entry.dataset_id, entry.task_id, entry.dataset_revision) == ("org/data", "lattice-orbit", commit)
     shards = [request for request in requests if request.endswith(".parquet")]
     assert shards
     assert all(f"/{commit}/" in request for request in shards)

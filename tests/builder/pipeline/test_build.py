@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import time
 from functools import partial
@@ -14,6 +15,8 @@ import numpy as np
 import pytest
 
 import rebar_depth_bench as rdb
+from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import open_folder
@@ -224,10 +227,24 @@ def test_leftovers_of_kill_after_publishing_are_repaired(small_root: Path, run_b
         (small_root / BUILD_FOLDER / f"two-bars-{name}" / "rows").mkdir(parents=True)
     assert "up to date" in run_build("--out", small_root, *SMALL).stdout
     assert not (small_root / BUILD_FOLDER).exists()
-    for name in ("README.md", "bars.parquet"):
+    for name in ("README.md", "bars.parquet", "eval.yaml"):
         (small_root / name).unlink()
         assert "up to date" in run_build("--out", small_root, *SMALL).stdout
         assert contents(small_root) == before
+
+
+def test_folder_without_benchmark_tasks_loads_and_gets_them(tiny_root: Path, tmp_path: Path) -> None:
+    """Load and continue a folder of a version that did not write ``eval.yaml``."""
+    root = tmp_path / "older"
+    shutil.copytree(tiny_root, root)
+    before = contents(root)
+    manifest = json.loads((root / "manifest.json").read_text())
+    del manifest["files"]["eval.yaml"]
+    (root / "manifest.json").write_text(json.dumps(manifest))
+    (root / "eval.yaml").unlink()
+    assert len(rdb.load(root, "lattice-orbit")) == 2
+    build(BuildRequest(("lattice-orbit",), 2, 160, 90, samples=1), root)
+    assert contents(root) == before
 
 
 def test_damaged_shard_is_rebuilt(small_root: Path, run_build: RunBuild) -> None:

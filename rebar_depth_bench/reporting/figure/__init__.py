@@ -1,0 +1,1 @@
+"""Figures for print: native against scaled AbsRel of several submissions, as SVG and PNG."""
