@@ -22,6 +22,11 @@ from dataset_builder.cli import main as rebar_build
 from rebar_depth_bench import score
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.cli.main import main as rebar_bench
+from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.ground_truth import config_truth
+from rebar_depth_bench.scoring.metrics import mean
+from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.single_bar import score_single_bar
 from rebar_depth_bench.submission.metadata import METADATA_NAME
 from rebar_depth_bench.view_ids import config_of
 
@@ -90,12 +95,43 @@ def _result(archive: Path, root: Path) -> dict[str, Any]:
     seconds = metadata["runtime"]["seconds"]
     return {
         **result,
+        "single_bar": _single_bar(archive, root),
         "notes": metadata.get("notes"),
         "seconds": {
             "a_view": {config: _median(seconds, config) for config in result["tables"]},
             "preparing": metadata["runtime"].get("preparing"),
         },
     }
+
+
+def _single_bar(archive: Path, root: Path) -> dict[str, dict[str, float | int | None]]:
+    """Return share and AbsRel of the single-bar interior by config, and AbsRel on the whole interior of its views.
+
+    The share is a mean over all views. The errors are means over the views with a predicted single-bar pixel.
+    """
+    by_config = {}
+    with open_evaluation(archive, root) as evaluation:
+        scores = {view.view_id: view for view in score_evaluation(evaluation).views}
+        for config in evaluation.configs:
+            truths = config_truth(config)
+            points = []
+            for position, truth in enumerate(truths):
+                prediction_m, score = evaluation.submission.read(truth.view_id), scores[truth.view_id]
+                single_bar = score_single_bar(truth, truths.single_bar(position), prediction_m, score.scale)
+                points.append((score, single_bar))
+            chosen = [(score, single) for score, single in points if single.native and single.scaled]
+            by_config[config.name] = {
+                "share": mean([single.share for _, single in points]),
+                "views": len(chosen),
+                **{
+                    f"{alignment}_abs_rel_{pixels}": mean(
+                        [getattr(pair[which], alignment).abs_rel for pair in chosen]
+                    )
+                    for alignment in ("native", "scaled")
+                    for which, pixels in enumerate(("interior", "single_bar"))
+                },
+            }
+    return by_config
 
 
 def _median(seconds: Mapping[str, float], config: str) -> float:

@@ -85,7 +85,8 @@ def _torch_numbers(p: torch.Tensor, z: torch.Tensor) -> list[float]:
 
 def extended_rows(root: str, config: str, submission: SubmissionReader) -> list[tuple[str, str]]:
     """Return the milliseconds per view of each measure family, native and scaled together, and their sum."""
-    steel = load_steel_truth(open_folder(root), config)
+    folder = open_folder(root)
+    steel = load_steel_truth(folder, folder.config(config))
     views = []
     for index in range(len(steel)):
         truth = steel.view(index)
@@ -102,7 +103,7 @@ def _evaluate_all(
 ) -> None:
     for truth, p_m in views:
         predictions = [p_m / 1.1 if alignment == SCALED else p_m for alignment in family.alignments]
-        list(family.evaluate(predictions, truth, steel))
+        list(family.evaluate(predictions, truth, steel.bars_by_view[truth.view_id]))
 
 
 def peak_megabytes(archive: Path, root: str) -> float:

@@ -36,11 +36,13 @@ def main(root: str, *configs: str) -> None:
     measures = measures_by_alignment()
     score_rows, error_rows = [], []
     for config in configs or folder.configs:
-        steel = load_steel_truth(folder, config)
+        steel = load_steel_truth(folder, folder.config(config))
         depth_m = {row["view_id"]: row["left_depth"] for row in rdb.load(root, config, columns=COLUMNS)}
         truths = [steel.view(index) for index in range(len(steel))]
         views = [
-            ExtendedView(truth.view_id, view_samples(depth_m[truth.view_id], truth, steel, 1.0))
+            ExtendedView(
+                truth.view_id, view_samples(depth_m[truth.view_id], truth, steel.bars_by_view[truth.view_id], 1.0)
+            )
             for truth in truths
         ]
         table = tabulate_extended(views, range(len(views)), measures)

@@ -10,8 +10,16 @@ import numpy as np
 from jaxtyping import Float, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.extended import alignment, boundary, depth_layers, full_mask, point_cloud, profiles
-from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, load_steel_truth
+from rebar_depth_bench.extended import (
+    alignment,
+    boundary,
+    depth_layers,
+    full_mask,
+    point_cloud,
+    profiles,
+    single_bar,
+)
+from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, SceneBars, load_steel_truth
 from rebar_depth_bench.extended.inspection import evaluate as inspection
 from rebar_depth_bench.extended.inspection import measures as inspection_measures
 from rebar_depth_bench.extended.inspection.visible_segments import visible_segments
@@ -43,7 +51,7 @@ ONCE, NATIVE, SCALED = "once", "native", "scaled"
 Predictions = Sequence[Float64[ndarray, " n"]]
 """Predictions of one view under several alignments: metres on ``truth.index``, NaN where missing."""
 
-EvaluateView = Callable[[Predictions, SteelTruth, ConfigSteelTruth], Iterable[Samples]]
+EvaluateView = Callable[[Predictions, SteelTruth, SceneBars], Iterable[Samples]]
 """Evaluator of a measure family: returns one set of samples per prediction."""
 
 
@@ -65,21 +73,21 @@ class MeasureFamily:
         return {measure.name: measure for measure in self.measures}
 
 
-def _clouds(predictions: Predictions, truth: SteelTruth, _: ConfigSteelTruth) -> list[Samples]:
+def _clouds(predictions: Predictions, truth: SteelTruth, _: SceneBars) -> list[Samples]:
     """Return the point cloud samples of each prediction; the true cloud is built once."""
     cloud = point_cloud.true_cloud(truth)
     return [point_cloud.cloud_samples(p_m, truth, cloud) for p_m in predictions]
 
 
-def _inspection(predictions: Predictions, truth: SteelTruth, config: ConfigSteelTruth) -> list[Samples]:
+def _inspection(predictions: Predictions, truth: SteelTruth, bars: SceneBars) -> list[Samples]:
     """Return the inspection samples of each prediction; the visible segments are computed once."""
-    visible = visible_segments(truth, config.cage)
-    return [inspection.inspection_samples(p_m, truth, config.cage, visible) for p_m in predictions]
+    visible = visible_segments(truth, bars.cage)
+    return [inspection.inspection_samples(p_m, truth, bars.cage, visible) for p_m in predictions]
 
 
-def _profile(predictions: Predictions, truth: SteelTruth, config: ConfigSteelTruth) -> list[Samples]:
+def _profile(predictions: Predictions, truth: SteelTruth, bars: SceneBars) -> list[Samples]:
     """Return the profile samples of each prediction."""
-    return [profiles.profile_samples(p_m, truth, config.diameter_m) for p_m in predictions]
+    return [profiles.profile_samples(p_m, truth, bars.diameter_m) for p_m in predictions]
 
 
 def _per_prediction(samples: Callable[[Float64[ndarray, " n"], SteelTruth], Samples]) -> EvaluateView:
@@ -95,6 +103,9 @@ MEASURE_FAMILIES: Mapping[str, MeasureFamily] = {
     ),
     "full_mask": MeasureFamily(
         "Rim included", full_mask.MEASURES, _per_prediction(full_mask.full_mask_samples), _BOTH
+    ),
+    "single_bar": MeasureFamily(
+        "Single-bar interior", single_bar.MEASURES, _per_prediction(single_bar.single_bar_samples), _BOTH
     ),
     "boundary": MeasureFamily("Boundary", boundary.MEASURES, _per_prediction(boundary.boundary_samples), (ONCE,)),
     "layers": MeasureFamily("Layers", depth_layers.MEASURES, _per_prediction(depth_layers.layer_samples), _BOTH),
@@ -138,12 +149,12 @@ def score_extended(
     measures = measures_by_alignment()
     tables: dict[str, ExtendedTable] = {}
     views: list[ViewNumbers] = []
-    for config in result.tables:
+    for config in evaluation.configs:
         steel = load_steel_truth(evaluation.folder, config, progress)
         work = partial(_view, evaluation.submission, steel, scales)
-        task = f"extended measures of {config}"
+        task = f"extended measures of {config.name}"
         config_views = map_with_progress(work, range(len(steel)), workers, progress, task, len(steel))
-        tables[config] = tabulate_extended(
+        tables[config.name] = tabulate_extended(
             config_views, protocol_indices([view.view_id for view in config_views]), measures
         )
         views += [view_numbers(view, measures) for view in config_views]
@@ -156,11 +167,12 @@ def _view(
     """Read a view's prediction and return its samples under each alignment."""
     truth = steel.view(position)
     prediction_m = submission.read(truth.view_id)
-    return ExtendedView(truth.view_id, view_samples(prediction_m, truth, steel, scales[truth.view_id]))
+    bars = steel.bars_by_view[truth.view_id]
+    return ExtendedView(truth.view_id, view_samples(prediction_m, truth, bars, scales[truth.view_id]))
 
 
 def view_samples(
-    prediction_m: Float[ndarray, "h w"], truth: SteelTruth, steel: ConfigSteelTruth, scale: float | None
+    prediction_m: Float[ndarray, "h w"], truth: SteelTruth, bars: SceneBars, scale: float | None
 ) -> dict[str, Samples]:
     """Return the samples of all measure families for one view, by alignment.
 
@@ -174,7 +186,7 @@ def view_samples(
     predictions = {ONCE: native_m, NATIVE: native_m, SCALED: scaled_m}
     samples: dict[str, dict[str, Float64[ndarray, " n"]]] = {name: {} for name in predictions}
     for family in MEASURE_FAMILIES.values():
-        samples_by_alignment = family.evaluate([predictions[name] for name in family.alignments], truth, steel)
+        samples_by_alignment = family.evaluate([predictions[name] for name in family.alignments], truth, bars)
         for name, of_alignment in zip(family.alignments, samples_by_alignment, strict=True):
             samples[name].update(of_alignment)
     return dict(samples)

@@ -13,6 +13,8 @@ failure; only these may be compared between methods.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
@@ -20,7 +22,7 @@ from numpy import ndarray
 from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES, METRICS, is_valid_prediction, metrics_at_scales
-from rebar_depth_bench.scoring.protocol import WITHIN_MM
+from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
 
 
 def full_mask_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
@@ -35,14 +37,16 @@ def full_mask_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples
     interior = truth.interior & mask
     mask_count, interior_count = np.count_nonzero(mask), np.count_nonzero(interior)
     return {
-        **_scores("full_mask", p_m, truth, mask),
-        **_scores("interior", p_m, truth, interior),
+        **region_scores("full_mask", p_m, truth, mask),
+        **region_scores("interior", p_m, truth, interior),
         "kept_share": np.array([interior_count / mask_count] if mask_count else [], np.float64),
     }
 
 
-def _scores(prefix: str, p_m: Float64[ndarray, " n"], truth: SteelTruth, pixels: Bool[ndarray, " n"]) -> Samples:
-    """Return the metrics over the selected pixels as samples, their names prefixed."""
+def region_scores(
+    region: str, p_m: Float64[ndarray, " n"], truth: SteelTruth, pixels: Bool[ndarray, " n"]
+) -> Samples:
+    """Return the metrics over the pixels of a region as samples, their names prefixed with that of the region."""
     predicted = pixels & is_valid_prediction(p_m)
     p_valid_m, z_m = p_m[predicted], truth.depth_m[predicted].astype(np.float64)
     numbers: dict[str, float] = {}
@@ -55,48 +59,56 @@ def _scores(prefix: str, p_m: Float64[ndarray, " n"], truth: SteelTruth, pixels:
         numbers.update((name, getattr(metrics, name)) for name in METRIC_NAMES)
         numbers.update((f"within_{t}mm", count / total) for t, count in within.items())
     return {
-        f"{prefix}_{name}": np.array([numbers[name]] if name in numbers else [], np.float64)
-        for name in _NUMBER_NAMES
+        f"{region}_{name}": np.array([numbers[name]] if name in numbers else [], np.float64)
+        for name in REGION_NUMBERS
     }
 
 
-_NUMBER_NAMES = (*METRIC_NAMES, "coverage", *(f"within_{t}mm" for t in WITHIN_MM))
+REGION_NUMBERS = (*METRIC_NAMES, "coverage", *(f"within_{t}mm" for t in WITHIN_MM))
 """Names of all numbers computed on each region."""
 
-_REGIONS = {
-    "full_mask": ("whole mask", "steel pixels, rim included"),
-    "interior": ("interior", "interior steel pixels"),
-}
-"""Short name and description of each region."""
+
+@dataclass(frozen=True)
+class Region:
+    """Region of a view: the prefix of its measures, its short name in titles, and a description of its pixels."""
+
+    prefix: str
+    short: str
+    pixels: str
 
 
-def _error_measure(region: str, metric: str) -> Measure:
-    """Return the measure of one error metric on one region."""
-    (short, pixels), info = _REGIONS[region], METRICS[metric]
-    definition = f"{metric} as rebar-1 defines it, over the predicted {pixels}; to set beside the other region's"
-    return Measure(
-        f"{region}_{metric}", f"{region}_{metric}", "mean", f"{info.title}, {short}", info.unit, "", definition
+_REGIONS = (
+    Region("full_mask", "whole mask", "steel pixels, rim included"),
+    Region("interior", "interior", "interior steel pixels"),
+)
+
+
+def region_measure(region: Region, number: str) -> Measure:
+    """Return the measure of one of ``REGION_NUMBERS`` on a region."""
+    return _error_measure(region, number) if number in METRICS else _share_measure(region, number)
+
+
+def _error_measure(region: Region, metric: str) -> Measure:
+    name, info = f"{region.prefix}_{metric}", METRICS[metric]
+    definition = (
+        f"{metric} as {PROTOCOL} defines it, over the predicted {region.pixels}; to set beside the other region's"
     )
+    return Measure(name, name, "mean", f"{info.title}, {region.short}", info.unit, "", definition)
 
 
-def _share_measure(region: str, metric: str) -> Measure:
-    """Return the measure of the coverage or of a share within a tolerance on one region."""
-    short, pixels = _REGIONS[region]
+def _share_measure(region: Region, metric: str) -> Measure:
+    name, short, pixels = f"{region.prefix}_{metric}", region.short, region.pixels
     if metric == "coverage":
         title, definition = f"Coverage, {short}", f"share of {pixels} with a prediction (finite and > 0)"
     else:
         tolerance = metric.removeprefix("within_").removesuffix("mm")
         title = f"Within {tolerance} mm, {short}"
         definition = f"share of {pixels} with |p - z| <= {tolerance} mm; a missing prediction is not within"
-    return Measure(f"{region}_{metric}", f"{region}_{metric}", "mean", title, "%", "higher", definition)
+    return Measure(name, name, "mean", title, "%", "higher", definition)
 
 
 MEASURES: tuple[Measure, ...] = (
-    *(
-        _error_measure(region, number) if number in METRICS else _share_measure(region, number)
-        for number in _NUMBER_NAMES
-        for region in _REGIONS
-    ),
+    *(region_measure(region, number) for number in REGION_NUMBERS for region in _REGIONS),
     Measure(
         "kept_share",
         "kept_share",

@@ -24,12 +24,14 @@ from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.geometry.cameras import Camera, pixel_rays
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.ground_truth import are_pixels_inside, cache_inputs, scored_counts, verified_views
+from rebar_depth_bench.scoring.protocol import single_bar_pixels
 
 _DTYPES: Mapping[str, type] = {
     "index": np.uint32,
     "depth_m": np.float32,
     "bar_id": np.uint16,
     "interior": np.bool_,
+    "single_bar": np.bool_,
     "run": np.int16,
     "front_m": np.float32,
     "behind_m": np.float32,
@@ -47,17 +49,24 @@ _LENS_NUMBERS, _CAMERA_NUMBERS = 9 + 5, 9 + 5 + 16
 
 
 @dataclass(frozen=True, eq=False)
+class SceneBars:
+    """Bars of a scene: their segments, and the nominal diameter by bar id (NaN for ids without a bar)."""
+
+    cage: CageTruth
+    diameter_m: Float64[ndarray, " ids"]
+
+
+@dataclass(frozen=True, eq=False)
 class ConfigSteelTruth:
     """Steel ground truth of all views of a config that have scored pixels.
 
-    ``cage`` holds the bar segments of the scene, ``diameter_m`` the nominal diameter by bar id (NaN for ids
-    without a bar). ``rays`` holds the rays of each distinct lens (K and distortion), which views share.
+    ``bars_by_view`` holds the bars of each view's scene. ``rays`` holds the rays of each distinct lens (K and
+    distortion), which views share.
     """
 
     height: int
     width: int
-    cage: CageTruth
-    diameter_m: Float64[ndarray, " ids"]
+    bars_by_view: Mapping[str, SceneBars]
     rays: Mapping[Lens, Rays]
     cache: ArrayCache
 
@@ -80,18 +89,14 @@ class ConfigSteelTruth:
         )
 
 
-def load_steel_truth(folder: DatasetFolder, name: str, progress: Progress = silent) -> ConfigSteelTruth:
-    """Return the ground truth of the config ``name`` for extended measures, from the cache or else computed.
+def load_steel_truth(
+    folder: DatasetFolder, config: DatasetConfig, progress: Progress = silent
+) -> ConfigSteelTruth:
+    """Return the ground truth of a config of ``folder`` for extended measures, from the cache or else computed.
 
-    Raises ``DatasetError`` if the bars of the scene are missing, or if the bars or a view contradict the manifest.
+    Raises ``DatasetError`` if the bars of a scene are missing, or if the bars or a view contradict the manifest.
     """
-    config, bars_path = folder.config(name), folder.verified_file(BARS_FILE)
-    bars = read_bars(bars_path).get(config.scene.name)
-    if bars is None:
-        raise DatasetError(f"{bars_path}: has no bars for scene {config.scene.name!r} of config {config.name}")
-    cage = cage_truth(bars)
-    diameter_m = np.full(np.iinfo(np.uint16).max + 1, np.nan)  # Images may show ids that the table lacks.
-    diameter_m[[bar.bar_id for bar in bars]] = [bar.diameter_m for bar in bars]
+    bars_by_view = _bars_by_view(folder, config)
     height, width = config.grid
     scored_px = scored_counts(config)
 
@@ -105,16 +110,30 @@ def load_steel_truth(folder: DatasetFolder, name: str, progress: Progress = sile
         inputs=cache_inputs(config, EXTENDED_PROTOCOL, folder.files[BARS_FILE]),
         dtypes=_DTYPES,
         view_ids=tuple(scored_px),
-        extract=lambda: _view_arrays(config, cage, diameter_m, progress),
+        extract=lambda: _view_arrays(config, bars_by_view, progress),
         is_sound=is_sound,
     )
     cache = open_cache(content)
     rays = {lens: _rays(lens, height, width) for lens in {numbers[:_LENS_NUMBERS] for numbers in cache.numbers}}
-    return ConfigSteelTruth(height, width, cage, diameter_m, rays, cache)
+    return ConfigSteelTruth(height, width, bars_by_view, rays, cache)
+
+
+def _bars_by_view(folder: DatasetFolder, config: DatasetConfig) -> dict[str, SceneBars]:
+    """Return the bars of each view's scene, by view id."""
+    path = folder.verified_file(BARS_FILE)
+    bars_by_scene, scenes = read_bars(path), {}
+    for scene in config.scenes:
+        bars = bars_by_scene.get(scene.name)
+        if bars is None:
+            raise DatasetError(f"{path}: has no bars for scene {scene.name!r} of config {config.name}")
+        diameter_m = np.full(np.iinfo(np.uint16).max + 1, np.nan)  # Images may show ids that the table lacks.
+        diameter_m[[bar.bar_id for bar in bars]] = [bar.diameter_m for bar in bars]
+        scenes[scene.name] = SceneBars(cage_truth(bars), diameter_m)
+    return {view_id: scenes[scene] for view_id, scene in config.scene_by_view.items()}
 
 
 def _view_arrays(
-    config: DatasetConfig, cage: CageTruth, diameter_m: Float64[ndarray, " ids"], progress: Progress
+    config: DatasetConfig, bars_by_view: Mapping[str, SceneBars], progress: Progress
 ) -> Iterator[ViewArrays]:
     """Yield the cached arrays of every view with scored pixels, with the numbers of K, distortion and pose."""
     rays: dict[Lens, Rays] = {}
@@ -124,13 +143,11 @@ def _view_arrays(
         lens = _lens(left.camera)
         if lens not in rays:
             rays[lens] = _rays(lens, *left.depth_m.shape)
-        arrays = _steel_arrays(left, scored, rays[lens], cage, diameter_m)
+        arrays = _steel_arrays(left, scored, rays[lens], bars_by_view[view_id])
         yield ViewArrays(view_id, arrays, (*lens, *left.camera.cam_from_world.ravel().tolist()))
 
 
-def _steel_arrays(
-    left: EyeView, scored: ndarray, rays: Rays, cage: CageTruth, diameter_m: Float64[ndarray, " ids"]
-) -> dict[str, ndarray]:
+def _steel_arrays(left: EyeView, scored: ndarray, rays: Rays, scene: SceneBars) -> dict[str, ndarray]:
     """Return the arrays of ``SteelTruth`` for one view, by field name.
 
     ``scored`` holds the flat indices of the scored pixels. Segments and other layers are determined for these
@@ -146,15 +163,17 @@ def _steel_arrays(
         "depth_m": depth_m.ravel()[index],
         "bar_id": bars.ravel()[index],
         "interior": interior,
+        "single_bar": np.zeros(len(index), dtype=bool),
         "run": np.full(len(index), -1, dtype=np.int16),
         "front_m": np.full(len(index), np.nan, dtype=np.float32),
         "behind_m": np.full(len(index), np.nan, dtype=np.float32),
     }
+    arrays["single_bar"][interior] = single_bar_pixels(bars, scored)
     own, z_m = arrays["bar_id"][interior], arrays["depth_m"][interior]
     camera_m = np.column_stack([z_m[:, None] * rays[scored], z_m])
     pose = left.camera.cam_from_world
-    arrays["run"][interior] = assign_segments((camera_m - pose[:3, 3]) @ pose[:3, :3], own, cage)
-    gap_m = diameter_m[own].astype(np.float32)
+    arrays["run"][interior] = assign_segments((camera_m - pose[:3, 3]) @ pose[:3, :3], own, scene.cage)
+    gap_m = scene.diameter_m[own].astype(np.float32)
     front_m, behind_m = other_layers(depth_m, bars, scored, gap_m)
     arrays["front_m"][interior], arrays["behind_m"][interior] = front_m, behind_m
     return arrays

@@ -1,4 +1,7 @@
-"""Error profiles: scale and AbsRel binned by true distance and by the apparent width of the bar."""
+"""Error profiles: scale and AbsRel binned by true distance and by the apparent width of the bar.
+
+The bins of true distance also have the share of the single-bar interior and AbsRel on it (``single_bar``).
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples, finite_sample, subsample
@@ -53,11 +56,34 @@ def profile_samples(
             enough = np.count_nonzero(inside) >= MIN_PIXELS
             samples[f"scale_at_{name}"] = finite_sample(median(ratio[inside]) if enough else None)
             samples[f"abs_rel_at_{name}"] = finite_sample(float(np.mean(error[inside])) if enough else None)
+    return {**samples, **_single_bar_samples(z, error, truth.single_bar[pixels], truth, sampled)}
+
+
+def _single_bar_samples(
+    z_m: Float64[ndarray, " k"],
+    error: Float64[ndarray, " k"],
+    single_bar: Bool[ndarray, " k"],
+    truth: SteelTruth,
+    sampled: Int64[ndarray, " m"],
+) -> Samples:
+    """Return the single-bar share of the ``sampled`` pixels in each bin of distance, and AbsRel on these pixels.
+
+    ``z_m``, ``error`` (|p - z| / z) and ``single_bar`` are those of the sampled pixels with a prediction.
+    """
+    samples = {}
+    all_z_m, all_single_bar = truth.depth_m[sampled], truth.single_bar[sampled]
+    for (low, high), name in zip(pairwise(DISTANCE_EDGES_M), bin_names("m", DISTANCE_EDGES_M), strict=True):
+        in_bin = all_single_bar[(all_z_m >= low) & (all_z_m < high)]
+        share = float(np.mean(in_bin)) if len(in_bin) >= MIN_PIXELS else None
+        chosen = error[(z_m >= low) & (z_m < high) & single_bar]
+        mean_error = float(np.mean(chosen)) if len(chosen) >= MIN_PIXELS else None
+        samples[f"single_bar_share_at_{name}"] = finite_sample(share)
+        samples[f"single_bar_abs_rel_at_{name}"] = finite_sample(mean_error)
     return samples
 
 
 def bin_names(axis: str, edges: tuple[float, ...]) -> list[str]:
-    """Return the name of each bin between ``edges``, the suffix of ``scale_at_`` and ``abs_rel_at_``."""
+    """Return the name of each bin between ``edges``, the suffix of ``scale_at_`` and the other measures."""
     return [f"{low:g}-{high:g}{axis}" for low, high in pairwise(edges)]
 
 
@@ -78,6 +104,13 @@ def _measures() -> Iterator[Measure]:
                 scale, scale, "median", f"Scale s {where}", "", "", f"median over views of median(z/p) {where}"
             )
             yield Measure(error, error, "mean", f"AbsRel {where}", "", "", f"mean over views of AbsRel {where}")
+    for name in bin_names("m", DISTANCE_EDGES_M):
+        where = f"at {name.removesuffix('m')} m"
+        share, error = f"single_bar_share_at_{name}", f"single_bar_abs_rel_at_{name}"
+        definition = f"mean over views of the single-bar share of the interior pixels {where}"
+        yield Measure(share, share, "mean", f"Single-bar share {where}", "%", "", definition)
+        definition = f"mean over views of AbsRel on the single-bar interior {where}"
+        yield Measure(error, error, "mean", f"AbsRel, single-bar, {where}", "", "", definition)
 
 
 MEASURES: tuple[Measure, ...] = tuple(_measures())

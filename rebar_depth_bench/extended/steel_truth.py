@@ -14,11 +14,12 @@ class SteelTruth:
 
     ``index`` holds flat indices into the height x width grid, ascending; the other arrays are parallel to it.
     ``depth_m`` is planar depth, metres. ``bar_id`` is 0 beside the steel; ``interior`` marks the scored pixels of
-    the protocol. ``rays`` are x/z and y/z of each pixel's ray in the camera frame (lens distortion undone), so
-    that ``x_cam = depth_m * (rays[:, 0], rays[:, 1], 1)``. ``run`` is the straight bar segment whose axis is
-    nearest to the true point (an index into ``CageTruth.segments``), -1 where the point is on no segment.
-    ``front_m`` and ``behind_m`` are the depths of the closest other layer in front of and behind the pixel, NaN
-    where none is visible: see ``depth_layers.other_layers``.
+    the protocol, and ``single_bar`` those of them whose 3 x 3 neighbourhood belongs to one bar. ``rays`` are x/z
+    and y/z of each pixel's ray in the camera frame (lens distortion undone), so that ``x_cam = depth_m * (rays[:,
+    0], rays[:, 1], 1)``. ``run`` is the straight bar segment whose axis is nearest to the true point (an index
+    into ``CageTruth.segments``), -1 where the point is on no segment. ``front_m`` and ``behind_m`` are the depths
+    of the closest other layer in front of and behind the pixel, NaN where none is visible: see
+    ``depth_layers.other_layers``.
     """
 
     view_id: str
@@ -30,6 +31,7 @@ class SteelTruth:
     depth_m: Float32[ndarray, " n"]
     bar_id: UInt16[ndarray, " n"]
     interior: Bool[ndarray, " n"]
+    single_bar: Bool[ndarray, " n"]
     rays: Float64[ndarray, "n 2"]
     run: ndarray  # Int16 n
     front_m: Float32[ndarray, " n"]

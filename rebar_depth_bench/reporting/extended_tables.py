@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table as RichTable
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
+from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, NATIVE, SCALED, MeasureFamily
 from rebar_depth_bench.extended.inspection.measures import MISS_MM
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
@@ -114,6 +114,22 @@ def format_value(value: float | None, measure: Measure, digits: int = 4) -> str:
         return formatting.DASH
     value = value if abs(value) >= _ZERO_TOLERANCE else 0.0
     return f"{100 * value:.1f}" if measure.unit == "%" else f"{value:.{digits}g}"
+
+
+def single_bar_sentence(table: ExtendedTable) -> str:
+    """Return share and AbsRel of the single-bar interior beside AbsRel of the whole one; empty without pixels."""
+    share = table.numbers[NATIVE]["single_bar_share"].value
+    if share is None:
+        return ""
+    text = f"{100 * share:.1f} % of the scored pixels, mean over views, belong to one bar with all neighbours"
+    if not share:
+        return f"{text}: every scored pixel has a second bar within one pixel."
+    errors = [
+        f"{alignment} {formatting.number(table.numbers[alignment]['single_bar_abs_rel'].value, 4)} "
+        f"(all scored pixels: {formatting.number(table.numbers[alignment]['interior_abs_rel'].value, 4)})"
+        for alignment in (NATIVE, SCALED)
+    ]
+    return f"{text}. AbsRel on them, mean over the views that have any: {', '.join(errors)}."
 
 
 def extended_csv(result: Result) -> str:

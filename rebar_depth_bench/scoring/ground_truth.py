@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, UInt32
+from jaxtyping import Bool, Float32, UInt32
 from numpy import ndarray
 
 from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
@@ -23,7 +23,7 @@ from rebar_depth_bench.data.eye_view import EyeView, eye_from_row, truth_columns
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.metrics import median
-from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels
+from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels, single_bar_pixels
 from rebar_depth_bench.scoring.reference import (
     REFERENCE_NUMBERS,
     Reference,
@@ -57,6 +57,10 @@ class ConfigTruth:
     def view_ids(self) -> tuple[str, ...]:
         """Ids of the views, in order."""
         return self.cache.view_ids
+
+    def single_bar(self, position: int) -> Bool[ndarray, " n"]:
+        """Return which scored pixels of the view at ``position`` are single-bar: see ``single_bar_pixels``."""
+        return self.cache.view(position).arrays["single_bar"]
 
     @property
     def medians_m(self) -> tuple[float, ...]:
@@ -98,7 +102,7 @@ def config_truth(config: DatasetConfig, progress: Progress = silent) -> ConfigTr
     content = CacheContent(
         source=config.root,
         inputs=cache_inputs(config, PROTOCOL),
-        dtypes={"index": np.uint32, "depth_m": np.float32},
+        dtypes={"index": np.uint32, "depth_m": np.float32, "single_bar": np.bool_},
         view_ids=tuple(scored_px),
         extract=lambda: _extract_views(config, progress),
         is_sound=is_sound,
@@ -163,7 +167,9 @@ def _extract_views(config: DatasetConfig, progress: Progress) -> Iterator[ViewAr
             median_m = median(depth_m)
             reference = view_reference(left.depth_m, pixels, median_m)
             numbers = (median_m, *reference.to_numbers())
-            yield ViewArrays(view_id, {"index": pixels, "depth_m": depth_m}, numbers)
+            single_bar = single_bar_pixels(left.bars, pixels)
+            arrays = {"index": pixels, "depth_m": depth_m, "single_bar": single_bar}
+            yield ViewArrays(view_id, arrays, numbers)
 
 
 def _verified_pixels(left: EyeView, record: ViewRecord, config: DatasetConfig) -> UInt32[ndarray, " n"]:

@@ -6,7 +6,7 @@ A change of any rule or number in this module requires a new protocol name.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt32
+from jaxtyping import Bool, Float32, UInt16, UInt32
 from numpy import ndarray
 
 PROTOCOL = "rebar-2"
@@ -38,6 +38,21 @@ def interior(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     eroded = np.zeros_like(mask)
     eroded[:, 1:-1] = rows[:, :-2] & rows[:, 1:-1] & rows[:, 2:]
     return eroded
+
+
+def single_bar_pixels(bars: UInt16[ndarray, "h w"], pixels: UInt32[ndarray, " n"]) -> Bool[ndarray, " n"]:
+    """Return which of the scored pixels belong to one bar with their whole 3 x 3 neighbourhood.
+
+    ``bars`` holds bar ids and ``pixels`` flat indices, which are never at the border of the image. Extended
+    measures call these pixels the single-bar interior; all other metrics use all scored pixels.
+    """
+    width, flat = bars.shape[1], bars.ravel()
+    centre = pixels.astype(np.intp)
+    own = flat[centre]
+    same = own > 0
+    for offset in (-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1):
+        same &= flat[centre + offset] == own
+    return same
 
 
 def scored_pixels(mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"]) -> UInt32[ndarray, " n"]:

@@ -25,7 +25,7 @@ from rebar_depth_bench.extended.point_cloud import TOLERANCES_MM
 from rebar_depth_bench.extended.profiles import AXES, bin_names
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting.charts.profile import ProfileBin, profile_chart
-from rebar_depth_bench.reporting.extended_tables import MISSED, UNDEFINED, is_miss
+from rebar_depth_bench.reporting.extended_tables import MISSED, UNDEFINED, is_miss, single_bar_sentence
 from rebar_depth_bench.reporting.formatting import DASH, interval_cell, number
 from rebar_depth_bench.reporting.html.rows import Cell
 
@@ -128,7 +128,7 @@ _AXIS_TITLES: Mapping[str, tuple[str, str]] = {
     "m": ("distance", "m"),
     "px": ("bar width in the picture", "pixels"),
 }
-_FOLDED_FAMILIES = ("alignment", "full_mask", "boundary", "layers", "clouds")
+_FOLDED_FAMILIES = ("alignment", "full_mask", "single_bar", "boundary", "layers", "clouds")
 
 MAIN_INSPECTION_MEASURES = (
     "bars_found",
@@ -177,7 +177,11 @@ class ToleranceRow:
 
 @dataclass(frozen=True)
 class ExtendedConfig:
-    """Formatted extended measures of one config; ``charts`` are pairs of caption and SVG."""
+    """Formatted extended measures of one config.
+
+    ``charts`` are pairs of caption and SVG. ``single_bar`` is a sentence on the single-bar interior, empty without
+    scored pixels.
+    """
 
     name: str
     views: int
@@ -186,6 +190,7 @@ class ExtendedConfig:
     other_inspection: ExtendedMeasureTable
     tolerances: list[ToleranceRow]
     families: list[ExtendedMeasureTable]
+    single_bar: str = ""
 
     def has_undefined_capability(self) -> bool:
         """Return whether any capability is undefined, because too many bars were not found."""
@@ -227,6 +232,7 @@ def _extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
         other_inspection=_measure_table(table, "Inspection: spread, median, found bars only", inspection, other),
         tolerances=[_tolerance_row(table, *line) for line in TOLERANCES],
         families=[family for family in folded if family.rows],
+        single_bar=single_bar_sentence(table),
     )
 
 

@@ -11,10 +11,11 @@ from rebar_depth_bench.console import ProgressBars, add_archive, add_data
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.ground_truth import config_truth
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.single_bar import score_single_bar
 from rebar_depth_bench.scoring.view_score import protocol_indices
 from rebar_depth_bench.studies.common import add_output_arguments, write_outputs
 from rebar_depth_bench.studies.distance import output
@@ -87,7 +88,11 @@ def run_distance_study(
     with open_evaluation(archive, root) as evaluation:
         result = score_evaluation(evaluation, progress=progress)
         names = _select_configs(archive, result, configs)
-        points = {name: _distance_points(result, evaluation.folder.config(name)) for name in names}
+        points = {
+            config.name: _distance_points(evaluation, result, config)
+            for config in evaluation.configs
+            if config.name in names
+        }
         provenance = evaluation.provenance()
     empty = [name for name, views in points.items() if not views]
     if empty:
@@ -115,12 +120,13 @@ def _select_configs(archive: str | os.PathLike[str], result: Result, configs: Se
     return wanted
 
 
-def _distance_points(result: Result, config: DatasetConfig) -> list[DistancePoint]:
+def _distance_points(evaluation: Evaluation, result: Result, config: DatasetConfig) -> list[DistancePoint]:
     truths = config_truth(config)
-    distances_m = dict(zip(truths.view_ids, truths.medians_m, strict=True))
-    views = [view for view in result.views if view.view_id in distances_m]
-    indices = protocol_indices([view.view_id for view in views])
-    return [
-        DistancePoint(config.name, index, distances_m[view.view_id], view)
-        for index, view in zip(indices, views, strict=True)
-    ]
+    scores = {view.view_id: view for view in result.views}
+    points = []
+    for position, index in enumerate(protocol_indices(truths.view_ids)):
+        truth, score = truths.view(position), scores[truths.view_ids[position]]
+        prediction_m = evaluation.submission.read(truth.view_id)
+        single_bar = score_single_bar(truth, truths.single_bar(position), prediction_m, score.scale)
+        points.append(DistancePoint(config.name, index, truth.median_m, score, single_bar))
+    return points

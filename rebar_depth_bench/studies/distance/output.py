@@ -55,6 +55,9 @@ def to_pandas(study: DistanceStudy) -> DataFrame:
                 "scale_max": bin_.scale_range[1] if bin_.scale_range else None,
                 **_estimate_cells("native_abs_rel", bin_.native_abs_rel),
                 **_estimate_cells("scaled_abs_rel", bin_.scaled_abs_rel),
+                "single_bar_share": bin_.single_bar_share,
+                **_estimate_cells("single_bar_native_abs_rel", bin_.single_bar_native_abs_rel),
+                **_estimate_cells("single_bar_scaled_abs_rel", bin_.single_bar_scaled_abs_rel),
                 **provenance.csv_cells(),
             }
             for bin_ in study.bins
@@ -71,7 +74,7 @@ def to_page(study: DistanceStudy) -> StudyPage:
         lead=" ".join([_slope_sentence(study.slopes[-1]), *_reversal_sentence(study.slopes[-1], study.bins)]),
         stamps=study.provenance.lines(),
         figures=(_scale_figure(study), _error_figure(study)),
-        tables=(_slope_table(study.slopes), _bin_table(study.bins)),
+        tables=(_slope_table(study.slopes), _bin_table(study.bins), _single_bar_table(study.bins)),
         notes=_notes(study),
     )
 
@@ -214,6 +217,23 @@ def _bin_table(bins: Sequence[DistanceBin]) -> PageTable:
     return page_table(caption, columns, bins)
 
 
+def _single_bar_table(bins: Sequence[DistanceBin]) -> PageTable:
+    caption = (
+        "Single-bar interior: scored pixels whose 3 x 3 neighbourhood belongs to one bar. The other scored pixels "
+        "have a second bar within one pixel, so that errors on them contain the step between the bars."
+    )
+    columns: Columns[DistanceBin] = (
+        ("Config", "", lambda row: printable(row.config)),
+        ("Distance", "m, from to", lambda row: _format_metre_range(row.low_m, row.high_m)),
+        ("Share", "% of scored pixels", lambda row: formatting.number(100 * row.single_bar_share, 1)),
+        ("AbsRel native ↓", "all scored", lambda row: formatting.number(row.native_abs_rel.value, 4)),
+        ("AbsRel native ↓", "single-bar", lambda row: formatting.number(row.single_bar_native_abs_rel.value, 4)),
+        ("AbsRel scaled ↓", "all scored", lambda row: formatting.number(row.scaled_abs_rel.value, 4)),
+        ("AbsRel scaled ↓", "single-bar", lambda row: formatting.number(row.single_bar_scaled_abs_rel.value, 4)),
+    )
+    return page_table(caption, columns, bins)
+
+
 def _notes(study: DistanceStudy) -> list[str]:
     notes = [
         "Distance of a view: the median true depth of its scored pixels. z: truth, p: prediction.",
@@ -238,6 +258,7 @@ def _view_json(point: DistancePoint) -> dict[str, Any]:
         "scale": score.scale,
         "native_abs_rel": score.native.abs_rel if score.native else None,
         "scaled_abs_rel": score.scaled.abs_rel if score.scaled else None,
+        "single_bar": asdict(point.single_bar),
     }
 
 

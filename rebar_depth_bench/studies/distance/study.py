@@ -20,9 +20,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS, Interval, interval, resample
-from rebar_depth_bench.scoring.metrics import mean
+from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS, Interval, Resampling, interval, resample
+from rebar_depth_bench.scoring.metrics import DepthMetrics, mean
 from rebar_depth_bench.scoring.provenance import Provenance
+from rebar_depth_bench.scoring.single_bar import SingleBarScore
 from rebar_depth_bench.scoring.view_score import ViewScore
 
 MIN_DISTANCE_RATIO = 1.05
@@ -37,13 +38,14 @@ class DistancePoint:
     """Score of one view at its distance.
 
     ``index`` is the index of the view in its full protocol; ``distance_m`` is the median true depth of its scored
-    pixels.
+    pixels. ``single_bar`` is the score on the single-bar interior.
     """
 
     config: str
     index: int
     distance_m: float
     score: ViewScore
+    single_bar: SingleBarScore
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,8 @@ class DistanceBin:
 
     ``distance_m`` is the median distance of the views. ``scale`` is the median and ``scale_range`` the (minimum,
     maximum) of s over the ``views_scored`` views that have a prediction; the AbsRel values are means over these
-    views.
+    views. ``single_bar_share`` is the mean share of single-bar pixels; the single-bar AbsRel values are means over
+    the views that have such pixels with a prediction.
     """
 
     config: str
@@ -76,6 +79,9 @@ class DistanceBin:
     scale_range: Interval | None
     native_abs_rel: IntervalEstimate
     scaled_abs_rel: IntervalEstimate
+    single_bar_share: float
+    single_bar_native_abs_rel: IntervalEstimate
+    single_bar_scaled_abs_rel: IntervalEstimate
 
 
 @dataclass(frozen=True)
@@ -149,13 +155,10 @@ def fit_scale_slope(name: str, configs: Mapping[str, Sequence[DistancePoint]]) -
 def _make_bin(points: Sequence[DistancePoint], low_m: float, high_m: float) -> DistanceBin:
     scales = np.array([scale for point in points if (scale := point.score.scale) is not None])
     with_scale = np.flatnonzero([point.score.scale is not None for point in points])
-    errors = np.array([_abs_rel_pair(point) for point in points])
     resampling = resample(_view_indices(points))
-    means = resampling.means(errors)
     medians = resampling.percentile(scales, with_scale, 50)
-    native_abs_rel, scaled_abs_rel = (
-        mean([value for value in column if not math.isnan(value)]) for column in errors.T.tolist()
-    )
+    native_abs_rel, scaled_abs_rel = _mean_abs_rels([point.score for point in points], resampling)
+    single_bar_native, single_bar_scaled = _mean_abs_rels([point.single_bar for point in points], resampling)
     return DistanceBin(
         config=points[0].config,
         low_m=low_m,
@@ -165,15 +168,26 @@ def _make_bin(points: Sequence[DistancePoint], low_m: float, high_m: float) -> D
         views_scored=len(scales),
         scale=IntervalEstimate(float(np.median(scales)) if len(scales) else None, interval(medians)),
         scale_range=(float(scales.min()), float(scales.max())) if len(scales) else None,
-        native_abs_rel=IntervalEstimate(native_abs_rel, interval(means[:, 0])),
-        scaled_abs_rel=IntervalEstimate(scaled_abs_rel, interval(means[:, 1])),
+        native_abs_rel=native_abs_rel,
+        scaled_abs_rel=scaled_abs_rel,
+        single_bar_share=float(np.mean([point.single_bar.share for point in points])),
+        single_bar_native_abs_rel=single_bar_native,
+        single_bar_scaled_abs_rel=single_bar_scaled,
     )
 
 
-def _abs_rel_pair(point: DistancePoint) -> tuple[float, float]:
-    """Return native and scaled AbsRel of a view, NaN if no pixel has a prediction."""
-    native, scaled = point.score.native, point.score.scaled
-    return (native.abs_rel if native else math.nan, scaled.abs_rel if scaled else math.nan)
+def _mean_abs_rels(
+    scores: Sequence[ViewScore | SingleBarScore], resampling: Resampling
+) -> tuple[IntervalEstimate, IntervalEstimate]:
+    """Return the means of native and scaled AbsRel over the views that have them."""
+    errors = np.array([[_abs_rel(score.native), _abs_rel(score.scaled)] for score in scores])
+    draws = resampling.means(errors)
+    means = [mean([value for value in column if not math.isnan(value)]) for column in errors.T.tolist()]
+    return IntervalEstimate(means[0], interval(draws[:, 0])), IntervalEstimate(means[1], interval(draws[:, 1]))
+
+
+def _abs_rel(metrics: DepthMetrics | None) -> float:
+    return metrics.abs_rel if metrics else math.nan
 
 
 def _view_indices(points: Sequence[DistancePoint]) -> list[int]:

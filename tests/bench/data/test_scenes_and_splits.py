@@ -18,10 +18,14 @@ from rebar_depth_bench.data.dataset import ConfigViews, iterate_rows
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.data.verification import truth_problems
 from rebar_depth_bench.errors import DatasetError, InputError, SubmissionError
+from rebar_depth_bench.extended.evaluate import score_extended
+from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.scoring.comparison import compare
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.result_io import read_result
+from rebar_depth_bench.scoring.score import score_evaluation
 from tests.synthetic_dataset import HEIGHT, WIDTH, drop_scene_column, write_dataset, write_split_dataset
 
 SCENES = {"a": "train", "b-1": "train", "c": "validation", "d": "test", "e": "test"}
@@ -272,3 +276,21 @@ def test_invalid_scenes_of_a_manifest(
     with pytest.raises(DatasetError) as caught:
         open_folder(tmp_path)
     assert (code, where) in [(problem.code, problem.where) for problem in caught.value.problems]
+
+
+def test_extended_measures_use_the_bars_of_each_view_s_scene(root: Path) -> None:
+    folder = open_folder(root)
+    config = folder.config("cages").of_split("train")
+    steel = load_steel_truth(folder, config)
+    diameters = {view_id: bars.diameter_m[1] for view_id, bars in steel.bars_by_view.items()}
+    assert diameters == {view_id: 0.001 if "train-a-" in view_id else 0.002 for view_id in view_ids("train")}
+
+
+def test_extended_scoring_of_a_split(root: Path, tmp_path: Path) -> None:
+    archive = write_truth(root, tmp_path / "a.zip", "validation", factor=1.25)
+    with open_evaluation(archive, root) as evaluation:
+        extended = score_extended(score_evaluation(evaluation), evaluation)
+    numbers = extended.tables["cages"].numbers["native"]
+    assert extended.tables["cages"].views == SPLIT_VIEWS["validation"]
+    assert numbers["single_bar_share"].value == 1.0
+    assert numbers["single_bar_abs_rel"].value == pytest.approx(0.25)

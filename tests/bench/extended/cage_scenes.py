@@ -89,8 +89,8 @@ def view(bars: Sequence[Bar], cam_from_world: np.ndarray = CAMERA_AT_ORIGIN) -> 
     K = np.array([[FOCAL_PX, 0, (WIDTH - 1) / 2], [0, FOCAL_PX, (HEIGHT - 1) / 2], [0, 0, 1.0]])
     run = assign_segments(world_m, bar_id, cage)
     truth = SteelTruth(
-        "lattice/0000", HEIGHT, WIDTH, K, cam_from_world, index.astype(np.uint32), z_m, bar_id, inside, rays,
-        run, no_layer, no_layer,
+        "lattice/0000", HEIGHT, WIDTH, K, cam_from_world, index.astype(np.uint32), z_m, bar_id, inside,
+        np.zeros_like(inside), rays, run, no_layer, no_layer,
     )  # fmt: skip
     return truth, cage
 

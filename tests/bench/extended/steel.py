@@ -21,6 +21,7 @@ def steel_truth(depth_m: np.ndarray, bar_id: np.ndarray | None = None, fx: float
         depth_m=np.asarray(depth_m, dtype=np.float32),
         bar_id=np.ones(count, dtype=np.uint16) if bar_id is None else bar_id.astype(np.uint16),
         interior=np.ones(count, dtype=bool),
+        single_bar=np.ones(count, dtype=bool),
         rays=np.column_stack([(np.arange(count) - K[0, 2]) / fx, np.zeros(count)]),
         run=np.zeros(count, dtype=np.int16),
         front_m=np.full(count, np.nan, dtype=np.float32),

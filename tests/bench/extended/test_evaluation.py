@@ -117,7 +117,8 @@ def test_result_is_identical_for_any_number_of_workers(
 
 
 def test_steel_truth_matches_dataset_folder(tiny_root: Path, tiny_truth: Depths, tiny_masks: Depths) -> None:
-    steel = load_steel_truth(open_folder(tiny_root), "lattice")
+    folder = open_folder(tiny_root)
+    steel = load_steel_truth(folder, folder.config("lattice"))
     assert len(steel) == len(tiny_truth)
     for number in range(len(steel)):
         view = steel.view(number)

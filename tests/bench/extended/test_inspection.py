@@ -245,11 +245,13 @@ def test_measures_have_samples_and_unique_names() -> None:
 
 
 def test_rendered_truth_is_perfect_up_to_ribs(tiny_root: Path) -> None:
-    steel = load_steel_truth(open_folder(tiny_root), "lattice")
+    folder = open_folder(tiny_root)
+    steel = load_steel_truth(folder, folder.config("lattice"))
     offsets_mm, detected = [], []
     for number in range(len(steel)):
         truth = steel.view(number)
-        samples = inspection_samples(truth.depth_m.astype(np.float64), truth, steel.cage)
+        cage = steel.bars_by_view[truth.view_id].cage
+        samples = inspection_samples(truth.depth_m.astype(np.float64), truth, cage)
         offsets_mm.append(samples["axis_offset_mm"])
         detected.append(samples["bar_found"])
     assert len(np.concatenate(detected)) > 0

@@ -32,8 +32,12 @@ def test_values_by_distance_and_width_bin() -> None:
         {
             "scale_at_0.3-0.4m": 0.5,
             "abs_rel_at_0.3-0.4m": 1.0,
+            "single_bar_share_at_0.3-0.4m": 1.0,
+            "single_bar_abs_rel_at_0.3-0.4m": 1.0,
             "scale_at_0.7-1m": 0.25,
             "abs_rel_at_0.7-1m": 3.0,
+            "single_bar_share_at_0.7-1m": 1.0,
+            "single_bar_abs_rel_at_0.7-1m": 3.0,
             "scale_at_8-12px": 0.5,
             "abs_rel_at_8-12px": 1.0,
             "scale_at_12-16px": 0.25,
@@ -48,12 +52,13 @@ def test_bin_with_few_predictions_has_no_value() -> None:
     p = z.copy()
     assert bin_values(p, z, np.ones(len(z)), np.array([np.nan, 0.01]))
     p[0] = np.nan
-    assert not bin_values(p, z, np.ones(len(z)), np.array([np.nan, 0.01]))
+    values = bin_values(p, z, np.ones(len(z)), np.array([np.nan, 0.01]))
+    assert values == {"single_bar_share_at_0.3-0.4m": 1.0}  # The share needs no prediction.
 
 
 def test_every_bin_has_a_measure() -> None:
     names = {measure.sample for measure in MEASURES}
-    assert len(names) == len(MEASURES) == 2 * (len(DISTANCE_EDGES_M) - 1 + len(WIDTH_EDGES_PX) - 1)
+    assert len(names) == len(MEASURES) == 4 * (len(DISTANCE_EDGES_M) - 1) + 2 * (len(WIDTH_EDGES_PX) - 1)
     z = np.full(60, 0.35)
     assert set(profile_samples(z, steel_truth(z), np.array([np.nan, 0.01]))) == names
     for edge in DISTANCE_EDGES_M[:-1]:

@@ -7,7 +7,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
-from rebar_depth_bench.scoring.protocol import interior
+from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 
 HOLES = (np.nan, np.inf, -np.inf, 0.0, -1.0)
 """Values of an archive that are no prediction."""
@@ -23,6 +23,9 @@ def steel_truth(
     index = np.flatnonzero(near & (depth_m > 0)).astype(np.uint32)
     no_layer = np.full(depth_m.shape, np.nan)
     K = ideal_K(width, height)
+    inside = interior(bars > 0) & (depth_m > 0)
+    single_bar = np.zeros_like(inside)
+    single_bar[inside] = single_bar_pixels(bars, np.flatnonzero(inside).astype(np.uint32))
     return SteelTruth(
         view_id="synthetic/0000",
         height=height,
@@ -32,7 +35,8 @@ def steel_truth(
         index=index,
         depth_m=depth_m.ravel()[index].astype(np.float32),
         bar_id=bars.ravel()[index].astype(np.uint16),
-        interior=(interior(bars > 0) & (depth_m > 0)).ravel()[index],
+        interior=inside.ravel()[index],
+        single_bar=single_bar.ravel()[index],
         rays=pixel_rays(K, width, height).reshape(-1, 3)[index, :2],
         run=np.full(len(index), -1, np.int16),
         front_m=(no_layer if front_m is None else front_m).ravel()[index].astype(np.float32),

@@ -45,6 +45,8 @@ LEVELS = {
     "boundary_f1": 0.4375,
     "layer_confusion": 0.0625,
     "interior_abs_rel": 0.0517,
+    "single_bar_share": 0.125,
+    "single_bar_abs_rel": 0.0317,
     **{
         f"cloud_{kind}_{t}mm": 0.1 + t / 40
         for kind in ("accuracy", "completeness", "f")
@@ -189,12 +191,21 @@ def test_every_heading_states_its_alignment(rendered: str) -> None:
 def test_families_are_collapsed_and_definitions_listed(rendered: str) -> None:
     section = extended_section_html(rendered)
     assert "<details open" not in section
-    for key in ("full_mask", "boundary", "layers", "clouds", "alignment"):
+    for key in ("full_mask", "single_bar", "boundary", "layers", "clouds", "alignment"):
         assert f"<summary>{MEASURE_FAMILIES[key].title} <" in section
     page = Page(rendered)
     for measure in (*MEASURE_FAMILIES["layers"].measures, *MEASURE_FAMILIES["alignment"].measures):
         assert re.sub(r"\s+", " ", measure.definition) in page.text, measure.name
     assert "title=" not in section, "reached by touch and keyboard, not by hovering"
+
+
+def test_single_bar_interior_stands_beside_the_whole_one(rendered: str) -> None:
+    match = re.search(r"<b>Single-bar interior.</b> (.*?)</p>", rendered)
+    assert match is not None
+    assert re.findall(r"\d+(?:\.\d+)?", match[1]) == ["12.5", "0.0317", "0.0517", "0.0159", "0.0259"]
+    none = {**LEVELS, "single_bar_share": 0.0}
+    page = render_report(result_with_extended(make_extended("lattice", levels=none), "lattice"), [])
+    assert "every scored pixel has a second bar within one pixel" in page
 
 
 def test_cloud_measures_form_one_row_per_tolerance(rendered: str) -> None:
@@ -305,4 +316,6 @@ def test_definitions_differing_only_in_step_are_merged() -> None:
         "AbsRel at N m",
         "Scale s on bars of N px",
         "AbsRel on bars of N px",
+        "Single-bar share at N m",
+        "AbsRel, single-bar, at N m",
     ]

@@ -152,7 +152,7 @@ def test_linked_cache_in_dataset_folder_is_not_followed(copy: Path, archive: Pat
     (copy / ".rebar-cache").symlink_to(outside)
     before, listing = tree(tmp_path / "dataset"), sorted(outside.rglob("*"))
     score(archive, copy)
-    load_steel_truth(open_folder(copy), CONFIG)
+    load_steel_truth(open_folder(copy), open_folder(copy).config(CONFIG))
     assert tree(copy) == before
     assert sorted(outside.rglob("*")) == listing
 
@@ -168,7 +168,7 @@ def test_digest_in_manifest_is_no_path(tiny_root: Path, tmp_path: Path, empty_ca
     )
     for _ in range(2):  # The second run deleted the folder.
         config_truth(hostile)
-        load_steel_truth(folder.model_copy(update={"config_by_name": {CONFIG: hostile}}), CONFIG)
+        load_steel_truth(folder, hostile)
     assert tree(documents) == {"letter.txt": b"precious"}
     assert len([*empty_cache.iterdir()]) == 2
     assert {path.name for path in tmp_path.iterdir()} == {"Documents", "caches"}
@@ -186,7 +186,7 @@ def test_other_views_have_an_entry_of_their_own(tiny_root: Path, copy: Path, emp
 def test_dataset_folder_is_not_written(copy: Path, archive: Path) -> None:
     before = tree(copy)
     score(archive, copy)
-    load_steel_truth(open_folder(copy), CONFIG)
+    load_steel_truth(open_folder(copy), open_folder(copy).config(CONFIG))
     assert tree(copy) == before
 
 
@@ -243,9 +243,10 @@ def test_images_may_show_bars_that_the_table_lacks(copy: Path) -> None:
     write_bars(copy / "bars.parquet", {scene: of_scene[: len(of_scene) // 2] for scene, of_scene in bars.items()})
     sha256 = file_sha256(copy / "bars.parquet")
     change_manifest(copy, lambda manifest, _: manifest["files"].update({"bars.parquet": sha256}), CONFIG)
-    steel = load_steel_truth(open_folder(copy), CONFIG)
+    folder = open_folder(copy)
+    steel = load_steel_truth(folder, folder.config(CONFIG))
     truth = steel.view(0)
-    assert np.isnan(steel.diameter_m[truth.bar_id]).any()
+    assert np.isnan(steel.bars_by_view[truth.view_id].diameter_m[truth.bar_id]).any()
 
 
 def test_cache_command_shows_and_clears(tiny_root: Path, empty_cache: Path) -> None:

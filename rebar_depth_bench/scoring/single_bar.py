@@ -1,0 +1,47 @@
+"""Single-bar interior: scored pixels whose 3 x 3 neighbourhood belongs to one bar.
+
+The interior of the protocol erodes the union of all bars. Where bars lie side by side in the image, a scored
+pixel can therefore have another bar beside it, at another depth; a prediction that is exact but shifted by one
+pixel has a large error there. Errors on the single-bar interior contain no such steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from rebar_depth_bench.scoring.ground_truth import ViewTruth
+from rebar_depth_bench.scoring.metrics import DepthMetrics, is_valid_prediction, metrics_at_scales
+
+
+@dataclass(frozen=True)
+class SingleBarScore:
+    """Share of a view's scored pixels that are single-bar, and the metrics of the valid ones among them.
+
+    ``native`` and ``scaled`` are None without such pixels. ``scaled`` uses the view's scale, that of all its
+    scored pixels.
+    """
+
+    share: float
+    native: DepthMetrics | None
+    scaled: DepthMetrics | None
+
+
+def score_single_bar(
+    truth: ViewTruth, single_bar: Bool[ndarray, " n"], prediction_m: Float[ndarray, "h w"], scale: float | None
+) -> SingleBarScore:
+    """Return the score of a view on its single-bar pixels.
+
+    ``single_bar`` marks them among the pixels of ``truth``; ``prediction_m`` is planar depth, metres, and
+    ``scale`` the view's scale, None if it has none.
+    """
+    share = float(np.mean(single_bar))
+    p_m = prediction_m.ravel().take(truth.index.astype(np.intp))
+    chosen = single_bar & is_valid_prediction(p_m)
+    if scale is None or not chosen.any():
+        return SingleBarScore(share, None, None)
+    (native, scaled), _ = metrics_at_scales(p_m[chosen], truth.depth_m[chosen], (1.0, scale), ())
+    return SingleBarScore(share, native, scaled)

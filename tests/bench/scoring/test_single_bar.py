@@ -1,0 +1,186 @@
+"""Single-bar interior: its pixels, share and errors, against loops over pixels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy import ndarray
+
+import rebar_depth_bench as rdb
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.extended.full_mask import REGION_NUMBERS, full_mask_samples
+from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, MIN_PIXELS, profile_samples
+from rebar_depth_bench.extended.single_bar import single_bar_samples
+from rebar_depth_bench.scoring.ground_truth import config_truth
+from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels
+from rebar_depth_bench.studies.distance.command import run_distance_study
+from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth
+
+Depths = dict[str, ndarray]
+Archive = Callable[..., Path]
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def expected_pixels(bars: ndarray, pixels: ndarray) -> list[bool]:
+    """Return which flat indices have nine equal ids other than 0 around them, by a loop."""
+    width, chosen = bars.shape[1], []
+    for pixel in pixels:
+        row, column = divmod(int(pixel), width)
+        around = {int(bars[y, x]) for y in range(row - 1, row + 2) for x in range(column - 1, column + 2)}
+        chosen.append(len(around) == 1 and 0 not in around)
+    return chosen
+
+
+def test_two_bars_side_by_side() -> None:
+    bars = np.zeros((7, 8), np.uint16)
+    bars[:, 1:4], bars[:, 4:7] = 1, 2
+    pixels = scored_pixels(bars > 0, np.ones(bars.shape, np.float32))
+    chosen = pixels[single_bar_pixels(bars, pixels)]
+    # The union of the bars keeps the columns 2 to 5; of these, 3 and 4 touch the other bar.
+    assert sorted({int(pixel) % 8 for pixel in pixels}) == [2, 3, 4, 5]
+    assert sorted({int(pixel) % 8 for pixel in chosen}) == [2, 5]
+    assert len(chosen) == 10
+
+
+@settings(max_examples=60)
+@given(SEEDS)
+def test_pixels_equal_a_loop(seed: int) -> None:
+    depth_m, bars = random_images(np.random.default_rng(seed))
+    pixels = scored_pixels(bars > 0, depth_m)
+    assert single_bar_pixels(bars, pixels).tolist() == expected_pixels(bars, pixels)
+
+
+@settings(max_examples=30)
+@given(SEEDS)
+def test_other_ids_choose_the_same_pixels(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth_m, bars = random_images(rng)
+    names = np.concatenate([[0], rng.permutation(np.arange(1, 60_000))]).astype(np.uint16)
+    pixels = scored_pixels(bars > 0, depth_m)
+    assert np.array_equal(single_bar_pixels(names[bars], pixels), single_bar_pixels(bars, pixels))
+
+
+@settings(max_examples=30)
+@given(SEEDS)
+def test_one_bar_has_the_whole_interior(seed: int) -> None:
+    depth_m, bars = random_images(np.random.default_rng(seed))
+    one = (bars > 0).astype(np.uint16)
+    assert single_bar_pixels(one, scored_pixels(one > 0, depth_m)).all()
+    truth = steel_truth(depth_m, one)
+    if truth.interior.any():
+        p_m = truth.depth_m.astype(np.float64)
+        assert single_bar_samples(p_m, truth)["single_bar_share"] == [1.0]
+
+
+@settings(max_examples=40)
+@given(SEEDS)
+def test_measures_equal_numpy_on_the_chosen_pixels(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = random_truth(rng)
+    p_m = random_prediction(rng, truth)
+    chosen = truth.single_bar
+    assert not (chosen & ~truth.interior).any()
+    samples = {name: values.tolist() for name, values in single_bar_samples(p_m, truth).items()}
+    count = np.count_nonzero(truth.interior)
+    assert samples["single_bar_share"] == ([np.count_nonzero(chosen) / count] if count else [])
+    with np.errstate(invalid="ignore"):
+        valid = chosen & np.isfinite(p_m) & (p_m > 0)
+    if not chosen.any():
+        assert all(samples[f"single_bar_{name}"] == [] for name in REGION_NUMBERS)
+        return
+    assert samples["single_bar_coverage"] == [np.count_nonzero(valid) / np.count_nonzero(chosen)]
+    z, p = truth.depth_m[valid].astype(np.float64), p_m[valid]
+    if valid.any():
+        assert samples["single_bar_abs_rel"] == pytest.approx([np.mean(np.abs(p - z) / z)], rel=1e-12)
+        assert samples["single_bar_rmse_cm"] == pytest.approx([100 * math.sqrt(np.mean((p - z) ** 2))], rel=1e-12)
+        assert samples["single_bar_delta1"] == [np.mean(np.maximum(p / z, z / p) < 1.25)]
+
+
+def test_shift_by_one_pixel_costs_less_on_single_bars() -> None:
+    """Exact depth shifted by one pixel is exact on flat bars, but not where another bar is within one pixel."""
+    depth_m, bars = np.full((9, 14), 0.5, np.float32), np.zeros((9, 14), np.uint16)
+    bars[:, 1:7], bars[:, 7:13] = 1, 2
+    depth_m[:, 7:13] = 0.8
+    truth = steel_truth(depth_m, bars)
+    shifted_m = np.roll(depth_m, 1, axis=1).astype(np.float64).ravel()[truth.index]
+    assert single_bar_samples(shifted_m, truth)["single_bar_abs_rel"] == [0.0]
+    assert full_mask_samples(shifted_m, truth)["interior_abs_rel"][0] > 0.03
+
+
+def test_profile_bins_equal_numpy() -> None:
+    rng = np.random.default_rng(3)
+    z_m = np.repeat(np.linspace(0.21, 0.95, 60), 60).reshape(60, 60).astype(np.float32)
+    bars = np.broadcast_to(1 + np.arange(60) // 4, (60, 60)).astype(np.uint16)
+    truth = steel_truth(z_m, bars)
+    p_m = truth.depth_m * rng.uniform(0.9, 1.1, len(truth.index))
+    p_m[rng.random(len(p_m)) < 0.2] = math.nan
+    samples = profile_samples(p_m, truth, np.full(70_000, 0.01))
+    filled = 0
+    for low, high in pairwise(DISTANCE_EDGES_M):
+        inside = truth.interior & (truth.depth_m >= low) & (truth.depth_m < high)
+        chosen = inside & truth.single_bar & np.isfinite(p_m)
+        share, error = (samples[f"single_bar_{name}_at_{low:g}-{high:g}m"] for name in ("share", "abs_rel"))
+        assert len(share) == (np.count_nonzero(inside) >= MIN_PIXELS)
+        assert len(error) == (np.count_nonzero(chosen) >= MIN_PIXELS)
+        if len(error):
+            filled += 1
+            z = truth.depth_m[chosen].astype(np.float64)
+            assert share[0] == pytest.approx(np.mean(truth.single_bar[inside]), rel=1e-12)
+            assert error[0] == pytest.approx(np.mean(np.abs(p_m[chosen] - z) / z), rel=1e-12)
+    assert filled == 6
+
+
+def rendered(root: Path, config: str) -> Mapping[str, tuple[ndarray, ndarray, ndarray]]:
+    columns = ["view_id", "left_bars", "left_mask", "left_depth"]
+    return {
+        row["view_id"]: (row["left_bars"], interior(row["left_mask"]), row["left_depth"])
+        for row in rdb.load(root, config, streaming=True, columns=columns)
+    }
+
+
+def test_rendered_views(tiny_root: Path) -> None:
+    truths = config_truth(open_folder(tiny_root).config("lattice"))
+    images = rendered(tiny_root, "lattice")
+    shares = []
+    for position, truth in enumerate(truths):
+        bars, inside, _ = images[truth.view_id]
+        single_bar = truths.single_bar(position)
+        assert np.array_equal(truth.index, np.flatnonzero(inside))
+        assert single_bar.tolist() == expected_pixels(bars, truth.index)
+        shares.append(single_bar.mean())
+    assert min(shares) < max(shares) < 1
+
+
+def test_study_reports_share_and_errors(tiny_root: Path, tiny_truth: Depths, archive_of: Archive) -> None:
+    rng = np.random.default_rng(5)
+    noisy = {view: z * rng.uniform(0.8, 1.3, z.shape).astype(np.float32) for view, z in tiny_truth.items()}
+    study = run_distance_study(archive_of(noisy), tiny_root, configs=["lattice"])
+    images = rendered(tiny_root, "lattice")
+    for point in study.points:
+        bars, inside, z_m = images[point.score.view_id]
+        pixels = np.flatnonzero(inside)
+        chosen = pixels[np.array(expected_pixels(bars, pixels))]
+        assert point.single_bar.share == len(chosen) / len(pixels)
+        if not len(chosen):
+            assert (point.single_bar.native, point.single_bar.scaled) == (None, None)
+            continue
+        z, p = (image.ravel().astype(np.float64) for image in (z_m, noisy[point.score.view_id]))
+        scale = np.median(z[pixels]) / np.median(p[pixels])
+        errors = [np.mean(np.abs(s * p[chosen] - z[chosen]) / z[chosen]) for s in (1.0, scale)]
+        assert point.single_bar.native is not None
+        assert point.single_bar.scaled is not None
+        found = [point.single_bar.native.abs_rel, point.single_bar.scaled.abs_rel]
+        assert found == pytest.approx(errors, rel=1e-9)
+    for bin_ in study.bins:
+        of_bin: list[Any] = [p for p in study.points if bin_.low_m <= p.distance_m < bin_.high_m]
+        assert bin_.single_bar_share == pytest.approx(np.mean([point.single_bar.share for point in of_bin]))
+        native = [point.single_bar.native.abs_rel for point in of_bin if point.single_bar.native]
+        assert bin_.single_bar_native_abs_rel.value == (pytest.approx(np.mean(native)) if native else None)
