@@ -31,6 +31,7 @@ COMMAND_SETTINGS: dict[str, tuple[str, ...]] = {
         "score_memory",
         "lease_seconds",
         "error_maps",
+        "hidden_truth",
     ),
     "token": ("state_dir", "db"),
     "remove": ("state_dir", "db", "archives"),
@@ -134,9 +135,11 @@ _COMMAND_HELP = {
 
 def _add_setting(command: argparse.ArgumentParser, name: str) -> None:
     field = Settings.model_fields[name]
+    flag: dict[str, Any] = {"nargs": "?", "const": "true"} if field.annotation is bool else {}
     default_text = "" if field.is_required() or field.default == "" else f" (default: {field.default})"
     command.add_argument(
         f"--{name.replace('_', '-')}",
         metavar=name.upper(),
         help=f"{field.description}{default_text}".replace("%", "%%"),
+        **flag,
     )

@@ -50,7 +50,11 @@ def open_service(settings: Settings) -> Iterator[Service]:
     submissions of another dataset, unless the setting ``rescore`` is on.
     """
     folder = open_folder(settings.data)
-    with work_dir(settings.spool) as spool, closing(Database(settings.database_url)) as database:
+    hidden_truth = settings.hidden_truth
+    with (
+        work_dir(settings.spool) as spool,
+        closing(Database(settings.database_url, hidden_truth=hidden_truth)) as database,
+    ):
         archives = ArchiveStore(settings.archives_url)
         database.migrate()
         remove_orphan_archives(database, archives)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from limits import parse_many
-from pydantic import ByteSize, Field, ValidationError, field_validator
+from pydantic import ByteSize, Field, ValidationError, ValidationInfo, field_validator
 from pydantic_core import ErrorDetails
 from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import make_url
@@ -62,6 +62,9 @@ class Settings(BaseSettings):
         le=100,
         description="worst views per config shown as error maps; these let a submitter compute the ground truth",
     )
+    hidden_truth: bool = Field(
+        False, description="return only rank error and coverage per config, rounded to three decimals"
+    )
     rescore: bool = Field(False, description="score submissions for another dataset again, against this one")
     workers: int = Field(1, ge=0, le=64, description="number of scoring processes that `serve` starts")
     dask_scheduler: str = Field("", description="address of a dask scheduler whose workers score the archives")
@@ -84,6 +87,13 @@ class Settings(BaseSettings):
         except (ArgumentError, ValueError):
             raise ValueError(expected) from None
         return url
+
+    @field_validator("hidden_truth")
+    @classmethod
+    def _check_no_error_maps(cls, hidden_truth: bool, info: ValidationInfo) -> bool:
+        if hidden_truth and info.data.get("error_maps"):
+            raise ValueError("expected error_maps 0, because error maps show the ground truth")
+        return hidden_truth
 
     @field_validator("read_rate_limit", "write_rate_limit")
     @classmethod

@@ -24,6 +24,7 @@ from rebar_depth_bench.errors import (
     problem_summary,
 )
 from rebar_depth_bench.reading import parse_json
+from rebar_depth_bench.scoring.disclosure import DisclosedResult, is_disclosed, read_disclosed
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.result_io import read_result
 from rebar_depth_bench.validation import Expected, StrictModel, one_of, text, validate_table, whole_number
@@ -125,14 +126,17 @@ class Response:
             error.problems = ()
         return error
 
-    def result(self, archive_sha256: str | None) -> Result:
-        """Return the result in the body. Raises ``AnswerError`` if it is none, or that of another archive."""
+    def result(self, archive_sha256: str | None) -> Result | DisclosedResult:
+        """Return the result in the body. Raises ``AnswerError`` if it is none, or that of another archive.
+
+        A leaderboard with hidden ground truth returns only the disclosed part of it.
+        """
         where = f"{self.where}: the result of the leaderboard"
-        _, problems = parse_json(self.body)
+        document, problems = parse_json(self.body)
         if problems:
             raise AnswerError(f"{where}: {problem_summary(problems)}")
         try:
-            result = read_result(self.body, where)
+            result = (read_disclosed if is_disclosed(document) else read_result)(self.body, where)
         except InputError as error:
             raise AnswerError(str(error)) from None
         if archive_sha256 not in (None, result.submission_sha256):

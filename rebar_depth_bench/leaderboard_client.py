@@ -126,6 +126,8 @@ class LeaderboardClient:
     def result(self, submission_id: str, archive_sha256: str | None = None) -> bytes:
         """Return the result JSON, byte-identical to the output of ``rebar-bench score --json``.
 
+        A leaderboard with hidden ground truth returns only the disclosed part of it.
+
         Raises ``ServiceError`` if the response status is not 200 or the body is no result, or that of another
         archive than the one with ``archive_sha256``.
         """

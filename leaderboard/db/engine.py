@@ -29,10 +29,14 @@ class Database:
 
     On SQLite, write transactions acquire the single write lock at their start (``BEGIN IMMEDIATE``) and wait for
     it; read transactions never wait.
+
+    With ``hidden_truth``, the functions of this package return only the disclosed part of the stored scores
+    (``rebar_depth_bench.scoring.disclosure``). What is stored does not depend on it.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, *, hidden_truth: bool = False) -> None:
         """Create the engine. Raises ``InputError`` if ``url`` is not a valid database URL."""
+        self.hidden_truth = hidden_truth
         try:
             self._engine = _engine(url)
         except (ArgumentError, NoSuchModuleError, ImportError, OSError) as error:

@@ -1,20 +1,24 @@
 """Leaderboard queries: ranked rows of a config, ranks and queue position of a submission, error maps.
 
 The queries select columns instead of ORM objects, so that a page with hundreds of rows takes milliseconds.
+
+If the ground truth is hidden, rows, order and ranks depend on the disclosed numbers only, and no error map is
+returned.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
-from sqlalchemy import false, func, select
-from sqlalchemy.orm import aliased
+from sqlalchemy import and_, false, func, or_, select
 
 from leaderboard.db.engine import Database
 from leaderboard.db.models import ErrorMapModel, LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
 from leaderboard.db.submissions import QUEUED, SCORED
+from rebar_depth_bench.scoring.disclosure import DisclosedTable, disclosed_number, smallest_disclosed_alike
 from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL, PROTOCOL
 
 
@@ -23,7 +27,7 @@ class LeaderboardEntry:
     """A submission's row of one config; ``rank`` is None if the row is not ranked.
 
     ``class_rank`` is the rank among the submissions that declare the same ``inputs``, None without a declaration.
-    ``table_json`` is the JSON text of the config's table in the result.
+    ``table_json`` is the JSON text of the config's table in the result, or of its disclosed part.
     """
 
     rank: int | None
@@ -113,22 +117,30 @@ def leaderboard_entries(
             SubmissionModel.public | own,
             ResultModel.protocol.in_((PROTOCOL, OLD_PROTOCOL)),
         )
-        .order_by(
-            LeaderboardRowModel.ranked.desc(),
-            LeaderboardRowModel.rank_error.nulls_last(),
-            SubmissionModel.created_at,
-        )
+        .order_by(SubmissionModel.created_at)
     )
     with database.read() as session:
-        rows = session.execute(query).all()
+        rows = [tuple(row) for row in session.execute(query)]
+    if database.hidden_truth:
+        rows = [_disclosed(row) for row in rows]
+    # Sorted here, because databases round differently; the sort is stable.
+    rows.sort(key=lambda row: (not row[0], row[1] is None, row[1]))
     overall, by_inputs = _RankCounter(), defaultdict[str, _RankCounter](_RankCounter)
     entries = []
-    for row in rows:
-        has_rank = row.ranked and row.public
-        rank = overall.next(row.rank_error) if has_rank else None
-        class_rank = by_inputs[row.inputs].next(row.rank_error) if has_rank and row.inputs else None
-        entries.append(LeaderboardEntry(rank, class_rank, *tuple(row)[2:]))
+    for ranked, rank_error, *fields in rows:
+        entry = LeaderboardEntry(None, None, *fields)
+        if ranked and entry.public:
+            class_rank = by_inputs[entry.inputs].next(rank_error) if entry.inputs else None
+            entry = replace(entry, rank=overall.next(rank_error), class_rank=class_rank)
+        entries.append(entry)
     return entries
+
+
+def _disclosed(row: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return the values of ``_COLUMNS`` with the rank error and the table as they are disclosed."""
+    ranked, rank_error, *others, table_json = row
+    shown = None if rank_error is None else disclosed_number(rank_error)
+    return ranked, shown, *others, DisclosedTable.model_validate_json(table_json).model_dump_json()
 
 
 def entries_of_class(entries: Sequence[LeaderboardEntry], inputs: str | None) -> list[LeaderboardEntry]:
@@ -154,6 +166,8 @@ class _RankCounter:
 
 def error_map_views(database: Database, submission_id: str) -> list[str]:
     """Return the ids of the views that have a stored error map, sorted."""
+    if database.hidden_truth:
+        return []
     query = select(ErrorMapModel.view_id).where(ErrorMapModel.submission_id == submission_id)
     with database.read() as session:
         return list(session.scalars(query.order_by(ErrorMapModel.view_id)))
@@ -161,6 +175,8 @@ def error_map_views(database: Database, submission_id: str) -> list[str]:
 
 def error_map_webp(database: Database, submission_id: str, view_id: str) -> bytes | None:
     """Return the error map of a view as WebP bytes, or None if none is stored."""
+    if database.hidden_truth:
+        return None
     with database.read() as session:
         record = session.get(ErrorMapModel, (submission_id, view_id))
         return None if record is None else record.webp
@@ -175,30 +191,26 @@ class QueuePosition:
 
 
 def ranks(database: Database, submission: SubmissionModel) -> dict[str, int]:
-    """Return the ranks of a submission by config, in one query; configs where it is not ranked are left out."""
+    """Return the ranks of a submission by config; configs where it is not ranked are left out."""
     if not submission.public:
         return {}
-    own_row, other_row, other_submission = (
-        aliased(LeaderboardRowModel),
-        aliased(LeaderboardRowModel),
-        aliased(SubmissionModel),
-    )
-    better = (
-        select(func.count())
-        .select_from(other_row)
-        .join(other_submission, other_submission.id == other_row.submission_id)
-        .where(
-            other_row.config == own_row.config,
-            other_row.ranked,
-            other_submission.status == SCORED,
-            other_submission.public,
-            other_row.rank_error < own_row.rank_error,
-        )
-        .scalar_subquery()
-    )
-    query = select(own_row.config, 1 + better).where(own_row.submission_id == submission.id, own_row.ranked)
+    row = LeaderboardRowModel
+    own = select(row.config, row.rank_error).where(row.submission_id == submission.id, row.ranked)
     with database.read() as session:
-        return dict(session.execute(query).all())
+        limits = {
+            config: smallest_disclosed_alike(error) if database.hidden_truth else error
+            for config, error in session.execute(own)
+            if error is not None
+        }
+        is_better = (and_(row.config == config, row.rank_error < limit) for config, limit in limits.items())
+        query = (
+            select(row.config, func.count())
+            .join(SubmissionModel, SubmissionModel.id == row.submission_id)
+            .where(or_(false(), *is_better), row.ranked, SubmissionModel.status == SCORED, SubmissionModel.public)
+            .group_by(row.config)
+        )
+        counts = dict(session.execute(query).all())
+    return {config: 1 + counts.get(config, 0) for config in limits}
 
 
 def queue_position(database: Database, submission: SubmissionModel) -> QueuePosition | None:

@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 
 from leaderboard.db.engine import Database
 from leaderboard.db.models import ErrorMapModel, LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
+from rebar_depth_bench.scoring.disclosure import disclosed_json
 from rebar_depth_bench.submission import SubmissionMeta
 
 QUEUED, SCORING, SCORED, FAILED, DELETED = "queued", "scoring", "scored", "failed", "deleted"
@@ -94,14 +95,18 @@ def find(database: Database, submission_id: str) -> SubmissionModel | None:
 
 
 def result_json(database: Database, submission_id: str) -> bytes | None:
-    """Return the result JSON of a scored submission, byte-identical to the command line's, or None."""
+    """Return the result JSON of a scored submission, byte-identical to the command line's, or None.
+
+    If the ground truth is hidden, it is the disclosed part of the result.
+    """
     query = (
         select(ResultModel.json)
         .join(SubmissionModel, SubmissionModel.id == ResultModel.submission_id)
         .where(ResultModel.submission_id == submission_id, SubmissionModel.status == SCORED)
     )
     with database.read() as session:
-        return session.scalar(query)
+        result = session.scalar(query)
+    return disclosed_json(result) if result is not None and database.hidden_truth else result
 
 
 def publish(database: Database, submission_id: str, public: bool) -> None:

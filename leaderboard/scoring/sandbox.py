@@ -29,6 +29,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError, RebarDepthError, SubmissionError, problem_summary
 from rebar_depth_bench.reporting.html.page import iter_view_panels
 from rebar_depth_bench.reporting.html.view_images import error_webp
+from rebar_depth_bench.scoring.disclosure import check_view_coverage
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.score import score_evaluation
@@ -75,6 +76,8 @@ def _score(archive: str, task: ScoringTask) -> None:
         raise DatasetError(f"{task.data}: the digest is {digest}, expected {task.dataset_digest}")
     with open_evaluation(archive, task.data) as evaluation:
         result = score_evaluation(evaluation)
+        if task.hidden_truth:
+            check_view_coverage(result.views)
         if task.error_maps:
             folder = Path(task.out) / ERROR_MAPS_DIR
             folder.mkdir()

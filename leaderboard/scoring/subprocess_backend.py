@@ -36,6 +36,7 @@ def make_subprocess_backend(settings: Settings, spool: Path) -> ScoringBackend:
                 out=scratch,
                 memory=settings.score_memory,
                 error_maps=settings.error_maps,
+                hidden_truth=settings.hidden_truth,
                 parent=os.getpid(),
             )
             try:

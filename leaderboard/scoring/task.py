@@ -14,7 +14,8 @@ class ScoringTask:
     """Input of the scoring process.
 
     ``archives`` is the URL of the archive storage, ``data`` the dataset, ``out`` the output folder, ``memory`` the
-    limit in bytes, ``error_maps`` the number of views per config, ``parent`` the id of the waiting process.
+    limit in bytes, ``error_maps`` the number of views per config, ``hidden_truth`` whether archives with a view of
+    low coverage fail, ``parent`` the id of the waiting process.
     """
 
     archives: str
@@ -24,6 +25,7 @@ class ScoringTask:
     out: str
     memory: int
     error_maps: int
+    hidden_truth: bool
     parent: int
 
     def to_json(self) -> bytes:

@@ -28,13 +28,18 @@ Uploads require a bearer token. An archive is validated before it is accepted; a
 against the quota. The id of a submission is random. Anyone who knows the id can read the submission, even if its
 rows are not on the leaderboard."""
 
+HIDDEN_TRUTH = """
+
+The ground truth is hidden: of each result, only the rank error and the coverage of each config are returned, to
+three decimals, and ranks use these rounded numbers."""
+
 
 def make_app(service: Service) -> FastAPI:
     """Return the application that serves ``service``."""
     app = FastAPI(
         title=service.settings.title,
         version=software_version(),
-        description=DESCRIPTION,
+        description=DESCRIPTION + (HIDDEN_TRUTH if service.settings.hidden_truth else ""),
         docs_url=None,  # These pages load scripts from other hosts.
         redoc_url=None,
     )

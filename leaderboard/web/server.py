@@ -50,6 +50,7 @@ def serve(settings: Settings) -> None:
         for signal_number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(signal_number, stop)
         details = {"version": software_version(), "dataset": service.folder.digest, "scorers": settings.workers}
+        details["hidden_truth"] = settings.hidden_truth
         _LOG.info("serving", database=without_password(settings.database_url), **details)
         with WorkerSupervisor(settings, settings.workers):
             server.run(sockets=[listener])

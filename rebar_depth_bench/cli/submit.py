@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import getpass
+import json
 import os
 import sys
 from pathlib import Path
@@ -12,10 +13,12 @@ from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.console import ProgressBars, add_archive, add_output_file, add_seconds
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.leaderboard_answers import server_lines
 from rebar_depth_bench.leaderboard_client import WAIT_S, LeaderboardClient
+from rebar_depth_bench.reporting.formatting import coverage_percent, number
 from rebar_depth_bench.reporting.tables import print_table
+from rebar_depth_bench.scoring.disclosure import DECIMALS, DisclosedResult, is_disclosed, read_disclosed
 from rebar_depth_bench.scoring.result_io import read_result
 
 SUMMARY = "upload an archive to a leaderboard, wait for its score and print the table"
@@ -63,7 +66,19 @@ def run(options: argparse.Namespace) -> None:
         result = leaderboard.result(accepted.id, accepted.archive_sha256)
     if options.json:
         write_bytes(options.json, result)
-    print_table(read_result(result, options.url), Console())
+    if is_disclosed(json.loads(result)):
+        _print_disclosed(read_disclosed(result, options.url))
+    else:
+        print_table(read_result(result, options.url), Console())
+
+
+def _print_disclosed(result: DisclosedResult) -> None:
+    """Print what a leaderboard with hidden ground truth discloses: one line per config."""
+    print(f"{printable(result.submission.method)}, protocol {result.protocol}, ground truth hidden")
+    for config, table in result.tables.items():
+        error, coverage = number(table.rank_error, DECIMALS), coverage_percent(table.coverage)
+        note = "" if table.ranked else ", not ranked"
+        print(f"{printable(config)}: rank error {error}, coverage {coverage} %{note}")
 
 
 def _read_token(file: Path | None) -> str:

@@ -60,7 +60,7 @@ def read_table(table: Mapping[str, Any]) -> Table:
     return content.content()
 
 
-class _StoredModel(StrictModel):
+class StoredModel(StrictModel):
     """Base class of the objects of a result."""
 
     model_config = ConfigDict(extra="ignore")
@@ -69,7 +69,7 @@ class _StoredModel(StrictModel):
 _NAME_CHARACTERS = 300
 _MAX_ENTRIES = 5000
 """Largest number of entries of a JSON object whose keys are names."""
-_Name = Annotated[str, text(_NAME_CHARACTERS)]
+Name = Annotated[str, text(_NAME_CHARACTERS)]
 # Constraints of pydantic's core are checked without Python code: the leaderboard reads a table for each row.
 _Count = Annotated[int, Field(ge=0, lt=1 << 53)]
 _Share = Annotated[float, Field(ge=0, le=1)]
@@ -87,8 +87,9 @@ def _check_length(table: object) -> object:
     return table
 
 
-_LENGTH = BeforeValidator(_check_length)
-_Intervals = Annotated[dict[str, _Interval], _LENGTH]
+LIMITED = BeforeValidator(_check_length)
+"""Annotation of a JSON object whose keys are names."""
+_Intervals = Annotated[dict[str, _Interval], LIMITED]
 
 
 def _has_tolerances(within_mm: Mapping[str, object]) -> bool:
@@ -98,7 +99,7 @@ def _has_tolerances(within_mm: Mapping[str, object]) -> bool:
 _WITHIN = Expected(f"a share for each of {', '.join(_TOLERANCES)} mm", _has_tolerances)
 
 
-class _MetricsJson(_StoredModel):
+class _MetricsJson(StoredModel):
     """Metrics of a view or table; null where a metric overflowed, or all of them without predictions."""
 
     abs_rel: _Size | None
@@ -112,7 +113,7 @@ class _MetricsJson(_StoredModel):
         return DepthMetrics(*[math.inf if value is None else value for value in values])
 
 
-class _AlignedJson(_StoredModel):
+class _AlignedJson(StoredModel):
     """Metrics of both alignments, which may be null without predictions."""
 
     coverage: _Share | None
@@ -135,14 +136,14 @@ class _AlignedJson(_StoredModel):
         return values.content() if self.is_predicted and values is not None else None
 
 
-class _ErrorsJson(_StoredModel):
+class _ErrorsJson(StoredModel):
     """Reference errors of one kind."""
 
     abs_rel: _Size | None = None
     rmse_cm: _Size | None = None
 
 
-class _ReferenceJson(_StoredModel):
+class _ReferenceJson(StoredModel):
     """Reference errors of a config."""
 
     constant: _ErrorsJson = _ErrorsJson()
@@ -154,14 +155,14 @@ class _ReferenceJson(_StoredModel):
         return Reference(constant.abs_rel, constant.rmse_cm, one_pixel.abs_rel, one_pixel.rmse_cm)
 
 
-class _PublishedJson(_StoredModel):
+class _PublishedJson(StoredModel):
     """Scene of the paper's Table I."""
 
-    scene: _Name
+    scene: Name
     same_optics: bool
 
 
-class _IntervalsJson(_StoredModel):
+class _IntervalsJson(StoredModel):
     """95 % intervals, nested like the metrics; a missing interval is undefined."""
 
     coverage: _Interval = None
@@ -193,7 +194,7 @@ class _TableJson(_AlignedJson):
     views_scored: _Count
     ranked: bool
     scale_median: _Size | None
-    within_mm: Annotated[dict[str, _Share | None], _WITHIN, _LENGTH]
+    within_mm: Annotated[dict[str, _Share | None], _WITHIN, LIMITED]
     rank_error: _Share | None = None
     reference: _ReferenceJson = _ReferenceJson()
     published: _PublishedJson | None = None
@@ -227,12 +228,12 @@ class _TableJson(_AlignedJson):
 class _ViewJson(_AlignedJson):
     """Scores of a view."""
 
-    view_id: _Name
+    view_id: Name
     scored_px: _Count
     coverage: _Share
     rank_error: _Share | None = None
     scale: _Size | None
-    within_mm: Annotated[dict[str, _Share], _WITHIN, _LENGTH]
+    within_mm: Annotated[dict[str, _Share], _WITHIN, LIMITED]
 
     @property
     def is_predicted(self) -> bool:
@@ -253,36 +254,36 @@ class _ViewJson(_AlignedJson):
         )
 
 
-class _DatasetJson(_StoredModel):
+class DatasetJson(StoredModel):
     """Identity of the dataset."""
 
     digest: Annotated[str, Field(pattern="^sha256:[0-9a-f]{64}$")]
-    version: _Name
+    version: Name
 
 
-class _SubmissionJson(_StoredModel):
+class SubmissionJson(StoredModel):
     """Identity of the submission."""
 
-    method: _Name
+    method: Name
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     inputs: Annotated[str, one_of(*INPUTS)] | None = None
     uses_ground_truth: bool | None = None
 
 
-class _SoftwareJson(_StoredModel):
+class SoftwareJson(StoredModel):
     """Version of the software that scored."""
 
-    version: _Name
+    version: Name
 
 
-class _ResultJson(_StoredModel):
+class _ResultJson(StoredModel):
     """Content of a result file."""
 
     protocol: Annotated[str, one_of(PROTOCOL, OLD_PROTOCOL)]
-    dataset: _DatasetJson
-    submission: _SubmissionJson
-    software: _SoftwareJson
-    tables: Annotated[dict[_Name, _TableJson], _LENGTH]
+    dataset: DatasetJson
+    submission: SubmissionJson
+    software: SoftwareJson
+    tables: Annotated[dict[Name, _TableJson], LIMITED]
     views: Annotated[list[_ViewJson], FailFast()]
 
     @model_validator(mode="after")

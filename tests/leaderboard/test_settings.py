@@ -68,6 +68,9 @@ CASES = {
     ),
     "port too high": Case("port: .*65535.*65536", "--port 65536"),
     "neither owner nor always": Case("default_visibility: .*'owner' or 'always'", "--default-visibility never"),
+    "hidden ground truth with error maps": Case(
+        "hidden_truth: expected error_maps 0", "--hidden-truth", environment={f"{PREFIX}ERROR_MAPS": "6"}
+    ),
     "malformed TOML": Case("malformed: .*\n.*not a valid TOML file", "--settings HERE/malformed"),
     "TOML that is not UTF-8": Case("latin: .*\n.*not UTF-8", "--settings HERE/latin"),
     "no TOML file": Case("none: .*\n.*cannot be read: No such file", "--settings HERE/none"),
@@ -234,6 +237,7 @@ def example_value(name: str) -> str:
         "write_rate_limit": "4/second",
         "state_dir": "/elsewhere",
         "rescore": "true",
+        "hidden_truth": "true",
     }
     kind = Settings.model_fields[name].annotation
     return special.get(name, "17" if kind in (int, float, ByteSize) else "something")
@@ -254,6 +258,13 @@ def test_every_setting_is_read_from_every_source(
     assert getattr(read_settings(None, rest), name) == by_command
     assert str(by_command).lower() in (value, f"{value}.0")
     assert Settings.model_fields[name].default != by_command
+
+
+@pytest.mark.parametrize("option", ["--hidden-truth", "--rescore"])
+def test_switches_need_no_value(option: str) -> None:
+    parsed = argument_parser().parse_args(["serve", option, "--data", "x"])
+    name = option.removeprefix("--").replace("-", "_")
+    assert getattr(read_settings(None, {"data": parsed.data, name: getattr(parsed, name)}), name) is True
 
 
 @pytest.mark.parametrize("command", COMMAND_SETTINGS)

@@ -23,25 +23,28 @@ from leaderboard.web.api.schemas import (
 )
 from leaderboard.web.cache import NO_STORE, REVALIDATE, RenderedBody, cached_public_body, conditional_response
 from rebar_depth_bench.reporting.tables import csv_text
+from rebar_depth_bench.scoring.disclosure import DisclosedTable
 from rebar_depth_bench.scoring.frames import TABLE_COLUMNS, table_values
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 
-def entries_to_csv(rows: Sequence[LeaderboardEntry]) -> str:
+def entries_to_csv(rows: Sequence[LeaderboardEntry], hidden_truth: bool = False) -> str:
     """Return rows as CSV: ranks, id, method, submitter, declarations, config, then the command line's columns.
 
-    Undefined numbers are empty cells.
+    If the ground truth is hidden, the last columns are those of the disclosed table. Undefined numbers are empty
+    cells.
     """
+    columns = tuple(DisclosedTable.model_fields) if hidden_truth else TABLE_COLUMNS
     header = ["rank", "class_rank", "id", "method", "submitter", "inputs", "uses_ground_truth", "config"]
     cells = (
         [
             *(row.rank, row.class_rank, row.submission_id, row.method, row.submitter),
             *(row.inputs, row.uses_ground_truth, row.config),
-            *table_values(json.loads(row.table_json)),
+            *(json.loads(row.table_json).values() if hidden_truth else table_values(json.loads(row.table_json))),
         ]
         for row in rows
     )
-    return csv_text([[*header, *TABLE_COLUMNS], *cells])
+    return csv_text([[*header, *columns], *cells])
 
 
 router = APIRouter(prefix="/api/v1", tags=["leaderboard"], responses=COMMON_RESPONSES)
@@ -90,7 +93,7 @@ async def leaderboard_csv(
     """Return the rows of a config as CSV."""
 
     def serialise(rows: list[LeaderboardEntry]) -> bytes:
-        return entries_to_csv(rows).encode()
+        return entries_to_csv(rows, service_of(request).settings.hidden_truth).encode()
 
     return await _leaderboard_response(request, config, inputs, token, CSV, serialise)
 

@@ -64,7 +64,10 @@ class RejectedResponse(BaseModel):
 
 
 class Submission(BaseModel):
-    """Submission with its status; ``result`` is the JSON of ``rebar-bench score`` once it is scored."""
+    """Submission with its status; ``result`` is the JSON of ``rebar-bench score`` once it is scored.
+
+    If the ground truth is hidden, it is only the rank error and the coverage of each config, rounded.
+    """
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -115,7 +118,7 @@ class Publication(BaseModel):
 
 
 class LeaderboardRow(BaseModel):
-    """Leaderboard row; ``table`` is the table of the config in the result JSON."""
+    """Leaderboard row; ``table`` is the table of the config in the result JSON of the submission."""
 
     rank: int | None = Field(description="rank by rank error, shared by equal errors; null if not ranked")
     class_rank: int | None = Field(description="rank among the rows with the same declared inputs")

@@ -98,7 +98,10 @@ def look_up(submission_id: SubmissionId, request: Request, service: ServiceDep, 
     response_class=Response,
 )
 def result(submission_id: SubmissionId, service: ServiceDep) -> Response:
-    """Return the result, byte for byte as `rebar-bench score ARCHIVE --data ROOT --json FILE` writes it."""
+    """Return the result, byte for byte as `rebar-bench score ARCHIVE --data ROOT --json FILE` writes it.
+
+    If the ground truth is hidden, it is only the rank error and the coverage of each config, rounded.
+    """
     get_submission(service, submission_id)
     content = submissions.result_json(service.database, submission_id)
     if content is None:

@@ -21,6 +21,7 @@ from leaderboard.db.rankings import (
     leaderboard_entries,
     ranking_version,
 )
+from leaderboard.web.pages.disclosed import disclosed_row
 from leaderboard.web.pages.rendering import DisplayTime, Link, format_time, link
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
@@ -28,6 +29,7 @@ from rebar_depth_bench.reporting.formatting import reference_rows
 from rebar_depth_bench.reporting.html.published import PaperRow, finite_interval, published_row, scatter_points
 from rebar_depth_bench.reporting.html.rows import ScoreRow, table_row
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, PublishedNumbers, load_published
+from rebar_depth_bench.scoring.disclosure import DisclosedTable
 from rebar_depth_bench.scoring.metrics import METRICS
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Table
@@ -171,7 +173,9 @@ class ConfigRanking:
 
 @dataclass(frozen=True)
 class _FormattedRow:
-    table: Table
+    """A row, and its table unless the ground truth is hidden."""
+
+    table: Table | None
     row: ScoreRow
 
 
@@ -184,7 +188,7 @@ def make_config_ranking(
     """
     all_rows = leaderboard_entries(database, config)
     rows = entries_of_class(all_rows, inputs)
-    formatted = [_format_row(row.method, row.table_json) for row in rows]
+    formatted = [_format_row(row.method, row.table_json, database.hidden_truth) for row in rows]
     marks = _plot_marks(rows, formatted)
     indices = sort_indices([(row.rank, numbers.row) for row, numbers in zip(rows, formatted, strict=True)], order)[
         :max_rows
@@ -208,7 +212,8 @@ def make_config_ranking(
 
 def _references(formatted: Sequence[_FormattedRow]) -> list[tuple[str, list[str], list[str]]]:
     """Return the reference rows, which every table of the current protocol contains."""
-    return next((rows for row in formatted if (rows := reference_rows(row.table.reference))), [])
+    tables = (row.table for row in formatted if row.table)
+    return next((rows for table in tables if (rows := reference_rows(table.reference))), [])
 
 
 @lru_cache(maxsize=1)
@@ -218,8 +223,10 @@ def published_numbers() -> PublishedNumbers:
 
 
 @lru_cache(maxsize=_FORMAT_CACHE_SIZE)
-def _format_row(method: str, table_json: str) -> _FormattedRow:
+def _format_row(method: str, table_json: str, hidden_truth: bool) -> _FormattedRow:
     """Return the formatted numbers of a row; cached, because they depend on the arguments only."""
+    if hidden_truth:
+        return _FormattedRow(None, disclosed_row(method, DisclosedTable.model_validate_json(table_json)))
     table = read_table(json.loads(table_json))
     return _FormattedRow(table, table_row(method, table))
 
@@ -260,6 +267,7 @@ def _plot_marks(rows: Sequence[LeaderboardEntry], formatted: Sequence[_Formatted
 
 def _plot_point(mark: str, numbers: _FormattedRow) -> ScatterPoint:
     native, scaled = numbers.row.native[0].value, numbers.row.scaled[0].value
+    assert numbers.table is not None
     assert native is not None
     assert scaled is not None
     intervals = numbers.table.intervals
@@ -269,7 +277,7 @@ def _plot_point(mark: str, numbers: _FormattedRow) -> ScatterPoint:
 
 def _published(formatted: Sequence[_FormattedRow]) -> tuple[list[PaperRow], str]:
     """Return the paper's rows of the scene that the config shows, and their camera distance."""
-    match = next((match for row in formatted if (match := row.table.published)), None)
+    match = next((match for row in formatted if row.table and (match := row.table.published)), None)
     scene = published_numbers().scenes.get(match.scene) if match else None
     if match is None or scene is None:
         return [], ""

@@ -18,6 +18,7 @@ from leaderboard.web.pages.static import static_path
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
+from rebar_depth_bench.scoring.disclosure import COVERAGE_RULE
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
 from rebar_depth_bench.submission.metadata import INPUTS, is_http_url
 from rebar_depth_bench.version import software_version
@@ -82,6 +83,8 @@ def _common_context(request: Request, service: Service) -> dict[str, Any]:
         "reference_note": formatting.REFERENCE_NOTE,
         "input_classes": INPUTS,
         "plural": formatting.plural,
+        "hidden_truth": service.settings.hidden_truth,
+        "coverage_rule": COVERAGE_RULE,
     }
 
 

@@ -13,6 +13,7 @@ from leaderboard.db.models import SubmissionModel
 from leaderboard.db.rankings import error_map_views, queue_position, submitter_name
 from leaderboard.db.submissions import QUEUED, SCORED, SCORING, result_json
 from leaderboard.service import Service
+from leaderboard.web.pages.disclosed import disclosed_context
 from leaderboard.web.pages.rendering import clean_text, format_size, format_time, link
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.reporting.charts import score_charts
@@ -90,6 +91,8 @@ def _result_context(
     if data is None:  # Deleted since its row was read.
         raise HTTPException(404, "no such submission")
     try:
+        if service.settings.hidden_truth:
+            return {"ranks": ranks, **disclosed_context(data, record.id)}
         result = read_result(data, record.id)
     except InputError:
         return {"scored": False, "reason": _UNREADABLE, "configs": [], "ranks": {}}

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from rebar_depth_bench.scoring.disclosure import disclosed_json
 from tests.leaderboard.client.requests import ESCAPES, TOKEN_INFO, URL, check_refused, submission, submit
 from tests.leaderboard.client.scripted_server import ScriptedServer, answer
 
@@ -161,3 +162,37 @@ def test_invalid_result_is_not_written(
     change(values)
     server.answers["result"] = [answer(values)]
     check_refused(server, archive, tmp_path, capsys)
+
+
+DISCLOSED_CHANGES = {
+    **{name: change for name, change in RESULT_CHANGES.items() if "view" not in name},
+    "many tables": lambda values: values.update(tables={str(k): {} for k in range(20_000)}),
+    "rank error above 1": lambda values: values["tables"]["lattice-orbit"].update(rank_error=1.5),
+    "coverage as text": lambda values: values["tables"]["lattice-orbit"].update(coverage=ESCAPES),
+    "mark without a result": lambda values: values.clear() or values.update(hidden_truth=True),
+}
+
+
+@pytest.mark.parametrize("change", DISCLOSED_CHANGES.values(), ids=DISCLOSED_CHANGES)
+def test_invalid_disclosed_result_is_not_written(
+    change: Any,
+    server: ScriptedServer,
+    archive: Path,
+    result_json: bytes,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    values = json.loads(disclosed_json(result_json))
+    change(values)
+    server.answers["result"] = [answer(values)]
+    check_refused(server, archive, tmp_path, capsys)
+
+
+def test_disclosed_result_is_printed_and_written(
+    server: ScriptedServer, archive: Path, result_json: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    server.answers["result"] = [answer(disclosed_json(result_json))]
+    assert submit(server, archive, "--json", str(tmp_path / "r.json")) == 0
+    assert (tmp_path / "r.json").read_bytes() == disclosed_json(result_json)
+    error = json.loads(result_json)["tables"]["lattice-orbit"]["rank_error"]
+    assert f"lattice-orbit: rank error {error:.3f}, coverage 100.0 %\n" in capsys.readouterr().out

@@ -1,0 +1,90 @@
+"""Disclosed part of results: what it contains, how it is rounded, and which archives are refused."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from rebar_depth_bench.errors import InputError, SubmissionError
+from rebar_depth_bench.scoring.disclosure import (
+    check_view_coverage,
+    disclosed_json,
+    disclosed_number,
+    is_disclosed,
+    read_disclosed,
+    smallest_disclosed_alike,
+)
+from tests.bench.reporting.results import result, scored_view
+
+RESULT = result(scored_view("lattice/0000", 0.12345), scored_view("pile/0000", 0.5, coverage=0.98765))
+
+
+def test_disclosed_result_has_rank_error_and_coverage_alone() -> None:
+    whole = RESULT.to_dict()
+    disclosed = json.loads(disclosed_json(RESULT.to_json()))
+    assert is_disclosed(disclosed)
+    assert not is_disclosed(whole)
+    assert disclosed.pop("hidden_truth") is True
+    tables = disclosed.pop("tables")
+    assert disclosed == {key: whole[key] for key in ("protocol", "dataset", "submission", "software")}
+    for config, table in whole["tables"].items():
+        assert tables[config] == {
+            "coverage": round(table["coverage"], 3),
+            "ranked": True,
+            "rank_error": round(table["rank_error"], 3),
+        }
+
+
+def test_new_numbers_of_results_are_not_disclosed() -> None:
+    document = RESULT.to_dict()
+    for part in (document, document["dataset"], document["submission"], document["tables"]["lattice"]):
+        part["new"] = 0.123456
+    assert disclosed_json(json.dumps(document).encode()) == disclosed_json(RESULT.to_json())
+
+
+def test_disclosed_result_is_read_and_disclosed_again_unchanged() -> None:
+    data = disclosed_json(RESULT.to_json())
+    content = read_disclosed(data, "r.json")
+    assert (content.submission.method, content.submission_sha256) == (RESULT.method, RESULT.submission_sha256)
+    assert disclosed_json(data) == data
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b'{"protocol": "rebar-9"}', b"[]", b'{"protocol": "rebar-9", "tables": {"lattice": {"rank_error": 0.5}}}'],
+)
+def test_unreadable_result_has_no_numbers(data: bytes) -> None:
+    assert json.loads(disclosed_json(data)) == {"hidden_truth": True}
+    with pytest.raises(InputError):
+        read_disclosed(disclosed_json(data), "r.json")
+
+
+def test_result_of_the_previous_protocol_has_no_rank_error() -> None:
+    document = {**RESULT.to_dict(), "protocol": "rebar-1"}
+    for table in document["tables"].values():
+        del table["rank_error"]
+    tables = json.loads(disclosed_json(json.dumps(document).encode()))["tables"]
+    assert [table["rank_error"] for table in tables.values()] == [None, None]
+
+
+@given(st.floats(0, 1), st.floats(0, 1))
+@example(0.0625, 0.0625)
+@example(0.0005, 0.001)
+@example(0.0004, 0.0)
+def test_limit_separates_numbers_that_are_disclosed_as_smaller(value: float, other: float) -> None:
+    limit = smallest_disclosed_alike(value)
+    assert (other < limit) == (disclosed_number(other) < disclosed_number(value))
+    assert disclosed_number(math.nextafter(limit, -1)) < disclosed_number(limit) or limit <= 0
+
+
+def test_view_below_half_coverage_is_refused_without_its_name() -> None:
+    check_view_coverage([scored_view("lattice/0000", coverage=0.5)])
+    with pytest.raises(SubmissionError) as refusal:
+        check_view_coverage([scored_view("lattice/0000"), scored_view("lattice/0001", coverage=0.4999)])
+    assert "lattice" not in str(refusal.value)
+    assert "0.4999" not in str(refusal.value)
+    assert [(problem.code, problem.where) for problem in refusal.value.problems] == [("missing", "")]

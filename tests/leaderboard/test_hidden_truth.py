@@ -1,0 +1,315 @@
+"""Hidden ground truth: what a server with ``--hidden-truth`` returns to submitters who probe for it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import re
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import numpy as np
+import pytest
+
+from rebar_depth_bench import SubmissionWriter, load
+from rebar_depth_bench.scoring.protocol import scored_pixels
+from tests.leaderboard.serving import RunServer, Server
+
+CONFIG, VIEWS = "lattice", 9
+PROBED, REPLACED, OMITTED = (f"{CONFIG}/{index:04d}" for index in (140, 252, 364))
+API = "/api/v1/submissions"
+ROWS, CSV = f"/api/v1/leaderboard?config={CONFIG}", f"/api/v1/leaderboard.csv?config={CONFIG}"
+
+Change = Callable[[str, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Probes:
+    """A server that hides the ground truth of a board that did not, its token, and submissions by what they are.
+
+    ``results`` are those of the submissions that were scored before the option was given, and ``printed`` is what
+    ``rebar-bench submit`` printed for the submission ``view``.
+    """
+
+    server: Server
+    token: str
+    ids: Mapping[str, str]
+    results: Mapping[str, dict[str, Any]]
+    printed: str
+
+    def get(self, path: str, **headers: str) -> httpx2.Response:
+        """Return the response to a request without a token."""
+        return httpx2.get(self.server.url + path, headers=headers, timeout=60)
+
+    def submission(self, name: str) -> dict[str, Any]:
+        """Return the JSON of a submission."""
+        return dict(self.get(f"{API}/{self.ids[name]}").json())
+
+    def table(self, name: str) -> dict[str, Any]:
+        """Return what is returned of the table of a submission."""
+        return dict(self.submission(name)["result"]["tables"][CONFIG])
+
+
+@pytest.fixture(scope="module")
+def write_constant(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Write an archive with one depth per view, of one method; ``change`` may replace the depth of a view."""
+    rows = list(load(tiny_root, CONFIG, columns=["view_id", "left_depth"]))
+
+    def write(depths_m: Mapping[str, float] | float, change: Change = lambda _, depth_m: depth_m) -> Path:
+        path = tmp_path_factory.mktemp("archive") / "submission.zip"
+        with SubmissionWriter(path, "constant", inputs="rgb", uses_ground_truth=False) as writer:
+            for row in rows:
+                value = depths_m if isinstance(depths_m, float) else depths_m[row["view_id"]]
+                depth_m = np.full(row["left_depth"].shape, value, dtype=np.float32)
+                writer.add(row["view_id"], change(row["view_id"], depth_m))
+        return path
+
+    return write
+
+
+@pytest.fixture(scope="module")
+def probes(
+    tiny_root: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    running_server: RunServer,
+    write_constant: Callable[..., Path],
+) -> Iterator[Probes]:
+    state = tmp_path_factory.mktemp("hidden") / "state"
+    rows = load(tiny_root, CONFIG, columns=["view_id", "left_depth", "left_mask"])
+    probed = next(row for row in rows if row["view_id"] == PROBED)
+    pixel = int(scored_pixels(probed["left_mask"], probed["left_depth"])[0])
+
+    def one_pixel(view_id: str, depth_m: np.ndarray) -> np.ndarray:
+        if view_id == PROBED:
+            depth_m.flat[pixel] = 1e12
+        return depth_m
+
+    def one_view(view_id: str, depth_m: np.ndarray) -> np.ndarray:
+        return np.full_like(depth_m, 1e12) if view_id == REPLACED else depth_m
+
+    def omitted(view_id: str, depth_m: np.ndarray) -> np.ndarray:
+        return np.zeros_like(depth_m) if view_id == OMITTED else depth_m
+
+    common: dict[str, Any] = {"quota": 6, "read_rate_limit": "60000/minute"}
+    ids: dict[str, str] = {}
+    results: dict[str, dict[str, Any]] = {}
+    with running_server(tiny_root, state, error_maps=1, **common) as server:
+        token = server.token("attacker")
+
+        def score_now(name: str, archive: Path) -> None:
+            ids[name] = server.submit_accepted(archive, token)
+            results[name] = server.wait_until_ended(ids[name])["result"]
+
+        score_now("constant", write_constant(1.0))
+        scales = {view["view_id"]: view["scale"] for view in results["constant"]["views"]}
+        score_now("corrected", write_constant(scales))
+        score_now("omitted before", write_constant(1.0, omitted))
+    with running_server(tiny_root, state, hidden_truth=True, **common) as server:
+        for name, change in (("pixel", one_pixel), ("omitted", omitted)):
+            ids[name] = server.submit_accepted(write_constant(1.0, change), token)
+            server.wait_until_ended(ids[name])
+        submitted = submit_by_command(server, token, write_constant(1.0, one_view))
+        ids["view"] = re.findall(r"/submissions/(\w+)", submitted.stderr)[0]
+        yield Probes(server, token, ids, results, submitted.stdout)
+
+
+def submit_by_command(server: Server, token: str, archive: Path) -> subprocess.CompletedProcess[str]:
+    """Run ``rebar-bench submit``."""
+    return subprocess.run(
+        [sys.executable, "-m", "rebar_depth_bench", "submit", str(archive), "--url", server.url],
+        env={**os.environ, "REBAR_LEADERBOARD_TOKEN": token},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+
+
+def test_attack_by_scales_works_on_a_board_that_publishes_them(probes: Probes) -> None:
+    errors = [probes.results[name]["tables"][CONFIG]["native"]["abs_rel"] for name in ("constant", "corrected")]
+    assert errors[1] < errors[0] / 5
+    assert probes.results["omitted before"]["tables"][CONFIG]["views_scored"] == VIEWS - 1
+
+
+def test_result_has_rank_error_and_coverage_alone(probes: Probes) -> None:
+    whole = probes.results["constant"]
+    expected = {key: whole[key] for key in ("protocol", "dataset", "submission", "software")}
+    table = whole["tables"][CONFIG]
+    expected["tables"] = {
+        CONFIG: {"ranked": True, **{key: round(table[key], 3) for key in ("coverage", "rank_error")}}
+    }
+    expected["hidden_truth"] = True
+    assert probes.get(f"{API}/{probes.ids['constant']}/result.json").json() == expected
+    assert probes.submission("constant")["result"] == expected
+    row = next(row for row in probes.get(ROWS).json()["rows"] if row["id"] == probes.ids["constant"])
+    assert row["table"] == expected["tables"][CONFIG]
+    assert (row["inputs"], row["uses_ground_truth"]) == ("rgb", False)
+
+
+def get_paths(probes: Probes) -> Iterator[str]:
+    """Yield every path that can be read: those of the OpenAPI document, with all ids, and the pages."""
+    document = probes.get("/openapi.json").json()
+    for path, operations in document["paths"].items():
+        if "{submission_id}" in path and "get" in operations:
+            yield from (path.replace("{submission_id}", submission_id) for submission_id in probes.ids.values())
+        elif "get" in operations:
+            yield path
+    yield from (
+        ROWS,
+        CSV,
+        f"{ROWS}&inputs=rgb",
+        f"{CSV}&inputs=rgb",
+        "/openapi.json",
+        "/how-to-submit",
+        "/nothing",
+    )
+    yield from ("/", "/?inputs=rgb", f"/?config={CONFIG}")
+    yield from (
+        f"/?config={CONFIG}&sort={name}" for name in ("rank_error", "-coverage", "rmse", "scale", "method")
+    )
+    for submission_id in probes.ids.values():
+        yield from (f"/submissions/{submission_id}", f"/submissions/{submission_id}?views={CONFIG}")
+    for submission_id, view_id in stored(probes, "SELECT submission_id, view_id FROM pictures"):
+        yield f"/submissions/{submission_id}/error-maps/{view_id}.webp"
+
+
+def stored(probes: Probes, query: str) -> list[tuple[Any, ...]]:
+    """Return rows of the database of the server."""
+    with closing(sqlite3.connect(probes.server.state / "leaderboard.sqlite")) as connection:
+        return list(connection.execute(query))
+
+
+@pytest.fixture(scope="module")
+def texts(probes: Probes) -> dict[str, str]:
+    """Return the text of all responses: for programs, for browsers and for the owner, by path and kind."""
+    kinds = {
+        "program": {},
+        "browser": {"Accept": "text/html"},
+        "owner": {"Authorization": f"Bearer {probes.token}"},
+    }
+    with httpx2.Client(base_url=probes.server.url, timeout=60) as client:
+        responses = {
+            f"{path} {kind}": client.get(path, headers=headers)
+            for path in get_paths(probes)
+            for kind, headers in kinds.items()
+        }
+    assert sum("error-maps" in path for path in responses) == 9
+    assert all(response.status_code == 404 for path, response in responses.items() if "error-maps" in path)
+    assert all(
+        response.headers["content-type"].startswith(("text/", "application/json"))
+        for response in responses.values()
+    )
+    return {path: response.text for path, response in responses.items()}
+
+
+_NO_SCORES = re.compile(
+    r"\d{4}-\d\d-\d\dT[\d:.]+Z|[\d.]+ (?:bytes|[KMG]iB)|\d+(?:\.\d+){2,}\S*|\b[0-9a-f]{32,64}\b"
+)
+"""Times, sizes, versions, addresses and digests."""
+
+
+def numbers_in(text: str) -> set[str]:
+    """Return the numbers in a response, without those that are no scores."""
+    return set(re.findall(r"\d+(?:\.\d+)?(?:e[+-]?\d+)?", _NO_SCORES.sub("", text)))
+
+
+def decimals_in(text: str) -> set[str]:
+    """Return the numbers with decimals of ``numbers_in``."""
+    return {number for number in numbers_in(text) if "." in number}
+
+
+def test_responses_contain_no_other_numbers(probes: Probes, texts: Mapping[str, str]) -> None:
+    tables = [probes.table(name) for name in probes.ids if name != "omitted"]
+    shown = {value for table in tables for value in (table["coverage"], table["rank_error"])}
+    assert all(value == round(value, 3) for value in shown)
+    allowed = {text for value in shown for text in (str(value), f"{value:.3f}", f"{value * 100:.1f}")}
+    for path, text in texts.items():
+        assert path.startswith("/metrics") or decimals_in(text) <= allowed, path
+
+
+def leaves(part: Any) -> Iterator[int | float]:
+    """Yield the numbers of JSON data."""
+    if isinstance(part, dict | list):
+        for value in part.values() if isinstance(part, dict) else part:
+            yield from leaves(value)
+    elif isinstance(part, int | float) and not isinstance(part, bool):
+        yield part
+
+
+def test_responses_contain_no_stored_number(probes: Probes, texts: Mapping[str, str]) -> None:
+    """Numbers of four and more digits are searched in all forms in which pages, tables and JSON write them."""
+    results = [json.loads(row[0]) for row in stored(probes, "SELECT json FROM results")]
+    assert len(results) == 5
+    forms = {form.format(number) for number in leaves(results) for form in ("{!r}", "{:.4f}", "{:.4g}", "{:.6g}")}
+    secret = {form for form in forms if len(re.sub(r"^[0.]+|\.", "", form.rstrip("0"))) >= 4}
+    assert len(secret) > 500
+    assert numbers_in(json.dumps(probes.results)) & secret
+    for path, text in texts.items():
+        assert not numbers_in(text) & secret, path
+
+
+def test_page_and_csv_show_disclosed_numbers(probes: Probes) -> None:
+    table = probes.table("constant")
+    page = probes.get(f"/submissions/{probes.ids['constant']}").text
+    for value in (table["rank_error"], table["coverage"]):
+        assert f'data-value="{value}"' in page
+    assert f"{table['rank_error']:.3f}<" in probes.get(f"/?config={CONFIG}").text
+    rows = list(csv.DictReader(io.StringIO(probes.get(CSV).text)))
+    assert list(rows[0])[-4:] == ["config", "coverage", "ranked", "rank_error"]
+    assert {row["id"]: float(row["rank_error"]) for row in rows}[probes.ids["constant"]] == table["rank_error"]
+
+
+def test_one_pixel_changes_nothing(probes: Probes) -> None:
+    assert probes.table("pixel") == probes.table("constant")
+    rows = {row["id"]: row for row in probes.get(ROWS).json()["rows"]}
+    own, constant = (rows[probes.ids[name]] for name in ("pixel", "constant"))
+    changed = {key for key in own if own[key] != constant[key]}
+    assert changed == {"id", "created_at"}, "equal errors share a rank"
+    pages = [probes.get(f"/submissions/{probes.ids[name]}").text for name in ("pixel", "constant")]
+    assert len({re.search(r"<h2 id=.results.*?</section>", page, re.DOTALL)[0] for page in pages}) == 1  # type: ignore[index]
+
+
+def test_one_view_changes_the_rank_error_by_its_share(probes: Probes) -> None:
+    before, after = probes.table("constant"), probes.table("view")
+    assert 0 < after.pop("rank_error") - before.pop("rank_error") <= 1 / VIEWS + 0.001
+    assert after == before
+
+
+def test_view_of_low_coverage_fails_without_details(probes: Probes) -> None:
+    submission = probes.submission("omitted")
+    assert (submission["status"], submission["result"]) == ("failed", None)
+    assert "predictions for at least 50 % of the scored pixels of each view" in submission["reason"]
+    assert CONFIG not in submission["reason"]
+    assert re.findall(r"\d+", submission["reason"]) == ["1", "50"]
+    assert probes.ids["omitted"] not in probes.get(ROWS).text
+    token = httpx2.get(
+        f"{probes.server.url}/api/v1/token", headers={"Authorization": f"Bearer {probes.token}"}
+    ).json()
+    assert token["quota_left"] == 0, "a failed submission counts"
+
+
+def test_scores_from_before_are_kept(probes: Probes) -> None:
+    assert probes.submission("omitted before")["status"] == "scored"
+    assert probes.table("corrected")["rank_error"] < probes.table("constant")["rank_error"]
+
+
+def test_ranks_of_pages_are_those_of_the_board(probes: Probes) -> None:
+    for row in probes.get(ROWS).json()["rows"]:
+        assert f"{CONFIG} rank {row['rank']}." in probes.get(f"/submissions/{row['id']}").text
+
+
+def test_command_prints_disclosed_numbers(probes: Probes) -> None:
+    error = probes.table("view")["rank_error"]
+    assert (
+        probes.printed
+        == f"constant, protocol rebar-2, ground truth hidden\n{CONFIG}: rank error {error:.3f}, coverage 100.0 %\n"
+    )
