@@ -26,30 +26,61 @@ REFERENCE_RESULTS = Path(__file__).parent / "reference.json"
 
 
 def reference_context() -> dict[str, Any]:
-    """Return the template variables of the reference results: command, subset, protocol, and rows by config."""
+    """Return the template variables of the reference results: command, subset, and rows by config."""
     document = json.loads(REFERENCE_RESULTS.read_text())
-    tables: dict[str, list[dict[str, str]]] = {}
+    by_config: dict[str, list[tuple[str, Mapping[str, Any]]]] = {}
     for method, result in document["results"].items():
-        for config, table in result["tables"].items():
-            tables.setdefault(config, []).append(_reference_row(method, result, config, table))
-    [protocol] = {result["protocol"] for result in document["results"].values()}
+        for config in result["tables"]:
+            by_config.setdefault(config, []).append((method, result))
     return {
         "command": document["command"],
         "subset": document["subset"],
-        "reference_protocol": protocol,
-        "reference": tables,
+        "reference": {config: _method_rows(config, rows) for config, rows in by_config.items()},
+        "reference_errors": {
+            config: {
+                name: [_number(errors["abs_rel"], 4), _number(errors["rmse_cm"], 2, " cm")]
+                for name, errors in rows[0][1]["tables"][config]["reference"].items()
+            }
+            for config, rows in by_config.items()
+        },
+        "single_bar": [_single_bar_row(config, *row) for config, rows in by_config.items() for row in rows],
     }
 
 
-def _reference_row(
-    method: str, result: Mapping[str, Any], config: str, table: Mapping[str, Any]
-) -> dict[str, str]:
+def _method_rows(config: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) -> list[dict[str, str]]:
+    """Return the formatted rows of a config by rank error; those that are not ranked come last."""
+    ordered = sorted(rows, key=lambda row: _rank_key(row[1]["tables"][config]))
+    return [_method_row_of(method, result, config) for method, result in ordered]
+
+
+def _rank_key(table: Mapping[str, Any]) -> tuple[bool, float]:
+    return not table["ranked"], table["rank_error"]
+
+
+def _single_bar_row(config: str, method: str, result: Mapping[str, Any]) -> dict[str, Any]:
+    numbers = result["single_bar"][config]
+    errors = {name: _number(value, 4) for name, value in numbers.items() if "_abs_rel_" in name}
+    return {
+        "config": config,
+        "method": method + _mark(method),
+        "share": _percent(numbers["share"]),
+        "views": numbers["views"],
+        **errors,
+    }
+
+
+def _mark(method: str) -> str:
+    return "` †" if own_methods()[method].info.uses_ground_truth else "`"
+
+
+def _method_row_of(method: str, result: Mapping[str, Any], config: str) -> dict[str, str]:
+    table = result["tables"][config]
     native, scaled = table["native"] or {}, table["scaled"] or {}
     bounds = (table.get("ci95") or {}).get("native", {}).get("abs_rel")
     interval = "" if bounds is None else f" ({_number(bounds[0], 3)}-{_number(bounds[1], 3)})"
     return {
-        "method": method,
-        "mark": " †" if own_methods()[method].info.uses_ground_truth else "",
+        "method": method + _mark(method),
+        "rank_error": _number(table["rank_error"], 4),
         "coverage": _percent(table["coverage"]),
         "abs_rel": _number(native.get("abs_rel"), 4) + interval,
         "rmse": _number(native.get("rmse_cm"), 2, " cm"),

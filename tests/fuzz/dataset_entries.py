@@ -23,6 +23,7 @@ from rebar_depth_bench.methods.controls import noisy_depth_m
 from rebar_depth_bench.submission import check_archive
 from tests.fuzz.entry_point import EntryPoint, bench, run_options
 from tests.fuzz.workspace import CACHE, CASE, Workspace
+from tests.synthetic_dataset import write_split_dataset
 
 TINY = Path(__file__).parents[1] / "data" / "tiny"
 CONFIG = "lattice-orbit"
@@ -57,6 +58,15 @@ def write_dataset_and_archive(workspace: Workspace) -> None:
     views = ConfigViews(open_folder(workspace.root / ROOT).config(CONFIG))
     with SubmissionWriter(workspace.case / "a.zip", "noisy-truth") as writer:
         for row in views.rows("left_depth"):
+            writer.add(row["view_id"], noisy_depth_m(row))
+
+
+def _write_scenes_and_archive(workspace: Workspace) -> None:
+    """Write a dataset with three scenes in two splits, and an archive with predictions of the split ``test``."""
+    root = workspace.root / ROOT
+    write_split_dataset(root, {"a": "train", "b": "test", "c": "test"}, 1)
+    with SubmissionWriter(workspace.case / "a.zip", "noisy-truth") as writer:
+        for row in load(root, "cages", streaming=True, columns=["view_id", "left_depth"]):
             writer.add(row["view_id"], noisy_depth_m(row))
 
 
@@ -145,6 +155,15 @@ _FROM_ARCHIVE = partial(EntryPoint, prepare=write_dataset_and_archive, result=sc
 DATASET_ENTRIES = (
     _FROM_ARCHIVE("score: manifest", 14, run=_score, targets=(f"{ROOT}/manifest.json",)),
     _FROM_ARCHIVE("score: shards", 14, run=_score, targets=(SHARDS,)),
+    EntryPoint(
+        "score: several scenes",
+        10,
+        _write_scenes_and_archive,
+        lambda workspace: _score(workspace, "--extended"),
+        (f"{ROOT}/manifest.json", f"{ROOT}/bars.parquet", f"{ROOT}/cages/*.parquet"),
+        result=score_result,
+        covered=True,
+    ),
     _FROM_ARCHIVE(
         "score: extended",
         5,
