@@ -21,8 +21,8 @@ from rebar_depth_bench.scoring.published_match import PublishedMatch
 from rebar_depth_bench.scoring.result import Result, Table
 from rebar_depth_bench.scoring.rounding import rounded
 
-CONFIGS_PER_BLOCK = 3
-"""Number of configs side by side, as in the paper; further configs follow in blocks below."""
+CONFIGS_PER_BLOCK = 2
+"""Number of configs side by side that fit into a page width of 17 cm; further configs follow in blocks below."""
 
 _COLUMNS = 5
 _MISSING = "--"
