@@ -26,7 +26,7 @@ from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.ground_truth import config_truth
 from rebar_depth_bench.scoring.metrics import mean
 from rebar_depth_bench.scoring.score import score_evaluation
-from rebar_depth_bench.scoring.single_bar import score_single_bar
+from rebar_depth_bench.scoring.single_bar import mean_single_bar, score_single_bar
 from rebar_depth_bench.submission.metadata import METADATA_NAME
 from rebar_depth_bench.view_ids import config_of
 
@@ -120,16 +120,14 @@ def _single_bar(archive: Path, root: Path) -> dict[str, dict[str, float | int | 
                 single_bar = score_single_bar(truth, truths.single_bar(position), prediction_m, score.scale)
                 points.append((score, single_bar))
             chosen = [(score, single) for score, single in points if single.native and single.scaled]
+            means = mean_single_bar([single for _, single in points])
             by_config[config.name] = {
-                "share": mean([single.share for _, single in points]),
+                "share": means.share,
                 "views": len(chosen),
-                **{
-                    f"{alignment}_abs_rel_{pixels}": mean(
-                        [getattr(pair[which], alignment).abs_rel for pair in chosen]
-                    )
-                    for alignment in ("native", "scaled")
-                    for which, pixels in enumerate(("interior", "single_bar"))
-                },
+                "native_abs_rel_interior": mean([score.native.abs_rel for score, _ in chosen if score.native]),
+                "native_abs_rel_single_bar": means.native.abs_rel if means.native else None,
+                "scaled_abs_rel_interior": mean([score.scaled.abs_rel for score, _ in chosen if score.scaled]),
+                "scaled_abs_rel_single_bar": means.scaled.abs_rel if means.scaled else None,
             }
     return by_config
 

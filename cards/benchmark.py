@@ -157,7 +157,8 @@ def _measure_row(name: str, measures: Sequence[Measure]) -> dict[str, str]:
     parameter = _PARAMETER.search(first.name)
     if parameter is not None:
         values = ", ".join(match[0] for measure in measures if (match := _PARAMETER.search(measure.name)))
-        definition = f"{definition.replace(f' {parameter[0]} ', ' N ', 1)}; N = {values}"
+        pattern = rf" {re.escape(parameter[0])} (?=mm|m\b|px|%)"
+        definition = f"{re.sub(pattern, ' N ', definition, count=1)}; N = {values}"
     return {
         "name": name,
         "unit": first.unit,

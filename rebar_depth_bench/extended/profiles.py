@@ -71,7 +71,7 @@ def _single_bar_samples(
     ``z_m``, ``error`` (|p - z| / z) and ``single_bar`` are those of the sampled pixels with a prediction.
     """
     samples = {}
-    all_z_m, all_single_bar = truth.depth_m[sampled], truth.single_bar[sampled]
+    all_z_m, all_single_bar = truth.depth_m[sampled].astype(np.float64), truth.single_bar[sampled]
     for (low, high), name in zip(pairwise(DISTANCE_EDGES_M), bin_names("m", DISTANCE_EDGES_M), strict=True):
         in_bin = all_single_bar[(all_z_m >= low) & (all_z_m < high)]
         share = float(np.mean(in_bin)) if len(in_bin) >= MIN_PIXELS else None

@@ -17,6 +17,7 @@ from rebar_depth_bench.extended.full_mask import REGION_NUMBERS, Region, region_
 from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 
+_INTERIOR_ABS_REL = "single_bar_views_abs_rel"
 _REGION = Region("single_bar", "single-bar", "interior pixels whose 3 x 3 neighbourhood belongs to one bar")
 
 
@@ -24,13 +25,16 @@ def single_bar_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Sample
     """Return a view's share of single-bar pixels and its metrics on them, as ``full_mask_samples`` does.
 
     ``p_m`` is planar depth on ``truth.index``, metres, NaN where missing. Metrics are empty where the view has no
-    such pixel.
+    such pixel. ``single_bar_views_abs_rel`` is AbsRel on the whole interior of a view that has AbsRel on them.
     """
     count, interior_count = np.count_nonzero(truth.single_bar), np.count_nonzero(truth.interior)
     share = [count / interior_count] if interior_count else []
+    scores = region_scores(_REGION.prefix, p_m, truth, truth.single_bar)
+    interior = region_scores("interior", p_m, truth, truth.interior)["interior_abs_rel"]
     return {
         "single_bar_share": np.array(share, np.float64),
-        **region_scores(_REGION.prefix, p_m, truth, truth.single_bar),
+        **scores,
+        _INTERIOR_ABS_REL: interior if len(scores["single_bar_abs_rel"]) else np.empty(0),
     }
 
 
@@ -46,5 +50,14 @@ MEASURES: tuple[Measure, ...] = (
         "pixels have a second bar within one pixel, so that errors on them contain the step between the bars",
     ),
     *(region_measure(_REGION, number) for number in REGION_NUMBERS),
+    Measure(
+        _INTERIOR_ABS_REL,
+        _INTERIOR_ABS_REL,
+        "mean",
+        "AbsRel, whole interior of the same views",
+        "",
+        "",
+        "mean of interior_abs_rel over the views that have single_bar_abs_rel, to set beside it",
+    ),
 )
 """Single-bar measures in table order."""

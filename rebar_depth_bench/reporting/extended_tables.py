@@ -126,10 +126,13 @@ def single_bar_sentence(table: ExtendedTable) -> str:
         return f"{text}: every scored pixel has a second bar within one pixel."
     errors = [
         f"{alignment} {formatting.number(table.numbers[alignment]['single_bar_abs_rel'].value, 4)} "
-        f"(all scored pixels: {formatting.number(table.numbers[alignment]['interior_abs_rel'].value, 4)})"
+        f"(all scored pixels: {formatting.number(table.numbers[alignment]['single_bar_views_abs_rel'].value, 4)})"
         for alignment in (NATIVE, SCALED)
     ]
-    return f"{text}. AbsRel on them, mean over the views that have any: {', '.join(errors)}."
+    return (
+        f"{text}. AbsRel on them, mean over the views that have any: {', '.join(errors)}. On the others a "
+        "second bar is within one pixel, so that a shift by one pixel already causes an error."
+    )
 
 
 def extended_csv(result: Result) -> str:

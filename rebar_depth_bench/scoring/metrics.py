@@ -147,6 +147,13 @@ def mean(values: Sequence[float]) -> float | None:
         return math.inf
 
 
+def mean_metrics(metrics: Sequence[DepthMetrics]) -> DepthMetrics | None:
+    """Return the mean of each metric over views; None for no views."""
+    means = {name: mean([getattr(of_view, name) for of_view in metrics]) for name in METRIC_NAMES}
+    defined = {name: value for name, value in means.items() if value is not None}
+    return DepthMetrics(**defined) if defined else None
+
+
 def is_valid_prediction(p_m: Float[ndarray, " n"]) -> Bool[ndarray, " n"]:
     """Return a mask of the valid predictions: finite and > 0."""
     with np.errstate(invalid="ignore"):

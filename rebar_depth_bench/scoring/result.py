@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.scoring.bootstrap import Interval
 from rebar_depth_bench.scoring.frames import tables_frame, views_frame
-from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics, mean
+from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics, mean, mean_metrics
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.published_match import PublishedMatch
 from rebar_depth_bench.scoring.reference import NO_REFERENCE, Reference
@@ -153,8 +153,8 @@ def tabulate(
     always finite.
     """
     predicted = [view for view in views if view.native is not None]
-    native = _mean_metrics([view.native for view in predicted if view.native])
-    scaled = _mean_metrics([view.scaled for view in predicted if view.scaled])
+    native = mean_metrics([view.native for view in predicted if view.native])
+    scaled = mean_metrics([view.scaled for view in predicted if view.scaled])
     return Table(
         views=len(views),
         views_scored=len(predicted),
@@ -170,12 +170,6 @@ def tabulate(
         split=split,
         intervals=view_intervals(views) if views else dict.fromkeys(VIEW_METRICS),
     )
-
-
-def _mean_metrics(metrics: Sequence[DepthMetrics]) -> DepthMetrics | None:
-    means = {name: mean([getattr(view_metrics, name) for view_metrics in metrics]) for name in METRIC_NAMES}
-    defined = {name: value for name, value in means.items() if value is not None}
-    return DepthMetrics(**defined) if defined else None
 
 
 def _describe_table(table: Table) -> str:

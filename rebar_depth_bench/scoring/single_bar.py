@@ -7,6 +7,7 @@ pixel has a large error there. Errors on the single-bar interior contain no such
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,18 +15,25 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from rebar_depth_bench.scoring.ground_truth import ViewTruth
-from rebar_depth_bench.scoring.metrics import DepthMetrics, is_valid_prediction, metrics_at_scales
+from rebar_depth_bench.scoring.metrics import (
+    DepthMetrics,
+    is_valid_prediction,
+    mean,
+    mean_metrics,
+    metrics_at_scales,
+)
 
 
 @dataclass(frozen=True)
 class SingleBarScore:
-    """Share of a view's scored pixels that are single-bar, and the metrics of the valid ones among them.
+    """Share of a view's scored pixels that are single-bar, their coverage, and the metrics of the valid ones.
 
-    ``native`` and ``scaled`` are None without such pixels. ``scaled`` uses the view's scale, that of all its
-    scored pixels.
+    ``coverage`` is None without such pixels, ``native`` and ``scaled`` without valid predictions on them.
+    ``scaled`` uses the view's scale, that of all its scored pixels.
     """
 
     share: float
+    coverage: float | None
     native: DepthMetrics | None
     scaled: DepthMetrics | None
 
@@ -41,7 +49,18 @@ def score_single_bar(
     share = float(np.mean(single_bar))
     p_m = prediction_m.ravel().take(truth.index.astype(np.intp))
     chosen = single_bar & is_valid_prediction(p_m)
+    coverage = np.count_nonzero(chosen) / np.count_nonzero(single_bar) if share else None
     if scale is None or not chosen.any():
-        return SingleBarScore(share, None, None)
+        return SingleBarScore(share, coverage, None, None)
     (native, scaled), _ = metrics_at_scales(p_m[chosen], truth.depth_m[chosen], (1.0, scale), ())
-    return SingleBarScore(share, native, scaled)
+    return SingleBarScore(share, coverage, native, scaled)
+
+
+def mean_single_bar(scores: Sequence[SingleBarScore]) -> SingleBarScore:
+    """Return the means over one or more views: the share of all, and the others of those that have a value."""
+    return SingleBarScore(
+        share=sum(score.share for score in scores) / len(scores),
+        coverage=mean([score.coverage for score in scores if score.coverage is not None]),
+        native=mean_metrics([score.native for score in scores if score.native]),
+        scaled=mean_metrics([score.scaled for score in scores if score.scaled]),
+    )

@@ -35,6 +35,11 @@ def test_benchmark_card_names_every_method_and_rule() -> None:
     assert "at least 0.95" in card
 
 
+def test_names_of_bins_stand_for_their_numbers_only() -> None:
+    row = next(line for line in benchmark_card().splitlines() if line.startswith("| `single_bar_within_Nmm`"))
+    assert "3 x 3 neighbourhood belongs to one bar with |p - z| <= N mm" in row.replace("\\|", "|")
+
+
 def test_every_column_is_described_once() -> None:
     rows = column_rows()
     described = [name.strip("`") for row in rows for name in row["names"].split(", ")]

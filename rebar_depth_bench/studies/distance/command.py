@@ -88,11 +88,8 @@ def run_distance_study(
     with open_evaluation(archive, root) as evaluation:
         result = score_evaluation(evaluation, progress=progress)
         names = _select_configs(archive, result, configs)
-        points = {
-            config.name: _distance_points(evaluation, result, config)
-            for config in evaluation.configs
-            if config.name in names
-        }
+        config_by_name = {config.name: config for config in evaluation.configs}
+        points = {name: _distance_points(evaluation, result, config_by_name[name]) for name in names}
         provenance = evaluation.provenance()
     empty = [name for name, views in points.items() if not views]
     if empty:

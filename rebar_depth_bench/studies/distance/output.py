@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,8 @@ from rebar_depth_bench.reporting.charts.lines import HEIGHT, LEFT, RIGHT, TOP, C
 from rebar_depth_bench.reporting.html.study_page import Columns, PageFigure, PageTable, StudyPage, page_table
 from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS
 from rebar_depth_bench.scoring.frames import make_frame
+from rebar_depth_bench.scoring.metrics import METRIC_NAMES
+from rebar_depth_bench.scoring.single_bar import SingleBarScore
 from rebar_depth_bench.studies.distance.study import (
     ALL_CONFIGS,
     DistanceBin,
@@ -55,9 +57,7 @@ def to_pandas(study: DistanceStudy) -> DataFrame:
                 "scale_max": bin_.scale_range[1] if bin_.scale_range else None,
                 **_estimate_cells("native_abs_rel", bin_.native_abs_rel),
                 **_estimate_cells("scaled_abs_rel", bin_.scaled_abs_rel),
-                "single_bar_share": bin_.single_bar_share,
-                **_estimate_cells("single_bar_native_abs_rel", bin_.single_bar_native_abs_rel),
-                **_estimate_cells("single_bar_scaled_abs_rel", bin_.single_bar_scaled_abs_rel),
+                **_single_bar_cells(bin_.single_bar),
                 **provenance.csv_cells(),
             }
             for bin_ in study.bins
@@ -225,13 +225,33 @@ def _single_bar_table(bins: Sequence[DistanceBin]) -> PageTable:
     columns: Columns[DistanceBin] = (
         ("Config", "", lambda row: printable(row.config)),
         ("Distance", "m, from to", lambda row: _format_metre_range(row.low_m, row.high_m)),
-        ("Share", "% of scored pixels", lambda row: formatting.number(100 * row.single_bar_share, 1)),
-        ("AbsRel native ↓", "all scored", lambda row: formatting.number(row.native_abs_rel.value, 4)),
-        ("AbsRel native ↓", "single-bar", lambda row: formatting.number(row.single_bar_native_abs_rel.value, 4)),
-        ("AbsRel scaled ↓", "all scored", lambda row: formatting.number(row.scaled_abs_rel.value, 4)),
-        ("AbsRel scaled ↓", "single-bar", lambda row: formatting.number(row.single_bar_scaled_abs_rel.value, 4)),
+        ("Share", "% of scored pixels", lambda row: formatting.coverage_percent(row.single_bar.share)),
+        ("Coverage", "% of them", lambda row: formatting.coverage_percent(row.single_bar.coverage)),
+        *(
+            (
+                f"{title} {better}",
+                f"{alignment}, {unit}" if unit else alignment,
+                _single_bar_cell(alignment, index),
+            )
+            for alignment in ("native", "scaled")
+            for index, (title, unit, better) in enumerate(formatting.METRIC_HEADS)
+        ),
     )
     return page_table(caption, columns, bins)
+
+
+def _single_bar_cell(alignment: str, index: int) -> Callable[[DistanceBin], str]:
+    return lambda row: formatting.metric_cells(getattr(row.single_bar, alignment))[index]
+
+
+def _single_bar_cells(score: SingleBarScore) -> dict[str, float | None]:
+    """Return the columns of the CSV with the numbers of the single-bar interior."""
+    metrics = {
+        f"single_bar_{alignment}_{name}": getattr(getattr(score, alignment), name, None)
+        for alignment in ("native", "scaled")
+        for name in METRIC_NAMES
+    }
+    return {"single_bar_share": score.share, "single_bar_coverage": score.coverage, **metrics}
 
 
 def _notes(study: DistanceStudy) -> list[str]:

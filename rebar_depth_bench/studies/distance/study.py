@@ -23,7 +23,7 @@ from numpy import ndarray
 from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS, Interval, Resampling, interval, resample
 from rebar_depth_bench.scoring.metrics import DepthMetrics, mean
 from rebar_depth_bench.scoring.provenance import Provenance
-from rebar_depth_bench.scoring.single_bar import SingleBarScore
+from rebar_depth_bench.scoring.single_bar import SingleBarScore, mean_single_bar
 from rebar_depth_bench.scoring.view_score import ViewScore
 
 MIN_DISTANCE_RATIO = 1.05
@@ -65,8 +65,7 @@ class DistanceBin:
 
     ``distance_m`` is the median distance of the views. ``scale`` is the median and ``scale_range`` the (minimum,
     maximum) of s over the ``views_scored`` views that have a prediction; the AbsRel values are means over these
-    views. ``single_bar_share`` is the mean share of single-bar pixels; the single-bar AbsRel values are means over
-    the views that have such pixels with a prediction.
+    views. ``single_bar`` has the means on the single-bar interior.
     """
 
     config: str
@@ -79,9 +78,7 @@ class DistanceBin:
     scale_range: Interval | None
     native_abs_rel: IntervalEstimate
     scaled_abs_rel: IntervalEstimate
-    single_bar_share: float
-    single_bar_native_abs_rel: IntervalEstimate
-    single_bar_scaled_abs_rel: IntervalEstimate
+    single_bar: SingleBarScore
 
 
 @dataclass(frozen=True)
@@ -157,8 +154,7 @@ def _make_bin(points: Sequence[DistancePoint], low_m: float, high_m: float) -> D
     with_scale = np.flatnonzero([point.score.scale is not None for point in points])
     resampling = resample(_view_indices(points))
     medians = resampling.percentile(scales, with_scale, 50)
-    native_abs_rel, scaled_abs_rel = _mean_abs_rels([point.score for point in points], resampling)
-    single_bar_native, single_bar_scaled = _mean_abs_rels([point.single_bar for point in points], resampling)
+    native_abs_rel, scaled_abs_rel = _mean_abs_rels(points, resampling)
     return DistanceBin(
         config=points[0].config,
         low_m=low_m,
@@ -170,17 +166,15 @@ def _make_bin(points: Sequence[DistancePoint], low_m: float, high_m: float) -> D
         scale_range=(float(scales.min()), float(scales.max())) if len(scales) else None,
         native_abs_rel=native_abs_rel,
         scaled_abs_rel=scaled_abs_rel,
-        single_bar_share=float(np.mean([point.single_bar.share for point in points])),
-        single_bar_native_abs_rel=single_bar_native,
-        single_bar_scaled_abs_rel=single_bar_scaled,
+        single_bar=mean_single_bar([point.single_bar for point in points]),
     )
 
 
 def _mean_abs_rels(
-    scores: Sequence[ViewScore | SingleBarScore], resampling: Resampling
+    points: Sequence[DistancePoint], resampling: Resampling
 ) -> tuple[IntervalEstimate, IntervalEstimate]:
     """Return the means of native and scaled AbsRel over the views that have them."""
-    errors = np.array([[_abs_rel(score.native), _abs_rel(score.scaled)] for score in scores])
+    errors = np.array([[_abs_rel(point.score.native), _abs_rel(point.score.scaled)] for point in points])
     draws = resampling.means(errors)
     means = [mean([value for value in column if not math.isnan(value)]) for column in errors.T.tolist()]
     return IntervalEstimate(means[0], interval(draws[:, 0])), IntervalEstimate(means[1], interval(draws[:, 1]))

@@ -20,7 +20,9 @@ from rebar_depth_bench.extended.full_mask import REGION_NUMBERS, full_mask_sampl
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, MIN_PIXELS, profile_samples
 from rebar_depth_bench.extended.single_bar import single_bar_samples
 from rebar_depth_bench.scoring.ground_truth import config_truth
+from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels
+from rebar_depth_bench.scoring.single_bar import SingleBarScore
 from rebar_depth_bench.studies.distance.command import run_distance_study
 from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth
 
@@ -56,6 +58,8 @@ def test_pixels_equal_a_loop(seed: int) -> None:
     depth_m, bars = random_images(np.random.default_rng(seed))
     pixels = scored_pixels(bars > 0, depth_m)
     assert single_bar_pixels(bars, pixels).tolist() == expected_pixels(bars, pixels)
+    truth = steel_truth(depth_m, bars)
+    assert all(0 <= share <= 1 for share in single_bar_samples(truth.depth_m, truth)["single_bar_share"])
 
 
 @settings(max_examples=30)
@@ -111,7 +115,9 @@ def test_shift_by_one_pixel_costs_less_on_single_bars() -> None:
     depth_m[:, 7:13] = 0.8
     truth = steel_truth(depth_m, bars)
     shifted_m = np.roll(depth_m, 1, axis=1).astype(np.float64).ravel()[truth.index]
-    assert single_bar_samples(shifted_m, truth)["single_bar_abs_rel"] == [0.0]
+    samples = single_bar_samples(shifted_m, truth)
+    assert samples["single_bar_abs_rel"] == [0.0]
+    assert samples["single_bar_views_abs_rel"] == full_mask_samples(shifted_m, truth)["interior_abs_rel"]
     assert full_mask_samples(shifted_m, truth)["interior_abs_rel"][0] > 0.03
 
 
@@ -136,6 +142,24 @@ def test_profile_bins_equal_numpy() -> None:
             assert share[0] == pytest.approx(np.mean(truth.single_bar[inside]), rel=1e-12)
             assert error[0] == pytest.approx(np.mean(np.abs(p_m[chosen] - z) / z), rel=1e-12)
     assert filled == 6
+
+
+def test_share_and_error_use_the_same_bins() -> None:
+    """A depth at the edge of two bins, which float32 rounds down, is in one bin for both numbers."""
+    z_m = np.full((20, 20), np.float32(0.7))
+    truth = steel_truth(z_m, np.ones(z_m.shape, np.uint16))
+    samples = profile_samples(truth.depth_m.astype(np.float64), truth, np.full(9, 0.01))
+    filled = {name.rpartition("_")[2] for name, values in samples.items() if len(values) and name.endswith("m")}
+    assert filled == {"0.5-0.7m"}
+
+
+def test_view_without_single_bar_pixels_has_no_errors() -> None:
+    bars = np.indices((9, 9)).sum(axis=0).astype(np.uint16) % 2 + 1
+    truth = steel_truth(np.ones((9, 9), np.float32), bars)
+    samples = single_bar_samples(truth.depth_m.astype(np.float64), truth)
+    assert {name: values.tolist() for name, values in samples.items() if len(values)} == {
+        "single_bar_share": [0.0]
+    }
 
 
 def rendered(root: Path, config: str) -> Mapping[str, tuple[ndarray, ndarray, ndarray]]:
@@ -170,10 +194,11 @@ def test_study_reports_share_and_errors(tiny_root: Path, tiny_truth: Depths, arc
         chosen = pixels[np.array(expected_pixels(bars, pixels))]
         assert point.single_bar.share == len(chosen) / len(pixels)
         if not len(chosen):
-            assert (point.single_bar.native, point.single_bar.scaled) == (None, None)
+            assert point.single_bar == SingleBarScore(0.0, None, None, None)
             continue
         z, p = (image.ravel().astype(np.float64) for image in (z_m, noisy[point.score.view_id]))
         scale = np.median(z[pixels]) / np.median(p[pixels])
+        assert point.single_bar.coverage == 1.0
         errors = [np.mean(np.abs(s * p[chosen] - z[chosen]) / z[chosen]) for s in (1.0, scale)]
         assert point.single_bar.native is not None
         assert point.single_bar.scaled is not None
@@ -181,6 +206,8 @@ def test_study_reports_share_and_errors(tiny_root: Path, tiny_truth: Depths, arc
         assert found == pytest.approx(errors, rel=1e-9)
     for bin_ in study.bins:
         of_bin: list[Any] = [p for p in study.points if bin_.low_m <= p.distance_m < bin_.high_m]
-        assert bin_.single_bar_share == pytest.approx(np.mean([point.single_bar.share for point in of_bin]))
-        native = [point.single_bar.native.abs_rel for point in of_bin if point.single_bar.native]
-        assert bin_.single_bar_native_abs_rel.value == (pytest.approx(np.mean(native)) if native else None)
+        assert bin_.single_bar.share == pytest.approx(np.mean([point.single_bar.share for point in of_bin]))
+        for name in METRIC_NAMES:
+            values = [getattr(point.single_bar.scaled, name) for point in of_bin if point.single_bar.scaled]
+            of_all = getattr(bin_.single_bar.scaled, name, None)
+            assert of_all == (pytest.approx(np.mean(values)) if values else None)

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.methods import METHODS
+from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.scoring.score import score
 from rebar_depth_bench.studies.distance.command import run_distance_study
 from rebar_depth_bench.studies.distance.output import to_page
@@ -67,6 +69,13 @@ def test_points_have_scores_and_true_distances_of_views(
     assert len(study.bins) == 1
     assert study.bins[0].native_abs_rel.value == pytest.approx(native.abs_rel, rel=1e-12)
     assert study.bins[0].scale.value == result.tables["lattice"].scale_median
+
+
+def test_configs_keep_the_order_of_the_user(tiny_root: Path, tmp_path: Path) -> None:
+    wanted = ["lattice-orbit", "lattice"]
+    predict(METHODS["truth"], tiny_root, tmp_path / "truth.zip")
+    study = run_distance_study(tmp_path / "truth.zip", tiny_root, configs=wanted)
+    assert list(dict.fromkeys(point.config for point in study.points)) == wanted
 
 
 def test_unknown_config_or_bin_count_raises(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:

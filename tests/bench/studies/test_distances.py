@@ -26,7 +26,7 @@ def point(
     metrics = None if scale is None else DepthMetrics(abs(1 / scale - 1), 1.0, 1.0, 0.5)
     coverage = 0.0 if scale is None else 1.0
     view = ViewScore(f"{config}/{index:04d}", 9, coverage, 0.5, scale, metrics, metrics, {})
-    return DistancePoint(config, index, distance_m, view, SingleBarScore(0.5, metrics, metrics))
+    return DistancePoint(config, index, distance_m, view, SingleBarScore(0.5, coverage, metrics, metrics))
 
 
 def sweep(scales: Sequence[float], config: str = "lattice-distance") -> list[DistancePoint]:
