@@ -46,7 +46,7 @@ def measure_views(spec: ConfigSpec) -> tuple[np.ndarray, np.ndarray]:
     """
     assembly = make_assembly(spec.scene.assembly)
     left_poses = poses(spec.protocol, aim_point_m(assembly), spec.rig, assembly.bars)
-    caster, cylinders = RayCaster(_steel(assembly)), Cylinders.from_bars(assembly.bars)
+    caster, cylinders = RayCaster(steel_mesh(assembly)), Cylinders.from_bars(assembly.bars)
     nearest_m = cylinders.distance_m(np.array([camera_centre(pose) for pose in left_poses]))
     rays = {eye: camera.rays() for eye, camera in rig_cameras(spec.rig, np.eye(4)).items()}
     views = []
@@ -59,7 +59,8 @@ def measure_views(spec: ConfigSpec) -> tuple[np.ndarray, np.ndarray]:
     return np.repeat(shells_m, len(views) // len(shells_m)), np.array(views)
 
 
-def _steel(assembly: Assembly) -> WorldMesh:
+def steel_mesh(assembly: Assembly) -> WorldMesh:
+    """Return the mesh of all bars, world frame."""
     mesh = merge_meshes([part.mesh for part in assembly.parts])
     bar_ids = [np.full(len(part.mesh.faces), part.bar_id, np.uint16) for part in assembly.parts]
     return WorldMesh(mesh.vertices_m, mesh.faces, np.concatenate(bar_ids))

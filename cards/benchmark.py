@@ -62,7 +62,8 @@ def _single_bar_row(config: str, method: str, result: Mapping[str, Any]) -> dict
     errors = {name: _number(value, 4) for name, value in numbers.items() if "_abs_rel_" in name}
     return {
         "config": config,
-        "method": method + _mark(method),
+        "method": method,
+        "mark": _mark(method),
         "share": _percent(numbers["share"]),
         "views": numbers["views"],
         **errors,
@@ -70,7 +71,7 @@ def _single_bar_row(config: str, method: str, result: Mapping[str, Any]) -> dict
 
 
 def _mark(method: str) -> str:
-    return "` †" if own_methods()[method].info.uses_ground_truth else "`"
+    return " †" if own_methods()[method].info.uses_ground_truth else ""
 
 
 def _method_row_of(method: str, result: Mapping[str, Any], config: str) -> dict[str, str]:
@@ -79,7 +80,8 @@ def _method_row_of(method: str, result: Mapping[str, Any], config: str) -> dict[
     bounds = (table.get("ci95") or {}).get("native", {}).get("abs_rel")
     interval = "" if bounds is None else f" ({_number(bounds[0], 3)}-{_number(bounds[1], 3)})"
     return {
-        "method": method + _mark(method),
+        "method": method,
+        "mark": _mark(method),
         "rank_error": _number(table["rank_error"], 4),
         "coverage": _percent(table["coverage"]),
         "abs_rel": _number(native.get("abs_rel"), 4) + interval,

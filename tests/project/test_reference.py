@@ -33,11 +33,18 @@ def test_run_has_its_configs_and_views(method: str) -> None:
 
 def test_truth_has_zero_error_and_noise_has_specified_error() -> None:
     for config, table in STORED["results"]["truth"]["tables"].items():
-        assert table["native"]["abs_rel"] == 0, config
-        assert table["ranked"]
+        assert table["native"]["abs_rel"] == table["rank_error"] == 0, config
+        assert not table["ranked"]
     for table in STORED["results"]["noisy-truth"]["tables"].values():
         assert table["native"]["abs_rel"] == pytest.approx(0.25, abs=0.003)
         assert table["scale_median"] == pytest.approx(1 / 1.25, abs=0.003)
+
+
+def test_reference_errors_do_not_depend_on_the_method() -> None:
+    for config, rows in reference_context()["reference_errors"].items():
+        tables = [STORED["results"][method]["tables"][config] for method, names in RUNS.items() if config in names]
+        assert all(table["reference"] == tables[0]["reference"] for table in tables)
+        assert rows["constant"][0] == f"{tables[0]['reference']['constant']['abs_rel']:.4f}"
 
 
 def test_card_rows_match_stored_results() -> None:
@@ -53,4 +60,5 @@ def test_card_rows_match_stored_results() -> None:
     assert row["abs_rel"] == f"{table['native']['abs_rel']:.4f} ({low:.3f}-{high:.3f})"
     assert row["rmse"] == f"{table['native']['rmse_cm']:.2f} cm"
     assert row["coverage"] == f"{100 * table['coverage']:.1f} %"
+    assert row["rank_error"] == f"{table['rank_error']:.4f}"
     assert row["within"] == f"{100 * table['within_mm']['5']:.1f} %"
