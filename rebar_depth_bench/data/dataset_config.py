@@ -276,10 +276,9 @@ class DatasetConfig(Located):
 
     @property
     def label(self) -> str:
-        """Name of the config, with split and scene if it is one scene of several; a name that a file can have."""
-        if not self.has_splits:
-            return self.name
-        return f"{self.name}.{self.scene.split}-{self.scene.name}"
+        """Name of the config, with its split and its scene if it has splits and is restricted to one of them."""
+        split = f".{self.splits[0]}" if self.has_splits and len(self.splits) == 1 else ""
+        return f"{self.name}{split}-{self.scene.name}" if split and len(self.scenes) == 1 else self.name + split
 
     @property
     def grid(self) -> tuple[int, int]:

@@ -161,10 +161,13 @@ def test_interrupted_prediction_of_scenes_resumes(root: Path, tmp_path: Path) ->
     assert rdb.score(tmp_path / "a.zip", root).tables == rdb.score(tmp_path / "b.zip", root).tables
 
 
-def test_single_view_method_predicts_the_chosen_split(root: Path, tmp_path: Path) -> None:
-    predict(Method(INFO, lambda: lambda row: row["left_depth"]), root, tmp_path / "a.zip", split="validation")
+@pytest.mark.parametrize("split", SPLIT_VIEWS)
+def test_single_view_method_predicts_the_chosen_split(root: Path, tmp_path: Path, split: str) -> None:
+    method = Method(INFO, lambda: lambda row: row["left_depth"], lambda row: {"first": row["scene"]})
+    reports = predict(method, root, tmp_path / "a.zip", split=split)
+    assert [*reports] == ["cages.validation-c" if split == "validation" else f"cages.{split}"]
     result = rdb.score(tmp_path / "a.zip", root)
-    assert [view.view_id for view in result.views] == view_ids("validation")
+    assert [view.view_id for view in result.views] == view_ids(split)
 
 
 def test_prediction_of_a_split_that_no_config_has_is_refused(tmp_path: Path) -> None:
