@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import InputError, escape_text, printable
 from rebar_depth_bench.reporting.formatting import short_digest, unranked_reason
-from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.result import Result, Table
 from rebar_depth_bench.scoring.rounding import rounded
+from rebar_depth_bench.view_ids import TEST_SPLIT
 
 if TYPE_CHECKING:
     from huggingface_hub import EvalResultEntry
@@ -51,14 +52,15 @@ def check_hub_id(hub_id: str | None) -> str:
 def eval_results(result: Result, folder: DatasetFolder, hub_id: str) -> tuple[str, list[str]]:
     """Return the content of an ``.eval_results`` file, and a note on each config that is left out of it.
 
-    The file has one entry per ranked config, without a date. The entries name the dataset's commit if the dataset
-    was read from the repository ``hub_id``. Raises ``InputError`` if no config is ranked.
+    The file has one entry per ranked config, without a date; a config with splits needs the split ``test``, which
+    its task names. The entries name the dataset's commit if the dataset was read from the repository ``hub_id``.
+    Raises ``InputError`` if there is no entry.
     """
     from huggingface_hub import eval_result_entries_to_yaml
 
-    reasons = {name: unranked_reason(table) for name, table in result.tables.items()}
+    reasons = {name: _omission_reason(table) for name, table in result.tables.items()}
     notes = [
-        f"{printable(name)} is left out of --eval-results, because it is not ranked: {reason}"
+        f"{printable(name)} is left out of --eval-results, because {reason}"
         for name, reason in reasons.items()
         if reason
     ]
@@ -66,6 +68,13 @@ def eval_results(result: Result, folder: DatasetFolder, hub_id: str) -> tuple[st
     if not entries:
         raise InputError("\n".join(["--eval-results has no ranked config to write", *notes]))
     return yaml_text(eval_result_entries_to_yaml(entries)), notes
+
+
+def _omission_reason(table: Table) -> str:
+    if table.split not in (None, TEST_SPLIT):
+        return f"it covers the split {table.split}, expected {TEST_SPLIT}"
+    reason = unranked_reason(table)
+    return f"it is not ranked: {reason}" if reason else ""
 
 
 def _entries(result: Result, folder: DatasetFolder, hub_id: str, configs: Sequence[str]) -> list[EvalResultEntry]:

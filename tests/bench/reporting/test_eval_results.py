@@ -98,6 +98,17 @@ def test_unranked_configs_are_left_out_with_a_note(folder: DatasetFolder) -> Non
     assert notes[0].startswith("mine ")
 
 
+@pytest.mark.parametrize("split", ["train", "validation"])
+def test_other_splits_than_that_of_the_task_are_left_out(split: str, folder: DatasetFolder) -> None:
+    scores = result(scored_view("lattice/0000"), scored_view(f"cages/{split}-a-0000"))
+    tables = {**scores.tables, "cages": replace(scores.tables["cages"], split=split)}
+    text, notes = eval_results(replace(scores, tables=tables), folder, HUB_ID)
+    assert [entry.task_id for entry in entries_of(text)] == ["lattice"]
+    assert [note.partition(" ")[0] for note in notes] == ["cages"]
+    with pytest.raises(InputError, match=split):
+        eval_results(replace(scores, tables={"cages": tables["cages"]}), folder, HUB_ID)
+
+
 def test_submission_that_uses_ground_truth_has_no_file(
     tiny_root: Path, tiny_truth: dict[str, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
