@@ -149,10 +149,16 @@ def _located_in_entry(problem: Problem, where: str) -> Problem:
 
 
 def _scene_problems(configs: Iterable[DatasetConfig]) -> Iterator[Problem]:
-    """Yield a problem for each scene that differs from an earlier one of the same name in another config."""
+    """Yield a problem for each scene without views, or unlike one of the same name in an earlier config."""
     first: dict[str, tuple[str, tuple[object, ...]]] = {}
     for config in configs:
+        with_views = set(config.scene_by_view.values())
         for scene in config.scenes:
+            if scene.name not in with_views:
+                where = format_location("configs", config.name, "views")
+                yield Problem(
+                    "missing", where, f"scene {scene.name} has no view", "one view or more of each scene"
+                )
             shown = (scene.board, scene.appearance, scene.mesh)
             other, expected = first.setdefault(scene.name, (config.name, shown))
             if shown != expected:

@@ -15,6 +15,8 @@ import pytest
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.columns import COLUMNS
 from rebar_depth_bench.data.dataset import ConfigViews, iterate_rows
+from rebar_depth_bench.data.dataset_config import ViewRecord
+from rebar_depth_bench.data.digests import views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.data.verification import truth_problems
 from rebar_depth_bench.errors import DatasetError, InputError, SubmissionError
@@ -257,9 +259,15 @@ def index_without_digits(entry: Entry) -> None:
     entry["views"][0]["view_id"] = "cages/train-a-x"
 
 
+def scene_without_views(entry: Entry) -> None:
+    entry["views"] = [view for view in entry["views"] if "train-a-" not in view["view_id"]]
+    entry["ground_truth_digest"] = views_digest(ViewRecord(**view) for view in entry["views"])
+
+
 @pytest.mark.parametrize(
     ("change", "code", "where"),
     [
+        (scene_without_views, "missing", "configs.cages.views"),
         (swap_split, "invalid", "configs.cages.views"),
         (share_shard, "duplicate", "configs.cages.scenes"),
         (repeat_scene, "duplicate", "configs.cages.scenes"),
