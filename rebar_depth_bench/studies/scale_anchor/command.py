@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from rebar_depth_bench.console import ProgressBars, add_data
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import open_evaluation
@@ -139,7 +140,7 @@ def run_anchor_study(
     return AnchorStudy(
         provenance=provenance,
         config=name,
-        markers=None if chosen.scene.board is None else chosen.scene.board.markers,
+        markers=_markers(chosen),
         seed=seed,
         views=len(truths),
         views_without_prediction=tuple(view.view_id for view in view_ratios if view.ratio is None),
@@ -150,6 +151,12 @@ def run_anchor_study(
         draws=per_k,
         skipped_counts=tuple(k for k in sorted(set(counts)) if k > len(ratios)),
     )
+
+
+def _markers(config: DatasetConfig) -> int | None:
+    """Return the number of markers on the board of a config's scenes; None without a board or if they differ."""
+    markers = {scene.board.markers if scene.board else None for scene in config.scenes}
+    return markers.pop() if len(markers) == 1 else None
 
 
 def _check_arguments(given_scale: float, counts: Sequence[int], draws: int, seed: int) -> None:

@@ -80,7 +80,7 @@ class AnchorRow:
 class AnchorStudy:
     """Result of the scale-anchor study of one config.
 
-    ``markers`` is the number of ArUco markers on the board of its scene, None without a board.
+    ``markers`` is the number of ArUco markers on the board of its scenes, None without a board or if they differ.
     ``given`` and ``all_views`` are the errors at the given scale and at the median ratio of all views. ``draws``
     has for each k of ``rows`` the errors at each drawn scale. ``skipped_counts`` are the requested k that exceed
     the number of views with a prediction.
