@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         action="extend",
         metavar="NAME",
-        help="configs to predict (default: all in the folder)",
+        help="configs to predict (default: all in the folder that have the split)",
     )
     parser.add_argument(
         "--split",

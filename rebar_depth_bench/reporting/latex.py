@@ -61,11 +61,10 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
     if len(digests) != 1:
         digest_list = ", ".join(sorted(map(formatting.short_digest, digests))) or "no result"
         raise InputError(f"LaTeX table: results of {len(digests)} datasets ({digest_list}), expected one dataset")
-    views = {config: table.views for result in results for config, table in result.tables.items()}
-    configs = list(views)
+    tables = {config: table for result in results for config, table in result.tables.items()}
+    configs = list(tables)
     configs_per_block = 1 if intervals else CONFIGS_PER_BLOCK
     blocks = [configs[start : start + configs_per_block] for start in range(0, len(configs), configs_per_block)]
-    tables = {config: table for result in results for config, table in result.tables.items()}
     matches = {config: tables[config].published if published else None for config in configs}
     paper_rows = [row for match in matches.values() for row in _paper_rows(match)]
     return _template().render(
@@ -73,7 +72,10 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
         columns=_COLUMNS,
         version=results[0].dataset_version,
         digest=formatting.short_digest(results[0].dataset_digest, 16),
-        view_counts=[f"{escape_latex(config)} {formatting.counted(views[config], 'view')}" for config in configs],
+        view_counts=[
+            f"{_config_name(config, table)} {formatting.counted(table.views, 'view')}"
+            for config, table in tables.items()
+        ],
         unranked=any(not table.ranked for result in results for table in result.tables.values()),
         undeclared=any(result.declared.uses_ground_truth is None for result in results),
         unranked_mark=_UNRANKED_MARK,
@@ -86,7 +88,7 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
         paper=load_published(),
         blocks=[
             {
-                "titles": [_config_title(config, tables[config].published) for config in block],
+                "titles": [_config_title(config, tables[config]) for config in block],
                 "rows": _result_rows(results, block, intervals),
                 "reference_rows": _reference_rows(results, block),
                 "published_rows": _published_rows({config: matches[config] for config in block}),
@@ -109,10 +111,14 @@ def _template() -> Template:
     return latex_environment.get_template("table.tex.j2")
 
 
-def _config_title(config: str, match: PublishedMatch | None) -> str:
+def _config_name(config: str, table: Table) -> str:
+    return escape_latex(formatting.config_title(config, table.split))
+
+
+def _config_title(config: str, table: Table) -> str:
     """Return a config's heading, with the working distance for a scene of the paper's Table I."""
-    scene = load_published().scenes.get(match.scene) if match else None
-    return escape_latex(config) + (f" ({scene.distance.replace('–', '--')})" if scene else "")
+    scene = load_published().scenes.get(table.published.scene) if table.published else None
+    return _config_name(config, table) + (f" ({scene.distance.replace('–', '--')})" if scene else "")
 
 
 def _result_rows(results: Sequence[Result], configs: Sequence[str], intervals: bool) -> list[list[str]]:

@@ -95,12 +95,12 @@ def compare(first: Result, other: Result) -> Comparison:
     Raises ``InputError`` if they were scored against different ground truth, have no config in common, or cover
     different splits of one.
     """
-    check_same_splits([first, other])
     if first.dataset_digest != other.dataset_digest:
         raise InputError(
             f"{other.method} was scored on the dataset {other.dataset_digest}, expected {first.dataset_digest} as "
             f"{first.method}: only submissions on the same ground truth can be compared"
         )
+    check_same_splits([first, other])
     shared = [config for config in first.tables if config in other.tables]
     if not shared:
         raise InputError(

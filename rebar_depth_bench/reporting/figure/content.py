@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.reporting.formatting import counted, rank_mark
+from rebar_depth_bench.reporting.formatting import config_title, counted, rank_mark
 from rebar_depth_bench.reporting.published import (
     OTHER_OPTICS_MARK,
     OTHER_OPTICS_NOTE,
@@ -88,7 +88,7 @@ def _panel(config: str, results: Sequence[Result], *, published: bool) -> Panel:
     for result, table in rows:
         if errors := _errors(table):
             shown.append(FigurePoint(_name(result), *errors, hollow=not table.is_comparable))
-    title = f"{printable(config, 40)}, {counted(first.views, 'view')}"
+    title = f"{config_title(printable(config, 40), first.split)}, {counted(first.views, 'view')}"
     if any(OTHER_OPTICS_MARK in point.mark for point in shown):
         title += f", paper {OTHER_OPTICS_MARK}"
     return Panel(printable(config), title, tuple(shown), first.reference)

@@ -183,10 +183,9 @@ def write_report(result: Result, evaluation: Evaluation, target: Path, *, views_
 
 def iter_view_panels(chosen: Mapping[str, list[ViewScore]], evaluation: Evaluation) -> Iterator[ViewPanels]:
     """Yield the arrays of the chosen views (by config), one view at a time; other rows are not decoded."""
-    for name, views in chosen.items():
-        scores = {view.view_id: view for view in views}
+    for config in evaluation.configs:
+        scores = {view.view_id: view for view in chosen.get(config.name, ())}
         if scores:
-            config = evaluation.folder.config(name)
             decoder = RowDecoder.of(config)
             for row in iterate_undecoded(config, _COLUMNS):
                 if score := scores.get(row["view_id"]):

@@ -24,10 +24,14 @@ from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.reporting.figure.content import figure_content
+from rebar_depth_bench.reporting.html.page import iter_view_panels
+from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.result_io import read_result
 from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.studies.scale_anchor.command import run_anchor_study
 from tests.synthetic_dataset import HEIGHT, WIDTH, drop_scene_column, write_dataset, write_split_dataset
 
 SCENES = {"a": "train", "b-1": "train", "c": "validation", "d": "test", "e": "test"}
@@ -112,6 +116,25 @@ def test_results_of_different_splits_are_not_compared(root: Path, tmp_path: Path
     results = [rdb.score(write_truth(root, tmp_path / f"{split}.zip", split), root) for split in ("train", "test")]
     with pytest.raises(InputError, match="covers the split test of cages, expected train"):
         compare(*results)
+
+
+def test_reports_name_the_split(root: Path, tmp_path: Path) -> None:
+    result = rdb.score(write_truth(root, tmp_path / "a.zip", "validation"), root)
+    [panel] = figure_content([result], published=True).panels
+    assert panel.title == "cages (validation), 3 views"
+    assert latex_table([result], published=True).count("cages (validation)") == 2  # Caption and heading.
+
+
+def test_report_shows_views_of_the_split(root: Path, tmp_path: Path) -> None:
+    with open_evaluation(write_truth(root, tmp_path / "a.zip", "train"), root) as evaluation:
+        result = score_evaluation(evaluation)
+        panels = list(iter_view_panels({"cages": list(result.views)}, evaluation))
+    assert [panel.view_id for panel in panels] == view_ids("train")
+
+
+def test_anchor_study_of_several_scenes(root: Path, tmp_path: Path) -> None:
+    study = run_anchor_study(write_truth(root, tmp_path / "a.zip", "test"), root, given_scale=1.0, counts=[2])
+    assert (study.views, study.markers) == (SPLIT_VIEWS["test"], None)
 
 
 INFO = MethodInfo("shifted", "test", ("left_depth", "scene"), False, "here", "none")
