@@ -12,7 +12,7 @@ import json
 import statistics
 import sys
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,10 @@ from dataset_builder.cli import main as rebar_build
 from rebar_depth_bench import score
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.cli.main import main as rebar_bench
-from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.scoring.ground_truth import config_truth
 from rebar_depth_bench.scoring.metrics import mean
-from rebar_depth_bench.scoring.score import score_evaluation
-from rebar_depth_bench.scoring.single_bar import mean_single_bar, score_single_bar
+from rebar_depth_bench.scoring.single_bar import mean_single_bar
+from rebar_depth_bench.studies.distance.command import run_distance_study
+from rebar_depth_bench.studies.distance.study import DistancePoint
 from rebar_depth_bench.submission.metadata import METADATA_NAME
 from rebar_depth_bench.view_ids import config_of
 
@@ -109,27 +108,23 @@ def _single_bar(archive: Path, root: Path) -> dict[str, dict[str, float | int | 
 
     The share is a mean over all views. The errors are means over the views with a predicted single-bar pixel.
     """
-    by_config = {}
-    with open_evaluation(archive, root) as evaluation:
-        scores = {view.view_id: view for view in score_evaluation(evaluation).views}
-        for config in evaluation.configs:
-            truths = config_truth(config)
-            points = []
-            for position, truth in enumerate(truths):
-                prediction_m, score = evaluation.submission.read(truth.view_id), scores[truth.view_id]
-                single_bar = score_single_bar(truth, truths.single_bar(position), prediction_m, score.scale)
-                points.append((score, single_bar))
-            chosen = [(score, single) for score, single in points if single.native and single.scaled]
-            means = mean_single_bar([single for _, single in points])
-            by_config[config.name] = {
-                "share": means.share,
-                "views": len(chosen),
-                "native_abs_rel_interior": mean([score.native.abs_rel for score, _ in chosen if score.native]),
-                "native_abs_rel_single_bar": means.native.abs_rel if means.native else None,
-                "scaled_abs_rel_interior": mean([score.scaled.abs_rel for score, _ in chosen if score.scaled]),
-                "scaled_abs_rel_single_bar": means.scaled.abs_rel if means.scaled else None,
-            }
-    return by_config
+    points_by_config: dict[str, list[DistancePoint]] = {}
+    for point in run_distance_study(archive, root).points:
+        points_by_config.setdefault(point.config, []).append(point)
+    return {config: _single_bar_means(points) for config, points in points_by_config.items()}
+
+
+def _single_bar_means(points: Sequence[DistancePoint]) -> dict[str, float | int | None]:
+    scores = [point.score for point in points if point.single_bar.native]
+    means = mean_single_bar([point.single_bar for point in points])
+    return {
+        "share": means.share,
+        "views": len(scores),
+        "native_abs_rel_interior": mean([score.native.abs_rel for score in scores if score.native]),
+        "native_abs_rel_single_bar": means.native.abs_rel if means.native else None,
+        "scaled_abs_rel_interior": mean([score.scaled.abs_rel for score in scores if score.scaled]),
+        "scaled_abs_rel_single_bar": means.scaled.abs_rel if means.scaled else None,
+    }
 
 
 def _median(seconds: Mapping[str, float], config: str) -> float:

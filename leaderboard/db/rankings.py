@@ -197,12 +197,12 @@ def ranks(database: Database, submission: SubmissionModel) -> dict[str, int]:
     row = LeaderboardRowModel
     own = select(row.config, row.rank_error).where(row.submission_id == submission.id, row.ranked)
     with database.read() as session:
-        limits = {
+        least_equal = {
             config: smallest_disclosed_alike(error) if database.hidden_truth else error
             for config, error in session.execute(own)
             if error is not None
         }
-        is_better = (and_(row.config == config, row.rank_error < limit) for config, limit in limits.items())
+        is_better = (and_(row.config == config, row.rank_error < error) for config, error in least_equal.items())
         query = (
             select(row.config, func.count())
             .join(SubmissionModel, SubmissionModel.id == row.submission_id)
@@ -210,7 +210,7 @@ def ranks(database: Database, submission: SubmissionModel) -> dict[str, int]:
             .group_by(row.config)
         )
         counts = dict(session.execute(query).all())
-    return {config: 1 + counts.get(config, 0) for config in limits}
+    return {config: 1 + counts.get(config, 0) for config in least_equal}
 
 
 def queue_position(database: Database, submission: SubmissionModel) -> QueuePosition | None:

@@ -62,6 +62,8 @@ def run(options: argparse.Namespace) -> None:
     """Score an archive, write the requested files and print the tables."""
     if options.html_views < 0:
         raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
+    if options.hub_id and not options.eval_results:
+        raise InputError("--hub-id is given without --eval-results, expected both or neither")
     hub_id = check_hub_id(options.hub_id) if options.eval_results else ""
     with open_evaluation(options.archive, options.data, expect_digest=options.expect_digest) as evaluation:
         with ProgressBars() as bars:

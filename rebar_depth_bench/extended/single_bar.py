@@ -17,7 +17,7 @@ from rebar_depth_bench.extended.full_mask import REGION_NUMBERS, Region, region_
 from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 
-_INTERIOR_ABS_REL = "single_bar_views_abs_rel"
+_VIEWS_ABS_REL = "single_bar_views_abs_rel"
 _REGION = Region("single_bar", "single-bar", "interior pixels whose 3 x 3 neighbourhood belongs to one bar")
 
 
@@ -34,7 +34,7 @@ def single_bar_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Sample
     return {
         "single_bar_share": np.array(share, np.float64),
         **scores,
-        _INTERIOR_ABS_REL: interior if len(scores["single_bar_abs_rel"]) else np.empty(0),
+        _VIEWS_ABS_REL: interior if len(scores["single_bar_abs_rel"]) else np.empty(0),
     }
 
 
@@ -51,8 +51,8 @@ MEASURES: tuple[Measure, ...] = (
     ),
     *(region_measure(_REGION, number) for number in REGION_NUMBERS),
     Measure(
-        _INTERIOR_ABS_REL,
-        _INTERIOR_ABS_REL,
+        _VIEWS_ABS_REL,
+        _VIEWS_ABS_REL,
         "mean",
         "AbsRel, whole interior of the same views",
         "",

@@ -84,7 +84,8 @@ def _entries(result: Result, folder: DatasetFolder, hub_id: str, configs: Sequen
         f"{result.method}: rank error of protocol {result.protocol}, lower is better; "
         f"software {EVALUATION_FRAMEWORK} {result.software_version}, "
         f"dataset {result.dataset_version} ({short_digest(result.dataset_digest)}), "
-        f"archive {short_digest(result.submission_sha256)}, declared inputs {result.declared.inputs or 'none'}"
+        f"archive {short_digest(result.submission_sha256)}, "
+        f"declared inputs: {result.declared.inputs or 'not declared'}"
     )
     return [
         EvalResultEntry(

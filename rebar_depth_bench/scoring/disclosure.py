@@ -54,7 +54,10 @@ _Number = Annotated[float, Field(ge=0, le=1), AfterValidator(disclosed_number)] 
 
 
 class DisclosedTable(StoredModel):
-    """Disclosed part of the table of a config; ``rank_error`` is None in results of the previous protocol."""
+    """Disclosed part of the table of a config.
+
+    ``rank_error`` is None without scored views and in results of the previous protocol.
+    """
 
     coverage: _Number
     ranked: bool

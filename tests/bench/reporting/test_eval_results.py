@@ -50,7 +50,7 @@ def test_score_writes_an_entry_per_config(
     assert [entry.value for entry in entries] == pytest.approx([0.2, 0.2], rel=1e-6)
     for entry in entries:
         assert entry.dataset_revision is entry.date is entry.source_url is None
-        words = ("test", "rebar-2", scored.software_version, scored.dataset_digest[:19], "declared inputs none")
+        words = ("test", "rebar-2", scored.software_version, scored.dataset_digest[:19], "inputs: not declared")
         assert all(word in str(entry.notes) for word in words)
     tasks = yaml.safe_load((tiny_root / "eval.yaml").read_text())["tasks"]
     assert [entry.task_id for entry in entries] == [task["id"] for task in tasks]
@@ -87,6 +87,11 @@ def test_missing_or_invalid_id_is_refused_before_scoring(
     assert "--hub-id" in stderr
     assert "nowhere" not in stderr
     assert not out.exists()
+
+
+def test_id_without_file_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["score", "nowhere.zip", "--data", "nowhere", "--hub-id", HUB_ID]) == 2
+    assert "--eval-results" in capsys.readouterr().err
 
 
 def test_unranked_configs_are_left_out_with_a_note(folder: DatasetFolder) -> None:
