@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import InputError, escape_text, printable
-from rebar_depth_bench.reporting.formatting import short_digest, unranked_reason
+from rebar_depth_bench.reporting.formatting import declaration_text, short_digest, unranked_reason
 from rebar_depth_bench.scoring.result import Result, Table
 from rebar_depth_bench.scoring.rounding import rounded
 from rebar_depth_bench.view_ids import TEST_SPLIT
@@ -85,7 +85,7 @@ def _entries(result: Result, folder: DatasetFolder, hub_id: str, configs: Sequen
         f"software {EVALUATION_FRAMEWORK} {result.software_version}, "
         f"dataset {result.dataset_version} ({short_digest(result.dataset_digest)}), "
         f"archive {short_digest(result.submission_sha256)}, "
-        f"declared inputs: {result.declared.inputs or 'not declared'}"
+        f"{declaration_text(result.declared)}"
     )
     return [
         EvalResultEntry(

@@ -85,7 +85,7 @@ def ground_truth_text(declared: Declaration) -> str:
 
 def declaration_text(declared: Declaration) -> str:
     """Return a submission's declaration in one line."""
-    return f"declared inputs: {declared.inputs or 'none'}; ground truth: {ground_truth_text(declared)}"
+    return f"inputs: {declared.inputs or 'not declared'}; ground truth: {ground_truth_text(declared)}"
 
 
 def metric_cell(metrics: DepthMetrics | None, name: str) -> str:
