@@ -63,10 +63,10 @@ class DatasetFolder(Located):
 
     def expected_views(self, split: str | None = None) -> dict[str, tuple[int, int]]:
         """Return the (height, width) of every view of every config, or of one split, keyed by view id."""
-        configs = self.config_by_name.values()
-        chosen = [config for config in configs if split is None or split in config.splits]
-        parts = chosen if split is None else [config.of_split(split) for config in chosen]
-        return {view_id: config.grid for config in parts for view_id in config.view_ids}
+        configs: Iterable[DatasetConfig] = self.config_by_name.values()
+        if split is not None:
+            configs = [config.of_split(split) for config in configs if split in config.splits]
+        return {view_id: config.grid for config in configs for view_id in config.view_ids}
 
 
 class _GroundTruth(ManifestTable):

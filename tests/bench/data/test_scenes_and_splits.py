@@ -182,7 +182,6 @@ def test_interrupted_prediction_of_scenes_resumes(root: Path, tmp_path: Path) ->
     predict(method, root, tmp_path / "a.zip")
     assert [views.config for views in prepared] == ["cages.test-d", "cages.test-e", "cages.test-e"]
     predict(method, root, tmp_path / "b.zip")
-    assert (tmp_path / "a.zip").read_bytes() != b""
     assert rdb.score(tmp_path / "a.zip", root).tables == rdb.score(tmp_path / "b.zip", root).tables
 
 
