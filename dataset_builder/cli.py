@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, SWEEPS, BuildRequest
+from dataset_builder.config.quality import DEFAULT_QUALITY, QUALITIES, SAMPLINGS, colour_spec
 from dataset_builder.scene.variants import VARIANTS
 from rebar_depth_bench.console import ProgressBars, replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError
@@ -86,7 +87,7 @@ def _build_request(options: argparse.Namespace) -> BuildRequest:
         views=options.views,
         width=options.width,
         height=options.height,
-        samples=options.samples,
+        colour=colour_spec(options.sampling, options.quality, options.samples),
         seed=options.seed,
         mesh=mesh_file_spec(options.mesh, options.mesh_unit) if options.mesh else None,
         variants=tuple(options.variant or ()),
@@ -187,10 +188,19 @@ def _add_build_arguments(parser: argparse.ArgumentParser) -> None:
         "--height", type=int, default=BuildRequest.height, help="image height in pixels (default: %(default)s)"
     )
     parser.add_argument(
+        "--sampling",
+        choices=SAMPLINGS,
+        help="more samples around the steel than elsewhere, or as many everywhere (default: steel-first)",
+    )
+    amount = parser.add_mutually_exclusive_group()
+    amount.add_argument(
+        "--quality", choices=QUALITIES, help=f"preset of samples and denoising (default: {DEFAULT_QUALITY})"
+    )
+    amount.add_argument(
         "--samples",
         type=int,
-        default=BuildRequest.samples,
-        help="Cycles samples per pixel (default: %(default)s)",
+        metavar="SPP",
+        help="Cycles samples per pixel instead of a preset, uniform unless --sampling steel-first is given",
     )
     parser.add_argument(
         "--workers", type=int, metavar="N", help="number of parallel render processes (default: 1)"
