@@ -143,7 +143,7 @@ Principal points that are half a pixel off in both eyes give 0.5 px, in one eye 
 MAX_INSET_PX = 1.0
 """Largest fitted inset, pixels."""
 MIN_DETECTED_SHARE = 0.5
-"""Least share of the visible markers that must be detected; not applied to scenes with a lighting variant."""
+"""Least share of the visible markers that must be detected; not applied where ``light_may_hide_markers``."""
 MAX_POSE_MM_PER_M = 8.0
 """Largest median position error, millimetres per metre of distance from the board's middle."""
 MAX_POSE_DEG = 0.5
@@ -195,7 +195,7 @@ def marker_verdict(config: AuditedConfig, views: Sequence[Sequence[DetectedMarke
     expected, detected = sum(eye.expected for eye in eyes), sum(len(eye.detected_px) for eye in eyes)
     if not expected:
         return Check(name, f"no unoccluded marker of {MIN_MARKER_WIDTH_PX:g} px or more", "skipped")
-    min_share = 0.0 if config.has_lighting_variant else MIN_DETECTED_SHARE
+    min_share = 0.0 if config.light_may_hide_markers else MIN_DETECTED_SHARE
     missing = (
         ()
         if detected >= min_share * expected

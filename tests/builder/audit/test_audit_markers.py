@@ -78,6 +78,9 @@ def test_undetected_markers_are_reported() -> None:
         blank_view, of=config(variants=("spotlight",))
     ).passed  # Hard light may make markers undetectable.
     assert not verdict(blank_view, of=config(variants=("clutter",))).passed
+    assert not verdict(blank_view, of=config(variants=("night", "sensor"))).passed, (
+        "exposed like the standard light"
+    )
 
 
 def test_occluded_markers_are_not_expected() -> None:
