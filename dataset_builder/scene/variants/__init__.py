@@ -42,14 +42,14 @@ _ALL = (
     ),
     Variant("city", "light of a panorama: high-rise buildings under a hazy sun", LIGHT_SLOT),
     Variant(
-        "courtyard", "light of a panorama: a courtyard between buildings, overcast, without a sun", LIGHT_SLOT
+        "courtyard", "light of a panorama: a courtyard between houses, a bright sky without a sun", LIGHT_SLOT
     ),
     Variant("forest", "light of a panorama: a garden under trees, with patches of bright sky", LIGHT_SLOT),
     Variant("interior", "light of a panorama: a hotel room with lamps and a window", LIGHT_SLOT),
     Variant("night", "light of a panorama: a park after dark, with lamps; exposed like the others", LIGHT_SLOT),
     Variant("studio", "light of a panorama: a photographer's studio with softboxes in the dark", LIGHT_SLOT),
-    Variant("sunrise", "light of a panorama: open country under a low sun", LIGHT_SLOT),
-    Variant("sunset", "light of a panorama: a promenade with the sun at the horizon, bluish", LIGHT_SLOT),
+    Variant("sunrise", "light of a panorama: a misty park under a low sun", LIGHT_SLOT),
+    Variant("sunset", "light of a panorama: a promenade, bluish, with the sun at the horizon", LIGHT_SLOT),
     Variant("mill-scale", "fresh steel: smooth blue-grey scale, hardly any rust", STEEL_SLOT),
     Variant("rusted", "steel that stood outside for months: rust all over", STEEL_SLOT),
     Variant("wet", "steel after rain: darker, with a gloss", STEEL_SLOT),
