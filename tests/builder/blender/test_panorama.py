@@ -65,20 +65,21 @@ def probe(folder: Path) -> None:
     """Render the sun of a turned panorama, and the opposite direction (runs in the Blender process)."""
     import bpy
 
+    from dataset_builder.blender.colour import configure_colour, render_colour
     from dataset_builder.blender.panorama import add_panorama
-    from dataset_builder.blender.render import configure_colour, render_colour
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     light = replace(light_of("sunrise"), strength=0.02, turn_deg=TURN_DEG)
     add_panorama(light)
-    configure_colour(ColourSpec(samples=4, denoise=False), threads=1)
+    configure_colour(threads=1)
+    no_steel = np.zeros((16, 16), dtype=bool)
     turn = np.deg2rad(TURN_DEG)
     turned = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
     towards = turned @ brightest_direction(panorama_pixels("sunrise"))
     K = np.array([[20.0, 0, 7.5], [0, 20.0, 7.5], [0, 0, 1]])
     for name, sign in (("sun", 1.0), ("opposite", -1.0)):
         camera = Camera(K, np.zeros(5), look_at(np.zeros(3), sign * towards * [1, 1, sign]), 16, 16)
-        np.save(folder / f"{name}.npy", render_colour(camera, 1, folder))
+        np.save(folder / f"{name}.npy", render_colour(camera, no_steel, ColourSpec(4, 4), 1, folder))
     try:
         add_panorama(replace(light, sha256="0" * 64))
     except BuildError as error:
