@@ -62,7 +62,9 @@ _ALL = (
     Variant("spacers", "plastic wheel spacers round some of the outer bars", PROPS_SLOT),
     Variant("tie-wire", "black wire of 1.2 mm tied round some of the crossings of bars", PROPS_SLOT),
     Variant(
-        SENSOR, "a camera's picture: noise, vignetting, demosaicing and JPEG; repeated for each eye", SENSOR_SLOT
+        SENSOR,
+        "pictures of a camera at 18 dB gain: vignetting, noise, demosaicing and JPEG compression",
+        SENSOR_SLOT,
     ),
 )
 VARIANTS: Mapping[str, Variant] = {variant.name: variant for variant in _ALL}
