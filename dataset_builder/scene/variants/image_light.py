@@ -45,8 +45,8 @@ IRRADIANCE = 5.0
 
 It was chosen so that the mean level of the pictures is about that of the standard light. Without a turn, four left
 views of each scene at 320 x 180 differ from it by -7 to +3 levels (of 255) in the laboratory, and by -22 to +21 on
-the building site, where the panorama is in the picture. ``python -m benchmarks.variants ROOT`` prints the levels of
-a folder.
+the building site, where the panorama is in the picture. ``python -m benchmarks.variants ROOT`` prints the levels
+of a folder.
 """
 IMAGE_LIGHTS = tuple(_IMAGES)
 """Names of the variants with the light of a panorama."""
