@@ -5,16 +5,17 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, SWEEPS, BuildRequest
+from dataset_builder.config.specs import CPU, GPU_TYPES
 from dataset_builder.scene.variants import VARIANTS
-from rebar_depth_bench.console import ProgressBars, replace_renamed_options, run_command
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.console import ProgressBars, Rate, replace_renamed_options, run_command
+from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.version import software_version
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ def _check_extra() -> None:
 def _build(options: argparse.Namespace) -> None:
     _check_extra()
     from dataset_builder.pipeline.build import build
+    from dataset_builder.pipeline.devices import Devices, find_devices
 
     if options.out is None:
         raise InputError("--out ROOT is missing, expected the dataset folder to build")
@@ -62,16 +64,42 @@ def _build(options: argparse.Namespace) -> None:
     workers = 1 if options.workers is None else options.workers
     if workers < 1:
         raise InputError(f"--workers is {workers}, expected 1 or more")
-    request = _build_request(options)
-    threads = max(1, (os.cpu_count() or 1) // workers)
-    with _cluster_context(options.cluster) as cluster, ProgressBars() as bars:
-        summary = build(
-            request, options.out, workers=workers, threads=threads, cluster=cluster, progress=bars.update
-        )
+    with _cluster_context(options.cluster, options.device) as cluster:
+        devices = Devices(options.device) if cluster else find_devices(options.device)
+        request = _build_request(options, devices.type)
+        threads = max(1, (os.cpu_count() or 1) // (workers * devices.count))
+        if options.dry_run:
+            _print_estimate(request, options.out, workers * devices.count, threads)
+            return
+        with ProgressBars(Rate("pictures", 2)) as bars:
+            summary = build(
+                request,
+                options.out,
+                workers=workers,
+                threads=threads,
+                devices=devices.count,
+                cluster=cluster,
+                progress=bars.update,
+            )
     _print_summary(options.out, summary)
 
 
-def _build_request(options: argparse.Namespace) -> BuildRequest:
+def _print_estimate(request: BuildRequest, out: Path, processes: int, threads: int) -> None:
+    """Print what a build would need; raise ``InputError`` if it would be refused."""
+    from dataset_builder.pipeline.build import plan_build
+    from dataset_builder.pipeline.disk_space import check_space
+    from dataset_builder.pipeline.estimate import estimate_build, estimate_lines
+    from dataset_builder.pipeline.retained import check_retained_configs
+
+    plans = plan_build(request, out)
+    check_retained_configs(out, plans)
+    with ProgressBars() as bars:
+        estimates = estimate_build(plans, out, threads, bars.update)
+    print(*map(printable, estimate_lines(estimates, out, processes)), sep="\n")
+    check_space(out, [estimate.space for estimate in estimates if estimate.space])
+
+
+def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
     """Return the build request of the options.
 
     With ``--scene`` and without ``--config``, only the given scene files are built. With ``--mesh``, the default
@@ -87,6 +115,7 @@ def _build_request(options: argparse.Namespace) -> BuildRequest:
         width=options.width,
         height=options.height,
         samples=options.samples,
+        device=device,
         seed=options.seed,
         mesh=mesh_file_spec(options.mesh, options.mesh_unit) if options.mesh else None,
         variants=tuple(options.variant or ()),
@@ -94,20 +123,24 @@ def _build_request(options: argparse.Namespace) -> BuildRequest:
     )
 
 
-def _cluster_context(address: str | None) -> AbstractContextManager[Renderer | None]:
-    """Return a context manager that connects to the cluster at ``address``, or yields None without an address.
+@contextmanager
+def _cluster_context(address: str | None, device: str) -> Iterator[Renderer | None]:
+    """Connect to the cluster at ``address``, whose workers must have the ``device``; yield None without an address.
 
-    Raises ``InputError`` if ``distributed`` is not installed.
+    Raises ``InputError`` if ``distributed`` is not installed or a worker has no such device.
     """
     if address is None:
-        return nullcontext()
+        yield None
+        return
     if find_spec("distributed") is None:
         raise InputError(
             "not installed: distributed; --cluster needs it: pip install 'rebar-depth-bench[cluster]'"
         )
     from dataset_builder.pipeline.dask_renderer import connect_to_cluster
 
-    return connect_to_cluster(address)
+    with connect_to_cluster(address) as cluster:
+        cluster.check_device(device)
+        yield cluster
 
 
 def _print_summary(out: Path, summary: BuildSummary) -> None:
@@ -193,7 +226,19 @@ def _add_build_arguments(parser: argparse.ArgumentParser) -> None:
         help="Cycles samples per pixel (default: %(default)s)",
     )
     parser.add_argument(
-        "--workers", type=int, metavar="N", help="number of parallel render processes (default: 1)"
+        "--device",
+        choices=(CPU, *GPU_TYPES, "auto"),
+        default=CPU,
+        help="type of device that renders colour; auto: the best one of this machine (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="print views, disk space, memory and duration of the build, measured with small pictures, and build "
+        "nothing",
+    )
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="number of parallel render processes per device (default: 1)"
     )
     parser.add_argument(
         "--cluster",

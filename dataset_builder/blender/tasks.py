@@ -7,6 +7,8 @@ is an independent check of the ground truth.
 from __future__ import annotations
 
 import os
+import resource
+import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -21,6 +23,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.blender.devices import select_device
 from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
 from dataset_builder.blender.render import configure_colour, render_colour, render_depth
 from dataset_builder.blender.scene import add_object, build_scene, mesh_data
@@ -72,6 +75,7 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
         assembly = make_assembly(config.scene.assembly)
         build_scene(assembly, config.scene)
         configure_colour(config.colour, task.threads)
+        select_device(config.colour.device, task.device_index)
         mesh = evaluated_world_mesh()
         _stage_mesh(mesh, staging.mesh, unit.mesh_sha256)
         caster = RayCaster(mesh)
@@ -89,6 +93,12 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
                 with watch.timing("write"):
                     stage_row(path, row, record)
             report({"view": index, "seconds": watch.take()})
+    report({"seconds": watch.take(), "memory_bytes": _peak_memory_bytes()})
+
+
+def _peak_memory_bytes() -> int:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # Linux counts KiB.
 
 
 @dataclass(frozen=True, eq=False)

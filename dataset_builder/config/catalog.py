@@ -7,6 +7,9 @@ from dataclasses import dataclass, replace
 
 from dataset_builder.config.rigs import zed_rig
 from dataset_builder.config.specs import (
+    CPU,
+    GPU_TYPES,
+    LENS_DEVICES,
     AppearanceSpec,
     AssemblySpec,
     ColourSpec,
@@ -118,7 +121,8 @@ class BuildRequest:
     """Request to ``rebar-build``: configs, number of views, image size (pixels) and render quality.
 
     ``views`` is the number of views per config, spread evenly over the trajectory; None selects all views.
-    ``samples`` are Cycles samples per pixel. ``mesh`` replaces the rods of the lattice. ``variants`` are names of
+    ``samples`` are Cycles samples per pixel. ``device`` is a type of device that renders colour, as in
+    ``ColourSpec``. ``mesh`` replaces the rods of the lattice. ``variants`` are names of
     ``scene.variants.VARIANTS``; they are appended to the names of configs and scenes. ``scenes`` are the configs
     of user scene files.
     """
@@ -128,6 +132,7 @@ class BuildRequest:
     width: int = RigSpec.width
     height: int = RigSpec.height
     samples: int = ColourSpec.samples
+    device: str = CPU
     seed: int = 0
     mesh: MeshFileSpec | None = None
     variants: tuple[str, ...] = ()
@@ -137,11 +142,13 @@ class BuildRequest:
         """Return the specs of all requested configs.
 
         Raises ``InputError`` that names every value out of range, and ``InputError`` for unknown configs, invalid
-        variants and duplicate config names, and if ``mesh`` is combined with a config that is not a lattice.
+        variants and duplicate config names, if ``mesh`` is combined with a config that is not a lattice, and if
+        ``device`` cannot render a config.
         """
         self._check_ranges()
         check_variants(self.variants)
         specs = [self._with_request(spec) for spec in (*_known_configs(self.configs), *self.scenes)]
+        self._check_device(specs)
         names = [spec.name for spec in specs]
         duplicates = sorted({name for name in names if names.count(name) > 1})
         if duplicates:
@@ -166,6 +173,18 @@ class BuildRequest:
         if problems:
             raise InputError.from_problems("build request", problems)
 
+    def _check_device(self, specs: Sequence[ConfigSpec]) -> None:
+        if self.device not in (CPU, *GPU_TYPES):
+            problem = Problem("unknown", "--device", f"got {self.device!r}", ", ".join((CPU, *GPU_TYPES)))
+            raise InputError.from_problems("build request", [problem])
+        raw = [spec.name for spec in specs if spec.rig.grid == "raw"]
+        if raw and self.device not in LENS_DEVICES:
+            raise InputError(
+                f"--device {self.device} cannot render {', '.join(raw)}: Cycles has lenses with distortion only on "
+                f"{' and '.join(LENS_DEVICES)}; build these configs with one of these devices, and the others with "
+                "--config and without them"
+            )
+
     def _with_request(self, spec: ConfigSpec) -> ConfigSpec:
         variants = tuple(
             name for name in VARIANTS if name in self.variants
@@ -183,7 +202,7 @@ class BuildRequest:
             name=spec.name + suffix,
             scene=scene,
             rig=replace(spec.rig, width=self.width, height=self.height),
-            colour=replace(spec.colour, samples=self.samples),
+            colour=replace(spec.colour, samples=self.samples, device=self.device),
         )
 
     def _assembly(self, spec: ConfigSpec) -> AssemblySpec:

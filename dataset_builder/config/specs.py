@@ -192,13 +192,24 @@ class RigSpec:
     grid: str = "ideal"
 
 
+CPU = "cpu"
+GPU_TYPES = ("optix", "cuda", "hip", "oneapi", "metal")
+"""Types of GPU devices, as Cycles names them in capitals; the best one first."""
+LENS_DEVICES = (CPU, "optix")
+"""Types of devices on which Blender 4.5 renders custom cameras, which the raw grid needs."""
+
+
 @dataclass(frozen=True)
 class ColourSpec:
-    """Colour rendering with Cycles: samples per pixel, denoising, and the OIDN prefilter of albedo and normals."""
+    """Colour rendering with Cycles: samples per pixel, denoising, and the OIDN prefilter of albedo and normals.
+
+    ``device`` is ``CPU`` or one of ``GPU_TYPES``, on which the bytes of the images depend.
+    """
 
     samples: int = 16
     denoise: bool = True
     prefilter: str = "FAST"
+    device: str = CPU
 
 
 @dataclass(frozen=True)
