@@ -56,6 +56,11 @@ def _build(options: argparse.Namespace) -> None:
 
     if options.out is None:
         raise InputError("--out ROOT is missing, expected the dataset folder to build")
+    if options.cluster is not None and options.dry_run:
+        raise InputError(
+            f"--dry-run is combined with --cluster {options.cluster}, expected only one of them: the estimate is "
+            "measured on this machine"
+        )
     if options.cluster is not None and options.workers is not None:
         raise InputError(
             f"--workers {options.workers} is combined with --cluster {options.cluster}, expected only one of "
@@ -125,7 +130,7 @@ def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
 
 @contextmanager
 def _cluster_context(address: str | None, device: str) -> Iterator[Renderer | None]:
-    """Connect to the cluster at ``address``, whose workers must have the ``device``; yield None without an address.
+    """Connect to the cluster at ``address``, whose workers must have ``device``; yield None without an address.
 
     Raises ``InputError`` if ``distributed`` is not installed or a worker has no such device.
     """

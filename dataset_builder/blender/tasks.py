@@ -93,7 +93,7 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
                 with watch.timing("write"):
                     stage_row(path, row, record)
             report({"view": index, "seconds": watch.take()})
-    report({"seconds": watch.take(), "memory_bytes": _peak_memory_bytes()})
+    report({"seconds": {}, "memory_bytes": _peak_memory_bytes(), "cpu_s": time.process_time()})
 
 
 def _peak_memory_bytes() -> int:

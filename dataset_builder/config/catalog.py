@@ -180,9 +180,9 @@ class BuildRequest:
         raw = [spec.name for spec in specs if spec.rig.grid == "raw"]
         if raw and self.device not in LENS_DEVICES:
             raise InputError(
-                f"--device {self.device} cannot render {', '.join(raw)}: Cycles has lenses with distortion only on "
-                f"{' and '.join(LENS_DEVICES)}; build these configs with one of these devices, and the others with "
-                "--config and without them"
+                f"{', '.join(raw)}: cannot be rendered with --device {self.device}, expected "
+                f"{' or '.join(LENS_DEVICES)}: Cycles has no lenses with distortion on others; "
+                "build the other configs separately, named with --config"
             )
 
     def _with_request(self, spec: ConfigSpec) -> ConfigSpec:

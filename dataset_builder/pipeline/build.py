@@ -50,11 +50,11 @@ def build(
     """Build the requested configs in the folder ``out``, or continue an interrupted build of them.
 
     Rendering uses ``workers`` concurrent processes of ``threads`` threads each on this machine, for each of
-    ``devices`` devices of the request's type, or the workers of ``cluster`` if it is not None. None of these changes
-    the bytes of the result. Each config is published as soon as it is complete.
+    ``devices`` devices of the request's type, or the workers of ``cluster`` if it is not None. None of these
+    changes the bytes of the result. Each config is published as soon as it is complete.
 
-    Raises ``InputError`` for a request that cannot be built or does not fit on the disk, ``RenderProcessError`` if a
-    render process dies twice, and ``BuildError`` if rendered data does not match its digests.
+    Raises ``InputError`` for a request that cannot be built or does not fit on the disk, ``RenderProcessError``
+    if a render process dies twice, and ``BuildError`` if rendered data does not match its digests.
     """
     plans = plan_build(request, out)
     check_fits_on_disk(out, plans)

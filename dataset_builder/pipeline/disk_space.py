@@ -1,7 +1,8 @@
 """Disk space of a build: its estimate, and the refusal of a build that does not fit.
 
-While a config is built, its rows are staged and then packed into shards beside them; the staged rows, and the files
-of an older build of the config, are deleted when it has been published. Only views that are not staged yet count.
+While a config is built, its rows are staged and then packed into shards beside them. The staged rows, and the
+files of an older build of the config, are deleted when it has been published. Only views that are not staged yet
+are estimated.
 The scratch folders of the workers of a cluster, which hold one work unit per render process, are not checked.
 """
 
@@ -31,14 +32,14 @@ _EXPONENT = -0.22
 A view of the lattice has 6.4, 4.8, 3.4 and 2.4 bytes per pixel at 160 x 90, 320 x 180, 640 x 360 and 1280 x 720.
 """
 _MARGIN = 1.15
-"""Margin for views with more detail than these scenes; the estimate of each of them is 1.3 to 1.45 times its size."""
+"""Margin for views with more detail than those of these scenes, whose sizes are estimated 1.2 to 1.5 times."""
 _SURROUNDINGS_BYTES = 1_000_000
 """Allowance for surfaces in the mesh of a scene that are no steel (0.1 MB), contact sheet and metadata."""
 
 
 @dataclass(frozen=True)
 class ConfigSpace:
-    """Disk space of a config: bytes staged already, of the missing views, of the mesh, and of files to be deleted."""
+    """Disk space of a config: bytes of staged views, missing views, the mesh, and the files that it replaces."""
 
     staged_bytes: int
     missing_bytes: int
@@ -64,8 +65,8 @@ class ConfigSpace:
 def view_bytes(rig: RigSpec, has_colour: bool) -> int:
     """Return the estimated size of one view of both eyes."""
     pixels = rig.width * rig.height
-    at_measured_size = _TRUTH_BYTES + _COLOUR_BYTES * has_colour
-    return round(_MARGIN * at_measured_size * pixels * (pixels / _MEASURED_PIXELS) ** _EXPONENT)
+    at_measured_size = _TRUTH_BYTES + _COLOUR_BYTES if has_colour else _TRUTH_BYTES
+    return int(_MARGIN * at_measured_size * pixels * (pixels / _MEASURED_PIXELS) ** _EXPONENT)
 
 
 def config_space(plan: ConfigPlan, out: Path) -> ConfigSpace:
@@ -111,8 +112,8 @@ def check_space(out: Path, spaces: Iterable[ConfigSpace]) -> None:
     needed, free = needed_bytes(spaces), free_bytes(out)
     if needed > free:
         raise InputError(
-            f"{out}: the build needs about {bytes_text(needed)} of disk space, but only {bytes_text(free)} are free: "
-            "free some space, choose another folder, or build fewer views, smaller images or fewer configs"
+            f"{out}: the build needs about {bytes_text(needed)} of disk space, but {bytes_text(free)} are free: "
+            "delete other files, choose another folder, or build fewer configs, fewer views or smaller images"
         )
 
 

@@ -1,7 +1,8 @@
 """Estimate of a build, without writing to the dataset folder: views, disk space, memory and duration.
 
-The duration is that of rendering on this machine as busy as it is now. It assumes that render processes do not slow
-each other down, and leaves out the packing of the finished views.
+The duration is that of rendering on this machine as busy as it is now. It assumes that render processes do not
+slow each other down, and leaves out the packing of the finished views. The processor time depends less on other
+programs.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from rebar_depth_bench.progress import Progress, silent
 
 @dataclass(frozen=True)
 class ConfigEstimate:
-    """Estimate of one config: views per remaining work unit, disk space, and the trial (None: nothing to render)."""
+    """Estimate of one config: views per remaining work unit, disk space and trial (None: nothing to render)."""
 
     spec: ConfigSpec
     views: int
@@ -38,9 +39,15 @@ class ConfigEstimate:
 
     def seconds(self, processes: int) -> float:
         """Return the duration of rendering with this number of concurrent processes."""
-        if self.trial is None:
-            return 0.0
-        return makespan([self.trial.unit_seconds(views, self.spec.rig) for views in self.unit_views], processes)
+        return makespan(self._unit_seconds(), processes)
+
+    @property
+    def cpu_seconds(self) -> float:
+        """Processor time of rendering in seconds."""
+        return self.trial.busy_threads * sum(self._unit_seconds()) if self.trial else 0.0
+
+    def _unit_seconds(self) -> list[float]:
+        return [self.trial.unit_seconds(views, self.spec.rig) for views in self.unit_views] if self.trial else []
 
 
 def estimate_build(
@@ -82,9 +89,8 @@ def estimate_lines(estimates: Sequence[ConfigEstimate], out: Path, processes: in
     for estimate in estimates:
         yield from _config_lines(estimate, processes)
     missing, views = (sum(getattr(item, name) for item in estimates) for name in ("missing", "views"))
-    seconds = sum(item.seconds(processes) for item in estimates)
     needed = needed_bytes(item.space for item in estimates if item.space)
-    yield f"total: {missing} of {views} views to render, {duration_text(seconds)} with {processes} render processes"
+    yield f"total: {missing} of {views} views to render, {_duration_text(estimates, processes)}"
     yield f"disk space: {bytes_text(needed)} needed, {bytes_text(free_bytes(out))} free for {out}"
 
 
@@ -100,8 +106,16 @@ def _config_lines(estimate: ConfigEstimate, processes: int) -> Iterator[str]:
     yield f"  disk space: {bytes_text(space.finished_bytes)} finished, {bytes_text(space.building_bytes)} to build"
     if trial is not None:
         yield f"  memory: {bytes_text(trial.process_memory_bytes(rig))} in each render process"
-        picture_s = trial.view_s_per_pixel * rig.width * rig.height / 2
-        yield f"  duration: {duration_text(estimate.seconds(processes))}, {picture_s:.1f} s a picture in one process"
+        yield f"  duration: {_duration_text([estimate], processes)}"
+
+
+def _duration_text(estimates: Sequence[ConfigEstimate], processes: int) -> str:
+    duration_s = sum(estimate.seconds(processes) for estimate in estimates)
+    cpu_s = sum(estimate.cpu_seconds for estimate in estimates)
+    return (
+        f"{duration_text(duration_s)}, with render processes: {processes} "
+        f"({duration_text(cpu_s)} of processor time in all)"
+    )
 
 
 def _colour_text(colour: ColourSpec | None) -> str:

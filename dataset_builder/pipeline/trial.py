@@ -34,10 +34,15 @@ _MEMORY_BYTES_PER_PIXEL = 900
 
 @dataclass(frozen=True)
 class Trial:
-    """Cost of rendering a config: constant seconds per process, seconds per pixel of a view, and memory."""
+    """Cost of rendering a config in one process: wall-clock seconds, processor time and memory.
+
+    ``process_s`` is spent once per process, ``view_s_per_pixel`` on each view of both eyes. ``busy_threads`` is
+    the processor time per second: the number of threads if the machine is idle, less if it is busy.
+    """
 
     process_s: float
     view_s_per_pixel: float
+    busy_threads: float
     pixels: int
     memory_bytes: int
 
@@ -58,29 +63,32 @@ def run_trial(spec: ConfigSpec, indices: Sequence[int], threads: int) -> Trial:
     small = replace(spec, rig=trial_rig(spec))
     chosen = tuple(indices[place] for place in subset(len(indices), _VIEWS))
     unit = WorkUnit(small, 0, chosen, False, None, generator_versions())
-    view_s: list[float] = []
-    memory: list[int] = []
+    views: list[float] = []
+    totals: dict[str, float] = {}
 
     def on_event(event: Event) -> None:
         if "view" in event:
-            view_s.append(sum(event["seconds"].values()))
-        memory.append(event.get("memory_bytes", 0))
+            views.append(sum(event["seconds"].values()))
+        totals.update((name, event[name]) for name in ("cpu_s", "memory_bytes") if name in event)
 
     start = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="rebar-trial-") as scratch, BlenderProcesses() as blender:
         staging = Staging(Path(scratch))
         blender.run(RenderTask(unit, staging, threads), f"the trial of {spec.name}", staging.log(0), on_event)
     total_s = time.perf_counter() - start
-    return trial_from_times(total_s, view_s[-len(chosen) :], small.rig.width * small.rig.height, max(memory))
+    process_s, view_s = split_times(total_s, views[-len(chosen) :])
+    pixels = small.rig.width * small.rig.height
+    return Trial(process_s, view_s / pixels, totals["cpu_s"] / total_s, pixels, int(totals["memory_bytes"]))
 
 
-def trial_from_times(total_s: float, view_s: Sequence[float], pixels: int, memory_bytes: int) -> Trial:
-    """Return the trial of a process that took ``total_s`` in all and ``view_s`` for its views.
+def split_times(total_s: float, view_s: Sequence[float]) -> tuple[float, float]:
+    """Return the constant time of a process and its time per view, from its total and the times of its views.
 
-    The first view includes the synchronisation of the scene and is left out of the time per view if there are others.
+    The first view includes the transfer of the scene to Cycles. It is left out of the time per view if there are
+    others.
     """
     steady_s = fmean(view_s[1:] or view_s)
-    return Trial(max(0.0, total_s - len(view_s) * steady_s), steady_s / pixels, pixels, memory_bytes)
+    return max(0.0, total_s - len(view_s) * steady_s), steady_s
 
 
 def trial_rig(spec: ConfigSpec) -> RigSpec:
