@@ -1,4 +1,4 @@
-"""Devices that render colour: the list of this machine, the choice of a type, and the share of each process.
+"""Devices that render colour: the list of this machine, the choice of a type, and the device of each process.
 
 Cycles itself lists the devices, in a Blender process. Only the type of the device is part of a config's key, so
 that equal GPUs give equal keys; GPUs of different models may differ in the last bit of a pixel. Rendering on a GPU
@@ -8,7 +8,9 @@ is untested: the machines that this was written on have none. The choice is test
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,9 +71,21 @@ def choose_devices(requested: str, available: DeviceNames, machine: str) -> Devi
     return Devices(requested, len(available[requested]))
 
 
-def device_slots(workers: int, devices: int) -> tuple[int, ...]:
-    """Return the device index of each render process, ``workers`` per device.
+class DeviceShares:
+    """Number of render processes on each of several equal devices; thread-safe."""
 
-    The devices alternate, so that a build with few units uses all of them.
-    """
-    return tuple(range(devices)) * workers
+    def __init__(self, devices: int) -> None:
+        self._running = [0] * devices
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def least_busy(self) -> Iterator[int]:
+        """Yield the index of the device with the fewest processes, the first of them; count one until the end."""
+        with self._lock:
+            index = self._running.index(min(self._running))
+            self._running[index] += 1
+        try:
+            yield index
+        finally:
+            with self._lock:
+                self._running[index] -= 1

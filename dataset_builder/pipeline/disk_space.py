@@ -8,13 +8,15 @@ The scratch folders of the workers of a cluster, which hold one work unit per re
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from dataset_builder.config.specs import RigSpec
-from dataset_builder.pipeline.folder import SHARD_NAME
+from dataset_builder.pipeline.folder import SHARD_NAME, existing_ancestor
 from dataset_builder.pipeline.plan import ConfigPlan
 from dataset_builder.pipeline.publish import is_published
 from dataset_builder.scene.model import Assembly
@@ -73,13 +75,13 @@ def config_space(plan: ConfigPlan, out: Path) -> ConfigSpace:
     """Return the disk space of a config that is not published yet in the folder ``out``."""
     staged = [path for index in plan.indices if (path := plan.staging.row(index)).is_file()]
     shards = (path for path in (out / plan.spec.name).glob("*.parquet") if SHARD_NAME.fullmatch(path.name))
-    abandoned = (staging for staging in plan.all_stagings() if staging != plan.staging.root)
-    other_rows = (path for staging in abandoned for path in staging.rglob("*.parquet"))
+    abandoned = (os.walk(staging) for staging in plan.all_stagings() if staging != plan.staging.root)
+    other_files = (Path(folder, name) for walk in abandoned for folder, _, names in walk for name in names)
     return ConfigSpace(
         _size(staged),
         (len(plan.indices) - len(staged)) * view_bytes(plan.spec.rig, plan.spec.colour is not None),
         _mesh_bytes(plan.assembly),
-        _size(shards) + _size(other_rows),
+        _size(shards) + _size(other_files),
     )
 
 
@@ -94,8 +96,7 @@ def needed_bytes(spaces: Iterable[ConfigSpace]) -> int:
 
 def free_bytes(out: Path) -> int:
     """Return the space that is free for a folder, which need not exist yet."""
-    existing = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
-    return shutil.disk_usage(existing).free
+    return shutil.disk_usage(existing_ancestor(out)).free
 
 
 def check_fits_on_disk(out: Path, plans: Sequence[ConfigPlan]) -> None:
@@ -133,4 +134,9 @@ def _mesh_bytes(assembly: Assembly) -> int:
 
 
 def _size(paths: Iterable[Path]) -> int:
-    return sum(path.stat().st_size for path in paths)
+    """Return the size of files; those that a build in another process has just removed have none."""
+    size = 0
+    for path in paths:
+        with suppress(FileNotFoundError):
+            size += path.stat().st_size
+    return size

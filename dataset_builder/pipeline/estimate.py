@@ -8,7 +8,7 @@ programs.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -76,9 +76,9 @@ def _estimate_config(plan: ConfigPlan, out: Path, threads: int, trials: dict[obj
     return ConfigEstimate(spec, len(plan.indices), unit_views, config_space(plan, out), trials.get(key))
 
 
-def makespan(durations: Iterable[float], processes: int) -> float:
+def makespan(durations: Sequence[float], processes: int) -> float:
     """Return the time until all tasks are done if each process takes the next task when it is free."""
-    busy_until = [0.0] * processes
+    busy_until = [0.0] * max(1, min(processes, len(durations)))
     for duration in durations:
         heapq.heapreplace(busy_until, busy_until[0] + duration)
     return max(busy_until)

@@ -10,11 +10,10 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from queue import SimpleQueue
 from typing import Protocol
 
 from dataset_builder.pipeline.blender_process import BlenderProcesses, Event, RenderTask
-from dataset_builder.pipeline.devices import device_slots
+from dataset_builder.pipeline.devices import DeviceShares
 from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
 from rebar_depth_bench.data.digests import file_sha256
@@ -38,31 +37,22 @@ class LocalRenderer:
     pool: ThreadPoolExecutor
     blender: BlenderProcesses
     threads: int
-    free_slots: SimpleQueue[int]
-    """Device indices of the processes that may be started; as many as ``pool`` has threads."""
+    devices: DeviceShares
 
     def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
         """Schedule ``unit`` on the next free process."""
         return self.pool.submit(self._render, unit, staging, on_view_done)
 
     def _render(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> UnitResult:
-        device_index = self.free_slots.get()
-        try:
-            return render_unit(
-                unit, staging, self.threads, self.blender, on_view_done, "this machine", device_index
-            )
-        finally:
-            self.free_slots.put(device_index)
+        with self.devices.least_busy() as index:
+            return render_unit(unit, staging, self.threads, self.blender, on_view_done, "this machine", index)
 
 
 @contextmanager
 def local_processes(workers: int, threads: int, devices: int = 1) -> Iterator[LocalRenderer]:
     """Yield a renderer with ``workers`` concurrent Blender processes per device, of ``threads`` threads each."""
-    slots: SimpleQueue[int] = SimpleQueue()
-    for device_index in device_slots(workers, devices):
-        slots.put(device_index)
-    with ThreadPoolExecutor(slots.qsize()) as pool, BlenderProcesses() as blender:
-        yield LocalRenderer(pool, blender, threads, slots)
+    with ThreadPoolExecutor(workers * devices) as pool, BlenderProcesses() as blender:
+        yield LocalRenderer(pool, blender, threads, DeviceShares(devices))
 
 
 def render_unit(
