@@ -7,13 +7,14 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, SWEEPS, BuildRequest
-from dataset_builder.config.specs import CPU, GPU_TYPES
-from dataset_builder.scene.variants import VARIANTS
+from dataset_builder.build_options import add_build_arguments, add_scene_arguments
+from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, BuildRequest
+from dataset_builder.config.quality import colour_spec
 from rebar_depth_bench.console import ProgressBars, Rate, replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.version import software_version
@@ -119,8 +120,7 @@ def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
         views=options.views,
         width=options.width,
         height=options.height,
-        samples=options.samples,
-        device=device,
+        colour=replace(colour_spec(options.sampling, options.quality, options.samples), device=device),
         seed=options.seed,
         mesh=mesh_file_spec(options.mesh, options.mesh_unit) if options.mesh else None,
         variants=tuple(options.variant or ()),
@@ -188,8 +188,8 @@ def argument_parser() -> argparse.ArgumentParser:
         description="Render a dataset folder of stereo views with exact depth, or resume an interrupted build.",
     )
     parser.add_argument("--version", action="version", version=software_version())
-    _add_build_arguments(parser)
-    _add_scene_arguments(parser)
+    add_build_arguments(parser)
+    add_scene_arguments(parser)
     parser.set_defaults(run=_build)
     commands = parser.add_subparsers(metavar="{audit,export}")
     auditing = commands.add_parser("audit", help="check a dataset folder and its ground truth")
@@ -201,84 +201,6 @@ def argument_parser() -> argparse.ArgumentParser:
     _add_export_arguments(exporting)
     exporting.set_defaults(run=_export)
     return parser
-
-
-def _add_build_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, metavar="ROOT", help="dataset folder to build or resume")
-    parser.add_argument(
-        "--config",
-        nargs="+",
-        action="extend",
-        metavar="NAME",
-        help=f"configs to build: {', '.join(CONFIGS)} (default: all of these), or {', '.join(SWEEPS)}",
-    )
-    parser.add_argument(
-        "--views",
-        type=int,
-        metavar="N",
-        help="number of views per config, evenly spaced over the full protocol (default: all)",
-    )
-    parser.add_argument(
-        "--width", type=int, default=BuildRequest.width, help="image width in pixels (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--height", type=int, default=BuildRequest.height, help="image height in pixels (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--samples",
-        type=int,
-        default=BuildRequest.samples,
-        help="Cycles samples per pixel (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--device",
-        choices=(CPU, *GPU_TYPES, "auto"),
-        default=CPU,
-        help="type of device that renders colour; auto: the best one of this machine (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--dry-run",
-        action="store_true",
-        help="print views, disk space, memory and duration of the build, measured with small pictures, and build "
-        "nothing",
-    )
-    parser.add_argument(
-        "--workers", type=int, metavar="N", help="number of parallel render processes per device (default: 1)"
-    )
-    parser.add_argument(
-        "--cluster",
-        metavar="ADDRESS",
-        help="address of a dask scheduler whose workers render the views, such as tcp://host:8786",
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, help="random seed of surfaces and noise (default: %(default)s)"
-    )
-
-
-def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--mesh", metavar="FILE", help="STL, PLY, OBJ or glTF file that replaces the lattice's rods"
-    )
-    parser.add_argument(
-        "--mesh-unit",
-        default="m",
-        metavar="UNIT",
-        help="unit of the mesh file: m, cm, mm, in or ft (default: m)",
-    )
-    parser.add_argument(
-        "--scene",
-        nargs="+",
-        action="extend",
-        metavar="FILE",
-        help="scene files to build: TOML or IFC; only these are built unless --config is given",
-    )
-    parser.add_argument(
-        "--variant",
-        nargs="+",
-        action="extend",
-        metavar="NAME",
-        help=f"appearance variants, appended to the config name: {', '.join(VARIANTS)}",
-    )
 
 
 def _add_audit_arguments(parser: argparse.ArgumentParser) -> None:

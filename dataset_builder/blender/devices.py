@@ -31,13 +31,12 @@ def available_devices() -> dict[str, list[str]]:
 def select_device(device: str, index: int) -> None:
     """Let Cycles render the open scene on device number ``index`` of a type, and on no other device.
 
-    Required after ``configure_colour``. OIDN denoises on the CPU in any case: images are then denoised in the
-    same way on all devices, and the GPU's memory holds only the scene.
+    Required after ``configure_colour``. The compositor denoises on the CPU in any case: images are then denoised
+    in the same way on all devices, and the GPU's memory holds only the scene.
 
     Raises ``InputError`` if there is no such device.
     """
     cycles = bpy.context.scene.cycles
-    cycles.denoising_use_gpu = False
     if device == CPU:
         cycles.device = "CPU"
         return

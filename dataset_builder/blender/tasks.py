@@ -23,13 +23,14 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.blender.colour import configure_colour, render_colour
 from dataset_builder.blender.devices import select_device
 from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
-from dataset_builder.blender.render import configure_colour, render_colour, render_depth
+from dataset_builder.blender.render import render_depth, use_cycles
 from dataset_builder.blender.scene import add_object, build_scene, mesh_data
 from dataset_builder.config.catalog import view_id
 from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import ColourSpec, ConfigSpec
+from dataset_builder.config.specs import ConfigSpec
 from dataset_builder.config.trajectories import poses
 from dataset_builder.pipeline.blender_process import DepthTask, RenderTask
 from dataset_builder.pipeline.shards import View, encode_view, stage_row
@@ -74,7 +75,7 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
     with watch.timing("scene"):
         assembly = make_assembly(config.scene.assembly)
         build_scene(assembly, config.scene)
-        configure_colour(config.colour, task.threads)
+        configure_colour(task.threads)
         select_device(config.colour.device, task.device_index)
         mesh = evaluated_world_mesh()
         _stage_mesh(mesh, staging.mesh, unit.mesh_sha256)
@@ -118,10 +119,12 @@ def _render_view(
     config = context.config
     eyes = {}
     for eye_index, (eye, camera) in enumerate(rig_cameras(config.rig, left_cam_from_world).items()):
-        with watch.timing("colour"):
-            rgb = render_colour(camera, _cycles_seed(config, index, eye_index), context.scratch)
         with watch.timing("truth"):
-            eyes[eye] = replace(context.caster.cast(camera, context.rays_cam[eye]), rgb=rgb)
+            truth = context.caster.cast(camera, context.rays_cam[eye])
+        with watch.timing("colour"):
+            seed = _cycles_seed(config, index, eye_index)
+            rgb = render_colour(camera, truth.mask, config.colour, seed, context.scratch)
+        eyes[eye] = replace(truth, rgb=rgb)
     return View(view_id(config.name, index), config.scene.name, eyes["left"], eyes["right"], config.rig.baseline_m)
 
 
@@ -158,7 +161,7 @@ def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None])
     bpy.ops.wm.read_factory_settings(use_empty=True)
     part = surface("dataset", Mesh(vertices_m, faces), "steel")
     add_object(part, mesh_data(part.name, part.mesh, part.material), np.zeros(3))
-    configure_colour(ColourSpec(samples=1, denoise=False), task.threads)
+    use_cycles(bpy.context.scene, task.threads)
     with tempfile.TemporaryDirectory(dir=task.out) as scratch:
         for n, camera in enumerate(task.cameras):
             depth_m = render_depth(camera, Path(scratch))

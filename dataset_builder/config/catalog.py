@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from dataset_builder.config.rigs import zed_rig
 from dataset_builder.config.specs import (
@@ -118,21 +118,18 @@ LATTICE_CONFIGS = tuple(name for name in CONFIGS if name.startswith("lattice"))
 
 @dataclass(frozen=True)
 class BuildRequest:
-    """Request to ``rebar-build``: configs, number of views, image size (pixels) and render quality.
+    """Request to ``rebar-build``: configs, number of views, image size (pixels) and colour quality.
 
     ``views`` is the number of views per config, spread evenly over the trajectory; None selects all views.
-    ``samples`` are Cycles samples per pixel. ``device`` is a type of device that renders colour, as in
-    ``ColourSpec``. ``mesh`` replaces the rods of the lattice. ``variants`` are names of
-    ``scene.variants.VARIANTS``; they are appended to the names of configs and scenes. ``scenes`` are the configs
-    of user scene files.
+    ``mesh`` replaces the rods of the lattice. ``variants`` are names of ``scene.variants.VARIANTS``; they are
+    appended to the names of configs and scenes. ``scenes`` are the configs of user scene files.
     """
 
     configs: tuple[str, ...] = tuple(CONFIGS)
     views: int | None = None
     width: int = RigSpec.width
     height: int = RigSpec.height
-    samples: int = ColourSpec.samples
-    device: str = CPU
+    colour: ColourSpec = field(default_factory=ColourSpec)
     seed: int = 0
     mesh: MeshFileSpec | None = None
     variants: tuple[str, ...] = ()
@@ -143,7 +140,7 @@ class BuildRequest:
 
         Raises ``InputError`` that names every value out of range, and ``InputError`` for unknown configs, invalid
         variants and duplicate config names, if ``mesh`` is combined with a config that is not a lattice, and if
-        ``device`` cannot render a config.
+        the device of ``colour`` cannot render a config.
         """
         self._check_ranges()
         check_variants(self.variants)
@@ -162,7 +159,7 @@ class BuildRequest:
             ("--views", self.views, 1, 1_000_000),
             ("--width", self.width, 16, 8192),
             ("--height", self.height, 16, 8192),
-            ("--samples", self.samples, 1, 65_536),
+            ("--samples", self.colour.steel_samples, 1, 65_536),
             ("--seed", self.seed, 0, 2**31 - 1),
         )
         problems = [
@@ -174,13 +171,14 @@ class BuildRequest:
             raise InputError.from_problems("build request", problems)
 
     def _check_device(self, specs: Sequence[ConfigSpec]) -> None:
-        if self.device not in (CPU, *GPU_TYPES):
-            problem = Problem("unknown", "--device", f"got {self.device!r}", ", ".join((CPU, *GPU_TYPES)))
+        device = self.colour.device
+        if device not in (CPU, *GPU_TYPES):
+            problem = Problem("unknown", "--device", f"got {device!r}", ", ".join((CPU, *GPU_TYPES)))
             raise InputError.from_problems("build request", [problem])
         raw = [spec.name for spec in specs if spec.rig.grid == "raw"]
-        if raw and self.device not in LENS_DEVICES:
+        if raw and device not in LENS_DEVICES:
             raise InputError(
-                f"{', '.join(raw)}: cannot be rendered with --device {self.device}, expected "
+                f"{', '.join(raw)}: cannot be rendered with --device {device}, expected "
                 f"{' or '.join(LENS_DEVICES)}: Cycles has no lenses with distortion on others; "
                 "build the other configs separately, named with --config"
             )
@@ -202,7 +200,7 @@ class BuildRequest:
             name=spec.name + suffix,
             scene=scene,
             rig=replace(spec.rig, width=self.width, height=self.height),
-            colour=replace(spec.colour, samples=self.samples, device=self.device),
+            colour=self.colour,
         )
 
     def _assembly(self, spec: ConfigSpec) -> AssemblySpec:

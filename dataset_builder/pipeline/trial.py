@@ -93,7 +93,7 @@ def split_times(total_s: float, view_s: Sequence[float]) -> tuple[float, float]:
 
 def trial_rig(spec: ConfigSpec) -> RigSpec:
     """Return the rig of a config with images small enough for a trial, of the same shape."""
-    rig, samples = spec.rig, spec.colour.samples if spec.colour else 1
+    rig, samples = spec.rig, spec.colour.steel_samples if spec.colour else 1
     pixels = _PIXELS * min(1.0, _FULL_SIZE_SAMPLES / samples)
     scale = min(1.0, sqrt(pixels / (rig.width * rig.height)))
     width, height = (max(_MIN_SIDE, round(side * scale)) for side in (rig.width, rig.height))

@@ -49,8 +49,9 @@ LIGHT_VARIANTS = [None, *(name for name, variant in VARIANTS.items() if variant.
 
 def probe(folder: Path) -> None:
     """Render every variant at low resolution and cast its ground truth (runs in the Blender process)."""
+    from dataset_builder.blender.colour import configure_colour, render_colour
     from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
-    from dataset_builder.blender.render import configure_colour, render_colour, render_depth
+    from dataset_builder.blender.render import render_depth
     from dataset_builder.blender.scene import build_scene
 
     arrays: dict[str, ndarray] = {}
@@ -58,14 +59,14 @@ def probe(folder: Path) -> None:
 
     def render_and_cast(key: str, assembly: Assembly, spec: SceneSpec, cameras: dict[int, Camera]) -> None:
         build_scene(assembly, spec)
-        configure_colour(ColourSpec(samples=2), threads=1)
+        configure_colour(threads=1)
         caster = RayCaster(evaluated_world_mesh())
-        for azimuth, camera in cameras.items():
-            ground_truth = caster.cast(camera)
+        truths = {azimuth: caster.cast(camera) for azimuth, camera in cameras.items()}
+        for azimuth, ground_truth in truths.items():
             arrays[f"{key}/bars/{azimuth}"] = ground_truth.bars
             arrays[f"{key}/depth/{azimuth}"] = ground_truth.depth_m
-        first_camera = next(iter(cameras.values()))
-        arrays[f"{key}/colour"] = render_colour(first_camera, seed=1, scratch_dir=folder)
+        first_camera, mask = next(iter(cameras.values())), next(iter(truths.values())).mask
+        arrays[f"{key}/colour"] = render_colour(first_camera, mask, ColourSpec(2, 2), seed=1, scratch_dir=folder)
         if key in CASES_WITH_CYCLES_DEPTH:
             arrays[f"{key}/cycles"] = render_depth(first_camera, scratch_dir=folder)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
-from dataset_builder.config.specs import CPU, GPU_TYPES
+from dataset_builder.config.specs import CPU, GPU_TYPES, ColourSpec
 from dataset_builder.pipeline.devices import AUTO, Devices, DeviceShares, available_devices, choose_devices
 from dataset_builder.pipeline.plan import config_parameters, plan_config
 from rebar_depth_bench.errors import InputError
@@ -66,7 +66,9 @@ def test_processes_are_spread_over_devices() -> None:
 
 def test_device_is_part_of_key_and_manifest(tmp_path: Path) -> None:
     plans = {
-        device: plan_config(BuildRequest(configs=("pile",), device=device).config_specs()[0], 1, tmp_path)
+        device: plan_config(
+            BuildRequest(configs=("pile",), colour=ColourSpec(device=device)).config_specs()[0], 1, tmp_path
+        )
         for device in (CPU, *GPU_TYPES)
     }
     assert len({plan.key for plan in plans.values()}) == len(plans)
@@ -76,20 +78,22 @@ def test_device_is_part_of_key_and_manifest(tmp_path: Path) -> None:
 
 def test_raw_grids_need_a_device_with_lenses() -> None:
     for device in (CPU, "optix"):
-        assert {spec.colour.device for spec in BuildRequest(device=device).config_specs() if spec.colour} == {
-            device
-        }
+        assert {
+            spec.colour.device
+            for spec in BuildRequest(colour=ColourSpec(device=device)).config_specs()
+            if spec.colour
+        } == {device}
     for device in ("cuda", "hip", "oneapi", "metal"):
         with pytest.raises(InputError, match="lattice-zed-raw: cannot be rendered with"):
-            BuildRequest(device=device).config_specs()
+            BuildRequest(colour=ColourSpec(device=device)).config_specs()
         others = tuple(name for name in CONFIGS if name != "lattice-zed-raw")
-        assert len(BuildRequest(configs=others, device=device).config_specs()) == len(others)
+        assert len(BuildRequest(configs=others, colour=ColourSpec(device=device)).config_specs()) == len(others)
 
 
 @pytest.mark.parametrize("device", ["auto", "gpu", ""])
 def test_request_needs_a_concrete_device(device: str) -> None:
     with pytest.raises(InputError, match="--device"):
-        BuildRequest(device=device).config_specs()
+        BuildRequest(colour=ColourSpec(device=device)).config_specs()
 
 
 def test_absent_device_is_refused_before_anything_is_written(tmp_path: Path, run_build: RunBuild) -> None:

@@ -24,7 +24,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError
 from tests.commands import run_in_process
 
-SMALL = BuildRequest(configs=("pile",), views=10, width=64, height=36, samples=1)
+SMALL = BuildRequest(configs=("pile",), views=10, width=64, height=36)
 
 
 @pytest.mark.parametrize("config", ["lattice", "lattice-orbit"])

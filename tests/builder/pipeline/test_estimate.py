@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.specs import RigSpec
+from dataset_builder.config.specs import ColourSpec, RigSpec
 from dataset_builder.pipeline.estimate import ConfigEstimate, makespan
 from dataset_builder.pipeline.trial import Trial, split_times, trial_rig
 from tests.building import TINY, TWO_BARS, RunBuild, contents
@@ -47,7 +47,9 @@ def test_first_view_tells_the_constant_time() -> None:
 @pytest.mark.parametrize("size", [(1280, 720), (640, 360), (8192, 16), (16, 8192), (20, 20)])
 @pytest.mark.parametrize("samples", [1, 64, 4096, 65_536])
 def test_trial_images_are_small_and_of_the_same_shape(size: tuple[int, int], samples: int) -> None:
-    [spec] = BuildRequest(configs=("pile",), width=size[0], height=size[1], samples=samples).config_specs()
+    [spec] = BuildRequest(
+        configs=("pile",), width=size[0], height=size[1], colour=ColourSpec(steel_samples=samples)
+    ).config_specs()
     rig = trial_rig(spec)
     assert 16 <= rig.width <= size[0]
     assert 16 <= rig.height <= size[1]
@@ -61,7 +63,7 @@ def test_dry_run_prints_views_space_memory_and_duration(tmp_path: Path, run_buil
     assert process.returncode == 0, process.stderr
     assert "two-bars: 9 views of two pictures, 160 x 90" in process.stdout
     assert "9 to render (18 pictures), 0 already staged" in process.stdout
-    assert "samples 1" in process.stdout
+    assert "steel_samples 1" in process.stdout
     memory = re.search(r"memory: ([\d.]+) ([MG])B in each", process.stdout)
     assert memory
     assert 200 < float(memory[1]) * (1000 if memory[2] == "G" else 1) < 5000
