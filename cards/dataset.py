@@ -145,6 +145,7 @@ def _config_row(config: DatasetConfig) -> dict[str, Any]:
         "out_of_protocol": int(np.count_nonzero(scored == 0)),
         "sheet": config.sheet,
         "variants": config.scene.appearance.variants,
+        "panorama": entry["scene"].get("appearance", {}).get("image_light", {}).get("image"),
         "optics": _OPTICS_TEXTS[entry["rig"]["grid"]],
         "constant": _reference(config, "constant"),
         "one_pixel": _reference(config, "one_pixel"),

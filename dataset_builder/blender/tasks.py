@@ -38,6 +38,7 @@ from dataset_builder.scene.assemblies import aim_point_m, make_assembly
 from dataset_builder.scene.mesh_ply import read_mesh_ply, write_mesh_ply
 from dataset_builder.scene.model import Mesh, WorldMesh, surface
 from dataset_builder.scene.raycast import RayCaster
+from dataset_builder.scene.variants.sensor import recorded
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError
 
@@ -124,6 +125,7 @@ def _render_view(
         with watch.timing("colour"):
             seed = _cycles_seed(config, index, eye_index)
             rgb = render_colour(camera, truth.mask, config.colour, seed, context.scratch)
+            rgb = recorded(rgb, config.scene, seed)
         eyes[eye] = replace(truth, rgb=rgb)
     return View(view_id(config.name, index), config.scene.name, eyes["left"], eyes["right"], config.rig.baseline_m)
 

@@ -180,7 +180,8 @@ def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
     assert scene["assembly"]["diameters_m"] == [0.007, 0.004]
     assert manifest["configs"]["lattice"]["generator"]["bpy"].startswith("4.5")
     assert (
-        "| `lattice` | lattice | 9 of 504 | 160 x 90 | 1 | 0.22-0.43 m |" in (tiny_root / "README.md").read_text()
+        "| `lattice` | lattice | 9 of 504 | 160 x 90 | 2, 8 around steel | 0.22-0.43 m |"
+        in (tiny_root / "README.md").read_text()
     )
 
 
@@ -190,6 +191,8 @@ def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
         (("--config", "latice"), "--config: got 'latice', expected one of lattice"),
         (("--views", "0"), "--views: got 0, expected 1 to"),
         (("--width", "2", "--samples", "0"), "--width: got 2, expected 16 to 8192\n  - --samples: got 0"),
+        (("--quality", "high", "--samples", "4"), "--samples: not allowed with argument --quality"),
+        (("--sampling", "best"), "invalid choice: 'best' (choose from 'steel-first', 'uniform')"),
         (("--workers", "0"), "--workers is 0, expected 1 or more"),
         (("--mesh", "nothing.stl"), "nothing.stl"),
         (("--mesh", __file__), "unsupported mesh file type '.py', expected"),
