@@ -26,7 +26,8 @@ _MEASURED_PIXELS = 640 * 360
 _COLOUR_BYTES, _TRUTH_BYTES = 1.61, 2.11
 """Bytes per pixel of a grid of ``_MEASURED_PIXELS``: largest mean of the views of lattice, pile and pier.
 
-Both eyes of a view together; colour is largest for the pier, ground truth for the lattice.
+Both eyes of a view together; colour is largest for the pier, ground truth for the lattice. The variant ``sensor``
+needs no more.
 """
 _EXPONENT = -0.22
 """Decrease of the bytes per pixel with the number of pixels, since edges cover a smaller share of larger images.
