@@ -2,8 +2,8 @@
 
 The duration is that of rendering on this machine as busy as it is now. It assumes that render processes do not
 slow each other down, and leaves out the packing of the finished views. The processor time depends less on other
-programs: in seven builds of 8 or 16 views at 320 x 180 and 640 x 360 it was estimated 16 % too low to 3 % too high,
-the time of packing included.
+programs: in seven builds of 8 or 16 views at 320 x 180 and 640 x 360 it was estimated 16 % too low to 3 % too
+high, the time of packing included.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.config.quality import QUALITIES
 from dataset_builder.config.specs import ColourSpec, RigSpec
 from dataset_builder.pipeline.estimate import ConfigEstimate, makespan
 from dataset_builder.pipeline.trial import Trial, split_times, trial_rig
@@ -63,7 +64,7 @@ def test_dry_run_prints_views_space_memory_and_duration(tmp_path: Path, run_buil
     assert process.returncode == 0, process.stderr
     assert "two-bars: 9 views of two pictures, 160 x 90" in process.stdout
     assert "9 to render (18 pictures), 0 already staged" in process.stdout
-    assert "steel_samples 1" in process.stdout
+    assert f"steel_samples {QUALITIES['preview'].steel_samples}" in process.stdout
     memory = re.search(r"memory: ([\d.]+) ([MG])B in each", process.stdout)
     assert memory
     assert 200 < float(memory[1]) * (1000 if memory[2] == "G" else 1) < 5000
