@@ -5,17 +5,18 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, SWEEPS, BuildRequest
-from dataset_builder.config.quality import DEFAULT_QUALITY, QUALITIES, SAMPLINGS, colour_spec
-from dataset_builder.scene.variants import VARIANTS
-from rebar_depth_bench.console import ProgressBars, replace_renamed_options, run_command
-from rebar_depth_bench.errors import InputError
+from dataset_builder.build_options import add_build_arguments, add_scene_arguments
+from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, BuildRequest
+from dataset_builder.config.quality import colour_spec
+from rebar_depth_bench.console import ProgressBars, Rate, replace_renamed_options, run_command
+from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.version import software_version
 
 if TYPE_CHECKING:
@@ -52,9 +53,15 @@ def _check_extra() -> None:
 def _build(options: argparse.Namespace) -> None:
     _check_extra()
     from dataset_builder.pipeline.build import build
+    from dataset_builder.pipeline.devices import Devices, find_devices
 
     if options.out is None:
         raise InputError("--out ROOT is missing, expected the dataset folder to build")
+    if options.cluster is not None and options.dry_run:
+        raise InputError(
+            f"--dry-run is combined with --cluster {options.cluster}, expected only one of them: the estimate is "
+            "measured on this machine"
+        )
     if options.cluster is not None and options.workers is not None:
         raise InputError(
             f"--workers {options.workers} is combined with --cluster {options.cluster}, expected only one of "
@@ -63,16 +70,42 @@ def _build(options: argparse.Namespace) -> None:
     workers = 1 if options.workers is None else options.workers
     if workers < 1:
         raise InputError(f"--workers is {workers}, expected 1 or more")
-    request = _build_request(options)
-    threads = max(1, (os.cpu_count() or 1) // workers)
-    with _cluster_context(options.cluster) as cluster, ProgressBars() as bars:
-        summary = build(
-            request, options.out, workers=workers, threads=threads, cluster=cluster, progress=bars.update
-        )
+    with _cluster_context(options.cluster, options.device) as cluster:
+        devices = Devices(options.device) if cluster else find_devices(options.device)
+        request = _build_request(options, devices.type)
+        threads = max(1, (os.cpu_count() or 1) // (workers * devices.count))
+        if options.dry_run:
+            _print_estimate(request, options.out, workers * devices.count, threads)
+            return
+        with ProgressBars(Rate("pictures", 2)) as bars:
+            summary = build(
+                request,
+                options.out,
+                workers=workers,
+                threads=threads,
+                devices=devices.count,
+                cluster=cluster,
+                progress=bars.update,
+            )
     _print_summary(options.out, summary)
 
 
-def _build_request(options: argparse.Namespace) -> BuildRequest:
+def _print_estimate(request: BuildRequest, out: Path, processes: int, threads: int) -> None:
+    """Print what a build would need; raise ``InputError`` if it would be refused."""
+    from dataset_builder.pipeline.build import plan_build
+    from dataset_builder.pipeline.disk_space import check_space
+    from dataset_builder.pipeline.estimate import estimate_build, estimate_lines
+    from dataset_builder.pipeline.retained import check_retained_configs
+
+    plans = plan_build(request, out)
+    check_retained_configs(out, plans)
+    with ProgressBars() as bars:
+        estimates = estimate_build(plans, out, threads, bars.update)
+    print(*map(printable, estimate_lines(estimates, out, processes)), sep="\n")
+    check_space(out, [estimate.space for estimate in estimates if estimate.space])
+
+
+def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
     """Return the build request of the options.
 
     With ``--scene`` and without ``--config``, only the given scene files are built. With ``--mesh``, the default
@@ -87,7 +120,7 @@ def _build_request(options: argparse.Namespace) -> BuildRequest:
         views=options.views,
         width=options.width,
         height=options.height,
-        colour=colour_spec(options.sampling, options.quality, options.samples),
+        colour=replace(colour_spec(options.sampling, options.quality, options.samples), device=device),
         seed=options.seed,
         mesh=mesh_file_spec(options.mesh, options.mesh_unit) if options.mesh else None,
         variants=tuple(options.variant or ()),
@@ -95,20 +128,24 @@ def _build_request(options: argparse.Namespace) -> BuildRequest:
     )
 
 
-def _cluster_context(address: str | None) -> AbstractContextManager[Renderer | None]:
-    """Return a context manager that connects to the cluster at ``address``, or yields None without an address.
+@contextmanager
+def _cluster_context(address: str | None, device: str) -> Iterator[Renderer | None]:
+    """Connect to the cluster at ``address``, whose workers must have ``device``; yield None without an address.
 
-    Raises ``InputError`` if ``distributed`` is not installed.
+    Raises ``InputError`` if ``distributed`` is not installed or a worker has no such device.
     """
     if address is None:
-        return nullcontext()
+        yield None
+        return
     if find_spec("distributed") is None:
         raise InputError(
             "not installed: distributed; --cluster needs it: pip install 'rebar-depth-bench[cluster]'"
         )
     from dataset_builder.pipeline.dask_renderer import connect_to_cluster
 
-    return connect_to_cluster(address)
+    with connect_to_cluster(address) as cluster:
+        cluster.check_device(device)
+        yield cluster
 
 
 def _print_summary(out: Path, summary: BuildSummary) -> None:
@@ -151,8 +188,8 @@ def argument_parser() -> argparse.ArgumentParser:
         description="Render a dataset folder of stereo views with exact depth, or resume an interrupted build.",
     )
     parser.add_argument("--version", action="version", version=software_version())
-    _add_build_arguments(parser)
-    _add_scene_arguments(parser)
+    add_build_arguments(parser)
+    add_scene_arguments(parser)
     parser.set_defaults(run=_build)
     commands = parser.add_subparsers(metavar="{audit,export}")
     auditing = commands.add_parser("audit", help="check a dataset folder and its ground truth")
@@ -164,81 +201,6 @@ def argument_parser() -> argparse.ArgumentParser:
     _add_export_arguments(exporting)
     exporting.set_defaults(run=_export)
     return parser
-
-
-def _add_build_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, metavar="ROOT", help="dataset folder to build or resume")
-    parser.add_argument(
-        "--config",
-        nargs="+",
-        action="extend",
-        metavar="NAME",
-        help=f"configs to build: {', '.join(CONFIGS)} (default: all of these), or {', '.join(SWEEPS)}",
-    )
-    parser.add_argument(
-        "--views",
-        type=int,
-        metavar="N",
-        help="number of views per config, evenly spaced over the full protocol (default: all)",
-    )
-    parser.add_argument(
-        "--width", type=int, default=BuildRequest.width, help="image width in pixels (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--height", type=int, default=BuildRequest.height, help="image height in pixels (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--sampling",
-        choices=SAMPLINGS,
-        help="more samples around the steel than elsewhere, or as many everywhere (default: steel-first)",
-    )
-    amount = parser.add_mutually_exclusive_group()
-    amount.add_argument(
-        "--quality", choices=QUALITIES, help=f"preset of samples and denoising (default: {DEFAULT_QUALITY})"
-    )
-    amount.add_argument(
-        "--samples",
-        type=int,
-        metavar="SPP",
-        help="Cycles samples per pixel instead of a preset, uniform unless --sampling steel-first is given",
-    )
-    parser.add_argument(
-        "--workers", type=int, metavar="N", help="number of parallel render processes (default: 1)"
-    )
-    parser.add_argument(
-        "--cluster",
-        metavar="ADDRESS",
-        help="address of a dask scheduler whose workers render the views, such as tcp://host:8786",
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, help="random seed of surfaces and noise (default: %(default)s)"
-    )
-
-
-def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--mesh", metavar="FILE", help="STL, PLY, OBJ or glTF file that replaces the lattice's rods"
-    )
-    parser.add_argument(
-        "--mesh-unit",
-        default="m",
-        metavar="UNIT",
-        help="unit of the mesh file: m, cm, mm, in or ft (default: m)",
-    )
-    parser.add_argument(
-        "--scene",
-        nargs="+",
-        action="extend",
-        metavar="FILE",
-        help="scene files to build: TOML or IFC; only these are built unless --config is given",
-    )
-    parser.add_argument(
-        "--variant",
-        nargs="+",
-        action="extend",
-        metavar="NAME",
-        help=f"appearance variants, appended to the config name: {', '.join(VARIANTS)}",
-    )
 
 
 def _add_audit_arguments(parser: argparse.ArgumentParser) -> None:

@@ -6,8 +6,10 @@ import argparse
 import os
 import re
 import sys
+import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -21,23 +23,65 @@ EXIT_DONE, EXIT_OTHER, EXIT_INPUT = 0, 1, 2
 """Exit codes: success, any other error, invalid input."""
 
 
+MAX_SILENCE_S = 600.0
+"""Longest time between two lines of progress, if there is progress, seconds."""
+
 MAX_SECONDS = 1e6
 """Longest duration that an option accepts, seconds; Python cannot wait for more than some 1e10."""
 
 
-class ProgressBars:
-    """Progress bars on standard error, one per task; plain lines if standard error is not a terminal."""
+@dataclass(frozen=True)
+class Rate:
+    """Rate of a task for the display: the name of what is counted, and how many of them are one step."""
 
-    def __init__(self) -> None:
+    unit: str
+    per_step: int
+
+    def text(self, steps: int, remaining: int, seconds: float) -> str:
+        """Return the rate of ``steps`` done in ``seconds``, and the time for the remaining ones."""
+        if steps < 1 or seconds <= 0:
+            return ""
+        per_minute = 60 * steps * self.per_step / seconds
+        return f"{per_minute:.3g} {self.unit}/min, {duration_text(remaining * seconds / steps)} left"
+
+
+def duration_text(seconds: float) -> str:
+    """Return a duration in its two largest units of hours, minutes and seconds."""
+    hours, minutes = divmod(round(seconds / 60), 60)
+    if seconds < 59.5:
+        return f"{seconds:.0f} s"
+    if seconds < 600:
+        return f"{round(seconds) // 60} min {round(seconds) % 60} s"
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
+
+
+@dataclass
+class _Started:
+    """State of a task when it was first shown, and the last line printed for it."""
+
+    done: int
+    seconds: float
+    tenth: int = -1
+    printed_s: float = 0.0
+
+
+class ProgressBars:
+    """Progress bars on standard error, one per task; plain lines if standard error is not a terminal.
+
+    With a ``rate`` they show it and the remaining time, from the steps done since a task was first shown.
+    """
+
+    def __init__(self, rate: Rate | None = None) -> None:
         self._console = Console(stderr=True)
         self._bars: dict[str, TaskID] = {}
-        self._lines: dict[str, int] = {}
+        self._started: dict[str, _Started] = {}
+        self._rate = rate
         self._progress = Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
-            Remaining(),
+            TextColumn("{task.fields[rate]}") if rate else Remaining(),
             console=self._console,
             disable=not self._console.is_terminal,
         )
@@ -52,20 +96,25 @@ class ProgressBars:
     def update(self, name: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` steps of the task ``name`` are finished."""
         name = printable(name)
+        now = time.monotonic()
+        started = self._started.setdefault(name, _Started(done, now))
+        rate = self._rate.text(done - started.done, total - done, now - started.seconds) if self._rate else ""
         if not self._console.is_terminal:
-            self._print_line(name, done, total)
+            _print_line(
+                started, now, f"{name}: {done} of {total}{rate and f', {rate}'}", done * 10 // max(total, 1)
+            )
             return
         if name not in self._bars:
-            self._bars[name] = self._progress.add_task(name, total=total)
-        self._progress.update(self._bars[name], completed=done, total=total)
+            self._bars[name] = self._progress.add_task(name, total=total, rate=rate)
+        self._progress.update(self._bars[name], completed=done, total=total, rate=rate)
 
-    def _print_line(self, name: str, done: int, total: int) -> None:
-        """Print a line at each tenth of the task, which keeps log files short."""
-        tenth = done * 10 // max(total, 1)
-        if self._lines.get(name) != tenth:
-            self._lines[name] = tenth
-            sys.stderr.write(f"{name}: {done} of {total}\n")  # In one call: several threads may write lines.
-            sys.stderr.flush()
+
+def _print_line(started: _Started, now: float, line: str, tenth: int) -> None:
+    """Print a line at each tenth of the task, and at least every ten minutes, which keeps log files short."""
+    if tenth != started.tenth or now - started.printed_s >= MAX_SILENCE_S:
+        started.tenth, started.printed_s = tenth, now
+        sys.stderr.write(line + "\n")  # In one call: several threads may write lines.
+        sys.stderr.flush()
 
 
 class Command(Protocol):

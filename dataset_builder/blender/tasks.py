@@ -7,6 +7,8 @@ is an independent check of the ground truth.
 from __future__ import annotations
 
 import os
+import resource
+import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -22,6 +24,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.blender.colour import configure_colour, render_colour
+from dataset_builder.blender.devices import select_device
 from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
 from dataset_builder.blender.render import render_depth, use_cycles
 from dataset_builder.blender.scene import add_object, build_scene, mesh_data
@@ -74,6 +77,7 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
         assembly = make_assembly(config.scene.assembly)
         build_scene(assembly, config.scene)
         configure_colour(task.threads)
+        select_device(config.colour.device, task.device_index)
         mesh = evaluated_world_mesh()
         _stage_mesh(mesh, staging.mesh, unit.mesh_sha256)
         caster = RayCaster(mesh)
@@ -91,6 +95,12 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
                 with watch.timing("write"):
                     stage_row(path, row, record)
             report({"view": index, "seconds": watch.take()})
+    report({"seconds": {}, "memory_bytes": _peak_memory_bytes(), "cpu_s": time.process_time()})
+
+
+def _peak_memory_bytes() -> int:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # Linux counts KiB.
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field, replace
 
 from dataset_builder.config.rigs import zed_rig
 from dataset_builder.config.specs import (
+    CPU,
+    GPU_TYPES,
+    LENS_DEVICES,
     AppearanceSpec,
     AssemblySpec,
     ColourSpec,
@@ -136,11 +139,13 @@ class BuildRequest:
         """Return the specs of all requested configs.
 
         Raises ``InputError`` that names every value out of range, and ``InputError`` for unknown configs, invalid
-        variants and duplicate config names, and if ``mesh`` is combined with a config that is not a lattice.
+        variants and duplicate config names, if ``mesh`` is combined with a config that is not a lattice, and if
+        the device of ``colour`` cannot render a config.
         """
         self._check_ranges()
         check_variants(self.variants)
         specs = [self._with_request(spec) for spec in (*_known_configs(self.configs), *self.scenes)]
+        self._check_device(specs)
         names = [spec.name for spec in specs]
         duplicates = sorted({name for name in names if names.count(name) > 1})
         if duplicates:
@@ -164,6 +169,19 @@ class BuildRequest:
         ]
         if problems:
             raise InputError.from_problems("build request", problems)
+
+    def _check_device(self, specs: Sequence[ConfigSpec]) -> None:
+        device = self.colour.device
+        if device not in (CPU, *GPU_TYPES):
+            problem = Problem("unknown", "--device", f"got {device!r}", ", ".join((CPU, *GPU_TYPES)))
+            raise InputError.from_problems("build request", [problem])
+        raw = [spec.name for spec in specs if spec.rig.grid == "raw"]
+        if raw and device not in LENS_DEVICES:
+            raise InputError(
+                f"{', '.join(raw)}: cannot be rendered with --device {device}, expected "
+                f"{' or '.join(LENS_DEVICES)}: Cycles has no lenses with distortion on others; "
+                "build the other configs separately, named with --config"
+            )
 
     def _with_request(self, spec: ConfigSpec) -> ConfigSpec:
         variants = tuple(

@@ -192,17 +192,25 @@ class RigSpec:
     grid: str = "ideal"
 
 
+CPU = "cpu"
+GPU_TYPES = ("optix", "cuda", "hip", "oneapi", "metal")
+"""Types of GPU devices, as Cycles names them in capitals; the best one first."""
+LENS_DEVICES = (CPU, "optix")
+"""Types of devices on which Blender 4.5 renders custom cameras, which the raw grid needs."""
+
+
 @dataclass(frozen=True)
 class ColourSpec:
     """Colour rendering with Cycles: samples per pixel, and the denoiser's prefilter of albedo and normals.
 
     Pixels in the box around the steel of a picture have ``steel_samples``, the others ``samples``. Sampling is
-    uniform if both are equal.
+    uniform if both are equal. ``device`` is ``CPU`` or one of ``GPU_TYPES``: the bytes of images depend on it.
     """
 
     samples: int = 4
     steel_samples: int = 28
     prefilter: str = "FAST"
+    device: str = CPU
 
 
 @dataclass(frozen=True)

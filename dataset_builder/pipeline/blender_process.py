@@ -36,6 +36,8 @@ class RenderTask:
     unit: WorkUnit
     staging: Staging
     threads: int
+    device_index: int = 0
+    """Index of the device among those of the type that the config names; unused on the CPU."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,12 @@ class DepthTask:
     threads: int
 
 
-Task = RenderTask | DepthTask
+@dataclass(frozen=True)
+class DevicesTask:
+    """Task that lists the devices of Cycles: one event ``devices`` with the names of the devices by type."""
+
+
+Task = RenderTask | DepthTask | DevicesTask
 
 
 Event = Mapping[str, Any]

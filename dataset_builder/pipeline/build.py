@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.pipeline.disk_space import check_fits_on_disk
 from dataset_builder.pipeline.folder import check_folder, remove_build_folder, remove_stagings
 from dataset_builder.pipeline.local_renderer import Renderer, local_processes
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, plan_config
@@ -42,30 +43,41 @@ def build(
     *,
     workers: int = 1,
     threads: int = 1,
+    devices: int = 1,
     cluster: Renderer | None = None,
     progress: Progress = silent,
 ) -> BuildSummary:
     """Build the requested configs in the folder ``out``, or continue an interrupted build of them.
 
-    Rendering uses ``workers`` concurrent processes of ``threads`` threads each on this machine, or the workers of
-    ``cluster`` if it is not None. Neither choice changes the bytes of the result. Each config is published as soon
-    as it is complete.
+    Rendering uses ``workers`` concurrent processes of ``threads`` threads each on this machine, for each of
+    ``devices`` devices of the request's type, or the workers of ``cluster`` if it is not None. None of these
+    changes the bytes of the result. Each config is published as soon as it is complete.
 
-    Raises ``InputError`` for a request that cannot be built, ``RenderProcessError`` if a render process dies
-    twice, and ``BuildError`` if rendered data does not match its digests.
+    Raises ``InputError`` for a request that cannot be built or does not fit on the disk, ``RenderProcessError``
+    if a render process dies twice, and ``BuildError`` if rendered data does not match its digests.
     """
-    plans = [plan_config(spec, request.views, out) for spec in request.config_specs()]
-    for plan in plans:  # Report an unusable mesh file before anything is written.
-        check_fits(plan.assembly, plan.spec)
-    check_folder(out, plans)
+    plans = plan_build(request, out)
+    check_fits_on_disk(out, plans)
     with build_lock(out / BUILD_FOLDER):
         try:
             check_retained_configs(out, plans)
             remove_leftovers(out)
-            with nullcontext(cluster) if cluster else local_processes(workers, threads) as renderer:
+            with nullcontext(cluster) if cluster else local_processes(workers, threads, devices) as renderer:
                 return _build_plans(plans, out, renderer, progress)
         finally:
             remove_build_folder(out / BUILD_FOLDER)
+
+
+def plan_build(request: BuildRequest, out: Path) -> list[ConfigPlan]:
+    """Return the plans of the requested configs; nothing is written.
+
+    Raises ``InputError`` for a request that cannot be built in the folder ``out``, such as an unusable mesh file.
+    """
+    plans = [plan_config(spec, request.views, out) for spec in request.config_specs()]
+    for plan in plans:
+        check_fits(plan.assembly, plan.spec)
+    check_folder(out, plans)
+    return plans
 
 
 def _build_plans(plans: Sequence[ConfigPlan], out: Path, renderer: Renderer, progress: Progress) -> BuildSummary:

@@ -4,6 +4,10 @@ No shared file system is required: a unit is sent to a worker as a plain value, 
 the worker's scratch folder, and is returned as bytes with their digests. The units of a lost worker are rendered
 by other workers, with the same bytes. An assembly file, which exists only on this machine, is uploaded once and
 passed on between the workers.
+
+A worker renders on the first device of its machine that has the requested type. On a machine with several GPUs,
+start one worker per GPU and let it see only this one, for example with ``CUDA_VISIBLE_DEVICES``; ``--nthreads`` is
+then the number of render processes per GPU.
 """
 
 from __future__ import annotations
@@ -24,8 +28,9 @@ import distributed
 from distributed.comm import get_address_host_port
 from distributed.scheduler import KilledWorker
 
-from dataset_builder.config.specs import ConfigSpec, PinnedFile, read_assembly_file
+from dataset_builder.config.specs import CPU, ConfigSpec, PinnedFile, read_assembly_file
 from dataset_builder.pipeline.blender_process import BlenderProcesses
+from dataset_builder.pipeline.devices import AUTO, available_devices, choose_devices
 from dataset_builder.pipeline.local_renderer import OnViewDone, render_unit
 from dataset_builder.pipeline.plan import generator_versions
 from dataset_builder.pipeline.shards import Staging
@@ -57,6 +62,17 @@ class ClusterRenderer:
             render_on_worker, unit, self._assembly_file(unit.config), key=key
         )
         return future
+
+    def check_device(self, device: str) -> None:
+        """Raise ``InputError`` if a connected worker has no device of a type, or if the type is ``auto``.
+
+        The type would otherwise depend on the workers that are connected when a build is started or continued.
+        """
+        if device == AUTO:
+            raise InputError(f"--device {AUTO} is combined with --cluster, expected the name of a device type")
+        if device != CPU:
+            for worker, available in self.client.run(available_devices).items():
+                choose_devices(device, available, f"worker {worker}")
 
     def _assembly_file(self, config: ConfigSpec) -> distributed.Future | None:
         spec = config.scene.assembly

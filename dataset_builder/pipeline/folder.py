@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan
@@ -37,8 +38,11 @@ def check_folder(out: Path, plans: Sequence[ConfigPlan]) -> None:
 
     No other files are ever changed. Folders that the build changes, its lock and staged files may not be links.
     """
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: is a file, expected a folder")
+    ancestor = existing_ancestor(out)
+    if not ancestor.is_dir():
+        raise InputError(f"{out}: {ancestor} is a file, expected a folder")
+    if not os.access(ancestor, os.W_OK | os.X_OK):
+        raise InputError(f"{out}: cannot be created or written to: no permission to write in {ancestor}")
     check_no_links(out, f"{BUILD_FOLDER}/{LOCK}", MESHES, PICTURES, *(plan.spec.name for plan in plans))
     for staging in (staging for plan in plans for staging in plan.all_stagings()):
         check_no_links(out, os.path.relpath(staging, out))
@@ -50,6 +54,16 @@ def check_folder(out: Path, plans: Sequence[ConfigPlan]) -> None:
         raise InputError(
             f"{out}: is not empty and has no {MANIFEST_FILE}, expected a new folder or a dataset folder"
         )
+
+
+def existing_ancestor(path: Path) -> Path:
+    """Return the longest part of a path that exists and can be reached; the path itself if it does."""
+    path = path.absolute()
+    for candidate in (path, *path.parents[:-1]):
+        with suppress(OSError):
+            if candidate.exists():
+                return candidate
+    return Path(path.anchor)
 
 
 def remove_unlisted_files(out: Path, listed: Collection[str]) -> None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from dataset_builder.pipeline.blender_process import BlenderProcesses, Event, RenderTask
+from dataset_builder.pipeline.devices import DeviceShares
 from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
 from rebar_depth_bench.data.digests import file_sha256
@@ -36,19 +37,22 @@ class LocalRenderer:
     pool: ThreadPoolExecutor
     blender: BlenderProcesses
     threads: int
+    devices: DeviceShares
 
     def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
         """Schedule ``unit`` on the next free process."""
-        return self.pool.submit(
-            render_unit, unit, staging, self.threads, self.blender, on_view_done, "this machine"
-        )
+        return self.pool.submit(self._render, unit, staging, on_view_done)
+
+    def _render(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> UnitResult:
+        with self.devices.least_busy() as index:
+            return render_unit(unit, staging, self.threads, self.blender, on_view_done, "this machine", index)
 
 
 @contextmanager
-def local_processes(workers: int, threads: int) -> Iterator[LocalRenderer]:
-    """Yield a renderer with ``workers`` concurrent Blender processes of ``threads`` threads each."""
-    with ThreadPoolExecutor(workers) as pool, BlenderProcesses() as blender:
-        yield LocalRenderer(pool, blender, threads)
+def local_processes(workers: int, threads: int, devices: int = 1) -> Iterator[LocalRenderer]:
+    """Yield a renderer with ``workers`` concurrent Blender processes per device, of ``threads`` threads each."""
+    with ThreadPoolExecutor(workers * devices) as pool, BlenderProcesses() as blender:
+        yield LocalRenderer(pool, blender, threads, DeviceShares(devices))
 
 
 def render_unit(
@@ -58,8 +62,11 @@ def render_unit(
     blender: BlenderProcesses,
     on_view_done: OnViewDone,
     worker: str,
+    device_index: int = 0,
 ) -> UnitResult:
     """Render a unit in a Blender process into ``staging`` and return its result without row and mesh bytes.
+
+    A GPU is number ``device_index`` of the type that the config names.
 
     Raises the ``InputError`` or ``BuildError`` that the process reports, and ``RenderProcessError`` naming the
     unit if the process dies twice.
@@ -72,5 +79,5 @@ def render_unit(
         if "view" in event:
             on_view_done(event["view"])
 
-    blender.run(RenderTask(unit, staging, threads), unit.label, staging.log(unit.shard), on_event)
+    blender.run(RenderTask(unit, staging, threads, device_index), unit.label, staging.log(unit.shard), on_event)
     return UnitResult(worker, dict(seconds), file_sha256(staging.mesh))

@@ -57,6 +57,19 @@ def local_root(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) ->
     return root
 
 
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [("auto", "--device auto is combined with --cluster"), ("hip", "--device hip: worker tcp:")],
+)
+def test_devices_are_those_of_the_workers(
+    cluster: Cluster, tmp_path: Path, run_build: RunBuild, device: str, message: str
+) -> None:
+    process = run_build("--out", tmp_path / "dataset", *SMALL, "--cluster", cluster.address, "--device", device)
+    assert process.returncode == 2, process.stderr
+    assert message in process.stderr
+    assert not any(tmp_path.iterdir())
+
+
 def test_cluster_build_equals_local_build(
     cluster: Cluster, local_root: Path, tmp_path: Path, run_build: RunBuild
 ) -> None:
