@@ -10,7 +10,7 @@ from dataset_builder.config.specs import ColourSpec
 QUALITIES: Mapping[str, ColourSpec] = {
     "preview": ColourSpec(samples=2, steel_samples=8),
     "standard": ColourSpec(),
-    "high": ColourSpec(samples=6, steel_samples=64),
+    "high": ColourSpec(samples=6, steel_samples=44),
 }
 """Presets by name, chosen by measurement (``python -m benchmarks.colour``)."""
 

@@ -208,7 +208,7 @@ class ColourSpec:
     """
 
     samples: int = 4
-    steel_samples: int = 28
+    steel_samples: int = 24
     prefilter: str = "FAST"
     device: str = CPU
 
