@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 _EXTRA_MODULES = ("bpy", "cv2", "embreex", "trimesh")
 
 
+COLOUR_OPTIONS = ("samples",)
+"""Options that only colour has; each is None if it is not given."""
 RENAMED_OPTIONS = {"--to": "--out"}
 """Old option strings that are still accepted, and their new names."""
 
@@ -80,18 +82,30 @@ def _build_request(options: argparse.Namespace) -> BuildRequest:
     from dataset_builder.config.scene_file import scene_config
     from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
 
+    _check_no_colour(options)
     default = () if options.scene else LATTICE_CONFIGS if options.mesh else CONFIGS
     return BuildRequest(
         configs=tuple(options.config or default),
         views=options.views,
         width=options.width,
         height=options.height,
-        samples=options.samples,
+        samples=BuildRequest.samples if options.samples is None else options.samples,
         seed=options.seed,
         mesh=mesh_file_spec(options.mesh, options.mesh_unit) if options.mesh else None,
         variants=tuple(options.variant or ()),
         scenes=tuple(scene_config(path) for path in options.scene or ()),
+        colour=not options.no_colour,
     )
+
+
+def _check_no_colour(options: argparse.Namespace) -> None:
+    """Raise ``InputError`` if options of colour are combined with ``--no-colour``."""
+    given = [f"--{name} {value}" for name in COLOUR_OPTIONS if (value := getattr(options, name)) is not None]
+    if options.no_colour and given:
+        raise InputError(
+            f"--no-colour is combined with {', '.join(given)}, expected only one of them: without colour, "
+            "nothing is sampled"
+        )
 
 
 def _cluster_context(address: str | None) -> AbstractContextManager[Renderer | None]:
@@ -189,8 +203,13 @@ def _add_build_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--samples",
         type=int,
-        default=BuildRequest.samples,
-        help="Cycles samples per pixel (default: %(default)s)",
+        metavar="SPP",
+        help=f"Cycles samples per pixel (default: {BuildRequest.samples})",
+    )
+    parser.add_argument(
+        "--no-colour",
+        action="store_true",
+        help="build depth, masks, ids and poses only; the columns left_rgb and right_rgb are null in every row",
     )
     parser.add_argument(
         "--workers", type=int, metavar="N", help="number of parallel render processes (default: 1)"

@@ -118,9 +118,9 @@ class BuildRequest:
     """Request to ``rebar-build``: configs, number of views, image size (pixels) and render quality.
 
     ``views`` is the number of views per config, spread evenly over the trajectory; None selects all views.
-    ``samples`` are Cycles samples per pixel. ``mesh`` replaces the rods of the lattice. ``variants`` are names of
-    ``scene.variants.VARIANTS``; they are appended to the names of configs and scenes. ``scenes`` are the configs
-    of user scene files.
+    ``samples`` are Cycles samples per pixel, which are not used if ``colour`` is False. ``mesh`` replaces the rods
+    of the lattice. ``variants`` are names of ``scene.variants.VARIANTS``; they are appended to the names of
+    configs and scenes. ``scenes`` are the configs of user scene files.
     """
 
     configs: tuple[str, ...] = tuple(CONFIGS)
@@ -132,6 +132,7 @@ class BuildRequest:
     mesh: MeshFileSpec | None = None
     variants: tuple[str, ...] = ()
     scenes: tuple[ConfigSpec, ...] = ()
+    colour: bool = True
 
     def config_specs(self) -> list[ConfigSpec]:
         """Return the specs of all requested configs.
@@ -183,7 +184,7 @@ class BuildRequest:
             name=spec.name + suffix,
             scene=scene,
             rig=replace(spec.rig, width=self.width, height=self.height),
-            colour=replace(spec.colour, samples=self.samples),
+            colour=ColourSpec(samples=self.samples) if self.colour else None,
         )
 
     def _assembly(self, spec: ConfigSpec) -> AssemblySpec:

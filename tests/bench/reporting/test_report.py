@@ -206,6 +206,7 @@ def test_large_panels_sample_depth_and_average_colour() -> None:
     depth = _decode_data_uri(images.truth).reshape(-1, 3)
     assert len(np.unique(depth, axis=0)) == 1, "an average would have made depths that do not exist"
     assert depth[0].tolist() == DEPTH_COLOURS[round((2.1 - 1.0) / 1.2 * 254)].tolist()
+    assert images.colour is not None
     assert abs(int(_decode_data_uri(images.colour)[180, 320, 0]) - 100) <= 3
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
-from dataset_builder.config.specs import DomeSpec, RigSpec, RingSpec
+from dataset_builder.config.specs import ColourSpec, DomeSpec, RigSpec, RingSpec
 from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.contact_sheet import STRIP_PANEL_PX, TILE_PX
 from dataset_builder.scene.assemblies import check_fits, make_assembly
@@ -201,5 +201,5 @@ def test_shadow_screen_among_cameras_is_rejected() -> None:
 
 def test_size_and_samples_reach_every_rig() -> None:
     for spec in BuildRequest(width=320, height=180, samples=3).config_specs():
-        assert (spec.rig.width, spec.rig.height, spec.colour.samples) == (320, 180, 3)
+        assert (spec.rig.width, spec.rig.height, spec.colour) == (320, 180, ColourSpec(samples=3))
         assert (spec.rig.calibration is None) == (spec.rig.baseline_m == RigSpec.baseline_m)
