@@ -1,6 +1,9 @@
-"""Colour quality per second: samples, denoiser and prefilter against a 256-sample reference, on steel.
+"""Colour quality per CPU second: presets and uniform sampling against 256 samples, on steel and beside it.
 
-python -m benchmarks.colour [CONFIG] [VIEWS]
+python -m benchmarks.colour OUT [WIDTH HEIGHT [CONFIG ...]]
+
+Writes the reference pictures to OUT and uses those that are there: they take most of the time. Also writes each
+picture, and its differences from the reference eight times as strong, for people to look at.
 """
 
 from __future__ import annotations
@@ -9,82 +12,122 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, UInt8
+from numpy import ndarray
+from PIL import Image
 
 from benchmarks.timing import machine_description, print_markdown
+from dataset_builder.blender.colour import configure_colour, render_colour
 from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
-from dataset_builder.blender.render import configure_colour, render_colour
 from dataset_builder.blender.scene import build_scene
 from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.config.quality import QUALITIES
 from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import ColourSpec
+from dataset_builder.config.specs import ColourSpec, ConfigSpec
 from dataset_builder.config.trajectories import poses, subset
 from dataset_builder.scene.assemblies import aim_point_m, make_assembly
 from dataset_builder.scene.raycast import RayCaster
+from rebar_depth_bench.geometry.cameras import Camera
 
-REFERENCE = ColourSpec(samples=256, prefilter="ACCURATE")
-"""Reference setting; denoised, since the noise of 256 raw samples would exceed the error of good candidates."""
+SCENES = ("lattice", "pile", "pier")
+PICTURES = 4
+"""Left pictures per config, evenly spread over its views."""
 
-BLENDERPROC_DEFAULT = ColourSpec(samples=16, prefilter="ACCURATE")
-"""Default denoiser settings of BlenderProc, at 16 samples."""
+BASELINE = "16 samples, ACCURATE"
+SETTINGS: Mapping[str, ColourSpec] = {
+    BASELINE: ColourSpec(16, 16, "ACCURATE"),
+    "16 samples, FAST": ColourSpec(16, 16),
+    **{f"--quality {name}": spec for name, spec in QUALITIES.items()},
+}
+"""Settings that are compared; the first has the default settings of BlenderProc's denoiser."""
 
-CANDIDATES = (
-    BLENDERPROC_DEFAULT,
-    ColourSpec(samples=16, denoise=False),
-    ColourSpec(samples=8),
-    ColourSpec(samples=8, prefilter="ACCURATE"),
-    ColourSpec(samples=12),
-    ColourSpec(samples=16),
-    ColourSpec(samples=24),
-    ColourSpec(samples=32),
-)
+REFERENCE = ColourSpec(256, 256, "ACCURATE")
+"""Reference; denoised, since the noise of 256 raw samples would exceed the error of good settings."""
+REFERENCE_SEED, SEED = 2, 1
 PSNR_PEAK = 255.0
+AMPLIFICATION = 8
 
 
-def main(config: str = "lattice", views: str = "1") -> None:
-    [spec] = BuildRequest(configs=(config,)).config_specs()
-    rig = spec.rig
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """Picture to render: its name, camera and mask of steel."""
+
+    name: str
+    camera: Camera
+    steel: Bool[ndarray, "h w"]
+
+
+def main(out: str, width: str = "1280", height: str = "720", *configs: str) -> None:
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_line = _redirect_blender_output()
+    write_line(f"{PICTURES} left pictures per config at {width} x {height}; {machine_description()}\n")
+    request = BuildRequest(configs or SCENES, width=int(width), height=int(height))
+    rows = [row for spec in request.config_specs() for row in _rows(spec, folder)]
+    headings = ["config", "setting", "samples", "CPU s a picture", "times", "PSNR on steel, dB", "elsewhere, dB"]
+    print_markdown(headings, rows, write_line)
+
+
+def _rows(spec: ConfigSpec, folder: Path) -> list[tuple[str, ...]]:
+    """Return a table row for each setting on one config."""
+    subjects = _open_scene(spec)
+    references = [_reference(subject, folder) for subject in subjects]
+    _render(subjects[0], ColourSpec(1, 1), SEED)  # The first render also loads the scene.
+    rows, baseline_s = [], np.nan
+    for name, colour in SETTINGS.items():
+        start = time.process_time()  # It includes all threads.
+        pictures = [_render(subject, colour, SEED) for subject in subjects]
+        seconds = (time.process_time() - start) / len(subjects)
+        baseline_s = seconds if name == BASELINE else baseline_s
+        for subject, picture, reference in zip(subjects, pictures, references, strict=True):
+            _save(picture, folder / f"{subject.name} {name.removeprefix('--')}.png")
+            difference = AMPLIFICATION * (picture.astype(int) - reference) + 128
+            _save(difference.clip(0, 255).astype(np.uint8), folder / f"{subject.name} {name[2:]} difference.png")
+        quality = [
+            _psnr_db(pictures, references, [subject.steel == on_steel for subject in subjects])
+            for on_steel in (True, False)
+        ]
+        numbers = (f"{seconds:.1f}", f"{seconds / baseline_s:.2f}", *(f"{psnr_db:.1f}" for psnr_db in quality))
+        rows.append((spec.name, name, f"{colour.samples} / {colour.steel_samples}", *numbers))
+    return rows
+
+
+def _open_scene(spec: ConfigSpec) -> list[Subject]:
     assembly = make_assembly(spec.scene.assembly)
     build_scene(assembly, spec.scene)
+    configure_colour(os.cpu_count() or 1)
     caster = RayCaster(evaluated_world_mesh())
-    all_poses = poses(spec.protocol, aim_point_m(assembly), rig, assembly.bars)
-    selected = [rig_cameras(rig, all_poses[index])["left"] for index in subset(len(all_poses), int(views))]
-    masks = [caster.cast(camera).mask for camera in selected]
+    left_poses = poses(spec.protocol, aim_point_m(assembly), spec.rig, assembly.bars)
+    subjects = []
+    for index in subset(len(left_poses), PICTURES):
+        camera = rig_cameras(spec.rig, left_poses[index])["left"]
+        name = f"{spec.name}-{spec.rig.width}-{index:04d}"
+        subjects.append(Subject(name, camera, caster.cast(camera).mask))
+    return subjects
 
-    write_line = _redirect_blender_output()
 
-    def render_views(colour: ColourSpec, seed: int) -> tuple[list[np.ndarray], float]:
-        configure_colour(colour, os.cpu_count() or 1)
-        pictures, seconds = [], []
-        with tempfile.TemporaryDirectory() as scratch:
-            for camera in selected:
-                start = time.perf_counter()
-                pictures.append(render_colour(camera, seed, Path(scratch)))
-                seconds.append(time.perf_counter() - start)
-        return pictures, float(np.median(seconds))
+def _reference(subject: Subject, folder: Path) -> UInt8[ndarray, "h w 3"]:
+    path = folder / f"{subject.name}.png"
+    if not path.is_file():
+        _save(_render(subject, REFERENCE, REFERENCE_SEED), path)
+    with Image.open(path) as image:
+        return np.array(image, dtype=np.uint8)
 
-    write_line(f"{config}, {len(selected)} left views at {rig.width} x {rig.height}; {machine_description()}\n")
-    # The first render of a scene also loads it into the renderer and is therefore not timed.
-    render_views(replace(BLENDERPROC_DEFAULT, samples=1), seed=0)
-    results = {colour: render_views(colour, seed=1) for colour in CANDIDATES}
-    reference, reference_s = render_views(REFERENCE, seed=2)
-    baseline_s = results[BLENDERPROC_DEFAULT][1]
-    table = [
-        (
-            _name(colour),
-            f"{seconds:.1f}",
-            f"{seconds / baseline_s:.2f}",
-            f"{_psnr_db(pictures, reference, masks):.1f}",
-        )
-        for colour, (pictures, seconds) in results.items()
-    ]
-    table.append((_name(REFERENCE), f"{reference_s:.1f}", f"{reference_s / baseline_s:.2f}", "reference"))
-    headings = ["setting", "s a picture", "times 16 + ACCURATE", "PSNR on steel, dB"]
-    print_markdown(headings, table, write_line)
+
+def _render(subject: Subject, colour: ColourSpec, seed: int) -> UInt8[ndarray, "h w 3"]:
+    with tempfile.TemporaryDirectory() as scratch:
+        return render_colour(subject.camera, subject.steel, colour, seed, Path(scratch))
+
+
+def _save(picture: UInt8[ndarray, "h w 3"], path: Path) -> None:
+    partial = path.with_suffix(".partial")
+    Image.fromarray(picture).save(partial, format="PNG")
+    partial.replace(path)
 
 
 def _redirect_blender_output() -> Callable[[str], None]:
@@ -95,13 +138,13 @@ def _redirect_blender_output() -> Callable[[str], None]:
     return lambda text: print(text, file=terminal)
 
 
-def _name(colour: ColourSpec) -> str:
-    return f"{colour.samples} samples" + (f", OIDN, {colour.prefilter} prefilter" if colour.denoise else ", raw")
-
-
-def _psnr_db(pictures: list[np.ndarray], reference: list[np.ndarray], masks: list[np.ndarray]) -> float:
-    """Return the peak signal-to-noise ratio in dB over the steel pixels of all 8-bit images."""
-    differences = [a[mask].astype(float) - b[mask] for a, b, mask in zip(pictures, reference, masks, strict=True)]
+def _psnr_db(
+    pictures: list[UInt8[ndarray, "h w 3"]],
+    references: list[UInt8[ndarray, "h w 3"]],
+    masks: list[Bool[ndarray, "h w"]],
+) -> float:
+    """Return the peak signal-to-noise ratio in dB over the chosen pixels of all 8-bit pictures."""
+    differences = [a[mask].astype(float) - b[mask] for a, b, mask in zip(pictures, references, masks, strict=True)]
     return float(20 * np.log10(PSNR_PEAK / np.sqrt(np.mean(np.concatenate(differences) ** 2))))
 
 

@@ -135,7 +135,7 @@ def _config_row(config: DatasetConfig) -> dict[str, Any]:
     return {
         "name": config.name,
         "views": f"{len(views)} of {entry['protocol_views']}",
-        "samples": "no colour" if config.colour is None else config.colour["samples"],
+        "samples": "no colour" if config.colour is None else _samples(config.colour),
         "has_colour": config.colour is not None,
         "steel_source": _steel_source(entry["scene"]["assembly"]),
         "grid": f"{rig.width} x {rig.height}",
@@ -146,6 +146,7 @@ def _config_row(config: DatasetConfig) -> dict[str, Any]:
         "out_of_protocol": int(np.count_nonzero(scored == 0)),
         "sheet": config.sheet,
         "variants": config.scene.appearance.variants,
+        "panorama": entry["scene"].get("appearance", {}).get("image_light", {}).get("image"),
         "optics": _OPTICS_TEXTS[entry["rig"]["grid"]],
         "constant": _reference(config, "constant"),
         "one_pixel": _reference(config, "one_pixel"),
@@ -159,6 +160,12 @@ def _reference(config: DatasetConfig, name: str) -> str:
     if errors is None or errors.abs_rel is None or errors.rmse_cm is None:
         return DASH
     return f"{errors.abs_rel:.4f}, {errors.rmse_cm:.2f} cm"
+
+
+def _samples(colour: Mapping[str, Any]) -> str:
+    """Return the samples per pixel, and those around the steel if they differ."""
+    samples, steel_samples = colour["samples"], colour.get("steel_samples")
+    return f"{samples}" if steel_samples in (None, samples) else f"{samples}, {steel_samples} around steel"
 
 
 def _steel_source(assembly: Mapping[str, Any]) -> str:

@@ -12,19 +12,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, SWEEPS, BuildRequest
+from dataset_builder.config.quality import DEFAULT_QUALITY, QUALITIES, SAMPLINGS, colour_spec
 from dataset_builder.scene.variants import VARIANTS
 from rebar_depth_bench.console import ProgressBars, replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
 
 if TYPE_CHECKING:
+    from dataset_builder.config.specs import ColourSpec
     from dataset_builder.pipeline.build import BuildSummary
     from dataset_builder.pipeline.local_renderer import Renderer
 
 _EXTRA_MODULES = ("bpy", "cv2", "embreex", "trimesh")
 
 
-COLOUR_OPTIONS = ("samples",)
+COLOUR_OPTIONS = ("sampling", "quality", "samples")
 """Options that only colour has; each is None if it is not given."""
 RENAMED_OPTIONS = {"--to": "--out"}
 """Old option strings that are still accepted, and their new names."""
@@ -82,30 +84,34 @@ def _build_request(options: argparse.Namespace) -> BuildRequest:
     from dataset_builder.config.scene_file import scene_config
     from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
 
-    _check_no_colour(options)
     default = () if options.scene else LATTICE_CONFIGS if options.mesh else CONFIGS
     return BuildRequest(
         configs=tuple(options.config or default),
         views=options.views,
         width=options.width,
         height=options.height,
-        samples=BuildRequest.samples if options.samples is None else options.samples,
+        colour=_colour_spec(options),
         seed=options.seed,
         mesh=mesh_file_spec(options.mesh, options.mesh_unit) if options.mesh else None,
         variants=tuple(options.variant or ()),
         scenes=tuple(scene_config(path) for path in options.scene or ()),
-        colour=not options.no_colour,
     )
 
 
-def _check_no_colour(options: argparse.Namespace) -> None:
-    """Raise ``InputError`` if options of colour are combined with ``--no-colour``."""
+def _colour_spec(options: argparse.Namespace) -> ColourSpec | None:
+    """Return the colour settings of the options, or None for ``--no-colour``.
+
+    Raises ``InputError`` if ``--no-colour`` is combined with options of colour.
+    """
+    if not options.no_colour:
+        return colour_spec(options.sampling, options.quality, options.samples)
     given = [f"--{name} {value}" for name in COLOUR_OPTIONS if (value := getattr(options, name)) is not None]
-    if options.no_colour and given:
+    if given:
         raise InputError(
             f"--no-colour is combined with {', '.join(given)}, expected only one of them: without colour, "
             "nothing is sampled"
         )
+    return None
 
 
 def _cluster_context(address: str | None) -> AbstractContextManager[Renderer | None]:
@@ -201,10 +207,19 @@ def _add_build_arguments(parser: argparse.ArgumentParser) -> None:
         "--height", type=int, default=BuildRequest.height, help="image height in pixels (default: %(default)s)"
     )
     parser.add_argument(
+        "--sampling",
+        choices=SAMPLINGS,
+        help="more samples around the steel than elsewhere, or as many everywhere (default: steel-first)",
+    )
+    amount = parser.add_mutually_exclusive_group()
+    amount.add_argument(
+        "--quality", choices=QUALITIES, help=f"preset of samples and denoising (default: {DEFAULT_QUALITY})"
+    )
+    amount.add_argument(
         "--samples",
         type=int,
         metavar="SPP",
-        help=f"Cycles samples per pixel (default: {BuildRequest.samples})",
+        help="Cycles samples per pixel instead of a preset, uniform unless --sampling steel-first is given",
     )
     parser.add_argument(
         "--no-colour",

@@ -11,7 +11,8 @@ from pathlib import Path
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from tests.processes import processes_below
 
-TINY = ("--width", "160", "--height", "90", "--samples", "1")
+TINY = ("--width", "160", "--height", "90", "--quality", "preview")
+"""Small pictures, rendered in two passes like those of the default quality."""
 TINY_VIEWS = 9
 """One more than a shard holds."""
 TWO_BARS = Path(__file__).parent / "data" / "two-bars.toml"

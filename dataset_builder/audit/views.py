@@ -12,7 +12,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import ESTIMATED_ROLE
-from dataset_builder.scene.variants import LIGHT_SLOT, PROPS_SLOT, variants_of_slot
+from dataset_builder.scene.variants import LIGHT_SLOT, PROPS_SLOT, SENSOR, variants_of_slot
+from dataset_builder.scene.variants.image_light import IMAGE_LIGHTS
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
@@ -41,9 +42,14 @@ class AuditedConfig:
         return bool(variants_of_slot(self.variants, PROPS_SLOT))
 
     @property
-    def has_lighting_variant(self) -> bool:
-        """Whether the scene has a lighting variant, under which markers may not be detected."""
-        return bool(variants_of_slot(self.variants, LIGHT_SLOT))
+    def has_sensor(self) -> bool:
+        """Whether the pictures have the noise and the compression of a sensor."""
+        return SENSOR in self.variants
+
+    @property
+    def light_may_hide_markers(self) -> bool:
+        """Whether the light may hide markers from the detector; panoramas are exposed like the standard light."""
+        return not set(variants_of_slot(self.variants, LIGHT_SLOT)) <= set(IMAGE_LIGHTS)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,8 @@ FLOOR_M = -0.78
 WALL_TOP_M = 1.6
 WEST_M, EAST_M, SOUTH_M, NORTH_M = -2.3, 2.5, -2.1, 2.3
 WALL_THICKNESS_M = 0.1
+WALLS = ("wall", "cabinet", "worktop", "shelf", "crate", "pinboard", "radiator", "door", "locker")
+"""First words of the names of the walls and of the furniture along them."""
 
 
 def laboratory() -> tuple[Part, ...]:

@@ -1,8 +1,8 @@
-"""Cycles rendering of the open scene on the CPU: colour images, and planar depth for the audit."""
+"""Cycles rendering of the open scene on the CPU: linear passes for colour, and planar depth for the audit."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -10,12 +10,11 @@ from typing import Any
 import bpy
 import numpy as np
 import OpenEXR
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 from numpy import ndarray
-from PIL import Image
 
 from dataset_builder.blender.camera import place_camera
-from dataset_builder.config.specs import ColourSpec
+from dataset_builder.scene.steel_box import PixelBox
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera
 
@@ -23,49 +22,51 @@ DEPTH_CHANNEL = "ViewLayer.Depth.Z"
 NO_SURFACE_M = 1e9
 """Depth above which a pixel has no surface; Cycles writes 1e10 there."""
 
-EXPOSURE_STOPS = 0.0
+PASS_CHANNELS = {"Combined": "RGB", "Denoising Albedo": "RGB", "Denoising Normal": "XYZ"}
+"""Channels of the render passes that ``render_passes`` returns: linear colour, and what guides the denoiser."""
+
+_INTO_PIXEL = 0.25
+"""Part of a pixel added to borders, which Blender rounds down: a rounding error must not lose a row."""
 
 
-def configure_colour(spec: ColourSpec, threads: int) -> None:
-    """Configure the open scene for ``render_colour``; required once after ``build_scene``.
+def render_passes(samples: range, box: PixelBox | None, scratch_dir: Path) -> Float32[ndarray, "h w 9"]:
+    """Render the passes of ``PASS_CHANNELS`` with the scene's camera; return the means of samples of each pixel.
 
-    Images are identical, byte for byte, for any number of ``threads``.
+    ``samples`` are indices into the pixel's sequence of samples, whose length and seed are settings of the scene:
+    the means of two adjacent ranges, weighted by their lengths, give the mean of both. With a ``box`` only its
+    pixels are rendered and returned.
     """
-    scene = bpy.context.scene
-    _use_cycles(scene, threads)
-    _set_attributes(
-        scene.cycles,
-        samples=spec.samples,
-        use_denoising=spec.denoise,
-        denoiser="OPENIMAGEDENOISE",
-        denoising_quality="HIGH",
-        denoising_prefilter=spec.prefilter,
-        denoising_input_passes="RGB_ALBEDO_NORMAL",
-        max_bounces=3,
-        diffuse_bounces=2,
-        glossy_bounces=3,
-        # With one or two lamps a light tree has no benefit; without it a frame takes a fifth less time.
-        use_light_tree=False,
-        sample_clamp_indirect=4.0,
-        caustics_reflective=False,
-        caustics_refractive=False,
-    )
-    _set_attributes(scene.view_settings, view_transform="AgX", look="None")
-    _set_attributes(scene.view_settings, exposure=EXPOSURE_STOPS, gamma=1.0)
+    scene, layer = bpy.context.scene, bpy.context.view_layer
+    subset = {
+        "use_sample_subset": True,
+        "sample_offset": samples.start,
+        "sample_subset_length": len(samples),
+    }
+    image_settings = {"file_format": "OPEN_EXR_MULTILAYER", "color_depth": "32", "exr_codec": "NONE"}
+    with (
+        temporary_settings(scene.cycles, **subset),
+        temporary_settings(layer.cycles, denoising_store_passes=True),
+        temporary_settings(scene.render, **_border(scene.render, box)),
+        rendered_file(scratch_dir / "passes.exr", scene, **image_settings) as path,
+    ):
+        return _read_channels(
+            path, [f"ViewLayer.{name}.{axis}" for name, axes in PASS_CHANNELS.items() for axis in axes]
+        )
 
 
-def render_colour(camera: Camera, seed: int, scratch_dir: Path) -> UInt8[ndarray, "h w 3"]:
-    """Render one colour image; ``seed`` determines its noise.
-
-    Raises ``BuildError`` if ``configure_colour`` has not been called.
-    """
-    scene = bpy.context.scene
-    if scene.render.engine != "CYCLES":
-        raise BuildError("the scene is not set up for colour: call configure_colour after build_scene")
-    place_camera(camera)
-    scene.cycles.seed = seed
-    with _rendered_file(scratch_dir / "colour.png", file_format="PNG", color_mode="RGB", color_depth="8") as path:
-        return np.array(Image.open(path).convert("RGB"), dtype=np.uint8)
+def _border(render: bpy.types.RenderSettings, box: PixelBox | None) -> dict[str, Any]:
+    """Return the settings that restrict a render to ``box``: fractions of the image from its lower left."""
+    if box is None:
+        return {"use_border": False}
+    width, height = render.resolution_x, render.resolution_y
+    return {
+        "use_border": True,
+        "use_crop_to_border": True,
+        "border_min_x": (box.left + _INTO_PIXEL) / width,
+        "border_max_x": (box.right + _INTO_PIXEL) / width,
+        "border_min_y": (height - box.bottom + _INTO_PIXEL) / height,
+        "border_max_y": (height - box.top + _INTO_PIXEL) / height,
+    }
 
 
 def render_depth(camera: Camera, scratch_dir: Path) -> Float32[ndarray, "h w"]:
@@ -78,15 +79,18 @@ def render_depth(camera: Camera, scratch_dir: Path) -> Float32[ndarray, "h w"]:
     scene, layer = bpy.context.scene, bpy.context.view_layer
     place_camera(camera)
     with (
-        _temporary_settings(scene.render, engine="CYCLES"),
-        _temporary_settings(
+        temporary_settings(scene.render, engine="CYCLES"),
+        temporary_settings(
             scene.cycles, device="CPU", samples=1, use_adaptive_sampling=False, use_denoising=False
         ),
-        _temporary_settings(scene.cycles, pixel_filter_type="BLACKMAN_HARRIS", filter_width=0.01, max_bounces=0),
-        _temporary_settings(layer, use_pass_z=True),
-        _rendered_file(scratch_dir / "depth.exr", file_format="OPEN_EXR_MULTILAYER", color_depth="32") as path,
+        temporary_settings(scene.cycles, pixel_filter_type="BLACKMAN_HARRIS", filter_width=0.01, max_bounces=0),
+        temporary_settings(layer, use_pass_z=True),
+        rendered_file(
+            scratch_dir / "depth.exr", scene, file_format="OPEN_EXR_MULTILAYER", color_depth="32"
+        ) as path,
     ):
-        depth_m = _read_depth_m(path)
+        depth_m = _read_channels(path, [DEPTH_CHANNEL])[..., 0]
+    depth_m[depth_m > NO_SURFACE_M] = 0.0
     return depth_m / _range_per_depth(camera) if camera.distortion.any() else depth_m
 
 
@@ -95,22 +99,21 @@ def _range_per_depth(camera: Camera) -> Float32[ndarray, "h w"]:
     return np.asarray(np.linalg.norm(camera.rays(), axis=-1), dtype=np.float32)
 
 
-def _read_depth_m(path: Path) -> Float32[ndarray, "h w"]:
-    """Return the depth channel of an EXR file; raise ``BuildError`` if it is missing."""
+def _read_channels(path: Path, names: Sequence[str]) -> Float32[ndarray, "h w c"]:
+    """Return the named channels of an EXR file; raise ``BuildError`` if one is missing."""
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels = file.channels()
-        if DEPTH_CHANNEL not in channels:
-            raise BuildError(f"{path} has no channel {DEPTH_CHANNEL}, only {sorted(channels)}")
-        depth_m = np.array(channels[DEPTH_CHANNEL].pixels, dtype=np.float32)
-    depth_m[depth_m > NO_SURFACE_M] = 0.0
-    return depth_m
+        missing = [name for name in names if name not in channels]
+        if missing:
+            raise BuildError(f"{path} has no channel {', '.join(missing)}, only {', '.join(sorted(channels))}")
+        return np.stack([channels[name].pixels for name in names], axis=-1, dtype=np.float32)
 
 
-def _use_cycles(scene: bpy.types.Scene, threads: int) -> None:
+def use_cycles(scene: bpy.types.Scene, threads: int) -> None:
     """Select Cycles on the CPU, with settings that make renders reproducible."""
     scene.render.engine = "CYCLES"
-    _set_attributes(scene.cycles, device="CPU", use_adaptive_sampling=False, use_animated_seed=False)
-    _set_attributes(
+    set_attributes(scene.cycles, device="CPU", use_adaptive_sampling=False, use_animated_seed=False)
+    set_attributes(
         scene.render,
         threads_mode="FIXED",
         threads=threads,
@@ -124,14 +127,14 @@ def _use_cycles(scene: bpy.types.Scene, threads: int) -> None:
 
 
 @contextmanager
-def _rendered_file(path: Path, **image_settings: Any) -> Iterator[Path]:
-    """Render the scene to ``path`` with the given image settings, and remove the file on exit."""
-    render = bpy.context.scene.render
+def rendered_file(path: Path, scene: bpy.types.Scene, **image_settings: Any) -> Iterator[Path]:
+    """Render ``scene`` to ``path`` with the given image settings, and remove the file on exit."""
+    render = scene.render
     with (
-        _temporary_settings(render.image_settings, **image_settings),
-        _temporary_settings(render, filepath=str(path), use_file_extension=False),
+        temporary_settings(render.image_settings, **image_settings),
+        temporary_settings(render, filepath=str(path), use_file_extension=False),
     ):
-        bpy.ops.render.render(write_still=True)
+        bpy.ops.render.render(write_still=True, scene=scene.name)
     try:
         yield path
     finally:
@@ -139,16 +142,17 @@ def _rendered_file(path: Path, **image_settings: Any) -> Iterator[Path]:
 
 
 @contextmanager
-def _temporary_settings(owner: Any, **values: Any) -> Iterator[None]:
+def temporary_settings(owner: Any, **values: Any) -> Iterator[None]:
     """Set attributes of ``owner`` to other values for the duration of the context."""
     before = {name: getattr(owner, name) for name in values}
-    _set_attributes(owner, **values)
+    set_attributes(owner, **values)
     try:
         yield
     finally:
-        _set_attributes(owner, **before)
+        set_attributes(owner, **before)
 
 
-def _set_attributes(owner: Any, **values: Any) -> None:
+def set_attributes(owner: Any, **values: Any) -> None:
+    """Set several attributes of ``owner``."""
     for name, value in values.items():
         setattr(owner, name, value)

@@ -10,32 +10,38 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.blender.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M, laboratory
+from dataset_builder.blender.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M, WALLS, laboratory
 from dataset_builder.blender.lights import LABORATORY_LIGHT, OUTDOOR_LIGHT, LightRig, add_light
 from dataset_builder.blender.materials import STEEL_VARIANT_MATERIALS, material, paper, surface_variation
 from dataset_builder.blender.outdoors import outdoors
+from dataset_builder.blender.panorama import add_panorama, let_light_through
 from dataset_builder.config.specs import SceneSpec
 from dataset_builder.scene.board_texture import board_texture
 from dataset_builder.scene.model import Assembly, Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box
 from dataset_builder.scene.variants import LIGHT_SLOT, STEEL_SLOT, check_variants, exclusive_variant
+from dataset_builder.scene.variants.image_light import image_light
 from dataset_builder.scene.variants.props import make_props
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 
 @dataclass(frozen=True)
 class Environment:
-    """Surroundings of the steel: surfaces (world, none is steel) and lights by light variant (None: default)."""
+    """Surroundings of the steel: surfaces (world, none is steel) and lights by light variant (None: default).
+
+    ``enclosure`` are the first words of the names of surfaces that would keep the light of a panorama out.
+    """
 
     parts: Callable[[], tuple[Part, ...]]
     light: Mapping[str | None, LightRig]
     floor_m: float
     """Height of the surface that a board lies on."""
+    enclosure: tuple[str, ...]
 
 
 ENVIRONMENTS: Mapping[str, Environment] = {
-    "laboratory": Environment(laboratory, LABORATORY_LIGHT, BENCH_TOP_M),
-    "outdoors": Environment(outdoors, OUTDOOR_LIGHT, 0.0),
+    "laboratory": Environment(laboratory, LABORATORY_LIGHT, BENCH_TOP_M, WALLS),
+    "outdoors": Environment(outdoors, OUTDOOR_LIGHT, 0.0, ("trees",)),
 }
 
 
@@ -70,13 +76,19 @@ def build_scene(assembly: Assembly, spec: SceneSpec, *, colour: bool = True) -> 
     environment = ENVIRONMENTS[spec.environment]
     # A floor at z = 0 would coincide with the top of the sheet, so it is lowered under a board.
     offset_z_m = 0.0 if spec.board is None else min(0.0, BENCH_TOP_M - environment.floor_m)
+    panorama = image_light(spec)
     for part in environment.parts():
-        add_object(part, _part_data(part, part.mesh, colour), np.array([0.0, 0.0, offset_z_m]))
+        mesh = _part_data(part, part.mesh, colour)
+        added = add_object(part, mesh, np.array([0.0, 0.0, offset_z_m]))
+        if panorama is not None and part.name.partition("-")[0] in environment.enclosure:
+            let_light_through(added)
     for part in make_props(assembly, spec):
         add_object(part, _part_data(part, part.mesh, colour), np.zeros(3))
     if spec.board is not None:
         _add_board(spec.board, colour)
-    if colour:
+    if colour and panorama is not None:
+        add_panorama(panorama)
+    elif colour:
         add_light(environment.light[exclusive_variant(variants, LIGHT_SLOT)])
     bpy.context.view_layer.update()
 

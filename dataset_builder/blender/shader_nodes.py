@@ -58,6 +58,11 @@ class NodeTreeBuilder:
         """Return ``position`` scaled axis by axis."""
         return self.node("ShaderNodeMapping", {"Vector": position, "Scale": scale}).outputs["Vector"]
 
+    def turned(self, direction: Socket, angle_rad: float) -> Socket:
+        """Return ``direction`` turned about z by ``angle_rad``, counter-clockwise from above."""
+        inputs: dict[str | int, Any] = {"Vector": direction, "Rotation": (0.0, 0.0, angle_rad)}
+        return self.node("ShaderNodeMapping", inputs, vector_type="VECTOR").outputs["Vector"]
+
     def shifted(self, position: Socket, offset_m: Socket) -> Socket:
         """Return ``position`` shifted by ``offset_m`` along all three axes, to select another part of a noise."""
         return self.node("ShaderNodeVectorMath", {0: position, 1: offset_m}, operation="ADD").outputs[0]

@@ -21,12 +21,13 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.blender.colour import configure_colour, render_colour
 from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
-from dataset_builder.blender.render import configure_colour, render_colour, render_depth
+from dataset_builder.blender.render import render_depth, use_cycles
 from dataset_builder.blender.scene import add_object, build_scene, mesh_data
 from dataset_builder.config.catalog import view_id
 from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import ColourSpec, ConfigSpec
+from dataset_builder.config.specs import ConfigSpec
 from dataset_builder.config.trajectories import poses
 from dataset_builder.pipeline.blender_process import DepthTask, RenderTask
 from dataset_builder.pipeline.shards import View, encode_view, stage_row
@@ -34,6 +35,7 @@ from dataset_builder.scene.assemblies import aim_point_m, make_assembly
 from dataset_builder.scene.mesh_ply import read_mesh_ply, write_mesh_ply
 from dataset_builder.scene.model import Mesh, WorldMesh, surface
 from dataset_builder.scene.raycast import RayCaster
+from dataset_builder.scene.variants.sensor import recorded
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError
 
@@ -72,7 +74,7 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
         assembly = make_assembly(config.scene.assembly)
         build_scene(assembly, config.scene, colour=config.colour is not None)
         if config.colour is not None:
-            configure_colour(config.colour, task.threads)
+            configure_colour(task.threads)
         mesh = evaluated_world_mesh()
         _stage_mesh(mesh, staging.mesh, unit.mesh_sha256)
         caster = RayCaster(mesh)
@@ -109,11 +111,14 @@ def _render_view(
     config = context.config
     eyes, rgb = {}, None
     for eye_index, (eye, camera) in enumerate(rig_cameras(config.rig, left_cam_from_world).items()):
+        with watch.timing("truth"):
+            truth = context.caster.cast(camera, context.rays_cam[eye])
         if config.colour is not None:
             with watch.timing("colour"):
-                rgb = render_colour(camera, _cycles_seed(config, index, eye_index), context.scratch)
-        with watch.timing("truth"):
-            eyes[eye] = replace(context.caster.cast(camera, context.rays_cam[eye]), rgb=rgb)
+                seed = _cycles_seed(config, index, eye_index)
+                rgb = render_colour(camera, truth.mask, config.colour, seed, context.scratch)
+                rgb = recorded(rgb, config.scene, seed)
+        eyes[eye] = replace(truth, rgb=rgb)
     return View(view_id(config.name, index), config.scene.name, eyes["left"], eyes["right"], config.rig.baseline_m)
 
 
@@ -150,7 +155,7 @@ def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None])
     bpy.ops.wm.read_factory_settings(use_empty=True)
     part = surface("dataset", Mesh(vertices_m, faces), "steel")
     add_object(part, mesh_data(part.name, part.mesh, part.material), np.zeros(3))
-    configure_colour(ColourSpec(samples=1, denoise=False), task.threads)
+    use_cycles(bpy.context.scene, task.threads)
     with tempfile.TemporaryDirectory(dir=task.out) as scratch:
         for n, camera in enumerate(task.cameras):
             depth_m = render_depth(camera, Path(scratch))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from dataset_builder.config.rigs import zed_rig
 from dataset_builder.config.specs import (
@@ -115,24 +115,23 @@ LATTICE_CONFIGS = tuple(name for name in CONFIGS if name.startswith("lattice"))
 
 @dataclass(frozen=True)
 class BuildRequest:
-    """Request to ``rebar-build``: configs, number of views, image size (pixels) and render quality.
+    """Request to ``rebar-build``: configs, number of views, image size (pixels) and colour quality.
 
     ``views`` is the number of views per config, spread evenly over the trajectory; None selects all views.
-    ``samples`` are Cycles samples per pixel, which are not used if ``colour`` is False. ``mesh`` replaces the rods
-    of the lattice. ``variants`` are names of ``scene.variants.VARIANTS``; they are appended to the names of
-    configs and scenes. ``scenes`` are the configs of user scene files.
+    ``colour`` None builds no colour. ``mesh`` replaces the rods of the lattice. ``variants`` are names of
+    ``scene.variants.VARIANTS``; they are appended to the names of configs and scenes. ``scenes`` are the configs
+    of user scene files.
     """
 
     configs: tuple[str, ...] = tuple(CONFIGS)
     views: int | None = None
     width: int = RigSpec.width
     height: int = RigSpec.height
-    samples: int = ColourSpec.samples
+    colour: ColourSpec | None = field(default_factory=ColourSpec)
     seed: int = 0
     mesh: MeshFileSpec | None = None
     variants: tuple[str, ...] = ()
     scenes: tuple[ConfigSpec, ...] = ()
-    colour: bool = True
 
     def config_specs(self) -> list[ConfigSpec]:
         """Return the specs of all requested configs.
@@ -156,7 +155,7 @@ class BuildRequest:
             ("--views", self.views, 1, 1_000_000),
             ("--width", self.width, 16, 8192),
             ("--height", self.height, 16, 8192),
-            ("--samples", self.samples, 1, 65_536),
+            ("--samples", None if self.colour is None else self.colour.steel_samples, 1, 65_536),
             ("--seed", self.seed, 0, 2**31 - 1),
         )
         problems = [
@@ -184,7 +183,7 @@ class BuildRequest:
             name=spec.name + suffix,
             scene=scene,
             rig=replace(spec.rig, width=self.width, height=self.height),
-            colour=ColourSpec(samples=self.samples) if self.colour else None,
+            colour=self.colour,
         )
 
     def _assembly(self, spec: ConfigSpec) -> AssemblySpec:

@@ -14,6 +14,8 @@ from dataset_builder.config.trajectories import subset, view_count
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging
 from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.model import Assembly
+from dataset_builder.scene.variants.image_light import image_light
+from dataset_builder.scene.variants.sensor import sensor_spec
 from rebar_depth_bench.data.columns import ROW_SCHEMA
 from rebar_depth_bench.data.digests import parameters_digest
 from rebar_depth_bench.version import software_version
@@ -60,8 +62,13 @@ def plan_config(spec: ConfigSpec, views: int | None, out: Path) -> ConfigPlan:
 
 
 def config_parameters(spec: ConfigSpec) -> dict[str, Any]:
-    """Return the spec of a config as JSON values; the path of an assembly file is reduced to its name."""
+    """Return the spec of a config as JSON values, with the parameters of its panorama and its sensor.
+
+    The path of an assembly file is reduced to its name.
+    """
     parameters = asdict(spec)
+    of_variants = {"image_light": image_light(spec.scene), "sensor": sensor_spec(spec.scene)}
+    parameters["scene"]["appearance"] |= {key: asdict(value) for key, value in of_variants.items() if value}
     assembly = parameters["scene"]["assembly"]
     if "path" in assembly:
         assembly["path"] = Path(assembly["path"]).name

@@ -40,6 +40,8 @@ class _Scene(_Table):
 
 class _Colour(_Table):
     samples: _Count
+    steel_samples: _Count | None = None
+    """None in entries of versions that sampled uniformly."""
 
 
 class _Rig(_Table):

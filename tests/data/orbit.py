@@ -15,6 +15,7 @@ import numpy as np
 
 from dataset_builder.config.catalog import BuildRequest, view_id
 from dataset_builder.config.rigs import rig_cameras
+from dataset_builder.config.specs import ColourSpec
 from dataset_builder.config.trajectories import poses
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.local_renderer import OnViewDone
@@ -28,7 +29,10 @@ from rebar_depth_bench.data.codecs import decode_rgb
 from rebar_depth_bench.data.digests import file_sha256
 
 IMAGES = Path(__file__).parent / "orbit"
-REQUEST = BuildRequest(configs=("lattice-orbit",), views=24, width=512, height=288, samples=1)
+SAMPLES = 1
+REQUEST = BuildRequest(
+    configs=("lattice-orbit",), views=24, width=512, height=288, colour=ColourSpec(SAMPLES, SAMPLES)
+)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""Appearance variants of scenes: lighting, steel surface, and props that occlude the steel.
+"""Appearance variants of scenes: lighting, steel surface, props that occlude the steel, and the camera's sensor.
 
 The names of the variants of a scene are in ``AppearanceSpec.variants``; the standard configs, like the scenes of
-the paper, have none. Light and steel variants change only colour, apart from the screen that ``shadows`` adds.
-Props are surfaces of the scene mesh, so depth and masks account for them.
+the paper, have none. Light, steel and sensor variants change only colour, apart from the screen that ``shadows``
+adds. Props are surfaces of the scene mesh, so depth and masks account for them.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 from rebar_depth_bench.errors import InputError, Problem
 
-LIGHT_SLOT, STEEL_SLOT, PROPS_SLOT = "light", "steel", "things"
+LIGHT_SLOT, STEEL_SLOT, PROPS_SLOT, SENSOR_SLOT = "light", "steel", "things", "sensor"
 EXCLUSIVE_SLOTS = (LIGHT_SLOT, STEEL_SLOT)
 """Slots that accept one variant at a time; variants of the props slot can be combined."""
 
+SENSOR = "sensor"
 SHADOWS = "shadows"
 SUN_FROM = (-0.53, -0.36, 0.77)
 """Direction from the steel to the sun of ``shadows``, world axes; the slatted screen is in this direction."""
@@ -39,6 +40,16 @@ _ALL = (
     Variant(
         SHADOWS, "hard sun through a slatted screen beyond the cameras: stripes of shadow on the steel", LIGHT_SLOT
     ),
+    Variant("city", "light of a panorama: high-rise buildings under a hazy sun", LIGHT_SLOT),
+    Variant(
+        "courtyard", "light of a panorama: a courtyard between houses, a bright sky without a sun", LIGHT_SLOT
+    ),
+    Variant("forest", "light of a panorama: a garden under trees, with patches of bright sky", LIGHT_SLOT),
+    Variant("interior", "light of a panorama: a hotel room with lamps and a window", LIGHT_SLOT),
+    Variant("night", "light of a panorama: a park after dark, with lamps; exposed like the others", LIGHT_SLOT),
+    Variant("studio", "light of a panorama: a photographer's studio with softboxes in the dark", LIGHT_SLOT),
+    Variant("sunrise", "light of a panorama: a misty park under a low sun", LIGHT_SLOT),
+    Variant("sunset", "light of a panorama: a promenade, bluish, with the sun at the horizon", LIGHT_SLOT),
     Variant("mill-scale", "fresh steel: smooth blue-grey scale, hardly any rust", STEEL_SLOT),
     Variant("rusted", "steel that stood outside for months: rust all over", STEEL_SLOT),
     Variant("wet", "steel after rain: darker, with a gloss", STEEL_SLOT),
@@ -50,6 +61,11 @@ _ALL = (
     ),
     Variant("spacers", "plastic wheel spacers round some of the outer bars", PROPS_SLOT),
     Variant("tie-wire", "black wire of 1.2 mm tied round some of the crossings of bars", PROPS_SLOT),
+    Variant(
+        SENSOR,
+        "pictures of a camera at 18 dB gain: vignetting, noise, demosaicing and JPEG compression",
+        SENSOR_SLOT,
+    ),
 )
 VARIANTS: Mapping[str, Variant] = {variant.name: variant for variant in _ALL}
 

@@ -78,6 +78,41 @@ def test_undetected_markers_are_reported() -> None:
         blank_view, of=config(variants=("spotlight",))
     ).passed  # Hard light may make markers undetectable.
     assert not verdict(blank_view, of=config(variants=("clutter",))).passed
+    assert not verdict(blank_view, of=config(variants=("night", "sensor"))).passed, (
+        "exposed like the standard light"
+    )
+
+
+def with_slipped_corners(eyes: list[DetectedMarkers], markers: int) -> list[DetectedMarkers]:
+    """Move one corner of the first ``markers`` detected markers by 3.5 pixels."""
+    slipped = []
+    for eye in eyes:
+        detected_px = eye.detected_px.copy()
+        detected_px[:markers, 0, 0] += 3.5
+        markers -= min(markers, len(detected_px))
+        slipped.append(replace(eye, detected_px=detected_px))
+    return slipped
+
+
+@pytest.mark.slow
+def test_single_slipped_corner_is_left_out_with_sensor_only() -> None:
+    noisy, eyes = config(variants=("sensor",)), detect_view_markers(config(), view("ideal"))
+    one_off = with_slipped_corners(eyes, 1)
+    assert not marker_verdict(config(), [one_off]).passed
+    check = marker_verdict(noisy, [one_off])
+    assert check.passed, check
+    assert "1 with a slipped corner left out" in check.measured
+    detected = sum(len(eye.detected_px) for eye in eyes)
+    for count in (2, detected):
+        problems = marker_verdict(noisy, [with_slipped_corners(eyes, count)]).problems
+        assert any(problem.startswith(f"{count} of {detected} markers have a corner") for problem in problems)
+
+
+@pytest.mark.slow
+def test_half_pixel_shift_of_K_is_reported_with_sensor() -> None:
+    shifted = with_K_shift(view("ideal"), ("left", "right"), 0, 0.5)
+    check = verdict(shifted, of=config(variants=("sensor",)))
+    assert any("detected markers are" in problem for problem in check.problems), check
 
 
 def test_occluded_markers_are_not_expected() -> None:

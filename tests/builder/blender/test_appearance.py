@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import sys
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,18 @@ from dataset_builder.config.trajectories import look_at_with_rig
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.raycast import RayCaster
-from dataset_builder.scene.variants import LIGHT_SLOT, PROPS_SLOT, STEEL_SLOT, VARIANTS, check_variants
+from dataset_builder.scene.variants import (
+    LIGHT_SLOT,
+    PROPS_SLOT,
+    SENSOR_SLOT,
+    SHADOWS,
+    STEEL_SLOT,
+    VARIANTS,
+    check_variants,
+)
+from dataset_builder.scene.variants.image_light import IMAGE_LIGHTS
 from dataset_builder.scene.variants.props import PROP_BUILDERS, make_props
+from dataset_builder.scene.variants.sensor import recorded
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K, look_at
@@ -45,12 +56,15 @@ SITE_CAMERA = Camera(
 )
 CASES_WITH_CYCLES_DEPTH = (*(f"laboratory/{name}" for name in PROP_BUILDERS), "outdoors/None", "outdoors/shadows")
 LIGHT_VARIANTS = [None, *(name for name, variant in VARIANTS.items() if variant.slot == LIGHT_SLOT)]
+WITHOUT_SURFACES = [name for name in VARIANTS if name not in PROP_BUILDERS]
+"""Variants that change colour only."""
 
 
 def probe(folder: Path) -> None:
     """Render every variant at low resolution and cast its ground truth (runs in the Blender process)."""
+    from dataset_builder.blender.colour import configure_colour, render_colour
     from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
-    from dataset_builder.blender.render import configure_colour, render_colour, render_depth
+    from dataset_builder.blender.render import render_depth
     from dataset_builder.blender.scene import build_scene
 
     arrays: dict[str, ndarray] = {}
@@ -58,14 +72,22 @@ def probe(folder: Path) -> None:
 
     def render_and_cast(key: str, assembly: Assembly, spec: SceneSpec, cameras: dict[int, Camera]) -> None:
         build_scene(assembly, spec)
-        configure_colour(ColourSpec(samples=2), threads=1)
-        caster = RayCaster(evaluated_world_mesh())
-        for azimuth, camera in cameras.items():
-            ground_truth = caster.cast(camera)
+        configure_colour(threads=1)
+        mesh = evaluated_world_mesh()
+        arrays[f"{key}/mesh"] = np.frombuffer(
+            sha256(
+                b"".join(array.tobytes() for array in (mesh.vertices_m, mesh.faces, mesh.face_bar_id))
+            ).digest(),
+            dtype=np.uint8,
+        )
+        caster = RayCaster(mesh)
+        truths = {azimuth: caster.cast(camera) for azimuth, camera in cameras.items()}
+        for azimuth, ground_truth in truths.items():
             arrays[f"{key}/bars/{azimuth}"] = ground_truth.bars
             arrays[f"{key}/depth/{azimuth}"] = ground_truth.depth_m
-        first_camera = next(iter(cameras.values()))
-        arrays[f"{key}/colour"] = render_colour(first_camera, seed=1, scratch_dir=folder)
+        first_camera, mask = next(iter(cameras.values())), next(iter(truths.values())).mask
+        rgb = render_colour(first_camera, mask, ColourSpec(2, 2), seed=1, scratch_dir=folder)
+        arrays[f"{key}/colour"] = recorded(rgb, spec, seed=1)
         if key in CASES_WITH_CYCLES_DEPTH:
             arrays[f"{key}/cycles"] = render_depth(first_camera, scratch_dir=folder)
 
@@ -89,10 +111,10 @@ def probe(folder: Path) -> None:
 
 
 def test_variants_have_description_and_slot() -> None:
-    assert {variant.slot for variant in VARIANTS.values()} == {LIGHT_SLOT, STEEL_SLOT, PROPS_SLOT}
+    assert {variant.slot for variant in VARIANTS.values()} == {LIGHT_SLOT, STEEL_SLOT, PROPS_SLOT, SENSOR_SLOT}
     assert all(name == variant.name and len(variant.description) > 20 for name, variant in VARIANTS.items())
     assert {name for name, variant in VARIANTS.items() if variant.slot == PROPS_SLOT} == set(PROP_BUILDERS) - {
-        "shadows"
+        SHADOWS
     }
 
 
@@ -101,6 +123,7 @@ def test_variants_have_description_and_slot() -> None:
     [
         (("fog",), [("unknown", "'fog'", "no such variant")]),
         (("dusk", "shadows"), [("conflict", "", "dusk, shadows all set the light")]),
+        (("city", "sensor", "night", "dusk"), [("conflict", "", "city, night, dusk all set the light")]),
         (("rusted", "clutter", "wet"), [("conflict", "", "rusted, wet all set the steel")]),
         (("clutter", "clutter"), [("duplicate", "'clutter'", "given 2 times")]),
         (("Dusk", ""), [("unknown", "'Dusk'", "no such variant"), ("unknown", "''", "no such variant")]),
@@ -117,6 +140,7 @@ def test_invalid_variant_names_are_rejected(names: tuple[str, ...], problems: li
 def test_compatible_variant_names_are_accepted() -> None:
     check_variants(())
     check_variants(("dusk", "rusted", "clutter", "formwork", "spacers", "tie-wire"))
+    check_variants(("sunset", "wet", "clutter", "sensor"))
 
 
 @pytest.fixture(scope="module")
@@ -138,11 +162,20 @@ def test_each_variant_changes_the_image(arrays: dict[str, ndarray], name: str) -
     assert mean_change(arrays, f"laboratory/{name}", "laboratory/None") > (0.1 if name == "tie-wire" else 0.3)
 
 
-@pytest.mark.parametrize("name", [name for name, variant in VARIANTS.items() if variant.slot != PROPS_SLOT])
-def test_light_and_steel_variants_keep_bar_ids(arrays: dict[str, ndarray], name: str) -> None:
+@pytest.mark.parametrize("name", WITHOUT_SURFACES)
+def test_light_steel_and_sensor_variants_keep_ground_truth(arrays: dict[str, ndarray], name: str) -> None:
+    places = ["laboratory", "outdoors"] if name in LIGHT_VARIANTS else ["laboratory"]
+    truth = [key for key in arrays if key.partition("/")[0] in places and "/None/" in key and "colour" not in key]
+    for key in truth:
+        if not key.endswith("/cycles"):
+            np.testing.assert_array_equal(arrays[key.replace("None", name)], arrays[key])
+    assert len(truth) >= 9
+
+
+def test_shadow_screen_keeps_bar_ids(arrays: dict[str, ndarray]) -> None:
     for azimuth in LATTICE_CAMERAS:
         np.testing.assert_array_equal(
-            arrays[f"laboratory/{name}/bars/{azimuth}"], arrays[f"laboratory/None/bars/{azimuth}"]
+            arrays[f"laboratory/{SHADOWS}/bars/{azimuth}"], arrays[f"laboratory/None/bars/{azimuth}"]
         )
 
 
@@ -193,6 +226,16 @@ def test_light_variants_differ_and_dark_ones_are_dark(arrays: dict[str, ndarray]
     for k, name in enumerate(LIGHT_VARIANTS):
         for other_name in LIGHT_VARIANTS[:k]:
             assert mean_change(arrays, f"{place}/{name}", f"{place}/{other_name}") > 3
+
+
+@pytest.mark.parametrize("place", ["laboratory", "outdoors"])
+@pytest.mark.parametrize("name", IMAGE_LIGHTS)
+def test_panoramas_expose_like_standard_light(arrays: dict[str, ndarray], place: str, name: str) -> None:
+    surface = arrays[f"{place}/None/depth/{30 if place == 'laboratory' else 0}"] > 0
+    rgb, standard = (arrays[f"{place}/{key}/colour"][surface] for key in (name, None))
+    assert abs(rgb.mean() - standard.mean()) < 40
+    assert (rgb.min(axis=1) >= 250).mean() < 0.02
+    assert (rgb.max(axis=1) <= 8).mean() < 0.02
 
 
 def test_variants_of_same_slot_are_rejected_before_build(folder: Path) -> None:

@@ -43,29 +43,35 @@ TANGENTIAL_CAMERA = Camera(
 TOP_CAMERA = rig_cameras(
     zed_rig(640, 360, "raw"), look_at(np.array([0.0, 0.0, 0.52]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
 )["left"]
+SPEC = ColourSpec(2, 4)
 DEPTH_CAMERAS = {"left": LEFT, "right": RIGHT, "tangential": TANGENTIAL_CAMERA, "pinhole": PINHOLE_CAMERA}
 
 
 def probe(folder: Path) -> None:
     """Render depth and colour with distorted and pinhole cameras in turn (runs in the Blender process)."""
+    from dataset_builder.blender.colour import configure_colour, render_colour
     from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
-    from dataset_builder.blender.render import configure_colour, render_colour, render_depth
+    from dataset_builder.blender.render import render_depth
     from dataset_builder.blender.scene import build_scene
 
     build_scene(lattice_assembly(SCENE.assembly), SCENE)  # type: ignore[arg-type]
-    configure_colour(ColourSpec(samples=2), threads=1)
+    configure_colour(threads=1)
     mesh = evaluated_world_mesh()
-    arrays: dict[str, ndarray] = {"pinhole_first": render_colour(PINHOLE_CAMERA, seed=1, scratch_dir=folder)}
-    arrays["raw"] = render_colour(LEFT, seed=1, scratch_dir=folder)
+    caster = RayCaster(mesh)
+
+    def picture(camera: Camera, spec: ColourSpec = SPEC) -> ndarray:
+        return render_colour(camera, caster.cast(camera).mask, spec, seed=1, scratch_dir=folder)
+
+    arrays: dict[str, ndarray] = {"pinhole_first": picture(PINHOLE_CAMERA)}
+    arrays["raw"] = picture(LEFT)
     for name, camera in DEPTH_CAMERAS.items():
         arrays[f"depth_{name}"] = render_depth(camera, scratch_dir=folder)
-    arrays["pinhole_again"] = render_colour(PINHOLE_CAMERA, seed=1, scratch_dir=folder)
-    arrays["raw_again"] = render_colour(LEFT, seed=1, scratch_dir=folder)
+    arrays["pinhole_again"] = picture(PINHOLE_CAMERA)
+    arrays["raw_again"] = picture(LEFT)
     build_scene(lattice_assembly(SCENE.assembly), SCENE)  # type: ignore[arg-type]
-    configure_colour(ColourSpec(samples=2), threads=2)
-    arrays["raw_two_threads"] = render_colour(LEFT, seed=1, scratch_dir=folder)
-    configure_colour(ColourSpec(samples=8), threads=2)
-    arrays["above"] = render_colour(TOP_CAMERA, seed=1, scratch_dir=folder)
+    configure_colour(threads=2)
+    arrays["raw_two_threads"] = picture(LEFT)
+    arrays["above"] = picture(TOP_CAMERA, ColourSpec(8, 8))
     np.savez(folder / "arrays.npz", **arrays)
     np.savez(folder / "mesh.npz", vertices_m=mesh.vertices_m, faces=mesh.faces, face_bar_id=mesh.face_bar_id)
     left_over = sorted(path.name for path in folder.iterdir())

@@ -16,6 +16,7 @@ from PIL import Image
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
+from dataset_builder.config.quality import colour_spec
 from dataset_builder.config.specs import ColourSpec, DomeSpec, RigSpec, RingSpec
 from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.contact_sheet import STRIP_PANEL_PX, TILE_PX
@@ -139,11 +140,14 @@ def test_user_scene_and_variant_are_added_to_dataset(tiny_root: Path, tmp_path: 
     for arguments in (
         ("--scene", "examples/beam.toml"),
         ("--config", "lattice", "--variant", "wet", "formwork"),
+        ("--config", "lattice", "--variant", "sensor", "sunset"),
     ):
         process = run_build("--out", root, *arguments, "--views", "1", *TINY)
         assert process.returncode == 0, process.stderr
-    entries = json.loads((root / "manifest.json").read_text())["configs"]
-    assert list(entries) == ["lattice", "lattice-orbit", "beam", "lattice-wet-formwork"]
+    manifest = json.loads((root / "manifest.json").read_text())
+    entries, digests = manifest["configs"], manifest["files"]
+    variants = ["lattice-sunset-sensor", "lattice-wet-formwork"]
+    assert list(entries) == ["lattice", "lattice-orbit", "beam", *variants]
     assert entries["lattice"] == json.loads(standard_manifest)["configs"]["lattice"]
     assert entries["lattice-wet-formwork"]["scene"]["appearance"]["variants"] == ["wet", "formwork"]
     assert rdb.load(root, "beam")[0]["left_mask"].any()
@@ -152,6 +156,16 @@ def test_user_scene_and_variant_are_added_to_dataset(tiny_root: Path, tmp_path: 
     (plain,) = (row for row in rdb.load(root, "lattice") if row["view_id"] == f"lattice/{index}")
     assert np.array_equal(plain["left_cam_from_world"], other["left_cam_from_world"])
     assert not np.array_equal(plain["left_rgb"], other["left_rgb"])
+    standard, captured = entries["lattice"], entries["lattice-sunset-sensor"]
+    appearance = captured["scene"]["appearance"]
+    assert (appearance["image_light"]["image"], appearance["sensor"]["jpeg_quality"]) == ("sunset", 80)
+    assert digests[captured["mesh"]] == digests[standard["mesh"]]
+    card = (root / "README.md").read_text()
+    assert "The light of `lattice-sunset-sensor` is the panorama sunset" in card
+    assert card.count("panorama") == 1
+    (record,) = captured["views"]
+    (plain_record,) = (item for item in standard["views"] if item["view_id"] == f"lattice/{index}")
+    assert record == {**plain_record, "view_id": record["view_id"]}, "ground truth does not depend on colour"
     assert audit(root, depth_views=0).failures == ()
 
 
@@ -200,6 +214,6 @@ def test_shadow_screen_among_cameras_is_rejected() -> None:
 
 
 def test_size_and_samples_reach_every_rig() -> None:
-    for spec in BuildRequest(width=320, height=180, samples=3).config_specs():
-        assert (spec.rig.width, spec.rig.height, spec.colour) == (320, 180, ColourSpec(samples=3))
+    for spec in BuildRequest(width=320, height=180, colour=colour_spec(samples=3)).config_specs():
+        assert (spec.rig.width, spec.rig.height, spec.colour) == (320, 180, ColourSpec(3, 3))
         assert (spec.rig.calibration is None) == (spec.rig.baseline_m == RigSpec.baseline_m)

@@ -16,6 +16,7 @@ import pytest
 
 import rebar_depth_bench as rdb
 from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.config.specs import ColourSpec
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.data.bars import read_bars
@@ -202,7 +203,8 @@ def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
     assert scene["assembly"]["diameters_m"] == [0.007, 0.004]
     assert manifest["configs"]["lattice"]["generator"]["bpy"].startswith("4.5")
     assert (
-        "| `lattice` | lattice | 9 of 504 | 160 x 90 | 1 | 0.22-0.43 m |" in (tiny_root / "README.md").read_text()
+        "| `lattice` | lattice | 9 of 504 | 160 x 90 | 2, 8 around steel | 0.22-0.43 m |"
+        in (tiny_root / "README.md").read_text()
     )
 
 
@@ -212,8 +214,14 @@ def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
         (("--config", "latice"), "--config: got 'latice', expected one of lattice"),
         (("--views", "0"), "--views: got 0, expected 1 to"),
         (("--width", "2", "--samples", "0"), "--width: got 2, expected 16 to 8192\n  - --samples: got 0"),
+        (("--quality", "high", "--samples", "4"), "--samples: not allowed with argument --quality"),
+        (("--sampling", "best"), "invalid choice: 'best' (choose from 'steel-first', 'uniform')"),
         (("--workers", "0"), "--workers is 0, expected 1 or more"),
         (("--no-colour", "--samples", "4"), "--no-colour is combined with --samples 4, expected only one"),
+        (
+            ("--no-colour", "--quality", "high", "--sampling", "uniform"),
+            "--no-colour is combined with --sampling uniform, --quality high, expected only one",
+        ),
         (("--mesh", "nothing.stl"), "nothing.stl"),
         (("--mesh", __file__), "unsupported mesh file type '.py', expected"),
     ],
@@ -267,7 +275,7 @@ def test_folder_without_benchmark_tasks_loads_and_gets_them(tiny_root: Path, tmp
     (root / "manifest.json").write_text(json.dumps(manifest))
     (root / "eval.yaml").unlink()
     assert len(rdb.load(root, "lattice-orbit")) == 2
-    build(BuildRequest(("lattice-orbit",), 2, 160, 90, samples=1), root)
+    build(BuildRequest(("lattice-orbit",), 2, 160, 90, colour=ColourSpec(1, 1)), root)
     assert contents(root) == before
 
 

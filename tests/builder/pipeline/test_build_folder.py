@@ -15,6 +15,7 @@ import pytest
 
 from dataset_builder.cli import main
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
+from dataset_builder.config.specs import ColourSpec
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.contact_sheet import write_contact_sheet
 from dataset_builder.pipeline.folder import check_folder
@@ -27,7 +28,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
 from tests.commands import run_in_process
 
-REQUEST = BuildRequest(configs=("pile",), views=1, width=16, height=16, samples=1)
+REQUEST = BuildRequest(configs=("pile",), views=1, width=16, height=16, colour=ColourSpec(1, 1))
 OWN_LOOKING = ("mine.ply", "mine.webp", "test-00000-of-00001-0123456789ab.parquet", ".a.ply.abcd_123.tmp", "0.log")
 STAGING = ".rebar-build/{key}"
 

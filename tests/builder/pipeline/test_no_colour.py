@@ -216,5 +216,5 @@ def test_colour_of_manifest_is_checked(tiny_root: Path, tmp_path: Path) -> None:
 
 
 def test_request_without_colour_has_no_parameters_of_it() -> None:
-    [spec] = BuildRequest(("pier",), colour=False).config_specs()
+    [spec] = BuildRequest(("pier",), colour=None).config_specs()
     assert spec.colour is None
