@@ -137,7 +137,7 @@ def _method_row(method: AnyMethod) -> dict[str, str]:
     info = method.info
     name = f"`{info.name}`{' †' if info.uses_ground_truth else ''}"
     what = f"{info.summary} ({info.untested_note})" if info.untested_note else info.summary
-    needs = "all views of a config" if isinstance(method, MultiViewMethod) else ", ".join(info.columns)
+    needs = "a whole config" if isinstance(method, MultiViewMethod) else ", ".join(info.columns)
     return {"name": name, "what": what, "needs": needs, "licence": info.licence}
 
 

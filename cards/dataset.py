@@ -135,7 +135,8 @@ def _config_row(config: DatasetConfig) -> dict[str, Any]:
     return {
         "name": config.name,
         "views": f"{len(views)} of {entry['protocol_views']}",
-        "samples": _samples(entry["colour"]),
+        "samples": "no colour" if config.colour is None else _samples(config.colour),
+        "has_colour": config.colour is not None,
         "steel_source": _steel_source(entry["scene"]["assembly"]),
         "grid": f"{rig.width} x {rig.height}",
         "distance": _distance(entry["protocol"]),

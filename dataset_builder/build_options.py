@@ -51,8 +51,12 @@ def add_build_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--device",
         choices=(CPU, *GPU_TYPES, "auto"),
-        default=CPU,
-        help="type of device that renders colour; auto: the best one of this machine (default: %(default)s)",
+        help=f"type of device that renders colour; auto: the best one of this machine (default: {CPU})",
+    )
+    parser.add_argument(
+        "--no-colour",
+        action="store_true",
+        help="build depth, masks, ids and poses only; the columns left_rgb and right_rgb are null in every row",
     )
     parser.add_argument(
         "--dry-run",

@@ -15,17 +15,21 @@ from typing import TYPE_CHECKING
 from dataset_builder.build_options import add_build_arguments, add_scene_arguments
 from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, BuildRequest
 from dataset_builder.config.quality import colour_spec
+from dataset_builder.config.specs import CPU
 from rebar_depth_bench.console import ProgressBars, Rate, replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.version import software_version
 
 if TYPE_CHECKING:
+    from dataset_builder.config.specs import ColourSpec
     from dataset_builder.pipeline.build import BuildSummary
     from dataset_builder.pipeline.local_renderer import Renderer
 
 _EXTRA_MODULES = ("bpy", "cv2", "embreex", "trimesh")
 
 
+COLOUR_OPTIONS = ("sampling", "quality", "samples", "device")
+"""Options that only colour has; each is None if it is not given."""
 RENAMED_OPTIONS = {"--to": "--out"}
 """Old option strings that are still accepted, and their new names."""
 
@@ -70,8 +74,9 @@ def _build(options: argparse.Namespace) -> None:
     workers = 1 if options.workers is None else options.workers
     if workers < 1:
         raise InputError(f"--workers is {workers}, expected 1 or more")
-    with _cluster_context(options.cluster, options.device) as cluster:
-        devices = Devices(options.device) if cluster else find_devices(options.device)
+    device = options.device or CPU
+    with _cluster_context(options.cluster, device) as cluster:
+        devices = Devices(device) if cluster else find_devices(device)
         request = _build_request(options, devices.type)
         threads = max(1, (os.cpu_count() or 1) // (workers * devices.count))
         if options.dry_run:
@@ -120,12 +125,28 @@ def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
         views=options.views,
         width=options.width,
         height=options.height,
-        colour=replace(colour_spec(options.sampling, options.quality, options.samples), device=device),
+        colour=_colour_spec(options, device),
         seed=options.seed,
         mesh=mesh_file_spec(options.mesh, options.mesh_unit) if options.mesh else None,
         variants=tuple(options.variant or ()),
         scenes=tuple(scene_config(path) for path in options.scene or ()),
     )
+
+
+def _colour_spec(options: argparse.Namespace, device: str) -> ColourSpec | None:
+    """Return the colour settings of the options, or None for ``--no-colour``.
+
+    Raises ``InputError`` if ``--no-colour`` is combined with options of colour.
+    """
+    if not options.no_colour:
+        return replace(colour_spec(options.sampling, options.quality, options.samples), device=device)
+    given = [f"--{name} {value}" for name in COLOUR_OPTIONS if (value := getattr(options, name)) is not None]
+    if given:
+        raise InputError(
+            f"--no-colour is combined with {', '.join(given)}, expected only one of them: without colour, "
+            "nothing is sampled"
+        )
+    return None
 
 
 @contextmanager

@@ -11,6 +11,7 @@ valid value::
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -67,6 +68,15 @@ def field_error(found: str, expected: str, code: ProblemCode = "invalid") -> Pyd
     """Return the error that a validator raises to report what it found and expected."""
     context = {"found": found, "expected": expected, "code": code}
     return PydanticCustomError(_EXPLAINED, "{found}, expected {expected}", context)
+
+
+def check_unique(names: Sequence[str], what: str) -> None:
+    """Raise the error of a field unless it has one or more names, each once."""
+    if not names:
+        raise field_error("got none", f"one {what} or more")
+    name, occurrences = Counter(names).most_common(1)[0]
+    if occurrences > 1:
+        raise field_error(f"{name} occurs more than once", f"each {what} once", "duplicate")
 
 
 def number(low: float, high: float = _MAX_MAGNITUDE, expected: str = "") -> Expected:

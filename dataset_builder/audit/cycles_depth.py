@@ -58,12 +58,12 @@ def cycles_difference_m(
 
 
 def cycles_verdict(config: str, difference_and_depth_m: ndarray[Any, Any], views: int) -> Check:
-    """Return the check of the depth differences of ``views`` views; it passes if no views were requested."""
+    """Return the check of the depth differences of ``views`` views, skipped if no views were requested."""
     name = f"{config}: depth compared with Cycles"
     if not views:
-        return Check(name, "skipped", "no views requested")
+        return Check.skip(name, "no views requested")
     if not len(difference_and_depth_m):
-        return Check(name, f"{views} views: no steel", "skipped")
+        return Check.skip(name, f"{views} views: no steel")
     difference_m, depth_m = difference_and_depth_m.T
     median_m, share = (
         float(np.median(difference_m)),

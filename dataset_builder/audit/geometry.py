@@ -122,7 +122,7 @@ def axis_verdict(config: AuditedConfig, ratios: Sequence[float]) -> Check:
     name, largest = f"{config.name}: steel distance from the bar axis", max(ratios, default=0.0)
     measured = f"at most {largest:.3f} radii"
     if not config.bars_with_known_axis:
-        return Check(name, "the bar axes are estimated", "skipped")
+        return Check.skip(name, "the bar axes are estimated")
     problem = f"a steel pixel is {largest:.3f} nominal radii away from its bar's axis"
     return Check(name, measured, f"{MAX_AXIS_RATIO} radii", (problem,) if largest > MAX_AXIS_RATIO else ())
 
@@ -174,10 +174,10 @@ def board_verdict(config: AuditedConfig, errors: Sequence[BoardError]) -> Check:
     """
     name = f"{config.name}: board at z = 0"
     if config.board is None:
-        return Check(name, "no board in this scene", "skipped")
+        return Check.skip(name, "no board in this scene")
     all_views = merged_board_errors(errors)
     if not all_views.pixels:
-        return Check(name, "no view sees the board", "skipped")
+        return Check.skip(name, "no view sees the board")
     bound = f"{MAX_BOARD_ERROR_M * 1e6:g} um"
     if not config.has_props:
         measured = f"at most {all_views.off_m * 1e6:.3f} um"

@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.audit.report import Check
+from dataset_builder.audit.report import NO_COLOUR, Check
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
 from rebar_depth_bench.geometry.aruco_board import MARKER_MODULES, BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.aruco_detection import Corners, detected_corners_px
@@ -58,6 +58,7 @@ class DetectedMarkers:
 
 def detect_markers(eye: AuditedEye, board: BoardSpec) -> DetectedMarkers:
     """Detect the board's markers that the eye sees completely, unobstructed and large enough."""
+    assert eye.rgb is not None
     layout = marker_corners_m(board)
     true_px = projected_corners_px(eye.camera, layout)
     visible_ids = [marker for marker in sorted(layout) if _is_unobstructed(eye, true_px[marker])]
@@ -197,11 +198,13 @@ def marker_verdict(config: AuditedConfig, views: Sequence[Sequence[DetectedMarke
     """Return the check of corners, detected share and poses of all views together."""
     name = f"{config.name}: ArUco markers"
     if config.board is None:
-        return Check(name, "no board in this scene", "skipped")
+        return Check.skip(name, "no board in this scene")
+    if not config.has_colour:
+        return Check.skip(name, NO_COLOUR)
     eyes = [eye for view in views for eye in view]
     expected, detected = sum(eye.expected for eye in eyes), sum(len(eye.detected_px) for eye in eyes)
     if not expected:
-        return Check(name, f"no unoccluded marker of {MIN_MARKER_WIDTH_PX:g} px or more", "skipped")
+        return Check.skip(name, f"no unoccluded marker of {MIN_MARKER_WIDTH_PX:g} px or more")
     min_share = 0.0 if config.light_may_hide_markers else MIN_DETECTED_SHARE
     missing = (
         ()

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
-from dataset_builder.audit.report import Check
+from dataset_builder.audit.report import NO_COLOUR, Check
 from dataset_builder.audit.stereo_consistency import project_into
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
 from rebar_depth_bench.geometry.cameras import camera_centre
@@ -126,9 +126,11 @@ def best_shift_px(cost: Float64[ndarray, " n"]) -> float:
 def photometric_verdict(config: AuditedConfig, fits: Sequence[PhotometricFit]) -> Check:
     """Return the check of the best shift of all views together, and of each view alone."""
     name = f"{config.name}: right image warped to the left by depth"
+    if not config.has_colour:
+        return Check.skip(name, NO_COLOUR)
     pixels = sum(fit.pixels for fit in fits)
     if pixels < _MIN_PIXELS:
-        return Check(name, f"only {pixels} textured pixels visible to both eyes", "skipped")
+        return Check.skip(name, f"only {pixels} textured pixels visible to both eyes")
     u_px, v_px = (best_shift_px(row) for row in np.sum([fit.cost for fit in fits], axis=0))
     judged = [fit for fit in fits if fit.pixels >= _MIN_VIEW_PIXELS]
     worst_px = max((abs(best_shift_px(row)) for fit in judged for row in fit.cost), default=0.0)
@@ -156,6 +158,7 @@ def photometric_verdict(config: AuditedConfig, fits: Sequence[PhotometricFit]) -
 
 
 def _smoothed_grey(eye: AuditedEye) -> Float32[ndarray, "h w"]:
+    assert eye.rgb is not None
     grey = cv2.cvtColor(eye.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     return np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX))
 

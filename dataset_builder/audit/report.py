@@ -9,20 +9,37 @@ from rich.table import Table
 
 from rebar_depth_bench.errors import problem_summary
 
+NO_COLOUR = "built without colour"
+"""Reason for which checks of colour are skipped."""
+
 
 @dataclass(frozen=True)
 class Check:
-    """Result of one check: its name, the measured value and its bound as text, and the problems found."""
+    """Result of one check: its name, the measured value and its bound as text, and the problems found.
+
+    A check is ``skipped`` if the config has nothing to measure; ``measured`` is then the reason.
+    """
 
     name: str
     measured: str
     bound: str
     problems: tuple[str, ...] = ()
+    skipped: bool = False
+
+    @classmethod
+    def skip(cls, name: str, reason: str) -> Check:
+        """Return the result of a check that is skipped for a reason."""
+        return cls(name, reason, "", skipped=True)
 
     @property
     def passed(self) -> bool:
-        """Whether the check has no problems."""
-        return not self.problems
+        """Whether the check was made and has no problems."""
+        return not self.problems and not self.skipped
+
+    @property
+    def verdict(self) -> str:
+        """Verdict in one word: ``ok``, ``skipped`` or ``FAILED``."""
+        return "skipped" if self.skipped else "ok" if self.passed else "FAILED"
 
 
 @dataclass(frozen=True)
@@ -34,8 +51,13 @@ class AuditReport:
 
     @property
     def failures(self) -> tuple[Check, ...]:
-        """Checks that did not pass."""
-        return tuple(check for check in self.checks if not check.passed)
+        """Checks that did not pass; those that are skipped are no failures."""
+        return tuple(check for check in self.checks if check.problems)
+
+    @property
+    def skipped(self) -> tuple[Check, ...]:
+        """Checks that were skipped."""
+        return tuple(check for check in self.checks if check.skipped)
 
 
 def print_audit(report: AuditReport, console: Console | None = None) -> None:
@@ -48,7 +70,7 @@ def print_audit(report: AuditReport, console: Console | None = None) -> None:
     for heading in ("check", "found", "bound", ""):
         table.add_column(heading, overflow="fold")
     for check in report.checks:
-        table.add_row(check.name, check.measured, check.bound, "ok" if check.passed else "FAILED")
+        table.add_row(check.name, check.measured, check.bound, check.verdict)
     console.print(table)
     for check in report.failures:
         console.print(f"{check.name}: {problem_summary(check.problems)}", markup=False, highlight=False)

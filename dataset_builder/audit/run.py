@@ -38,12 +38,14 @@ from rebar_depth_bench.progress import Progress, silent
 class ViewCheck:
     """Check over the views of a config: ``measure`` is applied to each view, ``verdict`` to all measurements.
 
-    ``views`` evenly spaced views of a config are measured, all of them if it is None.
+    ``views`` evenly spaced views of a config are measured, all of them if it is None; of a config without colour,
+    none for a check that ``needs_colour``.
     """
 
     measure: Callable[[AuditedConfig, AuditedView], Any]
     verdict: Callable[[AuditedConfig, Sequence[Any]], Check]
     views: int | None = None
+    needs_colour: bool = False
 
 
 VIEW_CHECKS: tuple[ViewCheck, ...] = (
@@ -52,8 +54,8 @@ VIEW_CHECKS: tuple[ViewCheck, ...] = (
     ViewCheck(epipolar_counts, epipolar_verdict),
     # The camera check compares K and distortion of every view, so a few views suffice for the lens model.
     ViewCheck(view_projection_error_px, projection_verdict, views=12),
-    ViewCheck(photometric_fit, photometric_verdict),
-    ViewCheck(detect_view_markers, marker_verdict),
+    ViewCheck(photometric_fit, photometric_verdict, needs_colour=True),
+    ViewCheck(detect_view_markers, marker_verdict, needs_colour=True),
 )
 """Checks of every view, in the order of the report."""
 
@@ -84,7 +86,8 @@ def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent
 def _config_checks(config: DatasetConfig, root: Path, depth_views: int, progress: Progress) -> Iterator[Check]:
     name, mesh = config.name, root / config.mesh
     steel = read_bars(root / BARS_FILE)[config.scene.name]
-    audited = AuditedConfig(name, config.scene.appearance.variants, steel, config.scene.board)
+    variants, board = config.scene.appearance.variants, config.scene.board
+    audited = AuditedConfig(name, variants, steel, board, config.colour is not None)
     aim_m, aim_problems = checked_aim_point_m(config, mesh)
     expected = expected_views(config, aim_m, steel)
     accumulator = _AuditAccumulator(config, audited, expected, depth_views)
@@ -112,7 +115,10 @@ class _AuditAccumulator:
         self._config, self._audited, self._expected = config, audited, expected
         self._bar_ids = {bar.bar_id for bar in audited.steel}
         self._rays = RayCache()
-        self._measured = [set(subset(len(config.views), check.views)) for check in VIEW_CHECKS]
+        self._measured = [
+            set() if check.needs_colour and config.colour is None else set(subset(len(config.views), check.views))
+            for check in VIEW_CHECKS
+        ]
         self._cycles_indices = set(subset(len(config.views), depth_views) if depth_views else ())
         self._problems: list[str] = []
         self.rows = 0

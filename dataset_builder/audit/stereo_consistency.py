@@ -108,7 +108,7 @@ def epipolar_verdict(config: AuditedConfig, views: Sequence[EpipolarCounts]) -> 
     )
     inside = seen + hidden + contradicted
     if not inside:
-        return Check(name, "no bar is two pixels wide or more", "skipped")
+        return Check.skip(name, "no bar is two pixels wide or more")
     share = contradicted / inside
     problem = f"{contradicted} of {inside} steel pixels should be visible to the right eye but are not"
     return Check(

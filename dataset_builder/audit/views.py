@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import ESTIMATED_ROLE
@@ -29,6 +29,7 @@ class AuditedConfig:
     variants: tuple[str, ...]
     steel: tuple[Bar, ...]
     board: BoardSpec | None
+    has_colour: bool = True
 
     @property
     def bars_with_known_axis(self) -> tuple[Bar, ...]:
@@ -53,12 +54,12 @@ class AuditedConfig:
 
 @dataclass(frozen=True, eq=False)
 class AuditedEye(EyeView):
-    """Eye of a view under audit: it has colour, pixel rays and the points that these determine.
+    """Eye of a view under audit: it has pixel rays and the points that these determine.
 
     ``rays_cam`` are the pixel rays in the camera frame with z = 1, so that planar depth scales them to points.
+    ``rgb`` is None in a config without colour.
     """
 
-    rgb: UInt8[ndarray, "h w 3"]
     rays_cam: Float64[ndarray, "h w 3"]
 
     @cached_property

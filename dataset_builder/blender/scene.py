@@ -58,16 +58,17 @@ SHAPE_TOLERANCE_M = 1e-9
 """Largest difference of coordinates between parts that share mesh data."""
 
 
-def build_scene(assembly: Assembly, spec: SceneSpec) -> None:
+def build_scene(assembly: Assembly, spec: SceneSpec, *, colour: bool = True) -> None:
     """Replace Blender's open file with the scene: one object per steel part, environment, props, board and lights.
 
+    Without ``colour``, the scene has the same meshes but neither materials nor lights.
     Raises ``InputError`` if the appearance variants do not pass ``check_variants``.
     """
     variants = spec.appearance.variants
     check_variants(variants)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     for part, mesh, origin_m in _with_shared_meshes(
-        _with_material(assembly.parts, exclusive_variant(variants, STEEL_SLOT))
+        _with_material(assembly.parts, exclusive_variant(variants, STEEL_SLOT)), colour
     ):
         steel = add_object(part, mesh, origin_m)
         for name, value in surface_variation(spec.seed, part.bar_id).items():
@@ -77,17 +78,17 @@ def build_scene(assembly: Assembly, spec: SceneSpec) -> None:
     offset_z_m = 0.0 if spec.board is None else min(0.0, BENCH_TOP_M - environment.floor_m)
     panorama = image_light(spec)
     for part in environment.parts():
-        mesh = mesh_data(part.name, part.mesh, part.material)
+        mesh = _part_data(part, part.mesh, colour)
         added = add_object(part, mesh, np.array([0.0, 0.0, offset_z_m]))
         if panorama is not None and part.name.partition("-")[0] in environment.enclosure:
             let_light_through(added)
     for part in make_props(assembly, spec):
-        add_object(part, mesh_data(part.name, part.mesh, part.material), np.zeros(3))
+        add_object(part, _part_data(part, part.mesh, colour), np.zeros(3))
     if spec.board is not None:
-        _add_board(spec.board)
-    if panorama is not None:
+        _add_board(spec.board, colour)
+    if colour and panorama is not None:
         add_panorama(panorama)
-    else:
+    elif colour:
         add_light(environment.light[exclusive_variant(variants, LIGHT_SLOT)])
     bpy.context.view_layer.update()
 
@@ -100,7 +101,7 @@ def _with_material(parts: tuple[Part, ...], look: str | None) -> tuple[Part, ...
 
 
 def _with_shared_meshes(
-    parts: tuple[Part, ...],
+    parts: tuple[Part, ...], colour: bool
 ) -> Iterator[tuple[Part, bpy.types.Mesh, Float64[ndarray, " 3"]]]:
     """Yield each part with its mesh data and origin; parts that differ only by a translation share mesh data."""
     shapes: list[tuple[Mesh, str, bpy.types.Mesh]] = []
@@ -111,7 +112,7 @@ def _with_shared_meshes(
             (data for mesh, name, data in shapes if name == part.material and _same_shape(mesh, local)), None
         )
         if data is None:
-            data = mesh_data(part.name, local, part.material)
+            data = _part_data(part, local, colour)
             shapes.append((local, part.material, data))
         yield part, data, origin_m
 
@@ -134,8 +135,16 @@ def add_object(part: Part, data: bpy.types.Mesh, origin_m: Float64[ndarray, " 3"
     return added
 
 
-def mesh_data(name: str, mesh: Mesh, material_name: str) -> bpy.types.Mesh:
-    """Return Blender mesh data with the triangles of ``mesh``, shaded smooth below ``SHARP_EDGE_DEG``."""
+def _part_data(part: Part, mesh: Mesh, colour: bool) -> bpy.types.Mesh:
+    """Return Blender mesh data with the triangles of ``mesh``, with the part's material if ``colour`` is True."""
+    return mesh_data(part.name, mesh, part.material if colour else None)
+
+
+def mesh_data(name: str, mesh: Mesh, material_name: str | None) -> bpy.types.Mesh:
+    """Return Blender mesh data with the triangles of ``mesh``, shaded smooth below ``SHARP_EDGE_DEG``.
+
+    It has no material if ``material_name`` is None.
+    """
     data = bpy.data.meshes.new(name)
     data.vertices.add(len(mesh.vertices_m))
     data.vertices.foreach_set("co", mesh.vertices_m.astype(np.float32).ravel())
@@ -146,15 +155,23 @@ def mesh_data(name: str, mesh: Mesh, material_name: str) -> bpy.types.Mesh:
     data.update(calc_edges=True)
     data.shade_smooth()
     data.set_sharp_from_angle(angle=float(np.deg2rad(SHARP_EDGE_DEG)))
-    data.materials.append(material(material_name))
+    if material_name is not None:
+        data.materials.append(material(material_name))
     return data
 
 
-def _add_board(spec: BoardSpec) -> None:
-    """Add the sheet with its printed top at z = 0; its other faces are plain paper."""
+def _add_board(spec: BoardSpec, colour: bool) -> None:
+    """Add the sheet with its top at z = 0; with ``colour``, the top is printed and the other faces are plain."""
     half_x, half_y = spec.width_m / 2, spec.height_m / 2
     sheet = box((-half_x, -half_y, -SHEET_THICKNESS_M), (half_x, half_y, 0.0))
-    data = mesh_data("board", sheet, "sheet edge")
+    data = mesh_data("board", sheet, "sheet edge" if colour else None)
+    if colour:
+        _print_board(data, sheet, spec)
+    add_object(surface("board", sheet, "paper"), data, np.zeros(3))
+
+
+def _print_board(data: bpy.types.Mesh, sheet: Mesh, spec: BoardSpec) -> None:
+    """Print the board's texture on the faces of its mesh data at z = 0."""
     data.materials.append(paper(board_texture(spec, BOARD_PX_PER_M)))
     on_top = (sheet.vertices_m[sheet.faces][:, :, 2] == 0.0).all(axis=1)
     data.polygons.foreach_set("material_index", on_top.astype(np.int32))
@@ -162,4 +179,3 @@ def _add_board(spec: BoardSpec) -> None:
     uv = sheet.vertices_m[:, :2] / np.array([spec.width_m, spec.height_m]) + 0.5
     layer = data.uv_layers.new(name="print")
     layer.data.foreach_set("uv", uv[sheet.faces.ravel()].astype(np.float32).ravel())
-    add_object(surface("board", sheet, "paper"), data, np.zeros(3))

@@ -75,9 +75,10 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
     config = unit.config
     with watch.timing("scene"):
         assembly = make_assembly(config.scene.assembly)
-        build_scene(assembly, config.scene)
-        configure_colour(task.threads)
-        select_device(config.colour.device, task.device_index)
+        build_scene(assembly, config.scene, colour=config.colour is not None)
+        if config.colour is not None:
+            configure_colour(task.threads)
+            select_device(config.colour.device, task.device_index)
         mesh = evaluated_world_mesh()
         _stage_mesh(mesh, staging.mesh, unit.mesh_sha256)
         caster = RayCaster(mesh)
@@ -116,16 +117,17 @@ class _RenderContext:
 def _render_view(
     context: _RenderContext, index: int, left_cam_from_world: Float64[ndarray, "4 4"], watch: Stopwatch
 ) -> View:
-    """Render colour and ray cast ground truth of both eyes of one view."""
+    """Render colour, if the config has it, and ray cast ground truth of both eyes of one view."""
     config = context.config
-    eyes = {}
+    eyes, rgb = {}, None
     for eye_index, (eye, camera) in enumerate(rig_cameras(config.rig, left_cam_from_world).items()):
         with watch.timing("truth"):
             truth = context.caster.cast(camera, context.rays_cam[eye])
-        with watch.timing("colour"):
-            seed = _cycles_seed(config, index, eye_index)
-            rgb = render_colour(camera, truth.mask, config.colour, seed, context.scratch)
-            rgb = recorded(rgb, config.scene, seed)
+        if config.colour is not None:
+            with watch.timing("colour"):
+                seed = _cycles_seed(config, index, eye_index)
+                rgb = render_colour(camera, truth.mask, config.colour, seed, context.scratch)
+                rgb = recorded(rgb, config.scene, seed)
         eyes[eye] = replace(truth, rgb=rgb)
     return View(view_id(config.name, index), config.scene.name, eyes["left"], eyes["right"], config.rig.baseline_m)
 

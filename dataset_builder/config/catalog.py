@@ -121,15 +121,16 @@ class BuildRequest:
     """Request to ``rebar-build``: configs, number of views, image size (pixels) and colour quality.
 
     ``views`` is the number of views per config, spread evenly over the trajectory; None selects all views.
-    ``mesh`` replaces the rods of the lattice. ``variants`` are names of ``scene.variants.VARIANTS``; they are
-    appended to the names of configs and scenes. ``scenes`` are the configs of user scene files.
+    ``colour`` None builds no colour. ``mesh`` replaces the rods of the lattice. ``variants`` are names of
+    ``scene.variants.VARIANTS``; they are appended to the names of configs and scenes. ``scenes`` are the configs
+    of user scene files.
     """
 
     configs: tuple[str, ...] = tuple(CONFIGS)
     views: int | None = None
     width: int = RigSpec.width
     height: int = RigSpec.height
-    colour: ColourSpec = field(default_factory=ColourSpec)
+    colour: ColourSpec | None = field(default_factory=ColourSpec)
     seed: int = 0
     mesh: MeshFileSpec | None = None
     variants: tuple[str, ...] = ()
@@ -159,7 +160,7 @@ class BuildRequest:
             ("--views", self.views, 1, 1_000_000),
             ("--width", self.width, 16, 8192),
             ("--height", self.height, 16, 8192),
-            ("--samples", self.colour.steel_samples, 1, 65_536),
+            ("--samples", None if self.colour is None else self.colour.steel_samples, 1, 65_536),
             ("--seed", self.seed, 0, 2**31 - 1),
         )
         problems = [
@@ -171,6 +172,8 @@ class BuildRequest:
             raise InputError.from_problems("build request", problems)
 
     def _check_device(self, specs: Sequence[ConfigSpec]) -> None:
+        if self.colour is None:
+            return
         device = self.colour.device
         if device not in (CPU, *GPU_TYPES):
             problem = Problem("unknown", "--device", f"got {device!r}", ", ".join((CPU, *GPU_TYPES)))

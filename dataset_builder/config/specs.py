@@ -215,10 +215,10 @@ class ColourSpec:
 
 @dataclass(frozen=True)
 class ConfigSpec:
-    """Config of the dataset: a scene, a camera trajectory (``protocol``), a rig and colour settings."""
+    """Config of the dataset: a scene, a camera trajectory (``protocol``), a rig, and colour settings or None."""
 
     name: str
     scene: SceneSpec
     protocol: TrajectorySpec
     rig: RigSpec = field(default_factory=RigSpec)
-    colour: ColourSpec = field(default_factory=ColourSpec)
+    colour: ColourSpec | None = field(default_factory=ColourSpec)

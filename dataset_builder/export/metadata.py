@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from dataset_builder.export.images import EXPORT_FILES
+from dataset_builder.export.images import EXPORT_FILES, ExportFile
 from dataset_builder.export.nerfstudio import json_lines
 from dataset_builder.export.views import CameraView
 from rebar_depth_bench.data.dataset_config import DatasetConfig
@@ -32,6 +32,11 @@ _NOT_PARAMETERS = ("views", "shards", "ground_truth_digest", "key", "mesh", "byt
 """Keys of a config's manifest entry that are not scene parameters."""
 
 
+def exported_files(config: DatasetConfig) -> Mapping[str, ExportFile]:
+    """Return the files exported for each eye of a config, by key: without colour there is no image."""
+    return {name: file for name, file in EXPORT_FILES.items() if config.colour is not None or file.column != "rgb"}
+
+
 def cameras_json(folder: DatasetFolder, config: DatasetConfig, views: Sequence[CameraView]) -> str:
     """Return ``cameras.json``: conventions, origin of the data, and one entry per view and eye."""
     head = {
@@ -43,11 +48,11 @@ def cameras_json(folder: DatasetFolder, config: DatasetConfig, views: Sequence[C
         },
         "licence": LICENCE,
     }
-    cameras = [_camera(view, eye, camera) for view in views for eye, camera in view.cameras.items()]
+    cameras = [_camera(config, view, eye, camera) for view in views for eye, camera in view.cameras.items()]
     return json_lines(head, "cameras", cameras)
 
 
-def _camera(view: CameraView, eye: str, camera: Camera) -> dict[str, Any]:
+def _camera(config: DatasetConfig, view: CameraView, eye: str, camera: Camera) -> dict[str, Any]:
     """Return the entry of one eye of a view."""
     return {
         "view_id": view.view_id,
@@ -58,21 +63,31 @@ def _camera(view: CameraView, eye: str, camera: Camera) -> dict[str, Any]:
         "distortion": camera.distortion.tolist(),
         "cam_from_world": camera.cam_from_world.tolist(),
         "baseline_m": view.baseline_m,
-        **{name: export_file.path(view.stem(eye)) for name, export_file in EXPORT_FILES.items()},
+        **{name: export_file.path(view.stem(eye)) for name, export_file in exported_files(config).items()},
     }
 
 
-def readme_txt(folder: DatasetFolder, config: str, views: int) -> str:
+def readme_txt(folder: DatasetFolder, config: DatasetConfig, views: int) -> str:
     """Return ``README.txt``: the content, unit and frame of each file."""
     return _README.format(
-        config=config, views=views, digest=folder.digest, version=folder.version, licence=LICENCE
+        config=config.name,
+        views=views,
+        digest=folder.digest,
+        version=folder.version,
+        no_colour=_NO_COLOUR if config.colour is None else "",
+        licence=LICENCE,
     )
+
+
+_NO_COLOUR = """
+This config was built without colour: images/, sparse/ and transforms.json do not exist.
+"""
 
 
 _README = """\
 rebar-depth-bench, config {config}: {views} stereo views of steel reinforcement with exact depth
 dataset {digest}, version {version}
-
+{no_colour}
 Files, NNNN being the view's number in its full protocol, left and right the eye:
   images/NNNN_left.png    8-bit colour, lossless
   depth/NNNN_left.exr     OpenEXR, one float32 channel "Y": metres, exact, 0 where there is no surface

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from dataset_builder.config.trajectories import subset
 from dataset_builder.export.colmap import cameras_txt, images_txt, points_txt
-from dataset_builder.export.images import EXPORT_FILES
-from dataset_builder.export.metadata import cameras_json, readme_txt
+from dataset_builder.export.metadata import cameras_json, exported_files, readme_txt
 from dataset_builder.export.nerfstudio import transforms_json
 from dataset_builder.export.target import export_target
 from dataset_builder.export.views import CameraView, StoredView, stored_views
@@ -108,16 +107,19 @@ def _export_config(
         views.append(stored.view)
         progress(f"export of {config.name}", len(views), len(wanted))
     texts = {
-        "sparse/0/cameras.txt": cameras_txt(views),
-        "sparse/0/images.txt": images_txt(views),
-        "sparse/0/points3D.txt": points_txt(bars.get(config.scene.name, ())),
-        "transforms.json": transforms_json(views),
         "cameras.json": cameras_json(folder, config, views),
-        "README.txt": readme_txt(folder, config.name, len(views)),
+        "README.txt": readme_txt(folder, config, len(views)),
     }
+    if config.colour is not None:  # COLMAP's and nerfstudio's files describe colour images.
+        texts |= {
+            "sparse/0/cameras.txt": cameras_txt(views),
+            "sparse/0/images.txt": images_txt(views),
+            "sparse/0/points3D.txt": points_txt(bars.get(config.scene.name, ())),
+            "transforms.json": transforms_json(views),
+        }
     for name, text in texts.items():
         write_text(into / name, text)
-    file_count = sum(len(view.cameras) for view in views) * len(EXPORT_FILES)
+    file_count = sum(len(view.cameras) for view in views) * len(exported_files(config))
     return ConfigExport(config.name, len(views), written, file_count - written)
 
 
@@ -126,7 +128,7 @@ def _write_missing(stored: StoredView, into: Path) -> int:
     targets = [
         (into / export_file.path(stored.view.stem(eye)), f"{eye}_{export_file.column}", export_file.encode)
         for eye in stored.view.cameras
-        for export_file in EXPORT_FILES.values()
+        for export_file in exported_files(stored.config).values()
     ]
     missing = [target for target in targets if not target[0].is_file()]
     decoded = stored.decode() if missing else {}

@@ -30,22 +30,26 @@ _SHOWN_COLUMNS = ("view_id", "left_rgb", "left_preview")
 def write_contact_sheet(config: DatasetConfig, target: Path) -> None:
     """Write a WebP of up to ``SHEET_VIEWS`` views spread evenly over a config: colour above the depth preview.
 
+    A config without colour has the depth preview only.
     Raises ``DatasetError`` if a shard is damaged.
     """
     positions = subset(len(config.views), SHEET_VIEWS)
     width, height = TILE_PX
     lines = -(-len(positions) // COLUMNS)
-    sheet = Image.new("RGB", (width * min(COLUMNS, len(positions)), 2 * height * lines), _BACKGROUND)
+    shown = ("left_rgb", "left_preview") if config.colour is not None else ("left_preview",)
+    line_height = len(shown) * height
+    sheet = Image.new("RGB", (width * min(COLUMNS, len(positions)), line_height * lines), _BACKGROUND)
     for n, row in enumerate(_decoded_rows(config, positions)):
-        left, top = n % COLUMNS * width, n // COLUMNS * 2 * height
-        label = row["view_id"].partition("/")[2]
-        sheet.paste(_with_label(_letterboxed(row["left_rgb"], TILE_PX), label), (left, top))
-        sheet.paste(_letterboxed(row["left_preview"], TILE_PX), (left, top + height))
+        left, top = n % COLUMNS * width, n // COLUMNS * line_height
+        tiles = [_letterboxed(row[column], TILE_PX) for column in shown]
+        _draw_label(tiles[0], row["view_id"].partition("/")[2])
+        for position, tile in enumerate(tiles):
+            sheet.paste(tile, (left, top + position * height))
     _save_webp(sheet, target)
 
 
 def write_scenes_strip(configs: Sequence[DatasetConfig], target: Path) -> None:
-    """Write a WebP with one colour view per config: the view with the median steel pixels.
+    """Write a WebP with one view per config, in colour if it has any: the view with the median steel pixels.
 
     Raises ``DatasetError`` if a shard is damaged.
     """
@@ -53,7 +57,8 @@ def write_scenes_strip(configs: Sequence[DatasetConfig], target: Path) -> None:
     for n, config in enumerate(configs):
         by_steel = sorted(range(len(config.views)), key=lambda index: config.views[index].steel_px)
         [row] = _decoded_rows(config, [by_steel[len(by_steel) // 2]])
-        strip.paste(_letterboxed(row["left_rgb"], STRIP_PANEL_PX), (n * STRIP_PANEL_PX[0], 0))
+        picture = row["left_rgb" if config.colour is not None else "left_preview"]
+        strip.paste(_letterboxed(picture, STRIP_PANEL_PX), (n * STRIP_PANEL_PX[0], 0))
     _save_webp(strip, target)
 
 
@@ -74,11 +79,10 @@ def _letterboxed(rgb: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> Image.I
     return canvas
 
 
-def _with_label(tile: Image.Image, label: str) -> Image.Image:
+def _draw_label(tile: Image.Image, label: str) -> None:
     draw = ImageDraw.Draw(tile)
     draw.rectangle((0, 0, 9 + 6 * len(label), 14), fill=_BACKGROUND)
     draw.text((4, 1), label, fill=(240, 240, 240))
-    return tile
 
 
 def _save_webp(picture: Image.Image, target: Path) -> None:

@@ -36,7 +36,8 @@ SHARD_NAME = re.compile(rf"test-\d{{5}}-of-\d{{5}}-[0-9a-f]{{{SHARD_DIGEST_CHARA
 def check_folder(out: Path, plans: Sequence[ConfigPlan]) -> None:
     """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder that the plans can be built in.
 
-    No other files are ever changed. Folders that the build changes, its lock and staged files may not be links.
+    No other files are ever changed. Folders that the build changes, its lock and staged files may not be links. A
+    config with colour may not be built again without.
     """
     ancestor = existing_ancestor(out)
     if not ancestor.is_dir():
@@ -49,7 +50,7 @@ def check_folder(out: Path, plans: Sequence[ConfigPlan]) -> None:
         for folder, folders, files in os.walk(staging):
             check_no_links(Path(folder), *folders, *files)
     if (out / MANIFEST_FILE).is_file():
-        open_folder(out)
+        _check_keeps_colour(out, plans)
     elif out.is_dir() and any(out.iterdir()) and not (out / BUILD_FOLDER / LOCK).is_file():
         raise InputError(
             f"{out}: is not empty and has no {MANIFEST_FILE}, expected a new folder or a dataset folder"
@@ -64,6 +65,16 @@ def existing_ancestor(path: Path) -> Path:
             if candidate.exists():
                 return candidate
     return Path(path.anchor)
+
+
+def _check_keeps_colour(out: Path, plans: Sequence[ConfigPlan]) -> None:
+    published = open_folder(out).config_by_name
+    names = [plan.spec.name for plan in plans if plan.spec.colour is None and plan.spec.name in published]
+    if with_colour := [name for name in names if published[name].colour is not None]:
+        raise InputError(
+            f"{out}: contains {', '.join(with_colour)} with colour, which --no-colour would replace; choose "
+            "another folder (--out) or other configs (--config)"
+        )
 
 
 def remove_unlisted_files(out: Path, listed: Collection[str]) -> None:
@@ -85,9 +96,13 @@ def remove_temporary_files(out: Path) -> None:
 
 
 def remove_stagings(plan: ConfigPlan) -> None:
-    """Delete all staging folders of a config."""
+    """Delete all staging folders of a config, but for a build without colour only its own.
+
+    The others may hold views with colour, which take hundreds of times as long.
+    """
     for staging in plan.all_stagings():
-        remove_folder(staging)
+        if plan.spec.colour is not None or staging == plan.staging.root:
+            remove_folder(staging)
 
 
 def remove_build_folder(folder: Path) -> None:

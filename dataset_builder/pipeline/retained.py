@@ -59,7 +59,7 @@ class _Entry(_Table):
     bytes: _Count
     protocol_views: _Count
     scene: _Scene
-    colour: _Colour
+    colour: _Colour | None
     rig: _Rig
     protocol: _Protocol
 

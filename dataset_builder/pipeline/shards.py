@@ -62,9 +62,9 @@ class Staging:
         return self.root / "shards" / f"{shard:05d}.parquet"
 
 
-def split_into_shards(indices: Sequence[int]) -> list[tuple[int, ...]]:
-    """Split the view indices of a config into shards of ``VIEWS_PER_SHARD`` views."""
-    return [tuple(indices[i : i + VIEWS_PER_SHARD]) for i in range(0, len(indices), VIEWS_PER_SHARD)]
+def split_into_shards(indices: Sequence[int], views: int = VIEWS_PER_SHARD) -> list[tuple[int, ...]]:
+    """Split the view indices of a config into shards, or other runs of ``views`` views."""
+    return [tuple(indices[i : i + views]) for i in range(0, len(indices), views)]
 
 
 def stage_row(path: Path, row: pa.Table, record: ViewRecord) -> None:
@@ -126,7 +126,7 @@ def _open_staged_row(path: Path) -> Iterator[pq.ParquetFile]:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Rendered stereo view of a scene; both eyes have colour."""
+    """Rendered stereo view of a scene; both eyes have colour, or neither."""
 
     view_id: str
     scene: str
@@ -145,9 +145,8 @@ def encode_view(view: View) -> tuple[pa.Table, ViewRecord]:
 
 
 def _eye_cells(eye: EyeView) -> dict[str, Any]:
-    assert eye.rgb is not None
     return {
-        "rgb": _image_cell(codecs.encode_rgb(eye.rgb)),
+        "rgb": None if eye.rgb is None else _image_cell(codecs.encode_rgb(eye.rgb)),
         "depth": codecs.encode_depth(eye.depth_m),
         "mask": _image_cell(codecs.encode_mask(eye.mask)),
         "bars": _image_cell(codecs.encode_bars(eye.bars)),

@@ -1,9 +1,10 @@
 """Work units of a build, and the checks of their results.
 
-A work unit renders views of one shard of a config. It is idempotent and contains only views that are not staged
-yet. Its result is a ``UnitResult``. A unit rendered on this machine writes its rows to the staging folder, view by
-view, and its result contains none; the result of a unit rendered elsewhere contains the bytes of each row. In both
-cases ``accept_result`` checks the result before it is used.
+A work unit renders views of one shard of a config. Without colour it renders those of several shards, because
+starting a process and building the scene take as long as several views. It is idempotent and contains only views
+that are not staged yet. Its result is a ``UnitResult``. A unit rendered on this machine writes its rows to the
+staging folder, view by view, and its result contains none; the result of a unit rendered elsewhere contains the
+bytes of each row. In both cases ``accept_result`` checks the result before it is used.
 
 The ground truth of all rows of a config is cast against the same mesh. The digest of the mesh is stored with the
 first result; the mesh itself, tens of megabytes, is returned only by the one unit that has ``with_mesh`` set.
@@ -19,19 +20,21 @@ from pathlib import Path
 
 from dataset_builder.config.specs import ConfigSpec
 from dataset_builder.pipeline.plan import ConfigPlan, generator_versions
-from dataset_builder.pipeline.shards import Staging, split_into_shards
+from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging, split_into_shards
 from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError, InputError
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import read_file
 
+VIEWS_WITHOUT_COLOUR = 4 * VIEWS_PER_SHARD
+"""Views of a work unit without colour."""
 _MESH_DIGEST = "mesh.sha256"
 
 
 @dataclass(frozen=True)
 class WorkUnit:
-    """Work unit: views ``indices`` of one shard of a config.
+    """Work unit: views ``indices`` of a config, all of ``shard`` or, without colour, of it and the next ones.
 
     ``with_mesh`` requests the mesh as well, ``mesh_sha256`` is its required digest (None: not known yet), and
     ``software_versions`` holds the versions of the software that the bytes depend on.
@@ -76,16 +79,17 @@ def remaining_units(plan: ConfigPlan) -> list[WorkUnit]:
     """Return the units of the views not staged yet; the first one requests the mesh if that is not staged."""
     known_mesh_sha256, software_versions = _known_mesh_sha256(plan.staging), generator_versions()
     needs_mesh = not plan.staging.mesh.is_file()
-    incomplete_shards = [
-        (shard, missing)
-        for shard, run in enumerate(split_into_shards(plan.indices))
+    views = VIEWS_WITHOUT_COLOUR if plan.spec.colour is None else VIEWS_PER_SHARD
+    incomplete = [
+        (position * views // VIEWS_PER_SHARD, missing)
+        for position, run in enumerate(split_into_shards(plan.indices, views))
         if (missing := tuple(index for index in run if not plan.staging.row(index).is_file()))
     ]
-    if needs_mesh and not incomplete_shards:
-        incomplete_shards = [(0, ())]
+    if needs_mesh and not incomplete:
+        incomplete = [(0, ())]
     return [
         WorkUnit(plan.spec, shard, missing, needs_mesh and position == 0, known_mesh_sha256, software_versions)
-        for position, (shard, missing) in enumerate(incomplete_shards)
+        for position, (shard, missing) in enumerate(incomplete)
     ]
 
 

@@ -48,7 +48,7 @@ COLUMN_DESCRIPTIONS: dict[str, str] = {
     "view_id": "`<config>/<0000>`: the view's index in its full protocol, also when a subset is built; "
     "`<config>/<split>-<scene>-<0000>` in configs of several scenes",
     "scene": "name of the scene, as in `bars.parquet` and `meshes/`",
-    "rgb": "lossless 8-bit colour, H x W, WebP",
+    "rgb": "lossless 8-bit colour, H x W, WebP; null in every row of a config built without colour",
     "depth": "lossless float32 planar depth along the optical axis, metres, 0.0 where there is no surface; "
     'TIFF, which `Image(mode="F")` of `datasets` reads too',
     "mask": "1-bit: steel, rim included",

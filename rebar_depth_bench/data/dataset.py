@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
-from rebar_depth_bench.data.columns import COLUMNS, features, validated_columns
+from rebar_depth_bench.data.columns import COLUMNS, column_kind, features, validated_columns
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.manifest import open_folder
@@ -25,6 +25,7 @@ from rebar_depth_bench.data.shards import (
     iterate_shards,
     lacks_scene_column,
 )
+from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.view_ids import TEST_SPLIT
 
@@ -75,10 +76,10 @@ def load(
 ) -> Dataset | IterableDataset:
     """Load one split of a config of a dataset folder or Hub repository.
 
-    Rows are dicts of decoded columns: colour uint8 H x W x 3, depth float32 H x W (planar,
-    metres, 0 where no surface), masks bool H x W, bar ids uint16 H x W, K float64 3 x 3 in pixels, distortion
-    float64 5, poses float64 4 x 4. ``columns`` selects columns; the others are not decoded. With ``streaming``
-    the result is an ``IterableDataset``, and nothing is copied to the cache of ``datasets``.
+    Rows are dicts of decoded columns: colour uint8 H x W x 3 (None in a config without colour), depth float32
+    H x W (planar, metres, 0 where no surface), masks bool H x W, bar ids uint16 H x W, K float64 3 x 3 in pixels,
+    distortion float64 5, poses float64 4 x 4. ``columns`` selects columns; the others are not decoded. With
+    ``streaming`` the result is an ``IterableDataset``, and nothing is copied to the cache of ``datasets``.
 
     Raises ``DatasetError`` for a folder, config, split or column that does not exist, and for a damaged shard; the
     rows raise it for a damaged cell.
@@ -144,6 +145,16 @@ def iterate_undecoded(config: DatasetConfig, columns: Sequence[str]) -> Iterator
     return all_rows(config, validated_columns(columns))
 
 
+def check_colour(config: DatasetConfig, columns: Sequence[str], reader: str) -> None:
+    """Raise ``DatasetError`` if ``reader`` needs columns of colour and the config was built without colour."""
+    needed = [name for name in columns if column_kind(name) == "rgb" and config.colour is None]
+    if needed:
+        raise DatasetError(
+            f"{config.root}: {reader} needs {', '.join(needed)}, but config {config.name} was built without "
+            "colour (rebar-build --no-colour); choose configs with colour (--config), or build it with colour"
+        )
+
+
 @dataclass(frozen=True)
 class ConfigViews:
     """Views, image size, board and mesh of one scene of a config."""
@@ -176,5 +187,9 @@ class ConfigViews:
         return self.source.file(self.source.mesh)
 
     def rows(self, *columns: str) -> Iterator[dict[str, Any]]:
-        """Yield the decoded ``view_id`` and named columns of each view, in order."""
+        """Yield the decoded ``view_id`` and named columns of each view, in order.
+
+        Raises ``DatasetError`` for colour of a config that has none.
+        """
+        check_colour(self.source, columns, "the method")
         return iterate_rows(self.source, ("view_id", *columns))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from functools import cached_property
 from typing import Annotated, Any, Self
 
@@ -14,7 +13,15 @@ from rebar_depth_bench.data.location import Located
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN, PATH_PATTERN, VIEW_ID_PATTERN
-from rebar_depth_bench.validation import Expected, StrictModel, field_error, number, one_of, whole_number
+from rebar_depth_bench.validation import (
+    Expected,
+    StrictModel,
+    check_unique,
+    field_error,
+    number,
+    one_of,
+    whole_number,
+)
 from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
 
 CENTRE, NEAREST_STEEL = "centre", "nearest steel"
@@ -92,7 +99,7 @@ class Scene(ManifestTable):
     @field_validator("shards")
     @classmethod
     def _check_shards(cls, shards: tuple[str, ...]) -> tuple[str, ...]:
-        _check_unique(shards, "shard")
+        check_unique(shards, "shard")
         return shards
 
 
@@ -141,7 +148,7 @@ class DatasetConfig(Located):
     ``manifest_entry`` is the entry of the whole config as it was written, with all parameters of the build.
     ``has_splits`` is False for a config of one scene, whose views are all in the split ``test`` and have ids
     ``<config>/<0000>``; in other configs the ids are ``<config>/<split>-<scene>-<0000>``. ``reference`` is None in
-    folders of earlier versions.
+    folders of earlier versions, ``colour`` in configs without colour, whose colour columns are null in every row.
     """
 
     name: _Name
@@ -155,6 +162,7 @@ class DatasetConfig(Located):
     key: Annotated[str, StringConstraints(max_length=200)]
     sheet: RelativePath
     reference: References | None = None
+    colour: Annotated[dict[str, Any] | None, Expected("parameters of colour, or null")] = Field({}, repr=False)
     manifest_entry: dict[str, Any] = Field(repr=False)
 
     @classmethod
@@ -172,14 +180,14 @@ class DatasetConfig(Located):
     @field_validator("scenes")
     @classmethod
     def _check_scenes(cls, scenes: tuple[Scene, ...]) -> tuple[Scene, ...]:
-        _check_unique([scene.name for scene in scenes], "scene")
-        _check_unique([shard for scene in scenes for shard in scene.shards], "shard")
+        check_unique([scene.name for scene in scenes], "scene")
+        check_unique([shard for scene in scenes for shard in scene.shards], "shard")
         return scenes
 
     @field_validator("views")
     @classmethod
     def _check_views(cls, views: tuple[ViewRecord, ...], info: ValidationInfo) -> tuple[ViewRecord, ...]:
-        _check_unique([view.view_id for view in views], "view")
+        check_unique([view.view_id for view in views], "view")
         name, rig, scenes = info.data.get("name"), info.data.get("rig"), info.data.get("scenes")
         prefixes = {f"{scene.split}-{scene.name}-" for scene in scenes or ()} if info.data["has_splits"] else set()
         for view in views:
@@ -289,12 +297,3 @@ class DatasetConfig(Located):
     def view_ids(self) -> tuple[str, ...]:
         """Ids of the views, in order."""
         return tuple(view.view_id for view in self.views)
-
-
-def _check_unique(names: Sequence[str], what: str) -> None:
-    """Raise the error of a field unless it has one or more names, each once."""
-    if not names:
-        raise field_error("got none", f"one {what} or more")
-    name, occurrences = Counter(names).most_common(1)[0]
-    if occurrences > 1:
-        raise field_error(f"{name} occurs more than once", f"each {what} once", "duplicate")

@@ -42,7 +42,8 @@ def torch_loader(
     A batch is a dict: ``rgb`` uint8 B x 3 x H x W, ``depth`` float32 B x 1 x H x W (planar, metres, 0 where there
     is no surface), ``mask`` bool B x 1 x H x W, ``K`` float64 B x 3 x 3 (pixels), ``poses`` float64 B x 4 x 4
     (``cam_from_world``), all of the left view, and ``view_id``, a list of str. With ``stereo`` the batch also has
-    the same keys of the right view, prefixed ``right_``, and ``baseline_m`` float64 B.
+    the same keys of the right view, prefixed ``right_``, and ``baseline_m`` float64 B. Batches of a config without
+    colour lack ``rgb`` and ``right_rgb``.
 
     Columns that a batch does not need are not decoded, except in a streamed dataset, whose columns are already
     decoded; pass ``columns`` to ``load`` to select them. ``shuffle`` requires a dataset that is not streamed.
@@ -70,6 +71,7 @@ class _Collate:
         batch: Batch = {
             key: _tensor(key, np.stack([np.asarray(row[column]) for row in rows]))
             for key, column in self._keys.items()
+            if rows[0][column] is not None
         }
         batch["view_id"] = [row["view_id"] for row in rows]
         return batch

@@ -27,20 +27,24 @@ from rebar_depth_bench.progress import Progress
 CONSTANT_DEPTH_M = 1.0
 
 
-def _predict_constant(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
-    return np.full(row["left_rgb"].shape[:2], CONSTANT_DEPTH_M, np.float32)
+def _prepare_constant(views: ConfigViews, work: Path, progress: Progress) -> Prepared:
+    del work, progress
+    depth_m = np.full(views.grid, CONSTANT_DEPTH_M, np.float32)
+    return Prepared(lambda _: depth_m)
 
 
-CONSTANT = Method(
+CONSTANT = MultiViewMethod(
     MethodInfo(
         name="constant",
         summary=f"control: {CONSTANT_DEPTH_M:g} m at every pixel",
-        columns=("left_rgb",),
+        columns=(),
         uses_intrinsics=False,
         source="this project",
         licence="Apache-2.0",
+        inputs="rgb",
     ),
-    lambda: _predict_constant,
+    _prepare_constant,
+    lambda _: None,
 )
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench.console import print_notice
-from rebar_depth_bench.data.dataset import iterate_undecoded
+from rebar_depth_bench.data.dataset import check_colour, iterate_undecoded
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
@@ -51,12 +51,15 @@ def predict(
     Returns the report of each scene that a multi-view method prepared, and of each config on which the method has
     notes, by ``DatasetConfig.label``.
 
-    Raises ``DatasetError`` for an unknown folder, config or split or another digest than ``expect_digest``,
+    Raises ``DatasetError`` for an unknown folder, config or split or another digest than ``expect_digest``, or
+    a config without colour if the method needs it,
     ``InputError`` if ``archive`` is a folder or the folder beside it holds anything but kept predictions, and
     ``MethodError`` if the method cannot run or returns invalid values.
     """
     folder = open_folder(root, expect_digest=expect_digest)
     chosen = _chosen_configs(folder, configs, split)
+    for config in chosen:
+        check_colour(config, method.info.columns, method.info.name)
     target = Path(archive)
     if target.is_dir():
         raise InputError(f"{target}: is a folder, expected the name of the archive to write")

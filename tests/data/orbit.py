@@ -29,7 +29,10 @@ from rebar_depth_bench.data.codecs import decode_rgb
 from rebar_depth_bench.data.digests import file_sha256
 
 IMAGES = Path(__file__).parent / "orbit"
-REQUEST = BuildRequest(configs=("lattice-orbit",), views=24, width=512, height=288, colour=ColourSpec(1, 1))
+SAMPLES = 1
+REQUEST = BuildRequest(
+    configs=("lattice-orbit",), views=24, width=512, height=288, colour=ColourSpec(SAMPLES, SAMPLES)
+)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ def render(root: Path) -> None:
 def render_orbit(root: Path) -> dict[str, bytes]:
     """Render the views of the orbit into the folder ``root`` and return the left images by file name."""
     size = ("--width", str(orbit.REQUEST.width), "--height", str(orbit.REQUEST.height))
-    options = ("--views", str(orbit.REQUEST.views), *size, "--samples", str(orbit.REQUEST.colour.samples))
+    options = ("--views", str(orbit.REQUEST.views), *size, "--samples", str(orbit.SAMPLES))
     finished = run_build("--out", root, "--config", *orbit.REQUEST.configs, *options)
     assert finished.returncode == 0, finished.stderr
     rows = pq.read_table(root / "lattice-orbit", columns=["view_id", "left_rgb"]).to_pylist()

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from rebar_depth_bench.data.dataset import ConfigViews
+from rebar_depth_bench.data.dataset import ConfigViews, check_colour
 from rebar_depth_bench.methods.base import Prepared
 from rebar_depth_bench.methods.multiview.dense import DENSE_METHODS
-from rebar_depth_bench.methods.multiview.images import LeftImages, select_pairs, write_left_images
+from rebar_depth_bench.methods.multiview.images import ROW_COLUMNS, LeftImages, select_pairs, write_left_images
 from rebar_depth_bench.methods.multiview.metric_scale import SCALE_SOURCES
 from rebar_depth_bench.methods.multiview.sfm import SparseReconstruction, reconstruct_sparse
 from rebar_depth_bench.progress import Progress, silent
@@ -31,7 +31,11 @@ def reconstruct_images(
 
 
 def check(views: ConfigViews, dense: str, scale_source: str) -> None:
-    """Raise ``MethodError`` if the named dense method cannot run or the scale source does not suit the config."""
+    """Raise ``MethodError`` if the named dense method cannot run or the scale source does not suit the config.
+
+    Raises ``DatasetError`` if the config has no colour.
+    """
+    check_colour(views.source, ROW_COLUMNS, f"{dense}-{scale_source}")
     DENSE_METHODS[dense].check()
     SCALE_SOURCES[scale_source].check(views)
 

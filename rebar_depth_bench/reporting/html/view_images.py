@@ -36,13 +36,13 @@ _BACKDROP_MAX_LEVEL = 84
 class ViewPanels:
     """Arrays and scores of one view to be rendered; all arrays share H x W.
 
-    ``rgb`` is uint8 H x W x 3; ``truth_m`` float32 metres, 0 without a surface; ``prediction_m`` float metres, not
-    finite or <= 0 without a prediction; ``steel`` bool, rim included; ``score`` holds the view's numbers. Raises
-    ``ValueError`` if the shapes differ.
+    ``rgb`` is uint8 H x W x 3, None in a config without colour; ``truth_m`` float32 metres, 0 without a surface;
+    ``prediction_m`` float metres, not finite or <= 0 without a prediction; ``steel`` bool, rim included; ``score``
+    holds the view's numbers. Raises ``ValueError`` if the shapes differ.
     """
 
     view_id: str
-    rgb: UInt8[ndarray, "h w 3"]
+    rgb: UInt8[ndarray, "h w 3"] | None
     truth_m: Float32[ndarray, "h w"]
     prediction_m: Float[ndarray, "h w"]
     steel: Bool[ndarray, "h w"]
@@ -50,7 +50,7 @@ class ViewPanels:
 
     def __post_init__(self) -> None:
         size = self.truth_m.shape
-        shapes = (self.rgb.shape[:2], self.prediction_m.shape, self.steel.shape)
+        shapes = [image.shape[:2] for image in (self.rgb, self.prediction_m, self.steel) if image is not None]
         if any(shape != size for shape in shapes):
             raise ValueError(f"{self.view_id}: the images of a view must share H x W = {size}, found {shapes}")
 
@@ -59,6 +59,7 @@ class ViewPanels:
 class ViewImages:
     """Encoded panels of one view as data URIs, and the ranges of their colour bars.
 
+    ``colour`` is None in a config without colour.
     Depth colours run from ``near_m`` to ``far_m`` for both ground truth and prediction, error colours from minus
     to plus ``native_limit_cm`` or ``scaled_limit_cm`` (None if no scored pixel has an error). ``predicted_m`` is
     the robust range of the prediction on scored pixels, which may lie outside the colour bar.
@@ -66,7 +67,7 @@ class ViewImages:
 
     width: int
     height: int
-    colour: str
+    colour: str | None
     truth: str
     prediction: str
     native_error: str
@@ -79,20 +80,20 @@ class ViewImages:
 
 
 def view_images(view: ViewPanels) -> ViewImages:
-    """Return the five encoded panels of a view, about ``PANEL_WIDTH`` pixels wide."""
+    """Return the encoded panels of a view, about ``PANEL_WIDTH`` pixels wide."""
     step = max(1, round(view.truth_m.shape[1] / PANEL_WIDTH))
     scored = scored_pixels(view.steel, view.truth_m)
     near_m, far_m = depth_range(view.truth_m, scored)
     native_m = signed_error(view, 1.0)
     scaled_m = signed_error(view, math.nan if view.score.scale is None else view.score.scale)
     native_limit, scaled_limit = (error_limit_cm(error_m, scored) for error_m in (native_m, scaled_m))
-    rgb = reduced_colour(view.rgb, step)
-    steel = view.steel[::step, ::step]
+    truth, steel = depth_image(view.truth_m[::step, ::step], near_m, far_m), view.steel[::step, ::step]
+    rgb = None if view.rgb is None else reduced_colour(view.rgb, step)
     return ViewImages(
-        width=rgb.shape[1],
-        height=rgb.shape[0],
-        colour=_data_uri(rgb, lossless=False),
-        truth=_data_uri(depth_image(view.truth_m[::step, ::step], near_m, far_m)),
+        width=truth.shape[1],
+        height=truth.shape[0],
+        colour=None if rgb is None else _data_uri(rgb, lossless=False),
+        truth=_data_uri(truth),
         prediction=_data_uri(depth_image(view.prediction_m[::step, ::step], near_m, far_m)),
         native_error=_data_uri(error_image(native_m[::step, ::step], steel, rgb, native_limit)),
         scaled_error=_data_uri(error_image(scaled_m[::step, ::step], steel, rgb, scaled_limit)),
@@ -109,7 +110,7 @@ def error_webp(view: ViewPanels) -> bytes:
     step = max(1, round(view.truth_m.shape[1] / PANEL_WIDTH))
     error_m = signed_error(view, 1.0)
     limit_cm = error_limit_cm(error_m, scored_pixels(view.steel, view.truth_m))
-    steel, rgb = view.steel[::step, ::step], reduced_colour(view.rgb, step)
+    steel, rgb = view.steel[::step, ::step], None if view.rgb is None else reduced_colour(view.rgb, step)
     return _encoded(error_image(error_m[::step, ::step], steel, rgb, limit_cm))
 
 
@@ -168,11 +169,14 @@ def depth_image(depth_m: Float[ndarray, "h w"], near_m: float, far_m: float) -> 
 def error_image(
     error_m: Float64[ndarray, "h w"],
     steel: Bool[ndarray, "h w"],
-    rgb: UInt8[ndarray, "h w 3"],
+    rgb: UInt8[ndarray, "h w 3"] | None,
     limit_cm: float | None,
 ) -> UInt8[ndarray, "h w 3"]:
-    """Return signed error on steel in colours over the dimmed scene, hazard stripes without prediction."""
-    image = _backdrop(rgb)
+    """Return signed error on steel in colours over the dimmed scene, hazard stripes without prediction.
+
+    The backdrop is black without ``rgb``.
+    """
+    image = np.zeros((*steel.shape, 3), np.uint8) if rgb is None else _backdrop(rgb)
     missing = steel & np.isnan(error_m)
     image[missing] = hatching(steel.shape, *_NO_PREDICTION_STRIPES)[missing]
     valid = steel & ~missing

@@ -235,7 +235,7 @@ def test_methods_list_marks_untested_and_multi_view(
         assert f"({METHODS[name].info.untested_note})" in listed
         assert METHODS[name].info.licence in listed
     multi_view_methods = [method for method in own_methods().values() if isinstance(method, MultiViewMethod)]
-    assert listed.count("(reads all views of a config before it predicts any)") == len(multi_view_methods) > 0
+    assert listed.count("(prepares a whole config before it predicts any view)") == len(multi_view_methods) > 0
     assert "both rgb, both" in listed
     assert "left_depth" in listed
     assert "right_rgb" not in listed

@@ -23,6 +23,7 @@ from rebar_depth_bench.reporting.html.view_images import (
     depth_range,
     error_image,
     error_limit_cm,
+    error_webp,
     signed_error,
     view_images,
 )
@@ -162,6 +163,19 @@ def test_error_image_signs_steel_and_stripes_missing() -> None:
     assert image[5, 5].tolist() == [44, 44, 44], "dimmed scene"
 
 
+def test_view_without_colour_has_other_panels() -> None:
+    view = dataclasses.replace(panels(factor=1.02), rgb=None)
+    images, with_colour = view_images(view), view_images(panels(factor=1.02))
+    assert images.colour is None
+    assert (images.width, images.truth) == (with_colour.width, with_colour.truth)
+    image = error_image(signed_error(view, 1.0), view.steel, None, 1.0)
+    assert (image[5, 25].tolist(), image[5, 5].tolist()) == (ERROR_COLOURS[254].tolist(), [0, 0, 0])
+    assert error_webp(view)
+    text = render_report(result(scored_view("lattice/0000")), [view])
+    assert "<strong>Colour</strong>" not in text
+    assert "<strong>Native error</strong>" in text
+
+
 def test_scaled_error_uses_scale_of_view() -> None:
     view = panels(factor=1.6)
     assert signed_error(view, 0.625)[5, 25] == pytest.approx(0.0, abs=1e-6)
@@ -206,6 +220,7 @@ def test_large_panels_sample_depth_and_average_colour() -> None:
     depth = _decode_data_uri(images.truth).reshape(-1, 3)
     assert len(np.unique(depth, axis=0)) == 1, "an average would have made depths that do not exist"
     assert depth[0].tolist() == DEPTH_COLOURS[round((2.1 - 1.0) / 1.2 * 254)].tolist()
+    assert images.colour is not None
     assert abs(int(_decode_data_uri(images.colour)[180, 320, 0]) - 100) <= 3
 
 

@@ -90,7 +90,7 @@ def test_undistorted_depth_on_raw_grid_is_reported() -> None:
 def test_board_check_is_skipped_without_board() -> None:
     without_board = config(board=None)
     check = board_verdict(without_board, [view_board_error(without_board, view("ideal"))])
-    assert (check.passed, check.measured, check.bound) == (True, "no board in this scene", "skipped")
+    assert (check.skipped, check.measured) == (True, "no board in this scene")
 
 
 def with_occluder(height_m: float, share: float) -> AuditedView:
@@ -123,7 +123,7 @@ def test_only_known_axes_are_checked() -> None:
     with_known_axes = config()
     known_bars, estimated_bar = with_known_axes.steel[:1], replace(with_known_axes.steel[1], role=ESTIMATED_ROLE)
     assert replace(with_known_axes, steel=(*known_bars, estimated_bar)).bars_with_known_axis == known_bars
-    assert axis_verdict(replace(with_known_axes, steel=(estimated_bar,)), [7.0]).bound == "skipped"
+    assert axis_verdict(replace(with_known_axes, steel=(estimated_bar,)), [7.0]).skipped
     assert not axis_verdict(with_known_axes, [MAX_AXIS_RATIO + 0.01]).passed
 
 
@@ -132,7 +132,7 @@ def test_epipolar_share_is_over_all_views() -> None:
     assert epipolar_verdict(config(), [good, EpipolarCounts(contradicted=1)]).passed
     few = int(2 * MAX_CONTRADICTED_SHARE * 100_000)
     assert not epipolar_verdict(config(), [good, EpipolarCounts(contradicted=few)]).passed
-    assert epipolar_verdict(config(), []).bound == "skipped"
+    assert epipolar_verdict(config(), []).skipped
 
 
 def test_cycles_differences_are_relative_to_depth() -> None:
@@ -145,7 +145,7 @@ def test_cycles_differences_are_relative_to_depth() -> None:
     noise_m[:20] = 0.007
     assert cycles_verdict("c", np.stack([noise_m, depth_m], axis=1), 2).passed
     assert not cycles_verdict("c", np.full((5, 2), np.nan), 2).passed
-    assert cycles_verdict("c", cycles_difference_m(Path("none.ply"), [], print), 0).measured == "skipped"
+    assert cycles_verdict("c", cycles_difference_m(Path("none.ply"), [], print), 0).skipped
     assert cycles_verdict("c", np.zeros((0, 2)), 2).measured == "2 views: no steel"
 
 

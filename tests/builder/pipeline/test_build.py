@@ -35,7 +35,9 @@ from tests.building import (
 from tests.processes import wait_until
 from tests.requirements import Repetitions
 
-SMALL = ("--scene", str(TWO_BARS), "--views", str(TINY_VIEWS), *TINY)
+VIEWS = ("--scene", str(TWO_BARS), "--views", str(TINY_VIEWS))
+SMALL = (*VIEWS, *TINY)
+WITHOUT_COLOUR = (*VIEWS, "--width", "640", "--height", "360", "--no-colour")
 
 
 @pytest.fixture(scope="module")
@@ -46,13 +48,31 @@ def small_root(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) ->
     return root
 
 
+@pytest.fixture(scope="module", params=[SMALL, WITHOUT_COLOUR], ids=["colour", "no colour"])
+def whole_build(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild
+) -> tuple[tuple[str, ...], Path]:
+    """Return the options of a build, and the folder that it makes without interruption."""
+    if request.param == SMALL:
+        return SMALL, request.getfixturevalue("small_root")
+    root = tmp_path_factory.mktemp("no-colour") / "dataset"
+    process = run_build("--out", root, *WITHOUT_COLOUR)
+    assert process.returncode == 0, process.stderr
+    return WITHOUT_COLOUR, root
+
+
 def test_killed_builds_resume_to_same_bytes(
-    small_root: Path, tmp_path: Path, run_build: RunBuild, start_build: StartBuild, repetitions: Repetitions
+    whole_build: tuple[tuple[str, ...], Path],
+    tmp_path: Path,
+    run_build: RunBuild,
+    start_build: StartBuild,
+    repetitions: Repetitions,
 ) -> None:
+    options, whole_root = whole_build
     root = tmp_path / "dataset"
     rng = np.random.default_rng(11)
     for kill in range(repetitions(1, 6)):
-        build = start_build(root, *SMALL)
+        build = start_build(root, *options)
         staged_before = staged_rows(root)
         wait_until(partial(progressed_or_ended, root, staged_before, build))
         time.sleep(float(rng.uniform(0, 0.4)))
@@ -61,9 +81,9 @@ def test_killed_builds_resume_to_same_bytes(
         else:
             os.killpg(build.pid, signal.SIGKILL)
         build.communicate()
-    process = run_build("--out", root, *SMALL)
+    process = run_build("--out", root, *options)
     assert process.returncode == 0, process.stderr
-    assert contents(root) == contents(small_root)
+    assert contents(root) == contents(whole_root)
     assert not (root / BUILD_FOLDER).exists()
 
 
@@ -78,11 +98,14 @@ def test_killed_build_leaves_no_render_process(tmp_path: Path, start_build: Star
     assert not any(process_dir.exists() for process_dir in process_dirs)
 
 
-def test_worker_count_does_not_change_bytes(small_root: Path, tmp_path: Path, run_build: RunBuild) -> None:
+def test_worker_count_does_not_change_bytes(
+    whole_build: tuple[tuple[str, ...], Path], tmp_path: Path, run_build: RunBuild
+) -> None:
+    options, whole_root = whole_build
     root = tmp_path / "dataset"
-    process = run_build("--out", root, *SMALL, "--workers", "2")
+    process = run_build("--out", root, *options, "--workers", "2")
     assert process.returncode == 0, process.stderr
-    assert contents(root) == contents(small_root)
+    assert contents(root) == contents(whole_root)
 
 
 def test_second_build_is_up_to_date(small_root: Path, run_build: RunBuild) -> None:
@@ -194,6 +217,11 @@ def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
         (("--quality", "high", "--samples", "4"), "--samples: not allowed with argument --quality"),
         (("--sampling", "best"), "invalid choice: 'best' (choose from 'steel-first', 'uniform')"),
         (("--workers", "0"), "--workers is 0, expected 1 or more"),
+        (("--no-colour", "--samples", "4"), "--no-colour is combined with --samples 4, expected only one"),
+        (
+            ("--no-colour", "--quality", "high", "--sampling", "uniform"),
+            "--no-colour is combined with --sampling uniform, --quality high, expected only one",
+        ),
         (("--mesh", "nothing.stl"), "nothing.stl"),
         (("--mesh", __file__), "unsupported mesh file type '.py', expected"),
     ],

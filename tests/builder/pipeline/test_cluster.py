@@ -81,6 +81,16 @@ def test_cluster_build_equals_local_build(
     assert "two-bars: 4 of 9" in process.stderr, "no progress within a unit"
 
 
+def test_cluster_build_without_colour_equals_local_build(
+    cluster: Cluster, tmp_path: Path, run_build: RunBuild
+) -> None:
+    request = (*SMALL[:-2], "--no-colour")
+    for out, options in (("here", ()), ("away", ("--cluster", cluster.address))):
+        process = run_build("--out", tmp_path / out, *request, *options)
+        assert process.returncode == 0, process.stderr
+    assert contents(tmp_path / "away") == contents(tmp_path / "here")
+
+
 def write_two_bars(path: Path) -> None:
     """Write a mesh of two vertical rods on the board, 10 mm in diameter and 80 mm high."""
     rods = [trimesh.creation.cylinder(radius=0.005, height=0.080, sections=24) for _ in range(2)]

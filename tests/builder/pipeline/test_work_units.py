@@ -58,6 +58,13 @@ def test_units_cover_views_once_and_request_one_mesh(plan: ConfigPlan) -> None:
     assert {unit.mesh_sha256 for unit in units} == {None}
 
 
+def test_units_without_colour_cover_several_shards(tmp_path: Path) -> None:
+    plan = plan_config(replace(CONFIGS["lattice"](), colour=None), 70, tmp_path)
+    units = remaining_units(plan)
+    assert [(unit.shard, len(unit.indices)) for unit in units] == [(0, 32), (4, 32), (8, 6)]
+    assert sum((unit.indices for unit in units), ()) == plan.indices
+
+
 def test_staged_views_are_not_planned_again(plan: ConfigPlan) -> None:
     first, second, third = remaining_units(plan)
     accept_result(second, make_result(second), plan.staging)

@@ -1,0 +1,220 @@
+"""Builds without colour: equal ground truth, null columns of colour, and what refuses or skips them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import datasets
+import numpy as np
+import pytest
+from PIL import Image
+
+import rebar_depth_bench as rdb
+from dataset_builder.audit import audit, print_audit
+from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.export import export
+from dataset_builder.pipeline.contact_sheet import TILE_PX
+from dataset_builder.pipeline.plan import BUILD_FOLDER
+from rebar_depth_bench.cli.main import main as rebar_bench
+from rebar_depth_bench.data.columns import COLUMNS
+from rebar_depth_bench.data.dataset import ConfigViews
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.errors import DatasetError
+from tests.building import TINY, TINY_VIEWS, TWO_BARS, RunBuild, contents
+from tests.commands import run_in_process
+
+SIZE = TINY[:4]
+COLOUR_COLUMNS = ("left_rgb", "right_rgb")
+TWO_VIEWS = ("--scene", str(TWO_BARS), "--views", "2")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) -> Path:
+    """Return a build without colour of the sample data, in the folder's own copy."""
+    root = tmp_path_factory.mktemp("no-colour") / "dataset"
+    for config, views in (("lattice", TINY_VIEWS), ("lattice-orbit", 2)):
+        process = run_build("--out", root, "--config", config, "--views", str(views), *SIZE, "--no-colour")
+        assert process.returncode == 0, process.stderr
+    return root
+
+
+def manifest(root: Path) -> dict[str, Any]:
+    loaded: dict[str, Any] = json.loads((root / "manifest.json").read_text())
+    return loaded
+
+
+def bench(*arguments: str | Path) -> str:
+    process = run_in_process(rebar_bench, *arguments)
+    assert process.returncode == 0, process.stderr
+    return process.stdout
+
+
+def test_ground_truth_equals_that_of_build_with_colour(root: Path, tiny_root: Path) -> None:
+    without, with_colour = open_folder(root), open_folder(tiny_root)
+    assert without.digest == with_colour.digest
+    assert without.files["meshes/lattice.ply"] == with_colour.files["meshes/lattice.ply"]
+    assert without.files["bars.parquet"] == with_colour.files["bars.parquet"]
+    for name, config in without.config_by_name.items():
+        assert config.manifest_entry["colour"] is None
+        assert config.key != with_colour.config(name).key
+        assert config.reference == with_colour.config(name).reference
+
+
+def test_plain_datasets_loads_null_colour(root: Path) -> None:
+    rows = datasets.load_dataset(str(root), "lattice", split="test")
+    assert rows.column_names == list(COLUMNS)
+    assert [row[column] for row in rows for column in COLOUR_COLUMNS] == [None] * 2 * TINY_VIEWS
+    assert all(row["left_preview"].size == (160, 90) and row["left_mask"].size == (160, 90) for row in rows)
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+def test_rows_have_no_colour_and_equal_others(root: Path, tiny_root: Path, streaming: bool) -> None:
+    for row, other in zip(
+        rdb.load(root, "lattice", streaming=streaming), rdb.load(tiny_root, "lattice"), strict=True
+    ):
+        assert list(row) == list(other)
+        assert row["left_rgb"] is row["right_rgb"] is None
+        assert all(np.array_equal(row[name], other[name]) for name in COLUMNS if name not in COLOUR_COLUMNS)
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+def test_batches_have_no_colour(root: Path, streaming: bool) -> None:
+    torch_loader = pytest.importorskip("rebar_depth_bench.data.torch_loader").torch_loader
+    batch = next(iter(torch_loader(rdb.load(root, "lattice", streaming=streaming), batch_size=2, stereo=True)))
+    assert not {"rgb", "right_rgb"} & set(batch)
+    assert batch["depth"].shape == batch["right_depth"].shape == (2, 1, 90, 160)
+
+
+def test_archive_has_same_scores_as_with_colour(root: Path, tiny_root: Path, tmp_path: Path) -> None:
+    for method in ("truth", "noisy-truth", "constant"):
+        archive, report = tmp_path / f"{method}.zip", tmp_path / f"{method}.html"
+        bench("predict", method, "--data", root, "--out", archive)
+        bench("check", archive, "--data", root)
+        bench("score", archive, "--data", root, "--html", report)
+        assert rdb.score(archive, root).to_json() == rdb.score(archive, tiny_root).to_json()
+        assert "Left colour image" not in report.read_text()
+        assert report.read_text().count("Ground truth</strong>") == 11
+    assert "noisy-truth" in bench("table", tmp_path / "truth.zip", tmp_path / "noisy-truth.zip", "--data", root)
+    bench("verify", root)
+
+
+@pytest.mark.parametrize("method", ["sgbm", "board-plane", "sweep-aruco"])
+def test_methods_of_colour_are_refused(root: Path, tmp_path: Path, method: str) -> None:
+    archive = tmp_path / "out" / "a.zip"
+    archive.parent.mkdir()
+    process = run_in_process(rebar_bench, "predict", method, "--data", root, "--out", archive)
+    assert process.returncode == 2
+    assert f"{method} needs left_rgb" in process.stderr
+    assert "config lattice was built without colour (rebar-build --no-colour)" in " ".join(process.stderr.split())
+    assert list(archive.parent.iterdir()) == []
+
+
+def test_method_that_asks_for_colour_later_is_refused(root: Path) -> None:
+    views = ConfigViews(open_folder(root).config("lattice"))
+    assert len(list(views.rows("left_depth"))) == TINY_VIEWS
+    with pytest.raises(DatasetError, match="right_rgb"):
+        next(views.rows("left_depth", "right_rgb"))
+
+
+def test_audit_skips_checks_of_colour(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report = audit(root, depth_views=1)
+    assert report.failures == ()
+    names = ("right image warped to the left by depth", "ArUco markers")
+    expected = [f"{config}: {name}" for config in ("lattice", "lattice-orbit") for name in names]
+    assert [check.name for check in report.skipped] == expected
+    assert not any(check.passed for check in report.skipped)
+    assert len([check for check in report.checks if check.passed]) == 1 + 2 * 7
+    print_audit(report)
+    printed = capsys.readouterr().out
+    assert (printed.count("skipped"), printed.count("│ ok")) == (4, 15)
+
+
+def test_config_with_colour_is_not_replaced(tiny_root: Path, tmp_path: Path, run_build: RunBuild) -> None:
+    before = contents(tiny_root)
+    process = run_build("--out", tiny_root, "--config", "pile", "lattice", *SIZE, "--no-colour")
+    assert process.returncode == 2
+    assert "contains lattice with colour, which --no-colour would replace" in process.stderr
+    assert contents(tiny_root) == before
+    assert not (tiny_root / BUILD_FOLDER).exists()
+
+
+def test_colour_replaces_build_without(tmp_path: Path, run_build: RunBuild) -> None:
+    colour, root = tmp_path / "colour", tmp_path / "dataset"
+    assert run_build("--out", colour, *TWO_VIEWS, *TINY).returncode == 0
+    assert run_build("--out", root, *TWO_VIEWS, *SIZE, "--no-colour").returncode == 0
+    assert contents(root) != contents(colour)
+    assert "built: two-bars" in run_build("--out", root, *TWO_VIEWS, *TINY).stdout
+    assert contents(root) == contents(colour)
+
+
+def test_both_kinds_share_a_folder_and_staged_colour_is_kept(
+    tiny_root: Path, tmp_path: Path, run_build: RunBuild
+) -> None:
+    root = tmp_path / "dataset"
+    shutil.copytree(tiny_root, root)
+    staged = root / BUILD_FOLDER / "two-bars-0123456789abcdef" / "rows"
+    staged.mkdir(parents=True)
+    process = run_build("--out", root, *TWO_VIEWS, *SIZE, "--no-colour")
+    assert process.returncode == 0, process.stderr
+    assert staged.is_dir(), "views of an interrupted build with colour"
+    card = (root / "README.md").read_text()
+    assert "`two-bars`: built without colour; `left_rgb` and `right_rgb` are null in every row." in card
+    assert "![two-bars: depth](pictures/two-bars.webp)" in card
+    assert "![lattice: colour, and depth below it]" in card
+    bench("predict", "sgbm", "--data", root, "--config", "lattice", "--out", tmp_path / "a.zip")
+    first = [
+        datasets.load_dataset(str(root), name, split="test")[0]["left_rgb"] for name in ("lattice", "two-bars")
+    ]
+    assert [cell is None for cell in first] == [False, True]
+
+
+def test_contact_sheet_shows_depth_alone(root: Path) -> None:
+    with Image.open(root / "pictures" / "lattice-orbit.webp") as sheet:
+        assert sheet.size == (2 * TILE_PX[0], TILE_PX[1])
+
+
+def test_export_leaves_out_what_describes_images(root: Path, tmp_path: Path) -> None:
+    summary = export(root, tmp_path / "export", ["lattice-orbit"])
+    assert [(config.views, config.written, config.kept) for config in summary.configs] == [(2, 16, 0)]
+    folder = tmp_path / "export" / "lattice-orbit"
+    assert {path.name for path in folder.iterdir()} == {
+        *("depth", "depth_mm", "masks", "bars", "cameras.json", "README.txt"),
+    }
+    cameras = json.loads((folder / "cameras.json").read_text())["cameras"]
+    assert [camera for camera in cameras if "image" in camera] == []
+    assert all((folder / camera["depth"]).is_file() for camera in cameras)
+    assert (
+        "built without colour: images/, sparse/ and transforms.json do not exist"
+        in (folder / "README.txt").read_text()
+    )
+
+
+@pytest.mark.parametrize("colour", [None, {"samples": 1}])
+def test_rows_that_contradict_manifest_are_damaged(
+    root: Path, tiny_root: Path, tmp_path: Path, colour: dict[str, int] | None
+) -> None:
+    """Load images of a config that has none, and null of one that has."""
+    copy = tmp_path / "dataset"
+    shutil.copytree(tiny_root if colour is None else root, copy)
+    edited = manifest(copy)
+    edited["configs"]["lattice"]["colour"] = colour
+    (copy / "manifest.json").write_text(json.dumps(edited))
+    with pytest.raises(DatasetError, match=r"view lattice/\d+: left_rgb is damaged"):
+        rdb.load(copy, "lattice")[0]
+
+
+def test_colour_of_manifest_is_checked(tiny_root: Path, tmp_path: Path) -> None:
+    edited = manifest(tiny_root)
+    edited["configs"]["lattice"]["colour"] = "none"
+    (tmp_path / "manifest.json").write_text(json.dumps(edited))
+    with pytest.raises(DatasetError) as caught:
+        open_folder(tmp_path)
+    assert [problem.where for problem in caught.value.problems] == ["configs.lattice.colour"]
+
+
+def test_request_without_colour_has_no_parameters_of_it() -> None:
+    [spec] = BuildRequest(("pier",), colour=None).config_specs()
+    assert spec.colour is None
