@@ -12,7 +12,7 @@ from typing import Any
 
 from dataset_builder.cli import argument_parser as builder_parser
 from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.specs import ColourSpec
+from dataset_builder.config.quality import colour_spec
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.plan import plan_config
 from rebar_depth_bench import SubmissionWriter, load
@@ -141,7 +141,7 @@ def _build(workspace: Workspace) -> None:
     build(_REQUEST, workspace.root / ROOT, cluster=_NoRenderer())
 
 
-_REQUEST = BuildRequest(configs=(CONFIG,), views=2, width=160, height=90, colour=ColourSpec(1, 1))
+_REQUEST = BuildRequest(configs=(CONFIG,), views=2, width=160, height=90, colour=colour_spec(quality="preview"))
 _DATASET_FILES = (
     "manifest.json",
     "README.md",

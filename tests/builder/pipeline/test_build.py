@@ -16,7 +16,7 @@ import pytest
 
 import rebar_depth_bench as rdb
 from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.specs import ColourSpec
+from dataset_builder.config.quality import colour_spec
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.data.bars import read_bars
@@ -275,7 +275,7 @@ def test_folder_without_benchmark_tasks_loads_and_gets_them(tiny_root: Path, tmp
     (root / "manifest.json").write_text(json.dumps(manifest))
     (root / "eval.yaml").unlink()
     assert len(rdb.load(root, "lattice-orbit")) == 2
-    build(BuildRequest(("lattice-orbit",), 2, 160, 90, colour=ColourSpec(1, 1)), root)
+    build(BuildRequest(("lattice-orbit",), 2, 160, 90, colour=colour_spec(quality="preview")), root)
     assert contents(root) == before
 
 
