@@ -219,8 +219,8 @@ def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
         (("--workers", "0"), "--workers is 0, expected 1 or more"),
         (("--no-colour", "--samples", "4"), "--no-colour is combined with --samples 4, expected only one"),
         (
-            ("--no-colour", "--quality", "high", "--sampling", "uniform"),
-            "--no-colour is combined with --sampling uniform, --quality high, expected only one",
+            ("--no-colour", "--quality", "high", "--sampling", "uniform", "--device", "cpu"),
+            "--no-colour is combined with --sampling uniform, --quality high, --device cpu, expected only one",
         ),
         (("--mesh", "nothing.stl"), "nothing.stl"),
         (("--mesh", __file__), "unsupported mesh file type '.py', expected"),

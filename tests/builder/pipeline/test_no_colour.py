@@ -141,6 +141,13 @@ def test_config_with_colour_is_not_replaced(tiny_root: Path, tmp_path: Path, run
     assert not (tiny_root / BUILD_FOLDER).exists()
 
 
+def test_estimate_without_colour(tmp_path: Path, run_build: RunBuild) -> None:
+    process = run_build("--out", tmp_path / "dataset", "--config", "lattice", *SIZE, "--no-colour", "--dry-run")
+    assert process.returncode == 0, process.stderr
+    assert "  colour: none" in process.stdout.splitlines()
+    assert not (tmp_path / "dataset").exists()
+
+
 def test_colour_replaces_build_without(tmp_path: Path, run_build: RunBuild) -> None:
     colour, root = tmp_path / "colour", tmp_path / "dataset"
     assert run_build("--out", colour, *TWO_VIEWS, *TINY).returncode == 0
