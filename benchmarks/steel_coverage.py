@@ -1,82 +1,112 @@
-"""Steel in the views of a config: share of the frame, depths, and views without steel, by shell.
+"""Steel in the views of a dataset folder: share of the frame, depth, interior, single bars and reference errors.
 
-python -m benchmarks.steel_coverage [CONFIG ...]
+python -m benchmarks.steel_coverage ROOT [JSON]
 
-Every view of the full trajectory is cast at 160 x 90 against the steel alone, without rendering. Depths are those
-of the left camera. The distance to the nearest steel is that from the left camera to the nearest bar, in any
-direction. The defaults are the configs with the three domes.
+``rebar-build --no-colour --out ROOT`` builds all views of the standard configs in about a second a view. Depths
+are those of the left camera; the nearest steel is the nearest point of any bar, in any direction. The numbers of
+the configs of which ROOT has all views are written to JSON; the cards show those of ``cards/steel.json``.
 """
 
 from __future__ import annotations
 
+import json
 import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from benchmarks.timing import print_markdown
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import ConfigSpec, RingSpec
-from dataset_builder.config.trajectories import poses
-from dataset_builder.scene.assemblies import aim_point_m, make_assembly
-from dataset_builder.scene.model import Assembly, WorldMesh
-from dataset_builder.scene.raycast import RayCaster
-from dataset_builder.scene.shapes.solids import merge_meshes
+from cards.steel import range_text
 from dataset_builder.scene.steel_distance import Cylinders
+from rebar_depth_bench.atomic_io import write_text
+from rebar_depth_bench.data.bars import BARS_FILE, read_bars
+from rebar_depth_bench.data.dataset import iterate_rows
+from rebar_depth_bench.data.dataset_config import CENTRE, DatasetConfig
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.geometry.cameras import camera_centre
+from rebar_depth_bench.scoring.protocol import scored_pixels, single_bar_pixels
 
-GRID = (160, 90)
-HEADS = ["config", "radius, m", "views", "nearest steel, m", "steel depth, m", "left, %", "right, %", "no steel"]
+HEADS = ["config", "radius, m", "views", "scored", "nearest steel, m", "steel depth, m", "steel, %", "interior, %"]
+NEAREST, NEAR, FAR, STEEL, INTERIOR, SINGLE = range(6)
+"""Columns of ``measure_views``."""
+_COLUMNS = ("left_depth", "left_mask", "left_bars", "left_cam_from_world")
 
 
-def main(*configs: str) -> None:
-    rows = []
-    for spec in BuildRequest(configs or ("lattice", "pile", "pier"), None, *GRID).config_specs():
-        radii_m, views = measure_views(spec)
-        rows += [(spec.name, f"{m:g}", *_summary(views[radii_m == m])) for m in np.unique(radii_m)]
-        rows.append((spec.name, "all", *_summary(views)))
+def main(root: str, json_file: str | None = None) -> None:
+    folder = open_folder(root)
+    bars = read_bars(folder.file(BARS_FILE))
+    rows, complete = [], {}
+    for name, config in folder.config_by_name.items():
+        views = measure_views(config, Cylinders.from_bars(bars[config.scene.name]))
+        protocol = config.manifest_entry["protocol"]
+        radii_m = protocol.get("radii_m", [protocol.get("radius_m")])
+        if len(views) == config.protocol_views:
+            complete[name] = summary(config, views)
+            shells = zip(radii_m, np.split(views, len(radii_m)), strict=True)
+            rows += [(name, f"{radius_m:g}", *_cells(shell)) for radius_m, shell in shells if len(radii_m) > 1]
+        rows.append((name, "all", *_cells(views)))
     print_markdown(HEADS, rows)
+    if json_file is not None:
+        document = {"command": "python -m benchmarks.steel_coverage ROOT cards/steel.json", "configs": complete}
+        write_text(Path(json_file), json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
-def measure_views(spec: ConfigSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Return the radius of each view, and for each view five numbers, metres and shares of the frame.
+def measure_views(config: DatasetConfig, steel: Cylinders) -> np.ndarray:
+    """Return six numbers for each left view of a config.
 
-    They are the distance to the nearest steel, the least and largest depth of steel in the left camera (NaN
-    without steel), and the share of steel in the left and in the right frame.
+    They are the distance to the nearest steel, the least and largest depth of steel, metres (NaN without steel),
+    the share of steel in the frame, the share of steel pixels in the interior (NaN without steel) and the share of
+    single-bar pixels in the interior (NaN without interior).
     """
-    assembly = make_assembly(spec.scene.assembly)
-    left_poses = poses(spec.protocol, aim_point_m(assembly), spec.rig, assembly.bars)
-    caster, cylinders = RayCaster(steel_mesh(assembly)), Cylinders.from_bars(assembly.bars)
-    nearest_m = cylinders.distance_m(np.array([camera_centre(pose) for pose in left_poses]))
-    rays = {eye: camera.rays() for eye, camera in rig_cameras(spec.rig, np.eye(4)).items()}
     views = []
-    for pose, distance_m in zip(left_poses, nearest_m, strict=True):
-        left, right = (caster.cast(camera, rays[eye]) for eye, camera in rig_cameras(spec.rig, pose).items())
-        steel_m = left.depth_m[left.mask] if left.mask.any() else np.array([np.nan])
-        views.append((distance_m, steel_m.min(), steel_m.max(), left.mask.mean(), right.mask.mean()))
-    protocol = spec.protocol
-    shells_m = [protocol.radius_m] if isinstance(protocol, RingSpec) else protocol.radii_m
-    return np.repeat(shells_m, len(views) // len(shells_m)), np.array(views)
+    for row in iterate_rows(config, _COLUMNS):
+        mask, depth_m = row["left_mask"], row["left_depth"]
+        pixels = scored_pixels(mask, depth_m)
+        steel_m = depth_m[mask] if mask.any() else np.array([np.nan])
+        interior = len(pixels) / np.count_nonzero(mask) if mask.any() else np.nan
+        single = np.mean(single_bar_pixels(row["left_bars"], pixels)) if len(pixels) else np.nan
+        nearest_m = steel.distance_m(camera_centre(row["left_cam_from_world"])[None])[0]
+        views.append((nearest_m, steel_m.min(), steel_m.max(), mask.mean(), interior, single))
+    return np.array(views)
 
 
-def steel_mesh(assembly: Assembly) -> WorldMesh:
-    """Return the mesh of all bars, world frame."""
-    mesh = merge_meshes([part.mesh for part in assembly.parts])
-    bar_ids = [np.full(len(part.mesh.faces), part.bar_id, np.uint16) for part in assembly.parts]
-    return WorldMesh(mesh.vertices_m, mesh.faces, np.concatenate(bar_ids))
+def summary(config: DatasetConfig, views: np.ndarray) -> Mapping[str, Any]:
+    """Return the entry of a config in ``cards/steel.json``."""
+    steel, single = views[:, STEEL], views[:, SINGLE]
+    scored = np.isfinite(single)
+    return {
+        "views": len(views),
+        "scored_views": int(np.count_nonzero(scored)),
+        "width": config.rig.width,
+        "height": config.rig.height,
+        "distance_to": config.manifest_entry["protocol"].get("distance_to", CENTRE),
+        "coverage": {
+            "mean": _rounded(steel.mean()),
+            "least": _rounded(steel.min()),
+            "most": _rounded(steel.max()),
+        },
+        "interior": _rounded(np.nanmean(views[:, INTERIOR])),
+        "depth_m": [_rounded(np.nanmin(views[:, NEAR])), _rounded(np.nanmax(views[:, FAR]))],
+        "reference": config.manifest_entry["reference"],
+        "single_bar": {"share": _rounded(single[scored].mean()), "views": int(np.count_nonzero(single[scored]))},
+    }
 
 
-def _summary(views: np.ndarray) -> tuple[object, ...]:
-    nearest_m, near_m, far_m, left, right = views.T
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
+def _cells(views: np.ndarray) -> tuple[object, ...]:
+    steel = 100 * views[:, STEEL]
     return (
         len(views),
-        f"{nearest_m.min():.3f}-{nearest_m.max():.3f}",
-        f"{np.nanmin(near_m):.3f}-{np.nanmax(far_m):.3f}",
-        *(
-            f"{100 * share.mean():.1f} ({100 * share.min():.1f}-{100 * share.max():.1f})"
-            for share in (left, right)
-        ),
-        int(np.count_nonzero((left == 0) | (right == 0))),
+        int(np.count_nonzero(np.isfinite(views[:, SINGLE]))),
+        range_text(views[:, NEAREST].min(), views[:, NEAREST].max(), 3),
+        range_text(np.nanmin(views[:, NEAR]), np.nanmax(views[:, FAR]), 3),
+        f"{steel.mean():.1f} ({range_text(steel.min(), steel.max(), 1)})",
+        f"{100 * np.nanmean(views[:, INTERIOR]):.1f}",
     )
 
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cards.steel import STEEL_RESULTS, depth_text, range_text
 from cards.templates import render
 from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, ONCE, MeasureFamily
 from rebar_depth_bench.extended.inspection.tolerances import PROFILES
@@ -108,6 +109,35 @@ def _percent(share: float | None) -> str:
     return "-" if share is None else f"{100 * share:.1f} %"
 
 
+def steel_context() -> dict[str, Any]:
+    """Return the template variables of the steel in the full protocols: command, image size and rows."""
+    document = json.loads(STEEL_RESULTS.read_text())
+    sizes = {f"{entry['width']} x {entry['height']}" for entry in document["configs"].values()}
+    rows = [_steel_row(name, entry) for name, entry in document["configs"].items()]
+    return {"steel_command": document["command"], "steel_size": " or ".join(sorted(sizes)), "steel": rows}
+
+
+def _steel_row(name: str, entry: Mapping[str, Any]) -> dict[str, str]:
+    coverage, single = entry["coverage"], entry["single_bar"]
+    without = entry["scored_views"] - single["views"]
+    least_and_most = range_text(100 * coverage["least"], 100 * coverage["most"], 1)
+    return {
+        "name": name,
+        "scored": f"{entry['scored_views']} of {entry['views']}",
+        "coverage": f"{_percent(coverage['mean'])} ({least_and_most})",
+        "interior": _percent(entry["interior"]),
+        "depth": depth_text(entry),
+        "single_bar": _percent(single["share"])
+        + (f", none in {without} of {entry['views']} views" if without else ""),
+        **{key: _errors(entry["reference"][key]) for key in ("constant", "one_pixel")},
+    }
+
+
+def _errors(errors: Mapping[str, float]) -> str:
+    rmse_cm = errors["rmse_cm"]
+    return f"{errors['abs_rel']:.3f}, {_number(rmse_cm, 1 if rmse_cm < 10 else 0, ' cm')}"
+
+
 _PARAMETER = re.compile(r"(?<=_)\d[\d.]*(?:-[\d.]+)?(?=(?:mm|pct|m|px)$)")
 """Pattern of the tolerance, threshold or bin at the end of a measure's name, without its unit."""
 
@@ -124,6 +154,7 @@ def benchmark_card() -> str:
         within_mm=WITHIN_MM,
         methods=[_method_row(method) for method in own_methods().values()],
         **reference_context(),
+        **steel_context(),
         draws=RESAMPLES,
         ring_views=BLOCK_VIEWS,
         min_views=MIN_VIEWS,

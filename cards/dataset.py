@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from huggingface_hub import DatasetCardData
 
+from cards.steel import depth_text, steel_by_config
 from cards.templates import render
 from rebar_depth_bench.data.columns import COLUMN_DESCRIPTIONS, column_kind, features
 from rebar_depth_bench.data.dataset_config import CENTRE, NEAREST_STEEL, DatasetConfig
@@ -26,18 +27,6 @@ _OPTICS_TEXTS = {
     "rectified": "factory-calibrated lenses, on the grid that OpenCV's stereoRectify makes of the pair; "
     "depth along the rectified axis",
 }
-STEEL_DEPTH: Mapping[tuple[str, str], str] = {
-    **dict.fromkeys([("lattice", CENTRE), ("lattice-12", CENTRE), ("lattice-zed-raw", CENTRE)], "0.13-0.49 m"),
-    **dict.fromkeys([("lattice-zed", CENTRE), ("lattice-zed-12", CENTRE)], "0.13-0.50 m"),
-    ("lattice-orbit", CENTRE): "0.24-0.39 m",
-    ("pile", CENTRE): "0.32-1.05 m",
-    ("pier", NEAREST_STEEL): "7.4-26.2 m",
-    ("lattice-distance", CENTRE): "0.13-1.64 m",
-    ("pile-distance", CENTRE): "0.34-2.33 m",
-    ("pier-distance", CENTRE): "1.7-20.4 m",
-}
-"""Depth of the steel in the left camera over the full trajectory of a standard config, by its name and
-``distance_to``, as printed by ``python -m benchmarks.steel_coverage CONFIG``."""
 _SIZE_CATEGORIES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 
 
@@ -181,7 +170,7 @@ def _distance(protocol: Mapping[str, Any]) -> str:
 
 def _steel_depth(config: DatasetConfig) -> str:
     """Return the range of steel depth of a standard config; a dash for other assemblies and trajectories."""
-    entry = config.manifest_entry
-    known = "path" not in entry["scene"]["assembly"]
-    distance_to = entry["protocol"].get("distance_to", CENTRE)
-    return STEEL_DEPTH.get((config.name, distance_to), DASH) if known else DASH
+    entry, steel = config.manifest_entry, steel_by_config().get(config.name)
+    if "path" in entry["scene"]["assembly"] or steel is None:
+        return DASH
+    return depth_text(steel) if entry["protocol"].get("distance_to", CENTRE) == steel["distance_to"] else DASH

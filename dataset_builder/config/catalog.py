@@ -58,9 +58,9 @@ PIER_DOME = DomeSpec(
 """The 504 views of the paper at 8-17 m from the nearest steel, at the heights of a person, a mast and a drone.
 
 The paper does not say what its distances are to. Its masks cover 4.5-7.2 % of the frame: here steel covers 5.2 %
-on average (10.9 % on the nearest shell, 3.1 % on the farthest), at depths of 7.4-26.2 m. With the same distances
-to the middle of the cage it would cover 9 %, from a depth of 3.3 m. ``python -m benchmarks.steel_coverage``
-measures these numbers of all domes.
+on average (10.9 % on the nearest shell, 3.1 % on the farthest), at depths of 7.4-26.3 m. With the same distances
+to the middle of the cage it would cover 9 %, from a depth of 3.3 m. ``python -m benchmarks.steel_coverage ROOT``
+measures these numbers of all domes in a folder.
 """
 LATTICE_RING = RingSpec(radius_m=0.325, elevation_deg=35.0, azimuths=100)
 

@@ -11,13 +11,17 @@ import yaml
 from datasets import load_dataset
 
 import rebar_depth_bench as rdb
-from benchmarks.steel_coverage import GRID, measure_views
+from benchmarks import steel_coverage
 from cards import benchmark_card, benchmark_tasks, dataset_card
-from cards.dataset import STEEL_DEPTH, column_rows
-from dataset_builder.config.catalog import BuildRequest
+from cards.dataset import column_rows
+from cards.steel import steel_by_config
+from dataset_builder.config.catalog import CONFIGS, SWEEPS
 from dataset_builder.config.specs import DomeSpec
+from dataset_builder.config.trajectories import view_count
+from dataset_builder.scene.steel_distance import Cylinders
+from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.columns import features
-from rebar_depth_bench.data.dataset_config import NEAREST_STEEL
+from rebar_depth_bench.data.dataset_config import CENTRE, NEAREST_STEEL
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods import own_methods
 from tests.synthetic_dataset import drop_scene_column
@@ -85,15 +89,40 @@ def test_card_of_an_older_folder_describes_its_shards(tiny_root: Path, tmp_path:
     }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["lattice", "pile", "pier"])
-def test_steel_depths_on_card_are_those_measured(name: str) -> None:
-    [spec] = BuildRequest((name,), None, *GRID).config_specs()
-    _, views = measure_views(spec)
-    low_m, high_m = views[:, 1].min(), views[:, 2].max()
-    decimals = 1 if high_m > 10 else 2
-    assert isinstance(spec.protocol, DomeSpec)
-    assert STEEL_DEPTH[name, spec.protocol.distance_to] == f"{low_m:.{decimals}f}-{high_m:.{decimals}f} m"
+def test_steel_on_cards_is_of_all_views_of_all_configs() -> None:
+    stored = steel_by_config()
+    assert set(stored) == {*CONFIGS, *SWEEPS}
+    for name, make in {**CONFIGS, **SWEEPS}.items():
+        protocol, entry = make().protocol, stored[name]
+        assert entry["views"] == view_count(protocol)
+        assert (entry["width"], entry["height"]) == (1280, 720)
+        assert entry["distance_to"] == (protocol.distance_to if isinstance(protocol, DomeSpec) else CENTRE)
+
+
+def test_steel_of_a_folder_is_measured(
+    tiny_root: Path, tiny_masks: dict[str, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = open_folder(tiny_root).config("lattice")
+    bars = read_bars(tiny_root / "bars.parquet")["lattice"]
+    views = steel_coverage.measure_views(config, Cylinders.from_bars(bars))
+    entry = steel_coverage.summary(config, views)
+    shares = [mask.mean() for mask in tiny_masks.values()]
+    assert entry["coverage"] == pytest.approx(
+        {"mean": np.mean(shares), "least": min(shares), "most": max(shares)}, rel=1e-5
+    )
+    assert entry["interior"] == pytest.approx(
+        np.mean([view.scored_px / view.steel_px for view in config.views]), rel=1e-5
+    )
+    assert entry["scored_views"] == len(config.views)
+    assert config.reference is not None
+    assert entry["reference"] == config.reference.model_dump()
+    nearest_m, near_m, far_m = views[:, :3].T
+    assert (nearest_m > 0.1).all()
+    assert (near_m > 0.75 * nearest_m).all()
+    assert entry["depth_m"] == pytest.approx([near_m.min(), far_m.max()], rel=1e-5)
+    steel_coverage.main(str(tiny_root), str(tmp_path / "steel.json"))
+    assert "| lattice | all | 9 | 9 |" in capsys.readouterr().out
+    assert '"configs": {}' in (tmp_path / "steel.json").read_text(), "the folder has 9 of 504 views"
 
 
 def test_card_states_what_distances_are_to(tiny_root: Path) -> None:
@@ -113,7 +142,7 @@ def test_card_states_what_distances_are_to(tiny_root: Path) -> None:
         )
         for kind, config in (("pier", pier), ("older", older))
     }
-    assert "| 0.22-0.43 m, nearest steel | 7.4-26.2 m |" in rows["pier"]
+    assert "| 0.22-0.43 m, nearest steel | 7.4-26.3 m |" in rows["pier"]
     assert "| 0.22-0.43 m | – |" in rows["older"]
 
 
