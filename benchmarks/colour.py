@@ -26,7 +26,7 @@ from dataset_builder.blender.colour import configure_colour, render_colour
 from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
 from dataset_builder.blender.scene import build_scene
 from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.quality import QUALITIES
+from dataset_builder.config.quality import QUALITIES, UNIFORM, colour_spec
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import ColourSpec, ConfigSpec
 from dataset_builder.config.trajectories import poses, subset
@@ -42,6 +42,7 @@ BASELINE = "16 samples, ACCURATE"
 SETTINGS: Mapping[str, ColourSpec] = {
     BASELINE: ColourSpec(16, 16, "ACCURATE"),
     "16 samples, FAST": ColourSpec(16, 16),
+    "--sampling uniform": colour_spec(UNIFORM),
     **{f"--quality {name}": spec for name, spec in QUALITIES.items()},
 }
 """Settings that are compared; the first has the default settings of BlenderProc's denoiser."""
