@@ -86,9 +86,10 @@ def _rows(spec: ConfigSpec, folder: Path) -> list[tuple[str, ...]]:
         seconds = (time.process_time() - start) / len(subjects)
         baseline_s = seconds if name == BASELINE else baseline_s
         for subject, picture, reference in zip(subjects, pictures, references, strict=True):
-            _save(picture, folder / f"{subject.name} {name.removeprefix('--')}.png")
+            stem = f"{subject.name} {name.removeprefix('--')}"
+            _save(picture, folder / f"{stem}.png")
             difference = AMPLIFICATION * (picture.astype(int) - reference) + 128
-            _save(difference.clip(0, 255).astype(np.uint8), folder / f"{subject.name} {name[2:]} difference.png")
+            _save(difference.clip(0, 255).astype(np.uint8), folder / f"{stem} difference.png")
         quality = [
             _psnr_db(pictures, references, [subject.steel == on_steel for subject in subjects])
             for on_steel in (True, False)
