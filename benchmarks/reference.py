@@ -1,9 +1,10 @@
-"""Reference results of every method that runs on a CPU without downloads, on a subset of every scene.
+"""Reference results of the methods that run on a CPU without downloads.
 
-``python -m benchmarks.reference OUT`` renders the subset into OUT/dataset, writes the predictions of each method
-to OUT/NAME.zip, scores them and writes ``cards/reference.json``, the source of the reference tables in the
-benchmark card. It takes hours. After an interruption, the same command computes only the archives that are missing
-or older than the dataset.
+``python -m benchmarks.reference OUT SET`` renders the views of a set into OUT/dataset, writes the predictions of
+each method to OUT/NAME.zip, scores them and writes ``cards/reference/SET.json``, the source of the tables in the
+benchmark card. ``subset`` has all methods on a subset of every scene; ``lattice``, ``pile`` and ``pier`` have the
+fast methods on all views of one scene. A set takes hours. After an interruption, the same command computes only the
+archives that are missing or older than the dataset. OUT must not be used for two sets.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from cards.benchmark import REFERENCE_RESULTS
+from cards.reference import results_file
 from dataset_builder.cli import main as rebar_build
 from rebar_depth_bench import score
 from rebar_depth_bench.atomic_io import write_text
@@ -31,16 +32,28 @@ from rebar_depth_bench.view_ids import config_of
 
 
 @dataclass(frozen=True)
-class Subset:
-    """Rendered subset of each config: number of evenly spread views, image size in pixels, samples per pixel."""
+class Renders:
+    """Rendered views of each config: their number, evenly spread, image size in pixels, and colour option."""
 
-    views: int = 72
+    views: int
+    colour: str
     width: int = 640
     height: int = 360
-    samples: int = 4
 
 
-SUBSET = Subset()
+@dataclass(frozen=True)
+class ReferenceSet:
+    """Set of results: renders, and the configs on which each method runs."""
+
+    renders: Renders
+    runs: Mapping[str, tuple[str, ...]]
+
+    @property
+    def configs(self) -> list[str]:
+        """Return the configs of the set, in the order in which methods name them."""
+        return list(dict.fromkeys(config for configs in self.runs.values() for config in configs))
+
+
 WITH_BOARD = ("lattice", "pile")
 ALL_SCENES = (*WITH_BOARD, "pier")
 
@@ -63,22 +76,50 @@ closer than the scanner's minimum range. ``lidar-survey`` is omitted because it 
 view.
 """
 
+SLOW_METHODS = ("sweep-aruco", "sweep-anchored")
+"""Methods that run on the subset only, because structure from motion takes up to 15 seconds a view there."""
 
-def main(out: Path) -> int:
-    """Compute missing archives and write the results; return the exit status."""
-    root = out / "dataset"
-    size = ("--width", SUBSET.width, "--height", SUBSET.height, "--samples", SUBSET.samples)
-    build = ("--out", root, "--config", *ALL_SCENES, "--views", SUBSET.views, *size)
+
+def _all_views(scene: str) -> ReferenceSet:
+    runs = {
+        method: (scene,) for method, configs in RUNS.items() if scene in configs and method not in SLOW_METHODS
+    }
+    return ReferenceSet(Renders(504, "--quality preview"), runs)
+
+
+SETS: Mapping[str, ReferenceSet] = {
+    "subset": ReferenceSet(Renders(72, "--samples 4"), RUNS),
+    **{scene: _all_views(scene) for scene in ALL_SCENES},
+}
+"""Sets of results by name."""
+
+
+def main(out: Path, set_name: str) -> int:
+    """Compute missing archives of a set and write its results; return the exit status."""
+    reference = SETS[set_name]
+    renders, root = reference.renders, out / "dataset"
+    size = ("--width", renders.width, "--height", renders.height)
+    build = (
+        "--out",
+        root,
+        "--config",
+        *reference.configs,
+        "--views",
+        renders.views,
+        *size,
+        *renders.colour.split(),
+    )
     if status := rebar_build(list(map(str, build))):
         return status
-    for method, configs in RUNS.items():
+    for method, configs in reference.runs.items():
         archive = out / f"{method}.zip"
         predict = ("predict", method, "--data", root, "--out", archive, "--config", *configs)
         if _is_stale(archive, root) and (status := rebar_bench(list(map(str, predict)))):
             return status
-    results = {method: _result(out / f"{method}.zip", root) for method in RUNS}
-    document = {"command": "python -m benchmarks.reference OUT", "subset": asdict(SUBSET), "results": results}
-    write_text(REFERENCE_RESULTS, json.dumps(document, indent=1, allow_nan=False) + "\n")
+    results = {method: _result(out / f"{method}.zip", root) for method in reference.runs}
+    command = f"python -m benchmarks.reference OUT {set_name}"
+    document = {"command": command, "renders": asdict(renders), "results": results}
+    write_text(results_file(set_name), json.dumps(document, indent=1, allow_nan=False) + "\n")
     return 0
 
 
@@ -132,6 +173,6 @@ def _median(seconds: Mapping[str, float], config: str) -> float:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit("usage: python -m benchmarks.reference OUT")
-    sys.exit(main(Path(sys.argv[1])))
+    if len(sys.argv) != 3 or sys.argv[2] not in SETS:
+        sys.exit(f"usage: python -m benchmarks.reference OUT {'|'.join(SETS)}")
+    sys.exit(main(Path(sys.argv[1]), sys.argv[2]))

@@ -1,6 +1,6 @@
 """Benchmark card: metrics, protocol, limits, methods and reference results.
 
-The constants of the card are taken from the code, the tables of reference results from ``cards/reference.json``.
+The constants of the card are taken from the code, the tables of results from the JSON files of this package.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
+from cards.reference import FULL_SETS, SUBSET, number, percent, reference_context
 from cards.steel import STEEL_RESULTS, depth_text, range_text
 from cards.templates import render
 from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, ONCE, MeasureFamily
@@ -21,92 +21,6 @@ from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_VIEWS, RESAMPLE
 from rebar_depth_bench.scoring.protocol import DELTA1_RATIO, MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.rounding import SIGNIFICANT_DIGITS
 from rebar_depth_bench.submission import INPUTS
-
-REFERENCE_RESULTS = Path(__file__).parent / "reference.json"
-"""JSON file of the reference results, written by ``python -m benchmarks.reference``."""
-
-
-def reference_context() -> dict[str, Any]:
-    """Return the template variables of the reference results: command, subset, and rows by config."""
-    document = json.loads(REFERENCE_RESULTS.read_text())
-    by_config: dict[str, list[tuple[str, Mapping[str, Any]]]] = {}
-    for method, result in document["results"].items():
-        for config in result["tables"]:
-            by_config.setdefault(config, []).append((method, result))
-    return {
-        "command": document["command"],
-        "subset": document["subset"],
-        "reference": {config: _method_rows(config, rows) for config, rows in by_config.items()},
-        "reference_errors": {
-            config: {
-                name: [_number(errors["abs_rel"], 4), _number(errors["rmse_cm"], 2, " cm")]
-                for name, errors in rows[0][1]["tables"][config]["reference"].items()
-            }
-            for config, rows in by_config.items()
-        },
-        "single_bar": [_single_bar_row(config, *row) for config, rows in by_config.items() for row in rows],
-    }
-
-
-def _method_rows(config: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) -> list[dict[str, str]]:
-    """Return the formatted rows of a config by rank error; those that are not ranked come last."""
-    ordered = sorted(rows, key=lambda row: _rank_key(row[1]["tables"][config]))
-    return [_method_row_of(method, result, config) for method, result in ordered]
-
-
-def _rank_key(table: Mapping[str, Any]) -> tuple[bool, float]:
-    return not table["ranked"], table["rank_error"]
-
-
-def _single_bar_row(config: str, method: str, result: Mapping[str, Any]) -> dict[str, Any]:
-    numbers = result["single_bar"][config]
-    errors = {name: _number(value, 4) for name, value in numbers.items() if "_abs_rel_" in name}
-    return {
-        "config": config,
-        "method": method,
-        "mark": _mark(method),
-        "share": _percent(numbers["share"]),
-        "views": numbers["views"],
-        **errors,
-    }
-
-
-def _mark(method: str) -> str:
-    return " †" if own_methods()[method].info.uses_ground_truth else ""
-
-
-def _method_row_of(method: str, result: Mapping[str, Any], config: str) -> dict[str, str]:
-    table = result["tables"][config]
-    native, scaled = table["native"] or {}, table["scaled"] or {}
-    bounds = (table.get("ci95") or {}).get("native", {}).get("abs_rel")
-    interval = "" if bounds is None else f" ({_number(bounds[0], 3)}-{_number(bounds[1], 3)})"
-    return {
-        "method": method,
-        "mark": _mark(method),
-        "rank_error": _number(table["rank_error"], 4),
-        "coverage": _percent(table["coverage"]),
-        "abs_rel": _number(native.get("abs_rel"), 4) + interval,
-        "rmse": _number(native.get("rmse_cm"), 2, " cm"),
-        "scaled": _number(scaled.get("abs_rel"), 4),
-        "scale": _number(table["scale_median"], 3),
-        "within": _percent(table["within_mm"]["5"]),
-        "seconds": _seconds(result, config, table["views"]),
-    }
-
-
-def _seconds(result: Mapping[str, Any], config: str, views: int) -> str:
-    """Return the formatted seconds per view, including an equal share of the preparation; "-" if unknown."""
-    seconds = result["seconds"]
-    preparing = (seconds["preparing"] or {}).get(config, 0.0)
-    return "-" if preparing is None else f"{seconds['a_view'][config] + preparing / views:.2g}"
-
-
-def _number(value: float | None, digits: int, unit: str = "") -> str:
-    return "-" if value is None else f"{value:.{digits}f}{unit}"
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f} %"
 
 
 def steel_context() -> dict[str, Any]:
@@ -124,10 +38,10 @@ def _steel_row(name: str, entry: Mapping[str, Any]) -> dict[str, str]:
     return {
         "name": name,
         "scored": f"{entry['scored_views']} of {entry['views']}",
-        "coverage": f"{_percent(coverage['mean'])} ({least_and_most})",
-        "interior": _percent(entry["interior"]),
+        "coverage": f"{percent(coverage['mean'])} ({least_and_most})",
+        "interior": percent(entry["interior"]),
         "depth": depth_text(entry),
-        "single_bar": _percent(single["share"])
+        "single_bar": percent(single["share"])
         + (f", none in {without} of {entry['views']} views" if without else ""),
         **{key: _errors(entry["reference"][key]) for key in ("constant", "one_pixel")},
     }
@@ -135,7 +49,7 @@ def _steel_row(name: str, entry: Mapping[str, Any]) -> dict[str, str]:
 
 def _errors(errors: Mapping[str, float]) -> str:
     rmse_cm = errors["rmse_cm"]
-    return f"{errors['abs_rel']:.3f}, {_number(rmse_cm, 1 if rmse_cm < 10 else 0, ' cm')}"
+    return f"{errors['abs_rel']:.3f}, {number(rmse_cm, 1 if rmse_cm < 10 else 0, ' cm')}"
 
 
 _PARAMETER = re.compile(r"(?<=_)\d[\d.]*(?:-[\d.]+)?(?=(?:mm|pct|m|px)$)")
@@ -153,7 +67,8 @@ def benchmark_card() -> str:
         inputs=[f"`{name}`" for name in INPUTS],
         within_mm=WITHIN_MM,
         methods=[_method_row(method) for method in own_methods().values()],
-        **reference_context(),
+        subset=reference_context(SUBSET),
+        full=[reference_context(name) for name in FULL_SETS],
         **steel_context(),
         draws=RESAMPLES,
         ring_views=BLOCK_VIEWS,

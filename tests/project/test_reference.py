@@ -8,54 +8,59 @@ from typing import Any
 
 import pytest
 
-from benchmarks.reference import RUNS, SUBSET
-from cards.benchmark import REFERENCE_RESULTS, reference_context
+from benchmarks.reference import RUNS, SETS
+from cards.reference import FULL_SETS, SUBSET, reference_context, results_file
 from rebar_depth_bench.methods import own_methods
 
-STORED: dict[str, Any] = json.loads(REFERENCE_RESULTS.read_text())
+PUBLISHED = (SUBSET, *FULL_SETS)
+STORED: dict[str, dict[str, Any]] = {name: json.loads(results_file(name).read_text()) for name in PUBLISHED}
 
 
 def test_every_cpu_method_has_a_stored_run() -> None:
-    assert set(STORED["results"]) == set(RUNS)
-    assert STORED["subset"] == asdict(SUBSET)
+    assert set(SETS[SUBSET].runs) == set(RUNS)
     untested = {name for name, method in own_methods().items() if method.info.untested_note}
     assert set(own_methods()) - untested - set(RUNS) == {"lidar-survey"}
 
 
-@pytest.mark.parametrize("method", RUNS)
-def test_run_has_its_configs_and_views(method: str) -> None:
-    result = STORED["results"][method]
-    assert tuple(result["tables"]) == RUNS[method]
-    assert result["submission"]["method"] == method
-    assert all(table["views"] <= SUBSET.views for table in result["tables"].values())
-    assert result["dataset"] == STORED["results"]["truth"]["dataset"]
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_set_has_its_methods_configs_and_views(name: str) -> None:
+    renders, runs, results = SETS[name].renders, SETS[name].runs, STORED[name]["results"]
+    assert STORED[name]["renders"] == asdict(renders)
+    assert set(results) == set(runs)
+    for method, result in results.items():
+        assert tuple(result["tables"]) == runs[method]
+        assert result["submission"]["method"] == method
+        assert all(table["views"] <= renders.views for table in result["tables"].values())
+        assert result["dataset"] == results["truth"]["dataset"]
 
 
-def test_truth_has_zero_error_and_noise_has_specified_error() -> None:
-    for config, table in STORED["results"]["truth"]["tables"].items():
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_truth_has_zero_error_and_noise_has_specified_error(name: str) -> None:
+    results = STORED[name]["results"]
+    for config, table in results["truth"]["tables"].items():
         assert table["native"]["abs_rel"] == table["rank_error"] == 0, config
         assert not table["ranked"]
-    for table in STORED["results"]["noisy-truth"]["tables"].values():
+    for table in results["noisy-truth"]["tables"].values():
         assert table["native"]["abs_rel"] == pytest.approx(0.25, abs=0.003)
         assert table["scale_median"] == pytest.approx(1 / 1.25, abs=0.003)
 
 
-def test_reference_errors_do_not_depend_on_the_method() -> None:
-    for config, rows in reference_context()["reference_errors"].items():
-        tables = [STORED["results"][method]["tables"][config] for method, names in RUNS.items() if config in names]
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_reference_errors_do_not_depend_on_the_method(name: str) -> None:
+    results = STORED[name]["results"]
+    for config, errors in reference_context(name)["errors"].items():
+        tables = [result["tables"][config] for result in results.values() if config in result["tables"]]
         assert all(table["reference"] == tables[0]["reference"] for table in tables)
-        assert rows["constant"][0] == f"{tables[0]['reference']['constant']['abs_rel']:.4f}"
+        assert errors["constant"][0] == f"{tables[0]['reference']['constant']['abs_rel']:.4f}"
 
 
-def test_card_rows_match_stored_results() -> None:
-    rows = {
-        (config, row["method"]): row
-        for config, config_rows in reference_context()["reference"].items()
-        for row in config_rows
-    }
-    assert set(rows) == {(config, method) for method, configs in RUNS.items() for config in configs}
-    table = STORED["results"]["sgbm-filled"]["tables"]["lattice"]
-    row = rows["lattice", "sgbm-filled"]
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_card_rows_match_stored_results(name: str) -> None:
+    config = SETS[name].configs[0]
+    rows = {row["method"]: row for row in reference_context(name)["rows"][config]}
+    assert set(rows) == {method for method, configs in SETS[name].runs.items() if config in configs}
+    table = STORED[name]["results"]["sgbm-filled"]["tables"][config]
+    row = rows["sgbm-filled"]
     low, high = table["ci95"]["native"]["abs_rel"]
     assert row["abs_rel"] == f"{table['native']['abs_rel']:.4f} ({low:.3f}-{high:.3f})"
     assert row["rmse"] == f"{table['native']['rmse_cm']:.2f} cm"
