@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 
 from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
-from rebar_depth_bench.console import ProgressBars, add_archive, add_data
+from rebar_depth_bench.console import ProgressBars, add_archive, add_data, print_notice
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.errors import SubmissionError
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.submission import check_archive
 
 SUMMARY = "list all problems of a submission archive"
@@ -21,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Check an archive; raise ``SubmissionError`` with all of its problems."""
+    """Check an archive, and look for mistakes; raise ``SubmissionError`` with all problems of the archive."""
     folder = open_folder(options.data, expect_digest=options.expect_digest)
     with ProgressBars() as bars:
         problems = check_archive(options.archive, folder.expected_views(), bars.update)
@@ -29,3 +31,6 @@ def run(options: argparse.Namespace) -> None:
     if problems:
         raise SubmissionError.from_problems(options.archive, problems)
     print(f"{options.archive}: no problem found")
+    with open_evaluation(options.archive, options.data) as evaluation:
+        for mistake in diagnose(evaluation):
+            print_notice(f"possible mistake: {mistake.text}")

@@ -17,6 +17,7 @@ from rebar_depth_bench.console import (
     add_workers,
     print_notice,
 )
+from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.reporting.eval_results import check_hub_id, eval_results
@@ -77,8 +78,9 @@ def run(options: argparse.Namespace) -> None:
         print_verified(
             evaluation.folder, f"views of {names} verified when their ground truth was stored in the cache"
         )
+        mistakes = diagnose(evaluation)
         if options.html:
-            write_report(result, evaluation, options.html, views_shown=options.html_views)
+            write_report(result, evaluation, options.html, mistakes=mistakes, views_shown=options.html_views)
     if options.eval_results:
         write_text(options.eval_results, entries)
         for note in notes:
@@ -92,3 +94,5 @@ def run(options: argparse.Namespace) -> None:
     print_table(result, Console())
     if result.extended is not None:
         print_extended(result.extended, Console())
+    for mistake in mistakes:
+        print_notice(f"possible mistake: {mistake.text}")

@@ -18,6 +18,7 @@ from markupsafe import Markup
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.data.dataset import iterate_undecoded
 from rebar_depth_bench.data.decoding import RowDecoder
+from rebar_depth_bench.diagnosis.diagnose import PossibleMistake
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import score_charts
@@ -60,10 +61,11 @@ class ConfigViewTables:
     views: int
 
 
-def render_report(result: Result, panels: Iterable[ViewPanels]) -> str:
+def render_report(result: Result, panels: Iterable[ViewPanels], mistakes: Sequence[PossibleMistake] = ()) -> str:
     """Return the HTML report of ``result`` with the images of ``panels``, by config, worst view first.
 
-    ``panels`` may be in any order and is iterated once; only the encoded images stay in memory.
+    ``panels`` may be in any order and is iterated once; only the encoded images stay in memory. ``mistakes`` are
+    the possible mistakes in the submission.
     """
     views = views_by_config(result)
     shown = shown_views(panels, list(result.tables))
@@ -77,6 +79,7 @@ def render_report(result: Result, panels: Iterable[ViewPanels]) -> str:
             protocol=result.protocol,
             script=script.text,
             policy=script.policy,
+            mistakes=[printable(mistake.text) for mistake in mistakes],
             metric_heads=formatting.METRIC_HEADS,
             tolerances=WITHIN_MM,
             dash_note=formatting.DASH_NOTE,
@@ -168,8 +171,15 @@ def _config_views(name: str, views: Sequence[ViewScore]) -> ConfigViewTables:
 _COLUMNS = ("view_id", "left_rgb", "left_depth", "left_mask")
 
 
-def write_report(result: Result, evaluation: Evaluation, target: Path, *, views_shown: int = VIEWS_SHOWN) -> None:
-    """Write the HTML report of ``result``, the scores of the submission of ``evaluation``.
+def write_report(
+    result: Result,
+    evaluation: Evaluation,
+    target: Path,
+    *,
+    mistakes: Sequence[PossibleMistake] = (),
+    views_shown: int = VIEWS_SHOWN,
+) -> None:
+    """Write the HTML report of ``result``, the scores of the submission of ``evaluation``, and its ``mistakes``.
 
     Up to ``views_shown`` views of each config are shown with images: the worst by rank error, then evenly
     spaced down to the best. Raises ``InputError`` if ``views_shown`` is negative.
@@ -178,7 +188,7 @@ def write_report(result: Result, evaluation: Evaluation, target: Path, *, views_
         config: views_to_show([view for view in result.views if config_of(view.view_id) == config], views_shown)
         for config in result.tables
     }
-    write_text(target, render_report(result, iter_view_panels(chosen, evaluation)))
+    write_text(target, render_report(result, iter_view_panels(chosen, evaluation), mistakes))
 
 
 def iter_view_panels(chosen: Mapping[str, list[ViewScore]], evaluation: Evaluation) -> Iterator[ViewPanels]:

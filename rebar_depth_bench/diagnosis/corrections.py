@@ -1,0 +1,200 @@
+"""Corrections of the mistakes that a diagnosis looks for, each a function of one view.
+
+A correction undoes a mistake and returns the errors of the prediction before and after (see ``errors``). All but
+those of units are independent of the scale of the predictions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from rebar_depth_bench.diagnosis.errors import (
+    Values,
+    line_error,
+    mean_error,
+    median_error,
+    median_ratio,
+    valid_share,
+)
+from rebar_depth_bench.diagnosis.views import DiagnosedView
+
+Image = Float[ndarray, "h w"]
+ReadPrediction = Callable[[int], Image]
+"""Function that returns the prediction submitted for the view at a position of the config."""
+
+UNITS: Mapping[str, float] = {
+    "millimetres": 1000.0,
+    "centimetres": 100.0,
+    "inches": 1 / 0.0254,
+    "feet": 1 / 0.3048,
+}
+"""Units in a metre."""
+UNIT_TOLERANCE = 0.06
+"""Largest deviation of a view's scale from that of a unit, as a share of the unit's logarithm.
+
+A wrong scale can have any size, so that the deviation must be the smaller the closer a unit is to the metre: a
+factor of 1.5 for millimetres, of 1.07 for feet.
+"""
+MAX_SHIFT_PX = 6
+"""Largest shift that is looked for, pixels."""
+LEAST_VALID_SHARE = 0.8
+"""Least number of valid pixels after a correction, as a share of those before."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of a view's prediction as it was submitted, and after a correction; NaN where there is none."""
+
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Correction of a mistake: what the predictions seem to be, what the errors are, and the errors of a view.
+
+    The errors are ``in_metres`` or independent of the scale of the predictions.
+    """
+
+    name: str
+    seems: str
+    measure: str
+    errors: Callable[[DiagnosedView], Errors]
+    in_metres: bool = False
+
+
+def unit_corrections() -> list[Correction]:
+    """Return the corrections of depth in other units than metres."""
+    return [
+        Correction(
+            unit,
+            f"in {unit}",
+            "median error",
+            partial(_unit_errors, units_in_metre=units_in_metre),
+            in_metres=True,
+        )
+        for unit, units_in_metre in UNITS.items()
+    ]
+
+
+def _unit_errors(view: DiagnosedView, units_in_metre: float) -> Errors:
+    p, z_m = view.left.values(view.prediction), view.left.depth_m
+    before, scale = median_error(p, z_m, 1.0), median_ratio(p, z_m) * units_in_metre
+    is_unit = scale > 0 and abs(math.log(scale)) <= UNIT_TOLERANCE * math.log(units_in_metre)
+    return Errors(before, median_error(p, z_m, 1 / units_in_metre) if is_unit else math.nan)
+
+
+def shape_corrections(views: Sequence[DiagnosedView], read: ReadPrediction, count: int) -> list[Correction]:
+    """Return the corrections of everything but units, for the ``views`` of a config that has ``count`` views."""
+    height, width = views[0].prediction.shape
+    turns = {**_TURNS, **(_QUARTER_TURNS if height == width else {})}
+    shift = best_shift(views)
+    ray = "distances along the rays instead of depth along the optical axis"
+    by_name: dict[str, tuple[str, str, Callable[[DiagnosedView], Errors]]] = {
+        "range": (ray, _SCALED, _range_errors),
+        "inverse": ("disparity or inverse depth instead of depth", _FITTED, _inverse_errors),
+        "right-eye": ("those of the right pictures", _SCALED, _right_eye_errors),
+        **{name: (seems, _SCALED, partial(_turned_errors, turn=turn)) for name, (seems, turn) in turns.items()},
+        **{
+            name: (f"those of other views: {order}", _SCALED, partial(_order_errors, source=source, read=read))
+            for name, (order, source) in _orders(count).items()
+        },
+    }
+    if shift != (0, 0):
+        seems = f"shifted by {shift[1]:+d} columns and {shift[0]:+d} rows"
+        by_name["shift"] = (seems, "mean error after scaling", partial(_shift_errors, shift=shift))
+    return [Correction(name, *parts) for name, parts in by_name.items()]
+
+
+_SCALED = "median error after scaling"
+_FITTED = "median error after scaling and shifting"
+_TURNS: Mapping[str, tuple[str, Callable[[Image], Image]]] = {
+    "mirrored": ("mirrored left to right", np.fliplr),
+    "upside-down": ("mirrored upside down", np.flipud),
+    "rotated": ("rotated by 180 degrees", partial(np.rot90, k=2)),
+}
+"""Ways to turn a picture, and how to undo them."""
+_QUARTER_TURNS: Mapping[str, tuple[str, Callable[[Image], Image]]] = {
+    "quarter-left": ("rotated by 90 degrees counter-clockwise", partial(np.rot90, k=-1)),
+    "quarter-right": ("rotated by 90 degrees clockwise", np.rot90),
+    "transposed": ("transposed: rows and columns exchanged", np.transpose),
+}
+"""The same for square pictures."""
+
+
+def _orders(count: int) -> Mapping[str, tuple[str, Callable[[int], int]]]:
+    """Return the wrong orders of ``count`` views, each with the position at which a view's prediction stands."""
+    as_text = sorted(range(count), key=str)
+    position = {view: n for n, view in enumerate(as_text)}
+    sorted_as_text = "sorted by numbers as text, 0, 1, 10, 100"
+    return {
+        "reversed": ("in reverse order", lambda view: count - 1 - view),
+        "one-early": ("each is that of the next view", lambda view: max(view - 1, 0)),
+        "one-late": ("each is that of the view before", lambda view: min(view + 1, count - 1)),
+        "as-text": (sorted_as_text, lambda view: position[view]),
+        "from-text": (f"read as if they had been {sorted_as_text}", lambda view: as_text[view]),
+    }
+
+
+def best_shift(views: Sequence[DiagnosedView]) -> tuple[int, int]:
+    """Return the rows and columns by which the predictions of all views are shifted, at most ``MAX_SHIFT_PX``.
+
+    It is the shift without which the mean error over the views is smallest.
+    """
+    steps = range(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1)
+    shifts = sorted(
+        ((dv, du) for dv in steps for du in steps), key=lambda shift: (abs(shift[0]) + abs(shift[1]), shift)
+    )
+    return min(shifts, key=lambda shift: math.fsum(_shift_errors(view, shift).after for view in views))
+
+
+def _shift_errors(view: DiagnosedView, shift: tuple[int, int]) -> Errors:
+    before, after = view.left.values(view.prediction), view.left.values(view.prediction, *shift)
+    errors = mean_error(before, view.left.depth_m), mean_error(after, view.left.depth_m)
+    return _comparable(Errors(*errors), before, after)
+
+
+def _range_errors(view: DiagnosedView) -> Errors:
+    p = view.left.values(view.prediction)
+    range_per_depth = np.linalg.norm(view.camera.rays(), axis=-1)[view.left.v, view.left.u]
+    return _errors(view, p, p / range_per_depth)
+
+
+def _inverse_errors(view: DiagnosedView) -> Errors:
+    """Return the errors of lines fitted to depth and to inverse depth, because disparity often has an offset."""
+    p, z_m = view.left.values(view.prediction), view.left.depth_m
+    as_depth = line_error(p, z_m, np.positive)
+    return Errors(median_error(p, z_m) if math.isnan(as_depth) else as_depth, line_error(p, z_m, np.reciprocal))
+
+
+def _right_eye_errors(view: DiagnosedView) -> Errors:
+    before, after = view.left.values(view.prediction), view.right.values(view.prediction)
+    errors = median_error(before, view.left.depth_m), median_error(after, view.right.depth_m)
+    return _comparable(Errors(*errors), before, after)
+
+
+def _turned_errors(view: DiagnosedView, turn: Callable[[Image], Image]) -> Errors:
+    return _errors(view, view.left.values(view.prediction), view.left.values(turn(view.prediction)))
+
+
+def _order_errors(view: DiagnosedView, source: Callable[[int], int], read: ReadPrediction) -> Errors:
+    return _errors(view, view.left.values(view.prediction), view.left.values(read(source(view.position))))
+
+
+def _errors(view: DiagnosedView, before: Values, after: Values) -> Errors:
+    """Return the median errors after scaling of the values before and after a correction."""
+    errors = median_error(before, view.left.depth_m), median_error(after, view.left.depth_m)
+    return _comparable(Errors(*errors), before, after)
+
+
+def _comparable(errors: Errors, before: Values, after: Values) -> Errors:
+    """Return errors without that after the correction if fewer pixels are valid then."""
+    is_comparable = valid_share(after) >= LEAST_VALID_SHARE * valid_share(before)
+    return errors if is_comparable else Errors(errors.before, math.nan)

@@ -1,0 +1,224 @@
+"""Diagnosis of submissions: every mistake is named, sound predictions are not, and results stay as they are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks.diagnosis import SOUND, learned_like, mistakes, mistakes_named
+from rebar_depth_bench import SubmissionWriter, score
+from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.data.dataset import iterate_rows
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.diagnosis.corrections import UNITS, best_shift
+from rebar_depth_bench.diagnosis.diagnose import diagnose
+from rebar_depth_bench.diagnosis.errors import line_error, median_error, median_ratio, resistant_line
+from rebar_depth_bench.diagnosis.views import MAX_VIEWS, DiagnosedView, Pixels, positions_to_read, read_views
+from rebar_depth_bench.methods import own_methods
+from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.scoring.evaluation import open_evaluation
+from tests.commands import run_in_process
+from tests.synthetic_dataset import write_dataset
+
+Rows = list[dict[str, np.ndarray]]
+_COLUMNS = ("view_id", "left_depth", "left_K", "baseline_m")
+
+ORDERS = ("reversed", "one-early", "one-late", "as-text", "from-text")
+ORDERS_OF_TEXT = ("as-text", "from-text")
+"""Orders that differ from the right one with more than ten views only."""
+
+
+@pytest.fixture(scope="module")
+def rows(tiny_root: Path) -> Rows:
+    config = open_folder(tiny_root).config("lattice")
+    return list(iterate_rows(config, _COLUMNS))
+
+
+@pytest.fixture(scope="module")
+def named_for_truth(tiny_root: Path, rows: Rows) -> dict[str, str]:
+    return mistakes_named(tiny_root, rows, [row["left_depth"] for row in rows])
+
+
+MADE = (
+    "inverse",
+    "range",
+    "mirrored",
+    "upside-down",
+    "rotated",
+    "shift",
+    "right-eye",
+    "same-map",
+    *UNITS,
+    *ORDERS,
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in MADE if name not in ORDERS_OF_TEXT])
+def test_mistake_in_exact_depth_is_named(named_for_truth: dict[str, str], name: str) -> None:
+    assert named_for_truth[name] == "yes"
+
+
+@pytest.mark.slow
+def test_every_correction_has_a_made_mistake(rows: Rows, named_for_truth: dict[str, str]) -> None:
+    assert set(mistakes(rows)) == {SOUND, *MADE}
+    assert named_for_truth[SOUND] == "-"
+
+
+@pytest.mark.slow
+def test_mistakes_in_learned_predictions_are_named_or_nothing_is(tiny_root: Path, rows: Rows) -> None:
+    named = mistakes_named(tiny_root, rows, learned_like([row["left_depth"] for row in rows]))
+    assert named[SOUND] == "-"
+    assert set(named.values()) == {"yes", "-"}
+    assert {name for name, cell in named.items() if cell == "yes"} >= {"millimetres", "centimetres", "inverse"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["sgbm", "sgbm-filled", "board-plane", "constant", "noisy-truth"])
+def test_sound_predictions_of_own_methods_are_not_mistaken(method: str, tiny_root: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "submission.zip"
+    predict(own_methods()[method], tiny_root, archive, configs=["lattice"])
+    with open_evaluation(archive, tiny_root) as evaluation:
+        assert diagnose(evaluation) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", UNITS)
+def test_unit_of_stereo_depth_is_named(unit: str, tiny_root: Path, tmp_path: Path, rows: Rows) -> None:
+    archive = tmp_path / "sgbm.zip"
+    predict(own_methods()["sgbm-filled"], tiny_root, archive, configs=["lattice"])
+    with open_evaluation(archive, tiny_root) as evaluation:
+        images = [np.array(evaluation.submission.read(str(row["view_id"]))) for row in rows]
+    assert _named(tiny_root, tmp_path, rows, mistakes(rows)[unit](images)) == [unit]
+
+
+@pytest.mark.parametrize("scale", [0.2, 0.35, 1 / 3, 0.5, 2.0, 3.0, 50.0])
+def test_wrong_scale_is_no_mistake(scale: float, tiny_root: Path, tmp_path: Path, rows: Rows) -> None:
+    assert _named(tiny_root, tmp_path, rows, [scale * row["left_depth"] for row in rows]) == []
+
+
+@pytest.mark.parametrize("image", ["noise", "constant", "plane", "nothing", "huge"])
+def test_prediction_without_structure_is_no_mistake(
+    image: str, tiny_root: Path, tmp_path: Path, rows: Rows
+) -> None:
+    random = np.random.default_rng(1)
+    shape = rows[0]["left_depth"].shape
+    v = np.arange(shape[0])[:, None]
+    make: dict[str, Callable[[], np.ndarray]] = {
+        "noise": lambda: random.uniform(0.1, 5.0, shape),
+        "constant": lambda: np.full(shape, 1000.0),
+        "plane": lambda: np.broadcast_to(0.5 + 0.01 * v + random.uniform(0, 1e-6), shape).copy(),
+        "nothing": lambda: np.full(shape, random.choice([0.0, math.nan, -1.0, math.inf])),
+        "huge": lambda: np.full(shape, 1e38) * random.uniform(0.5, 1, shape),
+    }
+    assert _named(tiny_root, tmp_path, rows, [make[image]() for _ in rows]) == []
+
+
+@pytest.mark.parametrize("order", ORDERS_OF_TEXT)
+def test_order_of_numbers_as_text_is_named(order: str, tmp_path: Path) -> None:
+    root = tmp_path / "dataset"
+    write_dataset(root, ["lattice"], 24)
+    rows = list(iterate_rows(open_folder(root).config("lattice"), _COLUMNS))
+    images = mistakes(rows)[order]([row["left_depth"] for row in rows])
+    assert _named(root, tmp_path, rows, images) == [order]
+
+
+def test_too_few_views_give_no_diagnosis(tiny_root: Path, tmp_path: Path) -> None:
+    columns = ("view_id", "left_depth")
+    orbit = list(iterate_rows(open_folder(tiny_root).config("lattice-orbit"), columns))
+    assert len(orbit) == 2
+    assert _named(tiny_root, tmp_path, orbit, [1000 * row["left_depth"] for row in orbit]) == []
+
+
+def test_commands_print_notes_and_leave_the_result_alone(tiny_root: Path, tmp_path: Path, rows: Rows) -> None:
+    archive, result, page = (tmp_path / name for name in ("mm.zip", "result.json", "report.html"))
+    _write(archive, rows, [1000 * row["left_depth"] for row in rows])
+    options = ("--data", tiny_root, "--json", result, "--html", page, "--html-views", "0")
+    scored = run_in_process(main, "score", archive, *options)
+    checked = run_in_process(main, "check", archive, "--data", tiny_root)
+    for finished in (scored, checked):
+        assert finished.returncode == 0
+        assert finished.stderr.count("possible mistake: ") == 1
+        assert "in millimetres" in finished.stderr
+        assert "mistake" not in finished.stdout
+    assert "Possible mistake: " in page.read_text()
+    assert result.read_bytes() == score(archive, tiny_root).to_json()
+
+
+def test_report_of_a_sound_submission_has_no_section_of_mistakes(
+    tiny_root: Path, tmp_path: Path, rows: Rows
+) -> None:
+    archive, page = tmp_path / "sound.zip", tmp_path / "report.html"
+    _write(archive, rows, [row["left_depth"] for row in rows])
+    finished = run_in_process(main, "score", archive, "--data", tiny_root, "--html", page, "--html-views", "0")
+    assert "mistake" not in finished.stderr
+    assert "mistake" not in page.read_text()
+
+
+def test_at_most_eight_evenly_spaced_views_with_steel_are_read(tmp_path: Path) -> None:
+    root = tmp_path / "dataset"
+    write_dataset(root, ["lattice"], 30)
+    config = open_folder(root).config("lattice")
+    positions = positions_to_read(config)
+    assert len(positions) == MAX_VIEWS
+    assert set(np.diff(positions)) <= {3, 4}
+    views = list(read_views(config, positions, lambda position: np.full((90, 160), float(position))))
+    assert [view.position for view in views] == positions
+    assert all((view.prediction == view.position).all() for view in views)
+
+
+@given(st.integers(-6, 6), st.integers(-6, 6), st.floats(0.1, 10))
+def test_best_shift_is_the_made_shift(dv: int, du: int, scale: float) -> None:
+    random = np.random.default_rng(3)
+    depth_m = random.uniform(1.0, 2.0, (40, 50))
+    v, u = (index.ravel() for index in np.mgrid[10:30, 10:40])
+    pixels = Pixels(v, u, depth_m[v, u])
+    view = DiagnosedView(0, None, pixels, pixels, scale * np.roll(depth_m, (dv, du), (0, 1)))  # type: ignore[arg-type]
+    assert best_shift([view]) == (dv, du)
+
+
+@given(st.floats(0.01, 100), st.floats(-5, 5), st.integers(0, 20))
+def test_resistant_line_ignores_outliers(slope: float, intercept: float, outliers: int) -> None:
+    x = np.linspace(1.0, 3.0, 99)
+    y = slope * x + intercept
+    y[:: max(99 // max(outliers, 1), 5)] += 1e6  # At most one in five.
+    if outliers == 0:
+        y = slope * x + intercept
+        assert resistant_line(x, y) == pytest.approx((slope, intercept), abs=1e-6 * (1 + slope))
+    found_slope, _ = resistant_line(x, y)
+    assert found_slope == pytest.approx(slope, rel=0.7)
+
+
+@given(st.floats(1e-3, 1e3), st.floats(0.0, 5.0))
+def test_inverse_depth_with_any_scale_and_offset_is_fitted(a: float, b: float) -> None:
+    z_m = np.linspace(0.5, 3.0, 300)
+    p = a / z_m + b
+    assert line_error(p, z_m, np.reciprocal) < 0.02
+    assert math.isnan(line_error(p, z_m, np.positive))
+
+
+@given(st.floats(1e-6, 1e6))
+def test_median_error_does_not_depend_on_the_scale(scale: float) -> None:
+    random = np.random.default_rng(5)
+    z_m, p = random.uniform(0.2, 17, 200), random.uniform(0.2, 17, 200)
+    assert median_error(scale * p, z_m) == pytest.approx(median_error(p, z_m), rel=1e-9)
+    assert median_ratio(scale * p, z_m) * scale == pytest.approx(median_ratio(p, z_m), rel=1e-9)
+
+
+def _named(root: Path, folder: Path, rows: Rows, images: Sequence[np.ndarray]) -> list[str]:
+    archive = folder / "submission.zip"
+    _write(archive, rows, images)
+    with open_evaluation(archive, root) as evaluation:
+        return [mistake.name for mistake in diagnose(evaluation)]
+
+
+def _write(archive: Path, rows: Rows, images: Sequence[np.ndarray]) -> None:
+    with SubmissionWriter(archive, method="made") as writer:
+        for row, image in zip(rows, images, strict=True):
+            writer.add(str(row["view_id"]), image.astype(np.float32))
