@@ -3,8 +3,8 @@
 ``python -m benchmarks.reference OUT SET`` renders the views of a set into OUT/dataset, writes the predictions of
 each method to OUT/NAME.zip, scores them and writes ``cards/reference/SET.json``, the source of the tables in the
 benchmark card. ``subset`` has all methods on a subset of every scene; ``lattice``, ``pile`` and ``pier`` have the
-fast methods on all views of one scene. A set takes hours. After an interruption, the same command computes only the
-archives that are missing or older than the dataset. OUT must not be used for two sets.
+fast methods on all views of one scene. A set takes hours. After an interruption, the same command computes only
+the archives that are missing or older than the dataset. OUT must not be used for two sets.
 """
 
 from __future__ import annotations

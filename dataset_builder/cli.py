@@ -18,6 +18,7 @@ from dataset_builder.config.quality import colour_spec
 from dataset_builder.config.specs import CPU
 from rebar_depth_bench.console import ProgressBars, Rate, replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError, printable
+from rebar_depth_bench.terminal import use_plain_characters
 from rebar_depth_bench.version import software_version
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ RENAMED_OPTIONS = {"--to": "--out"}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-build``; return its exit status."""
+    use_plain_characters()
     options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
     interrupted = "interrupted; run the same command again to continue"
     return run_command(lambda: options.run(options), interrupted=interrupted)

@@ -15,8 +15,10 @@ from leaderboard.log_setup import set_up_logs
 from leaderboard.settings import RENAMED_SETTINGS, Settings, read_settings
 from leaderboard.storage.archive_store import ArchiveStore
 from leaderboard.storage.backup import back_up
+from rebar_depth_bench.atomic_io import write_error
 from rebar_depth_bench.console import replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.terminal import use_plain_characters
 from rebar_depth_bench.version import software_version
 
 COMMAND_SETTINGS: dict[str, tuple[str, ...]] = {
@@ -44,6 +46,7 @@ RENAMED_OPTIONS = {f"--{old}": f"--{new.replace('_', '-')}" for old, new in RENA
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return the exit status: 0 = success, 2 = invalid input, 1 = any other error."""
+    use_plain_characters()
     options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
     return run_command(lambda: _run(options), interrupted="stopped")
 
@@ -90,12 +93,12 @@ def _remove(settings: Settings, submission_id: str) -> None:
 def _make_state_dir(folder: Path) -> None:
     """Create the state folder with mode 0700, because the ids in it give access to unpublished submissions.
 
-    Raises ``InputError`` if it cannot be created.
+    Raises ``InputError`` or ``OutputError`` if it cannot be created.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: cannot create the state folder: {error.strerror}") from None
+        raise write_error(f"the state folder {folder}", error) from None
 
 
 def argument_parser() -> argparse.ArgumentParser:

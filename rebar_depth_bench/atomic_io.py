@@ -1,17 +1,26 @@
-"""Atomic file writes (temporary file in the target's folder, fsync, rename) and file locks."""
+"""Atomic file writes (temporary file in the target's folder, fsync, rename), their errors, and file locks."""
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
+import secrets
+import stat
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import InputError, OutputError
 
+WRITE_ERRORS = frozenset(
+    (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.EPIPE)
+)
+"""Error numbers of failed writes: full, past a quota or size limit, read-only, forbidden, broken, unread pipe."""
+NO_SPACE = frozenset((errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS))
+"""Those of ``WRITE_ERRORS`` that only writing causes."""
 _TEMPORARY_NAME = re.compile(r"\.(.+)\.[a-z0-9_]{8}\.tmp")
 
 
@@ -25,33 +34,66 @@ def temporary_target(name: str) -> str | None:
 
 
 @contextmanager
+def named_write_errors(target: object) -> Iterator[None]:
+    """Raise ``OSError`` of ``WRITE_ERRORS`` in the block as ``OutputError`` that names ``target``."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in WRITE_ERRORS:
+            raise
+        raise write_error(target, error) from error
+
+
+def write_error(target: object, error: OSError) -> OutputError | InputError:
+    """Return the error of a failed write to ``target``: ``InputError`` if its name is at fault."""
+    kind = OutputError if error.errno in WRITE_ERRORS else InputError
+    reason = error.strerror if error.errno is None else os.strerror(error.errno)
+    return kind(f"{target}: cannot be written: {reason or error}")
+
+
+@contextmanager
 def atomic_replace(target: Path) -> Iterator[Path]:
     """Yield a temporary path in the target's folder; on a clean exit, flush it and rename it to ``target``.
 
-    Missing parent folders are created. On an exception the temporary file is removed and an existing ``target`` is
-    left unchanged. Raises ``InputError`` if ``target`` is a folder, a device or a pipe, or its folder cannot be
-    written.
+    Missing parent folders are created. A replaced file passes on its permissions; a new one has those of the
+    umask. On an exception the temporary file is removed and an existing ``target`` is left unchanged. Raises
+    ``InputError`` if ``target`` is a folder, a device or a pipe, or its name is impossible, and ``OutputError`` if
+    it or its folder cannot be written.
     """
     if target.is_dir():
         raise InputError(f"{target}: is a folder, expected the name of a file to write")
     if target.exists() and not target.is_file():  # Renaming would replace a device such as /dev/null.
         raise InputError(f"{target}: is a device or a pipe, expected the name of a file to write")
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent)
+        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666))
     except OSError as error:
-        raise InputError(f"{target}: cannot be written: {error.strerror}") from None
-    os.close(handle)
-    temporary = Path(name)
+        raise write_error(target, error) from None
     try:
-        yield temporary
-        temporary.chmod(0o644)
-        fsync_path(temporary)
-        temporary.replace(target)
-        fsync_path(target.parent)
+        with named_write_errors(target):
+            yield temporary
+            if target.exists():
+                temporary.chmod(stat.S_IMODE(target.stat().st_mode) & 0o777)
+            fsync_path(temporary)
+            temporary.replace(target)
+            fsync_path(target.parent)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def scratch_folder(prefix: str = "rebar-") -> Iterator[Path]:
+    """Yield an empty temporary folder, which is deleted on exit. Raises ``OutputError`` if there can be none."""
+    try:
+        folder = tempfile.TemporaryDirectory(prefix=prefix)
+    except OSError as error:  # ``tempfile`` reports as a missing folder that none has space.
+        message = f"no temporary folder can be made: {error.strerror}; set TMPDIR to a folder with space"
+        raise OutputError(message) from None
+    with folder as path:
+        yield Path(path)
 
 
 def fsync_path(path: Path) -> None:

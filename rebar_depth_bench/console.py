@@ -1,22 +1,22 @@
-"""Command-line basics of all programs: progress, exit codes, shared and renamed options, output checks."""
+"""Command-line basics of all programs: progress, exit codes, shared and renamed options."""
 
 from __future__ import annotations
 
 import argparse
 import os
-import re
 import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.progress import TimeRemainingColumn as Remaining
 
+from rebar_depth_bench.atomic_io import WRITE_ERRORS
 from rebar_depth_bench.errors import InputError, RebarDepthError, printable, terminal_text
 
 EXIT_DONE, EXIT_OTHER, EXIT_INPUT = 0, 1, 2
@@ -152,18 +152,26 @@ def add_commands(
 def run_command(command: Callable[[], None], interrupted: str = "interrupted") -> int:
     """Run a command and return its exit code.
 
-    A ``RebarDepthError`` is printed to standard error without a traceback. ``interrupted`` is the message printed
-    on Ctrl-C.
+    A ``RebarDepthError``, and an error of a machine that cannot write, is printed to standard error without a
+    traceback. If nobody reads standard output any more, the command ends without a message. ``interrupted`` is the
+    message printed on Ctrl-C.
     """
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", module=r"PIL\.")  # Errors name the image and its file.
             command()
+        sys.stdout.flush()
     except RebarDepthError as error:
         print_notice(f"error: {error}")
         return EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_standard_output()
+        return EXIT_OTHER
+    except OSError as error:
+        if error.errno not in WRITE_ERRORS:
+            raise
+        print_notice(f"error: {error.filename or 'standard output'}: {os.strerror(error.errno)}")
+        _discard_standard_output()
         return EXIT_OTHER
     except KeyboardInterrupt:
         print(interrupted, file=sys.stderr)
@@ -171,12 +179,10 @@ def run_command(command: Callable[[], None], interrupted: str = "interrupted") -
     return EXIT_DONE
 
 
-OUTPUT_OPTIONS = ("out", "json", "csv", "html", "latex", "extended_csv", "figure", "eval_results")
-"""Names (argparse dest) of the options that are output paths."""
-INPUT_FILE_OPTIONS = ("archive", "archives", "first", "others", "method", "token_file")
-"""Names of the options that are files to read; a method may be ``FILE.py:NAME`` or ``FILE.toml``."""
-INPUT_FOLDER_OPTIONS = ("data", "predictions", "kitti", "methods", "reference")
-"""Names of the options that are folders to read, or files or Hub repositories in their place."""
+def _discard_standard_output() -> None:
+    """Discard text that cannot be written: the interpreter would try again, and complain, when it ends."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def add_archive(parser: argparse.ArgumentParser) -> None:
@@ -192,11 +198,6 @@ def add_data(parser: argparse.ArgumentParser) -> None:
 def add_workers(parser: argparse.ArgumentParser) -> None:
     """Add the option ``--workers``."""
     parser.add_argument("--workers", type=int, metavar="N", help="number of threads (default: one per core)")
-
-
-def add_output_file(parser: argparse.ArgumentParser, option: str, summary: str) -> None:
-    """Add ``option``, the path of a file to write."""
-    parser.add_argument(option, type=Path, metavar="FILE", help=summary)
 
 
 def add_seconds(container: argparse._ActionsContainer, option: str, default: float, summary: str) -> None:
@@ -240,47 +241,3 @@ def replace_renamed_options(arguments: Sequence[str] | None, renamed: Mapping[st
             argument = f"{renamed[option]}{equals}{value}"
         replaced.append(argument)
     return replaced
-
-
-def check_outputs(options: Mapping[str, object]) -> None:
-    """Check the output paths of a command's ``options``.
-
-    Outputs are the options in ``OUTPUT_OPTIONS``, inputs those in ``INPUT_FILE_OPTIONS`` and
-    ``INPUT_FOLDER_OPTIONS``. Raises ``InputError`` if an output would overwrite an input, another output or a file
-    of an input folder, is a folder, or lies in a folder that cannot be written.
-    """
-    outputs = {name: value for name in OUTPUT_OPTIONS if isinstance(value := options.get(name), Path)}
-    folders = [path for name in INPUT_FOLDER_OPTIONS for path in _paths(options.get(name))]
-    files = [path for name in INPUT_FILE_OPTIONS for path in _paths(options.get(name))]
-    seen: dict[Path, str] = {}
-    for name, output in outputs.items():
-        option, target = f"--{name.replace('_', '-')}", output.resolve()
-        if target in seen:
-            raise InputError(f"{option} and {seen[target]} both name {output}, expected different files")
-        seen[target] = option
-        for path in (*files, *folders):
-            if path.exists() and target == path.resolve():
-                raise InputError(f"{option} names {output}, which is an input and would be overwritten")
-        for path in folders:
-            if path.is_dir() and name != "out" and path.resolve() in target.parents:
-                raise InputError(
-                    f"{option} names {output}, which is inside {path}: expected a path outside the input"
-                )
-        if name != "out" or not target.is_dir():
-            _check_writable(option, output, target)
-
-
-def _check_writable(option: str, output: Path, target: Path) -> None:
-    if target.is_dir():
-        raise InputError(f"{option} names {output}, which is a folder: expected a file to write")
-    ancestor = next(parent for parent in target.parents if parent.exists())
-    if not ancestor.is_dir():
-        raise InputError(f"{option} names {output}, but {ancestor} is a file: expected a folder")
-    if not os.access(ancestor, os.W_OK):
-        raise InputError(f"{option} names {output}, but {ancestor} cannot be written to")
-
-
-def _paths(value: object) -> list[Path]:
-    """Return the paths of an option: one, several or none; ``FILE.py:NAME`` is a path and the name of a method."""
-    values = value if isinstance(value, list) else [] if value is None else [value]
-    return [Path(re.sub(r"(\.py):\w+$", r"\1", str(item))) for item in values]

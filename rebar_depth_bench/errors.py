@@ -101,6 +101,10 @@ class CalibrationError(InputError):
     """Rejected calibration file."""
 
 
+class OutputError(RebarDepthError):
+    """Output that this machine cannot write: no space, quota or permission left, or past the file-size limit."""
+
+
 class BuildError(RebarDepthError):
     """Build failure that is not caused by the user's input."""
 

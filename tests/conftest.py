@@ -26,6 +26,7 @@ from tests import building, dask_cluster, requirements  # noqa: E402
 from tests.building import RunBuild, StartBuild  # noqa: E402
 from tests.dask_cluster import NewCluster  # noqa: E402
 from tests.requirements import Repetitions  # noqa: E402
+from tests.small_disks import NewDisk, mounted_disks  # noqa: E402
 
 # A shell that runs the tests in the background ignores this signal, and child processes would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -118,6 +119,13 @@ def _private_caches() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def blender() -> None:
     """Mark tests that start Blender; ``make`` has checked its system libraries before."""
+
+
+@pytest.fixture
+def new_disk(tmp_path: Path) -> Iterator[NewDisk]:
+    """Mount small disks: ``new_disk(size_bytes)``."""
+    with mounted_disks(tmp_path) as new:
+        yield new
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from numpy import ndarray
 from dataset_builder.audit.report import Check
 from dataset_builder.audit.views import AuditedEye
 from dataset_builder.pipeline.blender_process import BlenderProcesses, DepthTask
+from rebar_depth_bench.atomic_io import scratch_folder
 
 MAX_CYCLES_MEDIAN_RATIO = 5e-6
 """Largest median difference, relative to the median depth.
@@ -43,13 +43,13 @@ def cycles_difference_m(
     if not eyes:
         return np.zeros((0, 2))
     cameras = tuple(eye.camera for eye in eyes)
-    with tempfile.TemporaryDirectory() as folder, BlenderProcesses() as blender:
-        task = DepthTask(mesh, cameras, Path(folder), os.cpu_count() or 1)
-        log = Path(folder) / "blender.log"
+    with scratch_folder("rebar-audit-") as folder, BlenderProcesses() as blender:
+        task = DepthTask(mesh, cameras, folder, os.cpu_count() or 1)
+        log = folder / "blender.log"
         blender.run(
             task, f"the audit of {mesh.name}", log, lambda event: progress(event["camera"] + 1, len(cameras))
         )
-        cycles_depths_m = [np.load(Path(folder) / f"{n}.npy") for n in range(len(cameras))]
+        cycles_depths_m = [np.load(folder / f"{n}.npy") for n in range(len(cameras))]
     differences = []
     for eye, cycles_m in zip(eyes, cycles_depths_m, strict=True):
         depth_m = eye.depth_m[eye.mask].astype(np.float64)

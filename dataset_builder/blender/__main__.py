@@ -8,9 +8,11 @@ import pickle
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, BinaryIO
 
-from rebar_depth_bench.errors import BuildError, InputError
+from rebar_depth_bench.atomic_io import WRITE_ERRORS, write_error
+from rebar_depth_bench.errors import BuildError, InputError, OutputError
 
 Report = Callable[[Mapping[str, Any]], None]
 """Function that sends one event to the parent process."""
@@ -19,17 +21,25 @@ Report = Callable[[Mapping[str, Any]], None]
 def main() -> int:
     """Run the task pickled on standard input and return exit code 0; ``sys.argv[1]`` is the path of the log.
 
-    ``InputError`` and ``BuildError`` are reported as events; other exceptions are raised.
+    ``InputError``, ``BuildError``, ``OutputError`` and errors of a machine that cannot write are reported as
+    events; other exceptions are raised.
     """
-    report = _redirect_output(sys.argv[1])
+    report = _event_writer()
     task = pickle.load(sys.stdin.buffer)  # noqa: S301 -- The parent process is this program.
     _exit_with_parent(sys.stdin.buffer)
     try:
+        _redirect_output(sys.argv[1])
         _runner_for(task)(task, report)
     except InputError as error:
         report({"input_error": str(error)})
     except BuildError as error:
         report({"build_error": str(error)})
+    except OutputError as error:
+        report({"output_error": str(error)})
+    except OSError as error:
+        if error.errno not in WRITE_ERRORS:
+            raise
+        report({"output_error": str(write_error(error.filename or "a file of the render process", error))})
     return 0
 
 
@@ -50,14 +60,18 @@ def _runner_for(task: object) -> Callable[[Any, Report], None]:
     return runners[type(task)]
 
 
-def _redirect_output(log: str) -> Report:
-    """Redirect file descriptors 1 and 2 to the log; return a function that writes events to the old stdout."""
+def _event_writer() -> Report:
+    """Return a function that writes events to the present standard output."""
     events = os.fdopen(os.dup(1), "w", buffering=1)
+    return lambda event: print(json.dumps(event), file=events, flush=True)
+
+
+def _redirect_output(log: str) -> None:
+    """Redirect file descriptors 1 and 2 to the log."""
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
     os.close(descriptor)
-    return lambda event: print(json.dumps(event), file=events, flush=True)
 
 
 def _exit_with_parent(stream: BinaryIO) -> None:
@@ -72,8 +86,8 @@ def _exit_with_parent(stream: BinaryIO) -> None:
 
 
 if __name__ == "__main__":
-    sys.stdout.flush()
     status = main()
-    sys.stdout.flush()
-    sys.stderr.flush()
+    with suppress(OSError):  # The disk with the log may be full.
+        sys.stdout.flush()
+        sys.stderr.flush()
     os._exit(status)  # Skip Blender's teardown, which can crash after the task is done.

@@ -7,9 +7,7 @@ therefore rendered on the distorted grid itself, without resampling. Only Cycles
 from __future__ import annotations
 
 import hashlib
-import tempfile
 from importlib import resources
-from pathlib import Path
 
 import bpy
 import numpy as np
@@ -17,6 +15,7 @@ from jaxtyping import Float64
 from mathutils import Matrix
 from numpy import ndarray
 
+from rebar_depth_bench.atomic_io import scratch_folder
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid
 
@@ -60,8 +59,8 @@ def _compiled_shader() -> str:
     import _cycles  # type: ignore[import-not-found]  # can be found only after bpy has been imported
 
     source = resources.files(__package__).joinpath(SHADER).read_text(encoding="utf-8")
-    with tempfile.TemporaryDirectory() as scratch:
-        source_file, oso_file = Path(scratch, SHADER), Path(scratch, "camera.oso")
+    with scratch_folder("rebar-camera-") as scratch:
+        source_file, oso_file = scratch / SHADER, scratch / "camera.oso"
         source_file.write_text(source, encoding="utf-8")
         if not _cycles.osl_compile(str(source_file), str(oso_file)):
             raise BuildError(f"Blender cannot compile its camera shader {SHADER}; see its log for the reason")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ from numpy import ndarray
 
 from dataset_builder.blender.camera import place_camera
 from dataset_builder.scene.steel_box import PixelBox
+from rebar_depth_bench.atomic_io import named_write_errors
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera
 
@@ -27,6 +29,9 @@ PASS_CHANNELS = {"Combined": "RGB", "Denoising Albedo": "RGB", "Denoising Normal
 
 _INTO_PIXEL = 0.25
 """Part of a pixel added to borders, which Blender rounds down: a rounding error must not lose a row."""
+
+_MAX_BYTES_PER_PIXEL = 64
+"""Largest size of a rendered file: sixteen float32 channels, uncompressed."""
 
 
 def render_passes(samples: range, box: PixelBox | None, scratch_dir: Path) -> Float32[ndarray, "h w 9"]:
@@ -128,7 +133,11 @@ def use_cycles(scene: bpy.types.Scene, threads: int) -> None:
 
 @contextmanager
 def rendered_file(path: Path, scene: bpy.types.Scene, **image_settings: Any) -> Iterator[Path]:
-    """Render ``scene`` to ``path`` with the given image settings, and remove the file on exit."""
+    """Render ``scene`` to ``path`` with the given image settings, and remove the file on exit.
+
+    Raises ``OutputError`` if the file cannot be read in the block because the disk has no space for it: Blender
+    reports a picture that it could not write as finished.
+    """
     render = scene.render
     with (
         temporary_settings(render.image_settings, **image_settings),
@@ -137,8 +146,17 @@ def rendered_file(path: Path, scene: bpy.types.Scene, **image_settings: Any) -> 
         bpy.ops.render.render(write_still=True, scene=scene.name)
     try:
         yield path
+    except (OSError, RuntimeError, ValueError):
+        _check_space(path, render.resolution_x * render.resolution_y * _MAX_BYTES_PER_PIXEL)
+        raise
     finally:
         path.unlink(missing_ok=True)
+
+
+def _check_space(path: Path, size: int) -> None:
+    """Raise ``OutputError`` if a file of ``size`` bytes cannot be written at ``path``."""
+    with named_write_errors(path), path.open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, size)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ is an independent check of the ground truth.
 
 from __future__ import annotations
 
+import io
 import os
 import resource
 import sys
@@ -39,6 +40,7 @@ from dataset_builder.scene.mesh_ply import read_mesh_ply, write_mesh_ply
 from dataset_builder.scene.model import Mesh, WorldMesh, surface
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.variants.sensor import recorded
+from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError
 
@@ -169,5 +171,7 @@ def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None])
     with tempfile.TemporaryDirectory(dir=task.out) as scratch:
         for n, camera in enumerate(task.cameras):
             depth_m = render_depth(camera, Path(scratch))
-            np.save(task.out / f"{n}.npy", depth_m)
+            content = io.BytesIO()
+            np.save(content, depth_m)
+            write_bytes(task.out / f"{n}.npy", content.getvalue())
             report({"camera": n})

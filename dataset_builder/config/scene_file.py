@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
+from dataset_builder.config.scene_name import scene_name_of
 from dataset_builder.config.scene_schema import SCENE_NAME, SceneToml, read_scene_toml
 from dataset_builder.config.specs import AssemblySpec, ConfigSpec, DomeSpec, SceneSpec
 from dataset_builder.config.trajectories import camera_offsets_m
@@ -51,9 +52,10 @@ _DEFAULT_MARKERS = {"laboratory": 6, "outdoors": 0}
 def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     """Return the config of a scene file, with the default rig, colour settings and seed.
 
-    Defaults of omitted keys: the name is that of the file; the cameras are ``default_dome``; the environment is
-    the laboratory if all steel is within 0.45 m and all cameras are within 1.6 m of its centre, otherwise
-    outdoors; the board has 6 markers in the laboratory, and there is no board outdoors.
+    Defaults of omitted keys: the name is that of the file in lower case, with hyphens; the cameras are
+    ``default_dome``; the environment is the laboratory if all steel is within 0.45 m and all cameras are within
+    1.6 m of its centre, otherwise outdoors; the board has 6 markers in the laboratory, and there is no board
+    outdoors.
 
     Raises ``InputError`` if the file is neither TOML nor IFC, listing every missing, unknown or invalid key, for
     an invalid name, and if the assembly or the cameras do not fit. Raises ``MeshError`` if the cage or mesh is
@@ -61,7 +63,7 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     """
     path = Path(path)
     scene_toml = _read_scene(path)
-    name = path.stem if scene_toml.name is None else scene_toml.name
+    name = scene_name_of(path) if scene_toml.name is None else scene_toml.name
     _check_name(name, path)
     with _scene_and_key_named(scene_toml, path):
         assembly_spec = _assembly_spec(scene_toml, path)

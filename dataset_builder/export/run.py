@@ -12,7 +12,7 @@ from dataset_builder.export.metadata import cameras_json, exported_files, readme
 from dataset_builder.export.nerfstudio import transforms_json
 from dataset_builder.export.target import export_target
 from dataset_builder.export.views import CameraView, StoredView, stored_views
-from rebar_depth_bench.atomic_io import write_bytes, write_text
+from rebar_depth_bench.atomic_io import write_bytes, write_error, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
@@ -52,8 +52,8 @@ def export(
     kept, and the result is byte-identical to that of an uninterrupted export. ``progress`` counts views.
 
     Raises ``DatasetError`` for a folder that is not a complete local dataset folder, an unknown config or data
-    that contradicts the manifest; ``InputError`` for fewer than one view, for a ``to`` that contains anything but
-    an earlier export of the same data, and for one that cannot be written.
+    that contradicts the manifest; ``InputError`` for fewer than one view and for a ``to`` that contains anything
+    but an earlier export of the same data; ``OutputError`` for one that cannot be written.
     """
     folder = _local_folder(root)
     chosen = [folder.config(name) for name in dict.fromkeys(configs or folder.configs)]
@@ -68,7 +68,7 @@ def export(
                 for config in chosen
             ]
     except OSError as error:  # Only writing raises OSError here: reading raises DatasetError.
-        raise InputError(f"{to}: cannot be written: {error}") from error
+        raise write_error(error.filename or to, error) from error
     return ExportSummary(target, tuple(exported))
 
 

@@ -11,7 +11,7 @@ from typing import Annotated
 from pydantic import Strict
 
 from dataset_builder.export.images import EXPORT_FILES
-from rebar_depth_bench.atomic_io import exclusive_lock, temporary_target, write_text
+from rebar_depth_bench.atomic_io import exclusive_lock, temporary_target, write_error, write_text
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.limits import JSON_BYTES
@@ -58,7 +58,7 @@ def export_target(to: Path, folder: DatasetFolder, wanted: Mapping[str, Sequence
     try:
         to.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{to}: cannot be created: {error.strerror}") from None
+        raise write_error(to, error) from None
     with ExitStack() as stack:
         try:
             stack.enter_context(exclusive_lock(to))  # Locking the folder itself leaves no file behind.

@@ -21,7 +21,7 @@ from typing import Any
 
 from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import WorkUnit
-from rebar_depth_bench.errors import BuildError, InputError, RebarDepthError, RenderProcessError
+from rebar_depth_bench.errors import BuildError, InputError, OutputError, RebarDepthError, RenderProcessError
 from rebar_depth_bench.geometry.cameras import Camera
 
 
@@ -59,7 +59,11 @@ Task = RenderTask | DepthTask | DevicesTask
 
 
 Event = Mapping[str, Any]
-_ERRORS: Mapping[str, type[RebarDepthError]] = {"input_error": InputError, "build_error": BuildError}
+_ERRORS: Mapping[str, type[RebarDepthError]] = {
+    "input_error": InputError,
+    "build_error": BuildError,
+    "output_error": OutputError,
+}
 """Exception type by the key of the event that reports it; such an event ends the task."""
 ATTEMPTS = 2
 """Number of times a task is started before a dying process is an error."""
@@ -87,8 +91,8 @@ class BlenderProcesses:
         """Run ``task`` in a new process and pass its events to ``on_event``.
 
         A process that dies is restarted once. ``label`` names the task in errors; the output of Blender is written
-        to ``log``. Raises ``RenderProcessError`` if the process dies twice, and the ``InputError`` or
-        ``BuildError`` that the process reports.
+        to ``log``. Raises ``RenderProcessError`` if the process dies twice, and the ``InputError``, ``BuildError``
+        or ``OutputError`` that the process reports.
         """
         for attempt in range(1, ATTEMPTS + 1):
             status = self._run_once(task, log, on_event)
@@ -153,7 +157,7 @@ def _dispatch_event(event: Event, on_event: Callable[[Event], None]) -> None:
 
 def _failure_message(label: str, status: int, attempts: int, log: Path) -> str:
     reason = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
-    tail = log.read_text(errors="replace").splitlines()[-_LOG_TAIL_LINES:] if log.is_file() else []
+    tail = log.read_text("utf-8", errors="replace").splitlines()[-_LOG_TAIL_LINES:] if log.is_file() else []
     log_excerpt = "\n".join(f"  | {line}" for line in tail) or "  | (no output)"
     return (
         f"the render process for {label} died {attempts} times, the last time with {reason}; "

@@ -53,8 +53,9 @@ def build(
     ``devices`` devices of the request's type, or the workers of ``cluster`` if it is not None. None of these
     changes the bytes of the result. Each config is published as soon as it is complete.
 
-    Raises ``InputError`` for a request that cannot be built or does not fit on the disk, ``RenderProcessError``
-    if a render process dies twice, and ``BuildError`` if rendered data does not match its digests.
+    Raises ``InputError`` for a request that cannot be built, ``OutputError`` if it does not fit on the disk or the
+    machine cannot write, ``RenderProcessError`` if a render process dies twice, and ``BuildError`` if rendered
+    data does not match its digests.
     """
     plans = plan_build(request, out)
     check_fits_on_disk(out, plans)

@@ -7,15 +7,14 @@ is untested: the machines that this was written on have none. The choice is test
 
 from __future__ import annotations
 
-import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 from dataset_builder.config.specs import CPU, GPU_TYPES
 from dataset_builder.pipeline.blender_process import BlenderProcesses, DevicesTask, Event
+from rebar_depth_bench.atomic_io import scratch_folder
 from rebar_depth_bench.errors import InputError
 
 AUTO = "auto"
@@ -48,8 +47,8 @@ def available_devices() -> DeviceNames:
     def on_event(event: Event) -> None:
         found.update(event["devices"])
 
-    with tempfile.TemporaryDirectory(prefix="rebar-devices-") as scratch, BlenderProcesses() as blender:
-        blender.run(DevicesTask(), "the list of devices", Path(scratch) / "blender.log", on_event)
+    with scratch_folder("rebar-devices-") as scratch, BlenderProcesses() as blender:
+        blender.run(DevicesTask(), "the list of devices", scratch / "blender.log", on_event)
     return found
 
 

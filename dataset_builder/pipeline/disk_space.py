@@ -20,7 +20,7 @@ from dataset_builder.pipeline.folder import SHARD_NAME, existing_ancestor
 from dataset_builder.pipeline.plan import ConfigPlan
 from dataset_builder.pipeline.publish import is_published
 from dataset_builder.scene.model import Assembly
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import OutputError
 
 _MEASURED_PIXELS = 640 * 360
 _COLOUR_BYTES, _TRUTH_BYTES = 1.61, 2.11
@@ -101,7 +101,7 @@ def free_bytes(out: Path) -> int:
 
 
 def check_fits_on_disk(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    """Raise ``InputError`` if building the plans needs more than the free disk space.
+    """Raise ``OutputError`` if building the plans needs more than the free disk space.
 
     Whether configs are published already, which takes long in a large folder, is checked only if it matters.
     """
@@ -110,10 +110,10 @@ def check_fits_on_disk(out: Path, plans: Sequence[ConfigPlan]) -> None:
 
 
 def check_space(out: Path, spaces: Iterable[ConfigSpace]) -> None:
-    """Raise ``InputError`` if building configs one after the other needs more than the free disk space."""
+    """Raise ``OutputError`` if building configs one after the other needs more than the free disk space."""
     needed, free = needed_bytes(spaces), free_bytes(out)
     if needed > free:
-        raise InputError(
+        raise OutputError(
             f"{out}: the build needs about {bytes_text(needed)} of disk space, but {bytes_text(free)} are free: "
             "delete other files, choose another folder, or build fewer configs, fewer views or smaller images"
         )

@@ -16,7 +16,7 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan
 from rebar_depth_bench.atomic_io import temporary_target
 from rebar_depth_bench.data.bars import BARS_FILE
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import InputError, OutputError
 from rebar_depth_bench.paths import check_no_links, remove_file, remove_folder
 
 MESHES = "meshes"
@@ -36,14 +36,14 @@ SHARD_NAME = re.compile(rf"test-\d{{5}}-of-\d{{5}}-[0-9a-f]{{{SHARD_DIGEST_CHARA
 def check_folder(out: Path, plans: Sequence[ConfigPlan]) -> None:
     """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder that the plans can be built in.
 
-    No other files are ever changed. Folders that the build changes, its lock and staged files may not be links. A
-    config with colour may not be built again without.
+    Raises ``OutputError`` if it cannot be written. No other files are ever changed. Folders that the build
+    changes, its lock and staged files may not be links. A config with colour may not be built again without.
     """
     ancestor = existing_ancestor(out)
     if not ancestor.is_dir():
         raise InputError(f"{out}: {ancestor} is a file, expected a folder")
     if not os.access(ancestor, os.W_OK | os.X_OK):
-        raise InputError(f"{out}: cannot be created or written to: no permission to write in {ancestor}")
+        raise OutputError(f"{out}: cannot be written: no permission to write in {ancestor}")
     check_no_links(out, f"{BUILD_FOLDER}/{LOCK}", MESHES, PICTURES, *(plan.spec.name for plan in plans))
     for staging in (staging for plan in plans for staging in plan.all_stagings()):
         check_no_links(out, os.path.relpath(staging, out))

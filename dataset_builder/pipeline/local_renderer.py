@@ -68,8 +68,8 @@ def render_unit(
 
     A GPU is number ``device_index`` of the type that the config names.
 
-    Raises the ``InputError`` or ``BuildError`` that the process reports, and ``RenderProcessError`` naming the
-    unit if the process dies twice.
+    Raises the ``InputError``, ``BuildError`` or ``OutputError`` that the process reports, and
+    ``RenderProcessError`` naming the unit if the process dies twice.
     """
     seconds: defaultdict[str, float] = defaultdict(float)
 

@@ -33,7 +33,7 @@ from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generat
 from dataset_builder.pipeline.retained import entry_problems, published_configs
 from dataset_builder.pipeline.shards import pack_shard, read_staged_record, split_into_shards
 from dataset_builder.scene.assemblies import aim_point_m
-from rebar_depth_bench.atomic_io import exclusive_lock, write_bytes, write_text
+from rebar_depth_bench.atomic_io import exclusive_lock, write_bytes, write_error, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest, views_digest
@@ -51,12 +51,12 @@ STRIP = f"{PICTURES}/scenes.webp"
 def build_lock(folder: Path) -> Iterator[None]:
     """Hold an exclusive lock on the file ``lock`` in ``folder``; the lock of a killed process is released.
 
-    Raises ``InputError`` if another process holds the lock or the folder is not writable.
+    Raises ``InputError`` if another process holds the lock, and ``OutputError`` if the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder.parent}: cannot be created or written to: {error.strerror}") from None
+        raise write_error(folder.parent, error) from None
     with ExitStack() as stack:
         try:
             stack.enter_context(exclusive_lock(folder / LOCK))

@@ -7,12 +7,10 @@ number of pixels.
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
-from pathlib import Path
 from statistics import fmean
 
 from dataset_builder.config.specs import ConfigSpec, RigSpec
@@ -21,6 +19,7 @@ from dataset_builder.pipeline.blender_process import BlenderProcesses, Event, Re
 from dataset_builder.pipeline.plan import generator_versions
 from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import WorkUnit
+from rebar_depth_bench.atomic_io import scratch_folder
 
 _VIEWS = 4
 """Views of a trial; the first one tells the constant time of a process from the time per view."""
@@ -72,8 +71,8 @@ def run_trial(spec: ConfigSpec, indices: Sequence[int], threads: int) -> Trial:
         totals.update((name, event[name]) for name in ("cpu_s", "memory_bytes") if name in event)
 
     start = time.perf_counter()
-    with tempfile.TemporaryDirectory(prefix="rebar-trial-") as scratch, BlenderProcesses() as blender:
-        staging = Staging(Path(scratch))
+    with scratch_folder("rebar-trial-") as scratch, BlenderProcesses() as blender:
+        staging = Staging(scratch)
         blender.run(RenderTask(unit, staging, threads), f"the trial of {spec.name}", staging.log(0), on_event)
     total_s = time.perf_counter() - start
     process_s, view_s = split_times(total_s, views[-len(chosen) :])

@@ -15,8 +15,8 @@ from leaderboard.db.models import SubmissionModel
 from leaderboard.db.submissions import DELETED
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import ArchiveNotFoundError, ArchiveStore
-from rebar_depth_bench.atomic_io import atomic_replace
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.atomic_io import atomic_replace, write_error
+from rebar_depth_bench.errors import InputError, OutputError
 
 DATABASE, ARCHIVES = "leaderboard.sqlite", "archives"
 
@@ -27,7 +27,8 @@ def back_up(settings: Settings, target: Path) -> Path:
     The database is copied first; archives accepted later are left out, because their submissions are not in the
     copy. A repeated backup copies new archives only. The target is a valid state folder, which
     ``serve --state-dir target`` can serve. Raises ``InputError`` for a PostgreSQL database (use ``pg_dump``), a
-    missing database, and a target that the service uses, that holds other files or that cannot be written.
+    missing database, and a target that the service uses or that holds other files, and ``OutputError`` for one
+    that cannot be written.
     """
     source = sqlite_path(settings.database_url)
     if source is None:
@@ -45,7 +46,7 @@ def back_up(settings: Settings, target: Path) -> Path:
         _copy_database(source, target / DATABASE)
         _copy_archives(ArchiveStore(settings.archives_url), _submission_ids(target / DATABASE), archive_dir)
     except OSError as error:
-        raise InputError(f"{target}: cannot be written: {error.strerror or error}") from None
+        raise write_error(target, error) from None
     return target
 
 
@@ -74,6 +75,8 @@ def _copy_database(source: Path, copy: Path) -> None:
     ):
         try:
             source_connection.backup(copy_connection)
+        except sqlite3.OperationalError as error:
+            raise OutputError(f"{copy}: cannot be written: {error}") from None
         except sqlite3.DatabaseError as error:
             raise InputError(f"{source}: cannot be read as a database: {error}") from None
         for suffix in ("-wal", "-shm"):  # Left over if an earlier backup was served.

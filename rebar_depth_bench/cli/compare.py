@@ -7,9 +7,10 @@ import json
 
 from rich.console import Console
 
-from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.cli.dataset_options import add_expect_digest
-from rebar_depth_bench.console import ProgressBars, add_data, add_output_file, add_workers
+from rebar_depth_bench.console import ProgressBars, add_data, add_workers
+from rebar_depth_bench.output_options import add_output_file, prints_table
+from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.comparison_tables import comparison_csv, print_comparison
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.score import score
@@ -44,8 +45,8 @@ def run(options: argparse.Namespace) -> None:
     comparisons = [compare(first, other) for other in others]
     if options.json:
         content = [comparison.to_dict() for comparison in comparisons]
-        write_text(options.json, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+        write_output(options.json, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
     if options.csv:
-        write_text(options.csv, comparison_csv(comparisons))
-    for comparison in comparisons:
+        write_output(options.csv, comparison_csv(comparisons))
+    for comparison in comparisons if prints_table(options) else ():
         print_comparison(comparison, Console())

@@ -7,8 +7,10 @@ import os
 from collections.abc import Mapping, Sequence
 
 from rebar_depth_bench.cli import cache, check, compare, demo, methods, predict, score, submit, table, verify
-from rebar_depth_bench.console import Command, add_commands, check_outputs, replace_renamed_options, run_command
+from rebar_depth_bench.console import Command, add_commands, replace_renamed_options, run_command
+from rebar_depth_bench.output_options import check_outputs
 from rebar_depth_bench.studies.registry import STUDIES
+from rebar_depth_bench.terminal import use_plain_characters
 from rebar_depth_bench.version import software_version
 
 COMMANDS: Mapping[str, Command] = {
@@ -32,6 +34,7 @@ _STUDY_SUMMARY = "run a study of the paper on your own archives"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-bench`` and return its exit code."""
+    use_plain_characters()
     options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
     os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")  # ``datasets`` reads it at import.
     return run_command(lambda: _run(options), interrupted=getattr(options, "interrupted", "interrupted"))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from pathlib import Path
 
 from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
 from rebar_depth_bench.console import ProgressBars, add_data, add_seconds, print_notice
@@ -13,6 +12,7 @@ from rebar_depth_bench.methods import METHODS, find_method
 from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S
 from rebar_depth_bench.methods.registry import FROM_FOLDER
 from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
 
 SUMMARY = "run a method on a dataset and write a submission archive"
@@ -29,9 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("method", metavar="METHOD", help=names)
     add_data(parser)
     add_expect_digest(parser)
-    parser.add_argument(
-        "--out", required=True, type=Path, metavar="ARCHIVE", help="submission archive (zip) to write"
-    )
+    add_output_file(parser, "--out", "submission archive (zip) to write", metavar="ARCHIVE", required=True)
     parser.add_argument(
         "--config",
         nargs="+",
@@ -96,4 +94,5 @@ def run(options: argparse.Namespace) -> None:
     for config, preparation in prepared.items():
         for key, value in preparation.notes.items():
             print_notice(f"{config}: {key.replace('_', ' ')}: {format_note(value)}")
-    print(options.out)
+    if prints_table(options):
+        print(options.out)

@@ -7,25 +7,20 @@ from dataclasses import replace
 
 from rich.console import Console
 
-from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
-from rebar_depth_bench.console import (
-    ProgressBars,
-    add_archive,
-    add_data,
-    add_output_file,
-    add_workers,
-    print_notice,
-)
+from rebar_depth_bench.console import ProgressBars, add_archive, add_data, add_workers, print_notice
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.evaluate import score_extended
+from rebar_depth_bench.output_options import add_output_file, prints_table
+from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.eval_results import check_hub_id, eval_results
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.html.view_browser import VIEWS_SHOWN
 from rebar_depth_bench.reporting.tables import print_table, result_csv
 from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.score import score_evaluation
 
 SUMMARY = "score a submission archive, native and scaled"
@@ -82,15 +77,20 @@ def run(options: argparse.Namespace) -> None:
         if options.html:
             write_report(result, evaluation, options.html, mistakes=mistakes, views_shown=options.html_views)
     if options.eval_results:
-        write_text(options.eval_results, entries)
+        write_output(options.eval_results, entries)
         for note in notes:
             print_notice(note)
     if options.json:
-        write_bytes(options.json, result.to_json())
+        write_output(options.json, result.to_json())
     if options.csv:
-        write_text(options.csv, result_csv(result))
+        write_output(options.csv, result_csv(result))
     if options.extended_csv:
-        write_text(options.extended_csv, extended_csv(result))
+        write_output(options.extended_csv, extended_csv(result))
+    if prints_table(options):
+        _print_tables(result)
+
+
+def _print_tables(result: Result) -> None:
     print_table(result, Console())
     if result.extended is not None:
         print_extended(result.extended, Console())

@@ -11,11 +11,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from rebar_depth_bench.atomic_io import write_bytes
-from rebar_depth_bench.console import ProgressBars, add_archive, add_output_file, add_seconds
+from rebar_depth_bench.console import ProgressBars, add_archive, add_seconds
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.leaderboard_answers import server_lines
 from rebar_depth_bench.leaderboard_client import WAIT_S, LeaderboardClient
+from rebar_depth_bench.output_options import add_output_file, prints_table
+from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.formatting import coverage_percent, number
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.disclosure import DECIMALS, DisclosedResult, is_disclosed, read_disclosed
@@ -65,7 +66,9 @@ def run(options: argparse.Namespace) -> None:
             raise InputError(f"{options.archive}: scoring failed: {reason}")
         result = leaderboard.result(accepted.id, accepted.archive_sha256)
     if options.json:
-        write_bytes(options.json, result)
+        write_output(options.json, result)
+    if not prints_table(options):
+        return
     if is_disclosed(json.loads(result)):
         _print_disclosed(read_disclosed(result, options.url))
     else:

@@ -6,9 +6,10 @@ import argparse
 
 from rich.console import Console
 
-from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.cli.dataset_options import add_expect_digest
-from rebar_depth_bench.console import ProgressBars, add_data, add_output_file, add_workers, print_notice
+from rebar_depth_bench.console import ProgressBars, add_data, add_workers, print_notice
+from rebar_depth_bench.output_options import add_output_file, prints_table
+from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.comparison_tables import disambiguate_method_names, print_paper_table
 from rebar_depth_bench.reporting.figure.write import check_figure_path, write_figure
 from rebar_depth_bench.reporting.latex import latex_table
@@ -53,10 +54,11 @@ def run(options: argparse.Namespace) -> None:
     results = disambiguate_method_names(results)
     published = not options.no_published
     if options.latex:
-        write_text(options.latex, latex_table(results, published=published, intervals=options.intervals))
+        write_output(options.latex, latex_table(results, published=published, intervals=options.intervals))
     if options.csv:
-        write_text(options.csv, results_csv(results))
+        write_output(options.csv, results_csv(results))
     if options.figure:
         for note in write_figure(results, options.figure, published=published):
             print_notice(note)
-    print_paper_table(results, Console(), published=published)
+    if prints_table(options):
+        print_paper_table(results, Console(), published=published)

@@ -16,6 +16,7 @@ from rebar_depth_bench.data.cache_entry import (
     CacheContent,
     Entry,
     ViewArrays,
+    entry_in_memory,
     read_entry,
     write_entry,
 )
@@ -74,8 +75,9 @@ class ArrayCache:
 def open_cache(content: CacheContent) -> ArrayCache:
     """Open the entry of ``content``; if it is missing or damaged, it is written first, one view at a time.
 
-    If the user's cache folder cannot be used, the entry is kept in a temporary folder until this process ends.
-    Raises ``DatasetError`` if it cannot be written there either.
+    If the user's cache folder cannot be used, the entry is kept in a temporary folder until this process ends; if
+    that cannot be written either, in memory. A cache that cannot be written never fails a score. Raises
+    ``DatasetError`` if a view is out of range or missing.
     """
     return ArrayCache(content, _open(content))
 
@@ -93,6 +95,10 @@ def _open(content: CacheContent, *, anew: bool = False) -> Entry:
     try:
         return _open_in(temporary_folder(), content, anew)
     except OSError as error:
+        _warn_once(f"ground truth is kept in memory, since no temporary file can be written: {_reason(error)}")
+    try:
+        return entry_in_memory(content)
+    except ValueError as error:
         raise DatasetError(f"ground truth cannot be cached: {_reason(error)}") from None
 
 

@@ -9,6 +9,7 @@ everything that the values depend on.
 from __future__ import annotations
 
 import hashlib
+import io
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from zlib_ng import zlib_ng
 from rebar_depth_bench.data.cache_folder import ENTRY_SUFFIX
 from rebar_depth_bench.data.digests import parameters_digest
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.submission.zip_directory import FileSource
+from rebar_depth_bench.submission.zip_directory import ByteSource, FileSource, MemorySource
 from rebar_depth_bench.validation import StrictModel
 
 _FORMAT = "rebar-cache-2"
@@ -93,7 +94,7 @@ class Entry:
 
     path: Path
     content: CacheContent
-    source: FileSource
+    source: ByteSource
     index: _Index
     starts: tuple[int, ...]
     positions: Mapping[str, int]
@@ -138,11 +139,24 @@ def write_entry(file: BinaryIO, content: CacheContent) -> None:
     file.write(encoded + _TRAILER.pack(hashlib.sha256(encoded).digest(), len(encoded)))
 
 
+def entry_in_memory(content: CacheContent) -> Entry:
+    """Return an entry that is in no file.
+
+    Raises ``DatasetError`` if a view is out of range, and ``ValueError`` if views are missing.
+    """
+    file = io.BytesIO()
+    write_entry(file, content)
+    return _read_source(MemorySource(file.getbuffer()), Path("the cache in memory"), content)
+
+
 def read_entry(file: Path, path: Path, content: CacheContent) -> Entry:
     """Open ``file``, the entry that is or will be at ``path``; raise one of ``DAMAGE`` if it is not sound."""
     if file.is_symlink() or not file.is_file():
         raise ValueError("it is not a regular file")
-    source = FileSource(file)
+    return _read_source(FileSource(file), path, content)
+
+
+def _read_source(source: ByteSource, path: Path, content: CacheContent) -> Entry:
     end = source.size - _TRAILER.size
     digest, length = _TRAILER.unpack(source.read_at(end, _TRAILER.size))
     if length > _MAX_INDEX_BYTES_PER_VIEW * (len(content.view_ids) + 1):

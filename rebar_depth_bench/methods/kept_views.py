@@ -5,6 +5,7 @@ The folder and its files are checked before they are reused or deleted: they may
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -19,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from rebar_depth_bench.atomic_io import atomic_replace, write_text
+from rebar_depth_bench.atomic_io import named_write_errors, write_bytes, write_error, write_text
 from rebar_depth_bench.console import print_notice
 from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.limits import JSON_BYTES
@@ -61,8 +62,8 @@ class KeptViews:
     def open(cls, path: Path, key: Mapping[str, Any]) -> KeptViews:
         """Open the folder at ``path``, and empty it if it was made for another ``key``.
 
-        ``key`` holds everything that determines the predictions. Raises ``InputError`` if the folder cannot be
-        written, is a link or holds anything else.
+        ``key`` holds everything that determines the predictions. Raises ``InputError`` if the folder is a link or
+        holds anything else, and ``OutputError`` if it cannot be written.
         """
         key_json = json.dumps(key, sort_keys=True)
         try:
@@ -76,7 +77,7 @@ class KeptViews:
                 remove_folder(path)
             path.mkdir(parents=True)
         except OSError as error:
-            raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+            raise write_error(path, error) from None
         write_text(path / _KEY_FILE, key_json)
         return cls(path)
 
@@ -96,8 +97,9 @@ class KeptViews:
         """Store the depth of a view and its runtime in seconds."""
         # The archive holds longdouble as float32, too.
         stored = depth_m if depth_m.dtype.itemsize <= _MAX_ITEM_BYTES else depth_m.astype(np.float32)
-        with atomic_replace(self._view_file(view_id)) as temporary, temporary.open("wb") as stream:
-            np.savez(stream, **{view_id: stored, _SECONDS: np.array([[seconds]])})
+        content = io.BytesIO()
+        np.savez(content, **{view_id: stored, _SECONDS: np.array([[seconds]])})
+        write_bytes(self._view_file(view_id), content.getvalue())
 
     def get(self, view_id: str, grid: tuple[int, int]) -> tuple[Float[ndarray, "h w"], float]:
         """Return the stored depth and runtime in seconds of a view.
@@ -119,7 +121,8 @@ class KeptViews:
     def work_folder(self, config: str) -> Path:
         """Return the folder for a method's intermediate files of a config; created if missing."""
         folder = path_below(self.path, f"{config}{_WORK_SUFFIX}")
-        folder.mkdir(exist_ok=True)
+        with named_write_errors(folder):
+            folder.mkdir(exist_ok=True)
         return folder
 
     def put_preparation(self, config: str, preparation: PreparationReport) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from rebar_depth_bench.atomic_io import NO_SPACE, scratch_folder, write_error
 from rebar_depth_bench.console import print_notice
 from rebar_depth_bench.data.dataset import check_colour, iterate_undecoded
 from rebar_depth_bench.data.dataset_config import DatasetConfig
@@ -28,6 +29,7 @@ from rebar_depth_bench.errors import DatasetError, InputError, MethodError, Reba
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
 from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
+from rebar_depth_bench.outputs import is_stream, link_target
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
 from rebar_depth_bench.version import software_version
@@ -53,8 +55,9 @@ def predict(
 
     Raises ``DatasetError`` for an unknown folder, config or split or another digest than ``expect_digest``, or
     a config without colour if the method needs it,
-    ``InputError`` if ``archive`` is a folder or the folder beside it holds anything but kept predictions, and
-    ``MethodError`` if the method cannot run or returns invalid values.
+    ``InputError`` if ``archive`` is a folder or the folder beside it holds anything but kept predictions,
+    ``MethodError`` if the method cannot run or returns invalid values, and ``OutputError`` if the machine cannot
+    write.
     """
     folder = open_folder(root, expect_digest=expect_digest)
     chosen = _chosen_configs(folder, configs, split)
@@ -71,20 +74,32 @@ def predict(
     # Loading comes first so that its errors occur before anything is written.
     loaded = _load_method(method) if isinstance(method, Method) else None
     noted = {config.label: report for config in chosen if (report := _first_row_report(method, config))}
-    views = KeptViews.open(target.with_name(f".{target.name}.views"), _run_key(method, chosen))
-    usable = _usable_views(views, chosen)
-    for config in chosen:
-        done = usable & set(config.view_ids)
-        is_prepared = loaded is not None or _has_preparation(views, config.label)
-        if len(done) == len(config.views) and is_prepared:
-            continue
-        predictor = loaded or _prepare_method(method, ConfigViews(config), views, is_prepared, progress)
-        _predict_config(method, predictor, config, views, done, progress)
-    prepared = {config.label: report for config in chosen if (report := views.get_preparation(config.label))}
-    reports = noted | prepared
-    _write_archive(method, target, views, chosen, reports)
-    views.remove()
+    with _kept_views_folder(target) as kept:
+        views = KeptViews.open(kept, _run_key(method, chosen))
+        usable = _usable_views(views, chosen)
+        for config in chosen:
+            done = usable & set(config.view_ids)
+            is_prepared = loaded is not None or _has_preparation(views, config.label)
+            if len(done) == len(config.views) and is_prepared:
+                continue
+            predictor = loaded or _prepare_method(method, ConfigViews(config), views, is_prepared, progress)
+            _predict_config(method, predictor, config, views, done, progress)
+        prepared = {config.label: report for config in chosen if (report := views.get_preparation(config.label))}
+        reports = noted | prepared
+        _write_archive(method, target, views, chosen, reports)
+        views.remove()
     return reports
+
+
+@contextmanager
+def _kept_views_folder(archive: Path) -> Iterator[Path]:
+    """Yield the path for kept predictions: beside the archive, or a temporary one for a device or a pipe."""
+    if is_stream(archive):
+        with scratch_folder() as folder:
+            yield folder / "views"
+    else:
+        target = link_target(archive)
+        yield target.with_name(f".{target.name}.views")
 
 
 def _chosen_configs(folder: DatasetFolder, names: Sequence[str] | None, split: str) -> list[DatasetConfig]:
@@ -167,13 +182,15 @@ def _load_method(method: Method) -> Predictor:
 def _wrap_errors(what: str) -> Iterator[None]:
     """Convert exceptions of a method's code into ``MethodError`` with ``what`` failed and the source line.
 
-    Errors of this project (``RebarDepthError``) pass unchanged.
+    Errors of this project (``RebarDepthError``) pass unchanged, and a full disk is no failure of the method.
     """
     try:
         yield
     except RebarDepthError:
         raise
     except Exception as error:
+        if isinstance(error, OSError) and error.errno in NO_SPACE:
+            raise write_error(error.filename or f"{what}: a file of the method", error) from error
         frame = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{frame.filename}:{frame.lineno}"
         raise MethodError(f"{what}: raised {type(error).__name__}: {error} ({where})") from error

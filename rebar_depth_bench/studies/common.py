@@ -19,10 +19,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from rebar_depth_bench.atomic_io import write_bytes, write_text
-from rebar_depth_bench.console import add_output_file
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.output_options import add_output_file, prints_table
+from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.reporting.html.study_page import PageTable, StudyPage, render_study
@@ -47,17 +47,18 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
 def write_outputs(
     options: argparse.Namespace, content: Mapping[str, Any], frame: DataFrame, page: StudyPage
 ) -> None:
-    """Write the requested files, then print the tables and notes of the page to standard output.
+    """Write the requested files, then print the page's tables and notes unless a file is standard output.
 
     ``content`` is the JSON object and ``frame`` has the rows of the CSV; an empty frame writes an empty file.
     """
     if options.json:
-        write_bytes(options.json, json_bytes(content))
+        write_output(options.json, json_bytes(content))
     if options.csv:
-        write_text(options.csv, frame_csv(frame))
+        write_output(options.csv, frame_csv(frame))
     if options.html:
-        write_text(options.html, render_study(page))
-    print_page(page, Console())
+        write_output(options.html, render_study(page))
+    if prints_table(options):
+        print_page(page, Console())
 
 
 def json_bytes(content: Mapping[str, Any]) -> bytes:

@@ -1,4 +1,7 @@
-"""Assignment of archive entries to dataset views, with reports of unknown, duplicate and missing entries."""
+"""Assignment of archive entries to dataset views, with reports of unknown, duplicate and missing entries.
+
+A leading ``./``, with which bsdtar (Windows, macOS, FreeBSD) begins names, is dropped before they are compared.
+"""
 
 from __future__ import annotations
 
@@ -32,16 +35,21 @@ class MatchedEntries:
     problems: tuple[Problem, ...]
 
 
+def plain_name(name: str) -> str:
+    """Return an entry name without one leading ``./``."""
+    return name.removeprefix("./")
+
+
 def entry_view_id(name: str, expected: ExpectedViews) -> str | None:
     """Return the view_id that an entry name denotes, or None if it denotes no expected view."""
-    path = PurePosixPath(name)
-    view_id = name.removesuffix(path.suffix)
-    return view_id if path.suffix in FORMATS and view_id in expected else None
+    suffix = PurePosixPath(name).suffix
+    view_id = plain_name(name).removesuffix(suffix)
+    return view_id if suffix in FORMATS and view_id in expected else None
 
 
 def max_entry_bytes(name: str, expected: ExpectedViews) -> int | None:
     """Return the largest acceptable uncompressed size of the named entry, in bytes; None for an unknown entry."""
-    if name == METADATA_NAME:
+    if plain_name(name) == METADATA_NAME:
         return MAX_METADATA_BYTES
     view_id = entry_view_id(name, expected)
     return None if view_id is None else FORMATS[PurePosixPath(name).suffix].max_bytes(expected[view_id])
@@ -54,9 +62,9 @@ def match_entries(names: Sequence[str], expected: ExpectedViews) -> MatchedEntri
     """
     candidates: dict[str, list[int]] = defaultdict(list)
     unknown_entries: list[str] = []
-    folders = {f"{parent}/" for view_id in expected for parent in PurePosixPath(view_id).parents}
+    folders = {"./", *(f"{prefix}{config_of(view_id)}/" for view_id in expected for prefix in ("", "./"))}
     for index, name in enumerate(names):
-        key = METADATA_NAME if name == METADATA_NAME else entry_view_id(name, expected)
+        key = METADATA_NAME if plain_name(name) == METADATA_NAME else entry_view_id(name, expected)
         if key is not None:
             candidates[key].append(index)
         elif name not in folders:
@@ -76,7 +84,7 @@ def match_entries(names: Sequence[str], expected: ExpectedViews) -> MatchedEntri
 
 def _wrapper_folder_problem(names: Sequence[str], expected: ExpectedViews) -> Problem | None:
     """Return the problem of an archive whose valid entries all lie in one superfluous folder, or None."""
-    files = [name for name in names if not name.endswith("/") and not _is_macos_metadata(name)]
+    files = [plain_name(name) for name in names if not name.endswith("/") and not _is_macos_metadata(name)]
     tops = {name.partition("/")[0] for name in files}
     if len(tops) != 1:
         return None
@@ -108,18 +116,18 @@ def _unknown_entry_problems(unknown_entries: Sequence[str], expected: ExpectedVi
 
 
 def _unknown_entry_problem(name: str, expected: ExpectedViews) -> Problem:
-    path = PurePosixPath(name)
-    view_id = name.removesuffix(path.suffix)
+    path = PurePosixPath(plain_name(name))
+    view_id = plain_name(name).removesuffix(path.suffix)
     configs = sorted({config_of(view) for view in expected})
     found, allowed = "unknown entry", f"{METADATA_NAME} or <view_id> with {_ANY_SUFFIX}"
     if view_id in expected:
         found += f", the suffix is {escape_text(path.suffix or 'missing')}"
         allowed = _ANY_SUFFIX
-    elif path.suffix in FORMATS and config_of(name) in configs and "/" in name:
-        found += f", the dataset has no view {escape_text(view_id)} in the config {config_of(name)}"
+    elif path.suffix in FORMATS and config_of(view_id) in configs and "/" in view_id:
+        found += f", the dataset has no view {escape_text(view_id)} in the config {config_of(view_id)}"
         allowed = ""
-    elif path.suffix in FORMATS and "/" in name:
-        found += f", the dataset has no config {escape_text(config_of(name))}"
+    elif path.suffix in FORMATS and "/" in view_id:
+        found += f", the dataset has no config {escape_text(config_of(view_id))}"
         allowed = f"one of {', '.join(configs)}"
     return Problem("unknown", escape_text(name), found, allowed)
 
@@ -156,4 +164,4 @@ def _splits_by_config(parts: Iterable[tuple[str, str | None]]) -> dict[str, set[
 
 
 def _is_macos_metadata(name: str) -> bool:
-    return name.startswith("__MACOSX/") or PurePosixPath(name).name == ".DS_Store"
+    return plain_name(name).startswith("__MACOSX/") or PurePosixPath(name).name == ".DS_Store"

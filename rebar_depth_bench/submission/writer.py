@@ -15,8 +15,8 @@ from typing import BinaryIO, Self
 
 import numpy as np
 
-from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.errors import InputError, Problem, escape_text
+from rebar_depth_bench.outputs import output_file
 from rebar_depth_bench.paths import VIEW_ID_PATTERN
 from rebar_depth_bench.submission.metadata import METADATA_NAME, SubmissionMeta
 from rebar_depth_bench.submission.numpy_formats import Depth
@@ -35,9 +35,10 @@ class SubmissionWriter:
     """Context manager that writes an archive to ``path``: one ``.npy`` entry per view, and ``submission.json``.
 
     The archive appears at ``path`` only on a clean exit; after an exception in the block an existing file at
-    ``path`` is unchanged. The same predictions give the same bytes. Entries are stored uncompressed, which is
-    fastest to read; ``compress=True`` deflates them (about 100 times slower to write, 10 times slower to read, a
-    fifth smaller), and the bytes then also depend on the zlib library in use. ``inputs`` and
+    ``path`` is unchanged. Of a link its target is replaced; a device or a pipe is written through. The same
+    predictions give the same bytes. Entries are stored uncompressed, which is fastest to read; ``compress=True``
+    deflates them (about 100 times slower to write, 10 times slower to read, a fifth smaller), and the bytes then
+    also depend on the zlib library in use. ``inputs`` and
     ``uses_ground_truth`` are declared as in ``Declaration``. ``notes`` is free-form information about the method;
     no score depends on it.
     """
@@ -109,7 +110,7 @@ class SubmissionWriter:
         if self.path.is_dir():
             raise InputError(f"{self.path}: the path is a directory, expected a file name for the archive")
         with ExitStack() as stack:
-            part = stack.enter_context(atomic_replace(self.path))
+            part = stack.enter_context(output_file(self.path))
             self._file = stack.enter_context(part.open("wb"))
             self._zip = zipfile.ZipFile(self._file, "w", allowZip64=True)
             self._open = stack.pop_all()

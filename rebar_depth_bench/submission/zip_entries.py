@@ -79,7 +79,8 @@ def _name_problem(entry: ZipEntry) -> Problem | None:
     name = entry.name
     if any(ord(character) < 32 or ord(character) == 127 for character in name):
         return Problem("name", escape_text(name), "the name has a control character", "plain text")
-    if name.startswith("/") or "\\" in name or re.match(r"[A-Za-z]:", name) or ".." in name.split("/"):
+    plain = name.removeprefix("./")  # It is dropped before names are compared.
+    if plain.startswith("/") or "\\" in name or re.match(r"[A-Za-z]:", plain) or ".." in name.split("/"):
         expected = "a relative path without '..', '\\' or a drive"
         return Problem("name", escape_text(name), "the name escapes the archive", expected)
     return None

@@ -97,7 +97,7 @@ CASES = {
         f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x",
         "score --data DATA --state-dir HERE/state",
     ),
-    "state is a file": Case("cannot create the state folder", "--state-dir HERE/type"),
+    "state is a file": Case("the state folder .* cannot be written", "--state-dir HERE/type"),
     "port taken": Case("cannot listen on this address: Address already in use", "--port TAKEN"),
     "not our address": Case("cannot listen on this address", "--host 192.0.2.1"),
     "no address at all": Case("cannot listen on this address", f"--host {'x' * 70}"),

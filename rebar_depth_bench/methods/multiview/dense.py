@@ -7,6 +7,7 @@ only depth that is consistent with the depth of neighbouring views is kept.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.atomic_io import atomic_replace
+from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid, pixel_rays, project, transform
 from rebar_depth_bench.methods.multiview.images import LeftImages
@@ -156,8 +157,9 @@ def _plane_sweep(
         path = folder / f"{name}.npy"
         if not path.is_file():
             depth = _sweep_view(left_images, reconstruction, name, neighbours[name])
-            with atomic_replace(path) as temporary, temporary.open("wb") as stream:
-                np.save(stream, depth)
+            content = io.BytesIO()
+            np.save(content, depth)
+            write_bytes(path, content.getvalue())
 
     names = list(reconstruction.cam_from_sfm)
     map_with_progress(store_depth, names, None, progress, "plane sweep", len(names))

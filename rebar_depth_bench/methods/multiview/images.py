@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
+from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.data.dataset import ConfigViews
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
@@ -94,8 +95,8 @@ class LeftImages:
 def write_left_images(views: ConfigViews, folder: Path) -> LeftImages:
     """Write all left images, undistorted if the lens has distortion, and detect the markers of the board.
 
-    Raises ``MethodError`` if the views differ in K or distortion, if there are no views, or if an image cannot be
-    written.
+    Raises ``MethodError`` if the views differ in K or distortion or if there are none, and ``OutputError`` if an
+    image cannot be written.
     """
     folder.mkdir(exist_ok=True)
     height, width = views.grid
@@ -112,8 +113,7 @@ def write_left_images(views: ConfigViews, folder: Path) -> LeftImages:
             )
         name = names[row["view_id"]] = row["view_id"].rpartition("/")[2] + ".png"
         rgb = pinhole_image(row, grid)
-        if not cv2.imwrite(str(folder / name), rgb[..., ::-1]):
-            raise MethodError(f"{folder / name}: cannot be written")
+        write_bytes(folder / name, cv2.imencode(".png", rgb[..., ::-1])[1].tobytes())
         markers[name] = detected_corners_px(rgb, views.board.dictionary) if views.board else {}
         poses[name] = row["left_cam_from_world"]
     if grid is None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.figure.content import figure_content
 from rebar_depth_bench.reporting.figure.drawing import Drawing
 from rebar_depth_bench.reporting.figure.page import figure_drawing
@@ -26,5 +26,5 @@ def check_figure_path(path: Path) -> None:
 def write_figure(results: Sequence[Result], path: Path, *, published: bool) -> Sequence[str]:
     """Write the figure of results of one dataset, whose method names differ, and return what is left out of it."""
     content = figure_content(results, published=published)
-    write_bytes(path, _FORMATS[path.suffix.lower()](figure_drawing(content)))
+    write_output(path, _FORMATS[path.suffix.lower()](figure_drawing(content)))
     return content.left_out

@@ -15,11 +15,11 @@ from typing import Any
 
 from markupsafe import Markup
 
-from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.data.dataset import iterate_undecoded
 from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.diagnosis.diagnose import PossibleMistake
 from rebar_depth_bench.errors import printable
+from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import score_charts
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
@@ -188,7 +188,7 @@ def write_report(
         config: views_to_show([view for view in result.views if config_of(view.view_id) == config], views_shown)
         for config in result.tables
     }
-    write_text(target, render_report(result, iter_view_panels(chosen, evaluation), mistakes))
+    write_output(target, render_report(result, iter_view_panels(chosen, evaluation), mistakes))
 
 
 def iter_view_panels(chosen: Mapping[str, list[ViewScore]], evaluation: Evaluation) -> Iterator[ViewPanels]:

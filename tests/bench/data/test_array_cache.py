@@ -298,6 +298,25 @@ def test_unusable_cache_folder_is_replaced_by_temporary_one(
     assert "in a temporary folder" in line
 
 
+@pytest.mark.parametrize("limit_bytes", [0, 40])
+def test_score_needs_no_space_for_files(folder: Path, limit_bytes: int) -> None:
+    # A file-size limit holds for the cache and for temporary files, as a full disk does.
+    code = f"""
+        import resource
+        from tests.bench.data.test_array_cache import EXPECTED, content, indices
+        from rebar_depth_bench.data.array_cache import open_cache
+        resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_bytes}, {limit_bytes}))
+        cache = open_cache(content())
+        assert indices(cache) == EXPECTED and len(cache.numbers) == len(EXPECTED)
+    """
+    command = [sys.executable, "-B", "-c", textwrap.dedent(code)]
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert finished.returncode == 0, finished.stderr
+    assert len(finished.stderr.splitlines()) == 2
+    assert "kept in memory" in finished.stderr
+    assert [*folder.iterdir()] == []
+
+
 def test_entry_of_read_only_folder_is_used(folder: Path) -> None:
     open_cache(content())
     folder.chmod(0o500)

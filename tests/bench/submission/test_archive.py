@@ -101,6 +101,9 @@ def test_invalid_entry_is_named_in_problem(check: Check, records: list[Record], 
         b"lattice\\0000.npy",
         b"C:/x.npy",
         b"C:x.npy",
+        b".//lattice/0000.npy",
+        b"./../x.npy",
+        b"./C:/x.npy",
     ],
 )
 def test_escaping_names_are_rejected(check: Check, name: bytes) -> None:
@@ -147,6 +150,48 @@ def test_entry_inside_data_of_another_overlaps(check: Check) -> None:
     assert (other.code, other.where) == ("syntax", ENTRY)
 
 
+def _as_bsdtar(record: Record) -> Record:
+    """Return an entry as libarchive writes it: names begin with ./, times and owner, sizes after deflated data."""
+    extra = bytes.fromhex("55540d0007013f046b013f046b013f046b75780b000104000000000400000000")
+    if record.name.endswith(b"/"):
+        return Record(b"./" + record.name, mode=0o40755, extra=extra, local_extra=extra)
+    packed = deflated(b"./" + record.name, record.data)
+    crc, size, length = packed.crc, packed.size, len(packed.data)
+    data = packed.data + struct.pack("<4s3L", b"PK\7\10", crc, length, size)
+    return replace(packed, data=data, compressed=length, flags=8, extra=extra, local_extra=extra)
+
+
+def test_archives_of_bsdtar_are_read_like_any_other(tmp_path: Path) -> None:
+    path = tmp_path / "submission.zip"
+    records = [Record(b"./", mode=0o40755), *map(_as_bsdtar, (META, Record(b"lattice/"), FIRST, SECOND))]
+    path.write_bytes(build(records))
+    assert check_archive(path, EXPECTED) == []
+    with open_submission(path, EXPECTED) as reader:
+        assert reader.view_ids == ("lattice/0000", "lattice/0001")
+        assert np.array_equal(reader.read("lattice/0000"), DEPTH)
+
+
+def test_only_one_leading_dot_is_dropped_and_names_stay_unique(check: Check) -> None:
+    assert check([Record(b"./", mode=0o40755), Record(b"./lattice/", mode=0o40755), *GOOD]) == []
+    (problem,) = check([*GOOD, replace(FIRST, name=b"./lattice/0000.npy")])
+    assert (problem.code, problem.where) == ("duplicate", "lattice/0000")
+    assert "(lattice/0000.npy, ./lattice/0000.npy)" in problem.found
+    (problem,) = check([*GOOD, replace(META, name=b"./submission.json")])
+    assert (problem.code, problem.where) == ("duplicate", "submission.json")
+    for name in (b"././lattice/0000.npy", b"./readme.txt", b"./lattice/0002.npy", b""):
+        assert located(check([*GOOD, Record(name)])) == [("unknown", name.decode() or "''")]
+    huge = replace(FIRST, name=b"./lattice/0000.npy", size=640 * 10**6)
+    assert ("size", "./lattice/0000.npy") in located(check([META, huge, SECOND]))
+
+
+@pytest.mark.parametrize("dot", [b"", b"./"])
+def test_enclosing_folder_is_one_problem_behind_a_leading_dot(check: Check, dot: bytes) -> None:
+    wrapped = [replace(record, name=dot + b"sub/" + record.name) for record in GOOD]
+    (problem,) = check([Record(dot + b"sub/", mode=0o40755), *wrapped])
+    assert (problem.code, problem.where) == ("unknown", "sub/submission.json")
+    assert problem.expected.startswith("submission.json at the top level")
+
+
 def test_unknown_entries_are_explained(check: Check) -> None:
     unknown_names = [
         b"lattice/0002.npy",
@@ -166,13 +211,6 @@ def test_macos_entries_are_one_problem_with_a_remedy(check: Check) -> None:
     (problem,) = check([*GOOD, *junk])
     assert (problem.code, problem.where) == ("unknown", "__MACOSX/lattice/._0000.npy")
     assert "zip with:" in problem.expected
-
-
-def test_enclosing_folder_is_one_problem(check: Check) -> None:
-    wrapped = [replace(record, name=b"sub/" + record.name) for record in GOOD]
-    (problem,) = check([Record(b"sub/", mode=0o40755), *wrapped])
-    assert (problem.code, problem.where) == ("unknown", "sub/submission.json")
-    assert problem.expected.startswith("submission.json at the top level")
 
 
 def test_missing_views_and_metadata_are_reported(check: Check) -> None:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dataset_builder.config import scene_schema
-from dataset_builder.config.catalog import CONFIGS
+from dataset_builder.config.catalog import CONFIGS, BuildRequest
 from dataset_builder.config.scene_file import scene_config
+from dataset_builder.config.scene_name import scene_name_of
 from dataset_builder.config.scene_schema import TomlBar, read_scene_toml
 from dataset_builder.config.specs import DomeSpec
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
@@ -228,13 +233,53 @@ def test_unreadable_or_misnamed_files_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError) as raised:
         scene_config(write_scene(tmp_path, b"\xff\xfe"))
     assert codes_and_places(raised.value) == ["syntax"]
-    with pytest.raises(
-        InputError, match=r"would be named 'My Beam', expected a name of lower-case letters.*rename"
-    ):
-        scene_config(write_scene(tmp_path, MM + BAR, "My Beam.toml"))
     with pytest.raises(MeshError, match=r"my-beam.toml: ifc: .*gone.ifc: 1 problem\n  - cannot be read"):
         scene_config(write_scene(tmp_path, 'ifc = "gone.ifc"'))
     assert scene_config(write_scene(tmp_path, "\ufeff" + (MM + BAR).replace("\n", "\r\n"))).name == "my-beam"
     builtin_name = next(iter(CONFIGS))
     with pytest.raises(InputError, match=f"would be named '{builtin_name}'"):
         scene_config(write_scene(tmp_path, MM + BAR, f"{builtin_name}.toml"))
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("IfcReinforcingBar.ifc", "ifcreinforcingbar"),
+        ("My Beam.toml", "my-beam"),
+        ("(Rev. 3) Säule_B25.0  neu!.ifc", "rev-3-saule-b25-0-neu"),
+        ("Stra\u00dfe \u2116 1.IFC", "strasse-no-1"),
+        ("bewehrung.v2.toml", "bewehrung-v2"),
+        ("\u9244\u7b4b.ifc", ""),
+        ("\u9244\u7b4b 7.ifc", "7"),
+    ],
+)
+def test_scene_names_come_from_file_names(file: str, name: str) -> None:
+    assert scene_name_of(Path(file)) == name
+    assert scene_name_of(Path(unicodedata.normalize("NFD", file))) == name
+
+
+@given(st.text(min_size=1))
+def test_derived_scene_names_are_valid_or_refused(stem: str) -> None:
+    name = scene_name_of(Path("folder", f"a{stem.replace('/', '')}.ifc"))
+    assert re.fullmatch("[a-z0-9]+(-[a-z0-9]+)*", name)
+    assert scene_name_of(Path(f"{name}.ifc")) == name
+
+
+def test_file_names_without_a_scene_name_are_refused(tmp_path: Path) -> None:
+    assert scene_config(write_scene(tmp_path, MM + BAR, "My Beam.toml")).name == "my-beam"
+    for file, name in (
+        ("\u9244\u7b4b.toml", ""),
+        ("Lattice Orbit.toml", "lattice-orbit"),
+        (f"{'x' * 64}.toml", "x" * 64),
+        ("Beam Dusk.toml", "beam-dusk"),
+    ):
+        with pytest.raises(InputError, match=f"would be named '{name}', expected a name.*rename the file"):
+            scene_config(write_scene(tmp_path, MM + BAR, file))
+
+
+def test_files_that_give_the_same_scene_name_are_refused(tmp_path: Path) -> None:
+    scenes = tuple(
+        scene_config(write_scene(tmp_path, MM + BAR, file)) for file in ("My Beam.toml", "my_beam.toml")
+    )
+    with pytest.raises(InputError, match="more than one config is named my-beam"):
+        BuildRequest(configs=(), scenes=scenes).config_specs()

@@ -21,7 +21,7 @@ from dataset_builder.pipeline.disk_space import (
 )
 from dataset_builder.pipeline.plan import plan_config
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import OutputError
 from tests.commands import run_in_process
 
 SMALL = BuildRequest(configs=("pile",), views=10, width=64, height=36)
@@ -87,7 +87,7 @@ def test_space_of_a_new_folder_is_that_of_its_disk(tmp_path: Path) -> None:
 
 def test_build_that_does_not_fit_is_named_with_its_numbers(tmp_path: Path) -> None:
     check_space(tmp_path, [ConfigSpace(0, 1000, 0)])
-    with pytest.raises(InputError) as error:
+    with pytest.raises(OutputError) as error:
         check_space(tmp_path, [ConfigSpace(0, 10**18, 0)])
     assert str(tmp_path) in str(error.value)
     assert "needs about 2e+06 TB" in str(error.value)
@@ -103,7 +103,7 @@ def test_build_that_does_not_fit_is_refused_before_it_starts(tmp_path: Path, ext
     process = run_in_process(main, "--out", tmp_path / "dataset", *huge, *configs, *extra)
     if usable > 500e9:
         pytest.skip("the disk of the temporary folder has room for a huge build")
-    assert process.returncode == 2, process.stdout
+    assert process.returncode == 1, process.stdout
     assert "of disk space" in process.stderr
     assert not any(tmp_path.iterdir())
 

@@ -130,7 +130,7 @@ import os, sys
 from pathlib import Path
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.pipeline.build import plan_build
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import OutputError
 
 if os.geteuid() == 0:
     os.setgroups([])
@@ -138,7 +138,7 @@ if os.geteuid() == 0:
     os.setuid(65534)
 try:
     plan_build(BuildRequest(configs=("pile",), views=1), Path(sys.argv[1]))
-except InputError as error:
+except OutputError as error:
     sys.exit(str(error))
 """
 
@@ -152,5 +152,5 @@ def test_folder_without_permission_is_refused_before_the_start(tmp_path: Path, m
         process = subprocess.run(
             [sys.executable, "-c", UNPRIVILEGED, str(root)], capture_output=True, text=True, check=False
         )
-        assert f"{root}: cannot be created or written to" in process.stderr
+        assert f"{root}: cannot be written" in process.stderr
         assert "Traceback" not in process.stderr
