@@ -88,11 +88,11 @@ def run(options: argparse.Namespace) -> None:
         write_output(options.extended_csv, extended_csv(result))
     if prints_table(options):
         _print_tables(result)
+    for mistake in mistakes:
+        print_notice(f"possible mistake: {mistake.text}")
 
 
 def _print_tables(result: Result) -> None:
     print_table(result, Console())
     if result.extended is not None:
         print_extended(result.extended, Console())
-    for mistake in mistakes:
-        print_notice(f"possible mistake: {mistake.text}")
