@@ -49,6 +49,7 @@ def test_prediction_on_a_full_disk_is_finished_by_a_later_run(new_disk: NewDisk,
     assert disk.files() == {"a.zip"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "option", "suffix"),
     [

@@ -34,6 +34,7 @@ def archive(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_json_or_csv_on_standard_output_replaces_the_table(
     archive: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

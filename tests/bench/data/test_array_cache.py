@@ -298,6 +298,7 @@ def test_unusable_cache_folder_is_replaced_by_temporary_one(
     assert "in a temporary folder" in line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit_bytes", [0, 40])
 def test_score_needs_no_space_for_files(folder: Path, limit_bytes: int) -> None:
     # A file-size limit holds for the cache and for temporary files, as a full disk does.
