@@ -13,6 +13,11 @@ Everything else is refused: plates, brackets, hollow pipes, headed bars, several
 The diameter of a smooth bar is that of the circle through the vertices, since most programs set the corners of a
 polygon onto the circle. That of a ribbed bar, whose vertices are at various distances, is the diameter of the
 smooth bar of equal length and volume, as for the nominal diameter.
+
+Measured on six bent shapes (``tests.builder.scene.tube_shapes``): swept polygons of 8, 12 and 24 sides to 0.01 %
+of diameter and length; irregular triangles with their vertices on the tube, and ribbed bars, to 0.05 % of the
+diameter and 0.15 % of the length. Where the sides of a polygon are divided, most vertices are within the circle:
+the diameter is 5 % (8 sides), 2 % (12) or 0.6 % (24) too small.
 """
 
 from __future__ import annotations
@@ -130,7 +135,7 @@ def _start(surface: TubeSurface) -> tuple[Float64[ndarray, " 3"], Float64[ndarra
     The middle of the longest edge is tried first, which is between two rings if there are any; then those of edges
     that are spread over the surface, since the longest edge may be on a cap.
     """
-    radius_m = 2 * surface.volume_m3(np.zeros((1, 3))) / surface.areas_m2.sum()  # Exact for a tube, also bent.
+    radius_m = 2 * surface.volume_m3 / surface.areas_m2.sum()  # Exact for a tube, also bent.
     if not radius_m > 0:
         return None
     ends_m = surface.vertices_m[surface.edges]
@@ -190,7 +195,7 @@ def _verified(surface: TubeSurface, line_m: Float64[ndarray, "n 3"]) -> Tube | N
         return None
     is_smooth = bool(spread_m < _SMOOTH * radius_m)
     if not is_smooth:
-        radius_m = math.sqrt(surface.volume_m3(line_m[[0, -1]]) / (math.pi * length_m))
+        radius_m = math.sqrt(surface.volume_m3 / (math.pi * length_m))
     if not _is_tube(surface, line_m, radius_m, length_m):
         return None
     slack_m = radius_m * (_SIMPLIFY_SMOOTH if is_smooth else _SIMPLIFY_RIBBED)

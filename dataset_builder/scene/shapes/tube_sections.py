@@ -119,13 +119,14 @@ class _March:
         return cut.centre_m
 
     def _passes_first(self, here: _Section, following: _Section) -> bool:
-        """Return whether the first section lies between two sections."""
-        before, after = (
-            float((section.centre_m - self._first.centre_m) @ self._first.direction)
-            for section in (here, following)
-        )
-        near_m = np.linalg.norm(here.centre_m - self._first.centre_m)
-        return before <= 0 < after and bool(near_m < (_MAX_STEP + 1) * self._radius_m)
+        """Return whether the chord between two sections passes the first middle, not only its plane."""
+        offset_m = here.centre_m - self._first.centre_m
+        chord_m = following.centre_m - here.centre_m
+        before_m, advance_m = offset_m @ self._first.direction, chord_m @ self._first.direction
+        if not before_m <= 0 < before_m + advance_m:
+            return False
+        passed_m = offset_m - before_m / advance_m * chord_m
+        return bool(np.linalg.norm(passed_m) < self._radius_m)
 
     def _with_end(
         self, points_m: list[Float64[ndarray, " 3"]], direction: Float64[ndarray, " 3"]

@@ -119,21 +119,21 @@ class TubeSurface:
 
     def is_connected(self) -> bool:
         """Return whether all triangles hang together."""
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
+        return bool((_component(self.edges, len(self.vertices_m)) == 0).all())
 
-        count = len(self.vertices_m)
-        graph = coo_array((np.ones(len(self.edges)), tuple(self.edges.T)), shape=(count, count))
-        return int(connected_components(graph, directed=False)[0]) == 1
-
-    def volume_m3(self, closing_m: Float64[ndarray, "n 3"]) -> float:
-        """Return the enclosed volume; an open end is closed towards the nearest point of ``closing_m``."""
+    @cached_property
+    def volume_m3(self) -> float:
+        """Enclosed volume; an open end is closed towards the middle of the vertices around it."""
         inside = np.einsum("fi,fi->", self.corners_m[:, 0], self.area_vectors_m2) / 3
         directed = np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-        is_open = np.bincount(self.face_edges.ravel(), minlength=len(self.edges))[self.face_edges.ravel()] == 1
-        start_m, end_m = self.vertices_m[directed[is_open].T]
-        apex_m = closing_m[np.linalg.norm(start_m[:, None] - closing_m, axis=2).argmin(axis=1)]
-        return abs(float(inside + np.einsum("ni,ni->", apex_m, np.cross(end_m, start_m)) / 6))
+        uses = np.bincount(self.face_edges.ravel(), minlength=len(self.edges))
+        start, end = directed[uses[self.face_edges.ravel()] == 1].T
+        opening = _component(self.boundary_edges, len(self.vertices_m))[start]
+        count = np.maximum(np.bincount(opening, minlength=1), 1)
+        start_m, end_m = self.vertices_m[start], self.vertices_m[end]
+        sums_m = [np.bincount(opening, start_m[:, axis], len(count)) for axis in range(3)]
+        middle_m = (np.stack(sums_m, axis=1) / count[:, None])[opening]
+        return abs(float(inside + np.einsum("ni,ni->", middle_m, np.cross(end_m, start_m)) / 6))
 
     def cut(self, point_m: Float64[ndarray, " 3"], normal: Float64[ndarray, " 3"], reach_m: float) -> Cut | None:
         """Return the closed outline around ``point_m`` in which the plane cuts the surface, or None.
@@ -156,6 +156,15 @@ class TubeSurface:
         above_m, below_m = (start_m - point_m) @ normal, (point_m - end_m) @ normal
         corners_m = start_m + (above_m / (above_m + below_m))[:, None] * (end_m - start_m)
         return _outline(corners_m, index.reshape(-1, 2), faces, point_m, normal, reach_m)
+
+
+def _component(edges: Int64[ndarray, "e 2"], vertices: int) -> Int64[ndarray, " v"]:
+    """Return the number of each vertex's connected component, from 0."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(vertices, vertices))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def _outline(

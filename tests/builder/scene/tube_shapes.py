@@ -12,6 +12,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float64
 from numpy import ndarray
+from scipy.spatial import Delaunay
 
 from dataset_builder.audit.geometry import polyline_distance_m
 from dataset_builder.scene.model import Mesh
@@ -102,12 +103,41 @@ def unwelded(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices_m[faces].reshape(-1, 3), np.arange(faces.size, dtype=np.int32).reshape(-1, 3))
 
 
-def remeshed(mesh: Mesh, edge_m: float = 0.02) -> Mesh:
-    """Return a surface without rings: triangles are divided until no edge is longer than ``edge_m``."""
-    body = trimesh.Trimesh(mesh.vertices_m, mesh.faces)
-    vertices, faces = trimesh.remesh.subdivide_to_size(body.vertices, body.faces, edge_m, max_iter=12)
+def divided(mesh: Mesh, edge_m: float = 0.02) -> Mesh:
+    """Return triangles divided until no edge is longer than ``edge_m``; new vertices are on the old sides."""
+    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices_m, mesh.faces, edge_m, max_iter=12)
     body = trimesh.Trimesh(vertices, faces)
     return Mesh(np.array(body.vertices), np.array(body.faces, dtype=np.int32))
+
+
+def remeshed(line_m: Line, facets: int = 24) -> Mesh:
+    """Return a tube of irregular triangles whose vertices are on the tube, about ``facets`` around, ends open.
+
+    The tube is unrolled to a strip. The points of a jittered grid are triangulated there, repeated on both sides,
+    that the triangulation closes around the tube.
+    """
+    fine = swept(line_m, 4 * facets).vertices_m
+    rings_m = fine[: len(fine) // (4 * facets) * 4 * facets].reshape(-1, 4 * facets, 3)
+    if np.allclose(line_m[0], line_m[-1]):
+        rings_m = np.concatenate([rings_m, rings_m[:1]])
+    arc_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line_m, axis=0), axis=1))])
+    edge_m = np.pi * DIAMETER_M / facets
+    rows = int(arc_m[-1] / edge_m)
+    rng = np.random.default_rng(0)
+    row, column = (grid.ravel().astype(float) for grid in np.indices((rows + 1, facets)))
+    inner = (row > 0) & (row < rows)
+    row[inner] += rng.uniform(-0.4, 0.4, inner.sum())
+    column[inner] += rng.uniform(-0.4, 0.4, inner.sum())
+    flat = np.stack([row, column], axis=1)
+    three = np.concatenate([flat + np.array([0, turn * facets]) for turn in (-1, 0, 1)])
+    simplices = Delaunay(three).simplices
+    middle = three[simplices].mean(axis=1)[:, 1]
+    faces = simplices[(middle >= 0) & (middle < facets)] % len(flat)
+    at_m, angle = row / rows * arc_m[-1], np.floor(4 * column).astype(int) % (4 * facets)
+    segment = np.clip(np.searchsorted(arc_m, at_m) - 1, 0, len(arc_m) - 2)
+    share = ((at_m - arc_m[segment]) / np.diff(arc_m)[segment])[:, None]
+    vertices_m = (1 - share) * rings_m[segment, angle] + share * rings_m[segment + 1, angle]
+    return Mesh(vertices_m, faces.astype(np.int32))
 
 
 def ribbed(line_m: Line) -> Mesh:
@@ -119,7 +149,9 @@ TESSELLATIONS: Mapping[str, Callable[[Line], Mesh]] = {
     "12 facets": lambda line_m: swept(line_m, 12),
     "24 facets": lambda line_m: swept(line_m, 24),
     "24, unwelded": lambda line_m: unwelded(swept(line_m, 24)),
-    "24, no rings": lambda line_m: remeshed(swept(line_m, 24)),
+    "24, divided": lambda line_m: divided(swept(line_m, 24)),
+    "12, remeshed": lambda line_m: remeshed(line_m, 12),
+    "24, remeshed": lambda line_m: remeshed(line_m, 24),
     "ribbed": ribbed,
 }
 
