@@ -50,7 +50,7 @@ _MIN_LENGTH = 1.0
 _SMOOTH = 0.015
 """Largest spread of the distances of a smooth bar's vertices from the centreline, relative to the radius."""
 
-_AREA_RANGE = 0.8, 1.4
+_AREA_RANGE = 0.9, 1.4
 """Bounds of the area of the tube's side, relative to that of a smooth cylinder (pentagon: 0.94)."""
 
 _START_AREA_RANGE = 0.6, 2.0
@@ -192,7 +192,7 @@ def _verified(surface: TubeSurface, line_m: Float64[ndarray, "n 3"]) -> Tube | N
     radius_m = _weighted_median(feet.distance_m[lateral], weight[lateral])
     spread_m = np.average(np.abs(feet.distance_m[lateral] - radius_m), weights=weight[lateral])
     if spread_m > 2 * TOLERANCE * radius_m:
-        return None
+        return None  # Some vertices are even farther away, so the check of all of them is not needed.
     is_smooth = bool(spread_m < _SMOOTH * radius_m)
     if not is_smooth:
         radius_m = math.sqrt(surface.volume_m3 / (math.pi * length_m))

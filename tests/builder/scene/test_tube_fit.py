@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataset_builder.scene.model import Mesh
+from dataset_builder.scene.shapes.solids import ring_faces
 from dataset_builder.scene.shapes.tube_fit import MAX_TRIANGLES, NoTubeError, Tube, fit_tube
 from tests.builder.scene.tube_shapes import (
     CENTRELINES_M,
@@ -119,10 +120,19 @@ def _bar(sections: int) -> trimesh.Trimesh:
     return trimesh.creation.cylinder(0.005, 0.3, sections=sections)
 
 
-def _half_pipe() -> trimesh.Trimesh:
-    body = _bar(32)
-    body.update_faces(body.triangles_center[:, 0] > 0)
+def _open_pipe(low: float) -> trimesh.Trimesh:
+    """Return a pipe without caps and without the part of its side where x < ``low`` radii."""
+    body = _bar(64)
+    x, y, _ = body.triangles_center.T
+    body.update_faces((x > low * 0.005) & (np.hypot(x, y) > 0.004))
     return body
+
+
+def _double_wall() -> trimesh.Trimesh:
+    """Return a bar of 24 sides with a second side, of 12, through the same vertices."""
+    bar = swept(np.array([[0.0, 0, 0], [0.3, 0, 0]]), 24)
+    inner = ring_faces(2, 12)
+    return trimesh.Trimesh(bar.vertices_m, np.concatenate([bar.faces, 2 * inner]), process=False)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +141,9 @@ def _half_pipe() -> trimesh.Trimesh:
         trimesh.creation.box((0.3, 0.01, 0.01)),
         trimesh.creation.box((0.3, 0.3, 0.01)),
         _bar(3),
-        _half_pipe(),
+        _open_pipe(0.0),
+        _open_pipe(-0.93),
+        _double_wall(),
         trimesh.creation.annulus(0.004, 0.005, 0.3),
         trimesh.creation.cone(0.005, 0.3),
         trimesh.creation.icosphere(3, 0.1),
@@ -139,7 +151,20 @@ def _half_pipe() -> trimesh.Trimesh:
         trimesh.util.concatenate([_bar(24), _bar(24).apply_translation([0.1, 0, 0])]),
         trimesh.creation.icosphere(1, 0.1),
     ],
-    ids=["square", "plate", "triangle", "half pipe", "pipe", "cone", "sphere", "disc", "two bars", "blob"],
+    ids=[
+        "square",
+        "plate",
+        "triangle",
+        "half pipe",
+        "slit pipe",
+        "double wall",
+        "pipe",
+        "cone",
+        "sphere",
+        "disc",
+        "two bars",
+        "blob",
+    ],
 )
 def test_other_bodies_are_refused(body: trimesh.Trimesh) -> None:
     with pytest.raises(NoTubeError):
