@@ -201,7 +201,7 @@ def _is_view_independent(
     """
     radius_of = np.zeros(np.iinfo(np.uint16).max + 1)
     for bar in config.steel:
-        radius_of[bar.bar_id] = bar.diameter_m / 2
+        radius_of[bar.bar_id] = bar.diameter_m / 2 if bar.has_axis else np.inf
     depth_m = eye.depth_m.ravel()[pixels].astype(np.float64)
     radius_px = radius_of[eye.bars.ravel()[pixels]] * eye.camera.K[0, 0] / depth_m
     return np.asarray(radius_px * baseline_m / depth_m / 2 < _MAX_SHADING_SHIFT_PX)

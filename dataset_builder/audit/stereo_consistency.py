@@ -11,6 +11,7 @@ from numpy import ndarray
 
 from dataset_builder.audit.report import Check
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from rebar_depth_bench.data.bars import with_axis
 from rebar_depth_bench.geometry.cameras import project, transform
 from rebar_depth_bench.scoring.protocol import interior
 
@@ -74,11 +75,11 @@ def epipolar_counts(config: AuditedConfig, view: AuditedView) -> EpipolarCounts:
     The right view is read at the 4 x 4 pixel centres around the projection. Depth is compared along the right
     optical axis, because the eyes of a raw rig are not parallel. A point is seen if one of these pixels shows its
     bar at its depth within one bar diameter, hidden if one of them is nearer, and contradicted otherwise. Bars
-    thinner than two pixels can fall between pixel centres and are left out.
+    thinner than two pixels can fall between pixel centres and are left out, as are bars of unknown diameter.
     """
     left, right = view.left, view.right
     diameter_of = np.zeros(np.iinfo(np.uint16).max + 1)
-    for bar in config.steel:
+    for bar in with_axis(config.steel):
         diameter_of[bar.bar_id] = bar.diameter_m
     diameter_m = diameter_of[left.bars]
     wide_enough = diameter_m * left.camera.K[0, 0] >= _MIN_BAR_WIDTH_PX * left.depth_m

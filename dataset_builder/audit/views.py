@@ -14,7 +14,7 @@ from numpy import ndarray
 from dataset_builder.scene.model import ESTIMATED_ROLE
 from dataset_builder.scene.variants import LIGHT_SLOT, PROPS_SLOT, SENSOR, variants_of_slot
 from dataset_builder.scene.variants.image_light import IMAGE_LIGHTS
-from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
@@ -33,8 +33,8 @@ class AuditedConfig:
 
     @property
     def bars_with_known_axis(self) -> tuple[Bar, ...]:
-        """Bars whose axes are known exactly; an estimated axis is straight even if its bar is bent."""
-        return tuple(bar for bar in self.steel if bar.role != ESTIMATED_ROLE)
+        """Bars whose axes are known exactly; an axis fitted to the surface is no independent reference."""
+        return tuple(bar for bar in with_axis(self.steel) if bar.role != ESTIMATED_ROLE)
 
     @property
     def has_props(self) -> bool:

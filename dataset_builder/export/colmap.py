@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from dataset_builder.export.views import CameraView
 from dataset_builder.scene.shapes.bending import resample_polyline_m
-from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.geometry.cameras import Camera
 
 HALF_PIXEL = 0.5
@@ -76,8 +76,8 @@ def points_txt(bars: Sequence[Bar]) -> str:
 
 
 def axis_points_m(bars: Sequence[Bar]) -> Float64[ndarray, "n 3"]:
-    """Return points spread evenly over each bar's centreline, including its ends; world frame, metres."""
-    axes_m = [np.array(bar.axis_m, dtype=np.float64) for bar in bars]
+    """Return points spread evenly over each known centreline, including its ends; world frame, metres."""
+    axes_m = [np.array(bar.axis_m, dtype=np.float64) for bar in with_axis(bars)]
     length_m = sum(float(np.linalg.norm(np.diff(axis_m, axis=0), axis=1).sum()) for axis_m in axes_m)
     step_m = max(length_m / TARGET_POINT_COUNT, _MIN_STEP_M)
     return np.concatenate([np.empty((0, 3)), *(resample_polyline_m(axis_m, step_m) for axis_m in axes_m)])

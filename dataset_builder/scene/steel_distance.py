@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.data.bars import Bar, with_axis
 
 _CHUNK = 32
 _STEP_TOLERANCE_M = 1e-7
@@ -30,11 +30,12 @@ class Cylinders:
 
     @classmethod
     def from_bars(cls, bars: Sequence[Bar]) -> Cylinders:
-        """Return the cylinders of one or more bars; raise ``ValueError`` if there is no segment."""
-        lines_m = [np.array(bar.axis_m, dtype=np.float64) for bar in bars]
+        """Return the cylinders of the bars that have an axis; raise ``ValueError`` if there is no segment."""
+        measured = with_axis(bars)
+        lines_m = [np.array(bar.axis_m, dtype=np.float64) for bar in measured]
         start_m = np.concatenate([np.zeros((0, 3)), *(line_m[:-1] for line_m in lines_m)])
         along_m = np.concatenate([np.zeros((0, 3)), *(np.diff(line_m, axis=0) for line_m in lines_m)])
-        radius_m = np.repeat([bar.diameter_m / 2 for bar in bars], [len(line_m) - 1 for line_m in lines_m])
+        radius_m = np.repeat([bar.diameter_m / 2 for bar in measured], [len(line_m) - 1 for line_m in lines_m])
         length_m = np.linalg.norm(along_m, axis=1)
         used = length_m > 0
         if not used.any():

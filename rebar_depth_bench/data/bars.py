@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 BARS_FILE = "bars.parquet"
+_MEASURES = ("diameter_m", "axis")
 _CONTROL_CHARACTER = r"[\x00-\x1f\x7f-\x9f]"
 BARS_SCHEMA = pa.schema(
     [
@@ -37,14 +38,18 @@ BARS_SCHEMA = pa.schema(
         ("axis", pa.list_(pa.list_(pa.float64(), 3))),
     ]
 )
-"""Schema of ``bars.parquet``; ``axis`` is the centreline as a polyline in the world frame, metres."""
+"""Schema of ``bars.parquet``; ``axis`` is the centreline as a polyline in the world frame, metres.
+
+Axis and diameter are null for steel whose surface is not that of one round bar.
+"""
 
 
 @dataclass(frozen=True)
 class Bar:
     """Reinforcing bar: id (1 or more), role, nominal diameter in metres and centreline.
 
-    ``axis_m`` is the centreline as a polyline in the world frame, metres.
+    ``axis_m`` is the centreline as a polyline in the world frame, metres. Where none could be fitted to the bar's
+    surface, it is empty and the diameter is NaN (both null in the table).
     """
 
     bar_id: int
@@ -52,10 +57,27 @@ class Bar:
     diameter_m: float
     axis_m: tuple[tuple[float, float, float], ...]
 
+    @classmethod
+    def without_axis(cls, bar_id: int, role: str) -> Bar:
+        """Return a bar of unknown diameter and centreline."""
+        return cls(bar_id, role, math.nan, ())
+
+    @property
+    def has_axis(self) -> bool:
+        """Whether diameter and centreline are known."""
+        return bool(self.axis_m)
+
     @property
     def length_m(self) -> float:
-        """Length of the centreline, metres."""
+        """Length of the centreline, metres; NaN without one."""
+        if not self.has_axis:
+            return math.nan
         return sum(math.dist(start, end) for start, end in pairwise(self.axis_m))
+
+
+def with_axis(bars: Iterable[Bar]) -> tuple[Bar, ...]:
+    """Return the bars whose diameter and centreline are known, in order."""
+    return tuple(bar for bar in bars if bar.has_axis)
 
 
 def read_bars(path: Path) -> dict[str, tuple[Bar, ...]]:
@@ -86,12 +108,13 @@ def bars(root: str | Path) -> DataFrame:
     """Return the bars of every scene of a dataset folder or Hub repository as a frame, one row per bar.
 
     Columns: ``scene``, ``bar_id``, ``role``, ``diameter_m``, ``length_m`` (of the centreline) and ``axis_m``, a
-    float64 array of shape (n, 3), world frame. Raises ``DatasetError`` as ``open_folder`` and ``read_bars``.
+    float64 array of shape (n, 3), world frame. A bar without an axis has NaN, NaN and no points. Raises
+    ``DatasetError`` as ``open_folder`` and ``read_bars``.
     """
     import pandas as pd  # Half a second to import, which reading bars for scoring does not need.
 
     rows = [
-        (scene, bar.bar_id, bar.role, bar.diameter_m, bar.length_m, np.array(bar.axis_m))
+        (scene, bar.bar_id, bar.role, bar.diameter_m, bar.length_m, np.array(bar.axis_m).reshape(-1, 3))
         for scene, scene_bars in read_bars(open_folder(root).verified_file(BARS_FILE)).items()
         for bar in scene_bars
     ]
@@ -105,8 +128,8 @@ def write_bars(path: Path, scenes: Mapping[str, tuple[Bar, ...]]) -> None:
             "scene": scene,
             "bar_id": bar.bar_id,
             "role": bar.role,
-            "diameter_m": bar.diameter_m,
-            "axis": [list(point) for point in bar.axis_m],
+            "diameter_m": bar.diameter_m if bar.has_axis else None,
+            "axis": [list(point) for point in bar.axis_m] if bar.has_axis else None,
         }
         for scene, bars in sorted(scenes.items())
         for bar in bars
@@ -118,8 +141,10 @@ def write_bars(path: Path, scenes: Mapping[str, tuple[Bar, ...]]) -> None:
 def _bar_from_row(path: Path, row: Mapping[str, Any]) -> Bar:
     """Convert a row to a ``Bar``; raise ``DatasetError`` if a value is missing or invalid."""
     where = f"{path}: bar {row['bar_id']} of scene {short_repr(row['scene'])}"
-    empty = [name for name in BARS_SCHEMA.names if row[name] is None]
-    if empty or any(point is None for point in row["axis"]):
+    diameter_m, axis = row["diameter_m"], row["axis"]
+    has_axis = diameter_m is not None or axis is not None  # Both are null, or neither.
+    empty = [name for name in BARS_SCHEMA.names if row[name] is None and (has_axis or name not in _MEASURES)]
+    if empty or (axis is not None and any(point is None for point in axis)):
         raise DatasetError(f"{where} has no {', '.join(empty) or 'complete axis'}")
     if not re.fullmatch(NAME_PATTERN, row["scene"]):
         raise DatasetError(f"{where}: the name of the scene is invalid, expected {NAME_LETTERS}")
@@ -127,11 +152,13 @@ def _bar_from_row(path: Path, row: Mapping[str, Any]) -> Bar:
         raise DatasetError(f"{where}: role is {escape_text(row['role'])}, expected no control characters")
     if row["bar_id"] < 1:
         raise DatasetError(f"{where}: bar_id is {row['bar_id']}, expected 1 or more (0 means no steel)")
-    if not 0 < row["diameter_m"] < math.inf:
-        raise DatasetError(f"{where}: diameter_m is {row['diameter_m']}, expected a positive length")
-    axis_m = tuple((x, y, z) for x, y, z in row["axis"])
+    if not has_axis:
+        return Bar.without_axis(row["bar_id"], row["role"])
+    if not 0 < diameter_m < math.inf:
+        raise DatasetError(f"{where}: diameter_m is {diameter_m}, expected a positive length")
+    axis_m = tuple((x, y, z) for x, y, z in axis)
     if len(axis_m) < 2 or not all(
         value is not None and math.isfinite(value) for point in axis_m for value in point
     ):
         raise DatasetError(f"{where}: axis is {short_repr(axis_m)}, expected two or more finite points")
-    return Bar(row["bar_id"], row["role"], row["diameter_m"], axis_m)
+    return Bar(row["bar_id"], row["role"], diameter_m, axis_m)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
-from rebar_depth_bench.data.bars import BARS_FILE, read_bars
+from rebar_depth_bench.data.bars import BARS_FILE, read_bars, with_axis
 from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import EyeView
@@ -126,8 +126,10 @@ def _bars_by_view(folder: DatasetFolder, config: DatasetConfig) -> dict[str, Sce
         bars = bars_by_scene.get(scene.name)
         if bars is None:
             raise DatasetError(f"{path}: has no bars for scene {scene.name!r} of config {config.name}")
-        diameter_m = np.full(np.iinfo(np.uint16).max + 1, np.nan)  # Images may show ids that the table lacks.
-        diameter_m[[bar.bar_id for bar in bars]] = [bar.diameter_m for bar in bars]
+        # NaN for bars without a fitted axis, and for ids that images show and the table lacks.
+        diameter_m = np.full(np.iinfo(np.uint16).max + 1, np.nan)
+        measured = with_axis(bars)
+        diameter_m[[bar.bar_id for bar in measured]] = [bar.diameter_m for bar in measured]
         scenes[scene.name] = SceneBars(cage_truth(bars), diameter_m)
     return {view_id: scenes[scene] for view_id, scene in config.scene_by_view.items()}
 

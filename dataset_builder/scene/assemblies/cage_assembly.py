@@ -11,6 +11,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.assemblies.mesh_import import MAX_EXTENT_M, MIN_EXTENT_M
+from dataset_builder.scene.assemblies.surface_bar import axis_notes
 from dataset_builder.scene.model import MAX_BARS, Assembly, Mesh
 from dataset_builder.scene.shapes.bar_mesh import RibPattern, plain_bar_mesh, ribbed_bar_mesh
 from rebar_depth_bench.data.bars import Bar
@@ -51,7 +52,7 @@ _BEND_MARGIN_DIAMETERS = 1.0
 class CageBar:
     """A bar of a cage file with its name in error messages.
 
-    ``mesh`` (world, metres) is set only if the file has no axis for the bar.
+    ``mesh`` (world, metres) is set only if the file has no axis for the bar; only then the bar may be without one.
     """
 
     label: str
@@ -84,7 +85,8 @@ def cage_assembly(bars: Sequence[CageBar], where: str) -> Assembly:
         except ValueError as error:
             problems.append(Problem("invalid", bar.label, str(error)))
     raise_problems(problems, where)
-    return Assembly.from_meshes(meshes)
+    without_axis = [bar.label for bar in bars if not bar.bar.has_axis]
+    return Assembly.from_meshes(meshes, axis_notes(where, without_axis, len(bars)))
 
 
 def raise_problems(problems: Sequence[Problem], where: str) -> None:
@@ -95,12 +97,12 @@ def raise_problems(problems: Sequence[Problem], where: str) -> None:
 
 def _bar_problems(bar: CageBar) -> list[Problem]:
     """Return what is wrong with one bar: its diameter, non-finite coordinates, or points too far away."""
-    axis_m = np.array(bar.bar.axis_m)
+    diameter_m = bar.bar.diameter_m
     problems = []
-    if not MIN_DIAMETER_M <= bar.bar.diameter_m <= MAX_DIAMETER_M:  # The negated comparison also catches NaN.
+    if bar.bar.has_axis and not MIN_DIAMETER_M <= diameter_m <= MAX_DIAMETER_M:  # Also catches NaN.
         expected = f"{MIN_DIAMETER_M:g} to {MAX_DIAMETER_M:g} m: is the unit right?"
-        problems.append(Problem("invalid", bar.label, f"the diameter is {bar.bar.diameter_m:.6g} m", expected))
-    points_m = axis_m if bar.mesh is None else np.concatenate([axis_m, bar.mesh.vertices_m])
+        problems.append(Problem("invalid", bar.label, f"the diameter is {diameter_m:.6g} m", expected))
+    points_m = _points_m(bar)
     if not np.isfinite(points_m).all():
         problems.append(Problem("invalid", bar.label, "a coordinate is not finite", "finite numbers"))
     elif np.abs(points_m).max() > MAX_EXTENT_M:
@@ -110,9 +112,15 @@ def _bar_problems(bar: CageBar) -> list[Problem]:
     return problems
 
 
+def _points_m(bar: CageBar) -> Float64[ndarray, "n 3"]:
+    """Return the points of a bar's axis and mesh, as far as it has them."""
+    axis_m = np.array(bar.bar.axis_m, dtype=np.float64).reshape(-1, 3)
+    return axis_m if bar.mesh is None else np.concatenate([axis_m, bar.mesh.vertices_m])
+
+
 def _extent_problems(bars: Sequence[CageBar]) -> list[Problem]:
     """Return a problem if the largest side of the cage is implausible, else an empty list."""
-    points_m = np.concatenate([np.array(bar.bar.axis_m) for bar in bars])
+    points_m = np.concatenate([_points_m(bar) for bar in bars])
     extent_m = float(np.ptp(points_m, axis=0).max())
     if MIN_EXTENT_M < extent_m < MAX_EXTENT_M:
         return []
@@ -128,6 +136,8 @@ def _duplicate_axis_problems(bars: Sequence[CageBar]) -> list[Problem]:
     first_label: dict[object, str] = {}
     problems = []
     for bar in bars:
+        if not bar.bar.has_axis:
+            continue
         points = [
             tuple(point) for point in np.round(np.array(bar.bar.axis_m) / _SAME_AXIS_M).astype(np.int64).tolist()
         ]

@@ -15,7 +15,7 @@ from numpy import ndarray
 from dataset_builder.config.specs import SceneSpec
 from dataset_builder.scene.model import Assembly, Part
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m, plain_outer_radius_m
-from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.geometry.aruco_board import marker_corners_m
 
 MIN_CROSSING_ANGLE_DEG = 30.0
@@ -41,10 +41,10 @@ class Capsules:
     def from_bars(cls, bars: tuple[Bar, ...]) -> Capsules:
         """Return the capsules of ``bars``, in order."""
         lines = [np.asarray(bar.axis_m, dtype=np.float64) for bar in bars]
-        pieces = np.array([len(line) - 1 for line in lines])
+        pieces = np.array([len(line) - 1 for line in lines], dtype=np.int64)
         return cls(
-            np.concatenate([line[:-1] for line in lines]),
-            np.concatenate([line[1:] for line in lines]),
+            np.concatenate([np.zeros((0, 3)), *(line[:-1] for line in lines)]),
+            np.concatenate([np.zeros((0, 3)), *(line[1:] for line in lines)]),
             np.repeat([envelope_radius_m(bar.diameter_m) for bar in bars], pieces),
             np.repeat(np.arange(len(bars)), pieces),
         )
@@ -145,7 +145,7 @@ class Rect:
 
 @dataclass(frozen=True, eq=False)
 class PlacementContext:
-    """Bars and bounding box of the steel, occupied ground rectangles, and seed of the scene."""
+    """Bars with an axis and bounding box of all steel, occupied ground rectangles, and seed of the scene."""
 
     bars: tuple[Bar, ...]
     low_m: Float64[ndarray, " 3"]
@@ -159,7 +159,7 @@ class PlacementContext:
         vertices_m = assembly.vertices_m
         markers = marker_corners_m(spec.board).values() if spec.board else ()
         occupied = tuple(_footprint(corners_m) for corners_m in markers)
-        return cls(assembly.bars, vertices_m.min(axis=0), vertices_m.max(axis=0), occupied, spec.seed)
+        return cls(with_axis(assembly.bars), vertices_m.min(axis=0), vertices_m.max(axis=0), occupied, spec.seed)
 
     def with_parts(self, parts: tuple[Part, ...]) -> PlacementContext:
         """Return the context in which the footprints of ``parts`` are occupied too."""
@@ -202,7 +202,7 @@ class PlacementContext:
     @property
     def thickest_m(self) -> float:
         """Largest bar diameter."""
-        return max(bar.diameter_m for bar in self.bars)
+        return max((bar.diameter_m for bar in self.bars), default=0.0)
 
 
 def _footprint(points_m: Float64[ndarray, "n 3"]) -> Rect:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int16, Int64, UInt16
 from numpy import ndarray
 
-from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.errors import DatasetError
 
 PARALLEL_DEG = 5.0
@@ -190,11 +190,11 @@ class CageTruth:
 
 
 def cage_truth(bars: Iterable[Bar]) -> CageTruth:
-    """Return the straight segments of a scene's bars and their neighbours.
+    """Return the straight segments of a scene's bars and their neighbours; bars without an axis have none.
 
     Raises ``DatasetError`` if there are more than ``MAX_SEGMENTS``.
     """
-    segments = tuple(segment for bar in bars for segment in _straight_segments(bar))
+    segments = tuple(segment for bar in with_axis(bars) for segment in _straight_segments(bar))
     if len(segments) > MAX_SEGMENTS:
         raise DatasetError(f"the bars have {len(segments)} straight runs, expected up to {MAX_SEGMENTS}")
     start_m = np.array([segment.start_m for segment in segments], dtype=np.float64).reshape(-1, 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from rebar_depth_bench.data.bars import BARS_SCHEMA, Bar, read_bars, write_bars
+from rebar_depth_bench.data.bars import BARS_SCHEMA, Bar, read_bars, with_axis, write_bars
 from rebar_depth_bench.errors import DatasetError
 
 STRAIGHT = Bar(1, "tie", 0.016, ((0.0, 0.0, 0.0), (0.0, 0.0, 1.5)))
 BENT = Bar(65535, "hoop", 0.01, ((0.1, 0.0, 0.0), (0.2, 0.0, 0.0), (0.2, 0.3, 0.0)))
+WITHOUT_AXIS = Bar.without_axis(7, "imported")
 ROW = {"scene": "pier", "axis": STRAIGHT.axis_m, **{k: v for k, v in asdict(STRAIGHT).items() if k != "axis_m"}}
 
 
@@ -24,9 +26,18 @@ def write_rows(path: Path, *rows: dict[str, Any]) -> Path:
 
 
 def test_read_bars_returns_what_write_bars_wrote(tmp_path: Path) -> None:
-    scenes = {"pier": (STRAIGHT, BENT), "pile": (STRAIGHT,)}
+    scenes = {"pier": (STRAIGHT, BENT, WITHOUT_AXIS), "pile": (STRAIGHT,)}
     write_bars(tmp_path / "bars.parquet", scenes)
     assert read_bars(tmp_path / "bars.parquet") == scenes
+
+
+def test_bar_without_axis_is_null_in_the_table(tmp_path: Path) -> None:
+    write_bars(tmp_path / "bars.parquet", {"pier": (WITHOUT_AXIS,)})
+    (row,) = pq.read_table(tmp_path / "bars.parquet").to_pylist()
+    assert (row["bar_id"], row["diameter_m"], row["axis"]) == (7, None, None)
+    (bar,) = read_bars(tmp_path / "bars.parquet")["pier"]
+    assert (bar.has_axis, math.isnan(bar.diameter_m), math.isnan(bar.length_m)) == (False, True, True)
+    assert with_axis((STRAIGHT, bar, BENT)) == (STRAIGHT, BENT)
 
 
 @pytest.mark.parametrize(
@@ -39,6 +50,9 @@ def test_read_bars_returns_what_write_bars_wrote(tmp_path: Path) -> None:
         ({"axis": [[0.0, 0.0, 0.0], [0.0, float("inf"), 0.0]]}, "expected two or more finite points"),
         ({"axis": [[0.0, 0.0, 0.0], [0.0, None, 0.0]]}, "expected two or more finite points"),
         ({"axis": None, "role": None}, "has no role, axis"),
+        ({"axis": None}, "has no axis"),
+        ({"diameter_m": None}, "has no diameter_m"),
+        ({"diameter_m": None, "axis": None, "role": None}, "has no role$"),
     ],
 )
 def test_invalid_bar_is_named_in_error(tmp_path: Path, change: dict[str, Any], said: str) -> None:

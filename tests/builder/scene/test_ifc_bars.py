@@ -251,3 +251,23 @@ def test_extruded_bars_are_tessellated_and_fitted() -> None:
     assert (first.bar.diameter_m, second.bar.diameter_m) == pytest.approx((0.016, 0.012), rel=0.01)
     assert first.mesh is not None
     assert [bar.bar.bar_id for bar in (swept, first, second)] == [1, 2, 3]
+
+
+@pytest.mark.slow
+def test_tessellated_bodies_get_bent_axis_or_none() -> None:
+    """A U-bar and a plate in one Body are two bars; the kernel tessellates the bends of 30 mm."""
+    ifc = Ifc()
+    sine = 30 * (1 - 0.5**0.5)
+    points = [(0, 400, 0), (0, 30, 0), (sine, sine, 0), (30, 0, 0), (170, 0, 0)]
+    points += [(200 - sine, sine, 0), (200, 30, 0), (200, 400, 0)]
+    coordinates = ifc.new("IfcCartesianPointList3D", [tuple(map(float, point)) for point in points])
+    pieces = [("IfcLineIndex", (1, 2)), ("IfcArcIndex", (2, 3, 4)), ("IfcLineIndex", (4, 5))]
+    pieces += [("IfcArcIndex", (5, 6, 7)), ("IfcLineIndex", (7, 8))]
+    curve = ifc.new("IfcIndexedPolyCurve", coordinates, [ifc.new(*piece) for piece in pieces], False)
+    section = ifc.new("IfcRectangleProfileDef", "AREA", None, None, 100.0, 20.0)
+    plate = ifc.new("IfcExtrudedAreaSolid", section, ifc.axes((100, 200, 50)), ifc.direction((0, 0, 1)), 100.0)
+    ifc.bar(ifc.disc(curve, 6.0), plate)
+    bent, other = (cage_bar.bar for cage_bar in ifc.bars())
+    assert bent.diameter_m == pytest.approx(0.012, rel=0.001)
+    assert bent.length_m == pytest.approx(2 * 0.37 + 0.14 + math.pi * 0.03, rel=0.001)
+    assert not other.has_axis

@@ -17,6 +17,7 @@ from dataset_builder.scene.assemblies.mesh_file import load_assembly, mesh_file_
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.errors import MeshError
+from tests.builder.scene.tube_shapes import CENTRELINES_M, length_m, swept
 
 ALONG_X = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
 
@@ -189,28 +190,40 @@ def test_units_scale_vertices(tmp_path: Path, unit: str | float, per_metre: floa
     np.testing.assert_allclose(assembly.parts[1].mesh.vertices_m, RODS[1].vertices, atol=1e-12)
 
 
-def test_axis_and_diameter_of_open_tube_and_wedge(tmp_path: Path) -> None:
-    """Check the fitted axis and diameter of two bodies far from the origin.
-
-    One end of the tube is open, and one side of it is finely tessellated. The section of the wedge is a 3-4-5
-    triangle: the centroid of its surface differs from that of its volume.
-    """
+def test_axis_and_diameter_of_open_tube_far_from_origin(tmp_path: Path) -> None:
+    """Fit a tube one end of which is open and one side of which is finely tessellated."""
     tube = rod(0.016)
     tube.update_faces(tube.face_normals[:, 0] < 0.5)
     for _ in range(3):
         x, y, _ = tube.triangles_center.T
         tube = tube.subdivide(np.flatnonzero((x > 0.26) & (y > 0)))
+    tube.apply_translation([300, -200, 500])
+    bar = load_content(tmp_path, "a.obj", obj_bytes((tube,), "a")).bars[0]
+    np.testing.assert_allclose(bar.axis_m, [[300.0, -200, 500.1], [300.5, -200, 500.1]], rtol=0, atol=2e-6)
+    assert bar.diameter_m == pytest.approx(0.016, rel=0.005)
+
+
+def test_parts_that_are_no_round_bar_have_no_axis_and_are_named(tmp_path: Path) -> None:
+    """A note names a wedge, and a part of two rods, which stays one part; a bent bar gets its bent axis."""
     ends = [[x, y, z] for x in (0.0, 1.0) for y, z in ((0.0, 0.0), (0.03, 0.0), (0.0, 0.04))]
     faces = [[0, 2, 1], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]]
-    wedge = trimesh.Trimesh(ends, faces)
-    for body in (tube, wedge):
-        body.apply_translation([300, -200, 500])
-    bars = load_content(tmp_path, "a.obj", obj_bytes((tube, wedge), "ab")).bars
-    np.testing.assert_allclose(bars[0].axis_m, [[300.0, -200, 500.1], [300.5, -200, 500.1]], rtol=0, atol=2e-6)
-    middle = [-200 + 0.01, 500 + 0.04 / 3]
-    np.testing.assert_allclose(bars[1].axis_m, [[300, *middle], [301, *middle]], rtol=0, atol=2e-5)
-    assert bars[0].diameter_m == pytest.approx(0.016, rel=0.005)
-    assert bars[1].diameter_m == pytest.approx((4 * 0.0006 / np.pi) ** 0.5, rel=1e-3)
+    line_m = CENTRELINES_M["U-bar"]
+    u_bar = swept(line_m, 12)
+    bodies = (
+        trimesh.Trimesh(ends, faces),
+        concatenate_meshes(RODS[:2]),
+        trimesh.Trimesh(u_bar.vertices_m, u_bar.faces),
+        RODS[2],
+    )
+    assembly = load_content(tmp_path, "a.obj", obj_bytes(bodies, "abcd"))
+    assert [bar.has_axis for bar in assembly.bars] == [False, False, True, True]
+    assert len(assembly.bars[3].axis_m) == 2
+    assert assembly.bars[2].length_m == pytest.approx(length_m(line_m), rel=1e-4)
+    (note,) = assembly.notes
+    assert (note.source, note.code) == (str(tmp_path / "a.obj"), "axis")
+    assert "2 of 4 " in note.text
+    assert "bar 1, bar 2" in note.text
+    assert load_content(tmp_path, "b.obj", obj_bytes(RODS, "abc")).notes == ()
 
 
 def test_invalid_mesh_paths_and_units_are_rejected(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from numpy import ndarray
 from pydantic import Field, TypeAdapter, ValidationError
 
 from dataset_builder.scene.assemblies.cage_assembly import CageBar
-from dataset_builder.scene.assemblies.mesh_file import estimate_bar
 from dataset_builder.scene.assemblies.mesh_import import connected_components
+from dataset_builder.scene.assemblies.surface_bar import fitted_bar
 from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS, Mesh, axis_of
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import MeshError
@@ -171,7 +171,7 @@ class Answer:
         return CageBar(_bar_label(bar_id, record.label), Bar(bar_id, record.role, diameter_m, axis_of(axis_m)))
 
     def _surface_bars(self, bar_id: int, record: _SurfaceRecord) -> list[CageBar]:
-        """Return the connected surfaces of an object as bars with a straight axis (``estimate_bar``)."""
+        """Return the connected surfaces of an object as bars (``fitted_bar``)."""
         vertices_m, faces = self._array(record.vertices, "<f8"), self._array(record.faces, "<i4")
         if faces.min() < 0 or faces.max() >= record.vertices:
             raise AnswerError("a triangle refers to a vertex that does not exist")
@@ -179,7 +179,7 @@ class Answer:
         for number, part in enumerate(connected_components(Mesh(vertices_m, faces)), start=bar_id):
             label = _bar_label(number, record.label)
             try:
-                bars.append(CageBar(label, estimate_bar(number, part), mesh=part))
+                bars.append(CageBar(label, fitted_bar(number, part), mesh=part))
             except ValueError as error:
                 raise MeshError(f"{self._where}: {label}: is not a solid ({error}), expected a bar") from error
         return bars

@@ -1,7 +1,7 @@
 """Reinforcing bars of an IFC file, read by a process of their own with limits of time and memory.
 
 Bars have axes and diameters as modelled; an object without swept discs gives one bar for each connected surface,
-with the straight axis and the diameter of ``estimate_bar`` and the role "imported". ``scene.ifc_reader`` says
+with the axis and the diameter of ``fitted_bar`` and the role "imported". ``scene.ifc_reader`` says
 which objects are read. ifcopenshell may crash, hang or use any amount of memory on damaged files.
 """
 

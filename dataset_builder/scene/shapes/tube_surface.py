@@ -1,0 +1,210 @@
+"""Surface of a candidate tube: welded triangles, their neighbours, and cuts by planes.
+
+Used by ``tube_fit``. Coordinates are relative to the middle of the surface, so that a far origin costs no digits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from numpy import ndarray
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+_WELD_RATIO = 1e-6
+"""Grid on which vertices are merged, as a share of the surface's extent: 1 um for a bar of a metre."""
+
+_MAX_CUT_TRIANGLES = 5000
+"""Largest number of triangles that a plane may cut around a point."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """Closed outline in which a plane cuts a surface: centre, area and the triangles that are cut."""
+
+    centre_m: Float64[ndarray, " 3"]
+    area_m2: float
+    faces: Int64[ndarray, " k"]
+
+
+@dataclass(frozen=True, eq=False)
+class TubeSurface:
+    """Triangles without duplicates or zero area, vertices closer than the weld grid merged; metres."""
+
+    vertices_m: Float64[ndarray, "v 3"]
+    faces: Int64[ndarray, "f 3"]
+
+    @classmethod
+    def welded(cls, vertices_m: Float64[ndarray, "v 3"], faces: ndarray) -> TubeSurface:
+        """Return the surface of triangles in any order; vertices without triangles are dropped."""
+        used = vertices_m[faces.ravel()]
+        grid_m = max(float(np.ptp(used, axis=0).max()) * _WELD_RATIO, np.finfo(np.float64).tiny)
+        cells = np.round((used - used.min(axis=0)) / grid_m).astype(np.int64)
+        key = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]  # A cell number has 20 bits.
+        _, first, index = np.unique(key, return_index=True, return_inverse=True)
+        corners = index.reshape(-1, 3).astype(np.int64)
+        low, middle, high = np.sort(corners, axis=1).T
+        distinct = (low != middle) & (middle != high)
+        count = len(first)
+        _, kept = np.unique((low * count + middle) * count + high, return_index=True)
+        kept = kept[distinct[kept]]
+        return cls(used[first], corners[np.sort(kept)])
+
+    @cached_property
+    def corners_m(self) -> Float64[ndarray, "f 3 3"]:
+        """Corners of each triangle."""
+        return np.asarray(self.vertices_m[self.faces])
+
+    @cached_property
+    def area_vectors_m2(self) -> Float64[ndarray, "f 3"]:
+        """Normal of each triangle times its area."""
+        a, b, c = self.corners_m.transpose(1, 0, 2)
+        return np.asarray(np.cross(b - a, c - a) / 2)
+
+    @cached_property
+    def areas_m2(self) -> Float64[ndarray, " f"]:
+        """Area of each triangle."""
+        return np.asarray(np.linalg.norm(self.area_vectors_m2, axis=1))
+
+    @cached_property
+    def edges(self) -> Int64[ndarray, "e 2"]:
+        """Vertices of each edge, the smaller index first."""
+        return np.stack(np.divmod(self._edge_keys[0], len(self.vertices_m)), axis=1)
+
+    @cached_property
+    def face_edges(self) -> Int64[ndarray, "f 3"]:
+        """Edges of each triangle: from its first to its second vertex, second to third, third to first."""
+        return self._edge_keys[1].reshape(-1, 3)
+
+    @cached_property
+    def _edge_keys(self) -> tuple[Int64[ndarray, " e"], Int64[ndarray, " n"]]:
+        pairs = np.sort(np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+        keys, index = np.unique(pairs[:, 0] * len(self.vertices_m) + pairs[:, 1], return_inverse=True)
+        return keys, index.ravel()
+
+    @cached_property
+    def boundary_edges(self) -> Int64[ndarray, "b 2"]:
+        """Edges of one triangle only: open ends."""
+        uses = np.bincount(self.face_edges.ravel(), minlength=len(self.edges))
+        return np.asarray(self.edges[uses == 1])
+
+    @cached_property
+    def neighbours(self) -> tuple[Int64[ndarray, " n"], Int64[ndarray, " m"]]:
+        """Neighbours of all vertices in one array, and where those of each vertex start in it."""
+        both = np.concatenate([self.edges, self.edges[:, ::-1]])
+        both = both[np.argsort(both[:, 0], kind="stable")]
+        return both[:, 1], np.searchsorted(both[:, 0], np.arange(len(self.vertices_m) + 1))
+
+    @cached_property
+    def _face_tree(self) -> cKDTree:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.corners_m.mean(axis=1))
+
+    @cached_property
+    def _longest_edge_m(self) -> float:
+        return float(np.linalg.norm(np.diff(self.vertices_m[self.edges], axis=1), axis=2).max())
+
+    def _faces_near(self, point_m: Float64[ndarray, " 3"], reach_m: float) -> Int64[ndarray, " k"]:
+        """Return the triangles that may come within ``reach_m`` of a point, in order; all if edges are long."""
+        if self._longest_edge_m > 4 * reach_m:
+            return np.arange(len(self.faces))
+        near = self._face_tree.query_ball_point(point_m, reach_m + self._longest_edge_m, return_sorted=True)
+        return np.array(near, dtype=np.int64)
+
+    def is_connected(self) -> bool:
+        """Return whether all triangles hang together."""
+        return bool((_component(self.edges, len(self.vertices_m)) == 0).all())
+
+    @cached_property
+    def volume_m3(self) -> float:
+        """Enclosed volume; an open end is closed towards the middle of the vertices around it."""
+        inside = np.einsum("fi,fi->", self.corners_m[:, 0], self.area_vectors_m2) / 3
+        directed = np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+        uses = np.bincount(self.face_edges.ravel(), minlength=len(self.edges))
+        start, end = directed[uses[self.face_edges.ravel()] == 1].T
+        opening = _component(self.boundary_edges, len(self.vertices_m))[start]
+        count = np.maximum(np.bincount(opening, minlength=1), 1)
+        start_m, end_m = self.vertices_m[start], self.vertices_m[end]
+        sums_m = [np.bincount(opening, start_m[:, axis], len(count)) for axis in range(3)]
+        middle_m = (np.stack(sums_m, axis=1) / count[:, None])[opening]
+        return abs(float(inside + np.einsum("ni,ni->", middle_m, np.cross(end_m, start_m)) / 6))
+
+    def cut(self, point_m: Float64[ndarray, " 3"], normal: Float64[ndarray, " 3"], reach_m: float) -> Cut | None:
+        """Return the closed outline around ``point_m`` in which the plane cuts the surface, or None.
+
+        The plane passes through ``point_m`` with the unit vector ``normal``. The outline must come within
+        ``reach_m`` of the point and stay within twice that distance of it.
+        """
+        candidates = self._faces_near(point_m, 2 * reach_m)
+        face_side = (self.corners_m[candidates] - point_m) @ normal > 0
+        is_cut = face_side.any(axis=1) & ~face_side.all(axis=1)
+        faces, face_side = candidates[is_cut], face_side[is_cut]
+        if not 0 < len(faces) <= _MAX_CUT_TRIANGLES:
+            return None
+        # Each cut triangle has two cut edges; the edges are the corners of the outline.
+        cut_edge = face_side != np.roll(face_side, -1, axis=1)
+        pairs = self.face_edges[faces][cut_edge].reshape(-1, 2)
+        edges, index = np.unique(pairs, return_inverse=True)
+        start, end = self.edges[edges].T
+        start_m, end_m = self.vertices_m[start], self.vertices_m[end]
+        above_m, below_m = (start_m - point_m) @ normal, (point_m - end_m) @ normal
+        corners_m = start_m + (above_m / (above_m + below_m))[:, None] * (end_m - start_m)
+        return _outline(corners_m, index.reshape(-1, 2), faces, point_m, normal, reach_m)
+
+
+def _component(edges: Int64[ndarray, "e 2"], vertices: int) -> Int64[ndarray, " v"]:
+    """Return the number of each vertex's connected component, from 0."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(vertices, vertices))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def _outline(
+    corners_m: Float64[ndarray, "c 3"],
+    sides: Int64[ndarray, "s 2"],
+    faces: Int64[ndarray, " s"],
+    point_m: Float64[ndarray, " 3"],
+    normal: Float64[ndarray, " 3"],
+    reach_m: float,
+) -> Cut | None:
+    """Return the outline whose corner is the nearest to ``point_m``; None if it is open, forked or too far."""
+    offset_m = corners_m - point_m
+    distance_m = np.linalg.norm(offset_m, axis=1)
+    first = int(distance_m.argmin())
+    ordered = _closed_walk(sides, first) if distance_m[first] <= reach_m else None
+    if ordered is None:
+        return None
+    outline_m = offset_m[ordered]
+    following_m = np.roll(outline_m, -1, axis=0)
+    doubled_area = np.cross(outline_m, following_m) @ normal
+    total = float(doubled_area.sum())
+    if total == 0:
+        return None
+    centre_m = (doubled_area[:, None] * (outline_m + following_m)).sum(axis=0) / (3 * total)
+    is_part: Bool[ndarray, " c"] = np.zeros(len(corners_m), dtype=bool)
+    is_part[ordered] = True
+    return Cut(point_m + centre_m, abs(total) / 2, faces[is_part[sides[:, 0]]])
+
+
+def _closed_walk(sides: Int64[ndarray, "s 2"], first: int) -> list[int] | None:
+    """Return the corners of the closed outline through ``first``, in order, or None if it is open or forked."""
+    beside: list[list[int]] = [[] for _ in range(int(sides.max()) + 1)]
+    for a, b in sides.tolist():
+        beside[a].append(b)
+        beside[b].append(a)
+    ordered, before, here = [first], first, beside[first][0]
+    while here != first:
+        if len(beside[here]) != 2:
+            return None
+        ordered.append(here)
+        a, b = beside[here]
+        before, here = here, b if a == before else a
+    return ordered
