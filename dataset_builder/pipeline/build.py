@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections import defaultdict
 from collections.abc import Sequence
@@ -25,6 +26,7 @@ from dataset_builder.pipeline.publish import (
 from dataset_builder.pipeline.retained import check_retained_configs
 from dataset_builder.pipeline.work_units import accept_result, remaining_units
 from dataset_builder.scene.assemblies import check_fits
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.progress import Progress, silent
 
 
@@ -69,13 +71,15 @@ def build(
 
 
 def plan_build(request: BuildRequest, out: Path) -> list[ConfigPlan]:
-    """Return the plans of the requested configs; nothing is written.
+    """Return the plans of the requested configs; nothing is written. Notes on their files go to standard error.
 
     Raises ``InputError`` for a request that cannot be built in the folder ``out``, such as an unusable mesh file.
     """
     plans = [plan_config(spec, request.views, out) for spec in request.config_specs()]
     for plan in plans:
         check_fits(plan.assembly, plan.spec)
+    for note in dict.fromkeys(note for plan in plans for note in plan.assembly.notes):
+        print(printable(f"note: {note.source}: {note.text}"), file=sys.stderr)
     check_folder(out, plans)
     return plans
 

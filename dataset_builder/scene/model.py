@@ -56,19 +56,29 @@ def surface(name: str, mesh: Mesh, material: str) -> Part:
     return Part(name, mesh, NOT_STEEL, material)
 
 
+@dataclass(frozen=True)
+class Note:
+    """Remark about a file of the scene that its user should know: the file, a short code and the text."""
+
+    source: str
+    code: str
+    text: str
+
+
 @dataclass(frozen=True, eq=False)
 class Assembly:
-    """Steel of a scene: its bars, and one part per bar."""
+    """Steel of a scene: its bars, one part per bar, and notes about its file."""
 
     bars: tuple[Bar, ...]
     parts: tuple[Part, ...]
+    notes: tuple[Note, ...] = ()
 
     @classmethod
-    def from_meshes(cls, bars_and_meshes: Iterable[tuple[Bar, Mesh]]) -> Assembly:
+    def from_meshes(cls, bars_and_meshes: Iterable[tuple[Bar, Mesh]], notes: tuple[Note, ...] = ()) -> Assembly:
         """Return the assembly of bars and their meshes (world frame); a part is named by its bar's role and id."""
         pairs = tuple(bars_and_meshes)
         parts = (Part(f"{bar.role}-{bar.bar_id:03d}", mesh, bar.bar_id, STEEL) for bar, mesh in pairs)
-        return cls(tuple(bar for bar, _ in pairs), tuple(parts))
+        return cls(tuple(bar for bar, _ in pairs), tuple(parts), notes)
 
     @property
     def vertices_m(self) -> Float64[ndarray, "v 3"]:

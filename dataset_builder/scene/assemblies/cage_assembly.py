@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.assemblies.mesh_import import MAX_EXTENT_M, MIN_EXTENT_M
-from dataset_builder.scene.model import MAX_BARS, Assembly, Mesh
+from dataset_builder.scene.model import MAX_BARS, Assembly, Mesh, Note
 from dataset_builder.scene.shapes.bar_mesh import RibPattern, plain_bar_mesh, ribbed_bar_mesh
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import MeshError, Problem
@@ -51,13 +51,16 @@ _BEND_MARGIN_DIAMETERS = 1.0
 class CageBar:
     """A bar of a cage file with its name in error messages.
 
-    ``mesh`` (world, metres) is set only if the file has no axis for the bar.
+    ``mesh`` (world, metres) is set only if the file has no axis for the bar. ``source`` is the GlobalId of its IFC
+    object, and ``notes`` are remarks of the file's reader.
     """
 
     label: str
     bar: Bar
     ribs: bool = True
     mesh: Mesh | None = None
+    source: str | None = None
+    notes: tuple[Note, ...] = ()
 
 
 def cage_assembly(bars: Sequence[CageBar], where: str) -> Assembly:
@@ -84,7 +87,7 @@ def cage_assembly(bars: Sequence[CageBar], where: str) -> Assembly:
         except ValueError as error:
             problems.append(Problem("invalid", bar.label, str(error)))
     raise_problems(problems, where)
-    return Assembly.from_meshes(meshes)
+    return Assembly.from_meshes(meshes, tuple(dict.fromkeys(note for bar in bars for note in bar.notes)))
 
 
 def raise_problems(problems: Sequence[Problem], where: str) -> None:
