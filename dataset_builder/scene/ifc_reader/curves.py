@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
-from scipy.interpolate import BSpline
 
 from dataset_builder.scene.ifc_reader.pieces import ARC_STEP_DEG, Arc, Leg, Piece, Sampled, arc_through, cut
 from dataset_builder.scene.ifc_reader.placements import axis_placement, point_xyz, unit_vector, xyz
@@ -20,7 +19,7 @@ from dataset_builder.scene.ifc_reader.placements import axis_placement, point_xy
 _MAX_DEPTH = 20
 """Largest nesting depth of curves; deeper nesting is taken to be a cycle."""
 
-_MAX_PIECES = 100_000
+_MAX_PIECES = 10_000
 """Largest number of pieces of a composite curve, which a short file with nested curves can multiply."""
 
 _MAX_SPLINE_POINTS = 20_000
@@ -75,10 +74,14 @@ def _arc_index(corners: Float64[ndarray, "3 3"], angle_rad: float) -> list[Piece
 
 def _composite_curve(curve: Any, angle_rad: float, depth: int) -> list[Piece]:
     pieces: list[Piece] = []
+    known: dict[int, list[Piece]] = {}
     for segment in curve.Segments:
         if not segment.is_a("IfcCompositeCurveSegment"):
             raise ValueError(f"a segment is a {segment.is_a()}, expected an IfcCompositeCurveSegment")
-        parts = curve_pieces(segment.ParentCurve, angle_rad, depth + 1)
+        number = segment.ParentCurve.id()
+        if number not in known:
+            known[number] = curve_pieces(segment.ParentCurve, angle_rad, depth + 1)
+        parts = known[number]
         pieces += parts if segment.SameSense else _reversed(parts)
         if len(pieces) > _MAX_PIECES:
             raise ValueError(f"a composite curve has more than {_MAX_PIECES} pieces")
@@ -96,9 +99,7 @@ def _trimmed_curve(curve: Any, angle_rad: float, depth: int) -> list[Piece]:
     if basis.is_a("IfcConic"):
         return [_trimmed_conic(curve, basis, angle_rad)]
     if basis.is_a("IfcCompositeCurve") or basis.is_a("IfcTrimmedCurve"):
-        raise ValueError(
-            f"a curve that is trimmed is a {basis.is_a()}, expected a curve that is not made of others"
-        )
+        raise ValueError(f"a {basis.is_a()} is trimmed, expected a curve that is not made of others")
     pieces = curve_pieces(basis, angle_rad, depth + 1)
     first, last = sorted(_trim_parameter(curve, trim, _no_parameter, 1.0) for trim in "12")
     parts = cut(pieces, [piece.parameters for piece in pieces], first, last)
@@ -175,6 +176,8 @@ def _whole_conic(curve: Any, angle_rad: float, _depth: int) -> list[Piece]:
 
 def _b_spline(curve: Any, _angle_rad: float, _depth: int) -> list[Piece]:
     """Return a B-spline with knots, sampled so that neighbouring chords turn by at most ``ARC_STEP_DEG``."""
+    from scipy.interpolate import BSpline  # Imported when needed: it takes a second.
+
     degree = int(curve.Degree)
     knots = np.repeat(np.array(curve.Knots, np.float64), _multiplicities(curve, degree))
     weights = np.array(getattr(curve, "WeightsData", None) or np.ones(len(curve.ControlPointsList)))

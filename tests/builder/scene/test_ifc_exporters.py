@@ -163,5 +163,5 @@ def test_multiplied_curves_are_refused() -> None:
     for _ in range(12):
         curve = step.composite(*[curve] * 10)
     step.bar([step.disc(curve, 6.0, "$", "$")], None, None)
-    with pytest.raises(MeshError, match="more than 100000 pieces"):
+    with pytest.raises(MeshError, match="more than 10000 pieces"):
         read(step.text())
