@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from dataset_builder.scene.assemblies.mesh_import import MAX_EXTENT_M, MIN_EXTENT_M
 from dataset_builder.scene.assemblies.surface_bar import axis_notes
-from dataset_builder.scene.model import MAX_BARS, Assembly, Mesh
+from dataset_builder.scene.model import MAX_BARS, Assembly, Mesh, Note
 from dataset_builder.scene.shapes.bar_mesh import RibPattern, plain_bar_mesh, ribbed_bar_mesh
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import MeshError, Problem
@@ -53,12 +53,15 @@ class CageBar:
     """A bar of a cage file with its name in error messages.
 
     ``mesh`` (world, metres) is set only if the file has no axis for the bar; only then the bar may be without one.
+    ``source`` is the GlobalId of its IFC object, and ``notes`` are remarks of the file's reader.
     """
 
     label: str
     bar: Bar
     ribs: bool = True
     mesh: Mesh | None = None
+    source: str | None = None
+    notes: tuple[Note, ...] = ()
 
 
 def cage_assembly(bars: Sequence[CageBar], where: str) -> Assembly:
@@ -86,7 +89,8 @@ def cage_assembly(bars: Sequence[CageBar], where: str) -> Assembly:
             problems.append(Problem("invalid", bar.label, str(error)))
     raise_problems(problems, where)
     without_axis = [bar.label for bar in bars if not bar.bar.has_axis]
-    return Assembly.from_meshes(meshes, axis_notes(where, without_axis, len(bars)))
+    notes = tuple(dict.fromkeys(note for bar in bars for note in bar.notes))
+    return Assembly.from_meshes(meshes, (*notes, *axis_notes(where, without_axis, len(bars))))
 
 
 def raise_problems(problems: Sequence[Problem], where: str) -> None:

@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy import ndarray
 
 from rebar_depth_bench.errors import MeshError, exception_summary, printable
+
+if TYPE_CHECKING:
+    from dataset_builder.scene.ifc_reader.bars import Source
 
 _MAX_MESSAGE = 1000
 
@@ -40,13 +43,16 @@ def write_answer(content: bytes, stream: BinaryIO, before_kernel: Callable[[], o
     try:
         for shape in read_bars(content, step):
             count += 1
+            source = _source(shape.source)
             if isinstance(shape, Surface):
                 sizes = {"vertices": len(shape.vertices_m), "faces": len(shape.faces)}
-                record = {"kind": "surface", "label": shape.label, **sizes}
+                record = {"kind": "surface", "source": source, **sizes}
                 _write(stream, record, shape.vertices_m.astype("<f8"), shape.faces.astype("<i4"))
             else:
                 values = {"role": shape.role, "diameter_m": shape.diameter_m, "points": len(shape.axis_m)}
-                _write(stream, {"kind": "bar", "label": shape.label, **values}, shape.axis_m.astype("<f8"))
+                notes = [{"code": code, "text": text} for code, text in shape.notes]
+                record = {"kind": "bar", "source": source, "notes": notes, **values}
+                _write(stream, record, shape.axis_m.astype("<f8"))
         _write(stream, {"kind": "end", "shapes": count})
     except MemoryError:
         _write(stream, _failure("memory", ""))
@@ -56,6 +62,12 @@ def write_answer(content: bytes, stream: BinaryIO, before_kernel: Callable[[], o
         _write(stream, _failure("file", str(error)))
     except Exception as error:  # Damaged instances raise various exceptions when their attributes are read.
         _write(stream, _failure("file", f"cannot be read ({exception_summary(error)}), expected an IFC file"))
+
+
+def _source(source: Source) -> dict[str, Any]:
+    """Return the record of an object: its GlobalId, name, and declared sizes in metres."""
+    sizes = {"diameters_m": list(source.declared.diameters_m), "length_m": source.declared.length_m}
+    return {"global_id": source.global_id, "label": source.label, **sizes}
 
 
 def _failure(cause: str, message: str) -> dict[str, Any]:

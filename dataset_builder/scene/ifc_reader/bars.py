@@ -1,10 +1,9 @@
-"""Shapes of the reinforcing bars of an IFC model, as modelled: world frame, metres.
+"""Shapes of the reinforcement in an IFC model, as modelled: world frame, metres.
 
-Every IfcReinforcingBar is read, in the order of the instance numbers in the file. Each IfcSweptDiskSolid in its
-Body, directly or through IfcMappedItem, is one bar, since some programs write a whole row of bars as one object.
-The axis is the directrix (polylines, indexed curves of lines and arcs, composite curves of these and of trimmed
-lines and circles), the diameter twice the disc's radius. An object with any other item in its Body is
-tessellated as a whole. Other reinforcement (IfcReinforcingMesh, IfcTendon) and all other objects are left out.
+Every IfcReinforcingBar, IfcReinforcingMesh and IfcTendon is read, in the order of the instance numbers. Each sweep
+of a circle in its Body (``sweeps``), directly or through IfcMappedItem, is one bar, since some programs write a
+whole row of bars as one object. Only other solids are tessellated, each once for all of its uses. All other
+objects are left out.
 
 The project's coordinates are world coordinates; a context's coordinate system and map projections are ignored.
 """
@@ -19,41 +18,55 @@ import numpy as np
 from jaxtyping import Float64, Int32
 from numpy import ndarray
 
-from dataset_builder.scene.ifc_reader.geometry import directrix, mapped_matrix, placement_matrix
-from dataset_builder.scene.ifc_reader.model import Model, angle_unit_rad, length_unit_m, open_model, world_mesh
+from dataset_builder.scene.ifc_reader.bodies import BodyItem, body_items, type_objects
+from dataset_builder.scene.ifc_reader.declared import Declared, declared_sizes, role
+from dataset_builder.scene.ifc_reader.model import Model, angle_unit_rad, item_mesh, length_unit_m, open_model
+from dataset_builder.scene.ifc_reader.placements import placement_matrix
 from dataset_builder.scene.ifc_reader.source_check import Entity
+from dataset_builder.scene.ifc_reader.sweeps import Sweep, Units, read_sweep
+from dataset_builder.scene.model import MAX_BARS
 from rebar_depth_bench.errors import MeshError, escape_text
 
-ROLES = {"LIGATURE": "stirrup"}
-"""Roles of PredefinedType values whose lower-case name is not used as the role."""
+CLASSES = ("IfcReinforcingBar", "IfcReinforcingMesh", "IfcTendon")
+"""Classes whose objects are read."""
 
-_UNSPECIFIED_TYPES = ("USERDEFINED", "NOTDEFINED", None, "")
-_MAX_BODY_ITEMS = 10_000
-"""Largest number of items in one object's Body, with the items of nested maps counted at each use.
+MAX_POINTS = 20_000_000
+"""Largest number of points of all axes and surfaces of a model, which maps can multiply: 480 MB."""
 
-A short file with nested maps can expand to billions of items.
-"""
+_MAX_NAME = 60
+_DAMAGE = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+"""Exceptions of instances that are incomplete or not supported."""
 
 
 class ShapeError(MeshError):
-    """Object that the geometry kernel cannot tessellate; the message is the reason alone."""
+    """Solid that the geometry kernel cannot tessellate; the message is the reason alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Object of a model: GlobalId, its name in error messages, and what it declares about its bars."""
+
+    global_id: str
+    label: str
+    declared: Declared
 
 
 @dataclass(frozen=True, eq=False)
 class SweptBar:
-    """Bar with an axis: name of its object, role, axis and diameter (world, metres)."""
+    """Bar with an axis: its object, role, axis and diameter (world, metres), and notes (code and text)."""
 
-    label: str
+    source: Source
     role: str
     axis_m: Float64[ndarray, "n 3"]
     diameter_m: float
+    notes: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Tessellated object, of one or several bars: its name, vertices (world, metres) and triangles."""
+    """Tessellated solid, of one or several bars: its object, vertices (world, metres) and triangles."""
 
-    label: str
+    source: Source
     vertices_m: Float64[ndarray, "v 3"]
     faces: Int32[ndarray, "f 3"]
 
@@ -64,162 +77,123 @@ def read_bars(
     """Yield the shapes of an IFC file's ``content``, in its order.
 
     ``before_kernel`` is called with an object's name, and the reason why it has no axis, before the geometry
-    kernel tessellates it, which may hang or crash.
+    kernel tessellates a solid of it, which may hang or crash.
 
-    Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit or no reinforcing bar, or
-    if a bar depends on an instance that was not read as written; ``ShapeError`` if a bar has no usable geometry.
+    Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, no reinforcement or too
+    much of it, if a bar depends on an instance that was not read as written, or if it has no usable geometry;
+    ``ShapeError`` if a solid cannot be tessellated.
     """
     model = open_model(content)
-    objects = model.by_type("IfcReinforcingBar")
+    objects = sorted(
+        {entity.id(): entity for name in CLASSES for entity in model.by_type(name)}.values(), key=_number
+    )
     if not objects:
-        raise MeshError(f"contains no IfcReinforcingBar{_unread_reinforcement_note(model)}, expected at least one")
-    units = length_unit_m(model), angle_unit_rad(model)
-    placements: dict[int, Float64[ndarray, "4 4"]] = {}
+        raise MeshError(f"contains no reinforcement, expected at least one object of {', '.join(CLASSES)}")
+    for relation in model.by_type("IfcRelDefinesByType"):
+        model.check.attributes(relation, "RelatedObjects", "RelatingType")
+    reader = _Reader(model, before_kernel)
     for entity in objects:
-        _check_object(model, entity)
-    if any(_own_kind(entity) is None for entity in objects):
-        for relation in model.by_type("IfcRelDefinesByType"):
-            model.check.attributes(relation, "RelatedObjects", "RelatingType")
-    for entity in objects:
+        yield from reader.shapes(entity)
+
+
+class _Reader:
+    """Reader of a model's objects, which share placements and solids."""
+
+    def __init__(self, model: Model, before_kernel: Callable[[str, str], None]) -> None:
+        self._model, self._before_kernel = model, before_kernel
+        self._units = Units(length_unit_m(model), angle_unit_rad(model))
+        self._placements: dict[int, Float64[ndarray, "4 4"]] = {}
+        self._sweeps: dict[int, Sweep | None] = {}
+        self._meshes: dict[int, tuple[Float64[ndarray, "v 3"], Int32[ndarray, "f 3"]]] = {}
+        self._shapes = self._points = 0
+
+    def shapes(self, entity: Entity) -> Iterator[SweptBar | Surface]:
+        """Yield the shapes of an object; raise ``MeshError`` that names it."""
+        label = _label(entity)
         try:
-            shapes = _swept_bars(model, entity, units, placements)
-        except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
-            reason = shorten(str(error), 200) or type(error).__name__
-            before_kernel(_label(entity), reason)
-            yield _tessellated(model, entity)
-        else:
-            yield from shapes
+            types = self._checked_types(entity)
+            source = Source(
+                escape_text(shorten(str(entity.GlobalId), _MAX_NAME)),
+                label,
+                declared_sizes(self._model, entity, types, self._units.length_m),
+            )
+            items = body_items(self._model, entity, types)
+            world_from_object = placement_matrix(entity.ObjectPlacement, self._placements)
+            sweeps = [self._sweep(item.item) for item in items]
+        except MeshError as error:
+            raise MeshError(f"{label}: {error}") from error
+        except _DAMAGE as error:
+            reason = shorten(str(error), 400) or type(error).__name__
+            raise MeshError(f"{label} has no readable shape: {reason}") from error
+        for item, sweep in zip(items, sweeps, strict=True):
+            matrix = world_from_object @ item.object_from_item
+            if sweep is None:
+                yield self._surface(source, item, matrix)
+            else:
+                yield self._bar(source, role(entity, types), sweep, matrix, item.scale)
 
-
-def _unread_reinforcement_note(model: Model) -> str:
-    """Return a note for the error message on reinforcement of classes that are not read, or an empty string."""
-    unread_classes = [name for name in ("IfcReinforcingMesh", "IfcTendon") if model.by_type(name)]
-    return f" ({' and '.join(unread_classes)} are not supported)" if unread_classes else ""
-
-
-def _check_object(model: Model, entity: Entity) -> None:
-    """Raise ``MeshError`` unless an object's name, placement and Body were read as written."""
-    check = model.check
-    try:
-        names = (
-            "GlobalId",
-            "Name",
-            "ObjectType",
-            "ObjectPlacement",
-            "Representation",
-            "PredefinedType",
-            "BarRole",
-        )
-        check.attributes(entity, *names)
+    def _checked_types(self, entity: Entity) -> list[Entity]:
+        """Return the types of an object; raise ``MeshError`` unless its attributes were read as written."""
+        check = self._model.check
+        check.attributes(
+            entity, *("GlobalId", "Name", "ObjectType", "ObjectPlacement", "Representation"),
+            *("PredefinedType", "BarRole"),
+        )  # fmt: skip
         if entity.ObjectPlacement is not None:
             check.tree(entity.ObjectPlacement)
-        if entity.Representation is not None:
-            check.attributes(entity.Representation, "Representations")
-            for representation in entity.Representation.Representations:
-                check.attributes(representation, "RepresentationIdentifier")
-            for body in _bodies(entity):
-                check.tree(body)
-    except MeshError as error:
-        raise MeshError(f"{_label(entity)}: {error}") from error
+        return type_objects(self._model, entity)
+
+    def _sweep(self, solid: Entity) -> Sweep | None:
+        if solid.id() not in self._sweeps:
+            self._sweeps[solid.id()] = read_sweep(solid, self._units)
+        return self._sweeps[solid.id()]
+
+    def _bar(
+        self, source: Source, bar_role: str, sweep: Sweep, matrix: Float64[ndarray, "4 4"], scale: float
+    ) -> SweptBar:
+        self._count(source, len(sweep.axis))
+        axis = sweep.axis @ matrix[:3, :3].T + matrix[:3, 3]
+        unit_m = self._units.length_m
+        return SweptBar(source, bar_role, axis * unit_m, sweep.diameter * scale * unit_m, sweep.notes)
+
+    def _surface(self, source: Source, item: BodyItem, matrix: Float64[ndarray, "4 4"]) -> Surface:
+        number = item.item.id()
+        if number not in self._meshes:
+            self._before_kernel(source.label, f"the body is a {item.item.is_a()}")
+            self._meshes[number] = _tessellated(self._model, number)
+        vertices_m, faces = self._meshes[number]
+        self._count(source, len(vertices_m))
+        if np.linalg.det(matrix[:3, :3]) < 0:  # A reflection turns the triangles inside out.
+            faces = faces[:, ::-1]
+        return Surface(source, vertices_m @ matrix[:3, :3].T + matrix[:3, 3] * self._units.length_m, faces)
+
+    def _count(self, source: Source, points: int) -> None:
+        """Count a shape; raise ``MeshError`` if there are too many shapes or points."""
+        self._shapes, self._points = self._shapes + 1, self._points + points
+        if self._shapes > MAX_BARS or self._points > MAX_POINTS:
+            raise MeshError(
+                f"{source.label}: {self._shapes} bars of {self._points} points up to this object, "
+                f"expected at most {MAX_BARS} and {MAX_POINTS}"
+            )
 
 
-def _swept_bars(
-    model: Model, entity: Entity, units: tuple[float, float], placements: dict[int, Float64[ndarray, "4 4"]]
-) -> list[SweptBar]:
-    """Return the bar of each swept disc of an object.
-
-    ``units`` are the length unit in metres and the plane angle unit in radians; ``placements`` holds the matrices
-    of placements that are known, and is added to.
-
-    Raises ``ValueError`` if its Body is empty or holds other items, and other exceptions if it is incomplete.
-    """
-    unit_m, angle_rad = units
-    world_from_object = placement_matrix(entity.ObjectPlacement, placements)
-    label, role = _label(entity), ""
-    bars = []
-    for solid, object_from_solid, scale in _swept_solids(
-        [item for body in _bodies(entity) for item in body.Items]
-    ):
-        matrix = world_from_object @ object_from_solid
-        axis = directrix(solid, angle_rad) @ matrix[:3, :3].T + matrix[:3, 3]
-        role = role or _role(model, entity)
-        bars.append(SweptBar(label, role, axis * unit_m, 2 * float(solid.Radius) * scale * unit_m))
-    if not bars:
-        raise ValueError("the body is empty")
-    return bars
-
-
-def _bodies(entity: Entity) -> list[Entity]:
-    """Return the object's representations named Body, or all of them if there is none."""
-    representations = list(entity.Representation.Representations)
-    return [
-        representation for representation in representations if representation.RepresentationIdentifier == "Body"
-    ] or representations
-
-
-def _swept_solids(items: list[Entity]) -> Iterator[tuple[Entity, Float64[ndarray, "4 4"], float]]:
-    """Yield each swept disc with its ``object_from_solid`` and scale, in order, including nested maps.
-
-    Raises ``ValueError`` if there is another item or there are more than ``_MAX_BODY_ITEMS``.
-    """
-    maps: dict[int, tuple[Float64[ndarray, "4 4"], float, list[Entity]]] = {}
-    pending = [(item, np.eye(4), 1.0) for item in reversed(items)]
-    for _ in range(_MAX_BODY_ITEMS):
-        if not pending:
-            return
-        item, matrix, scale = pending.pop()
-        if item.is_a("IfcMappedItem"):
-            if item.id() not in maps:
-                inside = item.MappingSource.MappedRepresentation.Items
-                maps[item.id()] = (*mapped_matrix(item), list(reversed(inside)))
-            mapped, factor, inner = maps[item.id()]
-            pending += [(mapped_item, matrix @ mapped, scale * factor) for mapped_item in inner]
-        elif item.is_a("IfcSweptDiskSolid"):
-            yield item, matrix, scale
-        else:
-            raise ValueError(f"the body is a {item.is_a()}")
-    raise ValueError(f"the body has more than {_MAX_BODY_ITEMS} items, or circular maps")
-
-
-def _tessellated(model: Model, entity: Entity) -> Surface:
-    """Return the surface of an object; raise ``ShapeError`` if it cannot be tessellated."""
+def _tessellated(model: Model, number: int) -> tuple[Float64[ndarray, "v 3"], Int32[ndarray, "f 3"]]:
+    """Return the surface of an item, metres; raise ``ShapeError`` if it cannot be tessellated."""
     try:
-        vertices, faces = world_mesh(model, entity.id())
+        vertices, faces = item_mesh(model, number)
     except RuntimeError as error:
         if "bad_alloc" in str(error):
             raise MemoryError from error
         raise ShapeError(str(error) or "the geometry kernel failed") from error
     if not len(faces):
         raise ShapeError("has no surface")
-    return Surface(
-        _label(entity), np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int32).reshape(-1, 3)
-    )
+    return np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int32).reshape(-1, 3)
+
+
+def _number(entity: Entity) -> int:
+    return int(entity.id())
 
 
 def _label(entity: Entity) -> str:
-    """Return the object's name in error messages: GlobalId and instance number."""
-    return f"IfcReinforcingBar {escape_text(str(entity.GlobalId))} (#{entity.id()})"
-
-
-def _own_kind(source: Entity) -> str | None:
-    """Return the PredefinedType (BarRole in IFC2x3) of an object or a type, or None if it has none."""
-    kind = getattr(source, "PredefinedType", None) or getattr(source, "BarRole", None)
-    return None if kind in _UNSPECIFIED_TYPES else str(kind)
-
-
-def _role(model: Model, entity: Entity) -> str:
-    """Return the role of a bar: its or its type's PredefinedType (BarRole in IFC2x3), else ObjectType or Name."""
-    kind = _own_kind(entity)
-    for type_object in () if kind else _type_objects(entity):
-        model.check.attributes(type_object, "PredefinedType", "BarRole")
-        kind = kind or _own_kind(type_object)
-    if kind:
-        return ROLES.get(kind, kind.lower())
-    description = " ".join(str(entity.ObjectType or entity.Name or "").split())
-    return description[:60] or "bar"
-
-
-def _type_objects(entity: Entity) -> list[Entity]:
-    """Return the IfcTypeObjects that define an object."""
-    relations = [*(getattr(entity, "IsTypedBy", None) or ()), *(getattr(entity, "IsDefinedBy", None) or ())]
-    return [relation.RelatingType for relation in relations if relation.is_a("IfcRelDefinesByType")]
+    """Return the object's name in error messages: class, GlobalId and instance number."""
+    return f"{entity.is_a()} {escape_text(shorten(str(entity.GlobalId), _MAX_NAME))} (#{entity.id()})"

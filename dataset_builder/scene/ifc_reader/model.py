@@ -22,7 +22,17 @@ from rebar_depth_bench.errors import MeshError, escape_text
 
 _LOGGED_REASON = re.compile(r"\] (?!Pars)[A-Za-z]")
 """Message in the parser's log that gives a reason, after severity and time; out of memory, it may be cut off."""
-_PREFIXES = {"MILLI": 1e-3, "CENTI": 1e-2, "DECI": 1e-1, None: 1.0, "DECA": 1e1, "HECTO": 1e2, "KILO": 1e3}
+_PREFIXES: dict[str | None, float] = {
+    None: 1.0,
+    **dict(
+        zip(
+            ("DECI", "CENTI", "MILLI", "MICRO", "NANO", "PICO"), (1e-1, 1e-2, 1e-3, 1e-6, 1e-9, 1e-12), strict=True
+        )
+    ),
+    **dict(zip(("DECA", "HECTO", "KILO", "MEGA", "GIGA"), (1e1, 1e2, 1e3, 1e6, 1e9), strict=True)),
+}
+_MAX_UNIT_DEPTH = 10
+"""Largest number of units that are each defined by the next, such as an inch by a foot by a metre."""
 
 
 @dataclass(frozen=True)
@@ -86,17 +96,16 @@ def _has_class(schema: Any, name: str) -> bool:
     return True
 
 
-def world_mesh(model: Model, number: int) -> tuple[Any, Any]:
-    """Return vertices (flat, world, metres) and triangles (flat) of the instance ``number``.
+def item_mesh(model: Model, number: int) -> tuple[Any, Any]:
+    """Return vertices (flat, metres, frame of the item) and triangles (flat) of the solid ``number``.
 
     Raises ``RuntimeError`` if the geometry kernel cannot tessellate it. The kernel may also hang or crash.
     """
     settings = geom.settings()
-    settings.set("use-world-coords", True)
     settings.set("mesher-linear-deflection", 1e-5)
     settings.set("mesher-angular-deflection", 0.15)
-    geometry = geom.create_shape(settings, model.file.by_id(number)).geometry
-    return geometry.verts, geometry.faces
+    mesh = geom.create_shape(settings, model.file.by_id(number))
+    return mesh.verts, mesh.faces
 
 
 def length_unit_m(model: Model) -> float:
@@ -131,9 +140,11 @@ def _project_unit(model: Model, kind: str, base: str) -> float | None:
 def _to_base_unit(unit: Entity, base: str) -> float | None:
     """Return the factor from an IFC unit to the SI unit ``base``, or None if it is not such a unit."""
     factor = 1.0
-    if unit.is_a("IfcConversionBasedUnit"):  # For example, a foot defined as a number of metres.
-        factor = float(unit.ConversionFactor.ValueComponent.wrappedValue)
+    for _ in range(_MAX_UNIT_DEPTH):
+        if not unit.is_a("IfcConversionBasedUnit"):  # For example, a foot defined as a number of metres.
+            break
+        factor *= float(unit.ConversionFactor.ValueComponent.wrappedValue)
         unit = unit.ConversionFactor.UnitComponent
     if not unit.is_a("IfcSIUnit") or unit.Name != base or unit.Prefix not in _PREFIXES or not factor > 0:
         return None
-    return factor * _PREFIXES[unit.Prefix]
+    return float(factor * _PREFIXES[unit.Prefix])

@@ -28,7 +28,10 @@ _UNUSED = {
 }
 """Attributes without influence on the shape of a bar, which are neither checked nor followed."""
 
-_MAY_BE_NULL = {"BarRole", "EndParam", "GlobalId", "PredefinedType", "StartParam", "UnitsInContext"}
+_MAY_BE_NULL = {
+    *("BarRole", "EndParam", "GlobalId", "NominalDiameter", "PredefinedType", "StartParam", "UnitsInContext"),
+    *("LongitudinalBarNominalDiameter", "TransverseBarNominalDiameter"),
+}
 """Attributes that a version of IFC requires, that exporters leave out, and that the reader can do without."""
 
 _DIMENSION: dict[str, int | None] = {

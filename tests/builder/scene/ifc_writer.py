@@ -92,3 +92,10 @@ def extruded_circle(ifc: Ifc, radius: float = 8.0, x: float = 0.0) -> Any:
         "IfcCircleProfileDef", "AREA", None, ifc.new("IfcAxis2Placement2D", ifc.point((x, 0))), radius
     )
     return ifc.new("IfcExtrudedAreaSolid", circle, ifc.axes((0, 0, 0)), ifc.direction((0, 0, 1)), 500.0)
+
+
+def extruded_square(ifc: Ifc, side: float = 14.0, length: float = 500.0) -> Any:
+    square = ifc.new(
+        "IfcRectangleProfileDef", "AREA", None, ifc.new("IfcAxis2Placement2D", ifc.point((0, 0))), side, side
+    )
+    return ifc.new("IfcExtrudedAreaSolid", square, ifc.axes((0, 0, 0)), ifc.direction((0, 0, 1)), length)

@@ -14,14 +14,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ifcopenshell import geom
 from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
 from dataset_builder.scene.assemblies.ifc.process import ifc_bars
-from dataset_builder.scene.ifc_reader.geometry import arc_through, axis_placement
-from dataset_builder.scene.ifc_reader.model import open_model, world_mesh
+from dataset_builder.scene.ifc_reader.model import open_model
+from dataset_builder.scene.ifc_reader.pieces import arc_through
+from dataset_builder.scene.ifc_reader.placements import axis_placement
 from rebar_depth_bench.data.bars import Bar
-from tests.builder.scene.ifc_writer import Ifc, bars_in_process, extruded_circle
+from tests.builder.scene.ifc_writer import Ifc, bars_in_process, extruded_circle, extruded_square
 
 COLUMN = Path("examples/column.ifc")
 
@@ -59,8 +61,13 @@ def test_example_column_matches_ifcopenshell_geometry() -> None:
     model = open_model(content)
     numbers = [entity.id() for entity in model.by_type("IfcReinforcingBar")]
     bars = [cage_bar.bar for cage_bar in bars_in_process(content)]
+    settings = geom.settings()
+    settings.set("use-world-coords", True)
+    settings.set("mesher-linear-deflection", 1e-5)
+    settings.set("mesher-angular-deflection", 0.15)
     for k in (0, 8, 9):  # a vertical bar and stirrups in both orientations
-        distance_m = distance_to_axis_m(np.array(world_mesh(model, numbers[k])[0]).reshape(-1, 3), bars[k])
+        object_mesh = geom.create_shape(settings, model.file.by_id(numbers[k])).geometry
+        distance_m = distance_to_axis_m(np.array(object_mesh.verts).reshape(-1, 3), bars[k])
         # A chord of 6 degrees lies 17 um inside its arc of 12.5 mm.
         radius_m = bars[k].diameter_m / 2
         np.testing.assert_allclose(distance_m[distance_m > radius_m / 2], radius_m, atol=2e-5)
@@ -142,7 +149,8 @@ def test_arc_through_three_points_is_on_circle(turn: float, middle: float, radiu
     def on_circle(angle: float) -> ndarray:
         return np.asarray(centre + radius * (math.cos(angle) * basis[0] + math.sin(angle) * basis[1]))
 
-    points = arc_through(on_circle(0.0), on_circle(middle * turn), on_circle(turn))
+    [arc] = arc_through(on_circle(0.0), on_circle(middle * turn), on_circle(turn), 1.0)
+    points = arc.points()
     assert len(points) == max(2, math.ceil(math.degrees(turn) / 6 - 1e-6) + 1)
     expected = [on_circle(angle) for angle in np.linspace(0.0, turn, len(points))]
     np.testing.assert_allclose(points, expected, atol=radius * 1e-6)
@@ -150,7 +158,9 @@ def test_arc_through_three_points_is_on_circle(turn: float, middle: float, radiu
 
 def test_arc_of_collinear_points_is_line() -> None:
     points = np.array([(0.0, 0, 0), (1, 1, 0), (3, 3, 0)])
-    np.testing.assert_array_equal(arc_through(*points), points)
+    start, middle, end = points
+    first, second = arc_through(start, middle, end, 1.0)
+    np.testing.assert_array_equal([*first.points(), *second.points()[1:]], points)
 
 
 QUARTER_CIRCLE_MM = [
@@ -237,19 +247,19 @@ def test_bar_roles_and_order() -> None:
     assert [bar.bar_id for bar in bars] == [1, 2, 3, 4, 5]
 
 
-@pytest.mark.slow
-def test_extruded_bars_are_tessellated_and_fitted() -> None:
+def test_extruded_circles_are_exact_bars() -> None:
     ifc = Ifc()
-    ifc.bar(ifc.disc(ifc.polyline((0, 0, 0), (500, 0, 0))))
     ifc.bar(
         extruded_circle(ifc), extruded_circle(ifc, 6.0, x=50.0), at=ifc.at((100, 200, 300), (1, 0, 0), (0, 0, 1))
     )
-    swept, first, second = ifc_bars(ifc.file.to_string().encode(), "a.ifc")
-    assert (swept.bar.role, first.bar.role, second.bar.role) == ("bar", "imported", "imported")
-    np.testing.assert_allclose(first.bar.axis_m, [(0.1, 0.2, 0.3), (0.6, 0.2, 0.3)], atol=1e-4)
-    np.testing.assert_allclose(second.bar.axis_m, [(0.1, 0.2, 0.35), (0.6, 0.2, 0.35)], atol=1e-4)
-    assert (first.bar.diameter_m, second.bar.diameter_m) == pytest.approx((0.016, 0.012), rel=0.01)
+    first, second = ifc.bars()
+    assert not first.bar.has_axis  # A square section is no round bar.
     assert first.mesh is not None
+    assert second.mesh is not None
+    np.testing.assert_allclose(first.mesh.vertices_m.mean(axis=0), (0.35, 0.2, 0.3), atol=1e-6)
+    np.testing.assert_allclose(second.mesh.vertices_m.mean(axis=0), (0.35, -0.8, 0.3), atol=1e-6)
+    volumes = [signed_volume(bar.mesh.vertices_m, bar.mesh.faces) for bar in (first, second) if bar.mesh]
+    np.testing.assert_allclose(volumes, 0.008**2 * 0.5, rtol=1e-6)
     assert [bar.bar.bar_id for bar in (swept, first, second)] == [1, 2, 3]
 
 
@@ -271,3 +281,8 @@ def test_tessellated_bodies_get_bent_axis_or_none() -> None:
     assert bent.diameter_m == pytest.approx(0.012, rel=0.001)
     assert bent.length_m == pytest.approx(2 * 0.37 + 0.14 + math.pi * 0.03, rel=0.001)
     assert not other.has_axis
+
+
+def signed_volume(vertices: ndarray, faces: ndarray) -> float:
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return float((a * np.cross(b, c)).sum() / 6)

@@ -6,6 +6,7 @@ followed by the arrays that it announces (see ``scene.ifc_reader.answer``).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import IO, Annotated, Literal
 
 import numpy as np
@@ -13,12 +14,13 @@ from jaxtyping import Float64
 from numpy import ndarray
 from pydantic import Field, TypeAdapter, ValidationError
 
-from dataset_builder.scene.assemblies.cage_assembly import CageBar
+from dataset_builder.scene.assemblies.cage_assembly import CageBar, raise_problems
+from dataset_builder.scene.assemblies.ifc.declared import Trust, compare_declared
 from dataset_builder.scene.assemblies.mesh_import import connected_components
 from dataset_builder.scene.assemblies.surface_bar import fitted_bar
-from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS, Mesh, axis_of
+from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS, Mesh, Note, axis_of
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.errors import MeshError, Problem
 from rebar_depth_bench.reading import parse_json
 from rebar_depth_bench.validation import StrictModel
 
@@ -30,11 +32,31 @@ _Label = Annotated[str, Field(min_length=1, max_length=200)]
 _Message = Annotated[str, Field(max_length=1000)]
 
 
+_Size = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class _Source(StrictModel):
+    """Object of a file: GlobalId, name in messages, and the sizes that it declares for its bars, metres."""
+
+    global_id: _Label
+    label: _Label
+    diameters_m: Annotated[list[_Size], Field(max_length=3)]
+    length_m: _Size | None
+
+
+class _NoteRecord(StrictModel):
+    """Remark on a bar."""
+
+    code: Annotated[str, Field(pattern="^[a-z]{1,20}$")]
+    text: Annotated[str, Field(max_length=200)]
+
+
 class _BarRecord(StrictModel):
     """Bar with an axis of ``points`` points (float64, world, metres), which follow."""
 
     kind: Literal["bar"]
-    label: _Label
+    source: _Source
+    notes: Annotated[list[_NoteRecord], Field(max_length=10)]
     role: Annotated[str, Field(min_length=1, max_length=60)]
     diameter_m: Annotated[float, Field(gt=0, allow_inf_nan=False)]
     points: Annotated[int, Field(ge=2)]
@@ -44,7 +66,7 @@ class _SurfaceRecord(StrictModel):
     """Tessellated object; its vertices (float64, world, metres) and triangles (int32) follow."""
 
     kind: Literal["surface"]
-    label: _Label
+    source: _Source
     vertices: Annotated[int, Field(ge=3)]
     faces: Annotated[int, Field(ge=1)]
 
@@ -91,16 +113,18 @@ class OutOfMemoryError(Exception):
 class Answer:
     """Records of an answer; ``step`` is the last object that was to be tessellated, or None."""
 
-    def __init__(self, stream: IO[bytes], where: str) -> None:
-        self._stream, self._where = stream, where
+    def __init__(self, stream: IO[bytes], where: str, trust: Trust = "declared") -> None:
+        self._stream, self._where, self._trust = stream, where, trust
+        self._problems: list[Problem] = []
         self._bytes_left = MAX_ARRAY_BYTES
         self.step: _StepRecord | None = None
 
     def bars(self) -> list[CageBar]:
         """Return the bars, with ids from 1 in the order of the answer.
 
-        Raises ``MeshError`` if the process refused the file or a surface is not a bar, ``OutOfMemoryError`` if it
-        ran out of memory, and ``AnswerError`` if the answer is not complete and valid.
+        Raises ``MeshError`` if the process refused the file, a surface is not a bar, or diameters are not as
+        declared (``ifc.declared``), ``OutOfMemoryError`` if it ran out of memory, and ``AnswerError`` if the
+        answer is not complete and valid.
         """
         bars: list[CageBar] = []
         shapes = 0
@@ -119,6 +143,7 @@ class Answer:
                 case _EndRecord():
                     if record.shapes != shapes:
                         raise AnswerError(f"{shapes} shapes, expected {record.shapes}")
+                    raise_problems(self._problems, self._where)
                     return bars
             shapes += 1
             if len(bars) > MAX_BARS:
@@ -129,7 +154,7 @@ class Answer:
         label, reason = ("a bar", "") if self.step is None else (self.step.label, self.step.reason)
         return MeshError(
             f"{self._where}: {label} has no readable shape: {reason}; tessellation: {problem}; "
-            "expected an IfcSweptDiskSolid along lines and arcs, or another solid"
+            "expected a swept circle or another solid"
         )
 
     def _failure(self, record: _FailureRecord) -> Exception:
@@ -168,7 +193,17 @@ class Answer:
     def _swept_bar(self, bar_id: int, record: _BarRecord) -> CageBar:
         axis_m: Float64[ndarray, "n 3"] = np.round(self._array(record.points, "<f8"), METRE_DECIMALS)
         diameter_m = round(record.diameter_m, METRE_DECIMALS)
-        return CageBar(_bar_label(bar_id, record.label), Bar(bar_id, record.role, diameter_m, axis_of(axis_m)))
+        bar = Bar(bar_id, record.role, diameter_m, axis_of(axis_m))
+        label = _bar_label(bar_id, record.source.label)
+        notes = tuple(Note(record.source.label, note.code, note.text) for note in record.notes)
+        cage_bar = CageBar(label, bar, source=record.source.global_id, notes=notes)
+        return self._compared(cage_bar, record.source)
+
+    def _compared(self, bar: CageBar, source: _Source) -> CageBar:
+        """Return the bar with notes on what its object declares; collect a problem if that is far from it."""
+        notes, problem = compare_declared(bar, source.label, source.diameters_m, source.length_m, self._trust)
+        self._problems += [problem] if problem else []
+        return replace(bar, notes=(*bar.notes, *notes))
 
     def _surface_bars(self, bar_id: int, record: _SurfaceRecord) -> list[CageBar]:
         """Return the connected surfaces of an object as bars (``fitted_bar``)."""
@@ -177,11 +212,12 @@ class Answer:
             raise AnswerError("a triangle refers to a vertex that does not exist")
         bars = []
         for number, part in enumerate(connected_components(Mesh(vertices_m, faces)), start=bar_id):
-            label = _bar_label(number, record.label)
+            label = _bar_label(number, record.source.label)
             try:
-                bars.append(CageBar(label, fitted_bar(number, part), mesh=part))
+                bar = CageBar(label, fitted_bar(number, part), mesh=part, source=record.source.global_id)
             except ValueError as error:
                 raise MeshError(f"{self._where}: {label}: is not a solid ({error}), expected a bar") from error
+            bars.append(self._compared(bar, record.source))
         return bars
 
 

@@ -1,8 +1,8 @@
 """Reinforcing bars of an IFC file, read by a process of their own with limits of time and memory.
 
-Bars have axes and diameters as modelled; an object without swept discs gives one bar for each connected surface,
-with the axis and the diameter of ``fitted_bar`` and the role "imported". ``scene.ifc_reader`` says
-which objects are read. ifcopenshell may crash, hang or use any amount of memory on damaged files.
+Bars that are swept circles have axes and diameters as modelled; another solid gives one bar for each connected
+surface, with the axis and the diameter of ``fitted_bar`` and the role "imported". ``scene.ifc_reader`` says which
+objects are read. ifcopenshell may crash, hang or use any amount of memory on damaged files.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import IO
 
 from dataset_builder.scene.assemblies.cage_assembly import CageBar
 from dataset_builder.scene.assemblies.ifc.answer import Answer, AnswerError, OutOfMemoryError
+from dataset_builder.scene.assemblies.ifc.declared import Trust
 from rebar_depth_bench.errors import InputError, MeshError
 from rebar_depth_bench.limits import IFC_MEMORY_BYTES, IFC_SECONDS
 
@@ -30,10 +31,12 @@ _WALL_CLOCK_FACTOR = 2
 """Largest duration of the process, in multiples of its processor time."""
 
 
-def ifc_bars(content: bytes, where: str) -> list[CageBar]:
+def ifc_bars(content: bytes, where: str, trust: Trust = "declared") -> list[CageBar]:
     """Return the bars of an IFC file's ``content``; ``where`` names the file in error messages.
 
-    Bar ids start at 1 and follow the instance numbers in the file.
+    Bar ids start at 1 and follow the instance numbers in the file. Diameters and lengths are always those of the
+    geometry; with ``trust`` "declared", a diameter that is far from the declared one is refused
+    (``ifc.declared``).
 
     Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, no reinforcing bar or
     one without usable geometry (with its GlobalId), if a bar depends on an instance that cannot be read as
@@ -45,7 +48,7 @@ def ifc_bars(content: bytes, where: str) -> list[CageBar]:
             "pip install 'rebar-depth-bench[ifc]'"
         )
     with _reader(content) as reader:
-        answer = Answer(reader.stdout, where)
+        answer = Answer(reader.stdout, where, trust)
         try:
             return answer.bars()
         except OutOfMemoryError:

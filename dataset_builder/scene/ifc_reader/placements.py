@@ -1,0 +1,116 @@
+"""IFC placements and maps as matrices, and IFC points and directions as numbers, in the file's own length unit.
+
+Implements the definitions of IFC4 (ISO 16739-1): IfcLocalPlacement, IfcAxis2Placement, IfcMappedItem.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+MAX_PLACEMENT_DEPTH = 50
+"""Largest nesting depth of placements; deeper nesting is taken to be a cycle."""
+
+_SCALE_TOLERANCE = 1e-6
+"""Largest relative difference between the scales of a map's axes."""
+
+
+def placement_matrix(
+    placement: Any, known: dict[int, Float64[ndarray, "4 4"]], depth: int = 0
+) -> Float64[ndarray, "4 4"]:
+    """Return ``world_from_object`` of an IfcLocalPlacement; None is the world frame.
+
+    ``known`` holds matrices by instance number and is added to, since objects share the placements of storeys.
+    Raises ``ValueError`` if a placement has another class or the nesting is too deep.
+    """
+    if placement is None:
+        return np.eye(4)
+    if not placement.is_a("IfcLocalPlacement"):
+        raise ValueError(f"the placement is a {placement.is_a()}, expected an IfcLocalPlacement")
+    if depth > MAX_PLACEMENT_DEPTH:
+        raise ValueError(
+            f"placements are nested more than {MAX_PLACEMENT_DEPTH} times, or the nesting is circular"
+        )
+    number = placement.id()
+    if number not in known:
+        parent = placement_matrix(placement.PlacementRelTo, known, depth + 1)
+        known[number] = parent @ axis_placement(placement.RelativePlacement)
+    return known[number]
+
+
+def mapped_matrix(item: Any) -> tuple[Float64[ndarray, "4 4"], float]:
+    """Return ``object_from_map`` of an IfcMappedItem and its scale; mirrored targets are kept mirrored.
+
+    The order is that of IfcOpenShell: the mapping target is applied after the mapping origin. Raises
+    ``ValueError`` if the three axes scale differently, since a disc would not remain one.
+    """
+    target = item.MappingTarget
+    x_axis = unit_vector(target.Axis1, (1.0, 0.0, 0.0))
+    target_z = getattr(target, "Axis3", None)
+    z_axis = unit_vector(target_z, (0.0, 0.0, 1.0))
+    matrix = _frame_matrix(point_xyz(target.LocalOrigin), z_axis, x_axis)
+    if matrix[:3, 1] @ unit_vector(target.Axis2, (0.0, 1.0, 0.0)) < 0:  # The target is a reflection.
+        matrix[:3, 1] *= -1
+    scale = 1.0 if target.Scale is None else float(target.Scale)
+    other_scales = [getattr(target, name, None) for name in ("Scale2", "Scale3")]
+    if not scale > 0 or any(
+        other is not None and abs(other - scale) > _SCALE_TOLERANCE * scale for other in other_scales
+    ):
+        raise ValueError(
+            f"a map scales by {scale}, {other_scales[0]}, {other_scales[1]}, expected one factor above 0"
+        )
+    matrix[:3, :3] *= scale
+    return matrix @ axis_placement(item.MappingSource.MappingOrigin), scale
+
+
+def axis_placement(placement: Any) -> Float64[ndarray, "4 4"]:
+    """Return the matrix of an IfcAxis2Placement2D or 3D, with the columns x, y, z and location."""
+    z_axis = unit_vector(getattr(placement, "Axis", None), (0.0, 0.0, 1.0))
+    x_axis = unit_vector(placement.RefDirection, (1.0, 0.0, 0.0))
+    return _frame_matrix(point_xyz(placement.Location), z_axis, x_axis)
+
+
+def _frame_matrix(
+    origin: tuple[float, float, float], z_axis: Float64[ndarray, " 3"], x_axis: Float64[ndarray, " 3"]
+) -> Float64[ndarray, "4 4"]:
+    """Return the right-handed frame with that z axis, and x as close to ``x_axis`` as possible (IfcFirstProjAxis).
+
+    Raises ``ValueError`` if no x axis perpendicular to z can be derived.
+    """
+    x_axis = x_axis - (x_axis @ z_axis) * z_axis
+    if np.linalg.norm(x_axis) < 1e-9:
+        x_axis = np.eye(3)[0] - z_axis[0] * z_axis
+        if np.linalg.norm(x_axis) < 1e-9:
+            raise ValueError("the x and z axes of a placement are parallel")
+    x_axis = x_axis / np.linalg.norm(x_axis)
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([x_axis, np.cross(z_axis, x_axis), z_axis, origin])
+    return matrix
+
+
+def unit_vector(direction: Any, default: tuple[float, float, float] | None = None) -> Float64[ndarray, " 3"]:
+    """Return an IfcDirection, or ``default`` for None, as a unit vector.
+
+    Raises ``ValueError`` if it has no length.
+    """
+    ratios = np.array(default if direction is None else xyz(direction.DirectionRatios))
+    length = np.linalg.norm(ratios)
+    if not (np.isfinite(length) and length > 0):
+        raise ValueError("a direction has no length")
+    return np.asarray(ratios / length)
+
+
+def point_xyz(point: Any) -> tuple[float, float, float]:
+    """Return the coordinates of an IfcCartesianPoint as ``xyz`` does."""
+    return xyz(point.Coordinates)
+
+
+def xyz(coordinates: tuple[float, ...]) -> tuple[float, float, float]:
+    """Return two or three coordinates as three, with z = 0 for two; raise ``ValueError`` for more than three."""
+    x, y, *rest = coordinates
+    if len(rest) > 1:
+        raise ValueError(f"a point has {len(coordinates)} coordinates, expected 2 or 3")
+    return float(x), float(y), float(rest[0]) if rest else 0.0
