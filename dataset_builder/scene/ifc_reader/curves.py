@@ -101,7 +101,8 @@ def _trimmed_curve(curve: Any, angle_rad: float, depth: int) -> list[Piece]:
     if basis.is_a("IfcCompositeCurve") or basis.is_a("IfcTrimmedCurve"):
         raise ValueError(f"a {basis.is_a()} is trimmed, expected a curve that is not made of others")
     pieces = curve_pieces(basis, angle_rad, depth + 1)
-    first, last = sorted(_trim_parameter(curve, trim, _no_parameter, 1.0) for trim in "12")
+    begin = _knot_vector(basis)[int(basis.Degree)] if basis.is_a("IfcBSplineCurve") else 0.0
+    first, last = sorted(_trim_parameter(curve, trim, _no_parameter, 1.0) - begin for trim in "12")
     parts = cut(pieces, [piece.parameters for piece in pieces], first, last)
     return parts if curve.SenseAgreement else _reversed(parts)
 
@@ -179,7 +180,7 @@ def _b_spline(curve: Any, _angle_rad: float, _depth: int) -> list[Piece]:
     from scipy.interpolate import BSpline  # Imported when needed: it takes a second.
 
     degree = int(curve.Degree)
-    knots = np.repeat(np.array(curve.Knots, np.float64), _multiplicities(curve, degree))
+    knots = _knot_vector(curve)
     weights = np.array(getattr(curve, "WeightsData", None) or np.ones(len(curve.ControlPointsList)))
     control = np.array([point_xyz(point) for point in curve.ControlPointsList])
     if len(weights) != len(control) or len(knots) != len(control) + degree + 1 or not (weights > 0).all():
@@ -199,12 +200,15 @@ def _b_spline(curve: Any, _angle_rad: float, _depth: int) -> list[Piece]:
     raise ValueError(f"a B-spline needs more than {_MAX_SPLINE_POINTS} points, or has a sharp corner")
 
 
-def _multiplicities(curve: Any, degree: int) -> list[int]:
-    """Return how often each knot of a B-spline is repeated; raise ``ValueError`` if the numbers are not valid."""
-    repeats = [int(count) for count in curve.KnotMultiplicities]
+def _knot_vector(curve: Any) -> Float64[ndarray, " k"]:
+    """Return the knots of a B-spline, each repeated as often as it counts; the curve begins at ``[degree]``.
+
+    Raises ``ValueError`` if the multiplicities are not valid.
+    """
+    degree, repeats = int(curve.Degree), [int(count) for count in curve.KnotMultiplicities]
     if len(repeats) != len(curve.Knots) or not all(1 <= count <= degree + 1 for count in repeats):
         raise ValueError("the knot multiplicities of a B-spline are not valid")
-    return repeats
+    return np.repeat(np.array(curve.Knots, np.float64), repeats)
 
 
 def _largest_turn_deg(line: Float64[ndarray, "n 3"]) -> float:

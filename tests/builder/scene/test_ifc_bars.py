@@ -286,3 +286,15 @@ def test_tessellated_bodies_get_bent_axis_or_none() -> None:
 def signed_volume(vertices: ndarray, faces: ndarray) -> float:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return float((a * np.cross(b, c)).sum() / 6)
+
+
+@pytest.mark.parametrize(("first", "last", "length_mm"), [(100.0, 200.0, 500.0), (100.0, 150.0, 250.0)])
+def test_spline_is_trimmed_in_parameters_of_its_knots(first: float, last: float, length_mm: float) -> None:
+    ifc = Ifc()
+    control = [ifc.point((0, 0, 0)), ifc.point((500, 0, 0))]
+    shape = ("UNSPECIFIED", False, False, [2, 2], [100.0, 200.0], "UNSPECIFIED")
+    spline = ifc.new("IfcBSplineCurveWithKnots", 1, control, *shape)
+    trims = [ifc.parameter(first)], [ifc.parameter(last)]
+    ifc.bar(ifc.disc(ifc.new("IfcTrimmedCurve", spline, *trims, True, "PARAMETER")))
+    axis_mm = ifc.axis_m() * 1000
+    np.testing.assert_allclose(axis_mm[[0, -1]], [(0, 0, 0), (length_mm, 0, 0)], atol=1e-9)
