@@ -253,6 +253,22 @@ def test_extruded_circles_are_exact_bars() -> None:
         extruded_circle(ifc), extruded_circle(ifc, 6.0, x=50.0), at=ifc.at((100, 200, 300), (1, 0, 0), (0, 0, 1))
     )
     first, second = ifc.bars()
+    np.testing.assert_allclose(first.bar.axis_m, [(0.1, 0.2, 0.3), (0.6, 0.2, 0.3)], atol=1e-12)
+    np.testing.assert_allclose(second.bar.axis_m, [(0.1, 0.2, 0.35), (0.6, 0.2, 0.35)], atol=1e-12)
+    assert (first.bar.diameter_m, second.bar.diameter_m) == (0.016, 0.012)
+    assert first.mesh is None
+
+
+@pytest.mark.slow
+def test_other_solids_are_tessellated_and_placed() -> None:
+    ifc = Ifc(prefix=None)
+    solid = extruded_square(ifc, 0.008, 0.5)
+    ifc.bar(ifc.disc(ifc.polyline((0, 0, 0), (0.5, 0, 0)), 0.008))
+    mirror = ifc.new("IfcCartesianTransformationOperator3D", None, ifc.direction((0, -1, 0)), ifc.point((0, 1, 0)))
+    placed = ifc.at((0.1, 0.2, 0.3), (1, 0, 0), (0, 0, 1))
+    ifc.bar(solid, ifc.mapped(mirror, ifc.axes((0, 0, 0)), solid), at=placed)
+    swept, first, second = ifc_bars(ifc.file.to_string().encode(), "a.ifc")
+    assert (swept.bar.role, first.bar.role, second.bar.role) == ("bar", "imported", "imported")
     assert not first.bar.has_axis  # A square section is no round bar.
     assert first.mesh is not None
     assert second.mesh is not None
