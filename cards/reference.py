@@ -12,8 +12,8 @@ from rebar_depth_bench.methods import own_methods
 SUBSET = "subset"
 """Set of results of all methods on a subset of the views of three scenes."""
 
-FULL_SETS: tuple[str, ...] = ()
-"""Sets of results of the fast methods on all views of a scene, named after its config."""
+FULL_SETS = ("lattice",)
+"""Published sets of results of the fast methods on all views of a scene, each named after its config."""
 
 
 def results_file(set_name: str) -> Path:

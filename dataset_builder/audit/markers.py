@@ -11,8 +11,9 @@ camera error, which shifts or scales the marker centres. Measured on the lattice
 samples; 640 x 360, raw grid, 4 samples), the inset is 0.51 px in both cases; the residual is 0.21 and 0.28 px
 (RMS) of the corners, and 0.07 and 0.13 px of the marker centres (means of the four corners).
 
-In pictures with the noise of a sensor the sub-pixel search of a corner sometimes slides along an edge of a slanted
-marker, by some pixels. Such markers are counted and left out: camera errors displace all corners alike.
+In noisy pictures, of few samples or with the noise of a sensor, the sub-pixel search of a corner sometimes slides
+along an edge of a slanted marker, by some pixels. Such markers are counted and left out: camera errors displace
+all corners alike.
 
 Sub-pixel windows reach 4 px from a corner, or 0.8 of a marker's module if that is less, so that they never
 touch the bits inside the black frame. The detector's 0.3 modules leave 0.36 px of small markers (24 to 46 px).
@@ -157,7 +158,7 @@ Both pose bounds hold at ``NOMINAL_FOCAL_PX``; at half that focal length, where 
 they are twice as large.
 """
 SLIPPED_CORNER_PX = 1.5
-"""Error after the inset from which a marker's corner counts as slipped, in pictures with the noise of a sensor."""
+"""Error after the inset from which a marker's corner counts as slipped."""
 MAX_SLIPPED_SHARE = 0.1
 """Largest share of the detected markers with a slipped corner, if there are more than one."""
 _MIN_MARKERS = 2
@@ -211,7 +212,7 @@ def marker_verdict(config: AuditedConfig, views: Sequence[Sequence[DetectedMarke
         if detected >= min_share * expected
         else (f"{detected} of {expected} unoccluded, large markers are detected",)
     )
-    eyes = _without_slipped(eyes) if config.has_sensor else eyes
+    eyes = _without_slipped(eyes)
     slipped = detected - sum(len(eye.detected_px) for eye in eyes)
     if slipped > max(1, MAX_SLIPPED_SHARE * detected):
         missing = (*missing, f"{slipped} of {detected} markers have a corner {SLIPPED_CORNER_PX} px or more off")

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import ESTIMATED_ROLE
-from dataset_builder.scene.variants import LIGHT_SLOT, PROPS_SLOT, SENSOR, variants_of_slot
+from dataset_builder.scene.variants import LIGHT_SLOT, PROPS_SLOT, variants_of_slot
 from dataset_builder.scene.variants.image_light import IMAGE_LIGHTS
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.data.columns import EYES
@@ -40,11 +40,6 @@ class AuditedConfig:
     def has_props(self) -> bool:
         """Whether the scene has props, which may stand on the board or hide it."""
         return bool(variants_of_slot(self.variants, PROPS_SLOT))
-
-    @property
-    def has_sensor(self) -> bool:
-        """Whether the pictures have the noise and the compression of a sensor."""
-        return SENSOR in self.variants
 
     @property
     def light_may_hide_markers(self) -> bool:
