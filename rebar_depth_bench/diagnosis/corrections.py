@@ -19,8 +19,8 @@ from rebar_depth_bench.diagnosis.errors import (
     Values,
     line_error,
     mean_error,
-    median_error,
     median_ratio,
+    plane_error,
     valid_share,
 )
 from rebar_depth_bench.diagnosis.views import DiagnosedView
@@ -44,6 +44,13 @@ factor of 1.5 for millimetres, of 1.07 for feet.
 """
 MAX_SHIFT_PX = 6
 """Largest shift that is looked for, pixels."""
+CLEARLY_BETTER = 0.8
+"""``clearly_better`` of a mistake that changes the whole picture."""
+BETTER_THAN_PLANE = 0.7
+"""Largest error after an inversion, as a share of that of a plane at the median depth.
+
+A line fitted to predictions that have nothing to do with depth is such a plane.
+"""
 LEAST_VALID_SHARE = 0.8
 """Least number of valid pixels after a correction, as a share of those before."""
 
@@ -60,14 +67,14 @@ class Errors:
 class Correction:
     """Correction of a mistake: what the predictions seem to be, what the errors are, and the errors of a view.
 
-    The errors are ``in_metres`` or independent of the scale of the predictions.
+    A view is clearly better after the correction if its error is at most ``clearly_better`` of that before.
     """
 
     name: str
     seems: str
     measure: str
     errors: Callable[[DiagnosedView], Errors]
-    in_metres: bool = False
+    clearly_better: float
 
 
 def unit_corrections() -> list[Correction]:
@@ -76,9 +83,9 @@ def unit_corrections() -> list[Correction]:
         Correction(
             unit,
             f"in {unit}",
-            "median error",
+            "mean error",
             partial(_unit_errors, units_in_metre=units_in_metre),
-            in_metres=True,
+            CLEARLY_BETTER,
         )
         for unit, units_in_metre in UNITS.items()
     ]
@@ -86,9 +93,10 @@ def unit_corrections() -> list[Correction]:
 
 def _unit_errors(view: DiagnosedView, units_in_metre: float) -> Errors:
     p, z_m = view.left.values(view.prediction), view.left.depth_m
-    before, scale = median_error(p, z_m, 1.0), median_ratio(p, z_m) * units_in_metre
-    is_unit = scale > 0 and abs(math.log(scale)) <= UNIT_TOLERANCE * math.log(units_in_metre)
-    return Errors(before, median_error(p, z_m, 1 / units_in_metre) if is_unit else math.nan)
+    before, scale = mean_error(p, z_m, 1.0), median_ratio(p, z_m) * units_in_metre
+    # One depth for every pixel can be near any unit by chance.
+    is_unit = scale > 0 and abs(math.log(scale)) <= UNIT_TOLERANCE * math.log(units_in_metre) and np.ptp(p) != 0
+    return Errors(before, mean_error(p, z_m, 1 / units_in_metre) if is_unit else math.nan)
 
 
 def shape_corrections(views: Sequence[DiagnosedView], read: ReadPrediction, count: int) -> list[Correction]:
@@ -109,12 +117,20 @@ def shape_corrections(views: Sequence[DiagnosedView], read: ReadPrediction, coun
     }
     if shift != (0, 0):
         seems = f"shifted by {shift[1]:+d} columns and {shift[0]:+d} rows"
-        by_name["shift"] = (seems, "mean error after scaling", partial(_shift_errors, shift=shift))
-    return [Correction(name, *parts) for name, parts in by_name.items()]
+        by_name["shift"] = (seems, _SCALED, partial(_shift_errors, shift=shift))
+    return [
+        Correction(name, *parts, clearly_better=_SUBTLE.get(name, CLEARLY_BETTER))
+        for name, parts in by_name.items()
+    ]
 
 
-_SCALED = "median error after scaling"
+_SCALED = "mean error after scaling"
 _FITTED = "median error after scaling and shifting"
+_SUBTLE = {"range": 0.95, "shift": 0.9}
+"""``clearly_better`` of mistakes that change most pixels by less than the errors of a method.
+
+Those of sound predictions of the methods in ``benchmarks.diagnosis`` are 0.98 or more.
+"""
 _TURNS: Mapping[str, tuple[str, Callable[[Image], Image]]] = {
     "mirrored": ("mirrored left to right", np.fliplr),
     "upside-down": ("mirrored upside down", np.flipud),
@@ -170,13 +186,15 @@ def _range_errors(view: DiagnosedView) -> Errors:
 def _inverse_errors(view: DiagnosedView) -> Errors:
     """Return the errors of lines fitted to depth and to inverse depth, because disparity often has an offset."""
     p, z_m = view.left.values(view.prediction), view.left.depth_m
-    as_depth = line_error(p, z_m, np.positive)
-    return Errors(median_error(p, z_m) if math.isnan(as_depth) else as_depth, line_error(p, z_m, np.reciprocal))
+    as_depth, as_inverse = line_error(p, z_m, np.positive), line_error(p, z_m, np.reciprocal)
+    plane = plane_error(z_m)
+    before = plane if math.isnan(as_depth) else as_depth  # No rising line describes more than a plane does.
+    return Errors(before, as_inverse if as_inverse <= BETTER_THAN_PLANE * plane else math.nan)
 
 
 def _right_eye_errors(view: DiagnosedView) -> Errors:
     before, after = view.left.values(view.prediction), view.right.values(view.prediction)
-    errors = median_error(before, view.left.depth_m), median_error(after, view.right.depth_m)
+    errors = mean_error(before, view.left.depth_m), mean_error(after, view.right.depth_m)
     return _comparable(Errors(*errors), before, after)
 
 
@@ -189,8 +207,8 @@ def _order_errors(view: DiagnosedView, source: Callable[[int], int], read: ReadP
 
 
 def _errors(view: DiagnosedView, before: Values, after: Values) -> Errors:
-    """Return the median errors after scaling of the values before and after a correction."""
-    errors = median_error(before, view.left.depth_m), median_error(after, view.left.depth_m)
+    """Return the errors after scaling of the values before and after a correction."""
+    errors = mean_error(before, view.left.depth_m), mean_error(after, view.left.depth_m)
     return _comparable(Errors(*errors), before, after)
 
 

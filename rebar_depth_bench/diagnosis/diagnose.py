@@ -10,7 +10,6 @@ import numpy as np
 
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.diagnosis.corrections import Correction, Errors, shape_corrections, unit_corrections
-from rebar_depth_bench.diagnosis.errors import plane_error
 from rebar_depth_bench.diagnosis.views import DiagnosedView, positions_to_read, read_views
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.submission import SubmissionReader
@@ -19,12 +18,10 @@ MIN_VIEWS = 3
 """Number of views below which nothing is said."""
 MOST_VIEWS = 0.75
 """Share of the views that a correction must make clearly better."""
-CLEARLY_BETTER = 0.5
-"""Largest error after a correction, as a share of the error before."""
-BETTER_THAN_PLANE = 0.7
-"""Largest error after scaling and a correction, as a share of that of a plane at the median depth."""
 LEAST_ERROR = 0.002
 """Error from which a prediction is worth correcting."""
+SMALLEST_RATIO = 1e-6
+"""Bound of the ratios of errors, for predictions that a correction makes exact."""
 
 
 @dataclass(frozen=True)
@@ -81,32 +78,33 @@ def is_same_map(views: Sequence[DiagnosedView]) -> bool:
 def best_mistake(
     config: str, views: Sequence[DiagnosedView], corrections: Sequence[Correction]
 ) -> PossibleMistake | None:
-    """Return the mistake whose correction leaves the smallest error.
+    """Return the mistake whose correction reduces the errors most.
 
-    None if no correction makes most of the views clearly better.
+    None if no correction makes most of the views, and the geometric mean over all views, clearly better.
     """
-    mistakes = {}
+    found: dict[float, PossibleMistake] = {}
     for correction in corrections:
-        errors = [one for view in views if (one := correction.errors(view)).after <= _bound(correction, one, view)]
-        if len(errors) >= MOST_VIEWS * len(views):
+        errors = [correction.errors(view) for view in views]
+        better = [one for one in errors if _ratio(one) <= correction.clearly_better]
+        mean_ratio = math.exp(math.fsum(math.log(_ratio(one)) for one in errors) / len(views))
+        if len(better) >= MOST_VIEWS * len(views) and mean_ratio <= correction.clearly_better:
             before, after = (
-                float(np.median([getattr(one, name) for one in errors])) for name in ("before", "after")
+                float(np.median([getattr(one, name) for one in better])) for name in ("before", "after")
             )
             text = (
                 f"the predictions of {config} seem to be {correction.seems}: the {correction.measure} is "
                 f"{_percent(before)}, and {_percent(after)} if that is undone, "
-                f"in {len(errors)} of {len(views)} views"
+                f"in {len(better)} of {len(views)} views"
             )
-            mistakes[after] = PossibleMistake(config, correction.name, text)
-    return mistakes[min(mistakes)] if mistakes else None
+            found[mean_ratio] = PossibleMistake(config, correction.name, text)
+    return found[min(found)] if found else None
 
 
-def _bound(correction: Correction, errors: Errors, view: DiagnosedView) -> float:
-    """Return the largest error after a correction that is clearly better; below zero if nothing is."""
-    if not errors.before >= LEAST_ERROR:
-        return -1.0
-    plane = math.inf if correction.in_metres else BETTER_THAN_PLANE * plane_error(view.left.depth_m)
-    return min(CLEARLY_BETTER * errors.before, plane)
+def _ratio(errors: Errors) -> float:
+    """Return the error after a correction as a share of that before; 1 where nothing is to be corrected."""
+    if not errors.before >= LEAST_ERROR or math.isnan(errors.after):
+        return 1.0
+    return max(errors.after / errors.before, SMALLEST_RATIO)
 
 
 def _percent(share: float) -> str:

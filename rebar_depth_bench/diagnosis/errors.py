@@ -18,26 +18,18 @@ from rebar_depth_bench.scoring.metrics import is_valid_prediction
 Values = Float64[ndarray, " n"]
 
 
-def median_error(p: Values, z_m: Values, scale: float | None = None) -> float:
-    """Return the median error of ``scale * p``, by default after the scale median(z) / median(p).
-
-    NaN without a valid prediction.
-    """
-    return _error(p, z_m, scale, np.median)
-
-
-def mean_error(p: Values, z_m: Values) -> float:
-    """Return the mean error of p after the scale median(z) / median(p), NaN without a valid prediction."""
-    return _error(p, z_m, None, np.mean)
-
-
-def _error(p: Values, z_m: Values, scale: float | None, statistic: Callable[[Values], float]) -> float:
+def pixel_errors(p: Values, z_m: Values, scale: float | None = None) -> Values:
+    """Return the errors of the valid pixels of ``scale * p``, by default after the scale median(z) / median(p)."""
     valid = is_valid_prediction(p)
-    if not valid.any():
-        return math.nan
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         scaled, z_m = p[valid] * (median_ratio(p, z_m) if scale is None else scale), z_m[valid]
-        return float(statistic(np.abs(scaled - z_m) / np.maximum(scaled, z_m)))
+        return np.asarray(np.abs(scaled - z_m) / np.maximum(scaled, z_m))
+
+
+def mean_error(p: Values, z_m: Values, scale: float | None = None) -> float:
+    """Return the mean of ``pixel_errors``, NaN without any; no pixel counts for more than 1."""
+    errors = pixel_errors(p, z_m, scale)
+    return float(np.mean(errors)) if errors.size else math.nan
 
 
 def median_ratio(p: Values, z_m: Values) -> float:
@@ -61,7 +53,7 @@ def line_error(p: Values, z_m: Values, of_depth: Callable[[Values], Values]) -> 
     if not slope > 0:
         return math.nan
     fitted = slope * p + intercept
-    return median_error(of_depth(np.where(fitted > 0, fitted, np.nan)), z_m, 1.0)
+    return _median(pixel_errors(of_depth(np.where(fitted > 0, fitted, np.nan)), z_m, 1.0))
 
 
 def resistant_line(x: Values, y: Values) -> tuple[float, float]:
@@ -79,8 +71,12 @@ def resistant_line(x: Values, y: Values) -> tuple[float, float]:
 
 
 def plane_error(z_m: Values) -> float:
-    """Return the median error of a plane at the median depth: more than that of a prediction with structure."""
-    return median_error(np.ones_like(z_m), z_m)
+    """Return the median error of a plane at the median depth: that of a line fitted to nothing but noise."""
+    return _median(pixel_errors(np.ones_like(z_m), z_m))
+
+
+def _median(errors: Values) -> float:
+    return float(np.median(errors)) if errors.size else math.nan
 
 
 def valid_share(p: Values) -> float:
