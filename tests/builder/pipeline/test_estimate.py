@@ -130,14 +130,17 @@ import os, sys
 from pathlib import Path
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.pipeline.build import plan_build
+from dataset_builder.pipeline.folder import check_folder
 from rebar_depth_bench.errors import OutputError
 
+# The plans are made before, because other users may not be allowed to read this package.
+plans = plan_build(BuildRequest(configs=("pile",), views=1), Path(sys.argv[2]))
 if os.geteuid() == 0:
     os.setgroups([])
     os.setgid(65534)
     os.setuid(65534)
 try:
-    plan_build(BuildRequest(configs=("pile",), views=1), Path(sys.argv[1]))
+    check_folder(Path(sys.argv[1]), plans)
 except OutputError as error:
     sys.exit(str(error))
 """
@@ -150,7 +153,10 @@ def test_folder_without_permission_is_refused_before_the_start(tmp_path: Path, m
     folder.mkdir(mode=mode)
     for root in (folder, folder / "a" / "dataset"):
         process = subprocess.run(
-            [sys.executable, "-c", UNPRIVILEGED, str(root)], capture_output=True, text=True, check=False
+            [sys.executable, "-c", UNPRIVILEGED, str(root), str(tmp_path / "other")],
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert f"{root}: cannot be written" in process.stderr
         assert "Traceback" not in process.stderr
