@@ -16,10 +16,11 @@ import numpy as np
 from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
 from dataset_builder.config.scene_name import scene_name_of
 from dataset_builder.config.scene_schema import SCENE_NAME, SceneToml, read_scene_toml
-from dataset_builder.config.specs import AssemblySpec, ConfigSpec, DomeSpec, SceneSpec
+from dataset_builder.config.specs import AssemblySpec, CageFileSpec, ConfigSpec, DomeSpec, SceneSpec
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
-from dataset_builder.scene.assemblies.cage_file import cage_file_spec
+from dataset_builder.scene.assemblies.cage import Cage
+from dataset_builder.scene.assemblies.cage_file import cage_file_spec, read_cage
 from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
 from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.errors import InputError, MeshError
@@ -94,6 +95,19 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     markers = _DEFAULT_MARKERS[environment] if scene_toml.board is None else scene_toml.board
     board = BoardSpec(markers=markers) if markers else None
     return replace(config, scene=replace(scene, environment=environment, board=board))
+
+
+def scene_cage(path: str | os.PathLike[str]) -> Cage:
+    """Return the bars of a scene file, placed in the world frame.
+
+    Raises ``InputError`` and ``MeshError`` as ``scene_config`` where the file cannot be read.
+    """
+    path = Path(path)
+    scene_toml = _read_scene(path)
+    with _scene_and_key_named(scene_toml, path):
+        spec = _assembly_spec(scene_toml, path)
+        assert isinstance(spec, CageFileSpec)
+        return read_cage(spec)
 
 
 def default_dome(assembly: Assembly) -> DomeSpec:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.assemblies.mesh_import import MAX_EXTENT_M, MIN_EXTENT_M
 from dataset_builder.scene.assemblies.surface_bar import axis_notes
-from dataset_builder.scene.model import MAX_BARS, Assembly, Mesh, Note
+from dataset_builder.scene.model import MAX_BARS, Assembly, Mesh
 from dataset_builder.scene.shapes.bar_mesh import RibPattern, plain_bar_mesh, ribbed_bar_mesh
-from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import MeshError, Problem
 
 MIN_DIAMETER_M, MAX_DIAMETER_M = 0.0005, 0.2
@@ -46,22 +46,6 @@ _SAME_AXIS_M = 1e-6
 
 _BEND_MARGIN_DIAMETERS = 1.0
 """Distance from a bend's end, in diameters, at which the cross-section is perpendicular to the axis again."""
-
-
-@dataclass(frozen=True, eq=False)
-class CageBar:
-    """A bar of a cage file with its name in error messages.
-
-    ``mesh`` (world, metres) is set only if the file has no axis for the bar; only then the bar may be without one.
-    ``source`` is the GlobalId of its IFC object, and ``notes`` are remarks of the file's reader.
-    """
-
-    label: str
-    bar: Bar
-    ribs: bool = True
-    mesh: Mesh | None = None
-    source: str | None = None
-    notes: tuple[Note, ...] = ()
 
 
 def cage_assembly(bars: Sequence[CageBar], where: str) -> Assembly:

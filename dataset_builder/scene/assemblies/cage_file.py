@@ -14,7 +14,8 @@ import numpy as np
 
 from dataset_builder.config.scene_schema import TomlBar, read_scene_toml
 from dataset_builder.config.specs import CageFileSpec, read_assembly_file
-from dataset_builder.scene.assemblies.cage_assembly import CageBar, cage_assembly, raise_problems
+from dataset_builder.scene.assemblies.cage import Cage, CageBar
+from dataset_builder.scene.assemblies.cage_assembly import cage_assembly, raise_problems
 from dataset_builder.scene.assemblies.ifc.process import ifc_bars
 from dataset_builder.scene.model import Assembly, axis_of
 from dataset_builder.scene.shapes.bending import bent_line_m, mandrel_diameter_m
@@ -36,8 +37,13 @@ def load_cage(spec: CageFileSpec) -> Assembly:
     Raises ``MeshError`` if the file cannot be read, does not match ``spec.sha256``, violates its format or has
     invalid bars (see ``cage_assembly``); ``InputError`` if it is an IFC file and ifcopenshell is not installed.
     """
+    return cage_assembly(read_cage(spec).bars, spec.path)
+
+
+def read_cage(spec: CageFileSpec) -> Cage:
+    """Return the bars of a file (world, metres), in its order. Raises as ``load_cage`` where reading fails."""
     content = spec.check(read_assembly_file(spec.path, "cage", _READERS))
-    return cage_assembly(_READERS[Path(spec.path).suffix.lower()](content, spec.path), spec.path)
+    return Cage(tuple(_READERS[Path(spec.path).suffix.lower()](content, spec.path)))
 
 
 def _toml_bars(content: bytes, where: str) -> list[CageBar]:

@@ -21,7 +21,8 @@ from dataset_builder.config.scene_schema import read_scene_toml
 from dataset_builder.config.specs import CageFileSpec, DomeSpec, LatticeSpec, MeshFileSpec, RingSpec
 from dataset_builder.config.trajectories import view_count
 from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
-from dataset_builder.scene.assemblies.cage_assembly import MAX_RIBS_PER_ROW, CageBar, cage_assembly
+from dataset_builder.scene.assemblies.cage import CageBar
+from dataset_builder.scene.assemblies.cage_assembly import MAX_RIBS_PER_ROW, cage_assembly
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.mesh_ply import write_mesh_ply

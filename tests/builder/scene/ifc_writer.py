@@ -11,7 +11,7 @@ import ifcopenshell
 import numpy as np
 from numpy import ndarray
 
-from dataset_builder.scene.assemblies.cage_assembly import CageBar
+from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.assemblies.ifc.answer import Answer
 from dataset_builder.scene.ifc_reader.answer import write_answer
 

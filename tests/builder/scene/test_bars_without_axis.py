@@ -10,7 +10,8 @@ import pytest
 
 from dataset_builder.config.catalog import CONFIGS
 from dataset_builder.export.colmap import axis_points_m
-from dataset_builder.scene.assemblies.cage_assembly import CageBar, cage_assembly
+from dataset_builder.scene.assemblies.cage import CageBar
+from dataset_builder.scene.assemblies.cage_assembly import cage_assembly
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.solids import box
 from dataset_builder.scene.steel_distance import Cylinders

@@ -7,7 +7,8 @@ import io
 import numpy as np
 import pytest
 
-from dataset_builder.scene.assemblies.cage_assembly import CageBar, cage_assembly
+from dataset_builder.scene.assemblies.cage import CageBar
+from dataset_builder.scene.assemblies.cage_assembly import cage_assembly
 from dataset_builder.scene.assemblies.ifc.answer import Answer
 from dataset_builder.scene.assemblies.ifc.declared import Trust
 from dataset_builder.scene.ifc_reader import bars as reader_bars

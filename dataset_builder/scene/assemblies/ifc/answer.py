@@ -14,7 +14,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 from pydantic import Field, TypeAdapter, ValidationError
 
-from dataset_builder.scene.assemblies.cage_assembly import CageBar, raise_problems
+from dataset_builder.scene.assemblies.cage import CageBar
+from dataset_builder.scene.assemblies.cage_assembly import raise_problems
 from dataset_builder.scene.assemblies.ifc.declared import Trust, compare_declared
 from dataset_builder.scene.assemblies.mesh_import import connected_components
 from dataset_builder.scene.assemblies.surface_bar import fitted_bar

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
-from dataset_builder.scene.assemblies.cage_assembly import CageBar
+from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.model import Note
 from rebar_depth_bench.errors import Problem
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from threading import Event, Timer
 from typing import IO
 
-from dataset_builder.scene.assemblies.cage_assembly import CageBar
+from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.assemblies.ifc.answer import Answer, AnswerError, OutOfMemoryError
 from dataset_builder.scene.assemblies.ifc.declared import Trust
 from rebar_depth_bench.errors import InputError, MeshError
