@@ -143,7 +143,8 @@ def _problem(details: ErrorDetails, model: type[BaseModel], where: str) -> Probl
     if kind == "missing":
         return Problem("missing", place, "missing", _expectation(_model_at(model, location), location[-1]))
     if kind == "extra_forbidden":
-        known = _model_at(model, location).model_fields
+        fields = _model_at(model, location).model_fields
+        known = [field.alias or name for name, field in fields.items()]
         return Problem("unknown", place, "not a known key", _known_keys(str(location[-1]), known))
     expected = _TYPES.get(
         kind, details["msg"].removeprefix("Input should be ").replace("String should match", "text that matches")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from dataset_builder.config.file_specs import MeshFileSpec
 from dataset_builder.config.rigs import zed_rig
 from dataset_builder.config.specs import (
     CPU,
@@ -17,7 +18,6 @@ from dataset_builder.config.specs import (
     DistanceSweepSpec,
     DomeSpec,
     LatticeSpec,
-    MeshFileSpec,
     PierSpec,
     PileSpec,
     RigSpec,

@@ -14,14 +14,16 @@ from pathlib import Path
 import numpy as np
 
 from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
+from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.scene_name import scene_name_of
 from dataset_builder.config.scene_schema import SCENE_NAME, SceneToml, read_scene_toml
-from dataset_builder.config.specs import AssemblySpec, CageFileSpec, ConfigSpec, DomeSpec, SceneSpec
+from dataset_builder.config.specs import ConfigSpec, DomeSpec, SceneSpec
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
 from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, read_cage
-from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
+from dataset_builder.scene.assemblies.mesh_file import default_up, mesh_file_spec
+from dataset_builder.scene.assemblies.mesh_import import SUFFIXES as MESH_SUFFIXES
 from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.errors import InputError, MeshError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
@@ -97,17 +99,19 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     return replace(config, scene=replace(scene, environment=environment, board=board))
 
 
-def scene_cage(path: str | os.PathLike[str]) -> Cage:
-    """Return the bars of a scene file, placed in the world frame.
+def scene_cage(path: str | os.PathLike[str], mesh_unit: str | float = "m") -> Cage:
+    """Return the bars of a scene file or of a mesh file, placed in the world frame, with what they leave out.
 
-    Raises ``InputError`` and ``MeshError`` as ``scene_config`` where the file cannot be read.
+    A mesh file is in the unit ``mesh_unit`` and keeps its coordinates, as with ``--mesh``. Raises ``InputError``
+    and ``MeshError`` as ``scene_config`` where a file cannot be read; reasons for which a build refuses the bars
+    are in ``Cage.problems``.
     """
     path = Path(path)
+    if path.suffix.lower() in MESH_SUFFIXES:
+        return read_cage(mesh_file_spec(path, mesh_unit))
     scene_toml = _read_scene(path)
     with _scene_and_key_named(scene_toml, path):
-        spec = _assembly_spec(scene_toml, path)
-        assert isinstance(spec, CageFileSpec)
-        return read_cage(spec)
+        return read_cage(_assembly_spec(scene_toml, path))
 
 
 def default_dome(assembly: Assembly) -> DomeSpec:
@@ -125,7 +129,7 @@ def default_dome(assembly: Assembly) -> DomeSpec:
 def _read_scene(path: Path) -> SceneToml:
     suffix = path.suffix.lower()
     if suffix == ".ifc":
-        return SceneToml.model_construct(ifc=path.name)
+        return SceneToml(ifc=path.name)
     if suffix != ".toml":
         raise InputError(f"{path}: unsupported scene file type {suffix!r}, expected .toml or .ifc")
     return read_scene_toml(read_file(path, TOML_BYTES, "a scene file", InputError), str(path), RESERVED_NAMES)
@@ -140,10 +144,13 @@ def _check_name(name: str, path: Path) -> None:
         )
 
 
-def _assembly_spec(scene_toml: SceneToml, path: Path) -> AssemblySpec:
+def _assembly_spec(scene_toml: SceneToml, path: Path) -> CageFileSpec | MeshFileSpec:
     if scene_toml.mesh is not None:
-        return mesh_file_spec(str(path.parent / scene_toml.mesh), scene_toml.unit_m)
-    return cage_file_spec(str(path if scene_toml.ifc is None else path.parent / scene_toml.ifc))
+        mesh = str(path.parent / scene_toml.mesh)
+        placement = scene_toml.placement(default_up(mesh))
+        return mesh_file_spec(mesh, scene_toml.unit_m, placement, scene_toml.selections)
+    file = path if scene_toml.ifc is None else path.parent / scene_toml.ifc
+    return cage_file_spec(str(file), scene_toml.placement("z"), scene_toml.selections, scene_toml.trust)
 
 
 @contextmanager

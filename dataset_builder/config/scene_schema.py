@@ -2,7 +2,7 @@
 
 ```toml
 name = "my-beam"              # default: the file name; lower-case letters, digits and hyphens
-unit = "mm"                   # of every length: m, cm, mm, in, ft
+unit = "mm"                   # of every length: m, cm, mm, in, ft; default with ifc: m
 environment = "laboratory"    # or "outdoors"
 board = 6                     # markers on the A3 sheet: 6, 12, or false for no sheet
 
@@ -12,7 +12,7 @@ radii = [300, 400]
 elevations_deg = [15, 45]
 azimuths = 12
 
-[[bar]]                       # or, above the tables: mesh = "cage.stl", or ifc = "cage.ifc"
+[[bar]]                       # or, above the tables: mesh = "cage.stl", or ifc = "cage.ifc" (``source_tables``)
 diameter = 10
 points = [[-150, 0, 5], [150, 0, 5], [150, 0, 80]]   # corners of the path; world, z up, board at z = 0
 role = "main"                 # default "bar"
@@ -33,8 +33,20 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Strict, ValidationInfo, field_validator
 
+from dataset_builder.config.file_specs import Origin, PlacementSpec, Up
+from dataset_builder.config.source_tables import (
+    MAX_SELECTIONS,
+    OriginKey,
+    RotationKey,
+    SelectTable,
+    TranslationKey,
+    TrustKey,
+    UpKey,
+    selection_conflicts,
+)
 from dataset_builder.config.specs import DomeSpec, RigSpec, RingSpec
 from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS
+from dataset_builder.scene.selection import Selection
 from dataset_builder.scene.variants import VARIANTS
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.reading import parse_toml
@@ -203,11 +215,28 @@ class SceneToml(StrictModel):
     environment: Annotated[str, one_of(*ENVIRONMENTS)] | None = None
     board: Annotated[int | bool, Expected("6, 12 or false", lambda markers: markers in (0, 6, 12))] | None = None
     cameras: DomeTable | RingTable | None = None
+    up: UpKey | None = None
+    origin: OriginKey | None = None
+    rotate_deg: RotationKey = 0.0
+    translate: TranslationKey = (0.0, 0.0, 0.0)
+    select: Annotated[tuple[SelectTable, ...], Strict(False)] = ()
+    trust: TrustKey = "declared"
 
     @property
     def unit_m(self) -> float:
-        """One file unit in metres; 1.0 if the file has no lengths."""
+        """One file unit in metres; 1.0 if an IFC scene has no unit."""
         return _unit_m(self.unit)
+
+    def placement(self, up: Up) -> PlacementSpec:
+        """Return the placement, metres; ``up`` is the default vertical axis of the file that the scene names."""
+        x, y, z = (_to_metres(value, self.unit_m) for value in self.translate)
+        origin: Origin = self.origin or ("keep" if self.bar else "centre")
+        return PlacementSpec(self.up or up, origin, self.rotate_deg, (x, y, z))
+
+    @property
+    def selections(self) -> tuple[Selection, ...]:
+        """Tables ``[[select]]`` in file order."""
+        return tuple(table.selection() for table in self.select)
 
     @property
     def trajectory(self) -> DomeSpec | RingSpec | None:
@@ -228,6 +257,13 @@ class SceneToml(StrictModel):
         if name in (info.context or ()):
             raise field_error(f"got {name!r}", f"none of the names {', '.join(info.context)}", "conflict")
         return name
+
+    @field_validator("select", mode="before")
+    @classmethod
+    def _check_select_list(cls, tables: object) -> object:
+        if not isinstance(tables, list) or not 1 <= len(tables) <= MAX_SELECTIONS:
+            raise field_error(f"got {short_repr(tables)}", f"1 to {MAX_SELECTIONS} tables, each under [[select]]")
+        return tables
 
     @field_validator("bar", mode="before")
     @classmethod
@@ -271,7 +307,8 @@ def _read_cameras(values: object, unit_m: float, problems: list[Problem]) -> Dom
 
 def _conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
     """Yield the problems that concern several keys; values that are invalid alone are ignored."""
-    if "unit" not in values and ("ifc" not in values or "cameras" in values):
+    yield from selection_conflicts(values)
+    if "unit" not in values and "ifc" not in values:
         yield Problem("missing", "unit", "missing", _UNIT.text)
     sources = [key for key in SOURCES if key in values]
     if len(sources) != 1:

@@ -6,18 +6,12 @@ with ``dataclasses.asdict``: field names and defaults are part of the dataset fo
 
 from __future__ import annotations
 
-import hashlib
-import os
-from collections.abc import Collection
 from dataclasses import dataclass, field
-from pathlib import Path
 
+from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from rebar_depth_bench.data.dataset_config import CENTRE
-from rebar_depth_bench.errors import MeshError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration
-from rebar_depth_bench.limits import IFC_BYTES, MESH_BYTES, TOML_BYTES
-from rebar_depth_bench.reading import read_file
 
 
 @dataclass(frozen=True)
@@ -59,54 +53,6 @@ class PierSpec:
     vertical_diameter_m: float = 0.032
     hoop_diameter_m: float = 0.016
     tie_diameter_m: float = 0.016
-
-
-@dataclass(frozen=True)
-class PinnedFile:
-    """User's file with the digest of the content that it had when it was chosen."""
-
-    path: str
-    sha256: str
-
-    def check(self, content: bytes) -> bytes:
-        """Return ``content``; raise ``MeshError`` if its digest is not ``sha256``."""
-        actual_sha256 = hashlib.sha256(content).hexdigest()
-        if actual_sha256 != self.sha256:
-            raise MeshError(
-                f"{self.path}: the file has changed since it was selected: its sha256 is {actual_sha256}, "
-                f"expected {self.sha256}"
-            )
-        return content
-
-
-_LIMITS = {".toml": TOML_BYTES, ".ifc": IFC_BYTES}
-"""Limits of the files of an assembly by suffix; those of meshes have ``MESH_BYTES``."""
-
-
-def read_assembly_file(path: str | os.PathLike[str], kind: str, suffixes: Collection[str]) -> bytes:
-    """Return the bytes of a user's file; ``kind`` is ``mesh`` or ``cage``.
-
-    Raises ``MeshError`` if its suffix is not one of ``suffixes``, it cannot be read or it is too large.
-    """
-    suffix = Path(path).suffix.lower()
-    if suffix not in suffixes:
-        raise MeshError(f"{path}: unsupported {kind} file type {suffix!r}, expected {', '.join(suffixes)}")
-    return read_file(Path(path), _LIMITS.get(suffix, MESH_BYTES), f"a {kind} file", MeshError)
-
-
-@dataclass(frozen=True)
-class CageFileSpec(PinnedFile):
-    """Assembly read bar by bar from a TOML or IFC file."""
-
-    kind: str = "cage-file"
-
-
-@dataclass(frozen=True)
-class MeshFileSpec(PinnedFile):
-    """Assembly read from a mesh file; ``unit_m`` is one file unit in metres."""
-
-    unit_m: float
-    kind: str = "mesh-file"
 
 
 AssemblySpec = LatticeSpec | PileSpec | PierSpec | CageFileSpec | MeshFileSpec

@@ -28,7 +28,8 @@ import distributed
 from distributed.comm import get_address_host_port
 from distributed.scheduler import KilledWorker
 
-from dataset_builder.config.specs import CPU, ConfigSpec, PinnedFile, read_assembly_file
+from dataset_builder.config.file_specs import PinnedFile, read_assembly_file
+from dataset_builder.config.specs import CPU, ConfigSpec
 from dataset_builder.pipeline.blender_process import BlenderProcesses
 from dataset_builder.pipeline.devices import AUTO, available_devices, choose_devices
 from dataset_builder.pipeline.local_renderer import OnViewDone, render_unit

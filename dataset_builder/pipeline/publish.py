@@ -33,6 +33,7 @@ from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generat
 from dataset_builder.pipeline.retained import entry_problems, published_configs
 from dataset_builder.pipeline.shards import pack_shard, read_staged_record, split_into_shards
 from dataset_builder.scene.assemblies import aim_point_m
+from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.atomic_io import exclusive_lock, write_bytes, write_error, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
 from rebar_depth_bench.data.dataset_config import DatasetConfig
@@ -103,6 +104,7 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
         **config_parameters(plan.spec),
         "key": plan.key,
         "aim_point_m": aim_point_m(plan.assembly).tolist(),
+        **_placement(plan.assembly),
         "protocol_views": view_count(plan.spec.protocol),
         "generator": generator_versions(),
         "mesh": mesh,
@@ -119,6 +121,12 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
     write_contact_sheet(config, out / config.sheet)
     _write_bars(out, plan)
     _write_manifest(out, {**published_configs(out), config.name: config})
+
+
+def _placement(assembly: Assembly) -> dict[str, Any]:
+    """Return where the bars of a user's file were placed, as an entry of the manifest."""
+    matrix = assembly.world_from_source
+    return {} if matrix is None else {"world_from_source": matrix.tolist()}
 
 
 def _write_bars(out: Path, plan: ConfigPlan) -> None:

@@ -67,18 +67,28 @@ class Note:
 
 @dataclass(frozen=True, eq=False)
 class Assembly:
-    """Steel of a scene: its bars, one part per bar, and notes about its file."""
+    """Steel of a scene: its bars, one part per bar, notes about its file, and how it was placed.
+
+    ``world_from_source`` takes coordinates in the file's frame and unit to the world frame in metres; it is None
+    for a generated assembly.
+    """
 
     bars: tuple[Bar, ...]
     parts: tuple[Part, ...]
     notes: tuple[Note, ...] = ()
+    world_from_source: Float64[ndarray, "4 4"] | None = None
 
     @classmethod
-    def from_meshes(cls, bars_and_meshes: Iterable[tuple[Bar, Mesh]], notes: tuple[Note, ...] = ()) -> Assembly:
+    def from_meshes(
+        cls,
+        bars_and_meshes: Iterable[tuple[Bar, Mesh]],
+        notes: tuple[Note, ...] = (),
+        world_from_source: Float64[ndarray, "4 4"] | None = None,
+    ) -> Assembly:
         """Return the assembly of bars and their meshes (world frame); a part is named by its bar's role and id."""
         pairs = tuple(bars_and_meshes)
         parts = (Part(f"{bar.role}-{bar.bar_id:03d}", mesh, bar.bar_id, STEEL) for bar, mesh in pairs)
-        return cls(tuple(bar for bar, _ in pairs), tuple(parts), notes)
+        return cls(tuple(bar for bar, _ in pairs), tuple(parts), notes, world_from_source)
 
     @property
     def vertices_m(self) -> Float64[ndarray, "v 3"]:

@@ -11,7 +11,7 @@ import trimesh
 
 from dataset_builder.config.scene_file import scene_config
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
-from dataset_builder.scene.assemblies.mesh_file import load_assembly, mesh_file_spec
+from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from rebar_depth_bench.geometry.calibration import read_calibration
 from tests.bench.geometry.calibrations import CONF, TOML
@@ -45,7 +45,7 @@ def _gltf(path: Path) -> None:
 
 
 def _read_mesh(path: Path) -> object:
-    return [(bar.bar_id, bar.diameter_m, bar.axis_m) for bar in load_assembly(mesh_file_spec(path, "m")).bars]
+    return [(bar.bar_id, bar.diameter_m, bar.axis_m) for bar in load_cage(mesh_file_spec(path, "m")).bars]
 
 
 def _read_cage(path: Path) -> object:

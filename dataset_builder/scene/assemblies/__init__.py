@@ -9,19 +9,17 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.specs import (
     AssemblySpec,
-    CageFileSpec,
     ConfigSpec,
     LatticeSpec,
-    MeshFileSpec,
     PierSpec,
     PileSpec,
 )
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.scene.assemblies.cage_file import load_cage
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
-from dataset_builder.scene.assemblies.mesh_file import load_assembly
 from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.assemblies.pile import pile_assembly
 from dataset_builder.scene.model import Assembly
@@ -32,7 +30,7 @@ from rebar_depth_bench.errors import InputError, MeshError
 _BUILDERS: Mapping[type, Callable[[Any], Assembly]] = {
     CageFileSpec: load_cage,
     LatticeSpec: lattice_assembly,
-    MeshFileSpec: load_assembly,
+    MeshFileSpec: load_cage,
     PierSpec: pier_assembly,
     PileSpec: pile_assembly,
 }

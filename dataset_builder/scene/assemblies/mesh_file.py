@@ -1,8 +1,7 @@
-"""User mesh files (STL, PLY, OBJ, glTF) as assemblies: bars and parts in world metres.
+"""User mesh files (STL, PLY, OBJ, glTF) as cages.
 
-Nothing is moved: the file's frame is the world frame, z up, with the board at z = 0. The module
-``mesh_import`` defines what counts as a bar in each format and which id it gets. The centreline and the diameter
-of each bar are fitted to its mesh (``scene.assemblies.surface_bar``).
+The module ``mesh_import`` defines what counts as a bar in each format and which id it gets. The centreline and the
+diameter of each bar are fitted to its mesh (``scene.assemblies.surface_bar``).
 """
 
 from __future__ import annotations
@@ -10,21 +9,36 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
+from dataset_builder.config.file_specs import MeshFileSpec, PlacementSpec, Up, read_assembly_file
 from dataset_builder.config.scene_schema import UNITS_M
-from dataset_builder.config.specs import MeshFileSpec, read_assembly_file
-from dataset_builder.scene.assemblies.mesh_import import SUFFIXES, read_parts
-from dataset_builder.scene.assemblies.surface_bar import axis_notes, fitted_bar
-from dataset_builder.scene.model import STEEL, Assembly, Mesh, Part
-from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import MeshError
+from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
+from dataset_builder.scene.assemblies.mesh_import import (
+    GLTF_SUFFIXES,
+    MAX_FLOAT32_SPACING_M,
+    SUFFIXES,
+    MeshPart,
+    read_parts,
+)
+from dataset_builder.scene.assemblies.surface_bar import fitted_bar
+from dataset_builder.scene.selection import Selection
+from rebar_depth_bench.errors import MeshError, escape_text
 
 
-def mesh_file_spec(path: str | os.PathLike[str], unit: str | float) -> MeshFileSpec:
+def mesh_file_spec(
+    path: str | os.PathLike[str],
+    unit: str | float,
+    placement: PlacementSpec | None = None,
+    select: tuple[Selection, ...] = (),
+) -> MeshFileSpec:
     """Return the spec of a mesh file, which fixes its present content by SHA-256.
 
     ``unit`` is the length of one file unit: a name from ``UNITS_M``, or a number of metres. glTF is in metres
-    by its specification, so ``"m"`` is right for it unless its exporter deviates.
+    by its specification, so ``"m"`` is right for it unless its exporter deviates. The default placement keeps the
+    file's coordinates; only glTF, which is y up, is turned.
 
     Raises ``MeshError`` if the unit is unknown, the file cannot be read or its suffix is unknown.
     """
@@ -32,37 +46,72 @@ def mesh_file_spec(path: str | os.PathLike[str], unit: str | float) -> MeshFileS
         raise MeshError(f"{path}: unknown unit {unit!r}, expected one of {', '.join(UNITS_M)} or metres")
     unit_m = UNITS_M[unit] if isinstance(unit, str) else float(unit)
     _check_unit(unit_m, str(path))
-    return MeshFileSpec(
-        os.fspath(path), hashlib.sha256(read_assembly_file(path, "mesh", SUFFIXES)).hexdigest(), unit_m
-    )
+    digest = hashlib.sha256(read_assembly_file(path, "mesh", SUFFIXES)).hexdigest()
+    return MeshFileSpec(os.fspath(path), digest, unit_m, placement or PlacementSpec(default_up(path)), select)
 
 
-def load_assembly(spec: MeshFileSpec) -> Assembly:
-    """Return the file's bars, by ascending id, and one part (world, metres) for each of them.
+def default_up(path: str | os.PathLike[str]) -> Up:
+    """Return the vertical axis of a mesh file: y for glTF by its specification, z for others by custom."""
+    return "y" if Path(path).suffix.lower() in GLTF_SUFFIXES else "z"
 
-    A bar's axis and diameter are fitted to its mesh (``fitted_bar``), or null where no tube fits, which a note
-    says; parts need not be watertight.
+
+def read_mesh(spec: MeshFileSpec) -> Cage:
+    """Return the selected parts of a mesh file as bars, by ascending id (the file's frame, metres).
+
+    A bar's axis and diameter are fitted to its mesh (``fitted_bar``), or null where no tube fits; parts need not
+    be watertight. Selected parts are numbered from 1, but those of the dataset's own PLY keep their ids.
 
     Raises ``MeshError`` if the file cannot be read, does not match ``spec.sha256``, holds no bar, more than
-    65,535 bars, a bar without area or a non-finite coordinate, or if its extent is implausible for the unit.
+    65,535 bars, a bar without area or a non-finite coordinate, or stores coordinates that are too coarse.
     """
     _check_unit(spec.unit_m, spec.path)
-    meshes = read_parts(spec.check(read_assembly_file(spec.path, "mesh", SUFFIXES)), spec)
-    bars = tuple(_fitted_bar(bar_id, mesh, spec.path) for bar_id, mesh in meshes.items())
-    return Assembly(
-        bars=bars,
-        parts=tuple(Part(f"bar-{bar_id:03d}", mesh, bar_id, STEEL) for bar_id, mesh in meshes.items()),
-        notes=axis_notes(spec.path, [f"bar {bar.bar_id}" for bar in bars if not bar.has_axis], len(bars)),
-    )
+    parts = read_parts(spec.check(read_assembly_file(spec.path, "mesh", SUFFIXES)), spec)
+    taken, left_out = _selected(parts, spec)
+    _check_spacing(taken, spec)
+    bars = [_fitted_bar(part, spec.path) for part in taken]
+    return Cage(tuple(bars), tuple(left_out), unit_scale(spec.unit_m))
 
 
-def _fitted_bar(bar_id: int, mesh: Mesh, where: str) -> Bar:
-    """Return ``fitted_bar``; raise ``MeshError`` that names the file ``where`` if the mesh has no area."""
+def _selected(parts: Sequence[MeshPart], spec: MeshFileSpec) -> tuple[list[MeshPart], list[LeftOut]]:
+    """Return the parts that any table selects, numbered again, and those left out."""
+    if not spec.select:
+        return list(parts), []
+    taken = [part for part in parts if any(_is_selected(part, table, spec.unit_m) for table in spec.select)]
+    if not taken:
+        raise MeshError(
+            f"{spec.path}: no part is selected, expected [[select]] tables that match at least one of its "
+            f"{len(parts)} parts, such as {escape_text(parts[0].name)}"
+        )
+    kept = {part.bar_id for part in taken}
+    left_out = [
+        LeftOut(escape_text(part.name), "no [[select]] table matches") for part in parts if part.bar_id not in kept
+    ]
+    return [replace(part, bar_id=number) for number, part in enumerate(taken, start=1)], left_out
+
+
+def _is_selected(part: MeshPart, table: Selection, unit_m: float) -> bool:
+    return table.matches({"name": (part.name,)}) and table.contains(part.mesh.vertices_m / unit_m)
+
+
+def _check_spacing(parts: Sequence[MeshPart], spec: MeshFileSpec) -> None:
+    """Raise ``MeshError`` if 32-bit coordinates are so large that they cannot tell 0.1 mm apart."""
+    spacing_m = max(part.spacing_m for part in parts)
+    if spacing_m > MAX_FLOAT32_SPACING_M:
+        raise MeshError(
+            f"{spec.path}: its 32-bit coordinates are {spacing_m * 1000:.3g} mm apart so far from the file's "
+            f"origin, expected {MAX_FLOAT32_SPACING_M * 1000:g} mm or less: is the unit right? Otherwise export "
+            "the cage near the origin, or in a format with 64-bit coordinates (OBJ, PLY with double, IFC)"
+        )
+
+
+def _fitted_bar(part: MeshPart, where: str) -> CageBar:
+    """Return the bar of a part; raise ``MeshError`` that names the file ``where`` if its mesh has no area."""
+    label = f"bar {part.bar_id}, {escape_text(part.name)}"
     try:
-        return fitted_bar(bar_id, mesh)
+        return CageBar(label, fitted_bar(part.bar_id, part.mesh), mesh=part.mesh, source=escape_text(part.name))
     except ValueError as error:
         raise MeshError(
-            f"{where}: bar {bar_id} ({len(mesh.faces)} triangles) is not a valid surface: {error}"
+            f"{where}: {label} ({len(part.mesh.faces)} triangles) is not a valid surface: {error}"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Mesh file import: one mesh per bar id from a file's content, in world metres, z up.
+"""Mesh file import: the parts of a file's content, in the file's frame and in metres.
 
 - The dataset's own PLY layout (``dataset_builder.scene.mesh_ply``) is used unchanged: the faces with one
   ``bar_id`` form a part with that id; faces with id 0 (board, table) are left out.
@@ -10,9 +10,7 @@
   are merged. Components are numbered from 1 in the order of their first faces. Bars that share a vertex are
   one part.
 
-STL, PLY and OBJ coordinates are used unchanged and should be z up. glTF is y up by its specification and is
-rotated: (x, y, z) becomes (x, -z, y). Except in the dataset's own PLY, a closed part that is wound inside out
-is reversed.
+Except in the dataset's own PLY, a closed part that is wound inside out is reversed.
 
 trimesh takes more than half a second to import, which builds of the standard scenes do not need, so functions
 import it on use.
@@ -25,17 +23,18 @@ import logging
 import re
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Integer
+from jaxtyping import Float, Integer
 from numpy import ndarray
 
-from dataset_builder.config.specs import MeshFileSpec
+from dataset_builder.config.file_specs import MeshFileSpec
 from dataset_builder.scene.assemblies.mesh_formats.gltf import check_gltf
 from dataset_builder.scene.assemblies.mesh_formats.obj import read_obj
 from dataset_builder.scene.assemblies.mesh_formats.parsing import MalformedMeshError, Surface, check_surface
@@ -51,45 +50,64 @@ if TYPE_CHECKING:
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 """Supported suffixes of mesh files, in lower case."""
 
-MIN_EXTENT_M = 0.001
-MAX_EXTENT_M = 100.0
-"""Exclusive bounds of the largest side of an assembly, metres; beyond them its unit is wrong."""
+GLTF_SUFFIXES = (".glb", ".gltf")
+"""Suffixes of glTF files, which are y up by their specification."""
+
+MAX_FLOAT32_SPACING_M = 1e-4
+"""Largest distance of neighbouring 32-bit coordinates that is accepted, metres."""
 
 # A handler on trimesh's logger keeps its messages, including tracebacks, off stderr.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
-def read_parts(content: bytes, spec: MeshFileSpec) -> dict[int, Mesh]:
-    """Return one mesh (world, metres) per bar id, ascending, from a file's ``content``.
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """Part of a file: id, name, mesh (the file's frame, metres), and the spacing of 32-bit coordinates or 0."""
 
-    The suffix of ``spec.path`` selects the format. Raises ``MeshError`` if the content cannot be read, holds no
-    triangle, only id 0, more than ``MAX_BARS`` parts or a non-finite coordinate, or if its extent is
-    implausible for the unit.
+    bar_id: int
+    name: str
+    mesh: Mesh
+    spacing_m: float = 0.0
+
+
+def read_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
+    """Return the parts of a file's ``content``, by ascending id; the suffix of ``spec.path`` selects the format.
+
+    Raises ``MeshError`` if the content cannot be read, holds no triangle, only id 0, more than ``MAX_BARS`` parts
+    or a non-finite coordinate.
     """
     with _loader_errors_as_mesh_errors(spec.path):
         if Path(spec.path).suffix.lower() == ".ply" and has_mesh_ply_header(content):
             return _dataset_ply_parts(content, spec)
         objects = _read_objects(content, spec)
-        _check_extent(objects, spec)
-        parts = objects if len(objects) > 1 else connected_components(_merged_close_vertices(objects[0]))
-        if len(parts) > MAX_BARS:
-            raise MeshError(f"{spec.path}: {len(parts)} separate parts found, expected at most {MAX_BARS} bars")
-        return {bar_id: _oriented_outward(part) for bar_id, part in enumerate(parts, start=1)}
+        if not objects:
+            raise MeshError(f"{spec.path}: no triangle found, expected the surface of at least one bar")
+        if len(objects) == 1:
+            (whole,) = objects
+            meshes = connected_components(_merged_close_vertices(whole.mesh))
+            objects = [
+                replace(whole, name=f"part {number}", mesh=mesh) for number, mesh in enumerate(meshes, start=1)
+            ]
+        if len(objects) > MAX_BARS:
+            raise MeshError(f"{spec.path}: {len(objects)} separate parts found, expected at most {MAX_BARS} bars")
+        return [
+            replace(part, bar_id=bar_id, mesh=_oriented_outward(part.mesh))
+            for bar_id, part in enumerate(objects, start=1)
+        ]
 
 
-def _dataset_ply_parts(content: bytes, spec: MeshFileSpec) -> dict[int, Mesh]:
+def _dataset_ply_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
     """Return the parts of a PLY in the dataset's own layout, bit by bit if the unit is the metre."""
-    vertices, faces, bar_id = parse_mesh_ply(content, spec.path)
+    vertices, faces, face_bar_id = parse_mesh_ply(content, spec.path)
     whole = Mesh(vertices * spec.unit_m, faces)
-    parts = {int(bar_id[group[0]]): _submesh(whole, group) for group in _indices_by_label(bar_id)}
-    if parts.pop(NOT_STEEL, None) is not None and not parts:
+    meshes = {int(face_bar_id[group[0]]): _submesh(whole, group) for group in _indices_by_label(face_bar_id)}
+    if meshes.pop(NOT_STEEL, None) is not None and not meshes:
         raise MeshError(f"{spec.path}: every face has bar_id 0 (not steel), expected at least one bar")
-    _check_extent(parts.values(), spec)
-    return parts
+    return [MeshPart(bar_id, f"bar {bar_id}", mesh) for bar_id, mesh in meshes.items()]
 
 
-def _read_objects(content: bytes, spec: MeshFileSpec) -> list[Mesh]:
-    """Return the objects of any other file (metres, z up), ordered by name, without empty ones."""
+def _read_objects(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
+    """Return the objects of any other file, without ids, ordered by name, without empty ones."""
     suffix = Path(spec.path).suffix.lower()
     match suffix:
         case ".stl":
@@ -100,16 +118,28 @@ def _read_objects(content: bytes, spec: MeshFileSpec) -> list[Mesh]:
             surfaces = read_obj(content)
         case _:
             check_gltf(content, suffix == ".glb")
-            surfaces = _gltf_surfaces(content, suffix[1:])
+            return _gltf_objects(content, suffix[1:], spec.unit_m)
+    return _objects(
+        surfaces, spec.unit_m, max((_spacing(vertices) for vertices, _ in surfaces.values()), default=0.0)
+    )
+
+
+def _objects(surfaces: Mapping[str, Surface], unit_m: float, spacing: float) -> list[MeshPart]:
+    """Return surfaces as objects; ``spacing`` is that of their coordinates, in units of the file."""
     return [
-        Mesh(surfaces[name][0] * spec.unit_m, surfaces[name][1].astype(np.int32))
-        for name in sorted(surfaces, key=_natural_sort_key)
-        if len(surfaces[name][1])
+        MeshPart(0, name, Mesh(vertices.astype(np.float64) * unit_m, faces.astype(np.int32)), spacing * unit_m)
+        for name, (vertices, faces) in sorted(surfaces.items(), key=lambda item: _natural_sort_key(item[0]))
+        if len(faces)
     ]
 
 
-def _gltf_surfaces(content: bytes, file_type: str) -> dict[str, Surface]:
-    """Return the surface of each node by its name, z up; the primitives of a node are joined."""
+def _spacing(vertices: Float[ndarray, "v 3"]) -> float:
+    """Return the distance of the largest coordinate from the next that the file can store; 0 for float64."""
+    return float(np.spacing(np.abs(vertices).max(initial=0))) if vertices.dtype == np.float32 else 0.0
+
+
+def _gltf_objects(content: bytes, file_type: str, unit_m: float) -> list[MeshPart]:
+    """Return the nodes with a surface; the primitives of a node are joined."""
     import trimesh
 
     scene = trimesh.load_scene(
@@ -121,7 +151,9 @@ def _gltf_surfaces(content: bytes, file_type: str) -> dict[str, Surface]:
             surface = check_surface((np.asarray(body.vertices), np.asarray(body.faces, np.int64)), str, str)
             bodies[_object_name(scene, body)].append(surface)
     joined = {name: trimesh.util.append_faces(*zip(*parts, strict=True)) for name, parts in bodies.items()}
-    return {name: (vertices[:, [0, 2, 1]] * [1, -1, 1], faces) for name, (vertices, faces) in joined.items()}
+    # Coordinates are 32-bit before the transforms of the nodes, which are decimal numbers.
+    stored = [np.asarray(geometry.vertices, np.float32) for geometry in scene.geometry.values()]
+    return _objects(joined, unit_m, max(map(_spacing, stored), default=0.0))
 
 
 def _object_name(scene: trimesh.Scene, body: trimesh.Trimesh) -> str:
@@ -178,19 +210,6 @@ def _oriented_outward(mesh: Mesh) -> Mesh:
     if body.is_watertight and body.is_winding_consistent and body.volume < 0:
         body.invert()
     return Mesh(np.array(body.vertices), np.array(body.faces, np.int32))
-
-
-def _check_extent(meshes: Iterable[Mesh], spec: MeshFileSpec) -> None:
-    """Raise ``MeshError`` if there is no triangle or the extent is implausible for a reinforcement assembly."""
-    corners = np.concatenate([np.empty((0, 3)), *(mesh.vertices_m[mesh.faces.ravel()] for mesh in meshes)])
-    if not len(corners):
-        raise MeshError(f"{spec.path}: no triangle found, expected the surface of at least one bar")
-    extent = float(np.ptp(corners, axis=0).max())
-    if not MIN_EXTENT_M < extent < MAX_EXTENT_M:
-        raise MeshError(
-            f"{spec.path}: the assembly is {extent:.6g} m long, expected {MIN_EXTENT_M:g} to "
-            f"{MAX_EXTENT_M:g} m: is the unit right? One file unit was read as {spec.unit_m:g} m"
-        )
 
 
 @contextmanager

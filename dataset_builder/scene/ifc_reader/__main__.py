@@ -1,4 +1,6 @@
-"""Process that reads an IFC file: content on standard input, answer on standard output.
+"""Process that reads an IFC file: a line of JSON and the content on standard input, answer on standard output.
+
+The line is a list of the tables that select objects (``scene.selection.TABLES``).
 
 ``python -m dataset_builder.scene.ifc_reader MEMORY_BYTES CPU_SECONDS PARENT_PID``
 """
@@ -23,10 +25,12 @@ def main() -> None:
     _end_with_parent(parent_pid)
     _set_limits(memory_bytes, cpu_seconds)
     from dataset_builder.scene.ifc_reader.answer import write_answer
+    from dataset_builder.scene.selection import TABLES
 
     with os.fdopen(os.dup(1), "wb") as stream:
         os.dup2(2, 1)
-        write_answer(sys.stdin.buffer.read(), stream, lambda: signal.alarm(SECONDS_PER_SHAPE))
+        select = TABLES.validate_json(sys.stdin.buffer.readline())
+        write_answer(sys.stdin.buffer.read(), stream, select, lambda: signal.alarm(SECONDS_PER_SHAPE))
 
 
 def _set_limits(memory_bytes: int, cpu_seconds: int) -> None:

@@ -1,16 +1,16 @@
-"""Shapes of the reinforcement in an IFC model, as modelled: world frame, metres.
+"""Shapes of the reinforcement in an IFC model, as modelled: the project's frame, metres.
 
-Every IfcReinforcingBar, IfcReinforcingMesh and IfcTendon is read, in the order of the instance numbers. Each sweep
-of a circle in its Body (``sweeps``), directly or through IfcMappedItem, is one bar, since some programs write a
-whole row of bars as one object. Only other solids are tessellated, each once for all of its uses. All other
-objects are left out.
+Every IfcReinforcingBar, IfcReinforcingMesh and IfcTendon is read, or every object that a selection chooses, in the
+order of the instance numbers. Each sweep of a circle in its Body (``sweeps``), directly or through IfcMappedItem,
+is one bar, since some programs write a whole row of bars as one object. Only other solids are tessellated, each
+once for all of its uses. All other objects are left out.
 
 The project's coordinates are world coordinates; a context's coordinate system and map projections are ignored.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from textwrap import shorten
 
@@ -21,21 +21,17 @@ from numpy import ndarray
 from dataset_builder.scene.ifc_reader.bodies import BodyItem, body_items, type_objects
 from dataset_builder.scene.ifc_reader.declared import Declared, declared_sizes, role
 from dataset_builder.scene.ifc_reader.model import Model, angle_unit_rad, item_mesh, length_unit_m, open_model
+from dataset_builder.scene.ifc_reader.objects import DAMAGE, LeftOut, choose_objects, left_out_object, shown
 from dataset_builder.scene.ifc_reader.placements import placement_matrix
+from dataset_builder.scene.ifc_reader.relations import Relations
 from dataset_builder.scene.ifc_reader.source_check import Entity
 from dataset_builder.scene.ifc_reader.sweeps import Sweep, Units, read_sweep
 from dataset_builder.scene.model import MAX_BARS
-from rebar_depth_bench.errors import MeshError, escape_text
-
-CLASSES = ("IfcReinforcingBar", "IfcReinforcingMesh", "IfcTendon")
-"""Classes whose objects are read."""
+from dataset_builder.scene.selection import Selection
+from rebar_depth_bench.errors import MeshError
 
 MAX_POINTS = 20_000_000
 """Largest number of points of all axes and surfaces of a model, which maps can multiply: 480 MB."""
-
-_MAX_NAME = 60
-_DAMAGE = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
-"""Exceptions of instances that are incomplete or not supported."""
 
 
 class ShapeError(MeshError):
@@ -44,16 +40,18 @@ class ShapeError(MeshError):
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Object of a model: GlobalId, its name in error messages, and what it declares about its bars."""
+    """Object of a model: GlobalId, name in messages, what it declares about its bars, host and storey."""
 
     global_id: str
     label: str
     declared: Declared
+    host: str | None
+    storey: str | None
 
 
 @dataclass(frozen=True, eq=False)
 class SweptBar:
-    """Bar with an axis: its object, role, axis and diameter (world, metres), and notes (code and text)."""
+    """Bar with an axis: object, role, axis and diameter (the project's frame, metres), notes (code and text)."""
 
     source: Source
     role: str
@@ -64,65 +62,90 @@ class SweptBar:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Tessellated solid, of one or several bars: its object, vertices (world, metres) and triangles."""
+    """Tessellated solid, of one or several bars: object, vertices (the project's frame, metres), triangles."""
 
     source: Source
     vertices_m: Float64[ndarray, "v 3"]
     faces: Int32[ndarray, "f 3"]
 
 
+@dataclass(frozen=True)
+class Project:
+    """Project of a model: its length unit, metres."""
+
+    unit_m: float
+
+
+Shape = SweptBar | Surface
+
+
 def read_bars(
-    content: bytes, before_kernel: Callable[[str, str], None] = lambda *_: None
-) -> Iterator[SweptBar | Surface]:
-    """Yield the shapes of an IFC file's ``content``, in its order.
+    content: bytes, select: Sequence[Selection] = (), before_kernel: Callable[[str, str], None] = lambda *_: None
+) -> Iterator[Project | Shape | LeftOut]:
+    """Yield the project of an IFC file's ``content``, the objects that are left out, and the shapes in its order.
 
-    ``before_kernel`` is called with an object's name, and the reason why it has no axis, before the geometry
-    kernel tessellates a solid of it, which may hang or crash.
+    ``select`` chooses objects (``choose_objects``). ``before_kernel`` is called with an object's name, and the
+    reason why it has no axis, before the geometry kernel tessellates a solid of it, which may hang or crash.
 
-    Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, no reinforcement or too
+    Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, nothing to read or too
     much of it, if a bar depends on an instance that was not read as written, or if it has no usable geometry;
     ``ShapeError`` if a solid cannot be tessellated.
     """
     model = open_model(content)
-    objects = sorted(
-        {entity.id(): entity for name in CLASSES for entity in model.by_type(name)}.values(), key=_number
-    )
-    if not objects:
-        raise MeshError(f"contains no reinforcement, expected at least one object of {', '.join(CLASSES)}")
+    relations = Relations(model)
+    chosen, left_out = choose_objects(model, relations, select)
     for relation in model.by_type("IfcRelDefinesByType"):
         model.check.attributes(relation, "RelatedObjects", "RelatingType")
-    reader = _Reader(model, before_kernel)
-    for entity in objects:
-        yield from reader.shapes(entity)
+    reader = _Reader(model, relations, before_kernel)
+    yield Project(reader.unit_m)
+    yield from left_out
+    for item in chosen:
+        shapes = list(reader.shapes(item.entity))
+        points = np.concatenate([_points_m(shape) for shape in shapes]) / reader.unit_m
+        if item.tables and not any(table.contains(points) for table in item.tables):
+            yield left_out_object(item.entity, "not inside the box of a [[select]] table")
+        else:
+            yield from shapes
+
+
+def _points_m(shape: Shape) -> Float64[ndarray, "n 3"]:
+    return shape.axis_m if isinstance(shape, SweptBar) else shape.vertices_m
 
 
 class _Reader:
     """Reader of a model's objects, which share placements and solids."""
 
-    def __init__(self, model: Model, before_kernel: Callable[[str, str], None]) -> None:
-        self._model, self._before_kernel = model, before_kernel
+    def __init__(self, model: Model, relations: Relations, before_kernel: Callable[[str, str], None]) -> None:
+        self._model, self._relations, self._before_kernel = model, relations, before_kernel
         self._units = Units(length_unit_m(model), angle_unit_rad(model))
         self._placements: dict[int, Float64[ndarray, "4 4"]] = {}
         self._sweeps: dict[int, Sweep | None] = {}
         self._meshes: dict[int, tuple[Float64[ndarray, "v 3"], Int32[ndarray, "f 3"]]] = {}
         self._shapes = self._points = 0
 
-    def shapes(self, entity: Entity) -> Iterator[SweptBar | Surface]:
+    @property
+    def unit_m(self) -> float:
+        """The project's length unit, metres."""
+        return self._units.length_m
+
+    def shapes(self, entity: Entity) -> Iterator[Shape]:
         """Yield the shapes of an object; raise ``MeshError`` that names it."""
         label = _label(entity)
         try:
             types = self._checked_types(entity)
             source = Source(
-                escape_text(shorten(str(entity.GlobalId), _MAX_NAME)),
+                shown(entity.GlobalId),
                 label,
                 declared_sizes(self._model, entity, types, self._units.length_m),
+                _name(self._relations.host(entity)),
+                _name(self._relations.storey(entity)),
             )
             items = body_items(self._model, entity, types)
             world_from_object = placement_matrix(entity.ObjectPlacement, self._placements)
             sweeps = [self._sweep(item.item) for item in items]
         except MeshError as error:
             raise MeshError(f"{label}: {error}") from error
-        except _DAMAGE as error:
+        except DAMAGE as error:
             reason = shorten(str(error), 400) or type(error).__name__
             raise MeshError(f"{label} has no readable shape: {reason}") from error
         for item, sweep in zip(items, sweeps, strict=True):
@@ -190,10 +213,11 @@ def _tessellated(model: Model, number: int) -> tuple[Float64[ndarray, "v 3"], In
     return np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int32).reshape(-1, 3)
 
 
-def _number(entity: Entity) -> int:
-    return int(entity.id())
+def _name(entity: Entity | None) -> str | None:
+    """Return the name of a host or storey, or its GlobalId if it has no name."""
+    return None if entity is None else shown(entity.Name or entity.GlobalId)
 
 
 def _label(entity: Entity) -> str:
     """Return the object's name in error messages: class, GlobalId and instance number."""
-    return f"{entity.is_a()} {escape_text(shorten(str(entity.GlobalId), _MAX_NAME))} (#{entity.id()})"
+    return f"{entity.is_a()} {shown(entity.GlobalId)} (#{entity.id()})"

@@ -16,13 +16,14 @@ from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from dataset_builder.config.catalog import LATTICE_DOME
+from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.scene_file import NEAREST_RADIUS_PER_REACH, scene_config
 from dataset_builder.config.scene_schema import read_scene_toml
-from dataset_builder.config.specs import CageFileSpec, DomeSpec, LatticeSpec, MeshFileSpec, RingSpec
+from dataset_builder.config.specs import DomeSpec, LatticeSpec, RingSpec
 from dataset_builder.config.trajectories import view_count
 from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
+from dataset_builder.scene.assemblies.bar_meshes import MAX_RIBS_PER_ROW
 from dataset_builder.scene.assemblies.cage import CageBar
-from dataset_builder.scene.assemblies.cage_assembly import MAX_RIBS_PER_ROW, cage_assembly
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.mesh_ply import write_mesh_ply
@@ -32,6 +33,7 @@ from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import InputError, MeshError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from tests.builder.config.scene_files import BAR, MM, write_scene
+from tests.builder.scene.cages import assembly_of
 
 EXAMPLES = Path("examples")
 
@@ -243,17 +245,17 @@ def test_long_bars_are_plain_and_triangle_count_is_limited() -> None:
         return CageBar(f"bar {number}", Bar(number, "bar", 0.01, axis_m))
 
     max_ribbed_length_m = MAX_RIBS_PER_ROW * 0.68 * 0.01
-    short, long = cage_assembly(
+    short, long = assembly_of(
         [bar(1, max_ribbed_length_m * 0.999), bar(2, max_ribbed_length_m * 1.001)], "a"
     ).parts
     assert len(short.mesh.faces) > 100_000
     assert len(long.mesh.faces) == 96  # 24 sides of two triangles, two end caps of 24
-    many = cage_assembly([bar(number, 0.1) for number in range(1, 1000)], "a")
+    many = assembly_of([bar(number, 0.1) for number in range(1, 1000)], "a")
     assert {len(part.mesh.faces) for part in many.parts} == {96}
-    few = cage_assembly([bar(number, 0.1) for number in range(1, 20)], "a")
+    few = assembly_of([bar(number, 0.1) for number in range(1, 20)], "a")
     assert min(len(part.mesh.faces) for part in few.parts) > 5000
     with pytest.raises(MeshError, match=r"the bars make [0-9]+ triangles, expected at most 20000000"):
-        cage_assembly([bar(number, 3.0, points=10_000) for number in range(1, 20)], "a")
+        assembly_of([bar(number, 3.0, points=10_000) for number in range(1, 20)], "a")
 
 
 def test_straight_segments_next_to_bends_keep_section(tmp_path: Path) -> None:

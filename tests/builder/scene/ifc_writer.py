@@ -12,6 +12,7 @@ import numpy as np
 from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage import CageBar
+from dataset_builder.scene.assemblies.cage_checks import raise_problems
 from dataset_builder.scene.assemblies.ifc.answer import Answer
 from dataset_builder.scene.ifc_reader.answer import write_answer
 
@@ -19,11 +20,18 @@ Numbers = Sequence[float]
 
 
 def bars_in_process(content: bytes) -> list[CageBar]:
-    """Return the bars of an IFC file, read without the process that ``ifc_bars`` starts."""
+    """Return the bars of an IFC file, read without the process that ``ifc_cage`` starts."""
     stream = io.BytesIO()
     write_answer(content, stream)
     stream.seek(0)
-    return Answer(stream, "a.ifc").bars()
+    return checked_bars(Answer(stream, "a.ifc"))
+
+
+def checked_bars(answer: Answer) -> list[CageBar]:
+    """Return the bars of an answer; raise ``MeshError`` for the problems of its cage."""
+    cage = answer.cage()
+    raise_problems(cage.problems, "a.ifc")
+    return list(cage.bars)
 
 
 class Ifc:

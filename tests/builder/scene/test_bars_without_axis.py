@@ -11,13 +11,13 @@ import pytest
 from dataset_builder.config.catalog import CONFIGS
 from dataset_builder.export.colmap import axis_points_m
 from dataset_builder.scene.assemblies.cage import CageBar
-from dataset_builder.scene.assemblies.cage_assembly import cage_assembly
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.solids import box
 from dataset_builder.scene.steel_distance import Cylinders
 from dataset_builder.scene.variants.props import make_props
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.extended.inspection.segments import cage_truth
+from tests.builder.scene.cages import assembly_of
 
 ROD = Bar(1, "bar", 0.01, ((-0.2, 0.0, 0.1), (0.2, 0.0, 0.1)))
 UNKNOWN = Bar.without_axis(2, "imported")
@@ -26,7 +26,7 @@ PLATE = CageBar("plate", UNKNOWN, mesh=box((-0.1, 0.05, 0.05), (0.1, 0.06, 0.15)
 
 @cache
 def rod_and_plate() -> Assembly:
-    return cage_assembly([CageBar("rod", ROD), PLATE], "cage.ifc")
+    return assembly_of([CageBar("rod", ROD), PLATE], "cage.ifc")
 
 
 def test_cage_keeps_mesh_of_bar_without_axis_and_names_it() -> None:
@@ -43,7 +43,7 @@ def test_cage_keeps_mesh_of_bar_without_axis_and_names_it() -> None:
 def test_props_are_placed_by_known_axes(variant: str) -> None:
     scene = CONFIGS["lattice"]().scene
     scene = replace(scene, appearance=replace(scene.appearance, variants=(variant,)))
-    only_plate = cage_assembly([PLATE], "cage.ifc")
+    only_plate = assembly_of([PLATE], "cage.ifc")
     for assembly in (rod_and_plate(), only_plate):
         for part in make_props(assembly, scene):
             assert np.isfinite(part.mesh.vertices_m).all()

@@ -18,7 +18,7 @@ from ifcopenshell import geom
 from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
-from dataset_builder.scene.assemblies.ifc.process import ifc_bars
+from dataset_builder.scene.assemblies.ifc.process import ifc_cage
 from dataset_builder.scene.ifc_reader.model import open_model
 from dataset_builder.scene.ifc_reader.pieces import arc_through
 from dataset_builder.scene.ifc_reader.placements import axis_placement
@@ -267,7 +267,7 @@ def test_other_solids_are_tessellated_and_placed() -> None:
     mirror = ifc.new("IfcCartesianTransformationOperator3D", None, ifc.direction((0, -1, 0)), ifc.point((0, 1, 0)))
     placed = ifc.at((0.1, 0.2, 0.3), (1, 0, 0), (0, 0, 1))
     ifc.bar(solid, ifc.mapped(mirror, ifc.axes((0, 0, 0)), solid), at=placed)
-    swept, first, second = ifc_bars(ifc.file.to_string().encode(), "a.ifc")
+    swept, first, second = ifc_cage(ifc.file.to_string().encode(), "a.ifc").bars
     assert (swept.bar.role, first.bar.role, second.bar.role) == ("bar", "imported", "imported")
     assert not first.bar.has_axis  # A square section is no round bar.
     assert first.mesh is not None

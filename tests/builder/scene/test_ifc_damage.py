@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dataset_builder.scene.assemblies.cage_assembly import cage_assembly
 from rebar_depth_bench.errors import MeshError
+from tests.builder.scene.cages import assembly_of
 from tests.builder.scene.ifc_damage import damaged_bytes, damaged_token, differs_in_values_only
 from tests.builder.scene.ifc_writer import Ifc, bars_in_process, extruded_square
 
@@ -205,7 +205,7 @@ def test_exponential_maps_and_placement_cycles_are_refused() -> None:
 )
 def test_implausible_dimensions_are_rejected(old: str, new: str, words: str) -> None:
     with pytest.raises(MeshError, match=words):
-        cage_assembly(bars_in_process(column_with(old, new).encode()), "a.ifc")
+        assembly_of(bars_in_process(column_with(old, new).encode()), "a.ifc")
 
 
 @pytest.mark.slow

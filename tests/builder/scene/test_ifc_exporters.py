@@ -7,23 +7,23 @@ import io
 import numpy as np
 import pytest
 
+from dataset_builder.config.file_specs import Trust
 from dataset_builder.scene.assemblies.cage import CageBar
-from dataset_builder.scene.assemblies.cage_assembly import cage_assembly
 from dataset_builder.scene.assemblies.ifc.answer import Answer
-from dataset_builder.scene.assemblies.ifc.declared import Trust
 from dataset_builder.scene.ifc_reader import bars as reader_bars
 from dataset_builder.scene.ifc_reader.answer import write_answer
 from rebar_depth_bench.errors import MeshError
+from tests.builder.scene.cages import assembly_of
 from tests.builder.scene.ifc_exporters import STYLES, revit, u_curve
 from tests.builder.scene.ifc_step_text import METRES, MILLIMETRES, Step
-from tests.builder.scene.ifc_writer import bars_in_process
+from tests.builder.scene.ifc_writer import bars_in_process, checked_bars
 
 
 def read(content: str, trust: Trust = "declared") -> list[CageBar]:
     stream = io.BytesIO()
     write_answer(content.encode(), stream)
     stream.seek(0)
-    return Answer(stream, "a.ifc", trust).bars()
+    return checked_bars(Answer(stream, "a.ifc", trust))
 
 
 @pytest.mark.parametrize("name", STYLES)
@@ -95,7 +95,7 @@ def test_diameter_of_the_type_is_compared() -> None:
 
 def test_notes_reach_the_assembly_once() -> None:
     bars = read(straight_bar(6.4, 0.012))
-    [note] = cage_assembly(bars, "a.ifc").notes
+    [note] = assembly_of(bars, "a.ifc").notes
     assert note.code == "diameter"
     assert "IfcReinforcingBar" in note.source
 

@@ -20,7 +20,7 @@ import pytest
 from dataset_builder.config.scene_file import scene_config
 from dataset_builder.scene.assemblies.ifc import process
 from dataset_builder.scene.assemblies.ifc.answer import MAX_ARRAY_BYTES, Answer, AnswerError
-from dataset_builder.scene.assemblies.ifc.process import ifc_bars
+from dataset_builder.scene.assemblies.ifc.process import ifc_cage
 from dataset_builder.scene.model import MAX_BARS
 from rebar_depth_bench.errors import InputError, MeshError
 from rebar_depth_bench.limits import IFC_MEMORY_BYTES, IFC_SECONDS
@@ -60,7 +60,7 @@ def column_with(old: str, new: str) -> bytes:
 def test_content_that_crashed_or_stalled_is_refused_quickly(content: bytes, words: str) -> None:
     start = time.monotonic()
     with pytest.raises(MeshError, match=f"^a.ifc: .*{words}"):
-        ifc_bars(content, "a.ifc")
+        ifc_cage(content, "a.ifc")
     assert time.monotonic() - start < 30  # On an idle machine, 2 s.
 
 
@@ -79,14 +79,14 @@ def test_crash_and_time_limits_name_the_object(monkeypatch: pytest.MonkeyPatch) 
     ]:
         run_instead(monkeypatch, write + end)
         with pytest.raises(MeshError, match=rf"^a.ifc: .*\(#{bar.id()}\) .*no axis; tessellation: .*{words}"):
-            ifc_bars(content, "a.ifc")
+            ifc_cage(content, "a.ifc")
 
 
 @pytest.mark.slow
 def test_end_before_the_input_is_read_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "COMMAND", (sys.executable, "-c", "raise SystemExit(7)"))
     with pytest.raises(MeshError, match=r"^a.ifc: the file cannot be read: ifcopenshell crashed \(status 7\)"):
-        ifc_bars(b" " * 5_000_000, "a.ifc")
+        ifc_cage(b" " * 5_000_000, "a.ifc")
 
 
 @pytest.mark.slow
@@ -95,13 +95,13 @@ def test_limits_of_time_and_memory_end_the_process(monkeypatch: pytest.MonkeyPat
     content = column_with("DATA;", f"DATA;\n{points}")
     monkeypatch.setenv(IFC_SECONDS.variable, "1")
     with pytest.raises(MeshError, match=r"^a.ifc: .*more than 1 s \(REBAR_MAX_IFC_SECONDS raises the limit\)"):
-        ifc_bars(content, "a.ifc")
+        ifc_cage(content, "a.ifc")
     monkeypatch.undo()
     monkeypatch.setenv(IFC_MEMORY_BYTES.variable, str(250 << 20))
     with pytest.raises(
         MeshError, match=r"^a.ifc: .*needs more than 262144000 .*REBAR_MAX_IFC_MEMORY_BYTES raises"
     ):
-        ifc_bars(content, "a.ifc")
+        ifc_cage(content, "a.ifc")
 
 
 @pytest.mark.slow
@@ -110,7 +110,7 @@ def test_process_that_sleeps_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(IFC_SECONDS.variable, "1")
     start = time.monotonic()
     with pytest.raises(MeshError, match=r"more than 1 s \(REBAR_MAX_IFC_SECONDS raises the limit\)"):
-        ifc_bars(COLUMN.read_bytes(), "a.ifc")
+        ifc_cage(COLUMN.read_bytes(), "a.ifc")
     assert time.monotonic() - start < 50
 
 
@@ -141,11 +141,14 @@ time.sleep(100)
             os.kill(reader, signal.SIGKILL)
 
 
-SOURCE: dict[str, Any] = {"global_id": "g", "label": "a", "diameters_m": [], "length_m": None}
+NAMES: dict[str, Any] = {"global_id": "g", "label": "a", "host": "Wall", "storey": None}
+SOURCE: dict[str, Any] = NAMES | {"diameters_m": [], "length_m": None}
+PROJECT: dict[str, Any] = {"kind": "project", "unit_m": 0.001}
+LEFT_OUT: dict[str, Any] = {"kind": "left_out", "global_id": "w", "reason": "IfcWall: not reinforcement"}
 SWEEP: dict[str, Any] = {"role": "b", "diameter_m": 0.01, "points": 2}
 BAR: dict[str, Any] = {"kind": "bar", "source": SOURCE, "notes": []} | SWEEP
 SURFACE: dict[str, Any] = {"kind": "surface", "source": SOURCE, "vertices": 3, "faces": 1}
-END: dict[str, Any] = {"kind": "end", "shapes": 1}
+END: dict[str, Any] = {"kind": "end", "records": 2}
 LINE = np.array([[0, 0, 0], [1, 0, 0]], "<f8")
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f8")
 
@@ -161,9 +164,13 @@ def encoded(record: dict[str, Any] | np.ndarray | bytes) -> bytes:
 
 
 def test_sound_answer_gives_bars() -> None:
-    [bar] = answer(BAR, LINE, END).bars()
+    cage = answer(PROJECT, LEFT_OUT, BAR, LINE, END | {"records": 3}).cage()
+    [bar], [left_out] = cage.bars, cage.left_out
+    assert (left_out.source, left_out.reason) == ("w", "IfcWall: not reinforcement")
+    assert (bar.source, bar.host, bar.storey) == ("g", "Wall", None)
+    np.testing.assert_array_equal(cage.world_from_source, np.diag([0.001, 0.001, 0.001, 1]))
     assert (bar.label, bar.bar.bar_id, bar.bar.role, bar.bar.axis_m[1]) == ("bar 1, a", 1, "b", (1.0, 0.0, 0.0))
-    [bar] = answer(SURFACE, CORNERS, np.array([[0, 1, 2]], "<i4"), END).bars()
+    [bar] = answer(PROJECT, SURFACE, CORNERS, np.array([[0, 1, 2]], "<i4"), END).cage().bars
     assert bar.mesh is not None
     assert bar.bar.role == "imported"
 
@@ -188,8 +195,11 @@ def test_sound_answer_gives_bars() -> None:
         [BAR | {"source": SOURCE | {"diameters_m": [-1.0]}}, LINE, END],
         [BAR | {"notes": [{"code": "A b", "text": ""}]}, LINE, END],
         [BAR | {"extra": 1}, LINE, END],
+        [BAR | {"source": SOURCE | {"host": 1}}, LINE, END],
         [BAR, LINE + np.inf, END],
-        [BAR, LINE, END | {"shapes": 2}],
+        [PROJECT | {"unit_m": 0.0}],
+        [LEFT_OUT | {"reason": "x" * 201}],
+        [BAR, LINE, END | {"records": 3}],
         [SURFACE | {"vertices": 2}, CORNERS, END],
         [SURFACE, CORNERS, np.array([[0, 1, 3]], "<i4"), END],
         [SURFACE, CORNERS, np.array([[0, 1, -1]], "<i4"), END],
@@ -198,28 +208,28 @@ def test_sound_answer_gives_bars() -> None:
 )  # fmt: skip
 def test_invalid_answers_are_refused(records: list[dict[str, Any] | np.ndarray | bytes]) -> None:
     with pytest.raises(AnswerError) as caught:
-        answer(*records).bars()
+        answer(PROJECT, *records).cage()
     assert not caught.value.ended
 
 
 @pytest.mark.parametrize("records", [[], [BAR], [BAR, LINE], [BAR, LINE, b'{"kind": "e'], [SURFACE, CORNERS]])
 def test_incomplete_answers_are_refused(records: list[dict[str, Any] | np.ndarray | bytes]) -> None:
     with pytest.raises(AnswerError) as caught:
-        answer(*records).bars()
+        answer(PROJECT, *records).cage()
     assert caught.value.ended
 
 
 @pytest.mark.slow
 def test_too_many_bars_are_refused() -> None:
     with pytest.raises(MeshError, match=f"more than {MAX_BARS} bars found"):
-        answer(*(record for _ in range(MAX_BARS + 1) for record in (BAR, LINE))).bars()
+        answer(PROJECT, *(record for _ in range(MAX_BARS + 1) for record in (BAR, LINE))).cage()
 
 
 @pytest.mark.slow
 def test_invalid_answer_of_the_process_names_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
     run_instead(monkeypatch, "out.write(b'garbage\\n' * 1000000)")
     with pytest.raises(MeshError, match=r"^a.ifc: the IFC reader gave an invalid answer"):
-        ifc_bars(COLUMN.read_bytes(), "a.ifc")
+        ifc_cage(COLUMN.read_bytes(), "a.ifc")
 
 
 @pytest.mark.slow
@@ -228,7 +238,7 @@ def test_bar_without_readable_shape_is_named() -> None:
     bar = ifc.rooted("IfcReinforcingBar")
     name = bar.GlobalId.replace("$", "[$]")
     with pytest.raises(MeshError, match=f"^a.ifc: .*{name} .* no readable shape: .*empty"):
-        ifc_bars(ifc.file.to_string().encode(), "a.ifc")
+        ifc_cage(ifc.file.to_string().encode(), "a.ifc")
 
 
 def test_missing_ifcopenshell_names_pip_extra(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -241,8 +251,8 @@ def test_this_process_does_not_import_ifcopenshell() -> None:
     code = """
 import sys
 from pathlib import Path
-from dataset_builder.scene.assemblies.ifc.process import ifc_bars
-assert len(ifc_bars(Path("examples/column.ifc").read_bytes(), "a.ifc")) == 13
+from dataset_builder.scene.assemblies.ifc.process import ifc_cage
+assert len(ifc_cage(Path("examples/column.ifc").read_bytes(), "a.ifc").bars) == 13
 assert not [name for name in sys.modules if "ifcopenshell" in name or "ifc_reader" in name]
 """
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from dataset_builder.config.specs import MeshFileSpec
+from dataset_builder.config.file_specs import MeshFileSpec
+from dataset_builder.scene.assemblies.cage import CageBar
+from dataset_builder.scene.assemblies.cage_checks import cage_problems, raise_problems
 from dataset_builder.scene.assemblies.mesh_import import read_parts
 from dataset_builder.scene.model import Mesh
+from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import MeshError
 from tests.builder.scene.test_mesh_file import named_scene, obj_bytes
 from tests.requirements import Repetitions
@@ -47,7 +50,10 @@ def payload_start(name: str) -> int:
 
 
 def read(name: str, content: bytes) -> dict[int, Mesh]:
-    return read_parts(content, MeshFileSpec(name, "", 1.0))
+    parts = read_parts(content, MeshFileSpec(name, "", 1.0))
+    bars = [CageBar(part.name, Bar.without_axis(part.bar_id, "bar"), mesh=part.mesh) for part in parts]
+    raise_problems(cage_problems(bars), name)
+    return {part.bar_id: part.mesh for part in parts}
 
 
 def assert_refused_or_sound(name: str, content: bytes, lossless: Callable[[dict[int, Mesh]], bool]) -> None:

@@ -17,7 +17,8 @@ import pytest
 import trimesh
 from PIL import Image
 
-from dataset_builder.scene.assemblies.mesh_file import load_assembly, mesh_file_spec
+from dataset_builder.scene.assemblies.cage_file import load_cage
+from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
 from rebar_depth_bench.errors import MeshError
 from tests.builder.scene.test_mesh_file import RODS, load_content, named_scene, obj_bytes
 
@@ -62,7 +63,7 @@ INVALID_FILES: dict[str, tuple[str, bytes | str, str]] = {
     "no area": (
         ".obj",
         TRIANGLE + "f 1 2 2",
-        "bar 1 .1 triangles. is not a valid surface: every triangle has zero area",
+        "bar 1, part 1 .1 triangles. is not a valid surface: every triangle has zero area",
     ),
     "empty stl": (".stl", "", "0 bytes, expected a text or binary STL"),
     "cut binary stl": (".stl", BINARY_STL[:-1], "the header counts 256 triangles, but the file has 12883 bytes"),
@@ -302,7 +303,7 @@ def test_size_limit_and_pipes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
             mesh_file_spec(tmp_path / name, "m")
     (tmp_path / "link.stl").symlink_to(tmp_path / "a.stl")
     load_content(tmp_path, "a.stl", BINARY_STL)
-    assert load_assembly(mesh_file_spec(tmp_path / "link.stl", "m")).bars
+    assert load_cage(mesh_file_spec(tmp_path / "link.stl", "m")).bars
     monkeypatch.setenv("REBAR_MAX_MESH_BYTES", str(len(BINARY_STL) - 1))
     with pytest.raises(MeshError, match="REBAR_MAX_MESH_BYTES raises the limit"):
         mesh_file_spec(tmp_path / "a.stl", "m")

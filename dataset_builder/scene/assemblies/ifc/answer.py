@@ -6,6 +6,7 @@ followed by the arrays that it announces (see ``scene.ifc_reader.answer``).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import IO, Annotated, Literal
 
@@ -14,9 +15,9 @@ from jaxtyping import Float64
 from numpy import ndarray
 from pydantic import Field, TypeAdapter, ValidationError
 
-from dataset_builder.scene.assemblies.cage import CageBar
-from dataset_builder.scene.assemblies.cage_assembly import raise_problems
-from dataset_builder.scene.assemblies.ifc.declared import Trust, compare_declared
+from dataset_builder.config.file_specs import Trust
+from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
+from dataset_builder.scene.assemblies.ifc.declared import compare_declared
 from dataset_builder.scene.assemblies.mesh_import import connected_components
 from dataset_builder.scene.assemblies.surface_bar import fitted_bar
 from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS, Mesh, Note, axis_of
@@ -37,10 +38,12 @@ _Size = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class _Source(StrictModel):
-    """Object of a file: GlobalId, name in messages, and the sizes that it declares for its bars, metres."""
+    """Object of a file: GlobalId, name in messages, host, storey, and the sizes declared for its bars, metres."""
 
     global_id: _Label
     label: _Label
+    host: _Label | None
+    storey: _Label | None
     diameters_m: Annotated[list[_Size], Field(max_length=3)]
     length_m: _Size | None
 
@@ -52,8 +55,23 @@ class _NoteRecord(StrictModel):
     text: Annotated[str, Field(max_length=200)]
 
 
+class _ProjectRecord(StrictModel):
+    """Project of the file, with its length unit."""
+
+    kind: Literal["project"]
+    unit_m: _Size
+
+
+class _LeftOutRecord(StrictModel):
+    """Object that is not read, and the reason."""
+
+    kind: Literal["left_out"]
+    global_id: _Label
+    reason: _Label
+
+
 class _BarRecord(StrictModel):
-    """Bar with an axis of ``points`` points (float64, world, metres), which follow."""
+    """Bar with an axis of ``points`` points (float64, the file's frame, metres), which follow."""
 
     kind: Literal["bar"]
     source: _Source
@@ -64,7 +82,7 @@ class _BarRecord(StrictModel):
 
 
 class _SurfaceRecord(StrictModel):
-    """Tessellated object; its vertices (float64, world, metres) and triangles (int32) follow."""
+    """Tessellated object; its vertices (float64, metres) and triangles (int32) follow."""
 
     kind: Literal["surface"]
     source: _Source
@@ -89,13 +107,13 @@ class _FailureRecord(StrictModel):
 
 
 class _EndRecord(StrictModel):
-    """End of a complete answer, with its number of bars and surfaces."""
+    """End of a complete answer, with its number of other records but steps."""
 
     kind: Literal["end"]
-    shapes: int
+    records: int
 
 
-_Record = _BarRecord | _SurfaceRecord | _StepRecord | _FailureRecord | _EndRecord
+_Record = _ProjectRecord | _LeftOutRecord | _BarRecord | _SurfaceRecord | _StepRecord | _FailureRecord | _EndRecord
 _RECORD: TypeAdapter[_Record] = TypeAdapter(Annotated[_Record, Field(discriminator="kind")])
 
 
@@ -120,35 +138,49 @@ class Answer:
         self._bytes_left = MAX_ARRAY_BYTES
         self.step: _StepRecord | None = None
 
-    def bars(self) -> list[CageBar]:
-        """Return the bars, with ids from 1 in the order of the answer.
+    def cage(self) -> Cage:
+        """Return the bars (the file's frame, metres), with ids from 1 in the order of the answer.
 
-        Raises ``MeshError`` if the process refused the file, a surface is not a bar, or diameters are not as
-        declared (``ifc.declared``), ``OutOfMemoryError`` if it ran out of memory, and ``AnswerError`` if the
-        answer is not complete and valid.
+        Diameters that are far from the declared ones are problems of the cage (``ifc.declared``). Raises
+        ``MeshError`` if the process refused the file or a surface is not a bar, ``OutOfMemoryError`` if it ran out
+        of memory, and ``AnswerError`` if the answer is not complete and valid.
         """
         bars: list[CageBar] = []
-        shapes = 0
-        while True:
-            record = self._record()
+        left_out: list[LeftOut] = []
+        unit_m = None
+        for record in self._records():
             match record:
+                case _ProjectRecord():
+                    unit_m = record.unit_m
+                case _LeftOutRecord():
+                    left_out.append(LeftOut(record.global_id, record.reason))
                 case _BarRecord():
                     bars.append(self._swept_bar(len(bars) + 1, record))
                 case _SurfaceRecord():
                     bars += self._surface_bars(len(bars) + 1, record)
+            if len(bars) > MAX_BARS:
+                raise MeshError(f"{self._where}: more than {MAX_BARS} bars found, expected at most {MAX_BARS}")
+        if unit_m is None:
+            raise AnswerError("there is no project")
+        return Cage(tuple(bars), tuple(left_out), unit_scale(unit_m), tuple(self._problems))
+
+    def _records(self) -> Iterator[_Record]:
+        """Yield the records up to the end, without steps. Raises as ``cage``."""
+        count = 0
+        while True:
+            record = self._record()
+            match record:
                 case _StepRecord():
                     self.step = record
-                    continue
                 case _FailureRecord():
                     raise self._failure(record)
                 case _EndRecord():
-                    if record.shapes != shapes:
-                        raise AnswerError(f"{shapes} shapes, expected {record.shapes}")
-                    raise_problems(self._problems, self._where)
-                    return bars
-            shapes += 1
-            if len(bars) > MAX_BARS:
-                raise MeshError(f"{self._where}: more than {MAX_BARS} bars found, expected at most {MAX_BARS}")
+                    if record.records != count:
+                        raise AnswerError(f"{count} records, expected {record.records}")
+                    return
+                case _:
+                    count += 1
+                    yield record
 
     def no_shape_error(self, problem: str) -> MeshError:
         """Return the error of the object that was tessellated when ``problem`` occurred."""
@@ -197,14 +229,14 @@ class Answer:
         bar = Bar(bar_id, record.role, diameter_m, axis_of(axis_m))
         label = _bar_label(bar_id, record.source.label)
         notes = tuple(Note(record.source.label, note.code, note.text) for note in record.notes)
-        cage_bar = CageBar(label, bar, source=record.source.global_id, notes=notes)
-        return self._compared(cage_bar, record.source)
+        return self._compared(CageBar(label, bar, notes=notes), record.source)
 
     def _compared(self, bar: CageBar, source: _Source) -> CageBar:
-        """Return the bar with notes on what its object declares; collect a problem if that is far from it."""
+        """Return the bar with its object's names and notes on its sizes; collect a problem if they are far off."""
         notes, problem = compare_declared(bar, source.label, source.diameters_m, source.length_m, self._trust)
         self._problems += [problem] if problem else []
-        return replace(bar, notes=(*bar.notes, *notes))
+        notes = [*bar.notes, *notes]
+        return replace(bar, source=source.global_id, host=source.host, storey=source.storey, notes=tuple(notes))
 
     def _surface_bars(self, bar_id: int, record: _SurfaceRecord) -> list[CageBar]:
         """Return the connected surfaces of an object as bars (``fitted_bar``)."""
@@ -215,7 +247,7 @@ class Answer:
         for number, part in enumerate(connected_components(Mesh(vertices_m, faces)), start=bar_id):
             label = _bar_label(number, record.source.label)
             try:
-                bar = CageBar(label, fitted_bar(number, part), mesh=part, source=record.source.global_id)
+                bar = CageBar(label, fitted_bar(number, part), mesh=part)
             except ValueError as error:
                 raise MeshError(f"{self._where}: {label}: is not a solid ({error}), expected a bar") from error
             bars.append(self._compared(bar, record.source))

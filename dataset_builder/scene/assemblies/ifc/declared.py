@@ -8,14 +8,11 @@ programs write them in another unit, or for a whole row of bars.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
+from dataset_builder.config.file_specs import Trust
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.model import Note
 from rebar_depth_bench.errors import Problem
-
-Trust = Literal["declared", "geometry"]
-"""What to believe if the diameters are far apart: "declared" refuses the bar, "geometry" only notes it."""
 
 _NOTED, _REFUSED = 0.05, 0.25
 """Differences, relative to the declared value, above which there is a note, and above which a bar is refused."""

@@ -18,9 +18,10 @@ from dataclasses import dataclass
 from threading import Event, Timer
 from typing import IO
 
-from dataset_builder.scene.assemblies.cage import CageBar
+from dataset_builder.config.file_specs import Trust
+from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.assemblies.ifc.answer import Answer, AnswerError, OutOfMemoryError
-from dataset_builder.scene.assemblies.ifc.declared import Trust
+from dataset_builder.scene.selection import TABLES, Selection
 from rebar_depth_bench.errors import InputError, MeshError
 from rebar_depth_bench.limits import IFC_MEMORY_BYTES, IFC_SECONDS
 
@@ -31,15 +32,15 @@ _WALL_CLOCK_FACTOR = 2
 """Largest duration of the process, in multiples of its processor time."""
 
 
-def ifc_bars(content: bytes, where: str, trust: Trust = "declared") -> list[CageBar]:
-    """Return the bars of an IFC file's ``content``; ``where`` names the file in error messages.
+def ifc_cage(content: bytes, where: str, select: tuple[Selection, ...] = (), trust: Trust = "declared") -> Cage:
+    """Return the bars of an IFC file's ``content`` (its frame, metres); ``where`` names the file in messages.
 
-    Bar ids start at 1 and follow the instance numbers in the file. Diameters and lengths are always those of the
-    geometry; with ``trust`` "declared", a diameter that is far from the declared one is refused
-    (``ifc.declared``).
+    Without ``select``, all reinforcement is read. Bar ids start at 1 and follow the instance numbers in the file.
+    Diameters and lengths are always those of the geometry; with ``trust`` "declared", a diameter that is far from
+    the declared one is a problem of the cage (``ifc.declared``).
 
-    Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, no reinforcing bar or
-    one without usable geometry (with its GlobalId), if a bar depends on an instance that cannot be read as
+    Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, nothing to read or
+    a bar without usable geometry (with its GlobalId), if a bar depends on an instance that cannot be read as
     written, or if reading exceeds a limit; ``InputError`` if ifcopenshell is not installed.
     """
     if importlib.util.find_spec("ifcopenshell") is None:
@@ -47,10 +48,10 @@ def ifc_bars(content: bytes, where: str, trust: Trust = "declared") -> list[Cage
             "not installed: ifcopenshell; expected the ifc extra for IFC models: "
             "pip install 'rebar-depth-bench[ifc]'"
         )
-    with _reader(content) as reader:
+    with _reader(TABLES.dump_json(select) + b"\n" + content) as reader:
         answer = Answer(reader.stdout, where, trust)
         try:
-            return answer.bars()
+            return answer.cage()
         except OutOfMemoryError:
             raise MeshError(f"{where}: reading needs {_memory_limit()}") from None
         except AnswerError as error:
@@ -87,8 +88,8 @@ def _memory_limit() -> str:
 
 
 @contextmanager
-def _reader(content: bytes) -> Iterator[_Reader]:
-    """Start the process and pass it ``content``; it is killed at the end, or after its largest duration."""
+def _reader(request: bytes) -> Iterator[_Reader]:
+    """Start the process and pass it ``request``; it is killed at the end, or after its largest duration."""
     seconds = IFC_SECONDS.value()
     command = (*COMMAND, str(IFC_MEMORY_BYTES.value()), str(seconds), str(os.getpid()))
     with subprocess.Popen(
@@ -107,7 +108,7 @@ def _reader(content: bytes) -> Iterator[_Reader]:
         try:
             # The pipe is broken if the process has ended, for a reason that its status tells.
             with suppress(BrokenPipeError), process.stdin as stream:
-                stream.write(content)
+                stream.write(request)
             yield _Reader(process, process.stdout, expired)
         finally:
             timer.cancel()

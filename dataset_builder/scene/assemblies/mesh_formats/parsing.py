@@ -7,13 +7,16 @@ import warnings
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float, Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.errors import Problem, ProblemCode, escape_text
 
-Surface = tuple[Float64[ndarray, "v 3"], Int64[ndarray, "n 3"]]
-"""Vertices in the file's unit and axes, and triangles, whose corners are indices of these vertices."""
+Surface = tuple[Float[ndarray, "v 3"], Int64[ndarray, "n 3"]]
+"""Vertices in the file's unit and axes, and triangles, whose corners are indices of these vertices.
+
+Vertices are float32 where the file stores them so, otherwise float64.
+"""
 
 Place = Callable[[int], str]
 """Function from the index of a row, vertex or triangle to its place in the file."""

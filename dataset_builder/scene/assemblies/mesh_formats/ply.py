@@ -104,7 +104,7 @@ def _are_list_types(count: str, values: str) -> bool:
 
 
 def _vertices(elements: Sequence[Element], read: Mapping[str, Columns]) -> ndarray:
-    """Return the coordinates, (n, 3) float64, rounded to the type that the header gives them."""
+    """Return the coordinates, (n, 3), rounded to the type that the header gives them, as float32 or float64."""
     types = {
         item.name: item.values for e in elements if e.name == "vertex" for item in e.properties if not item.count
     }
@@ -112,9 +112,8 @@ def _vertices(elements: Sequence[Element], read: Mapping[str, Columns]) -> ndarr
         raise MalformedMeshError("missing", "header", "no vertices with the properties x, y and z", "a mesh")
     columns = read["vertex"]
     with np.errstate(over="ignore"):  # A number beyond float32 becomes infinite and is refused.
-        return np.column_stack([np.asarray(columns[axis]).astype(types[axis]) for axis in "xyz"]).astype(
-            np.float64
-        )
+        vertices = np.column_stack([np.asarray(columns[axis]).astype(types[axis]) for axis in "xyz"])
+    return vertices if vertices.dtype == np.float32 else vertices.astype(np.float64)
 
 
 def _triangles(elements: Sequence[Element], read: Mapping[str, Columns]) -> Int64[ndarray, "n 3"]:

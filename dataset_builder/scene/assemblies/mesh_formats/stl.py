@@ -55,7 +55,7 @@ def _binary_corners(content: bytes) -> ndarray | None:
     size = _HEADER_BYTES + triangles * _TRIANGLE.itemsize
     if len(content) == size:
         rows = np.frombuffer(content, _TRIANGLE, triangles, _HEADER_BYTES)
-        return rows["corners"].reshape(-1, 3).astype(np.float64)
+        return rows["corners"].reshape(-1, 3).astype(np.float32)
     if _SOLID.match(content.removeprefix(BYTE_ORDER_MARK)) and b"\0" not in content[:_HEADER_BYTES]:
         return None
     if len(content) < _HEADER_BYTES:
