@@ -82,12 +82,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mesh", metavar="FILE", help="STL, PLY, OBJ or glTF file that replaces the lattice's rods"
     )
-    parser.add_argument(
-        "--mesh-unit",
-        default="m",
-        metavar="UNIT",
-        help="unit of the mesh file: m, cm, mm, in or ft (default: m)",
-    )
+    add_mesh_unit(parser)
     parser.add_argument(
         "--scene",
         nargs="+",
@@ -101,4 +96,14 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         action="extend",
         metavar="NAME",
         help=f"appearance variants, appended to the config name: {', '.join(VARIANTS)}",
+    )
+
+
+def add_mesh_unit(parser: argparse.ArgumentParser) -> None:
+    """Add the option for the unit of a mesh file."""
+    parser.add_argument(
+        "--mesh-unit",
+        default="m",
+        metavar="UNIT",
+        help="unit of the mesh file: m, cm, mm, in or ft (default: m)",
     )

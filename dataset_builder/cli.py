@@ -12,12 +12,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dataset_builder.build_options import add_build_arguments, add_scene_arguments
+from dataset_builder.build_options import add_build_arguments, add_mesh_unit, add_scene_arguments
 from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, BuildRequest
 from dataset_builder.config.quality import colour_spec
 from dataset_builder.config.specs import CPU
 from rebar_depth_bench.console import ProgressBars, Rate, replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError, printable
+from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
+from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.terminal import use_plain_characters
 from rebar_depth_bench.version import software_version
 
@@ -204,6 +206,28 @@ def _export(options: argparse.Namespace) -> None:
     print(options.out)
 
 
+def _inspect(options: argparse.Namespace) -> None:
+    _check_extra()
+    from dataset_builder.config.scene_file import files_of_scene, scene_cage
+    from dataset_builder.inspection.picture import inspection_picture
+    from dataset_builder.inspection.report import inspection_json, print_inspection
+    from dataset_builder.inspection.summary import inspect_cage
+    from dataset_builder.pipeline.notes import print_notes
+    from dataset_builder.scene.assemblies.cage_checks import raise_problems
+
+    check_outputs({**vars(options), "scene_files": files_of_scene(options.scene_file)})
+    cage = scene_cage(options.scene_file, options.mesh_unit)
+    inspection = inspect_cage(cage, Path(options.scene_file).name)
+    if options.json is not None:
+        write_output(options.json, inspection_json(inspection))
+    if options.picture is not None:
+        write_output(options.picture, inspection_picture(inspection))
+    if prints_table(options):
+        print_inspection(inspection)
+    print_notes(cage.notes)
+    raise_problems(cage.problems, options.scene_file)
+
+
 def argument_parser() -> argparse.ArgumentParser:
     """Return the argument parser of ``rebar-build``."""
     parser = argparse.ArgumentParser(
@@ -214,7 +238,7 @@ def argument_parser() -> argparse.ArgumentParser:
     add_build_arguments(parser)
     add_scene_arguments(parser)
     parser.set_defaults(run=_build)
-    commands = parser.add_subparsers(metavar="{audit,export}")
+    commands = parser.add_subparsers(metavar="{audit,export,inspect}")
     auditing = commands.add_parser("audit", help="check a dataset folder and its ground truth")
     _add_audit_arguments(auditing)
     auditing.set_defaults(run=_audit)
@@ -223,6 +247,9 @@ def argument_parser() -> argparse.ArgumentParser:
     )
     _add_export_arguments(exporting)
     exporting.set_defaults(run=_export)
+    inspecting = commands.add_parser("inspect", help="show the bars of a scene file without rendering")
+    _add_inspect_arguments(inspecting)
+    inspecting.set_defaults(run=_inspect)
     return parser
 
 
@@ -235,6 +262,15 @@ def _add_audit_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="number of views per config whose depth is compared with Cycles' depth pass (default: %(default)s)",
     )
+
+
+def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "scene_file", metavar="SCENE", help="scene TOML, IFC model, or mesh file (STL, PLY, OBJ, glTF)"
+    )
+    add_mesh_unit(parser)
+    add_output_file(parser, "--json", "write the bars, what is left out, and the placement as JSON")
+    add_output_file(parser, "--picture", "write a PNG of the cage from four sides")
 
 
 def _add_export_arguments(parser: argparse.ArgumentParser) -> None:

@@ -11,11 +11,11 @@ from pathlib import Path
 from rebar_depth_bench.errors import InputError, OutputError
 from rebar_depth_bench.outputs import STANDARD_OUTPUT, is_standard_output, is_stream, link_target, open_descriptor
 
-OUTPUT_OPTIONS = ("out", "json", "csv", "html", "latex", "extended_csv", "figure", "eval_results")
+OUTPUT_OPTIONS = ("out", "json", "csv", "html", "latex", "extended_csv", "figure", "picture", "eval_results")
 """Names (argparse dest) of the options that are output paths."""
 STANDARD_OUTPUT_OPTIONS = ("--json", "--csv")
 """Options whose file may be ``-``, standard output."""
-INPUT_FILE_OPTIONS = ("archive", "archives", "first", "others", "method", "token_file")
+INPUT_FILE_OPTIONS = ("archive", "archives", "first", "others", "method", "token_file", "scene_files")
 """Names of the options that are files to read; a method may be ``FILE.py:NAME`` or ``FILE.toml``."""
 INPUT_FOLDER_OPTIONS = ("data", "predictions", "kitti", "methods", "reference")
 """Names of the options that are folders to read, or files or Hub repositories in their place."""

@@ -114,6 +114,16 @@ def scene_cage(path: str | os.PathLike[str], mesh_unit: str | float = "m") -> Ca
         return read_cage(_assembly_spec(scene_toml, path))
 
 
+def files_of_scene(path: str | os.PathLike[str]) -> list[Path]:
+    """Return a scene file and the file that it names. Raises ``InputError`` as ``scene_config``."""
+    path = Path(path)
+    if path.suffix.lower() in MESH_SUFFIXES:
+        return [path]
+    scene_toml = _read_scene(path)
+    named = scene_toml.mesh or scene_toml.ifc
+    return [path] if named is None else [path, path.parent / named]
+
+
 def default_dome(assembly: Assembly) -> DomeSpec:
     """Return ``LATTICE_DOME`` scaled to an assembly: 7 radii x 6 elevations x 12 azimuths, 504 views.
 

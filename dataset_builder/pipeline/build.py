@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from collections import defaultdict
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.pipeline.disk_space import check_fits_on_disk
 from dataset_builder.pipeline.folder import check_folder, remove_build_folder, remove_stagings
 from dataset_builder.pipeline.local_renderer import Renderer, local_processes
+from dataset_builder.pipeline.notes import print_notes
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, plan_config
 from dataset_builder.pipeline.publish import (
     build_lock,
@@ -26,12 +26,7 @@ from dataset_builder.pipeline.publish import (
 from dataset_builder.pipeline.retained import check_retained_configs
 from dataset_builder.pipeline.work_units import accept_result, remaining_units
 from dataset_builder.scene.assemblies import check_fits
-from dataset_builder.scene.model import Note
-from rebar_depth_bench.errors import printable
 from rebar_depth_bench.progress import Progress, silent
-
-_MAX_NOTES, _MAX_NOTE = 20, 4000
-"""Largest number of notes on scene files that are printed, and of characters of one."""
 
 
 @dataclass
@@ -83,17 +78,9 @@ def plan_build(request: BuildRequest, out: Path) -> list[ConfigPlan]:
     plans = [plan_config(spec, request.views, out) for spec in request.config_specs()]
     for plan in plans:
         check_fits(plan.assembly, plan.spec)
-    _print_notes(list(dict.fromkeys(note for plan in plans for note in plan.assembly.notes)))
+    print_notes(list(dict.fromkeys(note for plan in plans for note in plan.assembly.notes)))
     check_folder(out, plans)
     return plans
-
-
-def _print_notes(notes: Sequence[Note]) -> None:
-    """Print notes on scene files to standard error, at most ``_MAX_NOTES`` of them."""
-    for note in notes[:_MAX_NOTES]:
-        print(printable(f"note: {note.source}: {note.text}", _MAX_NOTE), file=sys.stderr)
-    if len(notes) > _MAX_NOTES:
-        print(f"note: {len(notes) - _MAX_NOTES} more notes are not shown", file=sys.stderr)
 
 
 def _build_plans(plans: Sequence[ConfigPlan], out: Path, renderer: Renderer, progress: Progress) -> BuildSummary:

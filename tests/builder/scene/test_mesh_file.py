@@ -86,7 +86,7 @@ def test_lattice_round_trips_through_every_format(tmp_path: Path, suffix: str) -
 
     assert [bar.bar_id for bar in imported.bars] == [part.bar_id for part in imported.parts] == list(range(1, 13))
     for bar, original in zip(imported.bars, lattice.bars, strict=True):
-        same_way = np.dot(np.subtract(*bar.axis_m), np.subtract(*original.axis_m)) > 0
+        same_way = np.vdot(np.diff(bar.axis_m, axis=0), np.diff(original.axis_m, axis=0)) > 0
         np.testing.assert_allclose(bar.axis_m[:: 1 if same_way else -1], original.axis_m, rtol=0, atol=1e-4)
         assert bar.role == "imported"
         assert bar.diameter_m == pytest.approx(original.diameter_m, rel=0.05)

@@ -1,0 +1,247 @@
+"""Picture of a cage from four sides, drawn without Blender: front, right, top and a corner."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+from numpy.typing import ArrayLike
+from PIL import Image, ImageDraw
+
+from dataset_builder.inspection.summary import Inspection
+from dataset_builder.scene.assemblies.cage import CageBar
+from rebar_depth_bench.errors import printable
+from rebar_depth_bench.reporting.figure.drawing import font, shortened
+from rebar_depth_bench.reporting.formatting import counted
+
+_PANEL_PX, _MARGIN_PX, _HEAD_PX = (960, 640), 40, 90
+_OVERSAMPLING = 2
+"""Pixels per pixel of the picture, along each side, that are drawn and averaged."""
+
+_PAPER, _INK, _GREY, _MARK = (255, 255, 255), (20, 20, 20), (110, 110, 110), (214, 0, 60)
+_COLOURS = ((0, 90, 160), (213, 94, 0), (0, 135, 100), (130, 70, 150), (170, 120, 0), (60, 60, 60), (0, 150, 190))
+"""Colours of diameters, the largest first; repeated for further ones."""
+_UNKNOWN = (150, 150, 150)
+_HAZE = 0.6
+"""Share of white in the colour of the farthest bars."""
+
+_MAX_MARKS = 200
+_MAX_EDGES = 20_000
+"""Largest number of edges that are drawn of the mesh of a bar without axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """Side of a cage: title, and the unit vectors to the right, up and towards the viewer as rows."""
+
+    title: str
+    axes: Float64[ndarray, "3 3"]
+
+
+def _rows(right: ArrayLike, up: ArrayLike, towards: ArrayLike) -> Float64[ndarray, "3 3"]:
+    rows = np.array([right, up, towards], dtype=np.float64)
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
+
+
+_TOWARDS_CORNER = np.array([0.9, -1.2, 0.8])
+_RIGHT_OF_CORNER = np.array([1.2, 0.9, 0.0])
+_SIDES = (
+    _Side("front: x to the right, z up", _rows((1, 0, 0), (0, 0, 1), (0, -1, 0))),
+    _Side("right: y to the right, z up", _rows((0, 1, 0), (0, 0, 1), (1, 0, 0))),
+    _Side("top: x to the right, y up", _rows((1, 0, 0), (0, 1, 0), (0, 0, 1))),
+    _Side(
+        "corner: from the front, the right and above",
+        _rows(_RIGHT_OF_CORNER, np.cross(_TOWARDS_CORNER, _RIGHT_OF_CORNER), _TOWARDS_CORNER),
+    ),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """Straight lines to draw: ends (world, metres), diameters (0 for edges of meshes) and colours."""
+
+    start_m: Float64[ndarray, "n 3"]
+    end_m: Float64[ndarray, "n 3"]
+    diameter_m: Float64[ndarray, " n"]
+    colour: Float64[ndarray, "n 3"]
+
+
+def inspection_picture(inspection: Inspection) -> bytes:
+    """Return a PNG of a cage from four sides, with its diameters, sizes, and marks where bars overlap."""
+    colours = _colours(inspection.cage.bars)
+    lines = _lines(inspection.cage.bars, colours)
+    width, height = 2 * _PANEL_PX[0], 2 * _PANEL_PX[1] + 2 * _HEAD_PX
+    picture = Image.new("RGB", (width, height), _PAPER)
+    for number, side in enumerate(_SIDES):
+        place = (number % 2 * _PANEL_PX[0], number // 2 * _PANEL_PX[1] + _HEAD_PX)
+        picture.paste(_panel(inspection, lines, side), place)
+    _write_head(ImageDraw.Draw(picture), inspection, width)
+    _write_legend(ImageDraw.Draw(picture), colours, inspection, height - _HEAD_PX + 24)
+    stream = io.BytesIO()
+    picture.save(stream, "png")
+    return stream.getvalue()
+
+
+def _diameter_mm(bar: CageBar) -> float | None:
+    return round(bar.bar.diameter_m * 1000, 2) if bar.bar.has_axis else None
+
+
+def _colours(bars: Sequence[CageBar]) -> dict[float | None, tuple[int, int, int]]:
+    """Return the colour of each diameter in millimetres, the largest first; None is an unknown diameter."""
+    found = {_diameter_mm(bar) for bar in bars}
+    known = sorted((diameter for diameter in found if diameter is not None), reverse=True)
+    colours: dict[float | None, tuple[int, int, int]] = {
+        diameter: _COLOURS[number % len(_COLOURS)] for number, diameter in enumerate(known)
+    }
+    return colours | ({None: _UNKNOWN} if None in found else {})
+
+
+def _lines(bars: Sequence[CageBar], colours: dict[float | None, tuple[int, int, int]]) -> _Lines:
+    parts = []
+    for bar in bars:
+        if bar.bar.has_axis:
+            axis_m = np.array(bar.bar.axis_m)
+            start_m, end_m, diameter_m = axis_m[:-1], axis_m[1:], bar.bar.diameter_m
+        else:
+            start_m, end_m = _mesh_edges(bar)
+            diameter_m = 0.0
+        colour = np.array(colours[_diameter_mm(bar)], dtype=np.float64)
+        parts.append((start_m, end_m, np.full(len(start_m), diameter_m), np.tile(colour, (len(start_m), 1))))
+    start, end, diameter, colour = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return _Lines(start, end, diameter, colour)
+
+
+def _mesh_edges(bar: CageBar) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"]]:
+    assert bar.mesh is not None  # A bar without axis has a mesh.
+    corners = bar.mesh.faces
+    edges = np.unique(
+        np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])), axis=0
+    )
+    edges = edges[:: max(1, len(edges) // _MAX_EDGES)]
+    return bar.mesh.vertices_m[edges[:, 0]], bar.mesh.vertices_m[edges[:, 1]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Projection:
+    """Orthographic projection of the world onto a panel, in pixels of the oversampled panel."""
+
+    axes: Float64[ndarray, "3 3"]
+    px_per_m: float
+    middle_m: Float64[ndarray, " 2"]
+
+    @classmethod
+    def fitting(cls, axes: Float64[ndarray, "3 3"], box_m: Float64[ndarray, "2 3"]) -> _Projection:
+        corners_m = (
+            np.array([[x, y, z] for x in box_m[:, 0] for y in box_m[:, 1] for z in box_m[:, 2]]) @ axes[:2].T
+        )
+        lower_m, upper_m = corners_m.min(axis=0), corners_m.max(axis=0)
+        space_px = np.array([_PANEL_PX[0] - 2 * _MARGIN_PX, _PANEL_PX[1] - 4 * _MARGIN_PX])
+        scale = float((space_px / np.maximum(upper_m - lower_m, 1e-6)).min())
+        return cls(axes, scale * _OVERSAMPLING, (lower_m + upper_m) / 2)
+
+    def pixels(self, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 2"]:
+        """Return the places of points in the panel."""
+        right, up = (points_m @ self.axes[:2].T - self.middle_m).T * self.px_per_m
+        width, height = (side * _OVERSAMPLING for side in _PANEL_PX)
+        return np.stack([width / 2 + right, height / 2 - up], axis=-1)
+
+
+def _panel(inspection: Inspection, lines: _Lines, side: _Side) -> Image.Image:
+    large = Image.new("RGB", (_PANEL_PX[0] * _OVERSAMPLING, _PANEL_PX[1] * _OVERSAMPLING), _PAPER)
+    projection = _Projection.fitting(side.axes, inspection.box_m)
+    draw = ImageDraw.Draw(large)
+    _draw_lines(draw, lines, projection)
+    for overlap in (inspection.overlaps or ())[:_MAX_MARKS]:
+        ((x, y),) = projection.pixels(np.array([overlap.point_m])).tolist()
+        draw.ellipse((x - 9, y - 9, x + 9, y + 9), outline=_MARK, width=3)
+    panel = large.resize(_PANEL_PX, Image.Resampling.BOX)
+    draw = ImageDraw.Draw(panel)
+    draw.text((_MARGIN_PX, 10), side.title, _INK, font(20))
+    _draw_scale_bar(draw, projection.px_per_m / _OVERSAMPLING)
+    return panel
+
+
+def _draw_lines(draw: ImageDraw.ImageDraw, lines: _Lines, projection: _Projection) -> None:
+    """Draw lines from back to front, each with a dark outline where it is wide enough, paler in the distance."""
+    towards = projection.axes[2]
+    nearness_m = (lines.start_m + lines.end_m) @ towards / 2
+    span_m = float(np.ptp(nearness_m)) or 1.0
+    haze = _HAZE * (nearness_m.max() - nearness_m) / span_m
+    fill = (lines.colour + haze[:, None] * (255 - lines.colour)).round().astype(int)
+    width = np.maximum(lines.diameter_m * projection.px_per_m, _OVERSAMPLING).round().astype(int)
+    ends = np.concatenate([projection.pixels(lines.start_m), projection.pixels(lines.end_m)], axis=1)
+    for index in np.argsort(nearness_m, kind="stable").tolist():
+        x0, y0, x1, y1 = ends[index].tolist()
+        colour, wide = tuple(fill[index].tolist()), int(width[index])
+        if wide >= 4 * _OVERSAMPLING:
+            edge = tuple((fill[index] * 0.55).astype(int).tolist())
+            _draw_rod(draw, (x0, y0, x1, y1), wide, edge)
+            wide -= 2 * _OVERSAMPLING
+        _draw_rod(draw, (x0, y0, x1, y1), wide, colour)
+
+
+def _draw_rod(
+    draw: ImageDraw.ImageDraw, ends: tuple[float, float, float, float], width: int, colour: tuple[int, ...]
+) -> None:
+    """Draw a line with round ends, which also joins the pieces of a bend."""
+    draw.line(ends, fill=colour, width=width)
+    if width > 2 * _OVERSAMPLING:
+        radius = (width - 1) / 2
+        for x, y in (ends[:2], ends[2:]):
+            draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour)
+
+
+def _draw_scale_bar(draw: ImageDraw.ImageDraw, px_per_m: float) -> None:
+    """Draw a bar of 1, 2 or 5 times a power of ten metres, up to a quarter of the panel."""
+    longest_m = _PANEL_PX[0] / 4 / px_per_m
+    power = 10.0 ** np.floor(np.log10(longest_m))
+    length_m = max(step * power for step in (1, 2, 5) if step * power <= longest_m)
+    x, y = _MARGIN_PX, _PANEL_PX[1] - 30
+    end = x + length_m * px_per_m
+    draw.line((x, y, end, y), _INK, 3)
+    for tick in (x, end):
+        draw.line((tick, y - 6, tick, y + 6), _INK, 2)
+    text = f"{length_m:g} m" if length_m >= 1 else f"{length_m * 1000:g} mm"
+    draw.text((end + 10, y - 11), text, _INK, font(18))
+
+
+def _write_head(draw: ImageDraw.ImageDraw, inspection: Inspection, width: int) -> None:
+    lower_m, upper_m = inspection.box_m
+    sides = " x ".join(f"{side:.3f}" for side in upper_m - lower_m)
+    name = shortened(printable(inspection.name), 30, width - 2 * _MARGIN_PX)
+    draw.text((_MARGIN_PX, 14), name, _INK, font(30))
+    bars = counted(len(inspection.cage.bars), "bar")
+    words = [f"{bars}, {sides} m (x, y, z)"]
+    if inspection.overlaps:
+        words.append(f"red circles: {counted(len(inspection.overlaps), 'pair')} of bars overlap")
+    draw.text((_MARGIN_PX, 54), "; ".join(words), _GREY, font(20))
+
+
+def _write_legend(
+    draw: ImageDraw.ImageDraw,
+    colours: dict[float | None, tuple[int, int, int]],
+    inspection: Inspection,
+    y: int,
+) -> None:
+    """Write the diameters with their colours, in as many columns as fit."""
+    x = _MARGIN_PX
+    for colour, text in _legend_entries(colours, inspection):
+        end = x + 46 + font(20).getlength(text)
+        if end > 2 * _PANEL_PX[0] - _MARGIN_PX:
+            x, y, end = _MARGIN_PX, y + 30, _MARGIN_PX + 46 + font(20).getlength(text)
+        draw.line((x, y + 12, x + 34, y + 12), colour, 8)
+        draw.text((x + 46, y), text, _INK, font(20))
+        x = int(end) + 36
+
+
+def _legend_entries(
+    colours: dict[float | None, tuple[int, int, int]], inspection: Inspection
+) -> Iterator[tuple[tuple[int, int, int], str]]:
+    for diameter_mm, colour in colours.items():
+        count = sum(_diameter_mm(bar) == diameter_mm for bar in inspection.cage.bars)
+        name = "no diameter" if diameter_mm is None else f"{diameter_mm:g} mm"
+        yield colour, f"{name} ({count})"

@@ -1,0 +1,168 @@
+"""Report of an inspection: tables in the terminal, and JSON."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from dataset_builder.inspection.overlaps import MAX_PAIRS, MIN_OVERLAP_M
+from dataset_builder.inspection.summary import BarGroup, Inspection
+from dataset_builder.scene.assemblies.cage import CageBar
+from rebar_depth_bench.reporting.formatting import counted
+from rebar_depth_bench.reporting.tables import plain_text, print_unwrapped
+
+_MAX_GROUPS = 40
+_MAX_OVERLAPS = 10
+_MAX_REASONS = 20
+_AXIS_WORDS: Mapping[str | None, str] = {
+    "exact": "from the file",
+    "fitted": "fitted to a surface",
+    None: "unknown (no tube fits the surface)",
+}
+
+
+def inspection_json(inspection: Inspection) -> str:
+    """Return an inspection as JSON, as the contract defines it.
+
+    Further keys are ``box_m`` (lower and upper corner of the steel, world), ``overlaps`` (null if too many bars
+    are close to each other), ``notes`` and ``problems``, the reasons for which a build refuses the cage.
+    """
+    cage = inspection.cage
+    overlaps = inspection.overlaps
+    values = {
+        "bars": [_bar_values(bar) for bar in cage.bars],
+        "left_out": [vars(record) for record in cage.left_out],
+        "world_from_source": cage.world_from_source.tolist(),
+        "box_m": inspection.box_m.tolist(),
+        "overlaps": None if overlaps is None else [vars(overlap) for overlap in overlaps],
+        "notes": [f"{note.source}: {note.text}" for note in cage.notes],
+        "problems": [str(problem) for problem in cage.problems],
+    }
+    return json.dumps(values, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _bar_values(bar: CageBar) -> dict[str, Any]:
+    known = bar.bar.has_axis
+    return {
+        "bar_id": bar.bar.bar_id,
+        "role": bar.bar.role,
+        "diameter_m": bar.bar.diameter_m if known else None,
+        "length_m": bar.bar.length_m if known else None,
+        "axis": bar.axis_kind,
+        "source": bar.source,
+        "host": bar.host,
+        "storey": bar.storey,
+    }
+
+
+def print_inspection(inspection: Inspection, console: Console | None = None) -> None:
+    """Print the groups of bars, then what else there is to know about the cage.
+
+    ``console`` defaults to a new console on standard output.
+    """
+    console = console or Console()
+    print_unwrapped(console, _group_table(inspection.groups))
+    more = inspection.groups[_MAX_GROUPS:]
+    if more:
+        bars = sum(group.bars for group in more)
+        _print(
+            console, f"and {counted(len(more), 'more group')} of {counted(bars, 'bar')} (--json lists all bars)"
+        )
+    console.print()
+    for line in (*_axis_lines(inspection), *_place_lines(inspection), *_overlap_lines(inspection)):
+        _print(console, line)
+    for line in _left_out_lines(inspection):
+        _print(console, line)
+
+
+def _print(console: Console, line: str) -> None:
+    console.print(plain_text(line), soft_wrap=True)
+
+
+def _group_table(groups: Sequence[BarGroup]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
+    for head in ("diameter\nmm", "role\n", "host\n", "storey\n", "bars\n", "length\nm", "mass\nkg"):
+        is_text = head.strip() in ("role", "host", "storey")
+        table.add_column(head, justify="left" if is_text else "right", no_wrap=True)
+    for group in groups[:_MAX_GROUPS]:
+        table.add_row(*map(plain_text, _cells(group)))
+    if len(groups) > 1:
+        table.add_section()
+        table.add_row(*map(plain_text, _total_cells(groups)))
+    return table
+
+
+def _cells(group: BarGroup) -> list[str]:
+    diameter = "unknown" if group.diameter_mm is None else f"{group.diameter_mm:g}"
+    names = [group.role, group.host or "", group.storey or ""]
+    return [diameter, *names, str(group.bars), _decimals(group.length_m, 2), _decimals(group.mass_kg, 1)]
+
+
+def _total_cells(groups: Sequence[BarGroup]) -> list[str]:
+    bars = sum(group.bars for group in groups)
+    return ["all", "", "", "", str(bars), _total(group.length_m for group in groups), _total(
+        (group.mass_kg for group in groups), 1
+    )]  # fmt: skip
+
+
+def _total(values: Iterable[float | None], decimals: int = 2) -> str:
+    known = [value for value in values if value is not None]
+    return _decimals(sum(known) if known else None, decimals)
+
+
+def _decimals(value: float | None, decimals: int) -> str:
+    return "" if value is None else f"{value:.{decimals}f}"
+
+
+def _axis_lines(inspection: Inspection) -> list[str]:
+    kinds = Counter[str | None](bar.axis_kind for bar in inspection.cage.bars)
+    found = [f"{kinds[kind]} {words}" for kind, words in _AXIS_WORDS.items() if kinds[kind]]
+    return [f"axes: {', '.join(found)}"]
+
+
+def _place_lines(inspection: Inspection) -> list[str]:
+    """Return the box of the steel and the transform from the file's frame."""
+    lower, upper = inspection.box_m
+    sides = " x ".join(f"{side:.3f}" for side in upper - lower)
+    ranges = ", ".join(
+        f"{axis} {low:.3f} to {high:.3f}" for axis, low, high in zip("xyz", lower, upper, strict=True)
+    )
+    matrix = inspection.cage.world_from_source
+    rows = [f"  [{', '.join(f'{value:.12g}' for value in row)}]" for row in matrix[:3]]
+    is_placed = not np.array_equal(matrix, np.eye(4))
+    words = "world_from_source (coordinates of the file to metres of the world):"
+    return [f"steel: {sides} m ({ranges})", *([words, *rows] if is_placed else ["coordinates: those of the file"])]
+
+
+def _overlap_lines(inspection: Inspection) -> list[str]:
+    if inspection.overlaps is None:
+        return [f"overlaps: not compared, more than {MAX_PAIRS} places where bars are close to each other"]
+    if not inspection.overlaps:
+        return [f"overlaps: no bars penetrate each other by more than {MIN_OVERLAP_M * 1000:g} mm"]
+    count = len(inspection.overlaps)
+    verb = "penetrates another" if count == 1 else "penetrate each other"
+    lines = [f"overlaps: {counted(count, 'pair')} of bars {verb} by more than {MIN_OVERLAP_M * 1000:g} mm"]
+    worst = inspection.overlaps[:_MAX_OVERLAPS]
+    lines += [f"  bars {item.bar_a} and {item.bar_b}: {item.depth_m * 1000:.1f} mm" for item in worst]
+    return lines + _more(count - len(worst))
+
+
+def _left_out_lines(inspection: Inspection) -> list[str]:
+    left_out = inspection.cage.left_out
+    if not left_out:
+        return []
+    reasons = Counter(record.reason for record in left_out).most_common()
+    lines = [f"left out: {counted(len(left_out), 'object')}"]
+    lines += [f"  {count} x {reason}" for reason, count in reasons[:_MAX_REASONS]]
+    return lines + _more(len(reasons) - _MAX_REASONS)
+
+
+def _more(count: int) -> list[str]:
+    return [f"  and {count} more (--json lists all)"] if count > 0 else []

@@ -1,0 +1,99 @@
+"""Summary of a cage: groups of bars, the box of its steel, and overlaps."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from dataset_builder.inspection.overlaps import Overlap, TooManyNeighboursError, overlaps
+from dataset_builder.scene.assemblies.cage import Cage, CageBar
+
+STEEL_KG_PER_M3 = 7850.0
+"""Density of reinforcing steel (EN 1992-1-1, 3.2.7)."""
+
+Box = Float64[ndarray, "2 3"]
+"""Lower and upper corner."""
+
+
+@dataclass(frozen=True)
+class BarGroup:
+    """Bars of one diameter (None: unknown), role, host and storey: their number, total length and mass.
+
+    Length and mass are None if the diameter is unknown.
+    """
+
+    diameter_mm: float | None
+    role: str
+    host: str | None
+    storey: str | None
+    bars: int
+    length_m: float | None
+    mass_kg: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """Cage of the file ``name``, its groups, the box of its steel (world, metres) and its overlaps.
+
+    ``overlaps`` is None if too many bars are close to each other to compare them.
+    """
+
+    name: str
+    cage: Cage
+    groups: tuple[BarGroup, ...]
+    box_m: Box
+    overlaps: tuple[Overlap, ...] | None
+
+
+def inspect_cage(cage: Cage, name: str) -> Inspection:
+    """Return the summary of a cage of one or more bars."""
+    boxes_m = np.array([bar_box_m(bar) for bar in cage.bars])
+    box_m = np.array([boxes_m[:, 0].min(axis=0), boxes_m[:, 1].max(axis=0)])
+    try:
+        found: tuple[Overlap, ...] | None = tuple(overlaps([bar.bar for bar in cage.bars]))
+    except TooManyNeighboursError:
+        found = None
+    return Inspection(name, cage, tuple(_groups(cage.bars)), box_m, found)
+
+
+def bar_box_m(bar: CageBar) -> Box:
+    """Return the box of a bar's surface: of its mesh, or of a circle swept along its axis, without ribs.
+
+    A circle of radius r perpendicular to the unit vector t extends r * sqrt(1 - t_i^2) along the axis i.
+    """
+    if bar.mesh is not None:
+        points_m = bar.mesh.vertices_m
+        return np.array([points_m.min(axis=0), points_m.max(axis=0)])
+    points_m = bar.points_m
+    steps_m = np.diff(points_m, axis=0)
+    lengths_m = np.linalg.norm(steps_m, axis=1, keepdims=True)
+    tangents = np.divide(steps_m, lengths_m, out=np.zeros_like(steps_m), where=lengths_m > 0)
+    reach_m = bar.bar.diameter_m / 2 * np.sqrt(np.clip(1 - tangents**2, 0, 1))
+    lower_m = np.minimum(points_m[:-1], points_m[1:]) - reach_m
+    upper_m = np.maximum(points_m[:-1], points_m[1:]) + reach_m
+    return np.array([lower_m.min(axis=0), upper_m.max(axis=0)])
+
+
+def _groups(bars: Sequence[CageBar]) -> list[BarGroup]:
+    """Return the groups by descending diameter, then by role, host and storey; unknown diameters last."""
+    by_key: dict[tuple[float | None, str, str | None, str | None], list[float]] = defaultdict(list)
+    for bar in bars:
+        diameter_mm = round(bar.bar.diameter_m * 1000, 2) if bar.bar.has_axis else None
+        by_key[diameter_mm, bar.bar.role, bar.host, bar.storey].append(bar.bar.length_m)
+    ordered = sorted(by_key, key=lambda key: (-(key[0] or 0.0), key[1], key[2] or "", key[3] or ""))
+    return [_group(key, by_key[key]) for key in ordered]
+
+
+def _group(key: tuple[float | None, str, str | None, str | None], lengths_m: Sequence[float]) -> BarGroup:
+    diameter_mm, role, host, storey = key
+    if diameter_mm is None:
+        return BarGroup(None, role, host, storey, len(lengths_m), None, None)
+    length_m = math.fsum(lengths_m)
+    mass_kg = math.pi / 4 * (diameter_mm / 1000) ** 2 * length_m * STEEL_KG_PER_M3
+    return BarGroup(diameter_mm, role, host, storey, len(lengths_m), length_m, mass_kg)
