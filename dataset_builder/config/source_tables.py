@@ -30,7 +30,7 @@ from rebar_depth_bench.validation import Expected, StrictModel, Triple, number, 
 MAX_SELECTIONS = 100
 _MESH_KEYS = ("name", "box")
 _Pattern = Annotated[str, text(200, 'a name or a glob pattern such as "Level 1*"')]
-_Corner = Annotated[Triple, three_numbers(-1e9, 1e9, "two corners, [[x, y, z], [x, y, z]]")]
+_Corner = Annotated[Triple, three_numbers(-1e12, 1e12, "three numbers from -1e12 to 1e12, [x, y, z]")]
 
 UpKey = Annotated[Up, one_of("z", "y")]
 OriginKey = Annotated[Origin, one_of("centre", "keep")]

@@ -99,13 +99,18 @@ def read_bars(
     reader = _Reader(model, relations, before_kernel)
     yield Project(reader.unit_m)
     yield from left_out
+    outside = 0
     for item in chosen:
         shapes = list(reader.shapes(item.entity))
         points = np.concatenate([_points_m(shape) for shape in shapes]) / reader.unit_m
         if item.tables and not any(table.contains(points) for table in item.tables):
+            outside += 1
             yield left_out_object(item.entity, "not inside the box of a [[select]] table")
         else:
             yield from shapes
+    if outside == len(chosen):
+        found = f"{outside} selected objects are not wholly inside"
+        raise MeshError(f"no object is inside the box of a [[select]] table: {found}, expected one or more")
 
 
 def _points_m(shape: Shape) -> Float64[ndarray, "n 3"]:

@@ -1,0 +1,181 @@
+"""The command ``rebar-build inspect``: what it prints and writes for sound, damaged and hostile files."""
+
+from __future__ import annotations
+
+import json
+import math
+from io import BytesIO, StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from rich.console import Console
+
+from dataset_builder.cli import main
+from dataset_builder.inspection.picture import inspection_picture
+from dataset_builder.inspection.report import inspection_json, print_inspection
+from dataset_builder.inspection.summary import bar_box_m, inspect_cage
+from dataset_builder.pipeline.notes import MAX_NOTES, print_notes
+from dataset_builder.scene.assemblies.bar_meshes import bar_mesh
+from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut
+from dataset_builder.scene.model import Mesh, Note, axis_of
+from dataset_builder.scene.shapes.bending import bent_line_m
+from rebar_depth_bench.data.bars import Bar
+from tests.builder.config.scene_files import BAR, MM, write_scene
+from tests.builder.scene.ifc_writer import Ifc
+from tests.commands import run_in_process
+
+COLUMN = Path("examples/column.ifc")
+KEYS = {"bar_id", "role", "diameter_m", "length_m", "axis", "source", "host", "storey"}
+
+
+def rods(folder: Path) -> Path:
+    """Write a rod of 12 mm and a box, whose axis is unknown, in millimetres."""
+    rod = trimesh.creation.cylinder(6, segment=[[0, 0, 100], [500, 0, 100]], sections=24)
+    block = trimesh.creation.box((40, 80, 20), trimesh.transformations.translation_matrix((0, 300, 100)))
+    trimesh.util.concatenate([rod, block]).export(folder / "Rods.stl")
+    return folder / "Rods.stl"
+
+
+def test_json_lists_every_bar(tmp_path: Path) -> None:
+    outputs = tmp_path / "a.json", tmp_path / "a.png"
+    completed = run_in_process(main, "inspect", COLUMN, "--json", outputs[0], "--picture", outputs[1])
+    assert completed.returncode == 0, completed.stderr
+    values = json.loads(outputs[0].read_text())
+    assert [bar["bar_id"] for bar in values["bars"]] == list(range(1, 14))
+    assert all(bar.keys() == KEYS and bar["axis"] == "exact" for bar in values["bars"])
+    assert {bar["storey"] for bar in values["bars"]} == {"Ground"}
+    assert values["world_from_source"] == np.diag([0.001, 0.001, 0.001, 1]).tolist()
+    uprights = [bar for bar in values["bars"] if bar["diameter_m"] == 0.008]
+    assert len(uprights) == 8
+    np.testing.assert_allclose([bar["length_m"] for bar in uprights], 0.2, atol=1e-3)
+    with Image.open(outputs[1]) as picture:
+        assert picture.format == "PNG"
+        assert picture.width >= 1600
+    mass_kg = sum(math.pi / 4 * bar["diameter_m"] ** 2 * bar["length_m"] * 7850 for bar in values["bars"])
+    assert f"{mass_kg:.1f}" in completed.stdout.splitlines()[-9]
+
+
+def test_mesh_file_has_fitted_and_unknown_axes(tmp_path: Path) -> None:
+    completed = run_in_process(main, "inspect", rods(tmp_path), "--mesh-unit", "mm", "--json", "-")
+    assert completed.returncode == 0, completed.stderr
+    rod, block = json.loads(completed.stdout)["bars"]
+    assert (rod["axis"], rod["source"], rod["host"]) == ("fitted", "part 1", None)
+    assert rod["diameter_m"] == pytest.approx(0.012, rel=0.01)
+    assert rod["length_m"] == pytest.approx(0.5, rel=0.005)
+    assert (block["axis"], block["diameter_m"], block["length_m"]) == (None, None, None)
+
+
+def test_dash_suppresses_the_table(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path, MM + BAR)
+    completed = run_in_process(main, "inspect", scene, "--json", "-")
+    assert json.loads(completed.stdout)["bars"][0]["source"] == "bar 1"
+    assert "steel:" in run_in_process(main, "inspect", scene).stdout
+
+
+def test_problems_are_told_after_everything_else(tmp_path: Path) -> None:
+    ifc = Ifc()
+    ifc.bar(ifc.disc(ifc.polyline((0, 0, 0), (500, 0, 0)), 8.0), NominalDiameter=32.0)
+    ifc.file.write(str(tmp_path / "a.ifc"))
+    completed = run_in_process(main, "inspect", tmp_path / "a.ifc", "--json", tmp_path / "a.json")
+    assert completed.returncode == 2
+    assert "16 mm in the geometry, 32 mm as declared" in completed.stderr
+    assert len(json.loads((tmp_path / "a.json").read_text())["problems"]) == 1
+    trusting = write_scene(tmp_path, 'ifc = "a.ifc"\ntrust = "geometry"\n')
+    assert run_in_process(main, "inspect", trusting).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.toml", "x", "a.toml"),
+        ("a.ifc", "ISO-10303-21;", "a.ifc"),
+        ("a.stl", "solid x", "a.stl"),
+        ("a.txt", "", "a.txt"),
+        ("a.toml", 'ifc = "missing.ifc"', "missing.ifc"),
+    ],
+)
+def test_unreadable_files_are_refused(tmp_path: Path, name: str, content: str, words: str) -> None:
+    (tmp_path / name).write_text(content)
+    completed = run_in_process(main, "inspect", tmp_path / name, "--picture", tmp_path / "a.png")
+    assert completed.returncode == 2
+    assert words in completed.stderr
+    assert "Traceback" not in completed.stderr
+    assert not (tmp_path / "a.png").exists()
+
+
+@pytest.mark.parametrize("output", ["scene.toml", "Rods.stl"])
+def test_inputs_are_not_overwritten(tmp_path: Path, output: str) -> None:
+    rods(tmp_path)
+    scene = write_scene(tmp_path, 'mesh = "Rods.stl"\nunit = "mm"\n', "scene.toml")
+    before = (tmp_path / output).read_bytes()
+    completed = run_in_process(main, "inspect", scene, "--json", tmp_path / output)
+    assert completed.returncode == 2
+    assert (tmp_path / output).read_bytes() == before
+
+
+def bars_of(*bars: Bar, **fields: str) -> Cage:
+    return Cage(tuple(CageBar(f"bar {bar.bar_id}", bar, source=f"bar {bar.bar_id}", **fields) for bar in bars))  # type: ignore[arg-type]
+
+
+def printed(cage: Cage) -> str:
+    stream = StringIO()
+    print_inspection(inspect_cage(cage, "a"), Console(file=stream, width=80))
+    return stream.getvalue()
+
+
+def test_hostile_names_are_shown_as_escapes() -> None:
+    cage = bars_of(
+        Bar(1, "[red]\x1b[31m", 0.01, ((0, 0, 0.1), (1, 0, 0.1))), host="\x07" + "W" * 300, storey="[b]"
+    )
+    text = printed(cage)
+    assert "\x1b" not in text
+    assert "\x07" not in text
+    assert "[red]" in text
+    assert inspection_picture(inspect_cage(cage, "a\x1b" * 300))
+
+
+def test_long_lists_are_cut_and_counted() -> None:
+    bars = [Bar(n, f"role {n}", 0.02, ((0, n * 0.01, 0.1), (1, n * 0.01, 0.1))) for n in range(1, 101)]
+    left_out = tuple(LeftOut(str(number), f"IfcWall: reason {number}") for number in range(50))
+    text = printed(Cage(bars_of(*bars).bars, left_out))
+    assert "and 60 more groups of 60 bars" in text
+    assert "left out: 50 objects" in text
+    assert "and 30 more" in text
+    assert "overlaps: 99 pairs" in text
+    assert "and 89 more" in text
+
+
+def test_box_is_that_of_the_mesh() -> None:
+    corners_m = np.array([[0, 0, 0], [0.4, 0.1, 0.05], [0.4, 0.6, 0.3], [0.1, 0.6, 0.9]])
+    bar = CageBar("a", Bar(1, "bar", 0.016, axis_of(bent_line_m(corners_m, 0.04))), ribs=False)
+    vertices_m = bar_mesh(bar).vertices_m
+    np.testing.assert_allclose(bar_box_m(bar), [vertices_m.min(axis=0), vertices_m.max(axis=0)], atol=2e-4)
+
+
+@pytest.mark.parametrize("scale", [0.1, 12.0])
+def test_picture_shows_bars_of_every_size(scale: float) -> None:
+    plate = trimesh.creation.box((scale / 3, scale / 3, 0.01))
+    mesh = Mesh(np.array(plate.vertices), np.array(plate.faces, np.int32))
+    cage = bars_of(Bar(1, "bar", 0.012, ((0, 0, 0.1), (scale, 0, 0.1))))
+    cage = Cage((*cage.bars, CageBar("plate", Bar.without_axis(2, "imported"), mesh=mesh)))
+    with Image.open(BytesIO(inspection_picture(inspect_cage(cage, "a")))) as picture:
+        pixels = np.asarray(picture)
+    corners = [(row, column) for row in (90, 730) for column in (0, 960)]
+    panels = [pixels[row : row + 640, column : column + 960] for row, column in corners]
+    for panel in panels:
+        assert (panel[60:580].max(axis=2).astype(int) - panel[60:580].min(axis=2) > 40).any()
+    json.loads(inspection_json(inspect_cage(cage, "a")))
+
+
+def test_notes_are_cut_and_lengths_come_last(capsys: pytest.CaptureFixture[str]) -> None:
+    bar = Bar(1, "bar", 0.01, ((0, 0, 0), (1, 0, 0)))
+    notes = [Note("a", "length", f"length {number}") for number in range(30)]
+    cage = Cage((CageBar("a", bar, notes=(*notes, Note("a", "gap", "a gap"))),))
+    print_notes(cage.notes)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "note: a: a gap"
+    assert len(lines) == MAX_NOTES + 1
+    assert "11 more notes" in lines[-1]
