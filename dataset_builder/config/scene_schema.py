@@ -6,8 +6,9 @@ unit = "mm"                   # of every length: m, cm, mm, in, ft
 environment = "laboratory"    # or "outdoors"
 board = 6                     # markers on the A3 sheet: 6, 12, or false for no sheet
 
-[cameras]                     # default: a dome around the assembly
-kind = "dome"                 # or "ring" with radius, elevation_deg, azimuths
+[cameras]                     # default: a dome around the assembly, or a survey of large steel
+kind = "dome"                 # or "ring" with radius, elevation_deg, azimuths;
+                              # or "survey" with, if wanted, distances, views_per_distance, seed
 radii = [300, 400]
 elevations_deg = [15, 45]
 azimuths = 12
@@ -33,8 +34,8 @@ from typing import Annotated, Any
 
 from pydantic import Strict, ValidationInfo, field_validator
 
-from dataset_builder.config.camera_tables import DomeTable, RingTable, camera_conflicts, list_of, read_cameras
-from dataset_builder.config.specs import DomeSpec, RingSpec
+from dataset_builder.config.camera_tables import AnyCamerasTable, camera_conflicts, list_of, read_cameras
+from dataset_builder.config.specs import TrajectorySpec
 from dataset_builder.scene.model import MAX_BARS, to_metres
 from dataset_builder.scene.variants import VARIANTS
 from rebar_depth_bench.errors import InputError, Problem
@@ -146,7 +147,7 @@ class SceneToml(StrictModel):
     ifc: _File | None = None
     environment: Annotated[str, one_of(*ENVIRONMENTS)] | None = None
     board: Annotated[int | bool, Expected("6, 12 or false", lambda markers: markers in (0, 6, 12))] | None = None
-    cameras: DomeTable | RingTable | None = None
+    cameras: AnyCamerasTable | None = None
 
     @property
     def unit_m(self) -> float:
@@ -154,8 +155,8 @@ class SceneToml(StrictModel):
         return _unit_m(self.unit)
 
     @property
-    def trajectory(self) -> DomeSpec | RingSpec | None:
-        """Camera trajectory in metres, or None for the default."""
+    def trajectory(self) -> TrajectorySpec | None:
+        """Camera trajectory in metres, a survey without its stations, or None for the default."""
         return None if self.cameras is None else self.cameras.trajectory(self.unit_m)
 
     @property
