@@ -23,8 +23,9 @@ from dataset_builder.scene.steel_distance import Cylinders
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.dataset import iterate_rows
-from rebar_depth_bench.data.dataset_config import CENTRE, DatasetConfig
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.trajectory import CENTRE
 from rebar_depth_bench.geometry.cameras import camera_centre
 from rebar_depth_bench.scoring.protocol import scored_pixels, single_bar_pixels
 
@@ -41,7 +42,7 @@ def main(root: str, json_file: str | None = None) -> None:
     for name, config in folder.config_by_name.items():
         views = measure_views(config, Cylinders.from_bars(bars[config.scene.name]))
         protocol = config.manifest_entry["protocol"]
-        radii_m = protocol.get("radii_m", [protocol.get("radius_m")])
+        radii_m = protocol.get("radii_m") or protocol.get("distances_m") or [protocol["radius_m"]]
         if len(views) == config.protocol_views:
             complete[name] = summary(config, views)
             shells = zip(radii_m, np.split(views, len(radii_m)), strict=True)

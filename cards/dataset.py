@@ -11,8 +11,9 @@ from huggingface_hub import DatasetCardData
 from cards.steel import depth_text, steel_by_config
 from cards.templates import render
 from rebar_depth_bench.data.columns import COLUMN_DESCRIPTIONS, column_kind, features
-from rebar_depth_bench.data.dataset_config import CENTRE, NEAREST_STEEL, DatasetConfig
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.shards import SCENE_COLUMN, lacks_scene_column
+from rebar_depth_bench.data.trajectory import CENTRE, NEAREST_STEEL, SURVEY
 from rebar_depth_bench.reporting.formatting import DASH
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.view_ids import TEST_SPLIT
@@ -164,6 +165,8 @@ def _steel_source(assembly: Mapping[str, Any]) -> str:
 def _distance(protocol: Mapping[str, Any]) -> str:
     if protocol["kind"] == "ring":
         return f"{protocol['radius_m']:g} m"
+    if protocol["kind"] == SURVEY:
+        return f"{min(protocol['distances_m']):g}-{max(protocol['distances_m']):g} m, steel aimed at"
     to_steel = ", nearest steel" if protocol.get("distance_to") == NEAREST_STEEL else ""
     return f"{min(protocol['radii_m']):g}-{max(protocol['radii_m']):g} m{to_steel}"
 

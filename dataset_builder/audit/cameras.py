@@ -22,7 +22,14 @@ from dataset_builder.audit.report import Check
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
 from dataset_builder.config.catalog import view_id
 from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import DistanceSweepSpec, DomeSpec, RigSpec, RingSpec, TrajectorySpec
+from dataset_builder.config.specs import (
+    DistanceSweepSpec,
+    DomeSpec,
+    RigSpec,
+    RingSpec,
+    SurveySpec,
+    TrajectorySpec,
+)
 from dataset_builder.config.trajectories import poses, subset
 from dataset_builder.scene.assemblies import aim_point_m
 from dataset_builder.scene.mesh_ply import read_mesh_ply
@@ -34,12 +41,14 @@ from rebar_depth_bench.data.eye_view import CAMERA_KINDS
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera, camera_centre
 from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
+from rebar_depth_bench.validation import short_repr
 
 _Spec = TypeVar("_Spec")
 _TRAJECTORY_SPECS: Mapping[str, Callable[..., TrajectorySpec]] = {
     "dome": DomeSpec,
     "ring": RingSpec,
     "sweep": DistanceSweepSpec,
+    "survey": SurveySpec,
 }
 
 
@@ -58,8 +67,8 @@ def _spec_from_manifest(config: DatasetConfig, key: str, make_spec: Callable[[An
         return make_spec(config.manifest_entry[key])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DatasetError(
-            f"manifest: the {key} of config {config.name} is {config.manifest_entry.get(key)!r}, expected a value "
-            f"that this version writes: {type(error).__name__}: {error}"
+            f"manifest: the {key} of config {config.name} is {short_repr(config.manifest_entry.get(key))}, "
+            f"expected a value that this version writes: {type(error).__name__}: {error}"
         ) from None
 
 

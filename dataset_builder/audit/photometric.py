@@ -8,13 +8,16 @@ through the three lowest costs gives the shift to hundredths of a pixel.
 Close steel is reported but not checked: the light and dark sides of a round bar depend on the eye's position.
 Between two eyes they move by about half the angle between the eyes times the bar's radius. Non-steel pixels within
 three pixels of a depth discontinuity are left out: their colour is mixed with that of a nearer surface of another
-parallax.
+parallax. So are those near ground so far and low that its depth changes by percents from pixel to pixel: its own
+pixels do not pass the test of visibility, and of the edge where a wall or a wood stands on it only one side would
+be compared, at different costs for shifts to both sides.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
@@ -49,6 +52,8 @@ _MIN_GRADIENT = 4.0
 _MAX_DIFFERENCE_LEVELS = 40.0
 """Clipping limit of the intensity difference, levels: bounds the weight of highlights that only one eye sees."""
 _RELATIVE_DEPTH_TOLERANCE = 0.03
+_WHOLE_PX = 1e-6
+"""Largest difference of a whole coordinate from a whole number, pixels."""
 _MAX_SHADING_SHIFT_PX = 0.05
 """Largest shift of a bar's shading between the eyes for the bar to count as view-independent, pixels."""
 _DEPTH_JUMP_PX = 0.2
@@ -166,7 +171,7 @@ def _smoothed_grey(eye: AuditedEye) -> Float32[ndarray, "h w"]:
 def _textured_pixels(levels: Float32[ndarray, "h w"], eye: AuditedEye, baseline_m: float) -> Int64[ndarray, " n"]:
     """Return the flat indices of pixels with depth and texture, evenly subsampled to at most 120,000.
 
-    Non-steel pixels near a depth discontinuity are left out.
+    Non-steel pixels near a depth discontinuity or a steep change of depth are left out.
     """
     along_u, along_v = (cv2.Sobel(levels, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
     textured = np.hypot(along_u, along_v) >= _MIN_GRADIENT
@@ -174,7 +179,12 @@ def _textured_pixels(levels: Float32[ndarray, "h w"], eye: AuditedEye, baseline_
     parallax_px = np.divide(
         eye.camera.K[0, 0] * baseline_m, eye.depth_m, out=np.zeros(has_depth.shape), where=has_depth
     )
+    around = np.ones((3, 3), dtype=np.uint8)
+    rise_m = np.maximum(
+        cv2.dilate(eye.depth_m, around) - eye.depth_m, eye.depth_m - cv2.erode(eye.depth_m, around)
+    )
     jump = (np.abs(cv2.Laplacian(parallax_px, cv2.CV_64F)) > _DEPTH_JUMP_PX) | eye.mask
+    jump |= rise_m >= _RELATIVE_DEPTH_TOLERANCE * eye.depth_m
     near = np.ones((2 * _DEPTH_JUMP_MARGIN_PX + 1,) * 2, dtype=np.uint8)
     near_jump = cv2.dilate(jump.astype(np.uint8), near) > 0
     return _evenly_subsampled(np.flatnonzero(textured & has_depth & (eye.mask | ~near_jump)), 6)
@@ -183,12 +193,16 @@ def _textured_pixels(levels: Float32[ndarray, "h w"], eye: AuditedEye, baseline_
 def _is_visible(
     eye: AuditedEye, px: Float64[ndarray, "n 2"], depth_m: Float64[ndarray, " n"], bars: ndarray
 ) -> Bool[ndarray, " n"]:
-    """Return whether the eye's four pixels around each projection have the point's bar id and about its depth."""
-    u, v = np.floor(px).astype(int).T
+    """Return whether the eye's pixels around each projection have the point's bar id and about its depth.
+
+    They are four, or fewer where a coordinate is whole. The rows of parallel eyes are: a row more, always the one
+    below, would leave out the lower sides of thin bars only.
+    """
+    low, high = np.floor(px + _WHOLE_PX).astype(int), np.ceil(px - _WHOLE_PX).astype(int)
     visible = np.ones(len(px), dtype=bool)
-    for dv, du in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        visible &= np.abs(eye.depth_m[v + dv, u + du] - depth_m) < _RELATIVE_DEPTH_TOLERANCE * depth_m
-        visible &= eye.bars[v + dv, u + du] == bars
+    for u, v in product((low[:, 0], high[:, 0]), (low[:, 1], high[:, 1])):
+        visible &= np.abs(eye.depth_m[v, u] - depth_m) < _RELATIVE_DEPTH_TOLERANCE * depth_m
+        visible &= eye.bars[v, u] == bars
     return visible
 
 

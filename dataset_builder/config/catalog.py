@@ -25,7 +25,7 @@ from dataset_builder.config.specs import (
     SceneSpec,
 )
 from dataset_builder.scene.variants import VARIANTS, check_variants
-from rebar_depth_bench.data.dataset_config import NEAREST_STEEL
+from rebar_depth_bench.data.trajectory import NEAREST_STEEL
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 

@@ -17,9 +17,17 @@ from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.scene_name import scene_name_of
 from dataset_builder.config.scene_schema import SCENE_NAME, SceneToml, read_scene_toml
-from dataset_builder.config.specs import ConfigSpec, DomeSpec, SceneSpec
+from dataset_builder.config.specs import (
+    ConfigSpec,
+    DomeSpec,
+    RigSpec,
+    SceneSpec,
+    SurveySpec,
+    TrajectorySpec,
+)
+from dataset_builder.config.survey import CameraSpace, with_stations
 from dataset_builder.config.trajectories import camera_offsets_m
-from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
+from dataset_builder.scene.assemblies import aim_point_m, check_above_ground, check_fits, make_assembly
 from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, read_cage
 from dataset_builder.scene.assemblies.mesh_file import default_up, mesh_file_spec
@@ -47,7 +55,16 @@ Objects lie on the bench beyond the first, furniture stands beyond the second.
 """
 
 OUTDOORS_CAMERA_RADIUS_M = 20.5
-"""Maximum horizontal distance of cameras from the world origin outdoors, metres: the ground is clear within it."""
+"""Maximum horizontal distance of cameras, and of steel that is surveyed, from the world origin outdoors, metres.
+
+The ground is clear within it.
+"""
+
+_CAMERA_SPACES = {
+    "laboratory": CameraSpace(LABORATORY_CAMERA_RADIUS_M, clear_radius_m=0.6, objects_m=0.2),
+    "outdoors": CameraSpace(OUTDOORS_CAMERA_RADIUS_M, clear_radius_m=OUTDOORS_CAMERA_RADIUS_M),
+}
+"""Spaces for the cameras of a survey by environment; the objects of the laboratory are those on its bench."""
 
 _DEFAULT_MARKERS = {"laboratory": 6, "outdoors": 0}
 
@@ -56,9 +73,9 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     """Return the config of a scene file, with the default rig, colour settings and seed.
 
     Defaults of omitted keys: the name is that of the file in lower case, with hyphens; the cameras are
-    ``default_dome``; the environment is the laboratory if all steel is within 0.45 m and all cameras are within
-    1.6 m of its centre, otherwise outdoors; the board has 6 markers in the laboratory, and there is no board
-    outdoors.
+    ``default_dome``, or a survey if that does not fit outdoors; the environment is the laboratory if all steel is
+    within 0.45 m and all cameras are within 1.6 m of its centre (wherever a survey places them), otherwise
+    outdoors; the board has 6 markers in the laboratory, and there is no board outdoors.
 
     Raises ``InputError`` if the file is neither TOML nor IFC, listing every missing, unknown or invalid key, for
     an invalid name, and if the assembly or the cameras do not fit. Raises ``MeshError`` if the cage or mesh is
@@ -71,32 +88,27 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     with _scene_and_key_named(scene_toml, path):
         assembly_spec = _assembly_spec(scene_toml, path)
         assembly = make_assembly(assembly_spec)
-    trajectory = scene_toml.trajectory or default_dome(assembly)
-    scene = SceneSpec(name, assembly_spec, None, scene_toml.environment or "laboratory")
-    config = ConfigSpec(name, scene, trajectory)
-    camera_radius_m = _camera_distance_m(assembly, config)
+    trajectory = scene_toml.trajectory or _default_trajectory(assembly)
+    camera_radius_m = _camera_radius_m(assembly, trajectory)
     misfit = _laboratory_misfit(assembly, camera_radius_m)
     environment = scene_toml.environment or ("outdoors" if misfit else "laboratory")
     if environment == "laboratory" and misfit:
         raise InputError(f'{path}: {misfit}: place the cage at the origin, or set environment = "outdoors"')
-    if camera_radius_m > OUTDOORS_CAMERA_RADIUS_M and scene_toml.trajectory is None:
-        raise InputError(
-            f"{path}: the cage is too large for the default camera dome: cameras would be "
-            f"{camera_radius_m:.4g} m from the world's origin, expected at most {OUTDOORS_CAMERA_RADIUS_M} m. "
-            "Check the unit and the position of the cage, or define [cameras] in a TOML file"
-        )
-    if camera_radius_m > OUTDOORS_CAMERA_RADIUS_M:
-        raise InputError(
-            f"{path}: cameras are {camera_radius_m:.4g} m from the world's origin, expected at most "
-            f"{OUTDOORS_CAMERA_RADIUS_M} m: is the unit right, and is the cage at the origin?"
-        )
+    if isinstance(trajectory, SurveySpec):
+        _check_outdoors_radius(path, "the steel extends", _steel_radius_m(assembly))
+    else:
+        _check_outdoors_radius(path, "cameras are", camera_radius_m)
     try:
+        check_above_ground(assembly, name)
+        if isinstance(trajectory, SurveySpec):
+            trajectory = with_stations(trajectory, assembly, _CAMERA_SPACES[environment], RigSpec(), str(path))
+        config = ConfigSpec(name, SceneSpec(name, assembly_spec, None, environment), trajectory)
         check_fits(assembly, config)
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from None
     markers = _DEFAULT_MARKERS[environment] if scene_toml.board is None else scene_toml.board
     board = BoardSpec(markers=markers) if markers else None
-    return replace(config, scene=replace(scene, environment=environment, board=board))
+    return replace(config, scene=replace(config.scene, board=board))
 
 
 def scene_cage(path: str | os.PathLike[str], mesh_unit: str | float = "m") -> Cage:
@@ -122,6 +134,12 @@ def files_of_scene(path: str | os.PathLike[str]) -> list[Path]:
     scene_toml = _read_scene(path)
     named = scene_toml.mesh or scene_toml.ifc
     return [path] if named is None else [path, path.parent / named]
+
+
+def _default_trajectory(assembly: Assembly) -> DomeSpec | SurveySpec:
+    """Return the default dome, or a survey without its stations if the dome does not fit outdoors."""
+    dome = default_dome(assembly)
+    return dome if _camera_radius_m(assembly, dome) <= OUTDOORS_CAMERA_RADIUS_M else SurveySpec()
 
 
 def default_dome(assembly: Assembly) -> DomeSpec:
@@ -177,16 +195,35 @@ def _scene_and_key_named(scene_toml: SceneToml, path: Path) -> Iterator[None]:
         raise named from error
 
 
-def _camera_distance_m(assembly: Assembly, config: ConfigSpec) -> float:
-    """Return the largest horizontal distance of a left camera from the world origin, metres."""
+def _camera_radius_m(assembly: Assembly, trajectory: TrajectorySpec) -> float:
+    """Return the largest horizontal distance of a left camera from the world origin, metres.
+
+    For a survey, which has no stations yet, this is the largest distance that they could have.
+    """
+    if isinstance(trajectory, SurveySpec):
+        return _steel_radius_m(assembly) + max(trajectory.distances_m)
     aim_m = aim_point_m(assembly)
-    offsets_m = camera_offsets_m(config.protocol, aim_m, assembly.bars)
+    offsets_m = camera_offsets_m(trajectory, aim_m, assembly.bars)
     return max(float(np.linalg.norm((aim_m + offset_m)[:2])) for offset_m in offsets_m)
+
+
+def _steel_radius_m(assembly: Assembly) -> float:
+    """Return the largest horizontal distance of steel from the world origin, metres."""
+    return float(np.linalg.norm(assembly.vertices_m[:, :2], axis=1).max())
+
+
+def _check_outdoors_radius(path: Path, what: str, radius_m: float) -> None:
+    """Raise ``InputError`` if ``what`` is beyond the cleared ground of the outdoor environment."""
+    if radius_m > OUTDOORS_CAMERA_RADIUS_M:
+        raise InputError(
+            f"{path}: {what} {radius_m:.4g} m from the world's origin, expected at most "
+            f"{OUTDOORS_CAMERA_RADIUS_M} m: is the unit right, and is the cage at the origin?"
+        )
 
 
 def _laboratory_misfit(assembly: Assembly, camera_radius_m: float) -> str | None:
     """Return why the assembly or its cameras do not fit into the laboratory, or None if they do."""
-    steel_radius_m = float(np.linalg.norm(assembly.vertices_m[:, :2], axis=1).max())
+    steel_radius_m = _steel_radius_m(assembly)
     if steel_radius_m > LABORATORY_STEEL_RADIUS_M:
         return (
             f"the steel extends {steel_radius_m:.4g} m from the laboratory's centre, "

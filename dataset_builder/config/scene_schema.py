@@ -6,8 +6,9 @@ unit = "mm"                   # of every length: m, cm, mm, in, ft; default with
 environment = "laboratory"    # or "outdoors"
 board = 6                     # markers on the A3 sheet: 6, 12, or false for no sheet
 
-[cameras]                     # default: a dome around the assembly
-kind = "dome"                 # or "ring" with radius, elevation_deg, azimuths
+[cameras]                     # default: a dome around the assembly, or a survey of large steel
+kind = "dome"                 # or "ring" with radius, elevation_deg, azimuths;
+                              # or "survey" with, if wanted, distances, views_per_distance, seed
 radii = [300, 400]
 elevations_deg = [15, 45]
 azimuths = 12
@@ -31,8 +32,9 @@ from itertools import count
 from pathlib import PurePosixPath
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Strict, ValidationInfo, field_validator
+from pydantic import Strict, ValidationInfo, field_validator
 
+from dataset_builder.config.camera_tables import AnyCamerasTable, camera_conflicts, list_of, read_cameras
 from dataset_builder.config.file_specs import Origin, PlacementSpec, Up
 from dataset_builder.config.source_tables import (
     MAX_SELECTIONS,
@@ -44,8 +46,8 @@ from dataset_builder.config.source_tables import (
     UpKey,
     selection_conflicts,
 )
-from dataset_builder.config.specs import DomeSpec, RigSpec, RingSpec
-from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS
+from dataset_builder.config.specs import TrajectorySpec
+from dataset_builder.scene.model import MAX_BARS, to_metres
 from dataset_builder.scene.selection import Selection
 from dataset_builder.scene.variants import VARIANTS
 from rebar_depth_bench.errors import InputError, Problem
@@ -70,9 +72,6 @@ UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254,
 
 ENVIRONMENTS = ("laboratory", "outdoors")
 SOURCES = ("bar", "mesh", "ifc")
-MAX_VIEWS = 10_000
-"""Maximum number of views of a config: the index in a view id has four digits."""
-_MAX_AZIMUTHS = 3600
 
 
 def _is_scene_name(name: str) -> bool:
@@ -89,28 +88,6 @@ SCENE_NAME = Expected(
 """Description of scene names, which are also the names of configs."""
 
 
-def _to_metres(length: float, unit_m: float) -> float:
-    """Return a length in metres, rounded to the picometre.
-
-    The rounding removes the floating-point error of the conversion: 9 mm is exactly 0.009 m, 16 mm exactly 0.016.
-    """
-    return round(length * unit_m, METRE_DECIMALS)
-
-
-def _check_distance(distance: float, info: ValidationInfo[float]) -> float:
-    """Check that a camera distance is at least the rig's baseline; ``info.context`` is the unit in metres."""
-    distance_m = _to_metres(distance, info.context)
-    if distance_m < RigSpec.baseline_m:
-        found = f"cameras are {distance_m:.4g} m from the aim point"
-        expected = f"at least the rig's baseline, {RigSpec.baseline_m} m: is the unit right?"
-        raise field_error(found, expected, "conflict")
-    return distance
-
-
-def _list_of(expected: str, min_length: int = 1) -> Expected:
-    return Expected(expected, lambda values: min_length <= len(values) <= 10_000)
-
-
 def _is_below(path: str) -> bool:
     """Return whether a relative path stays in its folder: a scene file names no other files of the machine."""
     parts = PurePosixPath(path).parts
@@ -125,38 +102,6 @@ _ROLE = Expected(
 _File = Annotated[str, Expected("the path of a file in the folder of this file, or below it", _is_below)]
 _Length = Annotated[float, number(0, expected="a length above 0, up to 1e9, in the file's unit")]
 _Point = Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers from -1e9 to 1e9, [x, y, z]")]
-_Distance = Annotated[float, number(0, expected="a distance above 0, up to 1e9"), AfterValidator(_check_distance)]
-_Elevation = Annotated[float, number(0, 89, "degrees above 0, up to 89")]
-
-
-class CamerasTable(StrictModel, extra="ignore"):
-    """Keys of the table ``[cameras]`` for all kinds."""
-
-    kind: Annotated[str, one_of("dome", "ring")]
-    azimuths: Annotated[int, whole_number(1, _MAX_AZIMUTHS)]
-
-
-class DomeTable(CamerasTable, extra="forbid"):
-    """Table ``[cameras]`` of a dome."""
-
-    radii: Annotated[tuple[_Distance, ...], Strict(False), _list_of("a list of distances")]
-    elevations_deg: Annotated[tuple[_Elevation, ...], Strict(False), _list_of("a list of elevations in degrees")]
-
-    def trajectory(self, unit_m: float) -> DomeSpec:
-        """Return the trajectory in metres; ``unit_m`` is the file's unit."""
-        radii_m = tuple(_to_metres(radius, unit_m) for radius in self.radii)
-        return DomeSpec(radii_m, self.elevations_deg, self.azimuths)
-
-
-class RingTable(CamerasTable, extra="forbid"):
-    """Table ``[cameras]`` of a ring."""
-
-    radius: _Distance
-    elevation_deg: _Elevation
-
-    def trajectory(self, unit_m: float) -> RingSpec:
-        """Return the trajectory in metres; ``unit_m`` is the file's unit."""
-        return RingSpec(_to_metres(self.radius, unit_m), self.elevation_deg, self.azimuths)
 
 
 @dataclass(frozen=True)
@@ -178,7 +123,7 @@ class BarTable(StrictModel):
     """One ``[[bar]]`` table; lengths are in the file's unit."""
 
     diameter: _Length
-    points: Annotated[tuple[_Point, ...], Strict(False), _list_of("two or more points, [[x, y, z], ...]", 2)]
+    points: Annotated[tuple[_Point, ...], Strict(False), list_of("two or more points, [[x, y, z], ...]", 2)]
     role: Annotated[str, _ROLE] = "bar"
     id: Annotated[int, whole_number(1, MAX_BARS)] | None = None
     bend_diameter: _Length | None = None
@@ -195,10 +140,10 @@ class BarTable(StrictModel):
     def in_metres(self, bar_id: int, unit_m: float) -> TomlBar:
         """Return the bar with its id and its lengths in metres; ``unit_m`` is the file's unit."""
         corners_m = tuple(
-            (_to_metres(x, unit_m), _to_metres(y, unit_m), _to_metres(z, unit_m)) for x, y, z in self.points
+            (to_metres(x, unit_m), to_metres(y, unit_m), to_metres(z, unit_m)) for x, y, z in self.points
         )
-        mandrel_m = None if self.bend_diameter is None else _to_metres(self.bend_diameter, unit_m)
-        return TomlBar(bar_id, self.role, _to_metres(self.diameter, unit_m), corners_m, mandrel_m, self.ribs)
+        mandrel_m = None if self.bend_diameter is None else to_metres(self.bend_diameter, unit_m)
+        return TomlBar(bar_id, self.role, to_metres(self.diameter, unit_m), corners_m, mandrel_m, self.ribs)
 
 
 class SceneToml(StrictModel):
@@ -214,7 +159,7 @@ class SceneToml(StrictModel):
     ifc: _File | None = None
     environment: Annotated[str, one_of(*ENVIRONMENTS)] | None = None
     board: Annotated[int | bool, Expected("6, 12 or false", lambda markers: markers in (0, 6, 12))] | None = None
-    cameras: DomeTable | RingTable | None = None
+    cameras: AnyCamerasTable | None = None
     up: UpKey | None = None
     origin: OriginKey | None = None
     rotate_deg: RotationKey = 0.0
@@ -229,7 +174,7 @@ class SceneToml(StrictModel):
 
     def placement(self, up: Up) -> PlacementSpec:
         """Return the placement, metres; ``up`` is the default vertical axis of the file that the scene names."""
-        x, y, z = (_to_metres(value, self.unit_m) for value in self.translate)
+        x, y, z = (to_metres(value, self.unit_m) for value in self.translate)
         origin: Origin = self.origin or ("keep" if self.bar else "centre")
         return PlacementSpec(self.up or up, origin, self.rotate_deg, (x, y, z))
 
@@ -239,8 +184,8 @@ class SceneToml(StrictModel):
         return tuple(table.selection() for table in self.select)
 
     @property
-    def trajectory(self) -> DomeSpec | RingSpec | None:
-        """Camera trajectory in metres, or None for the default."""
+    def trajectory(self) -> TrajectorySpec | None:
+        """Camera trajectory in metres, a survey without its stations, or None for the default."""
         return None if self.cameras is None else self.cameras.trajectory(self.unit_m)
 
     @property
@@ -283,7 +228,7 @@ def read_scene_toml(content: bytes, where: str, reserved: Collection[str] = ()) 
     if not problems:
         problems += _conflicts(values)
         if "cameras" in values:
-            values["cameras"] = _read_cameras(values["cameras"], _unit_m(values.get("unit")), problems)
+            values["cameras"] = read_cameras(values["cameras"], _unit_m(values.get("unit")), problems)
         scene = validate_table(SceneToml, values, problems, context=reserved)
         if scene is not None and not problems:
             return scene
@@ -292,17 +237,6 @@ def read_scene_toml(content: bytes, where: str, reserved: Collection[str] = ()) 
 
 def _unit_m(unit: object) -> float:
     return UNITS_M[unit] if isinstance(unit, str) and unit in UNITS_M else 1.0
-
-
-def _read_cameras(values: object, unit_m: float, problems: list[Problem]) -> DomeTable | RingTable | None:
-    """Return the table ``[cameras]``, or None after adding its problems to ``problems``."""
-    match values:
-        case {"kind": "dome"}:
-            return validate_table(DomeTable, values, problems, "cameras", unit_m)
-        case {"kind": "ring"}:
-            return validate_table(RingTable, values, problems, "cameras", unit_m)
-    validate_table(CamerasTable, values, problems, "cameras")
-    return None
 
 
 def _conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
@@ -315,11 +249,7 @@ def _conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
         found = f"found {' and '.join(sources) or 'no bars'}"
         expected = "exactly one of [[bar]] tables, mesh and ifc"
         yield Problem("conflict" if sources else "missing", "", found, expected)
-    match values.get("cameras"):
-        case {"kind": "dome", "radii": [*radii], "elevations_deg": [*elevations], "azimuths": int(azimuths)}:
-            views = len(radii) * len(elevations) * azimuths
-            if azimuths <= _MAX_AZIMUTHS and views > MAX_VIEWS:
-                yield Problem("conflict", "cameras", f"{views} views requested", f"at most {MAX_VIEWS}")
+    yield from camera_conflicts(values.get("cameras"))
     number_of_id: dict[int, int] = {}
     tables = values.get("bar")
     for bar_number, table in enumerate(tables if isinstance(tables, list) else (), start=1):

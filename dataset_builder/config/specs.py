@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
-from rebar_depth_bench.data.dataset_config import CENTRE
+from rebar_depth_bench.data.trajectory import CENTRE, SURVEY
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration
 
@@ -119,7 +119,28 @@ class DistanceSweepSpec:
     kind: str = "sweep"
 
 
-TrajectorySpec = DomeSpec | RingSpec | DistanceSweepSpec
+Point = tuple[float, float, float]
+Station = tuple[Point, Point]
+"""Place of a survey view: the centre of the left camera and the point that the rig is aimed at, world metres."""
+
+
+@dataclass(frozen=True)
+class SurveySpec:
+    """Survey of large steel: views at each of ``distances_m`` from points that are spread over the visible steel.
+
+    The distances are those of the left camera from the point of a bar's surface that the rig is aimed at.
+    ``stations`` are the places of the views in order, to the micrometre: they follow from the other fields and the
+    assembly (``config.survey``), and are stored so that every machine uses the same ones.
+    """
+
+    distances_m: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
+    views_per_distance: int = 126
+    seed: int = 0
+    stations: tuple[Station, ...] = ()
+    kind: str = SURVEY
+
+
+TrajectorySpec = DomeSpec | RingSpec | DistanceSweepSpec | SurveySpec
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,12 @@ from dataset_builder.config.specs import (
     DomeSpec,
     RigSpec,
     RingSpec,
+    SurveySpec,
     TrajectorySpec,
 )
 from dataset_builder.scene.steel_distance import radii_at_steel_distance_m
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.data.dataset_config import NEAREST_STEEL
+from rebar_depth_bench.data.trajectory import NEAREST_STEEL
 from rebar_depth_bench.geometry.cameras import look_at, rigid
 
 GOLDEN_TURN_DEG = 360.0 * (5**0.5 - 1) / 2
@@ -29,7 +30,7 @@ _RADIUS_DECIMALS = 3
 """Rounding of solved distances in metres: to the millimetre, so that they are equal on every machine."""
 
 
-class _Station(NamedTuple):
+class _Place(NamedTuple):
     """Place of the left camera in spherical coordinates round the target."""
 
     radius_m: float
@@ -42,8 +43,14 @@ def poses(
 ) -> list[Float64[ndarray, "4 4"]]:
     """Return ``cam_from_world`` of the left camera for every view of the full trajectory, in order.
 
-    Arguments and errors are those of ``camera_offsets_m``.
+    Each is aimed at the target, or at the point of its own station in a survey. Arguments and errors are those of
+    ``camera_offsets_m``.
     """
+    if isinstance(trajectory, SurveySpec):
+        return [
+            look_at_with_rig(np.array(centre_m), np.array(aimed_m), rig.baseline_m)
+            for centre_m, aimed_m in trajectory.stations
+        ]
     return [
         look_at_with_rig(target_m + direction, target_m, rig.baseline_m)
         for direction in camera_offsets_m(trajectory, target_m, bars)
@@ -62,41 +69,41 @@ def camera_offsets_m(
 
     The views of a dome are ordered by shell, then ring, then azimuth, so that consecutive views are close to each
     other. The views of a sweep are ordered by distance, then azimuth; the first azimuth is half a step off the
-    x axis, so that square cages are not seen face-on.
+    x axis, so that square cages are not seen face-on. The views of a survey are those of its stations.
     """
-    stations = _stations(trajectory)
+    if isinstance(trajectory, SurveySpec):
+        return [np.array(centre_m) - target_m for centre_m, _ in trajectory.stations]
+    places = _places(trajectory)
     if isinstance(trajectory, DomeSpec) and trajectory.distance_to == NEAREST_STEEL:
-        directions = np.array([_spherical(1.0, *angles) for _, *angles in stations])
-        distances_m = np.array([station.radius_m for station in stations])
+        directions = np.array([_spherical(1.0, *angles) for _, *angles in places])
+        distances_m = np.array([place.radius_m for place in places])
         radii_m = radii_at_steel_distance_m(target_m, directions, distances_m, bars)
         rounded_m = np.round(radii_m, _RADIUS_DECIMALS).tolist()
-        stations = [
-            _Station(radius_m, *angles) for radius_m, (_, *angles) in zip(rounded_m, stations, strict=True)
-        ]
-    return [_spherical(*station) for station in stations]
+        places = [_Place(radius_m, *angles) for radius_m, (_, *angles) in zip(rounded_m, places, strict=True)]
+    return [_spherical(*place) for place in places]
 
 
 def view_count(trajectory: TrajectorySpec) -> int:
     """Return the number of views of the full trajectory."""
-    return len(_stations(trajectory))
+    return len(trajectory.stations if isinstance(trajectory, SurveySpec) else _places(trajectory))
 
 
-def _stations(trajectory: TrajectorySpec) -> list[_Station]:
-    """Return the stations of the views in order, with the radii of the trajectory."""
+def _places(trajectory: DomeSpec | RingSpec | DistanceSweepSpec) -> list[_Place]:
+    """Return the places of the views in order, with the radii of the trajectory."""
     if isinstance(trajectory, RingSpec):
         return [
-            _Station(trajectory.radius_m, trajectory.elevation_deg, 360.0 * k / trajectory.azimuths)
+            _Place(trajectory.radius_m, trajectory.elevation_deg, 360.0 * k / trajectory.azimuths)
             for k in range(trajectory.azimuths)
         ]
     if isinstance(trajectory, DistanceSweepSpec):
         return [
-            _Station(radius_m, trajectory.elevation_deg, 360.0 * (k + 0.5) / trajectory.azimuths)
+            _Place(radius_m, trajectory.elevation_deg, 360.0 * (k + 0.5) / trajectory.azimuths)
             for radius_m in trajectory.radii_m
             for k in range(trajectory.azimuths)
         ]
     rings = [(radius_m, elevation) for radius_m in trajectory.radii_m for elevation in trajectory.elevations_deg]
     return [
-        _Station(radius_m, elevation, GOLDEN_TURN_DEG * ring + 360.0 * k / trajectory.azimuths)
+        _Place(radius_m, elevation, GOLDEN_TURN_DEG * ring + 360.0 * k / trajectory.azimuths)
         for ring, (radius_m, elevation) in enumerate(rings)
         for k in range(trajectory.azimuths)
     ]

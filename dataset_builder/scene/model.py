@@ -21,6 +21,15 @@ MAX_BARS = int(np.iinfo(np.uint16).max)
 METRE_DECIMALS = 12
 """Rounding of the lengths in scene files and IFC models after conversion to metres: to the picometre."""
 
+
+def to_metres(length: float, unit_m: float) -> float:
+    """Return a length in metres, rounded to the picometre.
+
+    The rounding removes the floating-point error of the conversion: 9 mm is exactly 0.009 m, 16 mm exactly 0.016.
+    """
+    return round(length * unit_m, METRE_DECIMALS)
+
+
 STEEL = "steel"
 """Material name of bars."""
 

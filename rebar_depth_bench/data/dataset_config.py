@@ -6,10 +6,12 @@ from collections.abc import Collection, Mapping
 from functools import cached_property
 from typing import Annotated, Any, Self
 
-from pydantic import ConfigDict, Field, Strict, StringConstraints, ValidationInfo, field_validator
+from pydantic import Field, Strict, StringConstraints, ValidationInfo, field_validator
 
 from rebar_depth_bench.data.digests import views_digest
 from rebar_depth_bench.data.location import Located
+from rebar_depth_bench.data.manifest_table import ManifestTable
+from rebar_depth_bench.data.trajectory import Survey, Trajectory, trajectory_of
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN, PATH_PATTERN, VIEW_ID_PATTERN
@@ -24,8 +26,6 @@ from rebar_depth_bench.validation import (
 )
 from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
 
-CENTRE, NEAREST_STEEL = "centre", "nearest steel"
-"""Values of ``Trajectory.distance_to``."""
 SCENE_FILES = ("mesh", "shards")
 """Keys of a scene that the entry of a config of one scene has beside the scene."""
 DIGEST_PATTERN = "sha256:[0-9a-f]{64}"
@@ -56,12 +56,6 @@ class ViewRecord(StrictModel):
     right: Sha256
     steel_px: Annotated[int, Field(ge=0)]
     scored_px: Annotated[int, Field(ge=0)]
-
-
-class ManifestTable(StrictModel):
-    """Base class of the objects that may contain further keys, which are ignored."""
-
-    model_config = ConfigDict(extra="ignore")
 
 
 class Appearance(ManifestTable):
@@ -110,24 +104,6 @@ class Rig(ManifestTable):
     height: _Side
 
 
-class Trajectory(ManifestTable):
-    """Cameras of a config: shells, rings of a shell, and azimuths of a ring.
-
-    ``radii_m`` are distances from the left camera to ``distance_to``: the centre of the assembly, as in all
-    folders without this key, or the nearest point of any bar's surface.
-    """
-
-    radii_m: Annotated[tuple[_Distance, ...], Strict(False), Field(min_length=1)] = (1.0,)
-    elevations_deg: Annotated[tuple[float, ...], Strict(False), Field(min_length=1)] = (0.0,)
-    azimuths: Annotated[int, whole_number(1, 1_000_000)]
-    distance_to: Annotated[str, one_of(CENTRE, NEAREST_STEEL)] = CENTRE
-
-    @property
-    def views(self) -> int:
-        """Number of views of the full trajectory."""
-        return len(self.radii_m) * len(self.elevations_deg) * self.azimuths
-
-
 class ReferenceRecord(ManifestTable):
     """AbsRel and RMSE (cm) of a reference, means over the views; None where undefined."""
 
@@ -157,7 +133,7 @@ class DatasetConfig(Located):
     rig: Rig
     views: Annotated[tuple[ViewRecord, ...], Strict(False)]
     ground_truth_digest: Digest
-    protocol: Trajectory | None = None
+    protocol: Trajectory | Survey | None = None
     protocol_views: Annotated[int, whole_number(1, 1_000_000)] = 0
     key: Annotated[str, StringConstraints(max_length=200)]
     sheet: RelativePath
@@ -176,6 +152,11 @@ class DatasetConfig(Located):
             files = {key: entry[key] for key in SCENE_FILES if key in entry}
             fields["scenes"] = [{**entry["scene"], "split": TEST_SPLIT, **files}]
         return fields
+
+    @field_validator("protocol", mode="before")
+    @classmethod
+    def _make_protocol(cls, fields: Any) -> Trajectory | Survey | None:
+        return None if fields is None else trajectory_of(fields)
 
     @field_validator("scenes")
     @classmethod

@@ -13,12 +13,12 @@ from rebar_depth_bench.data.dataset_config import (
     SCENE_FILES,
     DatasetConfig,
     Digest,
-    ManifestTable,
     RelativePath,
     Sha256,
 )
 from rebar_depth_bench.data.digests import file_sha256, views_digest
 from rebar_depth_bench.data.location import Located, local_path
+from rebar_depth_bench.data.manifest_table import ManifestTable
 from rebar_depth_bench.errors import DatasetError, InputError, Problem, escape_text
 from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.reading import parse_json, read_file

@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rebar_depth_bench.data.dataset_config import NEAREST_STEEL, DatasetConfig, Trajectory
+from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.trajectory import NEAREST_STEEL, Trajectory
 
 _GRID = (720, 1280)
 _IDEAL = ("ideal", 0.12)

@@ -19,8 +19,10 @@ import rebar_depth_bench as rdb
 from rebar_depth_bench.data.columns import features
 from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.trajectory import Survey, Trajectory
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import ideal_K, right_camera_pose
+from rebar_depth_bench.scoring.published_match import published_match
 
 HEIGHT, WIDTH, VIEWS = 90, 160, 9
 
@@ -155,6 +157,15 @@ def manifest(tiny_root: Path) -> Any:
 
 BOARD = "configs.lattice.scene.board"
 PROTOCOL_VIEWS = "configs.lattice.protocol_views"
+STATION = [[1.0, 0.0, 0.5], [0.5, 0.0, 0.5]]
+SURVEY = {
+    "kind": "survey",
+    "distances_m": [0.5, 1.0],
+    "views_per_distance": 252,
+    "seed": 0,
+    "stations": [STATION] * 504,
+}
+SURVEY_PLACE = "configs.lattice.protocol"
 ZEROS = "sha256:" + "0" * 64
 
 
@@ -163,6 +174,17 @@ def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
     with pytest.raises(rdb.DatasetError) as caught:
         open_folder(folder)
     return [(problem.code, problem.where) for problem in caught.value.problems]
+
+
+def test_survey_is_a_trajectory(manifest: Any, tmp_path: Path) -> None:
+    manifest["configs"]["lattice"]["protocol"] = SURVEY
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    config = open_folder(tmp_path).config("lattice")
+    assert isinstance(config.protocol, Survey)
+    assert (config.protocol.views, config.protocol.distances_m) == (504, (0.5, 1.0))
+    assert config.protocol.stations[0] == ((1.0, 0.0, 0.5), (0.5, 0.0, 0.5))
+    assert published_match(config) is None
+    assert isinstance(open_folder(tmp_path).config("lattice-orbit").protocol, Trajectory)
 
 
 @pytest.mark.parametrize(
@@ -219,6 +241,28 @@ def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
             lambda _, config: config["protocol"].update(distance_to="steel"),
             "invalid",
             "configs.lattice.protocol.distance_to",
+        ),
+        (lambda _, config: config.update(protocol=3), "invalid", "configs.lattice.protocol"),
+        *(
+            (
+                lambda _, config, keys=keys: config.update(protocol={**SURVEY, **keys}),
+                code,
+                f"{SURVEY_PLACE}.{place}",
+            )
+            for keys, code, place in (
+                ({"stations": [STATION] * 503}, "conflict", "stations"),
+                ({"stations": [STATION] * 503 + [3]}, "invalid", "stations 504"),
+                ({"stations": [[[1, 2], [3, 4, 5]]] + [STATION] * 503}, "invalid", "stations 1: 1"),
+                ({"distances_m": [1.0, -2.0]}, "invalid", "distances_m 2"),
+                ({"views_per_distance": 252.5}, "invalid", "views_per_distance"),
+            )
+        ),
+        (
+            lambda _, config: config.update(
+                protocol={**SURVEY, "stations": [STATION] * 2, "views_per_distance": 1}
+            ),
+            "conflict",
+            "configs.lattice.protocol_views",
         ),
         (
             lambda _, config: config["views"][0].update(steel_px=1 << 20, scored_px=1 << 20),

@@ -171,8 +171,10 @@ def test_large_cage_is_outdoors_and_rejected_in_laboratory(tmp_path: Path) -> No
     ):
         scene_config(write_scene(tmp_path, 'environment = "laboratory"\n' + content))
     far = '[cameras]\nkind = "ring"\nradius = 2000\nelevation_deg = 35\nazimuths = 4\n'
-    with pytest.raises(InputError, match=r"too large for the default camera dome: cameras would be 3\d\."):
-        scene_config(write_scene(tmp_path, MM + BAR.replace("100", "8000")))
+    with pytest.raises(
+        InputError, match=r"the steel extends 21 m from the world's origin, expected at most 20\.5"
+    ):
+        scene_config(write_scene(tmp_path, MM + BAR.replace("100", "21000")))
     with pytest.raises(InputError, match=r"cameras are 1.638 m from the laboratory's centre"):
         scene_config(write_scene(tmp_path, 'environment = "laboratory"\n' + MM + BAR + far))
 

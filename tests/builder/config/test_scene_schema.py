@@ -15,11 +15,13 @@ from dataset_builder.config.catalog import CONFIGS, BuildRequest
 from dataset_builder.config.scene_file import scene_config
 from dataset_builder.config.scene_name import scene_name_of
 from dataset_builder.config.scene_schema import TomlBar, read_scene_toml
-from dataset_builder.config.specs import DomeSpec
+from dataset_builder.config.specs import DomeSpec, SurveySpec
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
 from rebar_depth_bench.errors import InputError, MeshError
 from tests.builder.config.scene_files import BAR, MM, write_scene
 
+SURVEY = "[cameras]\nkind = 'survey'\n"
+INVALID_COUNT_AND_SEED = "invalid cameras.views_per_distance, invalid cameras.seed"
 INVALID_SCENES = [
     ("", "missing unit, missing"),
     (BAR, "missing unit"),
@@ -64,8 +66,20 @@ INVALID_SCENES = [
     (MM + "board = 7\n" + BAR, "invalid board"),
     (MM + "board = 6.0\n" + BAR, "invalid board"),
     (MM + "cameras = 3\n" + BAR, "invalid cameras"),
-    (MM + BAR + "[cameras]\n", "missing cameras.kind, missing cameras.azimuths"),
-    (MM + BAR + "[cameras]\nkind = 'x'\n", "invalid cameras.kind, missing cameras.azimuths"),
+    (MM + BAR + "[cameras]\n", "missing cameras.kind"),
+    (MM + BAR + "[cameras]\nkind = 'x'\n", "invalid cameras.kind"),
+    (MM + BAR + "[cameras]\nkind = ['survey']\n", "invalid cameras.kind"),
+    (MM + BAR + SURVEY + "azimuths = 3\n", "unknown cameras.azimuths"),
+    (MM + BAR + SURVEY + "distances = []\n", "invalid cameras.distances"),
+    (MM + BAR + SURVEY + "distances = 500\n", "invalid cameras.distances"),
+    (MM + BAR + SURVEY + "distances = [500, 0]\n", "invalid cameras.distances 2"),
+    (MM + BAR + SURVEY + "distances = [500, 119]\n", "conflict cameras.distances 2"),
+    (MM + BAR + SURVEY + "views_per_distance = 0\n", "invalid cameras.views_per_distance"),
+    (MM + BAR + SURVEY + "views_per_distance = 2.0\nseed = -1\n", INVALID_COUNT_AND_SEED),
+    (MM + BAR + SURVEY + "views_per_distance = 2501\n", "conflict cameras"),
+    (MM + BAR + SURVEY + f"distances = {[500] * 80}\n", "conflict cameras"),
+    (MM + BAR + SURVEY + "views_per_distance = 10001\n", "invalid cameras.views_per_distance"),
+    (MM + BAR + SURVEY + "stations = []\n", "unknown cameras.stations"),
     (
         MM + BAR + "[cameras]\nkind = 'ring'\n",
         "missing cameras.azimuths, missing cameras.radius, missing cameras.elevation_deg",
@@ -206,6 +220,17 @@ def test_documented_example_is_valid() -> None:
     assert (scene.name, scene.board, scene.trajectory) == ("my-beam", 6, DomeSpec((0.3, 0.4), (15.0, 45.0), 12))
     corners_m = ((-0.15, 0.0, 0.005), (0.15, 0.0, 0.005), (0.15, 0.0, 0.08))
     assert scene.bars == (TomlBar(7, "main", 0.01, corners_m, 0.04, True),)
+
+
+def test_survey_has_defaults_in_metres_and_distances_in_the_unit() -> None:
+    for unit, keys, expected in (
+        ("mm", "", SurveySpec((0.5, 1.0, 2.0, 4.0), 126, 0)),
+        ("ft", "", SurveySpec()),
+        ("ft", "distances = [5, 10]\n", SurveySpec((1.524, 3.048))),
+        ("mm", "views_per_distance = 2500\nseed = 7\n", SurveySpec(views_per_distance=2500, seed=7)),
+    ):
+        content = f'unit = "{unit}"\n{BAR}{SURVEY}{keys}'
+        assert read_scene_toml(content.encode(), "a").trajectory == expected
 
 
 BAR_1 = "bar 1 (bar, diameter 0.01 m)"

@@ -1,0 +1,71 @@
+"""Life-size cages as scene files for tests of survey cameras, and distances computed from their bars."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from rebar_depth_bench.data.bars import Bar
+
+Corners = Sequence[tuple[float, float, float]]
+
+
+def bar_table(diameter_mm: float, corners_mm: Corners) -> str:
+    """Return the table of a plain bar."""
+    points = [list(corner) for corner in corners_mm]
+    return f"[[bar]]\ndiameter = {diameter_mm}\nribs = false\npoints = {points}\n"
+
+
+def scene(bars: Iterable[str], cameras: str = "") -> str:
+    """Return a scene file in millimetres; ``cameras`` are the keys of a survey, or empty for the default."""
+    table = f'[cameras]\nkind = "survey"\n{cameras}\n' if cameras else ""
+    return f'unit = "mm"\n{table}{"".join(bars)}'
+
+
+def column() -> list[str]:
+    """Return the bars of a column of 0.4 x 0.4 x 2.4 m: four verticals and stirrups."""
+    verticals = [bar_table(20, [(x, y, 20), (x, y, 2400)]) for x in (-180, 180) for y in (-180, 180)]
+    stirrups = [
+        bar_table(10, [(-160, -196, z), (196, -196, z), (196, 196, z), (-196, 196, z), (-196, -160, z)])
+        for z in range(100, 2400, 300)
+    ]
+    return verticals + stirrups
+
+
+def wall() -> list[str]:
+    """Return the bars of a wall mesh of 3 x 2 m."""
+    upright = [bar_table(12, [(x, 0, 20), (x, 0, 2000)]) for x in range(-1500, 1501, 250)]
+    return upright + [bar_table(10, [(-1500, 12, z), (1500, 12, z)]) for z in range(100, 2000, 250)]
+
+
+def girder(length_mm: int) -> list[str]:
+    """Return the bars of a girder along x, 0.5 m wide and 0.8 m high: four main bars and uprights."""
+    half = length_mm / 2
+    main = [bar_table(25, [(-half, y, z), (half, y, z)]) for y in (-250, 250) for z in (60, 860)]
+    return main + [
+        bar_table(12, [(x, y, 60), (x, y, 860)])
+        for x in np.arange(-half + 200, half, 500).tolist()
+        for y in (-270, 270)
+    ]
+
+
+def segments(bars: Sequence[Bar]) -> tuple[ndarray, ndarray, ndarray]:
+    """Return starts, ends (s, 3) and radii (s,) of the straight pieces of the bars, metres."""
+    lines_m = [np.array(bar.axis_m) for bar in bars]
+    radii_m = [np.full(len(line_m) - 1, bar.diameter_m / 2) for bar, line_m in zip(bars, lines_m, strict=True)]
+    starts_m, ends_m = (
+        np.concatenate([line_m[part] for line_m in lines_m]) for part in (slice(-1), slice(1, None))
+    )
+    return starts_m, ends_m, np.concatenate(radii_m)
+
+
+def surface_distance_m(points_m: Float64[ndarray, "n 3"], bars: Sequence[Bar]) -> Float64[ndarray, " n"]:
+    """Return the signed distance of points from the nearest bar with rounded ends, negative inside."""
+    starts_m, ends_m, radii_m = segments(bars)
+    along_m = ends_m - starts_m
+    share = np.einsum("nsk,sk->ns", points_m[:, None] - starts_m, along_m) / (along_m**2).sum(axis=1)
+    nearest_m = starts_m + np.clip(share, 0, 1)[..., None] * along_m
+    return np.asarray((np.linalg.norm(points_m[:, None] - nearest_m, axis=2) - radii_m).min(axis=1))
