@@ -17,6 +17,7 @@ from dataset_builder.pipeline.folder import MESHES, PICTURES, SHARD_NAME
 from dataset_builder.pipeline.plan import ConfigPlan, config_parameters
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
+from rebar_depth_bench.data.trajectory import SURVEY
 from rebar_depth_bench.errors import DatasetError, InputError, Problem
 from rebar_depth_bench.validation import StrictModel, format_location, number, one_of, text, validate_table
 
@@ -49,7 +50,7 @@ class _Rig(_Table):
 
 
 class _Protocol(_Table):
-    kind: Annotated[str, one_of("dome", "ring", "sweep")]
+    kind: Annotated[str, one_of("dome", "ring", "sweep", SURVEY)]
     radius_m: _Distance = 1.0
 
 

@@ -41,6 +41,15 @@ def wall() -> list[str]:
     return upright + [bar_table(10, [(-1500, 12, z), (1500, 12, z)]) for z in range(100, 2000, 250)]
 
 
+def two_walls() -> list[str]:
+    """Return the bars of two wall meshes of 3 x 2 m, 2.5 m apart."""
+    meshes = []
+    for y in (-1250, 1250):
+        meshes += [bar_table(16, [(x, y, 20), (x, y, 2000)]) for x in range(-1500, 1501, 150)]
+        meshes += [bar_table(16, [(-1500, y + 16, z), (1500, y + 16, z)]) for z in range(100, 2000, 150)]
+    return meshes
+
+
 def girder(length_mm: int) -> list[str]:
     """Return the bars of a girder along x, 0.5 m wide and 0.8 m high: four main bars and uprights."""
     half = length_mm / 2

@@ -132,6 +132,9 @@ def test_site_coordinates_that_are_kept_are_refused(model: Path) -> None:
 
 
 def test_ifc_file_alone_is_centred(model: Path) -> None:
+    config = scene_config(model)
+    assert (config.name, config.scene.environment) == ("site-model", "outdoors")
+    assert config.protocol.kind == "survey"  # The dome would be too large.
     cage = scene_cage(model)
     assembly = cage_assembly(cage, str(model))
     assert 0 <= assembly.vertices_m[:, 2].min() <= 0.001
