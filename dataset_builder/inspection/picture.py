@@ -30,6 +30,8 @@ _HAZE = 0.6
 """Share of white in the colour of the farthest bars."""
 
 _MAX_MARKS = 200
+_MAX_PIECES = 50_000
+"""Largest number of pieces of bars that are drawn in the order of their own depths."""
 _MAX_EDGES = 20_000
 """Largest number of edges that are drawn of the mesh of a bar without axis."""
 
@@ -61,24 +63,23 @@ _SIDES = (
 
 
 @dataclass(frozen=True, eq=False)
-class _Lines:
-    """Straight lines to draw: ends (world, metres), diameters (0 for edges of meshes) and colours."""
+class _Stroke:
+    """Line to draw: points (world, metres), diameter (0 for an edge of a mesh) and colour."""
 
-    start_m: Float64[ndarray, "n 3"]
-    end_m: Float64[ndarray, "n 3"]
-    diameter_m: Float64[ndarray, " n"]
-    colour: Float64[ndarray, "n 3"]
+    points_m: Float64[ndarray, "n 3"]
+    diameter_m: float
+    colour: tuple[int, int, int]
 
 
 def inspection_picture(inspection: Inspection) -> bytes:
     """Return a PNG of a cage from four sides, with its diameters, sizes, and marks where bars overlap."""
     colours = _colours(inspection.cage.bars)
-    lines = _lines(inspection.cage.bars, colours)
+    strokes = _strokes(inspection.cage.bars, colours)
     width, height = 2 * _PANEL_PX[0], 2 * _PANEL_PX[1] + 2 * _HEAD_PX
     picture = Image.new("RGB", (width, height), _PAPER)
     for number, side in enumerate(_SIDES):
         place = (number % 2 * _PANEL_PX[0], number // 2 * _PANEL_PX[1] + _HEAD_PX)
-        picture.paste(_panel(inspection, lines, side), place)
+        picture.paste(_panel(inspection, strokes, side), place)
     _write_head(ImageDraw.Draw(picture), inspection, width)
     _write_legend(ImageDraw.Draw(picture), colours, inspection, height - _HEAD_PX + 24)
     stream = io.BytesIO()
@@ -100,29 +101,26 @@ def _colours(bars: Sequence[CageBar]) -> dict[float | None, tuple[int, int, int]
     return colours | ({None: _UNKNOWN} if None in found else {})
 
 
-def _lines(bars: Sequence[CageBar], colours: dict[float | None, tuple[int, int, int]]) -> _Lines:
-    parts = []
+def _strokes(bars: Sequence[CageBar], colours: dict[float | None, tuple[int, int, int]]) -> list[_Stroke]:
+    """Return the straight pieces of all bars, or whole bars if there are more than ``_MAX_PIECES`` pieces."""
+    whole = sum(len(bar.bar.axis_m) for bar in bars) > _MAX_PIECES
+    strokes = []
     for bar in bars:
-        if bar.bar.has_axis:
-            axis_m = np.array(bar.bar.axis_m)
-            start_m, end_m, diameter_m = axis_m[:-1], axis_m[1:], bar.bar.diameter_m
-        else:
-            start_m, end_m = _mesh_edges(bar)
-            diameter_m = 0.0
-        colour = np.array(colours[_diameter_mm(bar)], dtype=np.float64)
-        parts.append((start_m, end_m, np.full(len(start_m), diameter_m), np.tile(colour, (len(start_m), 1))))
-    start, end, diameter, colour = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return _Lines(start, end, diameter, colour)
+        colour = colours[_diameter_mm(bar)]
+        if not bar.bar.has_axis:
+            strokes += [_Stroke(edge_m, 0.0, colour) for edge_m in _mesh_edges(bar)]
+            continue
+        axis_m = np.array(bar.bar.axis_m)
+        lines = [axis_m] if whole else np.stack([axis_m[:-1], axis_m[1:]], axis=1)
+        strokes += [_Stroke(line_m, bar.bar.diameter_m, colour) for line_m in lines]
+    return strokes
 
 
-def _mesh_edges(bar: CageBar) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"]]:
+def _mesh_edges(bar: CageBar) -> Float64[ndarray, "n 2 3"]:
     assert bar.mesh is not None  # A bar without axis has a mesh.
-    corners = bar.mesh.faces
-    edges = np.unique(
-        np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])), axis=0
-    )
-    edges = edges[:: max(1, len(edges) // _MAX_EDGES)]
-    return bar.mesh.vertices_m[edges[:, 0]], bar.mesh.vertices_m[edges[:, 1]]
+    sides = np.concatenate([bar.mesh.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    edges = np.unique(np.sort(sides), axis=0)
+    return np.asarray(bar.mesh.vertices_m[edges[:: max(1, len(edges) // _MAX_EDGES)]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,11 +148,11 @@ class _Projection:
         return np.stack([width / 2 + right, height / 2 - up], axis=-1)
 
 
-def _panel(inspection: Inspection, lines: _Lines, side: _Side) -> Image.Image:
+def _panel(inspection: Inspection, strokes: Sequence[_Stroke], side: _Side) -> Image.Image:
     large = Image.new("RGB", (_PANEL_PX[0] * _OVERSAMPLING, _PANEL_PX[1] * _OVERSAMPLING), _PAPER)
     projection = _Projection.fitting(side.axes, inspection.box_m)
     draw = ImageDraw.Draw(large)
-    _draw_lines(draw, lines, projection)
+    _draw_strokes(draw, strokes, projection)
     for overlap in (inspection.overlaps or ())[:_MAX_MARKS]:
         ((x, y),) = projection.pixels(np.array([overlap.point_m])).tolist()
         draw.ellipse((x - 9, y - 9, x + 9, y + 9), outline=_MARK, width=3)
@@ -165,34 +163,31 @@ def _panel(inspection: Inspection, lines: _Lines, side: _Side) -> Image.Image:
     return panel
 
 
-def _draw_lines(draw: ImageDraw.ImageDraw, lines: _Lines, projection: _Projection) -> None:
-    """Draw lines from back to front, each with a dark outline where it is wide enough, paler in the distance."""
-    towards = projection.axes[2]
-    nearness_m = (lines.start_m + lines.end_m) @ towards / 2
-    span_m = float(np.ptp(nearness_m)) or 1.0
-    haze = _HAZE * (nearness_m.max() - nearness_m) / span_m
-    fill = (lines.colour + haze[:, None] * (255 - lines.colour)).round().astype(int)
-    width = np.maximum(lines.diameter_m * projection.px_per_m, _OVERSAMPLING).round().astype(int)
-    ends = np.concatenate([projection.pixels(lines.start_m), projection.pixels(lines.end_m)], axis=1)
+def _draw_strokes(draw: ImageDraw.ImageDraw, strokes: Sequence[_Stroke], projection: _Projection) -> None:
+    """Draw strokes from back to front, each with a dark outline where it is wide enough, paler in the distance."""
+    nearness_m = np.array([stroke.points_m.mean(axis=0) for stroke in strokes]) @ projection.axes[2]
+    haze = _HAZE * (nearness_m.max() - nearness_m) / (float(np.ptp(nearness_m)) or 1.0)
     for index in np.argsort(nearness_m, kind="stable").tolist():
-        x0, y0, x1, y1 = ends[index].tolist()
-        colour, wide = tuple(fill[index].tolist()), int(width[index])
-        if wide >= 4 * _OVERSAMPLING:
-            edge = tuple((fill[index] * 0.55).astype(int).tolist())
-            _draw_rod(draw, (x0, y0, x1, y1), wide, edge)
-            wide -= 2 * _OVERSAMPLING
-        _draw_rod(draw, (x0, y0, x1, y1), wide, colour)
+        stroke = strokes[index]
+        places = projection.pixels(stroke.points_m)
+        colour = np.array(stroke.colour) + haze[index] * (255 - np.array(stroke.colour))
+        width = round(max(stroke.diameter_m * projection.px_per_m, _OVERSAMPLING))
+        if width >= 4 * _OVERSAMPLING:
+            _draw_rod(draw, places, width, 0.55 * colour)
+            width -= 2 * _OVERSAMPLING
+        _draw_rod(draw, places, width, colour)
 
 
 def _draw_rod(
-    draw: ImageDraw.ImageDraw, ends: tuple[float, float, float, float], width: int, colour: tuple[int, ...]
+    draw: ImageDraw.ImageDraw, places: Float64[ndarray, "n 2"], width: int, colour: Float64[ndarray, " 3"]
 ) -> None:
     """Draw a line with round ends, which also joins the pieces of a bend."""
-    draw.line(ends, fill=colour, width=width)
+    red, green, blue = colour.round().astype(int).tolist()
+    draw.line(places.ravel().tolist(), fill=(red, green, blue), width=width)
     if width > 2 * _OVERSAMPLING:
         radius = (width - 1) / 2
-        for x, y in (ends[:2], ends[2:]):
-            draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour)
+        for x, y in places.tolist():
+            draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=(red, green, blue))
 
 
 def _draw_scale_bar(draw: ImageDraw.ImageDraw, px_per_m: float) -> None:

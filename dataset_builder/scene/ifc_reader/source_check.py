@@ -15,7 +15,13 @@ from typing import Any
 
 from ifcopenshell import entity_instance, ifcopenshell_wrapper
 
-from dataset_builder.scene.ifc_reader.step_text import StepText, class_name, same_tokens, split_arguments
+from dataset_builder.scene.ifc_reader.step_text import (
+    StepText,
+    class_name,
+    same_tokens,
+    same_values,
+    split_arguments,
+)
 from rebar_depth_bench.errors import MeshError, escape_text
 
 _types: Any = ifcopenshell_wrapper
@@ -84,7 +90,7 @@ class SourceCheck:
         attributes = self._class_attributes(entity.is_a())
         used = [attribute for attribute in attributes if not names or attribute.name in names]
         source, written = self._step.instance(entity.id()), entity.to_string(True).partition("=")[2]
-        if source != written:
+        if source != written and not same_values(source, written):
             self._compare(entity, used, source, written)
         references: list[Entity] = []
         for attribute in used:
