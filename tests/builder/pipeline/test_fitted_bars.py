@@ -50,12 +50,15 @@ def test_build_with_bent_bar_and_plate(tmp_path: Path, run_build: RunBuild) -> N
     (note,) = (line for line in process.stderr.splitlines() if line.startswith("note:"))
     assert "cage.obj" in note
     assert "1 of 2 bars" in note
-    assert note.endswith("bar 2")
+    assert note.endswith("bar 2, plate")
+    (entry,) = json.loads((root / "manifest.json").read_text())["configs"].values()
+    world_from_source = np.array(entry["world_from_source"])
+    line_m = LINE_M @ world_from_source[:3, :3].T + world_from_source[:3, 3]
 
     (bars,) = read_bars(root / "bars.parquet").values()
     assert bars[0].diameter_m == pytest.approx(0.012, rel=0.01)
     assert bars[0].length_m == pytest.approx(length_m(LINE_M), rel=0.005)
-    assert line_distance_m(np.array(bars[0].axis_m), LINE_M) < 1e-4
+    assert line_distance_m(np.array(bars[0].axis_m), line_m) < 1e-4
     assert not bars[1].has_axis
     assert pq.read_table(root / "bars.parquet")["axis"].null_count == 1
 
