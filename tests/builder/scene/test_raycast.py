@@ -79,3 +79,35 @@ def test_unprojected_depth_is_on_surface() -> None:
     off_plane_m = np.abs(np.einsum("ij,ij->i", points - triangles[:, 0], normals))
     assert off_plane_m.max() < 1e-7  # rounding error of float32 at about 1 m
     assert np.linalg.norm(camera_centre(pose)) > 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ray_along_the_plane_of_a_facet_meets_the_bar(seed: int) -> None:
+    """Rounding makes such rays hit a facet whose plane they intersect far away from the bar."""
+    rng, rays, facets, radius_m = np.random.default_rng(seed), 20_000, 24, 0.008
+    angle_rad = 2 * np.pi * np.arange(facets) / facets
+    ring_m = radius_m * np.stack([np.cos(angle_rad), np.sin(angle_rad)], axis=1)
+    vertices_m = np.concatenate([np.insert(ring_m, 2, z_m, axis=1) for z_m in (-1.0, 1.0)])
+    here, following = np.arange(facets), (np.arange(facets) + 1) % facets
+    faces = np.concatenate(
+        [
+            np.stack([here, following, following + facets], 1),
+            np.stack([here, following + facets, here + facets], 1),
+        ]
+    )
+    bar = WorldMesh(vertices_m, faces.astype(np.int32), np.ones(len(faces), np.uint16))
+    facet = rng.integers(facets, size=rays)
+    side_m = (np.roll(ring_m, -1, axis=0) - ring_m)[facet]
+    aim_m = np.column_stack([ring_m[facet] + rng.uniform(0, 1, (rays, 1)) * side_m, rng.uniform(-0.9, 0.9, rays)])
+    across = np.insert(side_m / np.linalg.norm(side_m, axis=1, keepdims=True), 2, 0, axis=1)
+    origins_m = aim_m + 12 * rng.choice([-1, 1], (rays, 1)) * across + rng.uniform(-2, 2, (rays, 1)) * [0, 0, 1]
+    directions = aim_m + rng.normal(0, 3e-7, (rays, 3)) - origins_m
+    range_m = RayCaster(bar).hits(origins_m, directions).range_m
+    hit = np.isfinite(range_m)
+    assert hit.sum() > 10_000
+    unit = directions[hit] / np.linalg.norm(directions[hit], axis=1, keepdims=True)
+    points_m = origins_m[hit] + range_m[hit, None] * unit
+    ratio = np.hypot(points_m[:, 0], points_m[:, 1]) / radius_m
+    assert ratio.min() > np.cos(np.pi / facets) - 1e-3
+    assert ratio.max() < 1.001
+    assert np.abs(points_m[:, 2]).max() < 1.001
