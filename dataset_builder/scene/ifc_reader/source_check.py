@@ -65,12 +65,16 @@ _PYTHON_TYPES: dict[str, tuple[type, ...]] = {
 
 @dataclass(frozen=True)
 class _Attribute:
-    """Attribute of a class: position, name, type as text, and whether a value is valid; None: any value."""
+    """Attribute of a class: position, name, type as text, and whether a value is valid; None: any value.
+
+    ``may_refer`` is False if no value refers to an instance.
+    """
 
     index: int
     name: str
     kind: str
     accepts: Callable[[Any], bool] | None
+    may_refer: bool
 
 
 class SourceCheck:
@@ -79,6 +83,7 @@ class SourceCheck:
     def __init__(self, schema: Any, step: StepText) -> None:
         self._schema, self._step = schema, step
         self._attributes: dict[str, list[_Attribute]] = {}
+        self._used: dict[tuple[str, tuple[str, ...]], list[_Attribute]] = {}
         self._seen: set[int] = set()
         self._dimensions: dict[int, frozenset[int]] = {}
 
@@ -87,20 +92,19 @@ class SourceCheck:
 
         A class may lack some of the names.
         """
-        attributes = self._class_attributes(entity.is_a())
-        used = [attribute for attribute in attributes if not names or attribute.name in names]
+        used = self._used_attributes(entity.is_a(), names)
         source, written = self._step.instance(entity.id()), entity.to_string(True).partition("=")[2]
         if source != written and not same_values(source, written):
             self._compare(entity, used, source, written)
         references: list[Entity] = []
         for attribute in used:
-            if attribute.accepts is None:
-                continue
             value = entity.get_argument(attribute.index)
+            assert attribute.accepts
             if not attribute.accepts(value):
                 found = "null" if value is None else escape_text(shorten(str(value), 60))
                 raise MeshError(f"{_where(entity, attribute)} is {found}, expected {shorten(attribute.kind, 80)}")
-            references += _references(value)
+            if attribute.may_refer:
+                references += _references(value)
         return references
 
     def tree(self, root: Entity) -> None:
@@ -154,12 +158,22 @@ class SourceCheck:
                 f"{entity.is_a()}"
             )
         for attribute in used:
-            if attribute.accepts and not same_tokens(given[attribute.index], read[attribute.index]):
+            if not same_tokens(given[attribute.index], read[attribute.index]):
                 found = escape_text("".join(given[attribute.index]))
                 raise MeshError(
                     f"{_where(entity, attribute)} is {found}, which cannot be read, "
                     f"expected {shorten(attribute.kind, 80)}"
                 )
+
+    def _used_attributes(self, name: str, names: tuple[str, ...]) -> list[_Attribute]:
+        """Return the attributes ``names`` of a class, or all, that have an influence on a bar."""
+        if (name, names) not in self._used:
+            self._used[name, names] = [
+                attribute
+                for attribute in self._class_attributes(name)
+                if attribute.accepts and (not names or attribute.name in names)
+            ]
+        return self._used[name, names]
 
     def _class_attributes(self, name: str) -> list[_Attribute]:
         """Return the attributes of a class."""
@@ -178,7 +192,7 @@ class SourceCheck:
         accepts = None if derived or name in _UNUSED else _predicate(kind)
         if accepts and (declared.optional() or name in _MAY_BE_NULL):
             accepts = _or_null(accepts)
-        return _Attribute(index, name, str(kind), accepts)
+        return _Attribute(index, name, str(kind), accepts, _may_refer(kind))
 
 
 def _where(entity: Entity, attribute: _Attribute) -> str:
@@ -193,6 +207,13 @@ def _references(value: Any) -> Iterator[Entity]:
     elif isinstance(value, tuple):
         for item in value:
             yield from _references(item)
+
+
+def _may_refer(kind: Any) -> bool:
+    """Return whether values of a type can refer to instances."""
+    while isinstance(kind, _types.named_type | _types.type_declaration | _types.aggregation_type):
+        kind = kind.type_of_element() if isinstance(kind, _types.aggregation_type) else kind.declared_type()
+    return not isinstance(kind, _types.simple_type | _types.enumeration_type)
 
 
 def _or_null(accepts: Callable[[Any], bool]) -> Callable[[Any], bool]:
