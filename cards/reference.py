@@ -12,7 +12,7 @@ from rebar_depth_bench.methods import own_methods
 SUBSET = "subset"
 """Set of results of all methods on a subset of the views of three scenes."""
 
-FULL_SETS = ("lattice",)
+FULL_SETS = ("lattice", "pile", "pier")
 """Published sets of results of the fast methods on all views of a scene, each named after its config."""
 
 
