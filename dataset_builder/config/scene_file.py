@@ -217,7 +217,8 @@ def _check_outdoors_radius(path: Path, what: str, radius_m: float) -> None:
     if radius_m > OUTDOORS_CAMERA_RADIUS_M:
         raise InputError(
             f"{path}: {what} {radius_m:.4g} m from the world's origin, expected at most "
-            f"{OUTDOORS_CAMERA_RADIUS_M} m: is the unit right, and is the cage at the origin?"
+            f"{OUTDOORS_CAMERA_RADIUS_M} m: is the unit right, and is the cage at the origin? [[select]] tables "
+            "choose a part of an IFC or mesh file"
         )
 
 
