@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float64, Int32
 from numpy import ndarray
 
 from dataset_builder.scene.model import WorldMesh
+from dataset_builder.scene.shapes.segments import closest_points_m
 from rebar_depth_bench.data.eye_view import EyeView
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid
@@ -146,14 +147,14 @@ def _closest_to_edges(
     origins_m: Float64[ndarray, "n 3"], directions: Float64[ndarray, "n 3"], corners_m: Float64[ndarray, "n 3 3"]
 ) -> Float64[ndarray, " n"]:
     """Return the ray parameter at which each ray is closest to an edge of its triangle."""
-    edges_m = np.roll(corners_m, -1, axis=1) - corners_m
-    to_start_m, along = corners_m - origins_m[:, None], directions[:, None]
-    square = (along * along).sum(axis=2, keepdims=True)
-    # Components across the ray: there the ray is a point, and its closest point of an edge is a projection.
-    start = to_start_m - (to_start_m * along).sum(axis=2, keepdims=True) / square * along
-    across = edges_m - (edges_m * along).sum(axis=2, keepdims=True) / square * along
-    length_square = (across * across).sum(axis=2, keepdims=True)
-    fraction = np.clip(-(start * across).sum(axis=2, keepdims=True) / np.maximum(length_square, 1e-30), 0.0, 1.0)
-    distance_m = np.linalg.norm(start + fraction * across, axis=2)
-    parameter = ((to_start_m + fraction * edges_m) * along).sum(axis=2) / square[..., 0]
-    return np.asarray(np.take_along_axis(parameter, distance_m.argmin(axis=1)[:, None], axis=1)[:, 0])
+    square = np.einsum("ij,ij->i", directions, directions)[:, None]
+    corner_parameters = np.einsum("ikj,ij->ik", corners_m - origins_m[:, None], directions) / square
+    ends_m = origins_m + corner_parameters.max(axis=1, keepdims=True) * directions
+    closest = [
+        closest_points_m(origins_m, ends_m, corners_m[:, corner], corners_m[:, (corner + 1) % 3])
+        for corner in range(3)
+    ]
+    distance_m = np.stack([np.linalg.norm(on_edge - on_ray, axis=1) for on_ray, on_edge in closest], axis=1)
+    on_edges_m = np.stack([on_edge for _, on_edge in closest], axis=1)
+    nearest_m = on_edges_m[np.arange(len(origins_m)), distance_m.argmin(axis=1)]
+    return np.asarray(np.einsum("ij,ij->i", nearest_m - origins_m, directions) / square[:, 0])
