@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -29,17 +30,19 @@ def write_answer(
     content: bytes,
     stream: BinaryIO,
     select: Sequence[Selection] = (),
-    before_kernel: Callable[[], object] = lambda: None,
+    kernel_limit: Callable[[], AbstractContextManager[object]] = nullcontext,
+    *,
+    two_processes: bool = False,
 ) -> None:
     """Write the selected shapes of an IFC file's ``content`` to ``stream``, or a failure; nothing is raised.
 
-    ``before_kernel`` is called before the geometry kernel is used.
+    The geometry kernel is used within ``kernel_limit()``. With ``two_processes``, large models are read by two.
     """
 
-    def step(label: str, reason: str) -> None:
+    def kernel_step(label: str, reason: str) -> AbstractContextManager[object]:
         _write(stream, {"kind": "step", "label": label, "reason": printable(reason)})
         stream.flush()  # The step must be known if the kernel crashes.
-        before_kernel()
+        return kernel_limit()
 
     try:
         # Imported here, so that a failed import is part of the answer.
@@ -49,7 +52,8 @@ def write_answer(
         return
     try:
         records = 0
-        for records, item in enumerate(read_bars(content, select, step), start=1):  # noqa: B007
+        items = read_bars(content, select, kernel_step, two_processes=two_processes)
+        for records, item in enumerate(items, start=1):  # noqa: B007
             _write(stream, *_record(item))
         _write(stream, {"kind": "end", "records": records})
     except MemoryError:

@@ -11,6 +11,7 @@ The project's coordinates are world coordinates; a context's coordinate system a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from textwrap import shorten
 
@@ -18,6 +19,7 @@ import numpy as np
 from jaxtyping import Float64, Int32
 from numpy import ndarray
 
+from dataset_builder.scene.ifc_reader.ahead import read_in_order
 from dataset_builder.scene.ifc_reader.bodies import BodyItem, body_items, type_objects
 from dataset_builder.scene.ifc_reader.declared import Declared, declared_sizes, role
 from dataset_builder.scene.ifc_reader.model import Model, angle_unit_rad, item_mesh, length_unit_m, open_model
@@ -78,14 +80,22 @@ class Project:
 
 Shape = SweptBar | Surface
 
+KernelStep = Callable[[str, str], AbstractContextManager[object]]
+"""Function of an object's name and a reason; its context is entered while the geometry kernel is used."""
+
 
 def read_bars(
-    content: bytes, select: Sequence[Selection] = (), before_kernel: Callable[[str, str], None] = lambda *_: None
+    content: bytes,
+    select: Sequence[Selection] = (),
+    kernel_step: KernelStep = lambda *_: nullcontext(),
+    *,
+    two_processes: bool = False,
 ) -> Iterator[Project | Shape | LeftOut]:
     """Yield the project of an IFC file's ``content``, the objects that are left out, and the shapes in its order.
 
-    ``select`` chooses objects (``choose_objects``). ``before_kernel`` is called with an object's name, and the
-    reason why it has no axis, before the geometry kernel tessellates a solid of it, which may hang or crash.
+    ``select`` chooses objects (``choose_objects``). ``kernel_step`` is called with an object's name and the reason
+    why it has no axis, and entered while the geometry kernel tessellates a solid of it, which may hang or crash.
+    With ``two_processes``, the objects of a large model are read in two processes (``ahead``).
 
     Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, nothing to read or too
     much of it, if a bar depends on an instance that was not read as written, or if it has no usable geometry;
@@ -96,12 +106,16 @@ def read_bars(
     chosen, left_out = choose_objects(model, relations, select)
     for relation in model.by_type("IfcRelDefinesByType"):
         model.check.attributes(relation, "RelatedObjects", "RelatingType")
-    reader = _Reader(model, relations, before_kernel)
+    reader, ahead = _Reader(model, relations, kernel_step), _Reader(model, relations, _no_kernel)
     yield Project(reader.unit_m)
     yield from left_out
     outside = 0
-    for item in chosen:
-        shapes = list(reader.shapes(item.entity))
+    size = _Size()
+    read_ahead = ahead.shapes if two_processes else None
+    all_shapes = read_in_order(reader.shapes, [item.entity for item in chosen], read_ahead)
+    for item, shapes in zip(chosen, all_shapes, strict=True):
+        for shape in shapes:
+            size.add(shape.source.label, len(_points_m(shape)))
         points = np.concatenate([_points_m(shape) for shape in shapes]) / reader.unit_m
         if item.tables and not any(table.contains(points) for table in item.tables):
             outside += 1
@@ -117,24 +131,44 @@ def _points_m(shape: Shape) -> Float64[ndarray, "n 3"]:
     return shape.axis_m if isinstance(shape, SweptBar) else shape.vertices_m
 
 
+def _no_kernel(label: str, reason: str) -> AbstractContextManager[object]:
+    """Refuse the geometry kernel, whose failures only the first process can report."""
+    raise ShapeError(f"{label}: {reason}")
+
+
+class _Size:
+    """Number of shapes and of their points."""
+
+    def __init__(self) -> None:
+        self._shapes = self._points = 0
+
+    def add(self, label: str, points: int) -> None:
+        """Count a shape of the object ``label``; raise ``MeshError`` if there are too many shapes or points."""
+        self._shapes, self._points = self._shapes + 1, self._points + points
+        if self._shapes > MAX_BARS or self._points > MAX_POINTS:
+            raise MeshError(
+                f"{label}: {self._shapes} bars of {self._points} points up to this object, "
+                f"expected at most {MAX_BARS} and {MAX_POINTS}"
+            )
+
+
 class _Reader:
     """Reader of a model's objects, which share placements and solids."""
 
-    def __init__(self, model: Model, relations: Relations, before_kernel: Callable[[str, str], None]) -> None:
-        self._model, self._relations, self._before_kernel = model, relations, before_kernel
+    def __init__(self, model: Model, relations: Relations, kernel_step: KernelStep) -> None:
+        self._model, self._relations, self._kernel_step = model, relations, kernel_step
         self._units = Units(length_unit_m(model), angle_unit_rad(model))
         self._placements: dict[int, Float64[ndarray, "4 4"]] = {}
         self._sweeps: dict[int, Sweep | None] = {}
         self._meshes: dict[int, tuple[Float64[ndarray, "v 3"], Int32[ndarray, "f 3"]]] = {}
-        self._shapes = self._points = 0
 
     @property
     def unit_m(self) -> float:
         """The project's length unit, metres."""
         return self._units.length_m
 
-    def shapes(self, entity: Entity) -> Iterator[Shape]:
-        """Yield the shapes of an object; raise ``MeshError`` that names it."""
+    def shapes(self, entity: Entity) -> list[Shape]:
+        """Return the shapes of an object; raise ``MeshError`` that names it."""
         label = _label(entity)
         try:
             types = self._checked_types(entity)
@@ -153,12 +187,18 @@ class _Reader:
         except DAMAGE as error:
             reason = shorten(str(error), 400) or type(error).__name__
             raise MeshError(f"{label} has no readable shape: {reason}") from error
+        shapes: list[Shape] = []
+        size = _Size()
         for item, sweep in zip(items, sweeps, strict=True):
             matrix = world_from_object @ item.object_from_item
-            if sweep is None:
-                yield self._surface(source, item, matrix)
-            else:
-                yield self._bar(source, role(entity, types), sweep, matrix, item.scale)
+            shape = (
+                self._surface(source, item, matrix)
+                if sweep is None
+                else self._bar(source, role(entity, types), sweep, matrix, item.scale)
+            )
+            size.add(label, len(_points_m(shape)))
+            shapes.append(shape)
+        return shapes
 
     def _checked_types(self, entity: Entity) -> list[Entity]:
         """Return the types of an object; raise ``MeshError`` unless its attributes were read as written."""
@@ -179,7 +219,6 @@ class _Reader:
     def _bar(
         self, source: Source, bar_role: str, sweep: Sweep, matrix: Float64[ndarray, "4 4"], scale: float
     ) -> SweptBar:
-        self._count(source, len(sweep.axis))
         axis = sweep.axis @ matrix[:3, :3].T + matrix[:3, 3]
         unit_m = self._units.length_m
         return SweptBar(source, bar_role, axis * unit_m, sweep.diameter * scale * unit_m, sweep.notes)
@@ -187,22 +226,12 @@ class _Reader:
     def _surface(self, source: Source, item: BodyItem, matrix: Float64[ndarray, "4 4"]) -> Surface:
         number = item.item.id()
         if number not in self._meshes:
-            self._before_kernel(source.label, f"the body is a {item.item.is_a()}")
-            self._meshes[number] = _tessellated(self._model, number)
+            with self._kernel_step(source.label, f"the body is a {item.item.is_a()}"):
+                self._meshes[number] = _tessellated(self._model, number)
         vertices_m, faces = self._meshes[number]
-        self._count(source, len(vertices_m))
         if np.linalg.det(matrix[:3, :3]) < 0:  # A reflection turns the triangles inside out.
             faces = faces[:, ::-1]
         return Surface(source, vertices_m @ matrix[:3, :3].T + matrix[:3, 3] * self._units.length_m, faces)
-
-    def _count(self, source: Source, points: int) -> None:
-        """Count a shape; raise ``MeshError`` if there are too many shapes or points."""
-        self._shapes, self._points = self._shapes + 1, self._points + points
-        if self._shapes > MAX_BARS or self._points > MAX_POINTS:
-            raise MeshError(
-                f"{source.label}: {self._shapes} bars of {self._points} points up to this object, "
-                f"expected at most {MAX_BARS} and {MAX_POINTS}"
-            )
 
 
 def _tessellated(model: Model, number: int) -> tuple[Float64[ndarray, "v 3"], Int32[ndarray, "f 3"]]:
