@@ -52,6 +52,9 @@ _DIMENSION: dict[str, int | None] = {
 }
 """Dimension of the points below instances of a class; None: that of its first point."""
 
+_COORDINATES = {name: f"{name.upper()}((" for name in ("IfcCartesianPoint", "IfcDirection")}
+"""Beginning of the text of an instance that has nothing but coordinates, by class."""
+
 _PYTHON_TYPES: dict[str, tuple[type, ...]] = {
     "string": (str,),
     "binary": (str,),
@@ -116,9 +119,31 @@ class SourceCheck:
                 self._dimensions[entity.id()] = self._dimensions_below(entity, references)
             elif entity.id() not in self._seen:
                 self._seen.add(entity.id())
+                if size := self._size_as_written(entity):
+                    self._dimensions[entity.id()] = frozenset((size,))
+                    continue
                 references = self.attributes(entity)
                 stack.append((entity, references))  # It is completed after the instances below it.
                 stack += [(reference, None) for reference in references]
+
+    def _size_as_written(self, entity: Entity) -> int:
+        """Return the number of coordinates (2 or 3) of a point or direction that is as written, else 0.
+
+        Half of the instances below a bar are of these classes, in their plain form. Of others, and of any doubt,
+        the result is 0: ``attributes`` decides.
+        """
+        name = entity.is_a()
+        if name not in _COORDINATES:
+            return 0
+        source = self._step.instance(entity.id())
+        begin, end = _COORDINATES[name], "))"
+        if not (source.startswith(begin) and source.endswith(end)):
+            return 0
+        try:
+            written = tuple(map(float, source[len(begin) : -len(end)].split(",")))
+        except ValueError:
+            return 0
+        return len(written) if len(written) in (2, 3) and written == entity.get_argument(0) else 0
 
     def _dimensions_below(self, entity: Entity, references: list[Entity]) -> frozenset[int]:
         """Return the numbers of coordinates of the points and directions that define an instance.
@@ -126,7 +151,7 @@ class SourceCheck:
         The set is empty for classes whose points are in several spaces.
         """
         name = entity.is_a()
-        if name in ("IfcCartesianPoint", "IfcDirection"):
+        if name in _COORDINATES:
             size = len(entity.get_argument(0))
             if size not in (2, 3):
                 raise MeshError(f"#{entity.id()} ({name}) has {size} coordinates, expected 2 or 3")
