@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
+from pathlib import Path
 
+from rebar_depth_bench.captures.opening import open_images
+from rebar_depth_bench.captures.views import ImageViews
 from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
-from rebar_depth_bench.console import ProgressBars, add_data, add_seconds, print_notice
+from rebar_depth_bench.console import ProgressBars, add_seconds, print_notice
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.methods import METHODS, find_method
+from rebar_depth_bench.data.views import Views
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.methods import METHODS, MultiViewMethod, find_method
 from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S
 from rebar_depth_bench.methods.registry import FROM_FOLDER
-from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.methods.runner import dataset_views, predict_views
 from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
 
@@ -27,8 +33,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.set_defaults(interrupted="interrupted; run the same command again to resume")
     parser.add_argument("method", metavar="METHOD", help=names)
-    add_data(parser)
+    data = (
+        "dataset folder, Hub repository, capture (left/, right/, calibration.conf), image folder with "
+        "cameras.toml, or KITTI's raw data"
+    )
+    parser.add_argument("--data", required=True, metavar="ROOT", help=data)
     add_expect_digest(parser)
+    parser.add_argument(
+        "--images",
+        type=Path,
+        metavar="FILE",
+        help="list of KITTI images, one <date>/<drive> <frame> l|r per line (default: the Eigen test split)",
+    )
     add_output_file(parser, "--out", "submission archive (zip) to write", metavar="ARCHIVE", required=True)
     parser.add_argument(
         "--config",
@@ -40,8 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--split",
         choices=SPLITS,
-        default=TEST_SPLIT,
-        help="split of the configs that have several (default: %(default)s)",
+        help=f"split of the configs that have several (default: {TEST_SPLIT})",
     )
     limit = (
         "time limit on an ONNX model for each view, and for opening it; onnxruntime stops between two operators "
@@ -77,22 +92,32 @@ def format_note(value: object) -> str:
 def run(options: argparse.Namespace) -> None:
     """Predict into an archive; print the method's notes to standard error and the archive's path."""
     method = find_method(options.method, view_timeout_s=options.view_timeout, nearest_m=options.nearest_distance)
-    folder = open_folder(options.data, expect_digest=options.expect_digest)
+    views = _open_views(options)
     info = method.info
     print_notice(f"{info.name}: {info.summary}; from {info.source}; licence {info.licence}")
-    print_verified(folder)
+    for one in views:
+        if isinstance(one, ImageViews):
+            print_notice(f"{one.config}: {len(one.view_ids)} views of {one.path}; {one.describe_camera()}")
+            if one.board_is_assumed and isinstance(method, MultiViewMethod):
+                print_notice(f"{one.config}: states no board, so it is taken to be {one.board}")
     with ProgressBars() as bars:
-        prepared = predict(
-            method,
-            options.data,
-            options.out,
-            configs=options.config,
-            split=options.split,
-            expect_digest=folder.digest,
-            progress=bars.update,
-        )
+        prepared = predict_views(method, views, options.out, bars.update)
     for config, preparation in prepared.items():
         for key, value in preparation.notes.items():
             print_notice(f"{config}: {key.replace('_', ' ')}: {format_note(value)}")
     if prints_table(options):
         print(options.out)
+
+
+def _open_views(options: argparse.Namespace) -> Sequence[Views]:
+    """Return the views of the data; print which digests of a dataset were verified."""
+    images = open_images(options.data, options.images)
+    if images is None:
+        folder = open_folder(options.data, expect_digest=options.expect_digest)
+        print_verified(folder)
+        return dataset_views(folder, options.config, options.split or TEST_SPLIT)
+    for option in ("config", "split", "expect_digest"):
+        if getattr(options, option) is not None:
+            name = f"--{option.replace('_', '-')}"
+            raise InputError(f"{options.data}: {name} is given, which is for dataset folders only")
+    return images

@@ -8,7 +8,7 @@ which commands that read only cached ground truth do not need, so functions impo
 from __future__ import annotations
 
 import glob
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
@@ -157,7 +157,7 @@ def check_colour(config: DatasetConfig, columns: Sequence[str], reader: str) -> 
 
 @dataclass(frozen=True)
 class ConfigViews:
-    """Views, image size, board and mesh of one scene of a config."""
+    """Views of scenes of a dataset's config; ``board`` and ``mesh`` need a config of one scene (see ``Views``)."""
 
     source: DatasetConfig
 
@@ -186,10 +186,36 @@ class ConfigViews:
         """Path of the scene's PLY mesh, which is ground truth. Raises ``DatasetError`` if it is missing."""
         return self.source.file(self.source.mesh)
 
-    def rows(self, *columns: str) -> Iterator[dict[str, Any]]:
-        """Yield the decoded ``view_id`` and named columns of each view, in order.
+    @property
+    def has_poses(self) -> bool:
+        """True: all views of a scene have poses in its world frame."""
+        return True
+
+    @property
+    def rectify(self) -> bool:
+        """False: on the raw grid of a config, methods see what the camera sees."""
+        return False
+
+    @property
+    def identity(self) -> list[str]:
+        """Key of the build and digest of the ground truth."""
+        return [self.source.key, self.source.ground_truth_digest]
+
+    def by_scene(self) -> tuple[ConfigViews, ...]:
+        """Return the views of each scene."""
+        return tuple(map(ConfigViews, self.source.by_scene()))
+
+    def check_columns(self, columns: Sequence[str], reader: str) -> None:
+        """Raise ``DatasetError`` if ``reader`` needs colour and the config was built without colour."""
+        check_colour(self.source, columns, reader)
+
+    def rows(self, *columns: str, skip: Collection[str] = ()) -> Iterator[dict[str, Any]]:
+        """Yield the decoded ``view_id`` and named columns of each view that is not in ``skip``, in order.
 
         Raises ``DatasetError`` for colour of a config that has none.
         """
-        check_colour(self.source, columns, "the method")
-        return iterate_rows(self.source, ("view_id", *columns))
+        self.check_columns(columns, "the method")
+        decoder = RowDecoder.of(self.source)
+        for row in iterate_undecoded(self.source, ("view_id", *columns)):
+            if row["view_id"] not in skip:
+                yield decoder.row(row)

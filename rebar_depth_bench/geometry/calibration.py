@@ -4,15 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 from rebar_depth_bench.errors import CalibrationError, Problem
-from rebar_depth_bench.geometry.calibration_formats import SIDES_PX, read_conf, read_toml
-from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration, check_invertible, scale_calibration
+from rebar_depth_bench.geometry.calibration_conf import read_conf
+from rebar_depth_bench.geometry.calibration_quantities import SIDES_PX
+from rebar_depth_bench.geometry.calibration_toml import table_calibration
+from rebar_depth_bench.geometry.stereo_calibration import (
+    Calibration,
+    MonoCalibration,
+    StereoCalibration,
+    check_invertible,
+    scale_calibration,
+)
 from rebar_depth_bench.limits import TOML_BYTES
-from rebar_depth_bench.reading import read_file
+from rebar_depth_bench.reading import parse_toml, read_file
 
+_AnyCalibration = TypeVar("_AnyCalibration", StereoCalibration, MonoCalibration, Calibration)
 Parser = Callable[[bytes, int, int, list[Problem]], StereoCalibration | None]
-PARSERS: Mapping[str, Parser] = {".conf": read_conf, ".toml": read_toml}
+
+
+def _read_toml(content: bytes, width: int, height: int, problems: list[Problem]) -> StereoCalibration | None:
+    document, syntax_problems = parse_toml(content)
+    problems += syntax_problems
+    table = None if problems else table_calibration(document, width, height, problems, is_stereo=True)
+    return table if isinstance(table, StereoCalibration) else None
+
+
+PARSERS: Mapping[str, Parser] = {".conf": read_conf, ".toml": _read_toml}
 
 
 def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibration:
@@ -56,27 +75,45 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
         problem = Problem("invalid", "", f"the file suffix is {path.suffix!r}", " or ".join(PARSERS))
         raise CalibrationError.from_problems(path, [problem])
     content = read_file(path, TOML_BYTES, "a calibration file", CalibrationError)
+    check_image_size(path, width, height)
     problems: list[Problem] = []
+    calibration = parser(content, width, height, problems)
+    if calibration is None or problems:
+        raise CalibrationError.from_problems(path, problems + calibration_problems(calibration))
+    return scaled_calibration(calibration, path, width, height)
+
+
+def check_image_size(path: object, width: int, height: int) -> None:
+    """Raise ``CalibrationError`` for images of a size that the calibration ``path`` cannot be scaled to."""
     if width not in SIDES_PX or height not in SIDES_PX:
         expected = f"{SIDES_PX[0]} to {SIDES_PX[-1]} pixels each"
         problem = Problem("invalid", "", f"it is requested for images of {width} x {height}", expected)
         raise CalibrationError.from_problems(path, [problem])
-    calibration = parser(content, width, height, problems)
-    if calibration is not None:
-        _check_rig(calibration, problems)
-    if calibration is None or problems:
+
+
+def scaled_calibration(calibration: _AnyCalibration, path: object, width: int, height: int) -> _AnyCalibration:
+    """Return a calibration for another image size; raise ``CalibrationError`` with its problems if it has any."""
+    if problems := calibration_problems(calibration):
         raise CalibrationError.from_problems(path, problems)
     return scale_calibration(calibration, width, height)
 
 
-def _check_rig(calibration: StereoCalibration, problems: list[Problem]) -> None:
-    x_m, y_m, z_m = calibration.translation_m
-    if max(abs(y_m), abs(z_m)) > abs(x_m) / 2:
-        found = f"the right camera is at {(-x_m, -y_m, -z_m)} m from the left one"
-        problems.append(Problem("conflict", "stereo", found, "an offset mostly along x"))
-    for eye, lens in (("left", calibration.left), ("right", calibration.right)):
+def calibration_problems(calibration: Calibration | None) -> list[Problem]:
+    """Return what is wrong with a calibration: an offset that is not along x, distortion without an inverse."""
+    if calibration is None:
+        return []
+    problems = []
+    eyes = {"left": calibration.left}
+    if isinstance(calibration, StereoCalibration):
+        eyes["right"] = calibration.right
+        x_m, y_m, z_m = calibration.translation_m
+        if max(abs(y_m), abs(z_m)) > abs(x_m) / 2:
+            found = f"the right camera is at {(-x_m, -y_m, -z_m)} m from the left one"
+            problems.append(Problem("conflict", "stereo", found, "an offset mostly along x"))
+    for eye, lens in eyes.items():
         try:
             check_invertible(lens, calibration.width, calibration.height)
         except ValueError as error:
             found = f"the distortion cannot be inverted at the image border: {error}"
             problems.append(Problem("conflict", eye, found))
+    return problems

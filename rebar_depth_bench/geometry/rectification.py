@@ -83,6 +83,7 @@ def rectify_pair(
     return Rectification(np.asarray(P_left[:, :3]), np.asarray(R_left), np.asarray(R_right), baseline_m)
 
 
+_MOTION_DECIMALS = 12
 PARALLEL_TOLERANCE = 1e-9
 """Largest deviation of an entry of ``right_from_left`` from that of a rectified pair."""
 
@@ -107,11 +108,16 @@ class RectifiedPair:
 
 
 def is_rectified(row: Mapping[str, Any]) -> bool:
-    """Return whether a row's cameras are undistorted, parallel, and offset along the left one's x axis."""
+    """Return whether a row's cameras are undistorted and parallel, and differ along the left one's x axis only.
+
+    The principal points may differ in x, which is a constant of all disparities.
+    """
     parallel = np.eye(4)
     parallel[0, 3] = -row["baseline_m"]
-    is_undistorted = not (row["left_distortion"].any() or row["right_distortion"].any())
-    return is_undistorted and bool(np.abs(_right_from_left(row) - parallel).max() <= PARALLEL_TOLERANCE)
+    differs = row["left_K"] != row["right_K"]
+    differs[0, 2] = False
+    has_lens = differs.any() or row["left_distortion"].any() or row["right_distortion"].any()
+    return not has_lens and bool(np.abs(_right_from_left(row) - parallel).max() <= PARALLEL_TOLERANCE)
 
 
 def rectified_pair(row: Mapping[str, Any]) -> RectifiedPair:
@@ -158,7 +164,9 @@ def matched_in_right(pair: RectifiedPair, disparity_px: Float32[ndarray, "hc wc"
 
 
 def _right_from_left(row: Mapping[str, Any]) -> Float64[ndarray, "4 4"]:
-    return np.asarray(row["right_cam_from_world"] @ inverse_rigid(row["left_cam_from_world"]))
+    """Return the motion of the pair without the rounding errors of its poses, so that it is that of all views."""
+    motion = row["right_cam_from_world"] @ inverse_rigid(row["left_cam_from_world"])
+    return np.asarray(np.round(motion, _MOTION_DECIMALS))
 
 
 def _rotations(rectified: Rectification) -> tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3 3"]]:

@@ -1,8 +1,9 @@
-"""Stereo calibration: intrinsics and distortion of two cameras, and the rigid motion between them."""
+"""Calibration of one camera or of a stereo pair: intrinsics, distortion, and the rigid motion of the pair."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -38,6 +39,19 @@ class StereoCalibration:
     translation_m: tuple[float, float, float]
 
 
+@dataclass(frozen=True)
+class MonoCalibration:
+    """Calibrated camera, for images of ``width`` x ``height`` pixels."""
+
+    width: int
+    height: int
+    left: Lens
+
+
+Calibration = StereoCalibration | MonoCalibration
+_AnyCalibration = TypeVar("_AnyCalibration", StereoCalibration, MonoCalibration, Calibration)
+
+
 def lens_K(lens: Lens) -> Float64[ndarray, "3 3"]:
     """Return the pinhole matrix of a camera, pixels."""
     return np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
@@ -58,7 +72,7 @@ def calibrated_baseline_m(calibration: StereoCalibration) -> float:
     return float(np.linalg.norm(calibration.translation_m))
 
 
-def scale_calibration(calibration: StereoCalibration, width: int, height: int) -> StereoCalibration:
+def scale_calibration(calibration: _AnyCalibration, width: int, height: int) -> _AnyCalibration:
     """Return the calibration for another image size that covers the same sensor area.
 
     Pixel centres are at integers, so scaling a side from W to W' gives cx' = (cx + 0.5) W'/W - 0.5. The distortion
@@ -72,13 +86,8 @@ def scale_calibration(calibration: StereoCalibration, width: int, height: int) -
         cx, cy = (lens.cx + 0.5) * scale_x - 0.5, (lens.cy + 0.5) * scale_y - 0.5
         return replace(lens, fx=lens.fx * scale_x, fy=lens.fy * scale_y, cx=cx, cy=cy)
 
-    return replace(
-        calibration,
-        width=width,
-        height=height,
-        left=scale_lens(calibration.left),
-        right=scale_lens(calibration.right),
-    )
+    scaled = replace(calibration, width=width, height=height, left=scale_lens(calibration.left))
+    return scaled if isinstance(scaled, MonoCalibration) else replace(scaled, right=scale_lens(scaled.right))
 
 
 def check_invertible(lens: Lens, width: int, height: int) -> None:

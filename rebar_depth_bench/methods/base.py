@@ -10,7 +10,7 @@ from typing import Any
 from jaxtyping import Float32
 from numpy import ndarray
 
-from rebar_depth_bench.data.dataset import ConfigViews
+from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.progress import Progress
 
 Predictor = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]
@@ -76,8 +76,8 @@ class MultiViewMethod:
     """
 
     info: MethodInfo
-    prepare: Callable[[ConfigViews, Path, Progress], Prepared]
-    check: Callable[[ConfigViews], None]
+    prepare: Callable[[Views, Path, Progress], Prepared]
+    check: Callable[[Views], None]
 
 
 AnyMethod = Method | MultiViewMethod

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.data.dataset import ConfigViews
+from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
@@ -27,7 +27,7 @@ from rebar_depth_bench.progress import Progress
 CONSTANT_DEPTH_M = 1.0
 
 
-def _prepare_constant(views: ConfigViews, work: Path, progress: Progress) -> Prepared:
+def _prepare_constant(views: Views, work: Path, progress: Progress) -> Prepared:
     del work, progress
     depth_m = np.full(views.grid, CONSTANT_DEPTH_M, np.float32)
     return Prepared(lambda _: depth_m)
@@ -99,7 +99,7 @@ def plane_depth_m(
     return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(np.nan))
 
 
-def _check_board_plane(views: ConfigViews) -> None:
+def _check_board_plane(views: Views) -> None:
     """Raise ``MethodError`` if OpenCV is missing or the config's scene has no board."""
     try:
         import cv2  # noqa: F401
@@ -113,7 +113,7 @@ def _check_board_plane(views: ConfigViews) -> None:
         )
 
 
-def _prepare_board_plane(views: ConfigViews, work: Path, progress: Progress) -> Prepared:
+def _prepare_board_plane(views: Views, work: Path, progress: Progress) -> Prepared:
     del work, progress
     from rebar_depth_bench.geometry.aruco_detection import board_pose, detected_corners_px
 

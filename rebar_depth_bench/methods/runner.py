@@ -1,4 +1,4 @@
-"""Prediction runs: apply a method to a dataset folder and write the submission archive.
+"""Prediction runs: apply a method to views and write the submission archive.
 
 Predictions are stored view by view in a folder beside the archive, so that an interrupted run is resumed and loses
 at most one view.
@@ -21,14 +21,13 @@ from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import NO_SPACE, scratch_folder, write_error
 from rebar_depth_bench.console import print_notice
-from rebar_depth_bench.data.dataset import check_colour, iterate_undecoded
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import DatasetError, InputError, MethodError, RebarDepthError, escape_text
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
 from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
+from rebar_depth_bench.methods.raw_images import rectifying_predictor
 from rebar_depth_bench.outputs import is_stream, link_target
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
@@ -46,48 +45,56 @@ def predict(
     expect_digest: str | None = None,
     progress: Progress = silent,
 ) -> dict[str, PreparationReport]:
-    """Predict a split of the named configs (default: all that have it), and write the archive atomically.
+    """Predict a split of the named configs of a dataset (default: all that have it) with ``predict_views``.
+
+    Raises ``DatasetError`` for an unknown folder, config or split or another digest than ``expect_digest``, and as
+    ``predict_views``.
+    """
+    folder = open_folder(root, expect_digest=expect_digest)
+    return predict_views(method, dataset_views(folder, configs, split), archive, progress)
+
+
+def predict_views(
+    method: AnyMethod, views: Sequence[Views], archive: str | Path, progress: Progress = silent
+) -> dict[str, PreparationReport]:
+    """Predict all ``views``, and write the archive atomically.
 
     Each view is stored beside the archive until all are predicted: after an interruption, the same call predicts
     only the missing ones. ``submission.json`` records the seconds per view and the method's notes on each config.
     Returns the report of each scene that a multi-view method prepared, and of each config on which the method has
-    notes, by ``DatasetConfig.label``.
+    notes, by ``Views.config``.
 
-    Raises ``DatasetError`` for an unknown folder, config or split or another digest than ``expect_digest``, or
-    a config without colour if the method needs it,
-    ``InputError`` if ``archive`` is a folder or the folder beside it holds anything but kept predictions,
-    ``MethodError`` if the method cannot run or returns invalid values, and ``OutputError`` if the machine cannot
-    write.
+    Raises ``InputError`` if the views lack columns that the method needs, if ``archive`` is a folder or the folder
+    beside it holds anything but kept predictions, ``MethodError`` if the method cannot run or returns invalid
+    values, and ``OutputError`` if the machine cannot write.
     """
-    folder = open_folder(root, expect_digest=expect_digest)
-    chosen = _chosen_configs(folder, configs, split)
-    for config in chosen:
-        check_colour(config, method.info.columns, method.info.name)
+    for config in views:
+        config.check_columns(method.info.columns, method.info.name)
     target = Path(archive)
     if target.is_dir():
         raise InputError(f"{target}: is a folder, expected the name of the archive to write")
     if isinstance(method, MultiViewMethod):
-        chosen = [scene for config in chosen for scene in config.by_scene()]
-        for config in chosen:
-            with _wrap_errors(f"{method.info.name}: {config.label}: check"):
-                method.check(ConfigViews(config))
+        views = [scene for config in views for scene in config.by_scene()]
+        for config in views:
+            with _wrap_errors(f"{method.info.name}: {config.config}: check"):
+                method.check(config)
     # Loading comes first so that its errors occur before anything is written.
     loaded = _load_method(method) if isinstance(method, Method) else None
-    noted = {config.label: report for config in chosen if (report := _first_row_report(method, config))}
-    with _kept_views_folder(target) as kept:
-        views = KeptViews.open(kept, _run_key(method, chosen))
-        usable = _usable_views(views, chosen)
-        for config in chosen:
+    noted = {config.config: report for config in views if (report := _first_row_report(method, config))}
+    with _kept_views_folder(target) as folder:
+        kept = KeptViews.open(folder, _run_key(method, views))
+        usable = _usable_views(kept, views)
+        for config in views:
             done = usable & set(config.view_ids)
-            is_prepared = loaded is not None or _has_preparation(views, config.label)
-            if len(done) == len(config.views) and is_prepared:
+            is_prepared = loaded is not None or _has_preparation(kept, config.config)
+            if len(done) == len(config.view_ids) and is_prepared:
                 continue
-            predictor = loaded or _prepare_method(method, ConfigViews(config), views, is_prepared, progress)
-            _predict_config(method, predictor, config, views, done, progress)
-        prepared = {config.label: report for config in chosen if (report := views.get_preparation(config.label))}
+            predictor = loaded or _prepare_method(method, config, kept, is_prepared, progress)
+            _predict_config(method, predictor, config, kept, done, progress)
+        prepared = {config.config: report for config in views if (report := kept.get_preparation(config.config))}
         reports = noted | prepared
-        _write_archive(method, target, views, chosen, reports)
-        views.remove()
+        _write_archive(method, target, kept, views, reports)
+        kept.remove()
     return reports
 
 
@@ -102,23 +109,25 @@ def _kept_views_folder(archive: Path) -> Iterator[Path]:
         yield target.with_name(f".{target.name}.views")
 
 
-def _chosen_configs(folder: DatasetFolder, names: Sequence[str] | None, split: str) -> list[DatasetConfig]:
-    """Return the named configs (default: all that have the split), restricted to a split.
+def dataset_views(
+    folder: DatasetFolder, names: Sequence[str] | None = None, split: str = TEST_SPLIT
+) -> list[ConfigViews]:
+    """Return the views of the named configs (default: all that have the split), restricted to a split.
 
     Raises ``DatasetError`` if there is no such config or split.
     """
     having_split = [name for name, config in folder.config_by_name.items() if split in config.splits]
-    chosen = [folder.config(name).of_split(split) for name in dict.fromkeys(names or having_split)]
+    chosen = [ConfigViews(folder.config(name).of_split(split)) for name in dict.fromkeys(names or having_split)]
     if not chosen:
         raise DatasetError(f"{folder.root}: no config has the split {escape_text(split)}")
     return chosen
 
 
-def _run_key(method: AnyMethod, configs: Sequence[DatasetConfig]) -> dict[str, Any]:
+def _run_key(method: AnyMethod, views: Sequence[Views]) -> dict[str, Any]:
     """Return everything that determines the predictions."""
     return {
         "method": vars(method.info),
-        "dataset": {config.label: [config.key, config.ground_truth_digest] for config in configs},
+        "dataset": {config.config: config.identity for config in views},
         "software": software_version(),
     }
 
@@ -126,27 +135,30 @@ def _run_key(method: AnyMethod, configs: Sequence[DatasetConfig]) -> dict[str, A
 def _predict_config(
     method: AnyMethod,
     predictor: Predictor,
-    config: DatasetConfig,
-    views: KeptViews,
+    views: Views,
+    kept: KeptViews,
     done: set[str],
     progress: Progress,
 ) -> None:
-    """Predict and store the views of a config that are not in ``done``."""
-    for count, row in enumerate(_remaining_rows(method, config, done), start=len(done) + 1):
+    """Predict and store the views that are not in ``done``."""
+    columns = method.info.columns
+    if views.rectify and "left_distortion" not in columns:
+        predictor, columns = rectifying_predictor(predictor, columns)
+    for count, row in enumerate(views.rows(*columns, skip=done), start=len(done) + 1):
         start = time.perf_counter()
         with _wrap_errors(f"{method.info.name}: {row['view_id']}: the predictor, given {', '.join(row)}"):
             prediction = predictor(row)
-        depth_m = _validated_depth(method, row["view_id"], prediction, config.grid)
-        views.put(row["view_id"], depth_m, time.perf_counter() - start)
-        progress(f"{method.info.name} on {config.label}", count, len(config.views))
+        depth_m = _validated_depth(method, row["view_id"], prediction, views.grid)
+        kept.put(row["view_id"], depth_m, time.perf_counter() - start)
+        progress(f"{method.info.name} on {views.config}", count, len(views.view_ids))
 
 
-def _usable_views(views: KeptViews, configs: Sequence[DatasetConfig]) -> set[str]:
+def _usable_views(kept: KeptViews, views: Sequence[Views]) -> set[str]:
     """Return the ids of the views that need not be predicted again, with a notice on them and on damaged ones."""
-    checked = [views.check(config.view_ids, config.grid) for config in configs]
+    checked = [kept.check(config.view_ids, config.grid) for config in views]
     usable = {view_id for done, _ in checked for view_id in done}
     if usable:
-        print_notice(f"resuming: {len(usable)} views are in {views.path}; delete it to start over")
+        print_notice(f"resuming: {len(usable)} views are in {kept.path}; delete it to start over")
     if errors := [error for _, damaged in checked for error in damaged]:
         print_notice(
             f"kept predictions that cannot be used are made again ({len(errors)}): {_on_one_line(errors[0])}"
@@ -154,10 +166,10 @@ def _usable_views(views: KeptViews, configs: Sequence[DatasetConfig]) -> set[str
     return usable
 
 
-def _has_preparation(views: KeptViews, config: str) -> bool:
+def _has_preparation(kept: KeptViews, config: str) -> bool:
     """Return whether the preparation of a config is completed; print a notice if its report is damaged."""
     try:
-        return views.get_preparation(config) is not None
+        return kept.get_preparation(config) is not None
     except InputError as error:
         print_notice(f"the kept report cannot be used, {config} is prepared again: {_on_one_line(error)}")
         return False
@@ -196,13 +208,13 @@ def _wrap_errors(what: str) -> Iterator[None]:
         raise MethodError(f"{what}: raised {type(error).__name__}: {error} ({where})") from error
 
 
-def _first_row_report(method: AnyMethod, config: DatasetConfig) -> PreparationReport | None:
+def _first_row_report(method: AnyMethod, views: Views) -> PreparationReport | None:
     """Return the report with a single-view method's notes on a config, None if it makes none."""
     if not isinstance(method, Method) or method.notes is None:
         return None
-    row = next(_remaining_rows(method, config, set()))
-    with _wrap_errors(f"{method.info.name}: {config.name}: notes"):
-        notes = _plain_notes(method, config.name, method.notes(row))
+    row = next(views.rows(*method.info.columns))
+    with _wrap_errors(f"{method.info.name}: {views.config}: notes"):
+        notes = _plain_notes(method, views.config, method.notes(row))
     return PreparationReport(notes=notes, seconds=None)
 
 
@@ -219,30 +231,22 @@ def _plain_notes(method: AnyMethod, config: str, notes: Mapping[str, Any]) -> di
 
 
 def _prepare_method(
-    method: AnyMethod, config: ConfigViews, views: KeptViews, is_prepared: bool, progress: Progress
+    method: AnyMethod, views: Views, kept: KeptViews, is_prepared: bool, progress: Progress
 ) -> Predictor:
     """Return the predictor of a multi-view method for a config, and store its report unless ``is_prepared``."""
     assert isinstance(method, MultiViewMethod)
-    work = views.work_folder(config.config)
+    work = kept.work_folder(views.config)
     started_from_scratch = not any(work.iterdir())
     start = time.perf_counter()
-    with _wrap_errors(f"{method.info.name}: {config.config}: prepare"):
-        prepared = method.prepare(config, work, progress)
+    with _wrap_errors(f"{method.info.name}: {views.config}: prepare"):
+        prepared = method.prepare(views, work, progress)
     if not isinstance(prepared, Prepared):
         raise MethodError(f"{method.info.name}: prepare returned {type(prepared).__name__}, expected a Prepared")
-    notes = _plain_notes(method, config.config, prepared.notes)
+    notes = _plain_notes(method, views.config, prepared.notes)
     if not is_prepared:
         seconds = round(time.perf_counter() - start, 1) if started_from_scratch else None
-        views.put_preparation(config.config, PreparationReport(notes=notes, seconds=seconds))
+        kept.put_preparation(views.config, PreparationReport(notes=notes, seconds=seconds))
     return prepared.predict
-
-
-def _remaining_rows(method: AnyMethod, config: DatasetConfig, done: set[str]) -> Iterator[dict[str, Any]]:
-    """Yield the decoded rows of the views that are not in ``done``; the others are not decoded."""
-    decoder, columns = RowDecoder.of(config), ("view_id", *method.info.columns)
-    for row in iterate_undecoded(config, columns):
-        if row["view_id"] not in done:
-            yield decoder.row(row)
 
 
 def _validated_depth(
@@ -261,11 +265,11 @@ def _validated_depth(
 def _write_archive(
     method: AnyMethod,
     archive: Path,
-    views: KeptViews,
-    configs: Sequence[DatasetConfig],
+    kept: KeptViews,
+    views: Sequence[Views],
     reports: dict[str, PreparationReport],
 ) -> None:
-    """Write the kept predictions of ``configs`` into the archive, with runtimes and notes."""
+    """Write the kept predictions of ``views`` into the archive, with runtimes and notes."""
     info = method.info
     runtime: dict[str, Any] = {
         "unit": "seconds",
@@ -283,7 +287,7 @@ def _write_archive(
         runtime=runtime,
         notes={config: report.notes for config, report in reports.items()} or None,
     ) as writer:
-        for config in configs:
+        for config in views:
             for view_id in config.view_ids:
-                depth_m, seconds = views.get(view_id, config.grid)
+                depth_m, seconds = kept.get(view_id, config.grid)
                 writer.add(view_id, depth_m, round(seconds, 4))

@@ -16,12 +16,12 @@ import pytest
 from PIL import Image
 
 from leaderboard.settings import read_settings
+from rebar_depth_bench.captures.folder import open_capture
+from rebar_depth_bench.captures.kitti_calibration import read_camera
 from rebar_depth_bench.errors import InputError, terminal_text
 from rebar_depth_bench.scoring.result_io import read_result
 from rebar_depth_bench.studies.depth_source import open_depths
-from rebar_depth_bench.studies.kitti.calibration import read_camera
 from rebar_depth_bench.studies.kitti.ground_truth import find_truth, project_scan, read_scan, read_truth
-from rebar_depth_bench.studies.pseudo_reference.capture import open_capture
 from rebar_depth_bench.submission.metadata import parse_metadata
 from tests.bench.damage import damaged
 from tests.bench.geometry.calibrations import CONF, TOML, write_and_read

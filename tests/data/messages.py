@@ -16,11 +16,11 @@ import numpy as np
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.scene_schema import read_scene_toml
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
+from rebar_depth_bench.captures.folder import open_capture
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.calibration import read_calibration
 from rebar_depth_bench.methods.onnx.spec import read_onnx_toml
-from rebar_depth_bench.studies.pseudo_reference.capture import open_capture
 from rebar_depth_bench.submission import open_submission
 from tests.bench.geometry.calibrations import CONF
 from tests.bench.submission.zips import DEPTH, EXPECTED, META, Record, build, npy, npz

@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import ModuleType
 
-from rebar_depth_bench.data.dataset import ConfigViews
+from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.progress import Progress
@@ -38,7 +38,7 @@ def _import_pipeline() -> ModuleType:
 
 
 def _method(dense: str, scale_source: str) -> MultiViewMethod:
-    def prepare(views: ConfigViews, work: Path, progress: Progress) -> Prepared:
+    def prepare(views: Views, work: Path, progress: Progress) -> Prepared:
         prepared: Prepared = _import_pipeline().prepare(views, work, progress, dense, scale_source)
         return prepared
 

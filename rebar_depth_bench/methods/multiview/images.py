@@ -15,66 +15,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Float64
 from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import write_bytes
-from rebar_depth_bench.data.dataset import ConfigViews
+from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.aruco_detection import Corners, board_pose, detected_corners_px
-from rebar_depth_bench.geometry.cameras import pixel_rays, project
-from rebar_depth_bench.geometry.rectification import enclosing_canvas, resample
+from rebar_depth_bench.geometry.undistortion import PinholeGrid, pinhole_grid, pinhole_image
 from rebar_depth_bench.methods.multiview.pose_errors import rotation_angle_deg
 
 
-@dataclass(frozen=True, eq=False)
-class PinholeGrid:
-    """Pinhole image grid that contains every pixel of a camera; without distortion, the camera's own grid.
-
-    ``canvas_pixel`` is the pixel (column, row) of this grid for each pixel of the camera, None if both grids are
-    the same. The optical axis is that of the camera, so planar depth is unchanged.
-    """
-
-    K: Float64[ndarray, "3 3"]
-    width: int
-    height: int
-    canvas_pixel: Int64[ndarray, "h w 2"] | None
-
-    def depth_on_left_grid(self, depth: Float32[ndarray, "hc wc"]) -> Float32[ndarray, "h w"]:
-        """Return planar depth (any unit) on the camera's grid, sampled at the pixel that each ray falls on."""
-        if self.canvas_pixel is None:
-            return depth
-        column, row = np.moveaxis(self.canvas_pixel, -1, 0)
-        return np.asarray(depth[row, column])
-
-
-def pinhole_grid(row: Mapping[str, Any], width: int, height: int) -> PinholeGrid:
-    """Return the pinhole grid of a row's ``width`` x ``height`` left camera (``left_K``, ``left_distortion``)."""
-    K, distortion = row["left_K"], row["left_distortion"]
-    if not distortion.any():
-        return PinholeGrid(K, width, height, None)
-    rays = pixel_rays(K, width, height, distortion)
-    wide_K, (wide_width, wide_height) = enclosing_canvas(K, [project(K, rays)])
-    return PinholeGrid(wide_K, wide_width, wide_height, np.rint(project(wide_K, rays)).astype(np.int64))
-
-
-def pinhole_image(row: Mapping[str, Any], grid: PinholeGrid) -> UInt8[ndarray, "hc wc 3"]:
-    """Return a row's left image on its pinhole grid, resampled (bicubic) if the lens has distortion."""
-    if grid.canvas_pixel is None:
-        return np.asarray(row["left_rgb"])
-    maps = cv2.initUndistortRectifyMap(
-        row["left_K"], row["left_distortion"], np.eye(3), grid.K, (grid.width, grid.height), cv2.CV_32FC1
-    )
-    return resample(row["left_rgb"], maps)
-
-
-ROW_COLUMNS = ("left_rgb", "left_K", "left_distortion", "left_cam_from_world")
-"""Dataset columns that are read; the poses serve only for error reports."""
+def row_columns(views: Views) -> tuple[str, ...]:
+    """Return the columns that are read; the poses, where there are any, serve only for error reports."""
+    columns = ("left_rgb", "left_K", "left_distortion")
+    return (*columns, "left_cam_from_world") if views.has_poses else columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +41,7 @@ class LeftImages:
     """Undistorted images in ``folder``, with the pinhole grid that they share.
 
     ``names`` maps view ids to image names; ``markers`` and ``cam_from_world`` are keyed by image name. The true
-    poses are used only for error reports.
+    poses are used only for error reports; there are none of captures without poses.
     """
 
     folder: Path
@@ -92,7 +51,7 @@ class LeftImages:
     cam_from_world: Mapping[str, Float64[ndarray, "4 4"]]
 
 
-def write_left_images(views: ConfigViews, folder: Path) -> LeftImages:
+def write_left_images(views: Views, folder: Path) -> LeftImages:
     """Write all left images, undistorted if the lens has distortion, and detect the markers of the board.
 
     Raises ``MethodError`` if the views differ in K or distortion or if there are none, and ``OutputError`` if an
@@ -103,7 +62,7 @@ def write_left_images(views: ConfigViews, folder: Path) -> LeftImages:
     grid: PinholeGrid | None = None
     camera: tuple[ndarray, ndarray] | None = None
     names, markers, poses = {}, {}, {}
-    for row in views.rows(*ROW_COLUMNS):
+    for row in views.rows(*row_columns(views)):
         row_camera = (row["left_K"], row["left_distortion"])
         if grid is None or camera is None:
             camera, grid = row_camera, pinhole_grid(row, width, height)
@@ -115,7 +74,8 @@ def write_left_images(views: ConfigViews, folder: Path) -> LeftImages:
         rgb = pinhole_image(row, grid)
         write_bytes(folder / name, cv2.imencode(".png", rgb[..., ::-1])[1].tobytes())
         markers[name] = detected_corners_px(rgb, views.board.dictionary) if views.board else {}
-        poses[name] = row["left_cam_from_world"]
+        if views.has_poses:
+            poses[name] = row["left_cam_from_world"]
     if grid is None:
         raise MethodError(f"{views.config}: has no views, expected three or more")
     return LeftImages(folder, names, grid, markers, poses)

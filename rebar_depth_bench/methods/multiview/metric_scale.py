@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.data.dataset import ConfigViews
+from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.aruco_detection import Corners
@@ -173,12 +173,12 @@ class MetricScale:
 class ScaleSource:
     """Source of metric scale; ``check`` raises ``MethodError`` for a config that it cannot scale."""
 
-    check: Callable[[ConfigViews], None]
-    scale: Callable[[ConfigViews, LeftImages, SparseReconstruction, Callable[[], DepthReader]], MetricScale]
+    check: Callable[[Views], None]
+    scale: Callable[[Views, LeftImages, SparseReconstruction, Callable[[], DepthReader]], MetricScale]
     """Returns the scale of a reconstruction. The reader factory computes dense depth when it is first called."""
 
 
-def _require_board(views: ConfigViews) -> None:
+def _require_board(views: Views) -> None:
     """Raise ``MethodError`` if the config's scene has no board."""
     if views.board is None:
         raise MethodError(
@@ -188,7 +188,7 @@ def _require_board(views: ConfigViews) -> None:
 
 
 def _scale_from_markers(
-    views: ConfigViews,
+    views: Views,
     left_images: LeftImages,
     reconstruction: SparseReconstruction,
     reader: Callable[[], DepthReader],
@@ -207,7 +207,7 @@ def _scale_from_markers(
 
 
 def _scale_from_ground_truth(
-    views: ConfigViews,
+    views: Views,
     left_images: LeftImages,
     reconstruction: SparseReconstruction,
     reader: Callable[[], DepthReader],

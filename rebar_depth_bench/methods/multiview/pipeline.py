@@ -11,17 +11,17 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from rebar_depth_bench.data.dataset import ConfigViews, check_colour
+from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.methods.base import Prepared
 from rebar_depth_bench.methods.multiview.dense import DENSE_METHODS
-from rebar_depth_bench.methods.multiview.images import ROW_COLUMNS, LeftImages, select_pairs, write_left_images
+from rebar_depth_bench.methods.multiview.images import LeftImages, row_columns, select_pairs, write_left_images
 from rebar_depth_bench.methods.multiview.metric_scale import SCALE_SOURCES
 from rebar_depth_bench.methods.multiview.sfm import SparseReconstruction, reconstruct_sparse
 from rebar_depth_bench.progress import Progress, silent
 
 
 def reconstruct_images(
-    views: ConfigViews, left_images: LeftImages, work: Path, progress: Progress = silent
+    views: Views, left_images: LeftImages, work: Path, progress: Progress = silent
 ) -> SparseReconstruction:
     """Return the sparse reconstruction of a config; if there is a board, its markers select the pairs to match."""
     K, board = left_images.grid.K, views.board
@@ -30,17 +30,17 @@ def reconstruct_images(
     return reconstruct_sparse(left_images.folder, names, K, work, pairs=pairs, progress=progress)
 
 
-def check(views: ConfigViews, dense: str, scale_source: str) -> None:
+def check(views: Views, dense: str, scale_source: str) -> None:
     """Raise ``MethodError`` if the named dense method cannot run or the scale source does not suit the config.
 
     Raises ``DatasetError`` if the config has no colour.
     """
-    check_colour(views.source, ROW_COLUMNS, f"{dense}-{scale_source}")
+    views.check_columns(row_columns(views), f"{dense}-{scale_source}")
     DENSE_METHODS[dense].check()
     SCALE_SOURCES[scale_source].check(views)
 
 
-def prepare(views: ConfigViews, work: Path, progress: Progress, dense: str, scale_source: str) -> Prepared:
+def prepare(views: Views, work: Path, progress: Progress, dense: str, scale_source: str) -> Prepared:
     """Reconstruct a config from its left views; notes compare cameras and scale with ground truth.
 
     Intermediate results are stored in ``work`` and reused. Views that were not registered have no prediction.

@@ -63,7 +63,12 @@ def similarity_to_world(cam_from_sfm: Poses, cam_from_world: Poses) -> Similarit
 
 
 def board_frame_report(cam_from_sfm: Poses, cam_from_world: Poses, metric: Similarity) -> dict[str, Any]:
-    """Return errors of scale, camera centres and rotations under the estimated similarity to the board frame."""
+    """Return errors of scale, camera centres and rotations under the estimated similarity to the board frame.
+
+    Without true poses, there is the scale alone.
+    """
+    if not cam_from_world:
+        return {"scale_m": metric.scale}
     return {
         **_scale_error(cam_from_sfm, cam_from_world, metric.scale),
         "cameras_compared": "in the board's frame",

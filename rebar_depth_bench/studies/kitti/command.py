@@ -19,6 +19,7 @@ from typing import get_args
 
 import numpy as np
 
+from rebar_depth_bench.captures.kitti_images import KittiImage, eigen_test_images, read_images
 from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.errors import InputError, Problem, SubmissionError
 from rebar_depth_bench.parallel import map_with_progress
@@ -34,7 +35,7 @@ from rebar_depth_bench.studies.kitti.ground_truth import (
     find_truth,
     read_truth,
 )
-from rebar_depth_bench.studies.kitti.metrics import CROPS, ImageScore, KittiImage, eigen_test_images, score_image
+from rebar_depth_bench.studies.kitti.metrics import CROPS, ImageScore, score_image
 from rebar_depth_bench.studies.kitti.output import to_page, to_pandas
 from rebar_depth_bench.studies.kitti.result import KittiProtocol, KittiResult, tabulate_images
 from rebar_depth_bench.submission import EntryError
@@ -77,6 +78,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=get_args(GroundTruthKind),
         help="raw: one laser scan; improved: several scans (652 images)",
     )
+    parser.add_argument(
+        "--images",
+        type=Path,
+        metavar="FILE",
+        help="list of images, one <date>/<drive> <frame> l|r per line (default: the Eigen test split)",
+    )
     parser.add_argument("--crop", choices=tuple(CROPS), default="garg", help="default: %(default)s")
     parser.add_argument(
         "--cap", type=float, default=DEFAULT_CAP_M, metavar="M", help="metres (default: %(default)s)"
@@ -95,8 +102,14 @@ def run(options: argparse.Namespace) -> None:
     """Run the study, write the requested outputs and print the tables."""
     protocol = KittiProtocol(options.ground_truth, options.crop, options.cap, options.lidar_depth)
     with ProgressBars() as bars:
+        images = None if options.images is None else read_images(options.images)
         result = run_kitti_study(
-            options.predictions, options.kitti, protocol, workers=options.workers, progress=bars.update
+            options.predictions,
+            options.kitti,
+            protocol,
+            images=images,
+            workers=options.workers,
+            progress=bars.update,
         )
     write_outputs(options, result.to_dict(), to_pandas(result), to_page(result))
 
@@ -132,7 +145,7 @@ def run_kitti_study(
                 f"{root}: no image has ground truth inside the crop {protocol.crop}, expected at least one"
             )
         archive = ArchiveIdentity(source.method, source.sha256())
-    version = f"KITTI Eigen test, {protocol.ground_truth}"
+    version = f"KITTI {'Eigen test' if images is None else 'list of images'}, {protocol.ground_truth}"
     digest = "sha256:" + hashlib.sha256("".join(outcome.digest for outcome in outcomes).encode()).hexdigest()
     return KittiResult(
         provenance=Provenance(PROTOCOL, digest, version, (archive,)),

@@ -21,11 +21,11 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
+from rebar_depth_bench.captures.image_header import read_image_shape
+from rebar_depth_bench.captures.kitti_calibration import MAX_SIDE_PX, KittiCamera, read_camera
+from rebar_depth_bench.captures.kitti_images import KittiImage
 from rebar_depth_bench.errors import DatasetError, Problem, format_shape
 from rebar_depth_bench.reading import open_regular
-from rebar_depth_bench.studies.image_header import read_image_shape
-from rebar_depth_bench.studies.kitti.calibration import MAX_SIDE_PX, KittiCamera, read_camera
-from rebar_depth_bench.studies.kitti.metrics import KittiImage
 from rebar_depth_bench.submission import EntryError
 from rebar_depth_bench.submission.image_formats import decode_png, max_png_bytes
 

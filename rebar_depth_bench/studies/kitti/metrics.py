@@ -1,24 +1,17 @@
-"""KITTI depth metrics, crops and the Eigen test split.
+"""KITTI depth metrics and crops of Eigen et al.
 
-The metrics and the 697 test images are those of Eigen et al., "Depth Map Prediction from a Single Image",
-NeurIPS 2014, as used by public evaluators since.
-
-``kitti_eigen_test_697.txt`` is the list of test images that is distributed with public evaluators (Monodepth and
-its successors), one image per line: ``<date>/<drive> <frame> <side>``. It contains only names, no KITTI data.
+Source: "Depth Map Prediction from a Single Image", NeurIPS 2014, as used by public evaluators since.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from importlib.resources import files
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.errors import RebarDepthError
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, median_scale
 from rebar_depth_bench.scoring.protocol import DELTA1_RATIO
 
@@ -134,56 +127,3 @@ def kitti_metrics(p_m: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"], cap_
         float(np.sqrt(np.mean(np.log(clamped_m / z_m) ** 2))),
         *deltas,
     )
-
-
-CONFIG_NAME = "kitti"
-SPLIT_FILE = "kitti_eigen_test_697.txt"
-_SPLIT_LINE = re.compile(r"(\d{4}_\d\d_\d\d)/(\1_drive_\d{4}_sync) (\d{10}) ([lr])")
-_CAMERAS = {"l": 2, "r": 3}
-
-
-@dataclass(frozen=True, order=True)
-class KittiImage:
-    """KITTI image: recording date, drive, frame number (ten digits) and side (``l`` or ``r``)."""
-
-    date: str
-    drive: str
-    frame: str
-    side: str
-
-    @property
-    def name(self) -> str:
-        """Return the name of the prediction: ``<drive>_<frame>_<side>``."""
-        return f"{self.drive}_{self.frame}_{self.side}"
-
-    @property
-    def view_id(self) -> str:
-        """Return the view id in an archive: ``kitti/<drive>_<frame>_<side>``."""
-        return f"{CONFIG_NAME}/{self.name}"
-
-    @property
-    def camera(self) -> int:
-        """Return the KITTI number of the colour camera: 2 on the left, 3 on the right."""
-        return _CAMERAS[self.side]
-
-
-def eigen_test_images() -> tuple[KittiImage, ...]:
-    """Return the 697 test images, sorted by drive and frame, so that consecutive frames are adjacent."""
-    return read_split(files("rebar_depth_bench.studies.kitti").joinpath(SPLIT_FILE).read_text(encoding="ascii"))
-
-
-def read_split(text: str) -> tuple[KittiImage, ...]:
-    """Return the sorted images of a split list.
-
-    Raises ``RebarDepthError`` for a malformed or duplicate line.
-    """
-    images: set[KittiImage] = set()
-    for number, line in enumerate(text.splitlines(), start=1):
-        match = _SPLIT_LINE.fullmatch(line.strip())
-        if match is None:
-            raise RebarDepthError(f"{SPLIT_FILE}: line {number} is {line!r}, expected <date>/<drive> <frame> l|r")
-        image = KittiImage(*match.groups())
-        if image in images:
-            raise RebarDepthError(f"{SPLIT_FILE}: line {number}: {image.name} is listed twice")
-        images.add(image)
-    return tuple(sorted(images))

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 
+from rebar_depth_bench.captures.folder import CAPTURE_LAYOUT, is_capture, open_capture
 from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.manifest import open_folder
@@ -26,7 +27,6 @@ from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
 from rebar_depth_bench.scoring.result import tabulate
 from rebar_depth_bench.studies.common import add_output_arguments, write_outputs
 from rebar_depth_bench.studies.depth_source import DepthSource, open_depths
-from rebar_depth_bench.studies.pseudo_reference.capture import CAPTURE_LAYOUT, is_capture, open_capture
 from rebar_depth_bench.studies.pseudo_reference.output import to_page, to_pandas
 from rebar_depth_bench.studies.pseudo_reference.result import (
     AgreementRow,
@@ -194,7 +194,7 @@ def _open_data(data: str, config: str | None) -> _StudyData:
             raise InputError(f"{data}: is a capture, expected no --config (found {config!r})")
         capture = open_capture(data)
         views = capture.expected_views()
-        name = f"capture {capture.path.resolve().name}"
+        name = f"capture {capture.config}"
         return _StudyData(name, views, views, camera=capture.describe_camera())
     folder = open_folder(data)
     if config is None and len(folder.configs) != 1:

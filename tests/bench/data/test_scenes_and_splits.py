@@ -19,6 +19,7 @@ from rebar_depth_bench.data.dataset_config import ViewRecord
 from rebar_depth_bench.data.digests import views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.data.verification import truth_problems
+from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import DatasetError, InputError, SubmissionError
 from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
@@ -140,11 +141,12 @@ def test_anchor_study_of_several_scenes(root: Path, tmp_path: Path) -> None:
 INFO = MethodInfo("shifted", "test", ("left_depth", "scene"), False, "here", "none")
 
 
-def multi_view_method(prepared: list[ConfigViews]) -> MultiViewMethod:
+def multi_view_method(prepared: list[Views]) -> MultiViewMethod:
     """Return a method that predicts the mean depth of all views of the scene, and records what it was given."""
 
-    def prepare(views: ConfigViews, work: Path, progress: Any) -> Prepared:
+    def prepare(views: Views, work: Path, progress: Any) -> Prepared:
         prepared.append(views)
+        assert isinstance(views, ConfigViews)
         rows = list(views.rows("left_depth", "scene"))
         assert {row["scene"] for row in rows} == {views.source.scene.name}
         assert [row["view_id"] for row in rows] == list(views.view_ids)
@@ -155,7 +157,7 @@ def multi_view_method(prepared: list[ConfigViews]) -> MultiViewMethod:
 
 
 def test_multi_view_method_receives_one_scene_at_a_time(root: Path, tmp_path: Path) -> None:
-    prepared: list[ConfigViews] = []
+    prepared: list[Views] = []
     reports = predict(multi_view_method(prepared), root, tmp_path / "a.zip", split="train")
     assert [views.config for views in prepared] == ["cages.train-a", "cages.train-b-1"]
     assert {label: report.notes for label, report in reports.items()} == {
@@ -169,7 +171,7 @@ def test_multi_view_method_receives_one_scene_at_a_time(root: Path, tmp_path: Pa
 
 
 def test_interrupted_prediction_of_scenes_resumes(root: Path, tmp_path: Path) -> None:
-    prepared: list[ConfigViews] = []
+    prepared: list[Views] = []
     method = multi_view_method(prepared)
 
     def stop(what: str, done: int, total: int) -> None:

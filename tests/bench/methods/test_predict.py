@@ -21,11 +21,11 @@ from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.errors import InputError, MethodError
 from rebar_depth_bench.methods import (
     METHODS,
-    ConfigViews,
     Method,
     MethodInfo,
     MultiViewMethod,
     Prepared,
+    Views,
     all_methods,
     find_method,
 )
@@ -234,12 +234,12 @@ def counting_method(log: list[str], *, unfit: str = "") -> MultiViewMethod:
     Its check fails for the config ``unfit``.
     """
 
-    def check(views: ConfigViews) -> None:
+    def check(views: Views) -> None:
         log.append(f"check {views.config}")
         if views.config == unfit:
             raise MethodError(f"{views.config}: does not fit")
 
-    def prepare(views: ConfigViews, work: Path, progress: Progress) -> Prepared:
+    def prepare(views: Views, work: Path, progress: Progress) -> Prepared:
         log.append(f"prepare {views.config} {(work / 'kept').exists()}")
         (work / "kept").touch()
         progress("preparing", 1, 1)

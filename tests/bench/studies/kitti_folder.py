@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from rebar_depth_bench.studies.kitti.metrics import KittiImage, eigen_test_images
+from rebar_depth_bench.captures.kitti_images import KittiImage, eigen_test_images
 
 WIDTH, HEIGHT = 124, 38
 FX, CX, CY = 72.15377, 60.95593, 17.2854

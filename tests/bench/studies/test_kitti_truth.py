@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rebar_depth_bench.errors import DatasetError, RebarDepthError
-from rebar_depth_bench.studies.kitti.calibration import KittiCamera, read_camera
+from rebar_depth_bench.captures.kitti_calibration import KittiCamera, read_camera
+from rebar_depth_bench.captures.kitti_images import eigen_test_images, parse_images
+from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.studies.kitti.ground_truth import (
     find_truth,
     project_scan,
     read_scan,
     read_truth,
 )
-from rebar_depth_bench.studies.kitti.metrics import eigen_test_images, read_split
 from tests.bench.studies import kitti_folder as kitti
 
 
@@ -39,14 +39,14 @@ def test_split_is_the_published_eigen_split() -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("2011_09_26/2011_09_28_drive_0002_sync 0000000069 l", "line 1 is '2011_09_26/2011_09_28"),
+        ("2011_09_26/2011_09_28_drive_0002_sync 0000000069 l", "line 1: the line is 2011_09_26/2011_09_28"),
         ("2011_09_26/2011_09_26_drive_0002_sync 69 l", "expected <date>/<drive> <frame>"),
         ("2011_09_26/2011_09_26_drive_0002_sync 0000000069 l\n" * 2, "line 2: .* is listed twice"),
     ],
 )
 def test_bad_split_list_names_line(text: str, words: str) -> None:
-    with pytest.raises(RebarDepthError, match=words):
-        read_split(text)
+    with pytest.raises(InputError, match=words):
+        parse_images("list.txt", text.encode())
 
 
 def test_scan_projection_matches_plain_python(tmp_path: Path) -> None:

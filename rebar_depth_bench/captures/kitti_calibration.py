@@ -1,4 +1,4 @@
-"""Reader of KITTI's two calibration files of a day.
+"""Reader of KITTI's two calibration files of a day: laser projection, and the rectified pair of colour cameras.
 
 Laser points are projected into the rectified colour images as in Geiger et al., "Vision meets Robotics: The KITTI
 Dataset", IJRR 2013, equation 8: ``y = P_rect_i  R_rect_00  T_velo_to_cam  x`` in homogeneous coordinates.
@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, DatasetError, Problem
+from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import parse_number, read_file
 from rebar_depth_bench.validation import format_location, short_repr
@@ -58,6 +59,34 @@ def read_camera(day_folder: Path, camera: int) -> KittiCamera:
     return KittiCamera(width, height, cam[projection] @ rectification @ cam_from_velo)
 
 
+def read_pair(day_folder: Path) -> StereoCalibration:
+    """Return the rectified colour cameras 2 (left) and 3 (right), which have the same axes and no distortion.
+
+    The baseline is P_rect_02[0, 3] / fx - P_rect_03[0, 3] / fx; the offsets along y and z, a few millimetres that
+    rectified images do not show, are left out, as in KITTI's development kit. Raises ``DatasetError`` with all
+    problems of the file.
+    """
+    keys = {f"{name}_{camera:02d}": kind for camera in (2, 3) for name, kind in _CAMERA_KEYS.items()}
+    path = day_folder / CAM_TO_CAM
+    cam = _read_file(path, keys)
+    lenses, offsets_m = [], []
+    for camera in (2, 3):
+        (fx, _, cx, x), (_, fy, cy, _), _ = cam[f"P_rect_{camera:02d}"].tolist()
+        lenses.append(Lens(fx, fy, cx, cy, (0.0, 0.0, 0.0, 0.0, 0.0)))
+        offsets_m.append(x / fx)
+    baseline_m = offsets_m[0] - offsets_m[1]
+    problems = []
+    if cam["S_rect_02"].tolist() != cam["S_rect_03"].tolist():
+        problems.append(Problem("conflict", "S_rect_03", "differs from S_rect_02", "images of one size"))
+    if not baseline_m > 0:
+        found = f"the right camera is {baseline_m:.6g} m to the right of the left one"
+        problems.append(Problem("conflict", "P_rect_03", found, "a distance above 0"))
+    if problems:
+        raise DatasetError.from_problems(path, problems)
+    width, height = map(int, cam["S_rect_02"])
+    return StereoCalibration(width, height, lenses[0], lenses[1], (0.0, 0.0, 0.0), (-baseline_m, 0.0, 0.0))
+
+
 @dataclass(frozen=True)
 class _Quantity:
     """Shape of the numbers of a key, what they are, and a predicate that they fulfil."""
@@ -84,6 +113,7 @@ _SIZE = _Quantity((2,), f"width and height, whole numbers from 1 to {MAX_SIDE_PX
 _PROJECTION = _Quantity((3, 4), "12 numbers, a projection whose last row is 0 0 1 t", _is_projection)
 _ROTATION = _Quantity((3, 3), "9 numbers, the rows of a rotation", _is_rotation)
 _TRANSLATION = _Quantity((3,), "3 numbers, metres", lambda _: True)
+_CAMERA_KEYS = {"S_rect": _SIZE, "P_rect": _PROJECTION}
 
 
 def _read_file(path: Path, quantities: Mapping[str, _Quantity]) -> dict[str, Numbers]:

@@ -1,0 +1,205 @@
+"""Files that state the cameras of a capture, and ``cameras.toml``, which also states its board and its poses.
+
+A folder holds one of these:
+
+- ``cameras.toml``, see below;
+- ``calibration.conf`` (Stereolabs) or ``calibration.toml`` (``geometry.calibration``);
+- calibrations of other programs (``geometry.calibration_programs``): one file ``*.yaml``, ``.yml``, ``.xml`` or
+  ``.json`` (OpenCV's FileStorage, a Kalibr camera chain, ROS ``camera_info`` of one camera), or two of them:
+  intrinsics and extrinsics of OpenCV, or ``left.*`` and ``right.*`` of ROS.
+
+``cameras.toml`` has the keys of ``calibration.toml``, of one camera (``[left]``) or of a pair, or names files in
+their place::
+
+    calibration = "stereo.yml"    # or two files: ["left.yaml", "right.yaml"]
+    unit = "mm"                   # of lengths in OpenCV's, ROS' and Kalibr's files; default: "m"
+
+    [board]                       # ArUco board, see geometry.aruco_board; default: its A3 sheet of 6 markers
+    markers = 12
+    marker_side_m = 0.05
+
+    [[pose]]                      # of all images or of none; OpenCV axes, metres
+    image = "0001"
+    cam_from_world = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.5], [0, 0, 0, 1]]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+from pydantic import Field, Strict, ValidationInfo, field_validator, model_validator
+
+from rebar_depth_bench.data.eye_view import camera_array
+from rebar_depth_bench.errors import CalibrationError, InputError, Problem
+from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
+from rebar_depth_bench.geometry.calibration import check_image_size, read_calibration, scaled_calibration
+from rebar_depth_bench.geometry.calibration_documents import DOCUMENT_SUFFIXES, parse_document
+from rebar_depth_bench.geometry.calibration_programs import program_calibration
+from rebar_depth_bench.geometry.calibration_toml import table_calibration
+from rebar_depth_bench.geometry.stereo_calibration import Calibration
+from rebar_depth_bench.limits import TOML_BYTES
+from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN
+from rebar_depth_bench.reading import parse_toml, read_file
+from rebar_depth_bench.validation import (
+    Expected,
+    StrictModel,
+    check_unique,
+    field_error,
+    number,
+    one_of,
+    text,
+    validate_table,
+)
+
+CAMERAS_FILE = "cameras.toml"
+_CALIBRATION_FILES = ("calibration.conf", "calibration.toml")
+_UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_CALIBRATION_KEYS = ("width", "height", "left", "right", "stereo")
+
+_FileName = Annotated[str, Field(pattern=f"^{NAME_PATTERN}$"), Expected(f"a file of the folder: {NAME_LETTERS}")]
+_Rows = Annotated[list[list[float]], Strict(False)]
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureCameras:
+    """Cameras of a capture: calibration for its image size, its board or None, and poses by image name.
+
+    ``board_is_assumed`` is True if no file states the board. Without poses, ``cam_from_world`` is empty.
+    """
+
+    calibration: Calibration
+    board: BoardSpec | None
+    board_is_assumed: bool
+    cam_from_world: Mapping[str, Float64[ndarray, "4 4"]]
+
+
+class _BoardTable(StrictModel):
+    width_m: Annotated[float, number(0, 10)] = BoardSpec.width_m
+    height_m: Annotated[float, number(0, 10)] = BoardSpec.height_m
+    markers: Annotated[int, one_of(6, 12)] = BoardSpec.markers
+    marker_side_m: Annotated[float, number(0, 10)] = BoardSpec.marker_side_m
+    dictionary: Annotated[str, text(40)] = BoardSpec.dictionary
+
+    @model_validator(mode="after")
+    def _check_layout(self) -> _BoardTable:
+        try:
+            marker_corners_m(self.spec)
+        except ValueError as error:
+            raise field_error(str(error), "a board with room for its markers", "conflict") from None
+        return self
+
+    @property
+    def spec(self) -> BoardSpec:
+        """The board."""
+        return BoardSpec(**self.model_dump())
+
+
+class _PoseTable(StrictModel):
+    image: Annotated[str, text(100)]
+    cam_from_world: Annotated[_Rows, Expected("4 rows of 4 numbers: a rotation, a translation in metres, 0 0 0 1")]
+
+    @field_validator("cam_from_world")
+    @classmethod
+    def _check_rigid(cls, rows: list[list[float]]) -> list[list[float]]:
+        try:
+            camera_array("cam_from_world", rows)
+        except ValueError as error:
+            raise field_error(str(error).partition(", expected")[0], "a rigid pose of 4 x 4 numbers") from None
+        return rows
+
+
+class _CamerasTable(StrictModel):
+    """Content of ``cameras.toml`` without the keys of ``calibration.toml``."""
+
+    calibration: Annotated[
+        _FileName | Annotated[list[_FileName], Field(min_length=1, max_length=2)] | None,
+        Expected("the name of a file beside this one, or two"),
+    ] = None
+    unit: Annotated[str, one_of(*_UNITS_M)] = "m"
+    board: _BoardTable | None = None
+    pose: tuple[_PoseTable, ...] = Field(default=(), strict=False)
+
+    @field_validator("pose")
+    @classmethod
+    def _check_images(cls, poses: tuple[_PoseTable, ...], _: ValidationInfo) -> tuple[_PoseTable, ...]:
+        if poses:
+            check_unique([pose.image for pose in poses], "image")
+        return poses
+
+
+def read_cameras(root: Path, images: Sequence[str], width: int, height: int, *, is_stereo: bool) -> CaptureCameras:
+    """Return the cameras of the folder ``root`` with ``images`` of ``width`` x ``height`` pixels.
+
+    Raises ``InputError`` if the folder states no cameras or states them twice, ``CalibrationError`` with the
+    problems of its files, which name keys and lines, and if a pair of images has the calibration of one camera.
+    """
+    path = root / CAMERAS_FILE
+    if not path.exists():
+        calibration = _file_calibration(root, _found_files(root), 1.0, width, height, is_stereo=is_stereo)
+        return CaptureCameras(calibration, BoardSpec(), True, {})
+    check_image_size(path, width, height)
+    document, problems = parse_toml(read_file(path, TOML_BYTES, "the cameras of a capture", CalibrationError))
+    own = {key: value for key, value in document.items() if key not in _CALIBRATION_KEYS}
+    rest = {key: value for key, value in document.items() if key in _CALIBRATION_KEYS}
+    table = None if problems else validate_table(_CamerasTable, own, problems)
+    inline = None
+    if table is not None and table.calibration is not None and rest:
+        problems.append(Problem("conflict", "calibration", f"given beside {', '.join(rest)}", "one of them"))
+    elif table is not None and table.calibration is None:
+        inline = table_calibration(rest, width, height, problems, is_stereo=is_stereo)
+    poses = {} if table is None else {pose.image: np.array(pose.cam_from_world) for pose in table.pose}
+    if table is not None and poses and (missing := sorted(set(images) - poses.keys())):
+        found = f"{len(missing)} images have none, such as {missing[0]}"
+        problems.append(Problem("missing", "pose", found, "poses of all images, or none"))
+    if table is None or problems:
+        raise CalibrationError.from_problems(path, problems)
+    if inline is not None:
+        calibration = scaled_calibration(inline, path, width, height)
+    else:
+        names = [table.calibration] if isinstance(table.calibration, str) else list(table.calibration or ())
+        paths = [root / name for name in names]
+        calibration = _file_calibration(root, paths, _UNITS_M[table.unit], width, height, is_stereo=is_stereo)
+    board = None if table.board is None else table.board.spec
+    return CaptureCameras(calibration, board or BoardSpec(), board is None, poses)
+
+
+def _found_files(root: Path) -> list[Path]:
+    """Return the calibration files of a folder. Raises ``InputError`` unless there is one, or a pair."""
+    own = [root / name for name in _CALIBRATION_FILES if (root / name).exists()]
+    others = sorted(path for path in root.iterdir() if path.suffix.lower() in DOCUMENT_SUFFIXES)
+    if len(own) == 1 or (not own and 1 <= len(others) <= 2):
+        return own or others
+    found = ", ".join(path.name for path in (*own, *others)[:5]) or "none"
+    raise InputError(
+        f"{root}: the calibration files are {found}, expected {CAMERAS_FILE}, {', '.join(_CALIBRATION_FILES)}, or "
+        f"one or two of *{', *'.join(DOCUMENT_SUFFIXES)}"
+    )
+
+
+def _file_calibration(
+    root: Path, paths: Sequence[Path], unit_m: float, width: int, height: int, *, is_stereo: bool
+) -> Calibration:
+    """Return the calibration in one or two files, scaled to the image size."""
+    if paths[0].suffix.lower() not in DOCUMENT_SUFFIXES:
+        return read_calibration(paths[0], width, height)
+    check_image_size(paths[0], width, height)
+    problems: list[Problem] = []
+    documents: dict[str, Any] = {}
+    for path in paths:
+        content = read_file(path, TOML_BYTES, "a calibration file", CalibrationError)
+        documents[path.name] = parse_document(path.name, content, problems)
+    calibration = None if problems else program_calibration(documents, width, height, unit_m, problems)
+    if calibration is None:
+        raise CalibrationError.from_problems(root, problems)
+    scaled: Calibration = scaled_calibration(calibration, root, width, height)
+    if is_stereo and not hasattr(scaled, "right"):
+        raise CalibrationError(
+            f"{root}: {', '.join(documents)}: describes one camera, expected the left and the right one"
+        )
+    return scaled

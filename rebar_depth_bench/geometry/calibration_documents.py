@@ -1,0 +1,105 @@
+"""Content of calibration files as other programs write them: YAML, and OpenCV's FileStorage in YAML, XML or JSON.
+
+A document is returned as dicts, lists, numbers and texts. Matrices of OpenCV are dicts with rows, cols and data.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from pathlib import PurePath
+from typing import Any
+from xml.etree import ElementTree
+
+from rebar_depth_bench.errors import Problem, escape_text
+from rebar_depth_bench.reading import MAX_NESTING, parse_json
+
+_OPENCV_HEADER = re.compile(r"\A\ufeff?%YAML[: ][0-9.]+[^\n]*\n")
+"""First line of OpenCV's YAML; its older form, ``%YAML:1.0``, is not YAML."""
+_OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
+_STORAGE = "opencv_storage"
+
+
+def parse_document(name: str, content: bytes, problems: list[Problem]) -> dict[str, Any]:
+    """Return the first document of a calibration file ``name``, whose suffix is one of ``DOCUMENT_SUFFIXES``.
+
+    Problems are added to ``problems``, and the result is empty if there are any.
+    """
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        problems.append(Problem("syntax", name, f"byte {error.start} is not UTF-8", "UTF-8 text"))
+        return {}
+    try:
+        document = _PARSERS[PurePath(name).suffix.lower()](text)
+    except RecursionError:
+        problems.append(Problem("size", name, "the values are nested too deep", f"at most {MAX_NESTING} levels"))
+        return {}
+    except ValueError as error:
+        problems.append(Problem("syntax", name, escape_text(" ".join(str(error).split()))))
+        return {}
+    if not isinstance(document, dict):
+        problems.append(Problem("invalid", name, f"holds {type(document).__name__}", "keys with values"))
+        return {}
+    return {str(key): value for key, value in document.items()}
+
+
+def _parse_yaml(text: str) -> Any:
+    """Return the first document of a YAML text. Raises ``ValueError`` for invalid YAML and for aliases."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]
+        """Loader of plain values and OpenCV's matrices; aliases are refused: they can make a short text huge."""
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.events.AliasEvent):
+                event = self.peek_event()
+                raise ValueError(f"line {event.start_mark.line + 1}: an alias (*), expected plain values")
+            return super().compose_node(parent, index)
+
+    Loader.add_constructor(_OPENCV_MATRIX, lambda loader, node: loader.construct_mapping(node, deep=True))
+    try:
+        return next(iter(yaml.load_all(_OPENCV_HEADER.sub("", text, count=1), Loader)), None)
+    except yaml.MarkedYAMLError as error:
+        line = "" if error.problem_mark is None else f"line {error.problem_mark.line + 1}: "
+        raise ValueError(f"{line}not valid YAML: {error.problem}") from None
+    except (yaml.YAMLError, TypeError, ValueError) as error:
+        raise ValueError(f"not valid YAML: {error}") from None
+
+
+def _parse_json(text: str) -> Any:
+    value, problems = parse_json(text.encode())
+    if problems:
+        raise ValueError(problems[0].found)
+    return value
+
+
+def _parse_xml(text: str) -> Any:
+    """Return the values of OpenCV's XML. Raises ``ValueError`` for invalid XML and for document types."""
+    if "<!" in re.sub("<!--.*?-->", "", text, flags=re.DOTALL):
+        raise ValueError("a document type or CDATA, expected OpenCV's XML")
+    try:
+        root = ElementTree.fromstring(text.lstrip("\ufeff").encode())  # noqa: S314 (no entities without a type)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"line {error.position[0]}: not valid XML: {error}") from None
+    if root.tag != _STORAGE:
+        raise ValueError(f"the first element is <{root.tag}>, expected <{_STORAGE}>")
+    return _element_value(root)
+
+
+def _element_value(element: ElementTree.Element) -> Any:
+    """Return the children of an element by name, or its numbers or text."""
+    if len(element):
+        return {child.tag: _element_value(child) for child in element}
+    words = (element.text or "").split()
+    return words if len(words) > 1 else "".join(words)
+
+
+_PARSERS: Mapping[str, Callable[[str], Any]] = {
+    ".yaml": _parse_yaml,
+    ".yml": _parse_yaml,
+    ".xml": _parse_xml,
+    ".json": _parse_json,
+}
+DOCUMENT_SUFFIXES = tuple(_PARSERS)
+"""Suffixes of the files that ``parse_document`` reads."""
