@@ -200,7 +200,9 @@ def _export(options: argparse.Namespace) -> None:
     from dataset_builder.export import export
 
     with ProgressBars() as bars:
-        summary = export(options.root, options.out, options.config, options.views, progress=bars.update)
+        summary = export(
+            options.root, options.out, options.config, options.views, options.layout, progress=bars.update
+        )
     for config in summary.configs:
         print(f"{config.config}: {config.views} views, {config.written} files written, {config.kept} kept")
     print(options.out)
@@ -286,4 +288,11 @@ def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="N",
         help="number of views per config, evenly spaced over the views of the folder (default: all)",
+    )
+    parser.add_argument(
+        "--layout",
+        choices=("plain", "zed", "kitti"),
+        default="plain",
+        help="plain: images, exact depth, masks, COLMAP, nerfstudio; zed: a capture; kitti: KITTI's raw data "
+        "(default: %(default)s)",
     )

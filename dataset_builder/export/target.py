@@ -10,10 +10,9 @@ from typing import Annotated
 
 from pydantic import Strict
 
-from dataset_builder.export.images import EXPORT_FILES
 from rebar_depth_bench.atomic_io import exclusive_lock, temporary_target, write_error, write_text
 from rebar_depth_bench.data.manifest import DatasetFolder
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.paths import check_no_links, remove_file
 from rebar_depth_bench.reading import parse_json, read_file
@@ -24,9 +23,6 @@ MARKER = "export.json"
 
 FORMAT = "rebar-depth-export-1"
 """Format version of ``MARKER``."""
-
-_FOLDERS = (".", "sparse/0", *sorted({file.folder for file in EXPORT_FILES.values()}))
-"""Folders of a config that the export writes to."""
 
 
 class _ExportedConfig(StrictModel):
@@ -40,21 +36,30 @@ class _Marker(StrictModel):
     """Content of ``MARKER``."""
 
     format: Annotated[str, one_of(FORMAT)]
+    layout: str = "plain"
     dataset: str
     configs: dict[str, _ExportedConfig]
 
 
 @contextmanager
-def export_target(to: Path, folder: DatasetFolder, wanted: Mapping[str, Sequence[str]]) -> Iterator[None]:
-    """Prepare and lock ``to`` for an export of the wanted view ids of each config.
+def export_target(
+    to: Path,
+    folder: DatasetFolder,
+    layout: str,
+    wanted: Mapping[str, Sequence[str]],
+    folders: Mapping[str, Sequence[str]],
+) -> Iterator[None]:
+    """Prepare and lock ``to`` for an export of the wanted view ids of each config in a layout.
+
+    ``folders`` are those of each config that the export writes to, relative to the config's own.
 
     Context manager; the lock is held until it exits. ``export.json`` in the folder records the dataset and, for
     each config, its build and its views. Temporary files left by a killed export are removed. Raises
-    ``InputError`` if the folder contains anything else, another dataset, another build or views that are not
+    ``InputError`` if the folder contains anything else, another dataset, layout or build, or views that are not
     wanted now, a link in place of a folder that the export writes to, or if another export holds the lock.
     """
     _check_target(to, folder)
-    check_no_links(to, *(f"{name}/{part}" for name in wanted for part in _FOLDERS))
+    check_no_links(to, *(f"{name}/{part}" for name in wanted for part in folders[name]))
     try:
         to.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -64,10 +69,10 @@ def export_target(to: Path, folder: DatasetFolder, wanted: Mapping[str, Sequence
             stack.enter_context(exclusive_lock(to))  # Locking the folder itself leaves no file behind.
         except BlockingIOError:
             raise InputError(f"{to}: another export is using this folder") from None
-        exported = _merged_configs(to, folder, wanted)
-        for part in (to, *(to / name / part for name in wanted for part in _FOLDERS)):
+        exported = _merged_configs(to, folder, layout, wanted)
+        for part in (to, *(to / name / part for name in wanted for part in folders[name])):
             _remove_temporary_files(part, MARKER if part == to else None)
-        marker = _Marker(format=FORMAT, dataset=folder.digest, configs=exported)
+        marker = _Marker(format=FORMAT, layout=layout, dataset=folder.digest, configs=exported)
         write_text(to / MARKER, json.dumps(marker.model_dump()) + "\n")
         yield
 
@@ -97,22 +102,22 @@ def _check_target(to: Path, folder: DatasetFolder) -> None:
 
 
 def _merged_configs(
-    to: Path, folder: DatasetFolder, wanted: Mapping[str, Sequence[str]]
+    to: Path, folder: DatasetFolder, layout: str, wanted: Mapping[str, Sequence[str]]
 ) -> dict[str, _ExportedConfig]:
     """Return the configs in ``to`` after the export: earlier ones remain, wanted ones are added or extended."""
     configs = {
         name: _ExportedConfig(key=folder.config(name).key, views=tuple(views)) for name, views in wanted.items()
     }
-    earlier = _read_marker(to / MARKER, folder) if (to / MARKER).is_file() else {}
+    earlier = _read_marker(to / MARKER, folder, layout) if (to / MARKER).is_file() else {}
     for name in earlier.keys() & configs.keys():
         _check_same_build(to, name, earlier[name], configs[name])
     return {**earlier, **configs}
 
 
-def _read_marker(path: Path, folder: DatasetFolder) -> dict[str, _ExportedConfig]:
+def _read_marker(path: Path, folder: DatasetFolder, layout: str) -> dict[str, _ExportedConfig]:
     """Return the configs of an earlier export from its ``export.json``.
 
-    Raises ``InputError`` if the file is invalid, has another format or names another dataset.
+    Raises ``InputError`` if the file is invalid, has another format or names another dataset or layout.
     """
     values, problems = parse_json(read_file(path, JSON_BYTES, "the record of an export", InputError))
     marker = None if problems else validate_table(_Marker, values, problems)
@@ -122,6 +127,11 @@ def _read_marker(path: Path, folder: DatasetFolder) -> dict[str, _ExportedConfig
         raise InputError(
             f"{path.parent}: contains an export of dataset {marker.dataset}, expected {folder.digest} "
             f"as in {folder.root}; choose another folder"
+        )
+    if marker.layout != layout:
+        raise InputError(
+            f"{path.parent}: contains an export in the layout {escape_text(marker.layout)}, expected {layout}; "
+            "choose another folder"
         )
     return marker.configs
 

@@ -20,7 +20,7 @@ from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import pixel_rays
-from rebar_depth_bench.methods import ConfigViews, MethodInfo, MultiViewMethod, Prepared
+from rebar_depth_bench.methods import MethodInfo, MultiViewMethod, Prepared, Views
 from rebar_depth_bench.progress import Progress
 
 _DIGITS = 12
@@ -37,11 +37,11 @@ def lidar_method(name: str, spec: ScannerSpec, what: str) -> MultiViewMethod:
     simulates what such an instrument could measure and uses no images.
     """
 
-    def check(_: ConfigViews) -> None:
+    def check(_: Views) -> None:
         if find_spec("embreex") is None:
             raise MethodError(f"{name} requires embreex for ray casting: pip install 'rebar-depth-bench[build]'")
 
-    def prepare(views: ConfigViews, _: Path, progress: Progress) -> Prepared:
+    def prepare(views: Views, _: Path, progress: Progress) -> Prepared:
         from dataset_builder.scene.raycast import RayCaster
 
         progress(f"{name}: the mesh of {views.config}", 0, 1)
