@@ -28,7 +28,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
@@ -42,7 +42,8 @@ from rebar_depth_bench.geometry.calibration import check_image_size, read_calibr
 from rebar_depth_bench.geometry.calibration_documents import DOCUMENT_SUFFIXES, parse_document
 from rebar_depth_bench.geometry.calibration_programs import program_calibration
 from rebar_depth_bench.geometry.calibration_toml import table_calibration
-from rebar_depth_bench.geometry.stereo_calibration import Calibration
+from rebar_depth_bench.geometry.stereo_calibration import Calibration, StereoCalibration
+from rebar_depth_bench.key_lines import with_lines
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN
 from rebar_depth_bench.reading import parse_toml, read_file
@@ -60,6 +61,12 @@ from rebar_depth_bench.validation import (
 CAMERAS_FILE = "cameras.toml"
 _CALIBRATION_FILES = ("calibration.conf", "calibration.toml")
 _UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_SQUARE_PIXEL_TOLERANCE = 0.03
+"""Maximum deviation of fx / fy from 1.
+
+Real cameras deviate by a fraction of a per cent; images of a different aspect ratio than the calibration's cause
+larger deviations.
+"""
 _CALIBRATION_KEYS = ("width", "height", "left", "right", "stereo")
 
 _FileName = Annotated[str, Field(pattern=f"^{NAME_PATTERN}$"), Expected(f"a file of the folder: {NAME_LETTERS}")]
@@ -144,7 +151,8 @@ def read_cameras(root: Path, images: Sequence[str], width: int, height: int, *, 
         calibration = _file_calibration(root, _found_files(root), 1.0, width, height, is_stereo=is_stereo)
         return CaptureCameras(calibration, BoardSpec(), True, {})
     check_image_size(path, width, height)
-    document, problems = parse_toml(read_file(path, TOML_BYTES, "the cameras of a capture", CalibrationError))
+    content = read_file(path, TOML_BYTES, "the cameras of a capture", CalibrationError)
+    document, problems = parse_toml(content)
     own = {key: value for key, value in document.items() if key not in _CALIBRATION_KEYS}
     rest = {key: value for key, value in document.items() if key in _CALIBRATION_KEYS}
     table = None if problems else validate_table(_CamerasTable, own, problems)
@@ -158,9 +166,9 @@ def read_cameras(root: Path, images: Sequence[str], width: int, height: int, *, 
         found = f"{len(missing)} images have none, such as {missing[0]}"
         problems.append(Problem("missing", "pose", found, "poses of all images, or none"))
     if table is None or problems:
-        raise CalibrationError.from_problems(path, problems)
+        raise CalibrationError.from_problems(path, with_lines(problems, content))
     if inline is not None:
-        calibration = scaled_calibration(inline, path, width, height)
+        calibration = _fitting(scaled_calibration(inline, path, width, height), path)
     else:
         names = [table.calibration] if isinstance(table.calibration, str) else list(table.calibration or ())
         paths = [root / name for name in names]
@@ -186,20 +194,29 @@ def _file_calibration(
     root: Path, paths: Sequence[Path], unit_m: float, width: int, height: int, *, is_stereo: bool
 ) -> Calibration:
     """Return the calibration in one or two files, scaled to the image size."""
+    source = " and ".join(map(str, paths))
     if paths[0].suffix.lower() not in DOCUMENT_SUFFIXES:
-        return read_calibration(paths[0], width, height)
+        return _fitting(read_calibration(paths[0], width, height), source)
     check_image_size(paths[0], width, height)
     problems: list[Problem] = []
-    documents: dict[str, Any] = {}
-    for path in paths:
-        content = read_file(path, TOML_BYTES, "a calibration file", CalibrationError)
-        documents[path.name] = parse_document(path.name, content, problems)
+    contents = {path.name: read_file(path, TOML_BYTES, "a calibration file", CalibrationError) for path in paths}
+    documents = {name: parse_document(name, content, problems) for name, content in contents.items()}
     calibration = None if problems else program_calibration(documents, width, height, unit_m, problems)
     if calibration is None:
+        for name, content in contents.items():
+            problems = with_lines(problems, content, name)
         raise CalibrationError.from_problems(root, problems)
-    scaled: Calibration = scaled_calibration(calibration, root, width, height)
-    if is_stereo and not hasattr(scaled, "right"):
-        raise CalibrationError(
-            f"{root}: {', '.join(documents)}: describes one camera, expected the left and the right one"
-        )
-    return scaled
+    if is_stereo and not isinstance(calibration, StereoCalibration):
+        problem = Problem("missing", "", "describes one camera", "the left and the right one")
+        raise CalibrationError.from_problems(source, [problem])
+    return _fitting(scaled_calibration(calibration, source, width, height), source)
+
+
+def _fitting(calibration: Calibration, source: object) -> Calibration:
+    """Return a calibration. Raises ``CalibrationError`` if it is for images of another aspect ratio."""
+    lens = calibration.left
+    if abs(lens.fx / lens.fy - 1) > _SQUARE_PIXEL_TOLERANCE:
+        found = f"at {calibration.width} x {calibration.height} pixels fx is {lens.fx / lens.fy:.3f} times fy"
+        problem = Problem("conflict", "", found, "1: these are the cameras of images of another aspect ratio")
+        raise CalibrationError.from_problems(source, [problem])
+    return calibration

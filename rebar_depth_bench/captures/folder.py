@@ -23,12 +23,6 @@ from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.geometry.stereo_calibration import MonoCalibration
 
 CAPTURE_LAYOUT = "left/<name>.png|jpg, right/<name>.png|jpg, calibration.conf|toml or another calibration"
-_SQUARE_PIXEL_TOLERANCE = 0.03
-"""Maximum deviation of fx / fy from 1.
-
-Real cameras deviate by a fraction of a per cent; images of a different aspect ratio than the calibration's cause
-larger deviations.
-"""
 
 
 def is_capture(path: str | os.PathLike[str]) -> bool:
@@ -64,12 +58,6 @@ def open_capture(path: str | os.PathLike[str]) -> ImageViews:
     calibration = cameras.calibration
     if not is_stereo:
         calibration = MonoCalibration(width, height, calibration.left)
-    ratio = calibration.left.fx / calibration.left.fy
-    if abs(ratio - 1) > _SQUARE_PIXEL_TOLERANCE:
-        raise InputError(
-            f"{root}: at the image size {width} x {height} fx is {ratio:.3f} times fy, expected 1: "
-            "the calibration belongs to images of another aspect ratio"
-        )
     return ImageViews(
         path=root,
         config=name,

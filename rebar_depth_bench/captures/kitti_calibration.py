@@ -16,6 +16,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, DatasetError, Problem
 from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
+from rebar_depth_bench.key_lines import with_lines
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import parse_number, read_file
 from rebar_depth_bench.validation import format_location, short_repr
@@ -122,7 +123,7 @@ def _read_file(path: Path, quantities: Mapping[str, _Quantity]) -> dict[str, Num
     texts = _key_values(content, problems)
     values = {key: _parse_numbers(texts, key, quantity, problems) for key, quantity in quantities.items()}
     if problems:
-        raise DatasetError.from_problems(path, problems)
+        raise DatasetError.from_problems(path, with_lines(problems, content))
     return values
 
 

@@ -99,20 +99,15 @@ class ImageViews:
         return dict.fromkeys(self.view_ids, self.grid)
 
     def describe_camera(self) -> str:
-        """Return a description of K, the baseline and the pixel grid that depth maps must have."""
+        """Return a description of K, the baseline and the pixel grid of depth maps."""
         left, (height, width) = self.calibration.left, self.grid
         description = (
             f"left fx {left.fx:.2f}, fy {left.fy:.2f}, cx {left.cx:.2f}, cy {left.cy:.2f} px at {width} x {height}"
         )
         if isinstance(self.calibration, StereoCalibration):
             description += f"; baseline {calibrated_baseline_m(self.calibration) * 1000:.2f} mm"
-        if any(left.distortion):
-            return (
-                f"{description}. The calibration has lens distortion: it describes raw pictures. Depth maps must "
-                "be on the very grid of the left pictures; depth of rectified pictures needs rectified pictures "
-                "there"
-            )
-        return f"{description}. Depth maps must be on the very grid of the left pictures"
+        grid = "as they are, not of rectified ones" if self.rectify else "(no lens distortion)"
+        return f"{description}. Depth maps are on the grid of the left images {grid}"
 
     def by_scene(self) -> tuple[ImageViews, ...]:
         """Return the views themselves."""

@@ -17,6 +17,7 @@ from rebar_depth_bench.geometry.stereo_calibration import (
     check_invertible,
     scale_calibration,
 )
+from rebar_depth_bench.key_lines import with_lines
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import parse_toml, read_file
 
@@ -79,7 +80,8 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
     problems: list[Problem] = []
     calibration = parser(content, width, height, problems)
     if calibration is None or problems:
-        raise CalibrationError.from_problems(path, problems + calibration_problems(calibration))
+        problems += calibration_problems(calibration)
+        raise CalibrationError.from_problems(path, with_lines(problems, content))
     return scaled_calibration(calibration, path, width, height)
 
 

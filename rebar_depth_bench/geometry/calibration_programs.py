@@ -10,8 +10,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -30,7 +32,10 @@ from rebar_depth_bench.validation import format_location, short_repr
 Document = Mapping[str, Any]
 Values = Float64[ndarray, "..."]
 
+_KNOWN_MODEL = "k1 k2 p1 p2 k3 (plumb_bob, radtan); rectify the images first"
+_CAMERAS = ("left", "right")
 _MAX_NUMBERS = 100
+_MAX_MAGNITUDE = 1e9
 _ROUNDED_ROTATION = 1e-4
 """Largest deviation of ``R @ R.T`` from the identity in a file with few digits; it is made exact."""
 _DISTORTION_TERMS = 5
@@ -39,10 +44,15 @@ _MODELS = ("plumb_bob", "radtan", "rational_polynomial", "none", "")
 
 
 class _Reader:
-    """Values of a document ``name``; problems are added to ``problems``, in place of which zeros are returned."""
+    """Values of a document ``name``; problems are added to ``problems``, in place of which zeros are returned.
 
-    def __init__(self, name: str, document: Document, problems: list[Problem]) -> None:
-        self.name, self.document, self._problems = name, document, problems
+    ``sources`` names the files of the keys of a document that was put together from several.
+    """
+
+    def __init__(
+        self, name: str, document: Document, problems: list[Problem], sources: Mapping[str, str] | None = None
+    ) -> None:
+        self.name, self.document, self._problems, self._sources = name, document, problems, sources or {}
         self._keys = {re.sub("[^a-z0-9]", "", key.lower()): key for key in document}
 
     def key(self, names: Iterable[str]) -> str | None:
@@ -78,7 +88,7 @@ class _Reader:
         if not isinstance(value, dict):
             self.problem("invalid", key, f"got {short_repr(value)}", "a table")
             value = {}
-        return _Reader(format_location(self.name, key), value, self._problems)
+        return _Reader(self.place(key), value, self._problems)
 
     def lens(self, matrix: Values, distortion: Values, model: object = "") -> dict[str, Any]:
         """Return the table of a lens for ``table_calibration``."""
@@ -91,12 +101,19 @@ class _Reader:
 
     def problem(self, code: Any, key: str, found: str, expected: str) -> None:
         """Add a problem at a key."""
-        self._problems.append(Problem(code, format_location(self.name, key), found, expected))
+        self._problems.append(Problem(code, self.place(key), found, expected))
+
+    def place(self, key: str) -> str:
+        """Return the location of a key."""
+        name = self._sources.get(key, self.name)
+        return format_location(name if ": " in name else f"{name}:", key)
+
+    def place_of(self, names: Iterable[str]) -> str:
+        """Return the location of the first key that the document has."""
+        return self.place(self.key(names) or "")
 
     def _unknown_model(self, found: str) -> None:
-        self._problems.append(
-            Problem("invalid", self.name, found, "k1 k2 p1 p2 k3 (plumb_bob, radtan); rectify the images first")
-        )
+        self._problems.append(Problem("invalid", self.name, found, _KNOWN_MODEL))
 
 
 def program_calibration(
@@ -108,47 +125,73 @@ def program_calibration(
     the documents state none. Problems are added to ``problems``; the result is None if there are any.
     """
     readers = [_Reader(name, document, problems) for name, document in documents.items()]
-    merged = _Reader(
-        readers[0].name, {key: value for one in readers for key, value in one.document.items()}, problems
-    )
-    if any("cam0" in one.document for one in readers):
-        table = _kalibr(merged, unit_m)
-    elif all(one.has(_ROS_MATRIX) and one.has(_ROS_PROJECTION) for one in readers):
-        table = _ros(readers, unit_m)
+    if all(one.has(_ROS_MATRIX) and one.has(_ROS_PROJECTION) for one in readers):
+        cameras = _ros(readers, unit_m)
     else:
-        table = _opencv(merged, unit_m)
+        merged = _merged(documents, problems)
+        cameras = _kalibr(merged, unit_m) if "cam0" in merged.document else _opencv(merged, unit_m)
     if problems:
         return None
-    is_stereo = "stereo" in table
-    return table_calibration(table, width, height, problems, is_stereo=is_stereo)
+    table_problems: list[Problem] = []
+    is_stereo = "stereo" in cameras.table
+    calibration = table_calibration(cameras.table, width, height, table_problems, is_stereo=is_stereo)
+    problems += [replace(problem, where=cameras.place(problem.where)) for problem in table_problems]
+    return calibration
 
 
-def _kalibr(chain: _Reader, unit_m: float) -> dict[str, Any]:
-    names = [name for name in ("cam0", "cam1") if name in chain.document]
-    cameras = {name: chain.table(name) for name in names}
+@dataclass(frozen=True)
+class _Cameras:
+    """Table of a calibration, as ``calibration_toml`` reads it, and locations of the matrix of each camera."""
+
+    table: Mapping[str, Any]
+    places: Sequence[str]
+
+    def place(self, where: str) -> str:
+        """Return the location in the documents of a location in the table."""
+        part, _, key = where.partition(".")
+        return f"{self.places[part == _CAMERAS[1]]}: {key or part}"
+
+
+def _merged(documents: Mapping[str, Document], problems: list[Problem]) -> _Reader:
+    """Return the reader of all keys of the documents; a key with two values adds a problem."""
+    merged: dict[str, Any] = {}
+    sources: dict[str, str] = {}
+    for name, document in documents.items():
+        for key, value in document.items():
+            if key in merged and value != merged[key]:
+                place = format_location(f"{name}:", key)
+                problems.append(Problem("duplicate", place, f"differs from that in {sources[key]}", "one value"))
+            merged.setdefault(key, value)
+            sources.setdefault(key, name)
+    return _Reader(next(iter(documents)), merged, problems, sources)
+
+
+def _kalibr(chain: _Reader, unit_m: float) -> _Cameras:
+    cameras = [chain.table(name) for name in ("cam0", "cam1") if name in chain.document]
     table: dict[str, Any] = {}
-    for eye, camera in zip(("left", "right"), cameras.values(), strict=False):
+    for eye, camera in zip(_CAMERAS, cameras, strict=False):
         model = camera.document.get("camera_model", "pinhole")
         if model != "pinhole":
             camera.problem("invalid", "camera_model", f"got {short_repr(model)}", "pinhole")
-        fx, fy, cx, cy = camera.numbers(("intrinsics",), (4,)).tolist()
+        fx, fy, cx, cy = camera.numbers(_KALIBR_MATRIX, (4,)).tolist()
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         terms = camera.numbers(("distortioncoeffs",), (-1,), np.zeros(4))
         table[eye] = camera.lens(matrix, terms, camera.document.get("distortion_model", ""))
-    table |= _size(cameras["cam0"], ("resolution",))
-    if "cam1" in cameras:
-        cam1_from_cam0 = cameras["cam1"].numbers(("tcncnm1",), (4, 4))
+    table |= _size(cameras[0], ("resolution",))
+    if len(cameras) == 2:
+        cam1_from_cam0 = cameras[1].numbers(("tcncnm1",), (4, 4))
         table["stereo"] = _motion(cam1_from_cam0[:3, :3], unit_m * cam1_from_cam0[:3, 3])
-    return table
+    return _Cameras(table, [camera.place_of(_KALIBR_MATRIX) for camera in cameras])
 
 
+_KALIBR_MATRIX = ("intrinsics",)
 _ROS_MATRIX = ("cameramatrix", "k")
 _ROS_PROJECTION = ("projectionmatrix", "p")
 
 
-def _ros(cameras: Sequence[_Reader], unit_m: float) -> dict[str, Any]:
+def _ros(cameras: Sequence[_Reader], unit_m: float) -> _Cameras:
     table: dict[str, Any] = {}
-    for eye, camera in zip(("left", "right"), cameras, strict=False):
+    for eye, camera in zip(_CAMERAS, cameras, strict=False):
         terms = camera.numbers(("distortioncoefficients", "d"), (-1,), np.zeros(5))
         model = camera.document.get("distortion_model", "")
         table[eye] = camera.lens(camera.numbers(_ROS_MATRIX, (3, 3)), terms, model)
@@ -156,16 +199,16 @@ def _ros(cameras: Sequence[_Reader], unit_m: float) -> dict[str, Any]:
     if len(cameras) == 2:
         rotations = [_rotation(camera, ("rectificationmatrix", "r")) for camera in cameras]
         projection = cameras[1].numbers(_ROS_PROJECTION, (3, 4))
-        if not projection[0, 0] > 0 > projection[0, 3]:
+        fx, x = projection[0, 0], projection[0, 3]
+        if fx > 0 > x:
+            right_from_rectified = rotations[1].T
+            translation_m = right_from_rectified @ np.array([x / fx * unit_m, 0.0, 0.0])
+            table["stereo"] = _motion(right_from_rectified @ rotations[0], translation_m)
+        else:
+            key = cameras[1].key(_ROS_PROJECTION) or _ROS_PROJECTION[0]
             expected = "fx above 0 and P[0, 3] = -fx * baseline, of the right camera of a calibrated pair"
-            cameras[1].problem(
-                "invalid", "projection_matrix", f"got {short_repr(projection[0].tolist())}", expected
-            )
-            return table
-        baseline_m = -projection[0, 3] / projection[0, 0] * unit_m
-        motion = rotations[1].T @ rotations[0]
-        table["stereo"] = _motion(motion, rotations[1].T @ np.array([-baseline_m, 0.0, 0.0]))
-    return table
+            cameras[1].problem("invalid", key, f"got {short_repr(projection[0].tolist())}", expected)
+    return _Cameras(table, [camera.place_of(_ROS_MATRIX) for camera in cameras])
 
 
 def _spellings(*stems: str, eyes: Iterable[str]) -> tuple[str, ...]:
@@ -176,16 +219,21 @@ def _spellings(*stems: str, eyes: Iterable[str]) -> tuple[str, ...]:
 
 _MATRICES = ("m", "k", "cameramatrix", "intrinsics", "intrinsicmatrix", "mtx", "cammatrix")
 _DISTORTIONS = ("d", "distcoeffs", "distcoeff", "distortioncoefficients", "distortioncoeffs", "distortion", "dist")
-_EYES = {"left": ("1", "left", "l"), "right": ("2", "right", "r")}
+_EYE_SPELLINGS: tuple[Sequence[str], ...] = (("1", "left", "l"), ("2", "right", "r"))
+_NO_EYE: tuple[Sequence[str], ...] = (("",),)
 
 
-def _opencv(storage: _Reader, unit_m: float) -> dict[str, Any]:
-    right = storage.key(_spellings(*_MATRICES, eyes=_EYES["right"]))
+def _opencv(storage: _Reader, unit_m: float) -> _Cameras:
+    right = storage.key(_spellings(*_MATRICES, eyes=_EYE_SPELLINGS[1]))
     is_stereo = right is not None and isinstance(storage.document[right], dict | list)
+    if float(storage.numbers(("fisheyemodel",), (1,), np.zeros(1))[0]):
+        storage.problem("invalid", "fisheye_model", "got a fisheye calibration", _KNOWN_MODEL)
     table: dict[str, Any] = {}
-    for eye in ("left", "right") if is_stereo else ("left",):
-        eyes = _EYES[eye] if is_stereo else ("",)
-        matrix = storage.numbers(_spellings(*_MATRICES, eyes=eyes), (3, 3))
+    places = []
+    for eye, eyes in zip(_CAMERAS, _EYE_SPELLINGS if is_stereo else _NO_EYE, strict=False):
+        names = _spellings(*_MATRICES, eyes=eyes)
+        places.append(storage.place_of(names))
+        matrix = storage.numbers(names, (3, 3))
         terms = storage.numbers(_spellings(*_DISTORTIONS, eyes=eyes), (-1,), np.zeros(5))
         table[eye] = storage.lens(matrix, terms, storage.document.get("distortion_model", ""))
     table |= _size(storage, ("imagesize", "size", "cameraresolution", "resolution"))
@@ -194,16 +242,17 @@ def _opencv(storage: _Reader, unit_m: float) -> dict[str, Any]:
         rotation = _rotation(storage, ("r", "rotation", "rotationmatrix", "rmat"))
         translation = storage.numbers(("t", "translation", "translationvector", "tvec"), (3,))
         table["stereo"] = _motion(rotation, unit_m * translation)
-    return table
+    return _Cameras(table, places)
 
 
-def _size(camera: _Reader, *names: Sequence[str]) -> dict[str, int]:
+def _size(camera: _Reader, *names: Sequence[str]) -> dict[str, float]:
     """Return width and height, from one key with both or from two keys; nothing if the document has none."""
     if not all(map(camera.has, names)):
         return {}
     shapes: Callable[[Sequence[str]], Values] = partial(camera.numbers, shape=(2,) if len(names) == 1 else (1,))
     width, height = np.concatenate([shapes(one) for one in names]).tolist()
-    return {"width": int(width), "height": int(height)}
+    sides_px = {"width": width, "height": height}
+    return {key: int(side_px) if side_px.is_integer() else side_px for key, side_px in sides_px.items()}
 
 
 def _rotation(camera: _Reader, names: Sequence[str]) -> Values:
@@ -229,7 +278,8 @@ def _flattened(value: Any) -> Iterable[float]:
     elif isinstance(value, str):
         yield parse_number(value)
     else:
-        yield float(value) if isinstance(value, int | float) and not isinstance(value, bool) else float("nan")
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        yield float(value) if is_number and abs(value) <= _MAX_MAGNITUDE else math.nan
 
 
 def _shape_text(shape: tuple[int, ...]) -> str:
