@@ -53,11 +53,11 @@ class _Reader:
         self, name: str, document: Document, problems: list[Problem], sources: Mapping[str, str] | None = None
     ) -> None:
         self.name, self.document, self._problems, self._sources = name, document, problems, sources or {}
-        self._keys = {re.sub("[^a-z0-9]", "", key.lower()): key for key in document}
+        self._keys = {_plain(key): key for key in document}
 
     def key(self, names: Iterable[str]) -> str | None:
         """Return the first key that the document has, compared without case and punctuation."""
-        return next((self._keys[name] for name in names if name in self._keys), None)
+        return next((self._keys[_plain(name)] for name in names if _plain(name) in self._keys), None)
 
     def has(self, names: Iterable[str]) -> bool:
         """Return whether the document has one of the keys."""
@@ -125,7 +125,7 @@ def program_calibration(
     the documents state none. Problems are added to ``problems``; the result is None if there are any.
     """
     readers = [_Reader(name, document, problems) for name, document in documents.items()]
-    if all(one.has(_ROS_MATRIX) and one.has(_ROS_PROJECTION) for one in readers):
+    if any(one.has(_ROS_MATRIX) and one.has(_ROS_PROJECTION) for one in readers):
         cameras = _ros(readers, unit_m)
     else:
         merged = _merged(documents, problems)
@@ -135,7 +135,7 @@ def program_calibration(
     table_problems: list[Problem] = []
     is_stereo = "stereo" in cameras.table
     calibration = table_calibration(cameras.table, width, height, table_problems, is_stereo=is_stereo)
-    problems += [replace(problem, where=cameras.place(problem.where)) for problem in table_problems]
+    problems += map(cameras.located, table_problems)
     return calibration
 
 
@@ -146,10 +146,10 @@ class _Cameras:
     table: Mapping[str, Any]
     places: Sequence[str]
 
-    def place(self, where: str) -> str:
-        """Return the location in the documents of a location in the table."""
-        part, _, key = where.partition(".")
-        return f"{self.places[part == _CAMERAS[1]]}: {key or part}"
+    def located(self, problem: Problem) -> Problem:
+        """Return a problem of the table with its location in the documents."""
+        part, _, key = problem.where.partition(".")
+        return replace(problem, where=self.places[part == _CAMERAS[1]], found=f"{key or part}: {problem.found}")
 
 
 def _merged(documents: Mapping[str, Document], problems: list[Problem]) -> _Reader:
@@ -175,29 +175,29 @@ def _kalibr(chain: _Reader, unit_m: float) -> _Cameras:
             camera.problem("invalid", "camera_model", f"got {short_repr(model)}", "pinhole")
         fx, fy, cx, cy = camera.numbers(_KALIBR_MATRIX, (4,)).tolist()
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        terms = camera.numbers(("distortioncoeffs",), (-1,), np.zeros(4))
+        terms = camera.numbers(("distortion_coeffs",), (-1,), np.zeros(4))
         table[eye] = camera.lens(matrix, terms, camera.document.get("distortion_model", ""))
     table |= _size(cameras[0], ("resolution",))
     if len(cameras) == 2:
-        cam1_from_cam0 = cameras[1].numbers(("tcncnm1",), (4, 4))
+        cam1_from_cam0 = cameras[1].numbers(("T_cn_cnm1",), (4, 4))
         table["stereo"] = _motion(cam1_from_cam0[:3, :3], unit_m * cam1_from_cam0[:3, 3])
     return _Cameras(table, [camera.place_of(_KALIBR_MATRIX) for camera in cameras])
 
 
 _KALIBR_MATRIX = ("intrinsics",)
-_ROS_MATRIX = ("cameramatrix", "k")
-_ROS_PROJECTION = ("projectionmatrix", "p")
+_ROS_MATRIX = ("camera_matrix", "K")
+_ROS_PROJECTION = ("projection_matrix", "P")
 
 
 def _ros(cameras: Sequence[_Reader], unit_m: float) -> _Cameras:
     table: dict[str, Any] = {}
     for eye, camera in zip(_CAMERAS, cameras, strict=False):
-        terms = camera.numbers(("distortioncoefficients", "d"), (-1,), np.zeros(5))
+        terms = camera.numbers(("distortion_coefficients", "D"), (-1,), np.zeros(5))
         model = camera.document.get("distortion_model", "")
         table[eye] = camera.lens(camera.numbers(_ROS_MATRIX, (3, 3)), terms, model)
-    table |= _size(cameras[0], ("imagewidth", "width"), ("imageheight", "height"))
+    table |= _size(cameras[0], ("image_width", "width"), ("image_height", "height"))
     if len(cameras) == 2:
-        rotations = [_rotation(camera, ("rectificationmatrix", "r")) for camera in cameras]
+        rotations = [_rotation(camera, ("rectification_matrix", "R")) for camera in cameras]
         projection = cameras[1].numbers(_ROS_PROJECTION, (3, 4))
         fx, x = projection[0, 0], projection[0, 3]
         if fx > 0 > x:
@@ -212,13 +212,16 @@ def _ros(cameras: Sequence[_Reader], unit_m: float) -> _Cameras:
 
 
 def _spellings(*stems: str, eyes: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of a quantity of one camera, without case and punctuation."""
+    """Return the names of a quantity of one camera."""
     pairs = [(stem, eye) for stem in stems for eye in eyes]
     return tuple(name for stem, eye in pairs for name in (stem + eye, eye + stem))
 
 
-_MATRICES = ("m", "k", "cameramatrix", "intrinsics", "intrinsicmatrix", "mtx", "cammatrix")
-_DISTORTIONS = ("d", "distcoeffs", "distcoeff", "distortioncoefficients", "distortioncoeffs", "distortion", "dist")
+_MATRICES = ("M", "K", "camera_matrix", "intrinsics", "intrinsic_matrix", "mtx", "cam_matrix")
+_DISTORTIONS = (
+    *("D", "distortion", "distortion_coefficients", "distortion_coeffs"),
+    *("dist", "dist_coeffs", "dist_coeff"),
+)
 _EYE_SPELLINGS: tuple[Sequence[str], ...] = (("1", "left", "l"), ("2", "right", "r"))
 _NO_EYE: tuple[Sequence[str], ...] = (("",),)
 
@@ -226,7 +229,7 @@ _NO_EYE: tuple[Sequence[str], ...] = (("",),)
 def _opencv(storage: _Reader, unit_m: float) -> _Cameras:
     right = storage.key(_spellings(*_MATRICES, eyes=_EYE_SPELLINGS[1]))
     is_stereo = right is not None and isinstance(storage.document[right], dict | list)
-    if float(storage.numbers(("fisheyemodel",), (1,), np.zeros(1))[0]):
+    if float(storage.numbers(("fisheye_model",), (1,), np.zeros(1))[0]):
         storage.problem("invalid", "fisheye_model", "got a fisheye calibration", _KNOWN_MODEL)
     table: dict[str, Any] = {}
     places = []
@@ -236,11 +239,11 @@ def _opencv(storage: _Reader, unit_m: float) -> _Cameras:
         matrix = storage.numbers(names, (3, 3))
         terms = storage.numbers(_spellings(*_DISTORTIONS, eyes=eyes), (-1,), np.zeros(5))
         table[eye] = storage.lens(matrix, terms, storage.document.get("distortion_model", ""))
-    table |= _size(storage, ("imagesize", "size", "cameraresolution", "resolution"))
-    table |= {} if "width" in table else _size(storage, ("imagewidth", "width"), ("imageheight", "height"))
+    table |= _size(storage, ("image_size", "size", "camera_resolution", "resolution"))
+    table |= {} if "width" in table else _size(storage, ("image_width", "width"), ("image_height", "height"))
     if is_stereo:
-        rotation = _rotation(storage, ("r", "rotation", "rotationmatrix", "rmat"))
-        translation = storage.numbers(("t", "translation", "translationvector", "tvec"), (3,))
+        rotation = _rotation(storage, ("R", "rotation", "rotation_matrix", "rmat"))
+        translation = storage.numbers(("T", "translation", "translation_vector", "tvec"), (3,))
         table["stereo"] = _motion(rotation, unit_m * translation)
     return _Cameras(table, places)
 
@@ -268,6 +271,11 @@ def _motion(rotation: Values, translation_m: Values) -> dict[str, Any]:
         u, _, vt = np.linalg.svd(rotation)
         rotation = u @ vt
     return {"rotation": rotation.tolist(), "translation_m": translation_m.tolist()}
+
+
+def _plain(key: str) -> str:
+    """Return a key without case and punctuation."""
+    return re.sub("[^a-z0-9]", "", key.lower())
 
 
 def _flattened(value: Any) -> Iterable[float]:

@@ -1,0 +1,1 @@
+"""Tests of captures: images with known cameras that are no dataset folder."""
