@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 
 from rebar_depth_bench.errors import Problem
 
@@ -32,24 +33,23 @@ def with_lines(problems: Sequence[Problem], content: bytes, name: str = "") -> l
 def key_line(text: str, where: str) -> int | None:
     """Return the number of the line of the key at a location, from 1, or None if the text has no such key.
 
-    Keys are searched in the order of the location, each after its table; commented lines are left out.
+    Keys are searched in the order of the location, each after its table; commented lines are left out. The n-th
+    item of a list is the n-th table of that name, or else in the line of the list.
     """
     position = 0
     for name, index in _LOCATION_PART.findall(where):
-        for _ in range(int(index or 1)):
-            match = _next_key(text, name, position)
-            if match is None:
-                return None
-            position = match.end()
+        matches = list(islice(_keys(text, name, position), int(index or 1)))
+        if not matches:
+            return None
+        position = matches[-1 if len(matches) == int(index or 1) else 0].end()
     return 1 + text.count("\n", 0, position) if position else None
 
 
-def _next_key(text: str, name: str, position: int) -> re.Match[str] | None:
-    """Return the match of ``[key]``, ``key =``, ``"key":`` or ``<key`` after ``position``, up to the key's end."""
+def _keys(text: str, name: str, position: int) -> Iterator[re.Match[str]]:
+    """Yield the matches of ``[key]``, ``key =``, ``"key":`` and ``<key`` after ``position``, up to the key's end."""
     key = re.escape(name)
     pattern = re.compile(rf"<{key}(?![\w.-])|(?<![\w-]){key}(?=[\"']?\s*[\].:=])", re.IGNORECASE)
     for match in pattern.finditer(text, position):
         line_start = 1 + text.rfind("\n", 0, match.start())
         if not text[line_start : match.start()].lstrip().startswith(("#", ";", "%")):
-            return match
-    return None
+            yield match

@@ -28,12 +28,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
-from pydantic import Field, Strict, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from rebar_depth_bench.data.eye_view import camera_array
 from rebar_depth_bench.errors import CalibrationError, InputError, Problem
@@ -70,7 +70,8 @@ larger deviations.
 _CALIBRATION_KEYS = ("width", "height", "left", "right", "stereo")
 
 _FileName = Annotated[str, Field(pattern=f"^{NAME_PATTERN}$"), Expected(f"a file of the folder: {NAME_LETTERS}")]
-_Rows = Annotated[list[list[float]], Strict(False)]
+_Row = Annotated[list[float], Field(min_length=4, max_length=4), Expected("4 numbers")]
+_Rows = Annotated[list[_Row], Field(min_length=4, max_length=4)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +123,7 @@ class _PoseTable(StrictModel):
 
 
 class _CamerasTable(StrictModel):
-    """Content of ``cameras.toml`` without the keys of ``calibration.toml``."""
+    """Content of ``cameras.toml``; ``table_calibration`` reads the keys of ``calibration.toml``."""
 
     calibration: Annotated[
         _FileName | Annotated[list[_FileName], Field(min_length=1, max_length=2)] | None,
@@ -131,6 +132,11 @@ class _CamerasTable(StrictModel):
     unit: Annotated[str, one_of(*_UNITS_M)] = "m"
     board: _BoardTable | None = None
     pose: tuple[_PoseTable, ...] = Field(default=(), strict=False)
+    width: Any = None
+    height: Any = None
+    left: Any = None
+    right: Any = None
+    stereo: Any = None
 
     @field_validator("pose")
     @classmethod
@@ -153,9 +159,8 @@ def read_cameras(root: Path, images: Sequence[str], width: int, height: int, *, 
     check_image_size(path, width, height)
     content = read_file(path, TOML_BYTES, "the cameras of a capture", CalibrationError)
     document, problems = parse_toml(content)
-    own = {key: value for key, value in document.items() if key not in _CALIBRATION_KEYS}
-    rest = {key: value for key, value in document.items() if key in _CALIBRATION_KEYS}
-    table = None if problems else validate_table(_CamerasTable, own, problems)
+    rest = {key: document[key] for key in _CALIBRATION_KEYS if key in document}
+    table = None if problems else validate_table(_CamerasTable, document, problems)
     inline = None
     if table is not None and table.calibration is not None and rest:
         problems.append(Problem("conflict", "calibration", f"given beside {', '.join(rest)}", "one of them"))

@@ -128,9 +128,8 @@ def test_invalid_file_is_refused_with_its_line(
         read(tmp_path)
     problem = caught.value.problems[0]
     assert problem.where == (f"{name}: {key}" if key else name)
-    assert problem.found.startswith(f"line {line}: " if line else "") and problem.found.startswith(
-        "line "
-    ) == bool(line)
+    stated = re.match(r"line (\d+): ", problem.found)
+    assert (stated and int(stated[1])) == line
 
 
 @pytest.mark.parametrize(
