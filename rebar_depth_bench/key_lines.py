@@ -46,7 +46,7 @@ def key_line(text: str, where: str) -> int | None:
 
 
 def _keys(text: str, name: str, position: int) -> Iterator[re.Match[str]]:
-    """Yield the matches of ``[key]``, ``key =``, ``"key":`` and ``<key`` after ``position``, up to the key's end."""
+    """Yield the matches of ``[key]``, ``key =``, ``"key":`` and ``<key`` after ``position``, up to their ends."""
     key = re.escape(name)
     pattern = re.compile(rf"<{key}(?![\w.-])|(?<![\w-]){key}(?=[\"']?\s*[\].:=])", re.IGNORECASE)
     for match in pattern.finditer(text, position):
