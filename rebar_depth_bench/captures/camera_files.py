@@ -59,6 +59,7 @@ from rebar_depth_bench.validation import (
 )
 
 CAMERAS_FILE = "cameras.toml"
+CALIBRATION_SUFFIXES = (".conf", *DOCUMENT_SUFFIXES)
 _CALIBRATION_FILES = ("calibration.conf", "calibration.toml")
 _UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _SQUARE_PIXEL_TOLERANCE = 0.03

@@ -16,8 +16,15 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from rebar_depth_bench.captures.camera_files import CAMERAS_FILE, read_cameras
-from rebar_depth_bench.captures.image_files import NAME, NAME_RULE, common_shape, entry_name, image_files
+from rebar_depth_bench.captures.camera_files import CALIBRATION_SUFFIXES, CAMERAS_FILE, read_cameras
+from rebar_depth_bench.captures.image_files import (
+    IMAGE_SUFFIXES,
+    NAME,
+    NAME_RULE,
+    common_shape,
+    entry_name,
+    image_files,
+)
 from rebar_depth_bench.captures.views import ImageViews
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.geometry.stereo_calibration import MonoCalibration
@@ -26,8 +33,15 @@ CAPTURE_LAYOUT = "left/<name>.png|jpg, right/<name>.png|jpg, calibration.conf|to
 
 
 def is_capture(path: str | os.PathLike[str]) -> bool:
-    """Return whether a folder is meant as a capture: whether it has a folder ``left`` or ``cameras.toml``."""
-    return (Path(path) / "left").is_dir() or (Path(path) / CAMERAS_FILE).is_file()
+    """Return whether a folder is meant as a capture.
+
+    It has a folder ``left``, or ``cameras.toml``, or both images and a calibration file.
+    """
+    root = Path(path)
+    if (root / "left").is_dir() or (root / CAMERAS_FILE).is_file():
+        return True
+    suffixes = {entry.suffix.lower() for entry in root.iterdir()} if root.is_dir() else set()
+    return not suffixes.isdisjoint(IMAGE_SUFFIXES) and not suffixes.isdisjoint(CALIBRATION_SUFFIXES)
 
 
 def open_capture(path: str | os.PathLike[str]) -> ImageViews:

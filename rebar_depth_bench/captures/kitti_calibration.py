@@ -6,7 +6,7 @@ Dataset", IJRR 2013, equation 8: ``y = P_rect_i  R_rect_00  T_velo_to_cam  x`` i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,24 +68,29 @@ def read_pair(day_folder: Path) -> StereoCalibration:
     problems of the file.
     """
     keys = {f"{name}_{camera:02d}": kind for camera in (2, 3) for name, kind in _CAMERA_KEYS.items()}
-    path = day_folder / CAM_TO_CAM
-    cam = _read_file(path, keys)
-    lenses, offsets_m = [], []
-    for camera in (2, 3):
-        (fx, _, cx, x), (_, fy, cy, _), _ = cam[f"P_rect_{camera:02d}"].tolist()
-        lenses.append(Lens(fx, fy, cx, cy, (0.0, 0.0, 0.0, 0.0, 0.0)))
-        offsets_m.append(x / fx)
-    baseline_m = offsets_m[0] - offsets_m[1]
-    problems = []
-    if cam["S_rect_02"].tolist() != cam["S_rect_03"].tolist():
-        problems.append(Problem("conflict", "S_rect_03", "differs from S_rect_02", "images of one size"))
-    if not baseline_m > 0:
-        found = f"the right camera is {baseline_m:.6g} m to the right of the left one"
-        problems.append(Problem("conflict", "P_rect_03", found, "a distance above 0"))
-    if problems:
-        raise DatasetError.from_problems(path, problems)
+    cam = _read_file(day_folder / CAM_TO_CAM, keys, _pair_problems)
+    left, right = (_lens(cam[key]) for key in ("P_rect_02", "P_rect_03"))
     width, height = map(int, cam["S_rect_02"])
-    return StereoCalibration(width, height, lenses[0], lenses[1], (0.0, 0.0, 0.0), (-baseline_m, 0.0, 0.0))
+    return StereoCalibration(width, height, left, right, (0.0, 0.0, 0.0), (-_baseline_m(cam), 0.0, 0.0))
+
+
+def _lens(projection: Numbers) -> Lens:
+    (fx, _, cx, _), (_, fy, cy, _), _ = projection.tolist()
+    return Lens(fx, fy, cx, cy, (0.0, 0.0, 0.0, 0.0, 0.0))
+
+
+def _baseline_m(cam: Mapping[str, Numbers]) -> float:
+    left_m, right_m = (float(cam[key][0, 3] / cam[key][0, 0]) for key in ("P_rect_02", "P_rect_03"))
+    return left_m - right_m
+
+
+def _pair_problems(cam: Mapping[str, Numbers]) -> Iterator[Problem]:
+    """Yield why two rectified cameras are no pair of a left and a right one."""
+    if cam["S_rect_02"].tolist() != cam["S_rect_03"].tolist():
+        yield Problem("conflict", "S_rect_03", "differs from S_rect_02", "images of one size")
+    if not _baseline_m(cam) > 0:
+        found = f"the right camera is {_baseline_m(cam):.6g} m to the right of the left one"
+        yield Problem("conflict", "P_rect_03", found, "a distance above 0")
 
 
 @dataclass(frozen=True)
@@ -117,11 +122,17 @@ _TRANSLATION = _Quantity((3,), "3 numbers, metres", lambda _: True)
 _CAMERA_KEYS = {"S_rect": _SIZE, "P_rect": _PROJECTION}
 
 
-def _read_file(path: Path, quantities: Mapping[str, _Quantity]) -> dict[str, Numbers]:
+def _read_file(
+    path: Path,
+    quantities: Mapping[str, _Quantity],
+    conflicts: Callable[[Mapping[str, Numbers]], Iterable[Problem]] = lambda _: (),
+) -> dict[str, Numbers]:
+    """Return numbers by key. Raises ``DatasetError`` with all problems, ``conflicts`` only of valid numbers."""
     content = read_file(path, TOML_BYTES, "KITTI's calibration of the day", DatasetError)
     problems: list[Problem] = []
     texts = _key_values(content, problems)
     values = {key: _parse_numbers(texts, key, quantity, problems) for key, quantity in quantities.items()}
+    problems += [] if problems else conflicts(values)
     if problems:
         raise DatasetError.from_problems(path, with_lines(problems, content))
     return values

@@ -38,7 +38,7 @@ class Views(Protocol):
 
     @property
     def rectify(self) -> bool:
-        """Whether methods that do not read the lens distortion are given rectified images."""
+        """Whether single-view methods that do not read the lens distortion are given rectified images."""
 
     @property
     def identity(self) -> Any:

@@ -6,7 +6,7 @@ A document is returned as dicts, lists, numbers and texts. Matrices of OpenCV ar
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import PurePath
 from typing import Any
 from xml.etree import ElementTree
@@ -45,26 +45,35 @@ def parse_document(name: str, content: bytes, problems: list[Problem]) -> dict[s
 
 
 def _parse_yaml(text: str) -> Any:
-    """Return the first document of a YAML text. Raises ``ValueError`` for invalid YAML and for aliases."""
+    """Return the first document of a text. Raises ``ValueError`` for invalid YAML, aliases and deep nesting."""
     import yaml
 
-    class Loader(yaml.SafeLoader):  # type: ignore[misc]
-        """Loader of plain values and OpenCV's matrices; aliases are refused: they can make a short text huge."""
-
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            if self.check_event(yaml.events.AliasEvent):
-                event = self.peek_event()
-                raise ValueError(f"line {event.start_mark.line + 1}: an alias (*), expected plain values")
-            return super().compose_node(parent, index)
+    class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+        """Loader of plain values and OpenCV's matrices."""
 
     Loader.add_constructor(_OPENCV_MATRIX, lambda loader, node: loader.construct_mapping(node, deep=True))
+    content = _OPENCV_HEADER.sub("\n", text, count=1)  # The numbers of the lines stay.
     try:
-        return next(iter(yaml.load_all(_OPENCV_HEADER.sub("", text, count=1), Loader)), None)
+        _check_events(yaml.parse(content, Loader))
+        return next(iter(yaml.load_all(content, Loader)), None)
     except yaml.MarkedYAMLError as error:
         line = "" if error.problem_mark is None else f"line {error.problem_mark.line + 1}: "
         raise ValueError(f"{line}not valid YAML: {error.problem}") from None
-    except (yaml.YAMLError, TypeError, ValueError) as error:
+    except (yaml.YAMLError, TypeError) as error:
         raise ValueError(f"not valid YAML: {error}") from None
+
+
+def _check_events(events: Iterable[Any]) -> None:
+    """Raise ``ValueError`` for aliases, which can make a short text huge, and for deep nesting."""
+    depth = 0
+    for event in events:
+        kind, line = type(event).__name__, event.start_mark.line + 1
+        depth += kind.endswith("StartEvent")
+        depth -= kind.endswith("EndEvent")
+        if kind == "AliasEvent":
+            raise ValueError(f"line {line}: an alias (*), expected plain values")
+        if depth > MAX_NESTING:
+            raise ValueError(f"line {line}: the values are nested too deep, expected at most {MAX_NESTING} levels")
 
 
 def _parse_json(text: str) -> Any:

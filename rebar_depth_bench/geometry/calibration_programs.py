@@ -53,7 +53,7 @@ class _Reader:
         self, name: str, document: Document, problems: list[Problem], sources: Mapping[str, str] | None = None
     ) -> None:
         self.name, self.document, self._problems, self._sources = name, document, problems, sources or {}
-        self._keys = {_plain(key): key for key in document}
+        self._keys = {_plain(str(key)): key for key in document}
 
     def key(self, names: Iterable[str]) -> str | None:
         """Return the first key that the document has, compared without case and punctuation."""

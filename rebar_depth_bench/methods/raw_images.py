@@ -2,7 +2,7 @@
 
 A method that reads the right image is given the rectified pair (``geometry.rectification``), another one the
 undistorted left image (``geometry.undistortion``). Its depth is transferred to the raw left image without
-interpolation. Methods that read ``left_distortion`` do this themselves.
+interpolation. Multi-view methods, and those that read ``left_distortion``, do this themselves.
 """
 
 from __future__ import annotations

@@ -142,7 +142,7 @@ def _predict_config(
 ) -> None:
     """Predict and store the views that are not in ``done``."""
     columns = method.info.columns
-    if views.rectify and "left_distortion" not in columns:
+    if views.rectify and isinstance(method, Method) and "left_distortion" not in columns:
         predictor, columns = rectifying_predictor(predictor, columns)
     for count, row in enumerate(views.rows(*columns, skip=done), start=len(done) + 1):
         start = time.perf_counter()

@@ -16,13 +16,17 @@ import pytest
 from PIL import Image
 
 from leaderboard.settings import read_settings
+from rebar_depth_bench.captures.camera_files import read_cameras
 from rebar_depth_bench.captures.folder import open_capture
-from rebar_depth_bench.captures.kitti_calibration import read_camera
+from rebar_depth_bench.captures.kitti_calibration import read_camera, read_pair
+from rebar_depth_bench.captures.kitti_images import read_images
 from rebar_depth_bench.errors import InputError, terminal_text
 from rebar_depth_bench.scoring.result_io import read_result
 from rebar_depth_bench.studies.depth_source import open_depths
 from rebar_depth_bench.studies.kitti.ground_truth import find_truth, project_scan, read_scan, read_truth
 from rebar_depth_bench.submission.metadata import parse_metadata
+from tests.bench.captures import calibration_files as calibrations
+from tests.bench.captures.test_cameras_toml import BOARD, POSES
 from tests.bench.damage import damaged
 from tests.bench.geometry.calibrations import CONF, TOML, write_and_read
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
@@ -56,6 +60,34 @@ def kitti_calibration(folder: Path, content: bytes, name: str) -> None:
     camera = read_camera(folder, 2)
     assert np.isfinite(camera.image_from_velo).all()
     assert np.isfinite(project_scan(kitti.random_scan(1, 100), camera)).all()
+
+
+def kitti_pair(folder: Path, content: bytes) -> None:
+    kitti.write_day(folder)
+    (folder / "calib_cam_to_cam.txt").write_bytes(content)
+    assert is_finite(astuple(read_pair(folder)))
+
+
+def kitti_list(folder: Path, content: bytes) -> None:
+    (folder / "images.txt").write_bytes(content)
+    assert all(image.name.isprintable() for image in read_images(folder / "images.txt"))
+
+
+def cameras(folder: Path, content: bytes, name: str) -> None:
+    (folder / name).write_bytes(content)
+    try:
+        read = read_cameras(folder, ["0001", "0002"], calibrations.WIDTH, calibrations.HEIGHT, is_stereo=True)
+    finally:
+        (folder / name).unlink()
+    assert is_finite(astuple(read.calibration))
+    assert all(np.isfinite(pose).all() for pose in read.cam_from_world.values())
+
+
+def opencv_bytes(folder: Path, suffix: str) -> bytes:
+    calibrations.write_opencv(folder, suffix)
+    content = (folder / f"stereo.{suffix}").read_bytes()
+    (folder / f"stereo.{suffix}").unlink()
+    return content
 
 
 def scan(folder: Path, content: bytes) -> None:
@@ -137,6 +169,19 @@ READERS: Mapping[str, tuple[Callable[[Path], bytes], Read]] = {
         lambda _: kitti.VELO_TO_CAM.encode(),
         partial(kitti_calibration, name="calib_velo_to_cam.txt"),
     ),
+    "KITTI pair": (lambda _: kitti.CAM_TO_CAM.encode(), kitti_pair),
+    "KITTI list": (
+        lambda _: b"".join(f"{i.date}/{i.drive} {i.frame} {i.side}\n".encode() for i in kitti.first_images(9)),
+        kitti_list,
+    ),
+    "cameras.toml": (
+        lambda _: (calibrations.TOML + BOARD + POSES).encode(),
+        partial(cameras, name="cameras.toml"),
+    ),
+    "OpenCV YAML": (partial(opencv_bytes, suffix="yml"), partial(cameras, name="a.yml")),
+    "OpenCV XML": (partial(opencv_bytes, suffix="xml"), partial(cameras, name="a.xml")),
+    "OpenCV JSON": (partial(opencv_bytes, suffix="json"), partial(cameras, name="a.json")),
+    "Kalibr chain": (lambda _: calibrations.kalibr_text().encode(), partial(cameras, name="a.yaml")),
     "KITTI scan": (lambda _: kitti.random_scan(1, 50).tobytes(), scan),
     "KITTI depth": (lambda _: png(np.arange(12).reshape(3, 4) * 256.0), improved),
     "capture PNG": (lambda _: image_bytes("PNG"), partial(capture_image, name="000000.png")),
