@@ -31,6 +31,6 @@ def open_images(data: str | Path, images: Path | None = None) -> Sequence[ImageV
     if is_capture(folder):
         return [open_capture(folder)]
     raise InputError(
-        f"{data}: has no {MANIFEST_FILE}, no left/, no images with {CAMERAS_FILE} or a calibration, and no days of "
-        "KITTI, expected a complete dataset folder written by rebar-build, or images with their cameras"
+        f"{data}: has no {MANIFEST_FILE}, no left/, no images with {CAMERAS_FILE} or a calibration, and no days "
+        "of KITTI, expected a complete dataset folder written by rebar-build, or images with their cameras"
     )
