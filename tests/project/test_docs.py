@@ -27,6 +27,7 @@ PAGES = [
     Path("SECURITY.md"),
     Path("cards/BENCHMARK.md"),
     Path("deploy/README.md"),
+    Path("docs/captures.md"),
 ]
 PARSERS: dict[str, ArgumentParser] = {
     "rebar-build": build_parser(),
