@@ -16,6 +16,7 @@ from dataset_builder.build_options import add_build_arguments, add_mesh_unit, ad
 from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, BuildRequest
 from dataset_builder.config.quality import colour_spec
 from dataset_builder.config.specs import CPU
+from dataset_builder.push import command as push_command
 from rebar_depth_bench.console import ProgressBars, Rate, replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
@@ -240,7 +241,7 @@ def argument_parser() -> argparse.ArgumentParser:
     add_build_arguments(parser)
     add_scene_arguments(parser)
     parser.set_defaults(run=_build)
-    commands = parser.add_subparsers(metavar="{audit,export,inspect}")
+    commands = parser.add_subparsers(metavar="{audit,export,inspect,push}")
     auditing = commands.add_parser("audit", help="check a dataset folder and its ground truth")
     _add_audit_arguments(auditing)
     auditing.set_defaults(run=_audit)
@@ -252,6 +253,9 @@ def argument_parser() -> argparse.ArgumentParser:
     inspecting = commands.add_parser("inspect", help="show the bars of a scene file without rendering")
     _add_inspect_arguments(inspecting)
     inspecting.set_defaults(run=_inspect)
+    pushing = commands.add_parser("push", help=push_command.SUMMARY)
+    push_command.add_arguments(pushing)
+    pushing.set_defaults(run=push_command.run)
     return parser
 
 

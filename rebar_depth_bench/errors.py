@@ -105,6 +105,10 @@ class OutputError(RebarDepthError):
     """Output that this machine cannot write: no space, quota or permission left, or past the file-size limit."""
 
 
+class HubError(RebarDepthError):
+    """Hugging Face Hub that cannot be reached, fails, or gives an answer that cannot be used."""
+
+
 class BuildError(RebarDepthError):
     """Build failure that is not caused by the user's input."""
 

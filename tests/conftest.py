@@ -9,6 +9,7 @@ import signal
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -34,6 +35,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # No test is timed: a busy machine is no failure.
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
+
+if TYPE_CHECKING:
+    from tests.hub_server import HubServer
 
 TINY_DATASET = Path(__file__).parent / "data" / "tiny"
 
@@ -188,6 +192,24 @@ def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Give the test a ground-truth cache of its own, and return its folder, which does not exist yet."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
     return tmp_path / "caches" / "rebar-depth-bench"
+
+
+@pytest.fixture
+def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
+    """Run a Hub on this machine, to which this process publishes with a token and without Xet."""
+    from huggingface_hub import close_session, constants
+
+    from tests.hub_server import TOKEN, running_hub
+
+    with running_hub() as server:
+        settings_of_hub = {"ENDPOINT": server.url, "HF_HUB_OFFLINE": False, "HF_HUB_DISABLE_XET": True}
+        for name, value in settings_of_hub.items():
+            monkeypatch.setattr(constants, name, value)
+        monkeypatch.setenv("HF_TOKEN", TOKEN)
+        monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+        close_session()
+        yield server
+        close_session()
 
 
 @pytest.fixture

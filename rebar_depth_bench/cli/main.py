@@ -6,7 +6,19 @@ import argparse
 import os
 from collections.abc import Mapping, Sequence
 
-from rebar_depth_bench.cli import cache, check, compare, demo, methods, predict, score, submit, table, verify
+from rebar_depth_bench.cli import (
+    cache,
+    check,
+    compare,
+    demo,
+    methods,
+    predict,
+    push_results,
+    score,
+    submit,
+    table,
+    verify,
+)
 from rebar_depth_bench.console import Command, add_commands, replace_renamed_options, run_command
 from rebar_depth_bench.output_options import check_outputs
 from rebar_depth_bench.studies.registry import STUDIES
@@ -22,6 +34,7 @@ COMMANDS: Mapping[str, Command] = {
     "methods": methods,
     "predict": predict,
     "submit": submit,
+    "push-results": push_results,
     "cache": cache,
     "demo": demo,
 }

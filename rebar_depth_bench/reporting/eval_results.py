@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from rebar_depth_bench.data.manifest import DatasetFolder
-from rebar_depth_bench.errors import InputError, escape_text, printable
+from rebar_depth_bench.errors import InputError, printable
+from rebar_depth_bench.hub.repository import check_repository_id
 from rebar_depth_bench.reporting.formatting import declaration_text, short_digest, unranked_reason
 from rebar_depth_bench.scoring.result import Result, Table
 from rebar_depth_bench.scoring.rounding import rounded
@@ -36,17 +37,7 @@ def check_hub_id(hub_id: str | None) -> str:
     """Return the id of a dataset repository, ORG/NAME. Raises ``InputError`` if it is missing or invalid."""
     if hub_id is None:
         raise InputError("--eval-results needs --hub-id ORG/NAME, the dataset's repository on the Hub")
-    from huggingface_hub.errors import HFValidationError
-    from huggingface_hub.utils import validate_repo_id  # type: ignore[attr-defined]
-
-    try:
-        validate_repo_id(hub_id)
-        valid = hub_id.count("/") == 1
-    except HFValidationError:
-        valid = False
-    if not valid:
-        raise InputError(f"--hub-id is {escape_text(hub_id)}, expected the id of a repository, ORG/NAME")
-    return hub_id
+    return check_repository_id(hub_id, "--hub-id")
 
 
 def eval_results(result: Result, folder: DatasetFolder, hub_id: str) -> tuple[str, list[str]]:

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from functools import partial
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from urllib.parse import unquote
 
 import pytest
 import yaml
@@ -20,8 +14,9 @@ from huggingface_hub import parse_eval_result_entries
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.manifest import open_folder
+from tests.hub_server import HubServer, folder_files, running_hub
 
-COMMITS = {"main": "a" * 40, "v1.0": "b" * 40, "refs/pr/1": "c" * 40}
+REVISIONS = ("main", "v1.0", "refs/pr/1")
 SCRIPT = """
 import sys
 import rebar_depth_bench as rdb
@@ -43,83 +38,14 @@ sys.exit(main(["score", f"{work}/a.zip", "--data", root, *outputs]))
 """
 
 
-class DatasetRequestHandler(BaseHTTPRequestHandler):
-    """Request handler with the endpoints of the Hub that read one dataset, ``org/data``, at several commits."""
-
-    def __init__(self, folder: Path, requests: list[str], *rest: object) -> None:
-        self.folder, self.requests = folder, requests
-        super().__init__(*rest)  # type: ignore[arg-type]
-
-    def do_GET(self) -> None:
-        self.answer()
-
-    def do_HEAD(self) -> None:
-        self.answer()
-
-    def log_message(self, *_: object) -> None:
-        """Suppress the request log."""
-
-    def answer(self) -> None:
-        path = unquote(self.path.partition("?")[0])
-        self.requests.append(f"{self.command} {path}")
-        for revision, commit in [*COMMITS.items(), *((commit, commit) for commit in COMMITS.values())]:
-            file = self.folder / path.removeprefix(f"/datasets/org/data/resolve/{revision}/").lstrip("/")
-            if path.startswith(f"/datasets/org/data/resolve/{revision}/") and file.is_file():
-                self.send_file(file, commit)
-                return
-            if path.startswith(tree := f"/api/datasets/org/data/tree/{revision}/"):
-                self.send_tree(self.folder / path.removeprefix(tree))
-                return
-            if path == f"/api/datasets/org/data/revision/{revision}":
-                self.reply(200, json.dumps({"id": "org/data", "sha": commit, "siblings": []}).encode(), {})
-                return
-        self.reply(404, b"{}", {"X-Error-Code": "RevisionNotFound"})
-
-    def send_tree(self, folder: Path) -> None:
-        entries = [
-            {
-                "type": "file",
-                "path": file.relative_to(self.folder).as_posix(),
-                "size": file.stat().st_size,
-                "oid": sha1(file),
-            }
-            for file in folder.iterdir()
-        ]
-        self.reply(200, json.dumps(entries).encode(), {})
-
-    def send_file(self, file: Path, commit: str) -> None:
-        content = file.read_bytes()
-        headers = {"ETag": f'"{sha1(file)}"', "X-Repo-Commit": commit, "Accept-Ranges": "bytes"}
-        first, _, last = self.headers.get("Range", "").removeprefix("bytes=").partition("-")
-        if first and self.command == "GET":
-            part = content[int(first) : int(last) + 1 if last else None]
-            self.reply(206, part, headers | {"Content-Range": f"bytes {first}-{last}/{len(content)}"})
-        else:
-            self.reply(200, content, headers)
-
-    def reply(self, status: int, body: bytes, headers: dict[str, str]) -> None:
-        self.send_response(status)
-        for name, value in {**headers, "Content-Length": str(len(body))}.items():
-            self.send_header(name, value)
-        self.end_headers()
-        if self.command != "HEAD":
-            self.wfile.write(body)
-
-
-def sha1(path: Path) -> str:
-    """Return the SHA-1 of a file in hexadecimal, used as ETag and object id."""
-    return hashlib.sha1(path.read_bytes()).hexdigest()
-
-
-@pytest.fixture
-def hub(tiny_root: Path) -> Iterator[tuple[str, list[str]]]:
-    """Serve the tiny dataset; yield the address and the list of requests."""
-    requests = list[str]()
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(DatasetRequestHandler, tiny_root, requests))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_port}", requests
-    server.shutdown()
-    server.server_close()
+@pytest.fixture(scope="module")
+def reading_hub(tiny_root: Path) -> Iterator[HubServer]:
+    """Serve the tiny dataset as ``org/data``, at a commit of its own for each revision."""
+    with running_hub() as server:
+        repository = server.add("datasets/org/data")
+        for revision in REVISIONS:
+            repository.commit(revision, folder_files(tiny_root), revision)
+        yield server
 
 
 def run_script(root: str, home: Path, endpoint: str) -> subprocess.CompletedProcess[str]:
@@ -132,18 +58,17 @@ def run_script(root: str, home: Path, endpoint: str) -> subprocess.CompletedProc
 
 @pytest.mark.slow
 @pytest.mark.parametrize("revision", ["", "@refs/pr/1"])
-def test_revision_selects_the_commit_of_all_files(
-    hub: tuple[str, list[str]], tmp_path: Path, revision: str
-) -> None:
-    endpoint, requests = hub
-    finished = run_script(f"org/data{revision}", tmp_path / "home", endpoint)
+def test_revision_selects_the_commit_of_all_files(reading_hub: HubServer, tmp_path: Path, revision: str) -> None:
+    reading_hub.requests.clear()
+    finished = run_script(f"org/data{revision}", tmp_path / "home", reading_hub.url)
     assert finished.returncode == 0, finished.stderr
-    commit = COMMITS.get(revision[1:] or "main", revision[1:])
+    commit = reading_hub.repositories["datasets/org/data"].branches[revision[1:] or "main"]
     lines = finished.stdout.splitlines()
     assert lines[:3] == [f"{commit} 2", "2", "2"]
     assert "no problem found in 10 files" in lines[3]
     [entry] = parse_eval_result_entries(yaml.safe_load((tmp_path / "results.yaml").read_text()))
     assert (entry.dataset_id, entry.task_id, entry.dataset_revision) == ("org/data", "lattice-orbit", commit)
+    requests = [request.path for request in reading_hub.requests]
     shards = [request for request in requests if request.endswith(".parquet")]
     assert shards
     assert all(f"/{commit}/" in request for request in shards)
@@ -151,8 +76,8 @@ def test_revision_selects_the_commit_of_all_files(
 
 
 @pytest.mark.slow
-def test_unknown_revision_is_refused(hub: tuple[str, list[str]], tmp_path: Path) -> None:
-    finished = run_script("org/data@v2", tmp_path / "home", hub[0])
+def test_unknown_revision_is_refused(reading_hub: HubServer, tmp_path: Path) -> None:
+    finished = run_script("org/data@v2", tmp_path / "home", reading_hub.url)
     assert "DatasetError: org/data@v2: not a local folder, and its manifest.json cannot" in finished.stderr
 
 

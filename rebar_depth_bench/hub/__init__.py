@@ -1,0 +1,1 @@
+"""Repositories of the Hugging Face Hub that this project publishes to, through ``huggingface_hub``."""

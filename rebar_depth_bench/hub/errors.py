@@ -1,0 +1,118 @@
+"""Errors of the Hugging Face Hub in words: what the Hub answered, and what the user can do about it.
+
+``huggingface_hub`` raises its own errors, those of its HTTP client, and ``ValueError``, ``KeyError`` or
+``TypeError`` for answers that it does not expect. All of them become errors of this project, and none of them
+contains the token.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rebar_depth_bench.errors import (
+    HubError,
+    InputError,
+    RebarDepthError,
+    escape_text,
+    exception_summary,
+    terminal_text,
+)
+
+_EXPECTED_OF_INPUT = {
+    400: "content that the Hub accepts",
+    401: "a valid token: hf auth login, or HF_TOKEN",
+    403: "a token with permission to write to this repository, and room in the storage of its owner",
+    404: "the id of a repository that exists, and that the token may see",
+    422: "content that the Hub accepts",
+}
+"""What is expected instead, by the HTTP status of answers that are caused by the user's id, token or files."""
+_EXPECTED_LATER = {
+    409: "no other change of the repository at the same time; run the command again",
+    412: "no other change of the repository at the same time; run the command again",
+    429: "fewer requests; run the command again later",
+}
+"""What is expected instead, by the HTTP status of answers that may be different later."""
+
+
+def require_token() -> None:
+    """Raise ``InputError`` unless a token is stored or given by the environment."""
+    from huggingface_hub import get_token
+
+    if not get_token():
+        raise InputError("no token for the Hugging Face Hub, expected one: hf auth login, or HF_TOKEN")
+
+
+def require_online() -> None:
+    """Raise ``InputError`` if ``HF_HUB_OFFLINE`` is set."""
+    from huggingface_hub import constants
+
+    if constants.HF_HUB_OFFLINE:
+        raise InputError("HF_HUB_OFFLINE is set, expected a connection to the Hugging Face Hub: unset it")
+
+
+@contextmanager
+def hub_errors(action: str) -> Iterator[None]:
+    """Convert the errors of ``huggingface_hub`` while it does ``action``, such as "org/name cannot be read".
+
+    Raises ``InputError`` if the Hub refuses the user's id, token or files, ``HubError`` for anything else.
+    Warnings are printed to standard error.
+    """
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        warnings.simplefilter("ignore", DeprecationWarning)  # The client's calls are not the user's.
+        try:
+            yield
+        except RebarDepthError:
+            raise
+        except Exception as error:  # The HTTP client's errors have no base class in the Hub's package.
+            raise _converted(action, error) from None
+    for warning in caught:
+        print(terminal_text(_without_token(str(warning.message))), file=sys.stderr)
+
+
+def _converted(action: str, error: Exception) -> RebarDepthError:
+    """Return the error of this project for an error of ``huggingface_hub``."""
+    from huggingface_hub import constants
+    from huggingface_hub.errors import HfHubHTTPError
+
+    place = f"{action}: the Hub at {constants.ENDPOINT}"
+    causes = list(_causes(error))
+    for cause in causes:
+        if isinstance(cause, HfHubHTTPError):
+            return _refusal(place, cause)
+        if isinstance(cause, OSError) and cause.filename is not None:
+            return InputError(f"{action}: {cause.filename} cannot be read: {cause.strerror or cause}")
+    summary = escape_text(_without_token(exception_summary(causes[-1])))
+    return HubError(f"{place} gives no usable answer: {summary}")
+
+
+def _refusal(place: str, error: object) -> RebarDepthError:
+    """Return the error for an HTTP status, with the Hub's own words if it gives any."""
+    status: int = error.response.status_code  # type: ignore[attr-defined]
+    message = error.server_message  # type: ignore[attr-defined]
+    words = f" ({escape_text(_without_token(str(message)))})" if message else ""
+    found = f"{place} answers with status {status}{words}"
+    if status in _EXPECTED_OF_INPUT:
+        return InputError(f"{found}, expected {_EXPECTED_OF_INPUT[status]}")
+    return HubError(f"{found}, expected {_EXPECTED_LATER.get(status, 'success')}")
+
+
+def _causes(error: Exception) -> Iterator[Exception]:
+    """Yield an error, the one that caused it, and so on; ``huggingface_hub`` wraps the errors of its threads."""
+    seen: set[int] = set()
+    current: BaseException | None = error
+    while isinstance(current, Exception) and id(current) not in seen:
+        seen.add(id(current))
+        yield current
+        current = current.__cause__
+
+
+def _without_token(text: str) -> str:
+    """Return text of a server without the token, which the server knows and could repeat."""
+    from huggingface_hub import get_token
+
+    token = get_token()
+    return text.replace(token, "[token]") if token else text

@@ -1,0 +1,231 @@
+"""Publishing of dataset folders on a Hub on this machine."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from huggingface_hub import constants
+from starlette.requests import Request
+
+from tests.builder.push.published import HUB_ID, KEY, list_files, push, write_publishable
+from tests.builder.push.xet import accept_xet
+from tests.hub_server import (
+    GITATTRIBUTES,
+    LFS_SUFFIXES,
+    TOKEN,
+    HubServer,
+    StoredRepository,
+    folder_files,
+    running_hub,
+)
+from tests.synthetic_dataset import write_dataset
+
+READ_BACK = """
+import sys
+import rebar_depth_bench as rdb
+from rebar_depth_bench.cli.main import main
+local, published = (rdb.load(root, "lattice") for root in sys.argv[1:])
+for one, other in zip(local, published, strict=True):
+    assert one["view_id"] == other["view_id"]
+    for name in ("left_rgb", "right_depth", "left_bars", "left_K", "right_cam_from_world"):
+        assert one[name].tobytes() == other[name].tobytes(), name
+sys.exit(main(["verify", sys.argv[2]]))
+"""
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_publishable(tmp_path / "dataset")
+
+
+def visible(repository: StoredRepository, branch: str = "main") -> dict[str, bytes]:
+    return {name: content for name, content in repository.files(branch).items() if not name.startswith(".")}
+
+
+def environment(hub: HubServer, tmp_path: Path, **settings: str) -> dict[str, str]:
+    home = {"HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path / "home"), "HF_HUB_OFFLINE": "0", "HF_TOKEN": TOKEN}
+    return {**os.environ, **home, "HF_HUB_DISABLE_XET": "1", "NO_PROXY": "127.0.0.1", **settings}
+
+
+def test_dry_run_lists_the_files_and_writes_nothing(hub: HubServer, root: Path) -> None:
+    finished = push(root)
+    assert finished.returncode == 0
+    for name, content in folder_files(root).items():
+        assert f"new      {name}, {len(content):,} bytes\n" in finished.stdout
+    assert "will be created" in finished.stdout
+    assert "--yes" in finished.stdout
+    assert hub.written() == []
+    assert hub.repositories == {}
+
+
+@pytest.mark.slow
+def test_published_folder_is_read_back_byte_for_byte(tiny_root: Path, hub: HubServer, tmp_path: Path) -> None:
+    finished = push(tiny_root, "--yes")
+    assert finished.returncode == 0, finished.stderr
+    repository = hub.repositories[KEY]
+    assert visible(repository) == folder_files(tiny_root)
+    assert finished.stdout.splitlines()[-1] == f"{hub.url}/{KEY}/commit/{repository.branches['main']}"
+    command = [sys.executable, "-c", READ_BACK, str(tiny_root), HUB_ID]
+    reading = environment(hub, tmp_path, HF_TOKEN="")
+    read = subprocess.run(command, env=reading, capture_output=True, text=True, timeout=300, check=False)
+    assert read.returncode == 0, read.stderr
+    assert "no problem found in 10 files, 11 views" in read.stdout
+
+
+def test_one_commit_makes_everything_visible(hub: HubServer, root: Path) -> None:
+    assert push(root, "--yes").returncode == 0
+    assert len(hub.repositories[KEY].commits) == 2  # the Hub's own, and ours
+    assert hub.written()[-1] == f"POST /api/{KEY}/commit/main"
+
+
+def test_second_push_uploads_nothing_and_makes_no_commit(hub: HubServer, root: Path) -> None:
+    assert push(root, "--yes").returncode == 0
+    hub.requests.clear()
+    for options in (["--yes"], []):
+        finished = push(root, *options)
+        assert finished.returncode == 0
+        assert "up to date" in finished.stdout
+    assert hub.written() == []
+
+
+def test_only_changes_are_sent_and_files_of_an_earlier_version_are_deleted(
+    hub: HubServer, root: Path, tmp_path: Path
+) -> None:
+    assert push(root, "--yes").returncode == 0
+    hub.requests.clear()
+    later = write_publishable(tmp_path / "later", ["lattice"])
+    planned = push(later).stdout
+    assert "deleted  pile/test.parquet\n" in planned
+    assert "changed  manifest.json" in planned
+    assert "lattice/test.parquet" not in planned
+    assert push(later, "--yes").returncode == 0
+    assert visible(hub.repositories[KEY]) == folder_files(later)
+    assert hub.repositories[KEY].files()[".gitattributes"] == GITATTRIBUTES
+    assert hub.uploads() == []  # Only small files changed, which are part of the commit.
+
+
+def test_killed_push_continues_without_sending_again_what_arrived(root: Path, tmp_path: Path) -> None:
+    with running_hub() as hub:
+        command = [sys.executable, "-m", "dataset_builder", "push", str(root), "--hub-id", HUB_ID, "--yes"]
+        processes = list[subprocess.Popen[bytes]]()
+
+        def kill_at_the_third_upload(_: Request) -> None:
+            if len(hub.uploads()) == 3:
+                processes[0].send_signal(signal.SIGKILL)
+
+        hub.faults["PUT *"] = kill_at_the_third_upload
+        log = (tmp_path / "log").open("wb")
+        processes.append(subprocess.Popen(command, env=environment(hub, tmp_path), stdout=log, stderr=log))
+        assert processes[0].wait(timeout=120) == -signal.SIGKILL
+        hub.faults.clear()
+        arrived = set(hub.objects)
+        assert arrived
+        assert visible(hub.repositories[KEY]) == {}
+        hub.requests.clear()
+        finished = subprocess.run(command, env=environment(hub, tmp_path), stdout=log, stderr=log, timeout=120)
+        log.close()
+        assert finished.returncode == 0, (tmp_path / "log").read_text()
+        assert not arrived & set(hub.uploads())
+        assert visible(hub.repositories[KEY]) == folder_files(root)
+
+
+def test_stray_files_stay_local(hub: HubServer, root: Path) -> None:
+    listed = folder_files(root)
+    for name in ("notes.txt", "lattice/old.parquet", ".rebar-build/lock"):
+        (root / name).parent.mkdir(exist_ok=True)
+        (root / name).write_text("mine")
+    finished = push(root, "--yes")
+    assert finished.returncode == 0
+    assert "notes.txt" in finished.stderr
+    assert visible(hub.repositories[KEY]) == listed
+
+
+def test_gitignore_of_the_repository_leaves_nothing_out(hub: HubServer, root: Path) -> None:
+    repository = hub.add(KEY, {".gitignore": b"*.parquet\nmanifest.json\n"})
+    assert push(root, "--yes").returncode == 0
+    assert visible(repository) == folder_files(root)
+
+
+def test_private_repository_and_branch_are_created(hub: HubServer, root: Path) -> None:
+    assert push(root, "--yes", "--private", "--revision", "v1").returncode == 0
+    repository = hub.repositories[KEY]
+    assert repository.private
+    assert visible(repository) == {}
+    assert visible(repository, "v1") == folder_files(root)
+    assert push(root, "--yes", "--private", "--revision", "v1").stdout.endswith("nothing to send\n")
+
+
+def test_branch_of_a_published_version_needs_no_upload(hub: HubServer, root: Path) -> None:
+    assert push(root, "--yes").returncode == 0
+    hub.requests.clear()
+    assert "will be created" in push(root, "--revision", "v1").stdout
+    assert push(root, "--yes", "--revision", "v1").returncode == 0
+    repository = hub.repositories[KEY]
+    assert repository.branches["v1"] == repository.branches["main"]
+    assert hub.uploads() == []
+
+
+def test_folder_that_does_not_match_its_manifest_is_refused_before_any_request(
+    hub: HubServer, root: Path, tmp_path: Path
+) -> None:
+    shard = root / "lattice" / "test.parquet"
+    content = shard.read_bytes()
+    for damage in (lambda: shard.write_bytes(content[:-1] + b"x"), shard.unlink):
+        damage()
+        for options in ([], ["--yes"]):
+            finished = push(root, *options)
+            assert finished.returncode == 2
+            assert "lattice/test.parquet" in finished.stderr
+    (unfinished := tmp_path / "unfinished").mkdir()
+    write_dataset(listed_partly := tmp_path / "partly", ["lattice"], 1)
+    for folder in (unfinished, listed_partly, tmp_path / "nowhere", Path(HUB_ID)):
+        assert push(folder, "--yes").returncode == 2
+    assert hub.requests == []
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "",
+        "---\nconfigs: [\n---\n",
+        "---\nlicense: mit\n---\n",
+        "---\nconfigs:\n- config_name: pier\n---\n",
+        "\xff",
+    ],
+)
+def test_card_that_the_parser_of_the_hub_does_not_read_is_refused(hub: HubServer, root: Path, header: str) -> None:
+    (root / "README.md").write_text(header, encoding="latin-1")
+    finished = push(list_files(root), "--yes")
+    assert finished.returncode == 2
+    assert "README.md" in finished.stderr
+    assert hub.requests == []
+
+
+@pytest.mark.slow
+def test_xet_stores_the_content_under_the_digests_of_the_manifest(
+    hub: HubServer, root: Path, tmp_path: Path
+) -> None:
+    committed = accept_xet(hub, tmp_path / "store")
+    command = [sys.executable, "-m", "dataset_builder", "push", str(root), "--hub-id", HUB_ID, "--yes"]
+    settings = environment(hub, tmp_path, HF_HUB_DISABLE_XET="0")
+    finished = subprocess.run(command, env=settings, capture_output=True, text=True, timeout=120, check=False)
+    assert finished.returncode == 0, finished.stderr
+    assert hub.uploads() == []
+    large = {name: file for name, file in folder_files(root).items() if name.endswith(LFS_SUFFIXES)}
+    assert committed == {name: hashlib.sha256(file).hexdigest() for name, file in large.items()}
+    stored_bytes = sum(path.stat().st_size for path in (tmp_path / "store").rglob("*") if path.is_file())
+    assert stored_bytes > max(map(len, large.values()))
+
+
+def test_offline_mode_is_refused(hub: HubServer, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    finished = push(root, "--yes")
+    assert finished.returncode == 2
+    assert "HF_HUB_OFFLINE" in finished.stderr
+    assert hub.requests == []
