@@ -10,7 +10,7 @@ from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.dataset import iterate_undecoded
 from rebar_depth_bench.data.dataset_config import DatasetConfig, ViewRecord
 from rebar_depth_bench.data.decoding import RowDecoder
-from rebar_depth_bench.data.eye_view import camera_from_row, eye_from_row, truth_columns
+from rebar_depth_bench.data.eye_view import camera_from_row, truth_columns, truth_from_row
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera
 
@@ -46,8 +46,8 @@ class StoredView:
         differs from the manifest.
         """
         decoded = RowDecoder.of(self.config).row(self.row)
-        for eye, expected in (("left", self.record.left), ("right", self.record.right)):
-            digest = eye_from_row(decoded, eye).digest()
+        for eye in self.config.truth_eyes:
+            digest, expected = truth_from_row(decoded, eye).digest(), getattr(self.record, eye)
             if digest != expected:
                 raise DatasetError(
                     f"{self.config.root}: view {self.record.view_id}: the {eye} ground truth has digest "

@@ -55,7 +55,7 @@ def write_scenes_strip(configs: Sequence[DatasetConfig], target: Path) -> None:
     """
     strip = Image.new("RGB", (STRIP_PANEL_PX[0] * len(configs), STRIP_PANEL_PX[1]), _BACKGROUND)
     for n, config in enumerate(configs):
-        by_steel = sorted(range(len(config.views)), key=lambda index: config.views[index].steel_px)
+        by_steel = sorted(range(len(config.views)), key=lambda index: config.views[index].steel_px or 0)
         [row] = _decoded_rows(config, [by_steel[len(by_steel) // 2]])
         picture = row["left_rgb" if config.colour is not None else "left_preview"]
         strip.paste(_letterboxed(picture, STRIP_PANEL_PX), (n * STRIP_PANEL_PX[0], 0))

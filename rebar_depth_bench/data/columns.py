@@ -22,6 +22,11 @@ COLUMNS = (
     "baseline_m",
 )
 """Names of the columns, in order."""
+OPTIONAL_COLUMNS = (
+    *("left_rgb", "left_mask", "left_bars"),
+    *(name for name in COLUMNS if name.startswith("right_") or name == "baseline_m"),
+)
+"""Columns that may be null in every row of a config that was imported."""
 
 
 def features(*, decode_images: bool = True) -> Features:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
-from rebar_depth_bench.data.columns import COLUMNS, column_kind, features, validated_columns
+from rebar_depth_bench.data.columns import COLUMNS, features, validated_columns
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.manifest import open_folder
@@ -76,10 +76,11 @@ def load(
 ) -> Dataset | IterableDataset:
     """Load one split of a config of a dataset folder or Hub repository.
 
-    Rows are dicts of decoded columns: colour uint8 H x W x 3 (None in a config without colour), depth float32
-    H x W (planar, metres, 0 where no surface), masks bool H x W, bar ids uint16 H x W, K float64 3 x 3 in pixels,
-    distortion float64 5, poses float64 4 x 4. ``columns`` selects columns; the others are not decoded. With
-    ``streaming`` the result is an ``IterableDataset``, and nothing is copied to the cache of ``datasets``.
+    Rows are dicts of decoded columns: colour uint8 H x W x 3, depth float32 H x W (planar, metres, 0 where no
+    surface), masks bool H x W, bar ids uint16 H x W, K float64 3 x 3 in pixels, distortion float64 5, poses
+    float64 4 x 4; None for colour of a config that was built without, and for what a config was imported without.
+    ``columns`` selects columns; the others are not decoded. With ``streaming`` the result is an
+    ``IterableDataset``, and nothing is copied to the cache of ``datasets``.
 
     Raises ``DatasetError`` for a folder, config, split or column that does not exist, and for a damaged shard; the
     rows raise it for a damaged cell.
@@ -145,14 +146,18 @@ def iterate_undecoded(config: DatasetConfig, columns: Sequence[str]) -> Iterator
     return all_rows(config, validated_columns(columns))
 
 
-def check_colour(config: DatasetConfig, columns: Sequence[str], reader: str) -> None:
-    """Raise ``DatasetError`` if ``reader`` needs columns of colour and the config was built without colour."""
-    needed = [name for name in columns if column_kind(name) == "rgb" and config.colour is None]
-    if needed:
-        raise DatasetError(
-            f"{config.root}: {reader} needs {', '.join(needed)}, but config {config.name} was built without "
-            "colour (rebar-build --no-colour); choose configs with colour (--config), or build it with colour"
-        )
+def check_columns(config: DatasetConfig, columns: Sequence[str], reader: str) -> None:
+    """Raise ``DatasetError`` if ``reader`` needs columns that are absent: built or imported without them."""
+    needed = [name for name in columns if name in config.absent_columns]
+    if not needed:
+        return
+    place = f"{config.root}: {reader} needs {', '.join(needed)}, but config {config.name} was"
+    if config.imported is not None:
+        raise DatasetError(f"{place} imported without them; choose other configs (--config)")
+    raise DatasetError(
+        f"{place} built without colour (rebar-build --no-colour); choose configs with colour (--config), or build "
+        "it with colour"
+    )
 
 
 @dataclass(frozen=True)
@@ -188,8 +193,8 @@ class ConfigViews:
 
     @property
     def has_poses(self) -> bool:
-        """True: all views of a scene have poses in its world frame."""
-        return True
+        """Whether all views of a scene have poses in its world frame."""
+        return self.source.imported is None or self.source.imported.has_poses
 
     @property
     def rectify(self) -> bool:
@@ -206,13 +211,13 @@ class ConfigViews:
         return tuple(map(ConfigViews, self.source.by_scene()))
 
     def check_columns(self, columns: Sequence[str], reader: str) -> None:
-        """Raise ``DatasetError`` if ``reader`` needs colour and the config was built without colour."""
-        check_colour(self.source, columns, reader)
+        """Raise ``DatasetError`` if ``reader`` needs columns that the config lacks."""
+        check_columns(self.source, columns, reader)
 
     def rows(self, *columns: str, skip: Collection[str] = ()) -> Iterator[dict[str, Any]]:
         """Yield the decoded ``view_id`` and named columns of each view that is not in ``skip``, in order.
 
-        Raises ``DatasetError`` for colour of a config that has none.
+        Raises ``DatasetError`` for columns that the config lacks.
         """
         self.check_columns(columns, "the method")
         decoder = RowDecoder.of(self.source)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, Strict, StringConstraints, ValidationInfo, field_validator
 
+from rebar_depth_bench.data.columns import EYES, OPTIONAL_COLUMNS
 from rebar_depth_bench.data.digests import views_digest
 from rebar_depth_bench.data.location import Located
 from rebar_depth_bench.data.manifest_table import ManifestTable
@@ -48,13 +49,14 @@ class ViewRecord(StrictModel):
     """Manifest entry of one view.
 
     ``left`` and ``right`` are the hex SHA-256 digests of the cameras' ground truth; ``steel_px`` and ``scored_px``
-    count steel and scored pixels.
+    count steel and scored pixels. ``right`` is None in a config without depth of the right camera, ``steel_px``
+    in one without masks.
     """
 
     view_id: _ViewId
     left: Sha256
-    right: Sha256
-    steel_px: Annotated[int, Field(ge=0)]
+    right: Sha256 | None
+    steel_px: Annotated[int, Field(ge=0)] | None
     scored_px: Annotated[int, Field(ge=0)]
 
 
@@ -72,17 +74,50 @@ class _BoardTable(StrictModel):
     dictionary: _Name
 
 
+class Imported(ManifestTable):
+    """How the data of a config were measured, if they were not rendered.
+
+    ``truth_sigma_m`` is the standard deviation of the ground truth's depth, metres, as its authors state it.
+    ``absent_columns`` are null in every row. Without ``has_poses``, the world frame of a view is its left camera.
+    """
+
+    truth_sigma_m: Annotated[float, number(1e-9, 10)]
+    absent_columns: Annotated[tuple[str, ...], Strict(False)] = ()
+    has_poses: bool = True
+
+    @field_validator("absent_columns")
+    @classmethod
+    def _check_absent(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        absent = set(names)
+        if unknown := sorted(absent - set(OPTIONAL_COLUMNS)):
+            raise field_error(f"got {escape_text(unknown[0])}", f"some of {', '.join(OPTIONAL_COLUMNS)}")
+        for needed, columns in _NEEDED.items():
+            if needed in absent and (present := sorted(columns - absent)):
+                found = f"{needed} is absent and {present[0]} is not"
+                raise field_error(found, f"{present[0]} to be absent as well", "conflict")
+        return names
+
+
+_NEEDED = {
+    "left_mask": {"left_bars"},
+    "right_mask": {"right_bars"},
+    "right_depth": {"right_mask", "right_bars"},
+    "right_K": {name for name in OPTIONAL_COLUMNS if name.startswith("right_") or name == "baseline_m"},
+}
+"""Columns that cannot be present without the column that is the key."""
+
+
 class Scene(ManifestTable):
     """Scene of a config, with its mesh and its shards, which hold the rows of no other scene.
 
-    ``board`` is the ArUco board under the assembly, or None.
+    ``board`` is the ArUco board under the assembly, or None; ``mesh`` is None in a config that was imported.
     """
 
     name: _Name
     split: Annotated[str, one_of(*SPLITS)] = TEST_SPLIT
     board: BoardSpec | None
     appearance: Appearance = Appearance()
-    mesh: RelativePath
+    mesh: RelativePath | None
     shards: Annotated[tuple[RelativePath, ...], Strict(False)]
 
     @field_validator("board", mode="before")
@@ -125,10 +160,12 @@ class DatasetConfig(Located):
     ``has_splits`` is False for a config of one scene, whose views are all in the split ``test`` and have ids
     ``<config>/<0000>``; in other configs the ids are ``<config>/<split>-<scene>-<0000>``. ``reference`` is None in
     folders of earlier versions, ``colour`` in configs without colour, whose colour columns are null in every row.
+    ``imported`` is None in configs that were rendered.
     """
 
     name: _Name
     has_splits: bool
+    imported: Imported | None = None
     scenes: Annotated[tuple[Scene, ...], Strict(False)]
     rig: Rig
     views: Annotated[tuple[ViewRecord, ...], Strict(False)]
@@ -160,9 +197,11 @@ class DatasetConfig(Located):
 
     @field_validator("scenes")
     @classmethod
-    def _check_scenes(cls, scenes: tuple[Scene, ...]) -> tuple[Scene, ...]:
+    def _check_scenes(cls, scenes: tuple[Scene, ...], info: ValidationInfo) -> tuple[Scene, ...]:
         check_unique([scene.name for scene in scenes], "scene")
         check_unique([shard for scene in scenes for shard in scene.shards], "shard")
+        if info.data.get("imported") is None and any(scene.mesh is None for scene in scenes):
+            raise field_error("mesh is null", "the mesh of a scene that was rendered", "conflict")
         return scenes
 
     @field_validator("views")
@@ -171,6 +210,8 @@ class DatasetConfig(Located):
         check_unique([view.view_id for view in views], "view")
         name, rig, scenes = info.data.get("name"), info.data.get("rig"), info.data.get("scenes")
         prefixes = {f"{scene.split}-{scene.name}-" for scene in scenes or ()} if info.data["has_splits"] else set()
+        imported: Imported | None = info.data.get("imported")
+        absent = imported.absent_columns if imported is not None else ()
         for view in views:
             config, _, suffix = view.view_id.partition("/")
             if name is not None and config != name:
@@ -178,10 +219,18 @@ class DatasetConfig(Located):
             if prefixes and (suffix.rstrip("0123456789") not in prefixes or not suffix[-4:].isdecimal()):
                 expected = f"{name}/<split>-<scene>-<0000> with the split and name of a scene"
                 raise field_error(f"got {view.view_id}", expected)
-            if rig is not None and not view.scored_px <= view.steel_px <= rig.width * rig.height:
+            if (view.right is None) != ("right_depth" in absent) or (view.steel_px is None) != (
+                "left_mask" in absent
+            ):
                 raise field_error(
-                    f"{view.view_id} has {view.scored_px} scored and {view.steel_px} steel pixels",
-                    f"no more scored than steel pixels, and at most {rig.width * rig.height}",
+                    f"{view.view_id} has null values", "null where the columns are absent", "conflict"
+                )
+            image_px = rig.width * rig.height if rig is not None else view.scored_px
+            steel_px = image_px if view.steel_px is None else view.steel_px
+            if rig is not None and not view.scored_px <= steel_px <= image_px:
+                raise field_error(
+                    f"{view.view_id} has {view.scored_px} scored and {steel_px} steel pixels",
+                    f"no more scored than steel pixels, and at most {image_px}",
                 )
         return views
 
@@ -222,13 +271,15 @@ class DatasetConfig(Located):
 
     @property
     def mesh(self) -> str:
-        """Name of the mesh of the only scene. Raises ``DatasetError`` as ``scene``."""
+        """Name of the mesh of the only scene. Raises ``DatasetError`` as ``scene``, and if there is none."""
+        if self.scene.mesh is None:
+            raise DatasetError(f"{self.root}: config {self.name} was imported without a mesh, expected one")
         return self.scene.mesh
 
     @property
     def meshes(self) -> tuple[str, ...]:
-        """Names of the meshes of all scenes."""
-        return tuple(scene.mesh for scene in self.scenes)
+        """Names of the meshes of all scenes that have one."""
+        return tuple(scene.mesh for scene in self.scenes if scene.mesh is not None)
 
     @property
     def shards(self) -> tuple[str, ...]:
@@ -268,6 +319,27 @@ class DatasetConfig(Located):
         """Name of the config, with its split and its scene if it has splits and is restricted to one of them."""
         split = f".{self.splits[0]}" if self.has_splits and len(self.splits) == 1 else ""
         return f"{self.name}{split}-{self.scene.name}" if split and len(self.scenes) == 1 else self.name + split
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of the shards, meshes and the contact sheet."""
+        return (*self.shards, *self.meshes, self.sheet)
+
+    @property
+    def absent_columns(self) -> frozenset[str]:
+        """Columns that are null in every row."""
+        without_colour = ("left_rgb", "right_rgb") if self.colour is None else ()
+        return frozenset((*without_colour, *(self.imported.absent_columns if self.imported is not None else ())))
+
+    @property
+    def truth_eyes(self) -> tuple[str, ...]:
+        """Eyes with ground truth: both, or the left one."""
+        return tuple(eye for eye in EYES if f"{eye}_depth" not in self.absent_columns)
+
+    @property
+    def truth_sigma_m(self) -> float | None:
+        """Standard deviation of the ground truth's depth, metres, None if it is exact."""
+        return None if self.imported is None else self.imported.truth_sigma_m
 
     @property
     def grid(self) -> tuple[int, int]:

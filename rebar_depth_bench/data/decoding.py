@@ -27,19 +27,19 @@ class RowDecoder:
     """Decoder of the rows of a config; it is small and can be pickled for worker processes.
 
     ``grid`` is the image size (height, width) that every cell must have, ``scene_by_view`` the name of the
-    scene of each view. Without ``has_colour``, the cells of colour columns are null and decode to None.
+    scene of each view. The cells of ``absent_columns`` are null and decode to None.
     """
 
     root: str
     config: str
     grid: tuple[int, int]
     scene_by_view: Mapping[str, str]
-    has_colour: bool = True
+    absent_columns: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, config: DatasetConfig) -> Self:
         """Return the decoder of a config."""
-        return cls(config.root, config.name, config.grid, config.scene_by_view, config.colour is not None)
+        return cls(config.root, config.name, config.grid, config.scene_by_view, config.absent_columns)
 
     def row(self, row: Mapping[str, Any]) -> dict[str, Any]:
         """Decode the cells of a row. Raises ``DatasetError`` naming view and column if a cell is damaged."""
@@ -53,6 +53,10 @@ class RowDecoder:
 
     def _decode(self, column: str, cell: Any, view: str) -> Any:
         try:
+            if column in self.absent_columns:
+                if cell is not None:
+                    raise ValueError("it has a value, expected null as in the manifest")
+                return None
             return self._decode_kind(column_kind(column), cell, view)
         except Exception as error:  # Pillow raises many types, which depend on the damage.
             reason = escape_text(str(error) or type(error).__name__)
@@ -62,10 +66,6 @@ class RowDecoder:
             ) from error
 
     def _decode_kind(self, kind: str, cell: Any, view: str) -> Any:
-        if kind == "rgb" and not self.has_colour:
-            if cell is not None:
-                raise ValueError("it holds an image, expected null in a config without colour")
-            return None
         if kind in _IMAGE_DECODERS:
             return _IMAGE_DECODERS[kind](cell["bytes"], self.grid)
         if kind == "depth":

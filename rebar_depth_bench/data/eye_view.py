@@ -21,23 +21,23 @@ _MAX_ROTATION_ERROR = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class EyeView:
-    """Camera and images of one eye of a view.
+class EyeTruth:
+    """Camera and images of one eye of a view, rendered or imported.
 
     ``rgb`` is None where colour is not needed. ``depth_m`` is planar z (0: no surface), ``mask`` marks steel
-    pixels, ``bars`` holds bar ids (0: no steel).
+    pixels, ``bars`` holds bar ids (0: no steel). Mask and bar ids are None in a config that was imported without.
     """
 
     camera: Camera
     rgb: UInt8[ndarray, "h w 3"] | None
     depth_m: Float32[ndarray, "h w"]
-    mask: Bool[ndarray, "h w"]
-    bars: UInt16[ndarray, "h w"]
+    mask: Bool[ndarray, "h w"] | None
+    bars: UInt16[ndarray, "h w"] | None
 
     def digest(self) -> str:
         """Return the hex SHA-256 of the ground truth: of image size, depth, mask, bar ids and camera.
 
-        It covers the decoded values, not their encoding.
+        It covers the decoded values, not their encoding, and which of them are absent.
         """
         digest = hashlib.sha256(np.array(self.depth_m.shape, "<u4").tobytes())
         arrays = (
@@ -49,20 +49,33 @@ class EyeView:
             (self.camera.cam_from_world, "<f8"),
         )
         for array, dtype in arrays:
-            digest.update(np.ascontiguousarray(array, dtype=dtype).data)
+            digest.update(b"absent" if array is None else np.ascontiguousarray(array, dtype=dtype).data)
         return digest.hexdigest()
 
 
+@dataclass(frozen=True, eq=False)
+class EyeView(EyeTruth):
+    """One eye of a rendered view, which has a mask and bar ids."""
+
+    mask: Bool[ndarray, "h w"]
+    bars: UInt16[ndarray, "h w"]
+
+
 def truth_columns(eye: str) -> tuple[str, ...]:
-    """Return the names of the columns that ``eye_from_row`` requires for ``left`` or ``right``."""
+    """Return the names of the columns that ``truth_from_row`` requires for ``left`` or ``right``."""
     return tuple(f"{eye}_{kind}" for kind in ("depth", "mask", "bars", *CAMERA_KINDS))
 
 
 def eye_from_row(row: Mapping[str, Any], eye: str) -> EyeView:
-    """Return one eye of a decoded row; ``rgb`` is None if the row lacks that column."""
+    """Return one eye of a decoded row of a rendered config; ``rgb`` is None if the row lacks that column."""
+    return EyeView(**vars(truth_from_row(row, eye)))
+
+
+def truth_from_row(row: Mapping[str, Any], eye: str) -> EyeTruth:
+    """Return one eye of a decoded row that has its depth; ``rgb`` is None if the row lacks that column."""
     depth_m = row[f"{eye}_depth"]
     camera = camera_from_row(row, eye, depth_m.shape[:2])  # A damaged image may have a third axis.
-    return EyeView(camera, row.get(f"{eye}_rgb"), depth_m, row[f"{eye}_mask"], row[f"{eye}_bars"])
+    return EyeTruth(camera, row.get(f"{eye}_rgb"), depth_m, row[f"{eye}_mask"], row[f"{eye}_bars"])
 
 
 def camera_from_row(row: Mapping[str, Any], eye: str, grid: tuple[int, int]) -> Camera:

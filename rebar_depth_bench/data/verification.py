@@ -6,11 +6,10 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.eye_view import eye_from_row, truth_columns
+from rebar_depth_bench.data.eye_view import truth_columns, truth_from_row
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder
 from rebar_depth_bench.errors import DatasetError, Problem, escape_text
 from rebar_depth_bench.paths import path_below
@@ -26,11 +25,7 @@ def file_problems(folder: DatasetFolder, progress: Progress = silent) -> Iterato
         if problem := _file_problem(folder, name, sha256):
             yield problem
         progress("files", done, len(folder.files))
-    used = {
-        name
-        for config in folder.config_by_name.values()
-        for name in (*config.shards, *config.meshes, config.sheet)
-    }
+    used = {name for config in folder.config_by_name.values() for name in config.files}
     for name in sorted(used - set(folder.files)):
         yield Problem("missing", name, "has no SHA-256 in the manifest, which names it", "one for each file")
     if folder.local is not None:
@@ -44,11 +39,11 @@ def truth_problems(config: DatasetConfig, progress: Progress = silent) -> Iterat
     Raises ``DatasetError`` for damaged shards and rows that are not the views of the manifest.
     """
     records = {record.view_id: record for record in config.views}
-    columns = ("view_id", "scene", *(name for eye in EYES for name in truth_columns(eye)))
+    columns = ("view_id", "scene", *(name for eye in config.truth_eyes for name in truth_columns(eye)))
     for done, row in enumerate(iterate_rows(config, columns), start=1):
         record = records[row["view_id"]]
-        for eye, expected in (("left", record.left), ("right", record.right)):
-            digest = eye_from_row(row, eye).digest()
+        for eye in config.truth_eyes:
+            digest, expected = truth_from_row(row, eye).digest(), getattr(record, eye)
             if digest != expected:
                 found = f"the {eye} ground truth has the digest {digest[:16]}"
                 yield Problem("conflict", record.view_id, found, f"{expected[:16]} as in the manifest")

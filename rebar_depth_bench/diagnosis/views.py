@@ -64,7 +64,12 @@ class DiagnosedView:
 
 
 def positions_to_read(config: DatasetConfig) -> list[int]:
-    """Return the positions of ``MAX_VIEWS`` evenly spaced views that have enough scored pixels."""
+    """Return the positions of ``MAX_VIEWS`` evenly spaced views that have enough scored pixels.
+
+    There are none in a config that lacks a column that is looked at.
+    """
+    if not config.absent_columns.isdisjoint(_COLUMNS):
+        return []
     usable = [n for n, view in enumerate(config.views) if view.scored_px >= MIN_PIXELS]
     count = min(len(usable), MAX_VIEWS)
     return [usable[n * len(usable) // count] for n in range(count)]

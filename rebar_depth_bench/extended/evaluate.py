@@ -19,7 +19,7 @@ from rebar_depth_bench.extended import (
     profiles,
     single_bar,
 )
-from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, SceneBars, load_steel_truth
+from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, SceneBars, has_bar_ids, load_steel_truth
 from rebar_depth_bench.extended.inspection import evaluate as inspection
 from rebar_depth_bench.extended.inspection import measures as inspection_measures
 from rebar_depth_bench.extended.inspection.visible_segments import visible_segments
@@ -143,6 +143,7 @@ def score_extended(
 ) -> ExtendedResult:
     """Return the extended measures of the submission that ``result`` was computed from.
 
+    All of them are null for a config without masks or bar ids.
     Raises ``DatasetError`` if the dataset folder lacks its bars or contradicts its manifest.
     """
     scales = {view.view_id: view.scale for view in result.views}
@@ -150,6 +151,9 @@ def score_extended(
     tables: dict[str, ExtendedTable] = {}
     views: list[ViewNumbers] = []
     for config in evaluation.configs:
+        if not has_bar_ids(config):
+            tables[config.name] = tabulate_extended([], protocol_indices([]), measures)
+            continue
         steel = load_steel_truth(evaluation.folder, config, progress)
         work = partial(_view, evaluation.submission, steel, scales)
         task = f"extended measures of {config.name}"

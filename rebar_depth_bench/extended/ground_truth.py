@@ -14,7 +14,7 @@ from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, with_axis
 from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
 from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.eye_view import EyeView
+from rebar_depth_bench.data.eye_view import EyeTruth
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.extended.depth_layers import other_layers
@@ -89,10 +89,15 @@ class ConfigSteelTruth:
         )
 
 
+def has_bar_ids(config: DatasetConfig) -> bool:
+    """Return whether a config has the masks and bar ids that all extended measures need."""
+    return config.absent_columns.isdisjoint(("left_mask", "left_bars"))
+
+
 def load_steel_truth(
     folder: DatasetFolder, config: DatasetConfig, progress: Progress = silent
 ) -> ConfigSteelTruth:
-    """Return the ground truth of a config of ``folder`` for extended measures, from the cache or else computed.
+    """Return the ground truth of a config that ``has_bar_ids`` for extended measures, from the cache or computed.
 
     Raises ``DatasetError`` if the bars of a scene are missing, or if the bars or a view contradict the manifest.
     """
@@ -123,7 +128,7 @@ def _bars_by_view(folder: DatasetFolder, config: DatasetConfig) -> dict[str, Sce
     path = folder.verified_file(BARS_FILE)
     bars_by_scene, scenes = read_bars(path), {}
     for scene in config.scenes:
-        bars = bars_by_scene.get(scene.name)
+        bars = bars_by_scene.get(scene.name, None if config.imported is None else ())
         if bars is None:
             raise DatasetError(f"{path}: has no bars for scene {scene.name!r} of config {config.name}")
         # NaN for bars without a fitted axis, and for ids that images show and the table lacks.
@@ -149,14 +154,16 @@ def _view_arrays(
         yield ViewArrays(view_id, arrays, (*lens, *left.camera.cam_from_world.ravel().tolist()))
 
 
-def _steel_arrays(left: EyeView, scored: ndarray, rays: Rays, scene: SceneBars) -> dict[str, ndarray]:
+def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars) -> dict[str, ndarray]:
     """Return the arrays of ``SteelTruth`` for one view, by field name.
 
     ``scored`` holds the flat indices of the scored pixels. Segments and other layers are determined for these
     only.
     """
-    depth_m, bars = left.depth_m, left.bars
-    index = np.flatnonzero(dilate_mask(left.mask) & (depth_m > 0))
+    depth_m, bars, mask = left.depth_m, left.bars, left.mask
+    assert bars is not None  # ``has_bar_ids``
+    assert mask is not None
+    index = np.flatnonzero(dilate_mask(mask) & (depth_m > 0))
     interior = np.zeros(depth_m.size, dtype=bool)
     interior[scored] = True
     interior = interior[index]

@@ -149,8 +149,13 @@ def short_digest(digest: str, digits: int = 12) -> str:
 
 
 def table_notes(table: Table) -> list[str]:
-    """Return sentences on why a row is not ranked, or its errors not compared with those of others."""
+    """Return sentences on measured ground truth, and on why a row is not ranked or its errors not compared."""
     notes = []
+    if table.truth_sigma_m is not None:
+        notes.append(
+            f"The ground truth was measured, with a standard deviation of {1000 * table.truth_sigma_m:.3g} mm, as "
+            "its authors state; smaller errors cannot be told from errors of the ground truth."
+        )
     if reason := unranked_reason(table):
         notes.append(f"Not ranked: {reason}.")
     if reasons := incomparable_reasons(table):

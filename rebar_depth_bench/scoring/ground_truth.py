@@ -19,7 +19,7 @@ from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
 from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
 from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.dataset_config import DatasetConfig, ViewRecord
-from rebar_depth_bench.data.eye_view import EyeView, eye_from_row, truth_columns
+from rebar_depth_bench.data.eye_view import EyeTruth, truth_columns, truth_from_row
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.metrics import median
@@ -146,7 +146,7 @@ def scored_counts(config: DatasetConfig) -> dict[str, int]:
 
 def verified_views(
     config: DatasetConfig, progress: Progress, task: str
-) -> Iterator[tuple[str, EyeView, UInt32[ndarray, " n"]]]:
+) -> Iterator[tuple[str, EyeTruth, UInt32[ndarray, " n"]]]:
     """Yield id, left eye and flat indices of the scored pixels of every view, verified against the manifest.
 
     ``task`` is its name in ``progress``. Raises ``DatasetError`` as ``iterate_rows``, and naming a view that does
@@ -155,7 +155,7 @@ def verified_views(
     records = {view.view_id: view for view in config.views}
     rows = iterate_rows(config, ("view_id", *truth_columns("left")))
     for done, row in enumerate(rows, start=1):
-        view_id, left = row["view_id"], eye_from_row(row, "left")
+        view_id, left = row["view_id"], truth_from_row(row, "left")
         yield view_id, left, _verified_pixels(left, records[view_id], config)
         progress(f"{task} of {config.name}", done, len(records))
 
@@ -172,7 +172,7 @@ def _extract_views(config: DatasetConfig, progress: Progress) -> Iterator[ViewAr
             yield ViewArrays(view_id, arrays, numbers)
 
 
-def _verified_pixels(left: EyeView, record: ViewRecord, config: DatasetConfig) -> UInt32[ndarray, " n"]:
+def _verified_pixels(left: EyeTruth, record: ViewRecord, config: DatasetConfig) -> UInt32[ndarray, " n"]:
     digest, pixels = left.digest(), scored_pixels(left.mask, left.depth_m)
     if digest != record.left or len(pixels) != record.scored_px:
         raise DatasetError(

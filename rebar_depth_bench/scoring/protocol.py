@@ -40,12 +40,15 @@ def interior(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     return eroded
 
 
-def single_bar_pixels(bars: UInt16[ndarray, "h w"], pixels: UInt32[ndarray, " n"]) -> Bool[ndarray, " n"]:
+def single_bar_pixels(bars: UInt16[ndarray, "h w"] | None, pixels: UInt32[ndarray, " n"]) -> Bool[ndarray, " n"]:
     """Return which of the scored pixels belong to one bar with their whole 3 x 3 neighbourhood.
 
     ``bars`` holds bar ids and ``pixels`` flat indices, which are never at the border of the image. Extended
-    measures call these pixels the single-bar interior; all other metrics use all scored pixels.
+    measures call these pixels the single-bar interior; all other metrics use all scored pixels. Without bar ids,
+    there are none.
     """
+    if bars is None:
+        return np.zeros(len(pixels), bool)
     width, flat = bars.shape[1], bars.ravel()
     centre = pixels.astype(np.intp)
     own = flat[centre]
@@ -55,9 +58,10 @@ def single_bar_pixels(bars: UInt16[ndarray, "h w"], pixels: UInt32[ndarray, " n"
     return same
 
 
-def scored_pixels(mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"]) -> UInt32[ndarray, " n"]:
+def scored_pixels(mask: Bool[ndarray, "h w"] | None, depth_m: Float32[ndarray, "h w"]) -> UInt32[ndarray, " n"]:
     """Return the flat, ascending indices of the scored pixels of a view: eroded steel mask and depth > 0.
 
-    A view without scored pixels is not part of the protocol.
+    Without a mask, all pixels with depth are scored. A view without scored pixels is not part of the protocol.
     """
-    return np.flatnonzero(interior(mask) & (depth_m > 0)).astype(np.uint32)
+    scored = depth_m > 0 if mask is None else interior(mask) & (depth_m > 0)
+    return np.flatnonzero(scored).astype(np.uint32)

@@ -95,7 +95,7 @@ def published_match(config: DatasetConfig) -> PublishedMatch | None:
     appearance variants.
     """
     is_complete = len(config.views) == config.protocol_views and config.grid == _GRID
-    if config.has_splits or not is_complete or config.scene.appearance.variants:
+    if config.imported is not None or config.has_splits or not is_complete or config.scene.appearance.variants:
         return None
     scene, rig = config.manifest_entry["scene"], config.manifest_entry["rig"]
     shown = (

@@ -63,12 +63,13 @@ def view_reference(depth_m: Float32[ndarray, "h w"], pixels: UInt32[ndarray, " n
     """Return the reference errors of a view on its scored pixels, one or more.
 
     ``depth_m`` is the true planar depth of the view in metres, 0 where there is no surface; ``pixels`` are flat
-    indices, none of them at the border; ``median_m`` is the median depth of these pixels. Neighbours without depth
-    are skipped.
+    indices; ``median_m`` is the median depth of these pixels. Neighbours without depth or outside the image are
+    skipped.
     """
-    width, flat_m, index = depth_m.shape[1], depth_m.ravel(), pixels.astype(np.intp)
-    z_m = flat_m[index]
-    shifted = [_errors(flat_m[index + step], z_m) for step in (-1, 1, -width, width)]
+    row, column = np.divmod(pixels.astype(np.intp), depth_m.shape[1])
+    framed_m = np.pad(depth_m, 1)
+    z_m = depth_m[row, column]
+    shifted = [_errors(framed_m[row + v, column + u], z_m) for v, u in ((1, 0), (1, 2), (0, 1), (2, 1))]
     one_pixel = [_defined_mean(values) for values in zip(*shifted, strict=True)]
     return Reference(*_errors(np.full(len(z_m), median_m), z_m), *one_pixel)
 

@@ -38,7 +38,7 @@ class Table:
 
     ``rank_error`` is None in results of the previous protocol; ``reference`` are the config's reference errors,
     and ``published`` is the scene of the paper's Table I that it shows, if any. ``split`` is None for a config of
-    one scene.
+    one scene. ``truth_sigma_m`` is the standard deviation of the ground truth's depth, None where it is exact.
     ``intervals`` has the 95 % block bootstrap interval of each of ``VIEW_METRICS``, None where it is undefined.
     """
 
@@ -54,6 +54,7 @@ class Table:
     reference: Reference = NO_REFERENCE
     published: PublishedMatch | None = None
     split: str | None = None
+    truth_sigma_m: float | None = None
     intervals: Mapping[str, Interval | None] = field(default_factory=dict)
 
     @property
@@ -145,6 +146,7 @@ def tabulate(
     reference: Reference = NO_REFERENCE,
     published: PublishedMatch | None = None,
     split: str | None = None,
+    truth_sigma_m: float | None = None,
 ) -> Table:
     """Return the table of a config from the scores of its scored views.
 
@@ -168,6 +170,7 @@ def tabulate(
         reference=reference,
         published=published,
         split=split,
+        truth_sigma_m=truth_sigma_m,
         intervals=view_intervals(views) if views else dict.fromkeys(VIEW_METRICS),
     )
 
@@ -191,6 +194,7 @@ def _within_dict(within_mm: Mapping[int, float | None] | Mapping[int, float]) ->
 def _table_dict(table: Table) -> dict[str, Any]:
     return {
         **({} if table.split is None else {"split": table.split}),
+        **({} if table.truth_sigma_m is None else {"truth_sigma_m": table.truth_sigma_m}),
         "views": table.views,
         "views_scored": table.views_scored,
         "coverage": rounded(table.coverage),

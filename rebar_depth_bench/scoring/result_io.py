@@ -199,6 +199,7 @@ class _TableJson(_AlignedJson):
     reference: _ReferenceJson = _ReferenceJson()
     published: _PublishedJson | None = None
     split: Annotated[str, one_of(*SPLITS)] | None = None
+    truth_sigma_m: _Size | None = None
     ci95: _IntervalsJson = _IntervalsJson()
 
     @property
@@ -217,6 +218,7 @@ class _TableJson(_AlignedJson):
             reference=self.reference.content(),
             published=None if self.published is None else PublishedMatch(**vars(self.published)),
             split=self.split,
+            truth_sigma_m=self.truth_sigma_m,
             native=self.metrics(self.native),
             scaled=self.metrics(self.scaled),
             scale_median=self.scale_median,

@@ -119,6 +119,7 @@ def _score_all(
             truths.reference,
             published_match(config),
             config.scenes[0].split if config.has_splits else None,
+            config.truth_sigma_m,
         )
         views += scores
         problems += [outcome for outcome in scored if isinstance(outcome, Problem)]

@@ -111,7 +111,7 @@ def test_steel_of_a_folder_is_measured(
         {"mean": np.mean(shares), "least": min(shares), "most": max(shares)}, rel=1e-5
     )
     assert entry["interior"] == pytest.approx(
-        np.mean([view.scored_px / view.steel_px for view in config.views]), rel=1e-5
+        np.mean([view.scored_px / (view.steel_px or np.nan) for view in config.views]), rel=1e-5
     )
     assert entry["scored_views"] == len(config.views)
     assert config.reference is not None

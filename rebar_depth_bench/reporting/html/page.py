@@ -208,6 +208,6 @@ def _panels(score: ViewScore, row: Mapping[str, Any], submission: SubmissionRead
         rgb=row["left_rgb"],
         truth_m=row["left_depth"],
         prediction_m=submission.read(score.view_id),
-        steel=row["left_mask"],
+        steel=row["left_depth"] > 0 if row["left_mask"] is None else row["left_mask"],
         score=score,
     )

@@ -21,7 +21,7 @@ from rebar_depth_bench.data.bars import read_bars, write_bars
 from rebar_depth_bench.data.codecs import decode_depth, encode_depth
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.eye_view import EyeView
+from rebar_depth_bench.data.eye_view import EyeTruth
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.progress import silent
@@ -230,7 +230,7 @@ def change_depth(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None
             depth_m = change(decode_depth(row["left_depth"], GRID))
             row["left_depth"] = encode_depth(depth_m)
             left = views[row["view_id"]]
-            digests[row["view_id"]] = EyeView(left.camera, None, depth_m, left.mask, left.bars).digest()
+            digests[row["view_id"]] = EyeTruth(left.camera, None, depth_m, left.mask, left.bars).digest()
         pq.write_table(pa.Table.from_pylist(rows, table.schema), path)
     change_manifest(
         root, lambda _, config: [view.update(left=digests[view["view_id"]]) for view in config["views"]], CONFIG
