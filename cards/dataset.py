@@ -119,6 +119,8 @@ def _shard_pattern(shards: Iterable[str]) -> str:
 
 def _config_row(config: DatasetConfig) -> dict[str, Any]:
     entry, rig, views = config.manifest_entry, config.rig, config.views
+    if config.imported is not None:
+        return _imported_row(config)
     steel = np.array([view.steel_px for view in views], float)
     scored = np.array([view.scored_px for view in views], float)
     with_steel = steel > 0
@@ -136,11 +138,32 @@ def _config_row(config: DatasetConfig) -> dict[str, Any]:
         "out_of_protocol": int(np.count_nonzero(scored == 0)),
         "sheet": config.sheet,
         "variants": config.scene.appearance.variants,
+        "imported": None,
         "panorama": entry["scene"].get("appearance", {}).get("image_light", {}).get("image"),
         "optics": _OPTICS_TEXTS[entry["rig"]["grid"]],
         "constant": _reference(config, "constant"),
         "one_pixel": _reference(config, "one_pixel"),
         "megabytes": f"{entry['bytes'] / 1e6:.1f}",
+    }
+
+
+def _imported_row(config: DatasetConfig) -> dict[str, Any]:
+    """Return the row of an imported config; what is not known of it is a dash."""
+    rig, scored = config.rig, [view.scored_px for view in config.views]
+    return {
+        "name": config.name,
+        "views": f"{len(config.views)}",
+        **dict.fromkeys(("samples", "distance", "steel_depth", "steel", "kept"), DASH),
+        **dict.fromkeys(("optics", "variants", "panorama")),
+        "has_colour": config.colour is not None,
+        "steel_source": "imported",
+        "grid": f"{rig.width} x {rig.height}",
+        "out_of_protocol": scored.count(0),
+        "sheet": config.sheet,
+        "imported": config.manifest_entry["imported"],
+        "constant": _reference(config, "constant"),
+        "one_pixel": _reference(config, "one_pixel"),
+        "megabytes": f"{config.manifest_entry['bytes'] / 1e6:.1f}",
     }
 
 

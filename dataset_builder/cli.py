@@ -16,6 +16,8 @@ from dataset_builder.build_options import add_build_arguments, add_mesh_unit, ad
 from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, BuildRequest
 from dataset_builder.config.quality import colour_spec
 from dataset_builder.config.specs import CPU
+from dataset_builder.export import command as export_command
+from dataset_builder.importing import command as import_command
 from dataset_builder.push import command as push_command
 from rebar_depth_bench.console import ProgressBars, Rate, replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError, printable
@@ -197,18 +199,6 @@ def _audit(options: argparse.Namespace) -> None:
         raise InputError(f"{options.root}: {len(report.failures)} of {len(report.checks)} checks failed")
 
 
-def _export(options: argparse.Namespace) -> None:
-    from dataset_builder.export import export
-
-    with ProgressBars() as bars:
-        summary = export(
-            options.root, options.out, options.config, options.views, options.layout, progress=bars.update
-        )
-    for config in summary.configs:
-        print(f"{config.config}: {config.views} views, {config.written} files written, {config.kept} kept")
-    print(options.out)
-
-
 def _inspect(options: argparse.Namespace) -> None:
     _check_extra()
     from dataset_builder.config.scene_file import files_of_scene, scene_cage
@@ -241,21 +231,17 @@ def argument_parser() -> argparse.ArgumentParser:
     add_build_arguments(parser)
     add_scene_arguments(parser)
     parser.set_defaults(run=_build)
-    commands = parser.add_subparsers(metavar="{audit,export,inspect,push}")
+    commands = parser.add_subparsers(metavar="{audit,export,import,inspect,push}")
     auditing = commands.add_parser("audit", help="check a dataset folder and its ground truth")
     _add_audit_arguments(auditing)
     auditing.set_defaults(run=_audit)
-    exporting = commands.add_parser(
-        "export", help="export a dataset folder as PNG, OpenEXR, COLMAP and nerfstudio files"
-    )
-    _add_export_arguments(exporting)
-    exporting.set_defaults(run=_export)
     inspecting = commands.add_parser("inspect", help="show the bars of a scene file without rendering")
     _add_inspect_arguments(inspecting)
     inspecting.set_defaults(run=_inspect)
-    pushing = commands.add_parser("push", help=push_command.SUMMARY)
-    push_command.add_arguments(pushing)
-    pushing.set_defaults(run=push_command.run)
+    for name, command in (("export", export_command), ("import", import_command), ("push", push_command)):
+        subparser = commands.add_parser(name, help=command.SUMMARY)
+        command.add_arguments(subparser)
+        subparser.set_defaults(run=command.run)
     return parser
 
 
@@ -277,26 +263,3 @@ def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
     add_mesh_unit(parser)
     add_output_file(parser, "--json", "write the bars, what is left out, and the placement as JSON")
     add_output_file(parser, "--picture", "write a PNG of the cage from four sides")
-
-
-def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("root", metavar="ROOT", help="dataset folder")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="output folder: new, or an earlier export to resume"
-    )
-    parser.add_argument(
-        "--config", nargs="+", action="extend", metavar="NAME", help="configs to export (default: all)"
-    )
-    parser.add_argument(
-        "--views",
-        type=int,
-        metavar="N",
-        help="number of views per config, evenly spaced over the views of the folder (default: all)",
-    )
-    parser.add_argument(
-        "--layout",
-        choices=("plain", "zed", "kitti"),
-        default="plain",
-        help="plain: images, exact depth, masks, COLMAP, nerfstudio; zed: a capture; kitti: KITTI's raw data "
-        "(default: %(default)s)",
-    )

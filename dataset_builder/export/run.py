@@ -66,6 +66,8 @@ def export(
     folder = _local_folder(root)
     chosen = [folder.config(name) for name in dict.fromkeys(configs or folder.configs)]
     for config in chosen:
+        if config.imported is not None:
+            raise InputError(f"{root}: config {config.name} was imported, expected configs that were rendered")
         LAYOUTS[layout].check(config)
     wanted = {config.name: _select_view_ids(config, views) for config in chosen}
     folders = {config.name: tuple(LAYOUTS[layout].folders(config, wanted[config.name])) for config in chosen}

@@ -36,22 +36,31 @@ SHARD_NAME = re.compile(rf"test-\d{{5}}-of-\d{{5}}-[0-9a-f]{{{SHARD_DIGEST_CHARA
 def check_folder(out: Path, plans: Sequence[ConfigPlan]) -> None:
     """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder that the plans can be built in.
 
-    Raises ``OutputError`` if it cannot be written. No other files are ever changed. Folders that the build
-    changes, its lock and staged files may not be links. A config with colour may not be built again without.
+    Raises as ``check_target`` does. A config with colour may not be built again without.
+    """
+    check_target(out, [plan.spec.name for plan in plans], [path for plan in plans for path in plan.all_stagings()])
+    if (out / MANIFEST_FILE).is_file():
+        _check_keeps_colour(out, plans)
+
+
+def check_target(out: Path, configs: Collection[str], stagings: Collection[Path]) -> None:
+    """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder, where configs can be written.
+
+    Raises ``OutputError`` if it cannot be written. No other files are ever changed. Folders that a build changes,
+    its lock and the files in the staging folders may not be links.
     """
     ancestor = existing_ancestor(out)
     if not ancestor.is_dir():
         raise InputError(f"{out}: {ancestor} is a file, expected a folder")
     if not os.access(ancestor, os.W_OK | os.X_OK):
         raise OutputError(f"{out}: cannot be written: no permission to write in {ancestor}")
-    check_no_links(out, f"{BUILD_FOLDER}/{LOCK}", MESHES, PICTURES, *(plan.spec.name for plan in plans))
-    for staging in (staging for plan in plans for staging in plan.all_stagings()):
+    check_no_links(out, f"{BUILD_FOLDER}/{LOCK}", MESHES, PICTURES, *configs)
+    for staging in stagings:
         check_no_links(out, os.path.relpath(staging, out))
         for folder, folders, files in os.walk(staging):
             check_no_links(Path(folder), *folders, *files)
-    if (out / MANIFEST_FILE).is_file():
-        _check_keeps_colour(out, plans)
-    elif out.is_dir() and any(out.iterdir()) and not (out / BUILD_FOLDER / LOCK).is_file():
+    is_dataset = (out / MANIFEST_FILE).is_file() or (out / BUILD_FOLDER / LOCK).is_file()
+    if out.is_dir() and any(out.iterdir()) and not is_dataset:
         raise InputError(
             f"{out}: is not empty and has no {MANIFEST_FILE}, expected a new folder or a dataset folder"
         )

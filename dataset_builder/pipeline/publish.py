@@ -10,7 +10,7 @@ earlier version built it, and the next build repairs them.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -31,11 +31,11 @@ from dataset_builder.pipeline.folder import (
 )
 from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.retained import entry_problems, published_configs
-from dataset_builder.pipeline.shards import pack_shard, read_staged_record, split_into_shards
+from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_record, split_into_shards
 from dataset_builder.scene.assemblies import aim_point_m
 from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.atomic_io import exclusive_lock, write_bytes, write_error, write_text
-from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
+from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, write_bars
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest, views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, DatasetFolder, open_folder
@@ -83,7 +83,7 @@ def repair_metadata(out: Path, plan: ConfigPlan) -> None:
     config = folder.config(plan.spec.name)
     if not _files_match(folder, (BARS_FILE, CARD, EVAL_FILE, STRIP, config.sheet)):
         write_contact_sheet(config, out / config.sheet)
-        _write_bars(out, plan)
+        _write_bars(out, {plan.spec.scene.name: plan.assembly.bars})
         _write_manifest(out, folder.config_by_name)
 
 
@@ -94,11 +94,8 @@ def _files_match(folder: DatasetFolder, names: Iterable[str]) -> bool:
 
 def publish_config(out: Path, plan: ConfigPlan) -> None:
     """Publish a completely staged config in the folder and remove the files it replaces."""
-    records = [
-        read_staged_record(plan.staging.row(index), view_id(plan.spec.name, index)) for index in plan.indices
-    ]
-    shards = _publish_shards(out, plan)
-    mesh = f"{MESHES}/{plan.spec.scene.name}.ply"
+    name, scene = plan.spec.name, plan.spec.scene.name
+    mesh = f"{MESHES}/{scene}.ply"
     write_bytes(out / mesh, plan.staging.mesh.read_bytes())
     entry: dict[str, Any] = {
         **config_parameters(plan.spec),
@@ -108,18 +105,34 @@ def publish_config(out: Path, plan: ConfigPlan) -> None:
         "protocol_views": view_count(plan.spec.protocol),
         "generator": generator_versions(),
         "mesh": mesh,
-        "sheet": f"{PICTURES}/{plan.spec.name}.webp",
+    }
+    publish_entry(out, name, entry, plan.staging, plan.indices, {scene: plan.assembly.bars})
+
+
+def publish_entry(
+    out: Path,
+    name: str,
+    parameters: Mapping[str, Any],
+    staging: Staging,
+    indices: Sequence[int],
+    bars: Mapping[str, tuple[Bar, ...]],
+) -> None:
+    """Publish a config: the staged rows, an entry with the ``parameters``, and the ``bars`` by scene."""
+    records = [read_staged_record(staging.row(index), view_id(name, index)) for index in indices]
+    shards = _publish_shards(out, name, staging, indices)
+    entry = {
+        **parameters,
+        "sheet": f"{PICTURES}/{name}.webp",
         "shards": shards,
-        "bytes": sum((out / name).stat().st_size for name in shards),
+        "bytes": sum((out / shard).stat().st_size for shard in shards),
         "ground_truth_digest": views_digest(records),
         "views": [record.model_dump() for record in records],
     }
-    name = plan.spec.name
     without_reference = DatasetConfig(**DatasetConfig.fields_of_entry(name, entry), root=str(out))
     entry["reference"] = reference_errors(without_reference).to_dict()
     config = DatasetConfig(**DatasetConfig.fields_of_entry(name, entry), root=str(out))
     write_contact_sheet(config, out / config.sheet)
-    _write_bars(out, plan)
+    _write_bars(out, bars)
     _write_manifest(out, {**published_configs(out), config.name: config})
 
 
@@ -129,10 +142,10 @@ def _placement(assembly: Assembly) -> dict[str, Any]:
     return {} if matrix is None else {"world_from_source": matrix.tolist()}
 
 
-def _write_bars(out: Path, plan: ConfigPlan) -> None:
-    path, scene = out / BARS_FILE, plan.spec.scene
+def _write_bars(out: Path, bars: Mapping[str, tuple[Bar, ...]]) -> None:
+    path = out / BARS_FILE
     published = read_bars(path) if path.is_file() else {}
-    write_bars(path, {**published, scene.name: plan.assembly.bars})
+    write_bars(path, {**published, **bars})
 
 
 def remove_leftovers(out: Path) -> None:
@@ -141,18 +154,18 @@ def remove_leftovers(out: Path) -> None:
     remove_temporary_files(out)
 
 
-def _publish_shards(out: Path, plan: ConfigPlan) -> list[str]:
+def _publish_shards(out: Path, config: str, staging: Staging, view_indices: Sequence[int]) -> list[str]:
     """Pack the shards and give each its name in the folder, which carries the digest of all of them."""
-    shard_indices = split_into_shards(plan.indices)
-    packed_paths = [plan.staging.shard(shard) for shard in range(len(shard_indices))]
+    shard_indices = split_into_shards(view_indices)
+    packed_paths = [staging.shard(shard) for shard in range(len(shard_indices))]
     for target, indices in zip(packed_paths, shard_indices, strict=True):
-        pack_shard([plan.staging.row(index) for index in indices], target)
+        pack_shard([staging.row(index) for index in indices], target)
     digest = parameters_digest([file_sha256(path) for path in packed_paths])[:SHARD_DIGEST_CHARACTERS]
     names = [
-        f"{plan.spec.name}/test-{shard:05d}-of-{len(shard_indices):05d}-{digest}.parquet"
+        f"{config}/test-{shard:05d}-of-{len(shard_indices):05d}-{digest}.parquet"
         for shard in range(len(shard_indices))
     ]
-    (out / plan.spec.name).mkdir(exist_ok=True)
+    (out / config).mkdir(exist_ok=True)
     for path, name in zip(packed_paths, names, strict=True):
         path.replace(out / name)
     return names
@@ -183,10 +196,12 @@ def _write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
 
 
 def _strip_key(config: DatasetConfig) -> str:
-    """Return the key that selects one panel of the strip: assembly kind, or file digest of a user's assembly."""
+    """Return the key of a panel of the strip: assembly kind, digest of a user's file, or an imported config."""
+    if config.imported is not None:
+        return config.name
     assembly = config.manifest_entry["scene"]["assembly"]
     return str(assembly.get("sha256", assembly["kind"]))
 
 
 def _listed_files(configs: Iterable[DatasetConfig]) -> set[str]:
-    return {STRIP, *(name for config in configs for name in (*config.shards, config.mesh, config.sheet))}
+    return {STRIP, *(name for config in configs for name in config.files)}

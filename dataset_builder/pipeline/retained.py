@@ -6,7 +6,7 @@ They are checked before anything is rendered, since card, pictures and manifest 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -54,6 +54,13 @@ class _Protocol(_Table):
     radius_m: _Distance = 1.0
 
 
+class _ImportedEntry(_Table):
+    """Keys of the manifest entry of an imported config that the card shows."""
+
+    bytes: _Count
+    protocol_views: _Count
+
+
 class _Entry(_Table):
     """Keys of a config's manifest entry that the card and the pictures show."""
 
@@ -70,38 +77,40 @@ def published_configs(out: Path) -> Mapping[str, DatasetConfig]:
     return open_folder(out).config_by_name if (out / MANIFEST_FILE).is_file() else {}
 
 
-def check_retained_configs(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    """Raise ``InputError`` if a config that is not being built is invalid or lacks a file.
+def check_retained_configs(out: Path, plans: Sequence[ConfigPlan], replaced: Collection[str] = ()) -> None:
+    """Raise ``InputError`` if a config that is not being built, or ``replaced``, is invalid or lacks a file.
 
     It also raises ``InputError`` if the scene of such a config is being changed.
     """
-    planned = {plan.spec.name for plan in plans}
+    planned = {plan.spec.name for plan in plans} | set(replaced)
     retained = [config for name, config in published_configs(out).items() if name not in planned]
     problems = [problem for config in retained for problem in entry_problems(config)]
     if problems:
         raise DatasetError.from_problems(out / MANIFEST_FILE, problems)
     for config in retained:
         _check_scene(out, config, plans)
-        missing_files = [file for file in (*config.shards, config.mesh) if not (out / file).is_file()]
+        missing_files = [file for file in (*config.shards, *config.meshes) if not (out / file).is_file()]
         if missing_files:
-            raise InputError(
-                f"{out}: {missing_files[0]} of config {config.name} is missing; rebuild this config too: "
-                f"--config {config.name}"
+            again = (
+                f"rebuild this config too: --config {config.name}"
+                if config.imported is None
+                else "import it again"
             )
+            raise InputError(f"{out}: {missing_files[0]} of config {config.name} is missing; {again}")
 
 
 def entry_problems(config: DatasetConfig) -> Iterator[Problem]:
     """Yield the problems of a config's manifest entry, whose files have the names that a build gives them."""
     where = format_location("configs", config.name)
     problems: list[Problem] = []
-    validate_table(_Entry, config.manifest_entry, problems, where)
+    validate_table(_Entry if config.imported is None else _ImportedEntry, config.manifest_entry, problems, where)
     yield from problems
     if not config.views or not config.shards:
         yield Problem("missing", where, "no views", "at least one view")
-    for key, found, expected in (
-        ("mesh", config.mesh, f"{MESHES}/{config.scene.name}.ply"),
-        ("sheet", config.sheet, f"{PICTURES}/{config.name}.webp"),
-    ):
+    names = [("sheet", config.sheet, f"{PICTURES}/{config.name}.webp")]
+    if config.imported is None:
+        names.append(("mesh", config.mesh, f"{MESHES}/{config.scene.name}.ply"))
+    for key, found, expected in names:
         if found != expected:
             yield Problem("name", f"{where}.{key}", f"got {found}", expected)
     for shard in config.shards:

@@ -9,7 +9,7 @@ depend on the number of workers or attempts.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
-from rebar_depth_bench.data.columns import ROW_SCHEMA, features
+from rebar_depth_bench.data.columns import ROW_SCHEMA, column_kind, features
 from rebar_depth_bench.data.dataset_config import ViewRecord
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeView
 from rebar_depth_bench.data.parquet import open_parquet
@@ -137,21 +137,37 @@ class View:
 
 def encode_view(view: View) -> tuple[pa.Table, ViewRecord]:
     """Return a view as a one-row table of ``ROW_SCHEMA``, and its record for the manifest."""
-    cells: dict[str, Any] = {"view_id": view.view_id, "scene": view.scene, "baseline_m": view.baseline_m}
+    columns: dict[str, Any] = {"view_id": view.view_id, "scene": view.scene, "baseline_m": view.baseline_m}
     for name, eye in (("left", view.left), ("right", view.right)):
-        cells |= {f"{name}_{kind}": cell for kind, cell in _eye_cells(eye).items()}
-    cells["left_preview"] = _image_cell(codecs.encode_palette(*depth_preview(view.left.depth_m)))
-    return pa.Table.from_pylist([cells], schema=ROW_SCHEMA), _view_record(view)
+        columns |= {f"{name}_{kind}": getattr(eye, kind) for kind in ("rgb", "mask", "bars")}
+        columns |= {f"{name}_{kind}": getattr(eye.camera, kind) for kind in CAMERA_KINDS}
+        columns[f"{name}_depth"] = eye.depth_m
+    return encode_row(columns), _view_record(view)
 
 
-def _eye_cells(eye: EyeView) -> dict[str, Any]:
-    return {
-        "rgb": None if eye.rgb is None else _image_cell(codecs.encode_rgb(eye.rgb)),
-        "depth": codecs.encode_depth(eye.depth_m),
-        "mask": _image_cell(codecs.encode_mask(eye.mask)),
-        "bars": _image_cell(codecs.encode_bars(eye.bars)),
-        **{kind: getattr(eye.camera, kind).tolist() for kind in CAMERA_KINDS},
-    }
+def encode_row(columns: Mapping[str, Any]) -> pa.Table:
+    """Return a one-row table of ``ROW_SCHEMA``; a column that is missing or None is null.
+
+    ``columns`` holds what ``rebar_depth_bench.load`` returns, without the preview, which is made from the depth.
+    """
+    preview = _image_cell(codecs.encode_palette(*depth_preview(columns["left_depth"])))
+    present = {name: value for name, value in columns.items() if value is not None}
+    cells = {name: _ENCODERS.get(column_kind(name), _plain)(value) for name, value in present.items()}
+    return pa.Table.from_pylist([{**cells, "left_preview": preview}], schema=ROW_SCHEMA)
+
+
+def _plain(value: Any) -> Any:
+    return value
+
+
+_ENCODERS: Mapping[str, Callable[[Any], Any]] = {
+    "rgb": lambda rgb: _image_cell(codecs.encode_rgb(rgb)),
+    "depth": codecs.encode_depth,
+    "mask": lambda mask: _image_cell(codecs.encode_mask(mask)),
+    "bars": lambda bars: _image_cell(codecs.encode_bars(bars)),
+    **dict.fromkeys(CAMERA_KINDS, lambda array: array.tolist()),
+}
+"""Encoders of cells by column kind; values of other kinds are stored as they are."""
 
 
 def _image_cell(content: bytes) -> dict[str, bytes | None]:

@@ -26,7 +26,7 @@ their place::
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -157,11 +157,32 @@ def read_cameras(root: Path, images: Sequence[str], width: int, height: int, *, 
     if not path.exists():
         calibration = _file_calibration(root, _found_files(root), 1.0, width, height, is_stereo=is_stereo)
         return CaptureCameras(calibration, BoardSpec(), True, {})
-    check_image_size(path, width, height)
     content = read_file(path, TOML_BYTES, "the cameras of a capture", CalibrationError)
     document, problems = parse_toml(content)
+    if problems:
+        raise CalibrationError.from_problems(path, problems)
+    return cameras_of_table(path, document, images, width, height, is_stereo=is_stereo)
+
+
+def cameras_of_table(
+    path: Path,
+    document: Mapping[str, Any],
+    images: Sequence[str],
+    width: int,
+    height: int,
+    *,
+    is_stereo: bool,
+    where: str = "",
+) -> CaptureCameras:
+    """Return the cameras that a table with the keys of ``cameras.toml`` states, of ``images`` as ``read_cameras``.
+
+    The table is the file ``path`` or, if ``where`` is not empty, the one in it with this name. Files that it names
+    are in the same folder. Raises ``CalibrationError`` as ``read_cameras``.
+    """
+    check_image_size(path, width, height)
+    problems: list[Problem] = []
     rest = {key: document[key] for key in _CALIBRATION_KEYS if key in document}
-    table = None if problems else validate_table(_CamerasTable, document, problems)
+    table = validate_table(_CamerasTable, document, problems)
     inline = None
     if table is not None and table.calibration is not None and rest:
         problems.append(Problem("conflict", "calibration", f"given beside {', '.join(rest)}", "one of them"))
@@ -172,13 +193,17 @@ def read_cameras(root: Path, images: Sequence[str], width: int, height: int, *, 
         found = f"{len(missing)} images have none, such as {missing[0]}"
         problems.append(Problem("missing", "pose", found, "poses of all images, or none"))
     if table is None or problems:
-        raise CalibrationError.from_problems(path, with_lines(problems, content))
+        located = [replace(one, where=f"{where}.{one.where}") for one in problems] if where else problems
+        content = read_file(path, TOML_BYTES, "the cameras of a capture", CalibrationError)
+        raise CalibrationError.from_problems(path, with_lines(located, content))
     if inline is not None:
         calibration = _fitting(scaled_calibration(inline, path, width, height), path)
     else:
         names = [table.calibration] if isinstance(table.calibration, str) else list(table.calibration or ())
-        paths = [root / name for name in names]
-        calibration = _file_calibration(root, paths, _UNITS_M[table.unit], width, height, is_stereo=is_stereo)
+        paths = [path.parent / name for name in names]
+        calibration = _file_calibration(
+            path.parent, paths, _UNITS_M[table.unit], width, height, is_stereo=is_stereo
+        )
     board = None if table.board is None else table.board.spec
     return CaptureCameras(calibration, board or BoardSpec(), board is None, poses)
 

@@ -1,0 +1,47 @@
+"""The ``rebar-build export`` command."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rebar_depth_bench.console import ProgressBars
+
+SUMMARY = "export a dataset folder as plain files, as a capture, or as KITTI's raw data"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    parser.add_argument("root", metavar="ROOT", help="dataset folder")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="output folder: new, or an earlier export to resume"
+    )
+    parser.add_argument(
+        "--config", nargs="+", action="extend", metavar="NAME", help="configs to export (default: all)"
+    )
+    parser.add_argument(
+        "--views",
+        type=int,
+        metavar="N",
+        help="number of views per config, evenly spaced over the views of the folder (default: all)",
+    )
+    parser.add_argument(
+        "--layout",
+        choices=("plain", "zed", "kitti"),
+        default="plain",
+        help="plain: images, exact depth, masks, COLMAP, nerfstudio; zed: a capture; kitti: KITTI's raw data "
+        "(default: %(default)s)",
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Export configs of a dataset folder; print the numbers of files."""
+    from dataset_builder.export import export
+
+    with ProgressBars() as bars:
+        summary = export(
+            options.root, options.out, options.config, options.views, options.layout, progress=bars.update
+        )
+    for config in summary.configs:
+        print(f"{config.config}: {config.views} views, {config.written} files written, {config.kept} kept")
+    print(options.out)

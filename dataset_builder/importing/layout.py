@@ -1,0 +1,198 @@
+"""Layout file: a TOML file that describes a set of images, depth maps, cameras and bars of another program.
+
+All files are named relative to its folder; ``{view}`` in a name stands for the name of a view::
+
+    description = "Column mock-up, scanned with a terrestrial laser scanner"
+    source = "https://example.org/mock-up"
+    licence = "CC-BY-4.0"
+    truth_sigma_m = 0.002             # standard deviation of the depth, metres
+
+    [files]
+    left_depth = "depth/{view}.exr"   # .exr, .tif, .png (16 bit), .npy, .npz, .pfm; required
+    left_rgb = "left/{view}.jpg"      # .png, .jpg
+    right_rgb = "right/{view}.jpg"    # and right_depth, left_mask, right_mask, left_bars, right_bars
+
+    [depth]
+    unit = "mm"                       # or scale = 0.001, metres of one unit; default: "m"
+    kind = "z"                        # "z", "range" along the ray, or "disparity" in pixels
+    invalid = [65535]                 # values without depth, beside those that are not finite or not above 0
+    channel = "R"                     # of EXR files with several channels
+
+    [cameras]                         # the keys of cameras.toml, see ``captures.camera_files``
+    calibration = "stereo.yml"
+
+    [poses]                           # of the left camera, for each view; or [[cameras.pose]]
+    file = "poses/{view}.txt"         # 4 x 4 numbers: .txt, .npy, .json
+    kind = "world_from_cam"           # or "cam_from_world"
+    axes = "opengl"                   # of the camera: "opencv" (default) or "opengl"
+    unit = "m"
+
+    [intrinsics]                      # of the left camera, where they differ between views
+    file = "intrinsics/{view}.json"   # 3 x 3 numbers
+    key = "K"                         # of JSON files
+
+    [masks]
+    values = [255]                    # steel; default: all but 0
+
+    [bars]                            # surveyed bars, in the world frame of the poses
+    file = "bars.csv"                 # bar_id, diameter_m, x_m, y_m, z_m; one line for each point of an axis
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Strict, model_validator
+
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.key_lines import with_lines
+from rebar_depth_bench.limits import TOML_BYTES
+from rebar_depth_bench.reading import parse_toml, read_file
+from rebar_depth_bench.validation import (
+    Expected,
+    StrictModel,
+    field_error,
+    number,
+    one_of,
+    text,
+    validate_table,
+    whole_number,
+)
+
+VIEW = "{view}"
+UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_MAX_SIDE_PX = 16384
+
+
+def _is_pattern(name: str) -> bool:
+    return name.count(VIEW) == 1 and not set(name.replace(VIEW, "")) & set("{}*?[]") and _is_below(name)
+
+
+def _is_below(name: str) -> bool:
+    return not Path(name).is_absolute() and ".." not in Path(name).parts
+
+
+_Pattern = Annotated[str, Expected(f"a name in or below the layout's folder with one {VIEW}", _is_pattern)]
+_File = Annotated[str, Expected("the name of a file in or below the layout's folder", _is_below)]
+_Unit = Annotated[str, one_of(*UNITS_M)]
+_Values = Annotated[tuple[float, ...], Strict(False)]
+
+
+class FilesTable(StrictModel):
+    """Names of the files of each view, by column."""
+
+    left_depth: _Pattern
+    left_rgb: _Pattern | None = None
+    right_rgb: _Pattern | None = None
+    right_depth: _Pattern | None = None
+    left_mask: _Pattern | None = None
+    right_mask: _Pattern | None = None
+    left_bars: _Pattern | None = None
+    right_bars: _Pattern | None = None
+
+    @property
+    def patterns(self) -> dict[str, str]:
+        """The patterns that are given, by column."""
+        return {name: pattern for name, pattern in self if pattern is not None}
+
+    @property
+    def has_right(self) -> bool:
+        """Whether there is a right camera."""
+        return any(name.startswith("right_") for name in self.patterns)
+
+    @model_validator(mode="after")
+    def _check_eyes(self) -> FilesTable:
+        if self.right_depth is None and (self.right_mask or self.right_bars):
+            raise field_error("right_depth is missing", "right_depth beside right_mask and right_bars", "conflict")
+        return self
+
+
+class DepthTable(StrictModel):
+    """How the values of depth maps are read."""
+
+    unit: _Unit | None = None
+    scale: Annotated[float, number(1e-9, 1e6)] | None = None
+    kind: Annotated[str, one_of("z", "range", "disparity")] = "z"
+    invalid: _Values = ()
+    channel: Annotated[str, text(100)] | None = None
+
+    @model_validator(mode="after")
+    def _check_unit(self) -> DepthTable:
+        if self.unit is not None and self.scale is not None:
+            raise field_error("got unit and scale", "one of them", "conflict")
+        if self.unit is not None and self.kind == "disparity":
+            raise field_error("got unit", "scale, pixels of one unit, for disparity", "conflict")
+        return self
+
+    @property
+    def factor(self) -> float:
+        """Metres (pixels of disparity) of one unit."""
+        return UNITS_M[self.unit] if self.unit is not None else 1.0 if self.scale is None else self.scale
+
+
+class MatricesTable(StrictModel):
+    """Files with one matrix per view."""
+
+    file: _Pattern
+    key: Annotated[str, text(100)] | None = None
+
+
+class PosesTable(MatricesTable):
+    """Poses of the left camera."""
+
+    kind: Annotated[str, one_of("cam_from_world", "world_from_cam")] = "cam_from_world"
+    axes: Annotated[str, one_of("opencv", "opengl")] = "opencv"
+    unit: _Unit = "m"
+
+
+class MasksTable(StrictModel):
+    """Values of masks that are steel; all but 0 if it is empty."""
+
+    values: _Values = ()
+
+
+class BarsTable(StrictModel):
+    """Surveyed bars."""
+
+    file: _File
+
+
+class Layout(StrictModel):
+    """Content of a layout file. ``width`` and ``height`` are required without images."""
+
+    description: Annotated[str, text(1000)] = ""
+    source: Annotated[str, text(1000)] = ""
+    licence: Annotated[str, text(200)] = ""
+    truth_sigma_m: Annotated[float, number(1e-9, 10, "the standard deviation of the depth, metres, above 0")]
+    width: Annotated[int, whole_number(16, _MAX_SIDE_PX)] | None = None
+    height: Annotated[int, whole_number(16, _MAX_SIDE_PX)] | None = None
+    files: FilesTable
+    cameras: dict[str, Any]
+    depth: DepthTable = DepthTable()
+    poses: PosesTable | None = None
+    intrinsics: MatricesTable | None = None
+    masks: MasksTable = MasksTable()
+    bars: BarsTable | None = None
+
+    @model_validator(mode="after")
+    def _check_sizes(self) -> Layout:
+        if self.files.left_rgb is None and (self.width is None or self.height is None):
+            raise field_error("width or height is missing", "both, or files.left_rgb", "missing")
+        if self.poses is not None and "pose" in self.cameras:
+            raise field_error("got poses and cameras.pose", "one of them", "conflict")
+        if self.bars is not None and self.poses is None and "pose" not in self.cameras:
+            raise field_error("got bars without poses", "poses in the frame of the bars", "conflict")
+        if self.intrinsics is not None and self.files.has_right:
+            raise field_error("got intrinsics of each view and a right camera", "one calibration", "conflict")
+        return self
+
+
+def read_layout(path: Path) -> Layout:
+    """Read a layout file. Raises ``InputError`` with all problems, which name keys and lines."""
+    content = read_file(path, TOML_BYTES, "a layout of data to import", InputError)
+    values, problems = parse_toml(content)
+    layout = None if problems else validate_table(Layout, values, problems)
+    if layout is None:
+        raise InputError.from_problems(path, with_lines(problems, content))
+    return layout

@@ -1,0 +1,180 @@
+"""Import of a layout as a config: staged view by view, then published as a build is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dataset_builder.config.catalog import view_id
+from dataset_builder.config.scene_file import RESERVED_NAMES
+from dataset_builder.config.scene_name import scene_name_of
+from dataset_builder.importing.bars_file import read_bars_file
+from dataset_builder.importing.layout import Layout, read_layout
+from dataset_builder.importing.views import SourceViews, open_views
+from dataset_builder.pipeline.folder import check_target, remove_build_folder
+from dataset_builder.pipeline.plan import BUILD_FOLDER, generator_versions
+from dataset_builder.pipeline.publish import build_lock, publish_entry, remove_leftovers
+from dataset_builder.pipeline.retained import check_retained_configs, published_configs
+from dataset_builder.pipeline.shards import Staging, encode_row, stage_row
+from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.data.columns import OPTIONAL_COLUMNS
+from rebar_depth_bench.data.dataset_config import ViewRecord
+from rebar_depth_bench.data.digests import file_sha256, parameters_digest
+from rebar_depth_bench.data.eye_view import truth_from_row
+from rebar_depth_bench.errors import InputError, escape_text
+from rebar_depth_bench.paths import remove_folder
+from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.protocol import scored_pixels
+
+_KEY_CHARACTERS = 16
+_ROLE = "not surveyed"
+"""Role of bars that images show and no file of bars describes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Import:
+    """Data to import as the config ``name``: checked views, surveyed bars, and the columns that are absent."""
+
+    name: str
+    views: SourceViews
+    bars: tuple[Bar, ...]
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of the data."""
+        return self.views.layout
+
+    @property
+    def absent_columns(self) -> tuple[str, ...]:
+        """Columns that are null in every row, sorted."""
+        files, present = self.layout.files, set(self.layout.files.patterns)
+        present |= {name.replace("bars", "mask") for name in present}  # A mask follows from bar ids.
+        if files.has_right:
+            present |= {f"right_{kind}" for kind in ("K", "distortion", "cam_from_world")} | {"baseline_m"}
+        return tuple(sorted(set(OPTIONAL_COLUMNS) - present))
+
+
+def plan_import(path: Path, name: str) -> Import:
+    """Return the data that a layout file describes, after checking all of it but the content of images.
+
+    Raises ``InputError`` with all problems of the layout, its cameras or its bars, and for a reserved name.
+    """
+    if scene_name_of(Path(f"{name}.toml")) != name or name in RESERVED_NAMES:
+        raise InputError(
+            f"--config is {escape_text(name)}, expected a name of a-z, 0-9 and - that is not a standard one"
+        )
+    layout = read_layout(path)
+    views = open_views(path, layout)
+    bars = read_bars_file(path.parent / layout.bars.file) if layout.bars is not None else ()
+    return Import(name, views, bars)
+
+
+def run_import(source: Import, out: Path, progress: Progress = silent) -> None:
+    """Write the config into the dataset folder ``out``, or continue an interrupted import.
+
+    Raises ``InputError`` for images that cannot be read, for a folder that is none of a dataset, and for a config
+    of this name that was rendered; nothing is published then.
+    """
+    key = parameters_digest(_key_inputs(source, progress))
+    staging = Staging(out / BUILD_FOLDER / f"{source.name}-{key[:_KEY_CHARACTERS]}")
+    check_target(out, [source.name], [staging.root])
+    published = published_configs(out).get(source.name)
+    if published is not None and published.imported is None:
+        raise InputError(f"{out}: config {source.name} was rendered, expected another --config for imported data")
+    if published is not None and published.key == key:
+        return
+    with build_lock(out / BUILD_FOLDER):
+        try:
+            check_retained_configs(out, [], {source.name})
+            remove_leftovers(out)
+            ids = _stage_views(source, staging, progress)
+            bars = {bar.bar_id: bar for bar in source.bars}
+            bars |= {bar_id: Bar.without_axis(bar_id, _ROLE) for bar_id in sorted(ids - bars.keys())}
+            scene_bars = {source.name: tuple(bars[bar_id] for bar_id in sorted(bars))}
+            indices = range(len(source.views.names))
+            publish_entry(out, source.name, _entry(source, key), staging, indices, scene_bars)
+            remove_folder(staging.root)
+        finally:
+            remove_build_folder(out / BUILD_FOLDER)
+
+
+def _key_inputs(source: Import, progress: Progress) -> list[Any]:
+    """Return everything that determines the bytes of the config."""
+    files = source.views.files
+    digests = []
+    for done, path in enumerate(files, start=1):
+        digests.append(file_sha256(path))
+        progress("files read", done, len(files))
+    calibration = asdict(source.views.cameras.calibration)
+    poses = {name: pose.tolist() for name, pose in source.views.cameras.cam_from_world.items()}
+    bars = [asdict(bar) for bar in source.bars]
+    return [
+        source.layout.model_dump(),
+        source.views.names,
+        digests,
+        calibration,
+        poses,
+        bars,
+        generator_versions(),
+    ]
+
+
+def _stage_views(source: Import, staging: Staging, progress: Progress) -> set[int]:
+    """Stage the rows of all views; return the bar ids in the left images.
+
+    All views are decoded, as those of an interrupted import are compared as well.
+    """
+    ids: set[int] = set()
+    for index, name in enumerate(source.views.names):
+        columns = source.views.decode(name)
+        if "left_bars" in columns:
+            ids |= set(np.unique(columns["left_bars"]).tolist()) - {0}
+        path = staging.row(index)
+        if not path.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            identity = {"view_id": view_id(source.name, index), "scene": source.name}
+            stage_row(path, encode_row({**identity, **columns}), _record(identity["view_id"], columns))
+        progress(f"import of {source.name}", index + 1, len(source.views.names))
+    return ids
+
+
+def _record(identity: str, columns: Mapping[str, Any]) -> ViewRecord:
+    row = {**dict.fromkeys(OPTIONAL_COLUMNS), **columns}
+    left, mask = truth_from_row(row, "left"), row["left_mask"]
+    return ViewRecord(
+        view_id=identity,
+        left=left.digest(),
+        right=truth_from_row(row, "right").digest() if row["right_depth"] is not None else None,
+        steel_px=None if mask is None else int(np.count_nonzero(mask)),
+        scored_px=len(scored_pixels(mask, left.depth_m)),
+    )
+
+
+def _entry(source: Import, key: str) -> dict[str, Any]:
+    """Return the manifest entry of the config without its shards and views."""
+    layout, (height, width) = source.layout, source.views.grid
+    board = None if source.views.cameras.board_is_assumed else source.views.cameras.board
+    return {
+        "imported": {
+            "truth_sigma_m": layout.truth_sigma_m,
+            "absent_columns": source.absent_columns,
+            "has_poses": source.views.has_poses,
+            "description": layout.description,
+            "source": layout.source,
+            "licence": layout.licence,
+            "layout": layout.model_dump(exclude_none=True),
+            "views": source.views.names,
+        },
+        "scene": {"name": source.name, "board": None if board is None else asdict(board)},
+        "rig": {"width": width, "height": height},
+        "colour": {} if "left_rgb" in layout.files.patterns else None,
+        "mesh": None,
+        "key": key,
+        "protocol": None,
+        "protocol_views": len(source.views.names),
+        "generator": generator_versions(),
+    }

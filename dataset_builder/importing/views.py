@@ -1,0 +1,185 @@
+"""Views of a layout: their names and files, and the decoded images, depth maps and cameras of each."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+from numpy import ndarray
+
+from dataset_builder.importing.depth_maps import DEPTH_SUFFIXES, depth_converter, read_depth
+from dataset_builder.importing.labels import LABEL_SUFFIXES, bar_ids, read_labels
+from dataset_builder.importing.layout import VIEW, Layout
+from dataset_builder.importing.matrices import MATRIX_SUFFIXES, cam_from_world, read_matrix
+from rebar_depth_bench.captures.camera_files import CaptureCameras, cameras_of_table
+from rebar_depth_bench.captures.image_files import IMAGE_SUFFIXES, common_shape, read_image
+from rebar_depth_bench.data.columns import EYES, column_kind
+from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
+from rebar_depth_bench.geometry.stereo_calibration import (
+    StereoCalibration,
+    calibrated_baseline_m,
+    lens_distortion,
+    lens_K,
+    right_from_left,
+)
+from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN
+
+_SUFFIXES: Mapping[str, tuple[str, ...]] = {
+    "rgb": IMAGE_SUFFIXES,
+    "depth": DEPTH_SUFFIXES,
+    "mask": LABEL_SUFFIXES,
+    "bars": LABEL_SUFFIXES,
+    "matrix": MATRIX_SUFFIXES,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class SourceViews:
+    """Checked views of a layout: names, files by column, image size (height, width) and cameras.
+
+    Without poses, ``has_poses`` is False and the world frame of a view is its left camera.
+    """
+
+    root: Path
+    layout: Layout
+    names: tuple[str, ...]
+    grid: tuple[int, int]
+    cameras: CaptureCameras
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether the views have poses in one world frame."""
+        return self.layout.poses is not None or bool(self.cameras.cam_from_world)
+
+    @property
+    def files(self) -> list[Path]:
+        """Files of all views."""
+        return [self.file(pattern, name) for pattern in _patterns(self.layout).values() for name in self.names]
+
+    def file(self, pattern: str, name: str) -> Path:
+        """Return the file of a view."""
+        return self.root / pattern.replace(VIEW, name)
+
+    def decode(self, name: str) -> dict[str, Any]:
+        """Return the arrays of a view by column; columns that the layout does not have are left out.
+
+        Raises ``InputError`` with the problems of the view's files.
+        """
+        try:
+            return {**self._cameras(name), **self._images(name)}
+        except EntryError as error:
+            raise InputError.from_problems(f"{self.root}: view {name}", error.problems) from None
+
+    def _cameras(self, name: str) -> dict[str, Any]:
+        layout, calibration = self.layout, self.cameras.calibration
+        pose = self.cameras.cam_from_world.get(name, np.eye(4))
+        if layout.poses is not None:
+            pose = cam_from_world(self.file(layout.poses.file, name), layout.poses)
+        K = lens_K(calibration.left)
+        if layout.intrinsics is not None:
+            K = read_matrix(self.file(layout.intrinsics.file, name), layout.intrinsics.key, (3, 3))
+        columns: dict[str, Any] = {
+            "left_K": K,
+            "left_distortion": lens_distortion(calibration.left),
+            "left_cam_from_world": pose,
+        }
+        if isinstance(calibration, StereoCalibration) and layout.files.has_right:
+            columns |= {
+                "right_K": lens_K(calibration.right),
+                "right_distortion": lens_distortion(calibration.right),
+                "right_cam_from_world": right_from_left(calibration) @ pose,
+                "baseline_m": calibrated_baseline_m(calibration),
+            }
+        return columns
+
+    def _images(self, name: str) -> dict[str, Any]:
+        convert = depth_converter(self.layout.depth, self.cameras.calibration)
+        columns: dict[str, Any] = {}
+        for column, pattern in self.layout.files.patterns.items():
+            path, kind, eye = self.file(pattern, name), column_kind(column), column.partition("_")[0]
+            if kind == "rgb":
+                columns[column] = read_image(path, self.grid)
+            elif kind == "depth":
+                columns[column] = convert(read_depth(path, self.grid, self.layout.depth), eye)
+            else:
+                values = read_labels(path, self.grid)
+                columns[column] = self._mask(values) if kind == "mask" else bar_ids(path, values)
+        for eye in EYES:
+            if f"{eye}_bars" in columns:
+                has_id = columns[f"{eye}_bars"] > 0
+                outside = int(np.count_nonzero(has_id & ~columns.setdefault(f"{eye}_mask", has_id)))
+                if outside:
+                    found = f"{outside} pixels have a bar id and are no steel in the mask"
+                    raise EntryError(Problem("conflict", f"{eye}_bars", found, "bar ids on steel only"))
+        return columns
+
+    def _mask(self, values: ndarray) -> Bool[ndarray, "h w"]:
+        steel = self.layout.masks.values
+        return np.isin(values, steel) if steel else values != 0
+
+
+def open_views(path: Path, layout: Layout) -> SourceViews:
+    """Return the views of a layout file, after checking that all files are there.
+
+    Sizes of images are compared by their headers. Raises ``InputError`` with all problems.
+    """
+    root, problems = path.parent, list[Problem]()
+    for key, pattern in _patterns(layout).items():
+        suffixes = _SUFFIXES[column_kind(key)] if key in layout.files.patterns else _SUFFIXES["matrix"]
+        if Path(pattern).suffix.lower() not in suffixes:
+            problems.append(
+                Problem("invalid", key, f"got {escape_text(pattern)}", f"a name ending in {', '.join(suffixes)}")
+            )
+    names = _view_names(root, layout.files.left_depth, problems)
+    if not names and not problems:
+        problems.append(Problem("missing", "files.left_depth", "no file has this name", layout.files.left_depth))
+    for key, pattern in _patterns(layout).items():
+        missing = [name for name in names if not (root / pattern.replace(VIEW, name)).is_file()]
+        if missing:
+            found = f"{pattern.replace(VIEW, missing[0])} is missing, as for {len(missing)} of {len(names)} views"
+            problems.append(Problem("missing", key, found))
+    if problems:
+        raise InputError.from_problems(path, problems)
+    patterns = [layout.files.patterns[key] for key in ("left_rgb", "right_rgb") if key in layout.files.patterns]
+    grid = common_shape([root / pattern.replace(VIEW, name) for pattern in patterns for name in names], problems)
+    stated = (layout.height, layout.width)
+    if grid is not None and None not in stated and grid != stated:
+        problems.append(
+            Problem("conflict", "width", f"the images are {grid[1]} x {grid[0]}", "their width and height")
+        )
+    if problems:
+        raise InputError.from_problems(path, problems)
+    height, width = grid if grid is not None else (layout.height or 0, layout.width or 0)
+    cameras = cameras_of_table(
+        path, layout.cameras, names, width, height, is_stereo=layout.files.has_right, where="cameras"
+    )
+    depth_converter(layout.depth, cameras.calibration)
+    return SourceViews(root, layout, tuple(names), (height, width), cameras)
+
+
+def _patterns(layout: Layout) -> dict[str, str]:
+    """Return all patterns of files of single views, by column or key."""
+    matrices = {"poses": layout.poses, "intrinsics": layout.intrinsics}
+    return {
+        **layout.files.patterns,
+        **{f"{key}.file": table.file for key, table in matrices.items() if table is not None},
+    }
+
+
+def _view_names(root: Path, pattern: str, problems: list[Problem]) -> list[str]:
+    """Return the sorted names of the views whose left depth map exists."""
+    before, _, after = pattern.partition(VIEW)
+    match = re.compile(f"{re.escape(before)}({NAME_PATTERN}){re.escape(after)}")
+    found = [path.relative_to(root).as_posix() for path in root.glob(pattern.replace(VIEW, "*"))]
+    names = {name: match.fullmatch(name) for name in sorted(found)}
+    problems += [
+        Problem("name", "files.left_depth", f"got {escape_text(name)}", f"views named by {NAME_LETTERS}")
+        for name, matched in names.items()
+        if matched is None
+    ]
+    return sorted(matched[1] for matched in names.values() if matched is not None)
