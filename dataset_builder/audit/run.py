@@ -19,6 +19,7 @@ from dataset_builder.audit.cameras import (
 from dataset_builder.audit.cycles_depth import cycles_difference_m, cycles_verdict
 from dataset_builder.audit.files import check_files, row_problems
 from dataset_builder.audit.geometry import axis_verdict, board_verdict, max_axis_distance_ratio, view_board_error
+from dataset_builder.audit.imported import imported_checks
 from dataset_builder.audit.markers import detect_view_markers, marker_verdict
 from dataset_builder.audit.photometric import photometric_fit, photometric_verdict
 from dataset_builder.audit.report import AuditReport, Check
@@ -84,6 +85,10 @@ def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent
 
 
 def _config_checks(config: DatasetConfig, root: Path, depth_views: int, progress: Progress) -> Iterator[Check]:
+    if config.imported is not None:
+        bars = read_bars(root / BARS_FILE).get(config.scene.name, ())
+        yield from imported_checks(config, config.imported, bars, progress)
+        return
     name, mesh = config.name, root / config.mesh
     steel = read_bars(root / BARS_FILE)[config.scene.name]
     variants, board = config.scene.appearance.variants, config.scene.board
