@@ -44,9 +44,11 @@ def read_depth(path: Path, grid: Grid, table: DepthTable) -> Float64[ndarray, "h
     else:
         values = read_pixels(path, content, _PILLOW_FORMATS[suffix])
     check_grid(path, values, grid)
-    units = values.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # A damaged file may hold NaN that signal.
+        units = values.astype(np.float64)
     units[~np.isfinite(units) | (units <= 0) | np.isin(units, table.invalid)] = np.nan
-    return units * table.factor
+    with np.errstate(over="ignore"):
+        return np.asarray(units * table.factor)
 
 
 def depth_converter(
@@ -72,7 +74,7 @@ def depth_converter(
     product = calibration.left.fx * baseline_m
 
     def from_disparity(values: Float64[ndarray, "h w"], _: str) -> Float32[ndarray, "h w"]:
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", over="ignore"):
             return _stored(product / (values + offset_px))
 
     return from_disparity

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -38,12 +38,13 @@ def check_folder(out: Path, plans: Sequence[ConfigPlan]) -> None:
 
     Raises as ``check_target`` does. A config with colour may not be built again without.
     """
-    check_target(out, [plan.spec.name for plan in plans], [path for plan in plans for path in plan.all_stagings()])
+    stagings = (path for plan in plans for path in plan.all_stagings())  # Not read before ``out`` is checked.
+    check_target(out, [plan.spec.name for plan in plans], stagings)
     if (out / MANIFEST_FILE).is_file():
         _check_keeps_colour(out, plans)
 
 
-def check_target(out: Path, configs: Collection[str], stagings: Collection[Path]) -> None:
+def check_target(out: Path, configs: Collection[str], stagings: Iterable[Path]) -> None:
     """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder, where configs can be written.
 
     Raises ``OutputError`` if it cannot be written. No other files are ever changed. Folders that a build changes,

@@ -21,9 +21,9 @@ import pyarrow.parquet as pq
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
-from rebar_depth_bench.data.columns import ROW_SCHEMA, column_kind, features
+from rebar_depth_bench.data.columns import COLUMNS, ROW_SCHEMA, column_kind, features
 from rebar_depth_bench.data.dataset_config import ViewRecord
-from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeView
+from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeView, absent_cell
 from rebar_depth_bench.data.parquet import open_parquet
 from rebar_depth_bench.data.shards import rows_table
 from rebar_depth_bench.errors import InputError, Problem, escape_text
@@ -146,14 +146,19 @@ def encode_view(view: View) -> tuple[pa.Table, ViewRecord]:
 
 
 def encode_row(columns: Mapping[str, Any]) -> pa.Table:
-    """Return a one-row table of ``ROW_SCHEMA``; a column that is missing or None is null.
+    """Return a one-row table of ``ROW_SCHEMA``; a column that is missing or None is absent.
 
     ``columns`` holds what ``rebar_depth_bench.load`` returns, without the preview, which is made from the depth.
     """
-    preview = _image_cell(codecs.encode_palette(*depth_preview(columns["left_depth"])))
-    present = {name: value for name, value in columns.items() if value is not None}
-    cells = {name: _ENCODERS.get(column_kind(name), _plain)(value) for name, value in present.items()}
-    return pa.Table.from_pylist([{**cells, "left_preview": preview}], schema=ROW_SCHEMA)
+    preview: Any = _image_cell(codecs.encode_palette(*depth_preview(columns["left_depth"])))
+    cells = {"left_preview": preview}
+    for name in COLUMNS:
+        value, kind = columns.get(name), column_kind(name)
+        if value is not None:
+            cells[name] = _ENCODERS.get(kind, _plain)(value)
+        elif name not in cells:
+            cells[name] = absent_cell(kind)
+    return pa.Table.from_pylist([cells], schema=ROW_SCHEMA)
 
 
 def _plain(value: Any) -> Any:

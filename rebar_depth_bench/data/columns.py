@@ -26,7 +26,7 @@ OPTIONAL_COLUMNS = (
     *("left_rgb", "left_mask", "left_bars"),
     *(name for name in COLUMNS if name.startswith("right_") or name == "baseline_m"),
 )
-"""Columns that may be null in every row of a config that was imported."""
+"""Columns that may be null in every row of a config that was imported; K, distortion and pose are NaN then."""
 
 
 def features(*, decode_images: bool = True) -> Features:

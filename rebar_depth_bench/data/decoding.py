@@ -10,7 +10,7 @@ from typing import Any, Self
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.columns import column_kind
 from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.eye_view import CAMERA_KINDS, camera_array
+from rebar_depth_bench.data.eye_view import CAMERA_KINDS, camera_array, is_absent
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.validation import short_repr
 
@@ -27,7 +27,7 @@ class RowDecoder:
     """Decoder of the rows of a config; it is small and can be pickled for worker processes.
 
     ``grid`` is the image size (height, width) that every cell must have, ``scene_by_view`` the name of the
-    scene of each view. The cells of ``absent_columns`` are null and decode to None.
+    scene of each view. The cells of ``absent_columns`` are null, or NaN in a matrix, and decode to None.
     """
 
     root: str
@@ -54,7 +54,7 @@ class RowDecoder:
     def _decode(self, column: str, cell: Any, view: str) -> Any:
         try:
             if column in self.absent_columns:
-                if cell is not None:
+                if not is_absent(cell):
                     raise ValueError("it has a value, expected null as in the manifest")
                 return None
             return self._decode_kind(column_kind(column), cell, view)

@@ -88,6 +88,19 @@ def camera_from_row(row: Mapping[str, Any], eye: str, grid: tuple[int, int]) -> 
     return Camera(K, distortion, cam_from_world, width, height)
 
 
+def absent_cell(kind: str) -> list[Any] | None:
+    """Return the cell of an absent column: null, or NaN for ``CAMERA_KINDS``.
+
+    Parquet readers of Arrow fail on null lists of a fixed size.
+    """
+    return np.full(_CAMERA_SHAPES[kind], np.nan).tolist() if kind in CAMERA_KINDS else None
+
+
+def is_absent(cell: Any) -> bool:
+    """Return whether a cell is null, or a list of NaN."""
+    return cell is None or (isinstance(cell, list) and len(cell) > 0 and bool(np.isnan(np.ravel(cell)).all()))
+
+
 def camera_array(kind: str, cell: Any) -> Float64[ndarray, ...]:
     """Return a cell of one of ``CAMERA_KINDS`` as an array; arrays are returned unchanged.
 
