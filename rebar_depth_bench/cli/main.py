@@ -18,6 +18,7 @@ from rebar_depth_bench.cli import (
     submit,
     table,
     verify,
+    view,
 )
 from rebar_depth_bench.console import Command, add_commands, replace_renamed_options, run_command
 from rebar_depth_bench.output_options import check_outputs
@@ -36,6 +37,7 @@ COMMANDS: Mapping[str, Command] = {
     "submit": submit,
     "push-results": push_results,
     "cache": cache,
+    "view": view,
     "demo": demo,
 }
 
