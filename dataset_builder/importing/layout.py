@@ -27,7 +27,7 @@ All files are named relative to its folder; ``{view}`` in a name stands for the 
     axes = "opengl"                   # of the camera: "opencv" (default) or "opengl"
     unit = "m"
 
-    [intrinsics]                      # of the left camera, where they differ between views
+    [intrinsics]                      # of images of one camera, where they differ between views
     file = "intrinsics/{view}.json"   # 3 x 3 numbers
     key = "K"                         # of JSON files
 

@@ -12,6 +12,7 @@ import pytest
 
 from dataset_builder.cli import argument_parser as build_parser
 from dataset_builder.config.catalog import CONFIGS, SWEEPS
+from dataset_builder.importing.layout import read_layout
 from dataset_builder.scene.variants import VARIANTS
 from leaderboard.cli import argument_parser as board_parser
 from leaderboard.settings import Settings
@@ -28,6 +29,7 @@ PAGES = [
     Path("cards/BENCHMARK.md"),
     Path("deploy/README.md"),
     Path("docs/captures.md"),
+    Path("docs/import.md"),
 ]
 PARSERS: dict[str, ArgumentParser] = {
     "rebar-build": build_parser(),
@@ -116,3 +118,10 @@ def default_text(limit: Limit) -> str:
         return f"{limit.default:,} {limit.name.rpartition('_')[2]}"
     power = 3 if limit.default % (1 << 30) == 0 else 2
     return f"{limit.default >> (10 * power)} {('B', 'KiB', 'MiB', 'GiB')[power]}"
+
+
+def test_documented_layout_files_are_valid(tmp_path: Path) -> None:
+    for block in blocks(Path("docs/import.md"), "toml"):
+        path = tmp_path / "layout.toml"
+        path.write_text(block)
+        assert read_layout(path).truth_sigma_m > 0
