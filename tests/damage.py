@@ -11,7 +11,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rebar_depth_bench.data.dataset_config import ViewRecord
+from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.digests import views_digest
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from dataset_builder.audit.report import Check
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.data.columns import EYES
-from rebar_depth_bench.data.dataset_config import ViewRecord
+from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.data.verification import file_problems

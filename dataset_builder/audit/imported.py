@@ -18,8 +18,9 @@ from dataset_builder.audit.geometry import polyline_distance_m
 from dataset_builder.audit.report import Check
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.data.columns import COLUMNS
+from rebar_depth_bench.data.config_tables import Imported, ViewRecord
 from rebar_depth_bench.data.dataset import iterate_rows
-from rebar_depth_bench.data.dataset_config import DatasetConfig, Imported, ViewRecord
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import EyeTruth, truth_from_row
 from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid, pixel_rays, project, transform
 from rebar_depth_bench.progress import Progress

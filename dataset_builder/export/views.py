@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from rebar_depth_bench.data.columns import EYES
+from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.dataset import iterate_undecoded
-from rebar_depth_bench.data.dataset_config import DatasetConfig, ViewRecord
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.eye_view import camera_from_row, truth_columns, truth_from_row
 from rebar_depth_bench.errors import DatasetError

@@ -22,7 +22,7 @@ from dataset_builder.pipeline.retained import check_retained_configs, published_
 from dataset_builder.pipeline.shards import Staging, encode_row, stage_row
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import OPTIONAL_COLUMNS
-from rebar_depth_bench.data.dataset_config import ViewRecord
+from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest
 from rebar_depth_bench.data.eye_view import truth_from_row
 from rebar_depth_bench.errors import InputError, escape_text

@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.columns import COLUMNS, ROW_SCHEMA, column_kind, features
-from rebar_depth_bench.data.dataset_config import ViewRecord
+from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeView, absent_cell
 from rebar_depth_bench.data.parquet import open_parquet
 from rebar_depth_bench.data.shards import rows_table

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rebar_depth_bench.reading import open_regular
 
 if TYPE_CHECKING:
-    from rebar_depth_bench.data.dataset_config import ViewRecord
+    from rebar_depth_bench.data.config_tables import ViewRecord
 
 _CHUNK_BYTES = 1 << 20
 

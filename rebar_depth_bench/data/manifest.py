@@ -8,14 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from rebar_depth_bench.data.dataset_config import (
-    DIGEST_PATTERN,
-    SCENE_FILES,
-    DatasetConfig,
-    Digest,
-    RelativePath,
-    Sha256,
-)
+from rebar_depth_bench.data.config_tables import DIGEST_PATTERN, SCENE_FILES, Digest, RelativePath, Sha256
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256, views_digest
 from rebar_depth_bench.data.location import Located, local_path
 from rebar_depth_bench.data.manifest_table import ManifestTable

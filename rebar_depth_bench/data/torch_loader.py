@@ -43,7 +43,7 @@ def torch_loader(
     is no surface), ``mask`` bool B x 1 x H x W, ``K`` float64 B x 3 x 3 (pixels), ``poses`` float64 B x 4 x 4
     (``cam_from_world``), all of the left view, and ``view_id``, a list of str. With ``stereo`` the batch also has
     the same keys of the right view, prefixed ``right_``, and ``baseline_m`` float64 B. Batches of a config without
-    colour lack ``rgb`` and ``right_rgb``.
+    colour lack ``rgb`` and ``right_rgb``, and those of an imported config all that it lacks.
 
     Columns that a batch does not need are not decoded, except in a streamed dataset, whose columns are already
     decoded; pass ``columns`` to ``load`` to select them. ``shuffle`` requires a dataset that is not streamed.

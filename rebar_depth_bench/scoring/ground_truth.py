@@ -17,8 +17,9 @@ from numpy import ndarray
 
 from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
 from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
+from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.dataset import iterate_rows
-from rebar_depth_bench.data.dataset_config import DatasetConfig, ViewRecord
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import EyeTruth, truth_columns, truth_from_row
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.progress import Progress, silent

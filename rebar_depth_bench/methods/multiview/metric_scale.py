@@ -37,6 +37,7 @@ MAX_REPROJECTION_ERROR_PX = 3.0
 """Reprojection error up to which a view is an inlier."""
 MIN_MARKERS = 2
 """Smallest number of triangulated markers."""
+_TRUTH_COLUMNS = ("left_depth", "left_mask")
 _TRIANGULATION_STEPS = 3
 """Number of reweighted least-squares solutions for the position of a corner."""
 
@@ -206,6 +207,11 @@ def _scale_from_markers(
     return MetricScale(fit.metric.scale, notes)
 
 
+def _require_ground_truth(views: Views) -> None:
+    """Raise ``InputError`` if the views lack depth or masks."""
+    views.check_columns(_TRUTH_COLUMNS, "a scale anchored to the ground truth")
+
+
 def _scale_from_ground_truth(
     views: Views,
     left_images: LeftImages,
@@ -214,7 +220,7 @@ def _scale_from_ground_truth(
 ) -> MetricScale:
     """Return the median over views of median(z / z_estimated) on the scored pixels (the paper, II.C)."""
     ratios, read_depth = [], reader()
-    for row in views.rows("left_depth", "left_mask"):
+    for row in views.rows(*_TRUTH_COLUMNS):
         name = left_images.names[row["view_id"]]
         if name not in reconstruction.cam_from_sfm:
             continue
@@ -237,6 +243,6 @@ def _scale_from_ground_truth(
 
 SCALE_SOURCES: Mapping[str, ScaleSource] = {
     "aruco": ScaleSource(_require_board, _scale_from_markers),
-    "anchored": ScaleSource(lambda _: None, _scale_from_ground_truth),
+    "anchored": ScaleSource(_require_ground_truth, _scale_from_ground_truth),
 }
 """Sources of metric scale by the last part of a method's name."""

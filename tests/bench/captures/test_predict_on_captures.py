@@ -24,6 +24,7 @@ def predict(root: Path, archive: Path, *options: str, method: str = "sgbm") -> i
     [
         ("noisy-truth", (), "needs left_depth"),
         ("truth", (), "needs left_depth"),
+        ("sweep-anchored", (), "needs left_depth, left_mask"),
         ("sgbm", ("--config", "lattice"), "--config is given, which is for dataset folders only"),
         ("sgbm", ("--split", "test"), "--split is given"),
         ("sgbm", ("--expect-digest", "sha256:" + "0" * 64), "--expect-digest is given"),

@@ -14,8 +14,8 @@ import pytest
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.columns import COLUMNS
+from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.dataset import ConfigViews, iterate_rows
-from rebar_depth_bench.data.dataset_config import ViewRecord
 from rebar_depth_bench.data.digests import views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.data.verification import truth_problems

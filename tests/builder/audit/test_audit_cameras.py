@@ -28,7 +28,8 @@ from dataset_builder.config.trajectories import poses
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.steel_distance import Cylinders
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.data.dataset_config import DatasetConfig, ViewRecord
+from rebar_depth_bench.data.config_tables import ViewRecord
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera, camera_centre, right_camera_pose

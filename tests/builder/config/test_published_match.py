@@ -13,7 +13,8 @@ from dataset_builder.config.catalog import CONFIGS
 from dataset_builder.config.specs import ConfigSpec
 from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.plan import config_parameters
-from rebar_depth_bench.data.dataset_config import DatasetConfig, ViewRecord
+from rebar_depth_bench.data.config_tables import ViewRecord
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import views_digest
 from rebar_depth_bench.scoring.published_match import PublishedMatch, published_match
 
