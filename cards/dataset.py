@@ -44,8 +44,14 @@ def dataset_card(version: str, digest: str, configs: Sequence[DatasetConfig]) ->
         digest=digest,
         protocol=PROTOCOL,
         configs=[_config_row(config) for config in configs],
+        has_rendered=bool(_rendered(configs)),
         columns=column_rows(),
     )
+
+
+def _rendered(configs: Iterable[DatasetConfig]) -> list[DatasetConfig]:
+    """Return the configs that were not imported; all statements about rendering and licence hold for these."""
+    return [config for config in configs if config.imported is None]
 
 
 def column_rows() -> list[dict[str, str]]:
@@ -73,10 +79,10 @@ def _card_metadata(version: str, configs: Sequence[DatasetConfig]) -> DatasetCar
 
     views = sum(len(config.views) for config in configs)
     card = DatasetCardData(
-        license="cc-by-4.0",
+        license="other" if any(config.imported for config in configs) else "cc-by-4.0",
         pretty_name=PRETTY_NAME,
         task_categories=["depth-estimation"],
-        tags=["depth", "stereo", "construction", "rebar", "synthetic"],
+        tags=["depth", "stereo", "construction", "rebar", *(["synthetic"] if _rendered(configs) else [])],
         size_categories=[next((name for limit, name in _SIZE_CATEGORIES if views < limit), "100K<n<1M")],
     )
     infos = {config.name: _dataset_info(config, version) for config in configs}

@@ -10,8 +10,10 @@ from typing import Any
 import datasets
 import numpy as np
 import pytest
+import yaml
 
 import rebar_depth_bench as rdb
+from cards.dataset import dataset_card
 from dataset_builder.audit import audit
 from dataset_builder.cli import main as build_main
 from dataset_builder.importing.run import plan_import, run_import
@@ -97,23 +99,28 @@ def test_uncertainty_is_beside_the_results(
         for row in rdb.load(complete, "mock-up"):
             writer.add(row["view_id"], row["left_depth"])
     result, page = tmp_path / "r.json", tmp_path / "r.html"
-    command = [
-        "score",
-        str(archive),
-        "--data",
-        str(complete),
-        "--extended",
-        "--json",
-        str(result),
-        "--html",
-        str(page),
-    ]
-    assert bench_main(command) == 0
+    outputs = ["--json", str(result), "--html", str(page)]
+    assert bench_main(["score", str(archive), "--data", str(complete), "--extended", *outputs]) == 0
     table = json.loads(result.read_bytes())["tables"]["mock-up"]
     assert (table["truth_sigma_m"], table["rank_error"]) == (0.001, 0.0)
     assert "standard deviation of 1 mm" in " ".join(capsys.readouterr().out.split())
     assert "standard deviation of 1 mm" in page.read_text()
     assert "0.001 m" in (complete / "README.md").read_text()
+
+
+def test_card_states_licence_and_origin_of_each_config(complete: Path, tiny_root: Path) -> None:
+    """What holds for rendered configs only is not said of imported ones."""
+    own, rendered = (list(open_folder(root).config_by_name.values()) for root in (complete, tiny_root))
+    text = dataset_card("1.0.0", "digest", own)
+    header = yaml.safe_load(text.split("---")[1])
+    assert header["license"] == "other"
+    assert "synthetic" not in header["tags"]
+    assert "`mock-up`: its authors state no licence." in text
+    assert not [word for word in ("Cycles", "CC BY", "Synthetic") if word in text]
+    both = dataset_card("1.0.0", "digest", [*rendered, *own])
+    assert yaml.safe_load(both.split("---")[1])["license"] == "other"
+    assert "The configs `mock-up` were imported" in both
+    assert "The rendered data: CC BY 4.0." in both
 
 
 @pytest.mark.slow
