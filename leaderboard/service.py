@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import structlog
+from anyio import Lock
 from sqlalchemy import select
 
 from leaderboard.db import jobs
@@ -39,6 +41,8 @@ class Service:
     spool: Path
     checker: ArchiveChecker
     metrics: ServiceMetrics
+    upload_locks: defaultdict[int, Lock] = field(default_factory=lambda: defaultdict(Lock))
+    """Locks by id of a token, held while an archive is received and checked; used on the event loop only."""
 
 
 @contextmanager

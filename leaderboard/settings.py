@@ -55,7 +55,10 @@ class Settings(BaseSettings):
         description="always: every scored submission is public; owner: only after its owner publishes it",
     )
     quota: int = Field(10, ge=0, description="accepted submissions per token and day (UTC)")
-    max_upload: ByteSize = Field(ByteSize(8 * GIB), gt=0, description="maximum size of an archive")
+    max_upload: ByteSize = Field(ByteSize(16 * GIB), gt=0, description="maximum size of an archive")
+    upload_idle_seconds: float = Field(
+        30.0, gt=0, description="time without a byte from the client after which an upload is ended"
+    )
     error_maps: int = Field(
         0,
         ge=0,

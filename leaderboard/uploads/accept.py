@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Mapping
 
 import structlog
-from anyio import to_thread
+from anyio import fail_after, to_thread
 
 from leaderboard.db import submissions
 from leaderboard.db.models import SubmissionModel, TokenModel
@@ -31,15 +31,23 @@ async def accept_upload(
 ) -> SubmissionModel:
     """Accept an upload and return its database row; archive and row are on disk on return.
 
-    The quota is checked before the archive is read, and only accepted archives count. Raises
-    ``UploadRejectedError``.
+    Uploads with one token are received one after the other, so that they do not fill the disk. The quota is
+    checked before the archive is read, and only accepted archives count. Raises ``UploadRejectedError``.
     """
+    async with service.upload_locks[token.id]:
+        return await _accept(service, token, body, headers)
+
+
+async def _accept(
+    service: Service, token: TokenModel, body: AsyncIterator[bytes], headers: Mapping[str, str]
+) -> SubmissionModel:
     settings = service.settings
     if await to_thread.run_sync(quota_used, service, token) >= settings.quota:
         raise _quota_exceeded(settings.quota)
     if int(headers.get("content-length", 0)) > settings.max_upload + MAX_OVERHEAD_BYTES:
         raise UploadRejectedError(413, too_large_message(settings.max_upload))
     try:
+        body = _with_idle_timeout(body, settings.upload_idle_seconds)
         received = await receive(body, headers.get("content-type", ""), service.spool, settings.max_upload)
         try:
             return await _validate_and_store(service, token, received)
@@ -48,6 +56,20 @@ async def accept_upload(
     except (OSError, RebarDepthError) as error:
         _LOG.error("upload failed: service unavailable", error=str(error))
         raise UploadRejectedError(503, UNAVAILABLE_MESSAGE) from None
+
+
+async def _with_idle_timeout(body: AsyncIterator[bytes], seconds: float) -> AsyncIterator[bytes]:
+    """Yield the parts of ``body``. Raises ``UploadRejectedError`` (408) if none arrives for ``seconds``."""
+    while True:
+        try:
+            with fail_after(seconds):
+                part = await anext(body, None)
+        except TimeoutError:
+            message = f"the upload was ended, because nothing was received for {seconds:g} seconds"
+            raise UploadRejectedError(408, message) from None
+        if part is None:
+            return
+        yield part
 
 
 async def _validate_and_store(service: Service, token: TokenModel, received: ReceivedArchive) -> SubmissionModel:

@@ -23,6 +23,7 @@ CONTENT_POLICY = (
     "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
 SECURITY_HEADERS = {
+    "Cache-Control": "no-store",  # Responses that may be stored have their own.
     "Content-Security-Policy": CONTENT_POLICY,
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -55,7 +56,7 @@ class RequestMiddleware:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        start, status = time.perf_counter(), 500
+        start, status, method = time.perf_counter(), 500, scope["method"]
 
         async def send_with_headers(message: Message) -> None:
             nonlocal status
@@ -64,6 +65,8 @@ class RequestMiddleware:
                 _add_security_headers(message)
             await send(message)
 
+        # The server leaves out the body of responses to HEAD; FastAPI routes of GET do not take HEAD themselves.
+        scope = {**scope, "method": "GET"} if scope["method"] == "HEAD" else scope
         try:
             if self._is_allowed(scope):
                 await self._app(scope, receive, send_with_headers)
@@ -72,7 +75,7 @@ class RequestMiddleware:
                     scope, receive, send_with_headers
                 )
         finally:
-            self._log_request(scope, status, time.perf_counter() - start)
+            self._log_request(method, scope, status, time.perf_counter() - start)
 
     def _is_allowed(self, scope: Scope) -> bool:
         if scope["path"] in _UNLIMITED_PATHS:
@@ -81,10 +84,10 @@ class RequestMiddleware:
         address = (scope.get("client") or ("unknown",))[0]
         return self._limiter.hit(limit, kind, address)
 
-    def _log_request(self, scope: Scope, status: int, seconds: float) -> None:
+    def _log_request(self, method: str, scope: Scope, status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", "none")  # Not the path, which may contain a private id.
         # Clients can send any method name, and each label value would create a permanent time series.
-        method = scope["method"] if scope["method"] in _KNOWN_METHODS else "other"
+        method = method if method in _KNOWN_METHODS else "other"
         self._metrics.requests.labels(method, route, str(status)).inc()
         self._metrics.request_seconds.labels(method, route).observe(seconds)
         _LOG.info("request", method=method, route=route, status=status, ms=round(1000 * seconds, 1))

@@ -29,7 +29,7 @@ def serve(settings: Settings) -> None:
     """
     if settings.dask_scheduler:
         check_dask()
-    with open_service(settings) as service, _listen(settings) as listener:
+    with open_service(settings) as service, listening_socket(settings) as listener:
         config = uvicorn.Config(
             make_app(service),
             access_log=False,
@@ -57,11 +57,18 @@ def serve(settings: Settings) -> None:
         _LOG.info("stopped")
 
 
-def _listen(settings: Settings) -> socket.socket:
-    """Return a listening socket. Raises ``InputError`` if the address is in use or not available here."""
+def listening_socket(settings: Settings) -> socket.socket:
+    """Return a socket that listens on the address of the settings, without Nagle's algorithm.
+
+    Raises ``InputError`` if the address is in use or not available here.
+    """
     try:
         family = socket.getaddrinfo(settings.host, settings.port)[0][0]
-        return socket.create_server((settings.host, settings.port), family=family, backlog=512)
+        listener = socket.create_server((settings.host, settings.port), family=family, backlog=512)
     except (OSError, UnicodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{settings.host}:{settings.port}: cannot listen on this address: {reason}") from None
+    # Connections inherit this. asyncio sets it only for sockets whose protocol is IPPROTO_TCP, which that of
+    # ``create_server`` is not; with Nagle's algorithm every small response on a kept connection waits 40 ms.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return listener

@@ -307,10 +307,17 @@ def test_all_responses_have_security_headers(board: SharedServer) -> None:
         assert "server" not in headers
 
 
-@pytest.mark.parametrize("path", ["/", "/healthz"])
-def test_head_requests_return_empty_body(board: SharedServer, path: str) -> None:
-    response = call(board.server, "HEAD", path)
-    assert (response.status_code, response.content) == (200, b"")
+HEAD_PATHS = ("/", "/healthz", "/metrics", "/how-to-submit", "/static/page.css", "/openapi.json")
+
+
+@pytest.mark.parametrize(
+    "path", [*HEAD_PATHS, "/api/v1/leaderboard?config=lattice", "/api/v1/leaderboard.csv", "/no"]
+)
+def test_head_requests_return_the_headers_of_get(board: SharedServer, path: str) -> None:
+    head, get = (call(board.server, method, path) for method in ("HEAD", "GET"))
+    assert (head.status_code, head.content) == (get.status_code, b"")
+    same = ("content-type", "cache-control", "etag")
+    assert [head.headers.get(name) for name in same] == [get.headers.get(name) for name in same]
 
 
 def test_requests_over_rate_limit_are_429(tiny_root: Path, tmp_path: Path, running_server: RunServer) -> None:

@@ -9,12 +9,15 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import httpx2
 import pytest
 
+from leaderboard.settings import read_settings
+from leaderboard.web.server import listening_socket
 from tests.leaderboard.conftest import WriteArchive
 from tests.leaderboard.raw_http import END, MULTIPART, connect, multipart_part, read_response, request_head
 from tests.leaderboard.serving import RunServer, Server
@@ -155,3 +158,64 @@ def test_interrupted_upload_leaves_no_file_or_traceback(small_server: Server, is
         num_open_files(small_server.process.pid) < files_before + UPLOADS
     )  # A database connection may have been opened.
     assert not any("Traceback" in line or '"error"' in line for line in small_server.log)
+
+
+@pytest.fixture(scope="module")
+def hurried_server(
+    tiny_root: Path, tmp_path_factory: pytest.TempPathFactory, running_server: RunServer
+) -> Iterator[Server]:
+    """Return a server that ends uploads after a second without a byte."""
+    state = tmp_path_factory.mktemp("hurried") / "state"
+    with running_server(tiny_root, state, workers=0, upload_idle_seconds=1) as server:
+        yield server
+
+
+@pytest.mark.parametrize("sent", [b"", CHUNK], ids=["nothing", "a part"])
+def test_stalled_upload_is_ended(hurried_server: Server, sent: bytes) -> None:
+    token = hurried_server.token(f"stalled after {len(sent)}")
+    headers = (f"Authorization: Bearer {token}", f"Content-Type: {MULTIPART}", "Content-Length: 3000000")
+    with connect(hurried_server.url) as connection:
+        connection.sendall(request_head(API, headers) + (multipart_frame()[0] + sent if sent else b""))
+        response = read_response(connection)
+    assert response.status == 408, response.text
+    assert "nothing was received for 1 seconds" in response.text
+    assert spool_files(hurried_server) == []
+
+
+def test_uploads_with_one_token_are_received_one_after_the_other(
+    tiny_root: Path, tmp_path: Path, write_archive: WriteArchive, running_server: RunServer
+) -> None:
+    """Uploads with another token are not affected."""
+    before, after = multipart_frame()
+    content = write_archive("slow", configs=("lattice-orbit",)).read_bytes()
+    with running_server(tiny_root, tmp_path / "state", workers=0) as server, ExitStack() as stack:
+        own, other = server.token("own"), server.token("other")
+        length = len(before) + len(content) + len(after)
+        connections = []
+        for token in (own, own, own, other):
+            connection = stack.enter_context(connect(server.url))
+            headers = (f"Authorization: Bearer {token}", f"Content-Type: {MULTIPART}", f"Content-Length: {length}")
+            connection.sendall(request_head(API, headers) + before + content[:1000])
+            connections.append(connection)
+        assert wait_for(lambda: len(spool_files(server)) == 2)
+        time.sleep(0.5)
+        assert len(spool_files(server)) == 2
+        for connection in connections:
+            connection.sendall(content[1000:] + after)
+        for connection in connections:
+            assert read_response(connection).status == 202
+        assert spool_files(server) == []
+
+
+def test_archive_of_the_full_protocols_fits_the_default_limit() -> None:
+    """Float32 depth of six configs of 504 views and one of 100 views, 1280 x 720, stored without compression."""
+    full = (6 * 504 + 100) * (1280 * 720 * 4 + 128)
+    assert full < read_settings(None, {"data": "ROOT"}).max_upload
+
+
+def test_small_responses_are_sent_at_once() -> None:
+    settings = read_settings(None, {"data": "ROOT", "port": 0})
+    with listening_socket(settings) as listener, socket.create_connection(listener.getsockname()):
+        accepted, _ = listener.accept()
+        with accepted:
+            assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)

@@ -21,9 +21,6 @@ def healthz(service: ServiceDep) -> dict[str, str]:
     return {"status": "ok", "version": software_version(), "dataset": service.folder.digest}
 
 
-router.add_api_route("/healthz", healthz, methods=["HEAD"], include_in_schema=False)
-
-
 @router.get(
     "/metrics",
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},

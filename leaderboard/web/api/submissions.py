@@ -50,6 +50,7 @@ _UPLOAD_REQUEST_BODY = {
 }
 _ERROR_RESPONSES: Responses = {
     **MISSING_TOKEN_RESPONSE,
+    408: {"model": ErrorResponse, "description": "the client sent nothing for too long"},
     413: {"model": ErrorResponse, "description": "the archive is too large"},
     422: {"model": RejectedResponse, "description": "the archive is invalid; it does not count against the quota"},
     429: {"model": ErrorResponse, "description": "too many requests, or the daily quota is used up"},

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated
 
+from anyio import to_thread
 from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
@@ -19,6 +20,7 @@ from leaderboard.web.cache import (
     cache_state_of,
     cached_public_body,
     conditional_response,
+    get_or_render,
 )
 from leaderboard.web.pages.leaderboard import (
     NATIVE,
@@ -71,30 +73,30 @@ async def leaderboard_page(
     return conditional_response(request, body, HTML, {"Cache-Control": REVALIDATE})
 
 
-router.add_api_route("/", leaderboard_page, methods=["HEAD"])
-
-
 @router.get("/submissions/{submission_id}", name="submission_page")
-def submission_page(
+async def submission_page(
     submission_id: SubmissionId, request: Request, service: ServiceDep, views: _NameQuery = None
 ) -> Response:
     """Return the page of a submission, which anyone who knows its URL may read.
 
     All views of the config ``views`` are listed, and the worst views of the others.
     """
-    record = get_submission(service, submission_id)
+    record = await to_thread.run_sync(get_submission, service, submission_id)
     if record.status != SCORED:
-        return render(request, "submission.html.j2", cache=NO_STORE, **submission_context(service, record, views))
-    submission_ranks = ranks(service.database, record)
-    version = (record.id, record.finished_at, record.public, *sorted(submission_ranks.items()))
+        context = await to_thread.run_sync(submission_context, service, record, views)
+        return render(request, "submission.html.j2", cache=NO_STORE, **context)
     views = views if views in service.folder.configs else None
+    cache_state = cache_state_of(request)
+    # The ranks on the page depend on the public rows of all configs.
+    versions = tuple(sorted((await cache_state.versions.get()).items()))
+    version = (record.id, record.finished_at, record.public, versions)
     key = (submission_page, root_path(request), views, *version)
 
     def make() -> RenderedBody:
-        context = submission_context(service, record, views, submission_ranks)
+        context = submission_context(service, record, views, ranks(service.database, record))
         return key, page_content(request, "submission.html.j2", **context)
 
-    body = cache_state_of(request).bodies.get(key, make)
+    body = await get_or_render(cache_state, key, make)
     return conditional_response(request, body, HTML, {"Cache-Control": _cache_control(record.public)})
 
 
