@@ -21,7 +21,7 @@ from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import Database
 from leaderboard.db.jobs import Outcome
 from leaderboard.db.models import SubmissionModel, TokenModel
-from leaderboard.db.submissions import QUEUED, SCORED, SCORING, Upload
+from leaderboard.db.submissions import QUEUED, SCORED, SCORING, Quota, Upload
 from leaderboard.db.tokens import create_token, find_token
 from rebar_depth_bench.submission import SubmissionMeta
 from tests.synthetic_dataset import scale_errors
@@ -60,7 +60,7 @@ def add_scored_submissions(database: Database, result_json: bytes, rows: int, se
         method = f"method {number:04d}"
         meta = SubmissionMeta(method=method, url="https://example.org/method" if number % 2 else None)
         upload = Upload(meta, secrets.token_hex(32), 1, digest)
-        submissions.accept(database, submission_id, token, upload, WITHOUT_LIMIT, True)
+        submissions.accept(database, submission_id, token, upload, Quota(WITHOUT_LIMIT, WITHOUT_LIMIT), True)
         jobs.claim(database, "filler", 60.0)
         result = scale_errors(json.loads(result_json), rng.uniform(0.2, 5.0))
         result["submission"]["method"] = method
@@ -110,8 +110,19 @@ def remove_scored_except(database: Database, ids_to_keep: Sequence[str]) -> None
 @contextmanager
 def running_server(data: Path, state: Path, db: str, scorers: int) -> Iterator[ServerProcess]:
     """Run ``rebar-leaderboard serve`` on a free port with rate limits and quota too high to take effect."""
-    limits = ["--read-rate-limit", f"{WITHOUT_LIMIT}/minute", "--write-rate-limit", f"{WITHOUT_LIMIT}/minute"]
-    options = ["--quota", str(WITHOUT_LIMIT), "--workers", str(scorers), "--port", "0", *limits]
+    limits = ["--quota-bytes", "1TiB", "--max-connections-per-address", "0"]
+    limits += ["--read-rate-limit", f"{WITHOUT_LIMIT}/minute", "--write-rate-limit", f"{WITHOUT_LIMIT}/minute"]
+    options = [
+        "--quota",
+        str(WITHOUT_LIMIT),
+        "--workers",
+        str(scorers),
+        "--port",
+        "0",
+        *limits,
+        "--quota-bytes",
+        "1TiB",
+    ]
     command = [sys.executable, "-m", "leaderboard", "serve", "--data", str(data), "--state-dir", str(state)]
     log = state / "log"
     with log.open("w") as stream:

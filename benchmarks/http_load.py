@@ -6,11 +6,9 @@ import asyncio
 import json
 import random
 import resource
-import secrets
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 WRITE_CHUNK_BYTES = 1 << 16
 _STREAM_LIMIT_BYTES = 1 << 22
@@ -30,7 +28,8 @@ class LoadPlan:
     """Definition of a load: readers that request random ``targets`` (route, path), and one uploader per token.
 
     ``pause_s`` and ``upload_pause_s`` are the seconds between the response to a reader or an uploader and its next
-    request. ``conditional`` readers send ``If-None-Match`` with the last entity tag of the path.
+    request. ``archives`` are uploaded one after the other. ``conditional`` readers send ``If-None-Match`` with the
+    last entity tag of the path.
     """
 
     host: str
@@ -40,7 +39,7 @@ class LoadPlan:
     seconds: float
     pause_s: float = 0.0
     conditional: bool = False
-    archive: Path | None = None
+    archives: Iterator[bytes] = field(default_factory=lambda: iter(()))
     tokens: Sequence[str] = ()
     upload_pause_s: float = 0.0
 
@@ -105,37 +104,29 @@ async def _run_reader(plan: LoadPlan, result: LoadResult, rng: random.Random, en
 
 
 async def _run_uploader(plan: LoadPlan, result: LoadResult, token: str, end: float) -> None:
-    """Upload the archive repeatedly until ``end``, each time on a new connection as real clients do."""
-    assert plan.archive is not None
-    content = plan.archive.read_bytes()
+    """Upload archives until ``end``, each time on a new connection as real clients do."""
     while time.perf_counter() < end:
+        content = next(plan.archives)
         start = time.perf_counter()
         try:
             async with _Connection(plan.host, plan.port) as connection:
-                response = await connection.send_request(*_multipart_request(plan.host, token, content))
+                response = await connection.send_request(*_upload_request(plan.host, token, content))
         except (OSError, EOFError, ValueError) as error:
-            result.errors.append(f"POST: {error!r}")
+            result.errors.append(f"PUT: {error!r}")
         else:
             result.upload_s.append(time.perf_counter() - start)
             if response.status != 202 or json.loads(response.body)["status"] != "queued":
-                result.errors.append(f"POST: {response.status} {response.body[:200]!r}")
+                result.errors.append(f"PUT: {response.status} {response.body[:200]!r}")
         await asyncio.sleep(plan.upload_pause_s)
 
 
-def _multipart_request(host: str, token: str, content: bytes) -> tuple[bytes, ...]:
-    """Return the parts of a multipart upload request: head, form prefix, archive content and form suffix."""
-    boundary = secrets.token_hex(16)
-    before = (
-        f'--{boundary}\r\nContent-Disposition: form-data; name="archive"; filename="a.zip"\r\n'
-        "Content-Type: application/zip\r\n\r\n"
-    ).encode()
-    after = f"\r\n--{boundary}--\r\n".encode()
+def _upload_request(host: str, token: str, content: bytes) -> tuple[bytes, ...]:
+    """Return head and body of an upload."""
     head = (
-        f"POST /api/v1/submissions HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n"
-        f"Content-Type: multipart/form-data; boundary={boundary}\r\n"
-        f"Content-Length: {len(before) + len(content) + len(after)}\r\n\r\n"
+        f"PUT /api/v1/submissions HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n"
+        f"Content-Length: {len(content)}\r\n\r\n"
     ).encode()
-    return head, before, content, after
+    return head, content
 
 
 class _Connection:

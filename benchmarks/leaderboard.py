@@ -11,11 +11,12 @@ alone saturate the server: the rates are its maximum throughput, the latencies t
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import statistics
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
@@ -29,10 +30,12 @@ from leaderboard.db.engine import Database
 from leaderboard.db.submissions import SCORED
 from leaderboard.settings import read_settings
 from rebar_depth_bench.data.manifest import open_folder
+from tests.leaderboard.serving import distinct_archive
 from tests.synthetic_dataset import write_archive, write_dataset
 
 CONFIGS, VIEWS = ("lattice", "pile"), 24
 SEED = 7
+COPIES = 50
 ALL = "all"
 ALONE, BUSY = "reads alone", "with uploads and scoring"
 WARM_UP_S = 3.0
@@ -71,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as scratch:
         data, archive = _dataset_and_archive(options, Path(scratch))
         state = Path(scratch) / "state"
-        state.mkdir()
+        state.mkdir(mode=0o700)
         settings = read_settings(None, {"data": str(data), "state_dir": state, "db": options.db})
         with closing(Database(settings.database_url)) as database:
             database.migrate()
@@ -85,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             )
             with running_server(data, state, options.db, options.workers) as served:
                 config = open_folder(data).configs[0]
-                plan = replace(_plan(options, served, config, ids), archive=archive)
+                plan = replace(_plan(options, served, config, ids), archives=_distinct(archive))
                 before_mb = served.megabytes()
                 windows = _measure(plan, served, database, ids, options)
                 memory_mb = (before_mb, served.megabytes())
@@ -125,6 +128,13 @@ def _dataset_and_archive(options: argparse.Namespace, scratch: Path) -> tuple[Pa
     write_dataset(data, CONFIGS, VIEWS)
     write_archive(archive, CONFIGS, VIEWS, "benchmark", SEED)
     return data, archive
+
+
+def _distinct(archive: Path) -> Iterator[bytes]:
+    """Yield copies of the archive that differ, because a leaderboard scores the same archive once."""
+    copies = [distinct_archive(archive, number).read_bytes() for number in range(COPIES)]
+    for number in itertools.count():
+        yield copies[number] if number < COPIES else distinct_archive(archive, number).read_bytes()
 
 
 def _plan(options: argparse.Namespace, served: ServerProcess, config: str, ids: Sequence[str]) -> LoadPlan:

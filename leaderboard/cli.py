@@ -1,8 +1,9 @@
-"""Command-line interface ``rebar-leaderboard``: serve, score, token, remove, backup."""
+"""Command-line interface ``rebar-leaderboard``."""
 
 from __future__ import annotations
 
 import argparse
+import stat
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,8 +11,9 @@ from typing import Any
 
 from leaderboard.db import submissions
 from leaderboard.db.engine import Database
-from leaderboard.db.tokens import create_token, replace_token
+from leaderboard.db.tokens import create_token, replace_token, revoke_token
 from leaderboard.log_setup import set_up_logs
+from leaderboard.operations import run_operation
 from leaderboard.settings import RENAMED_SETTINGS, Settings, read_settings
 from leaderboard.storage.archive_store import ArchiveStore
 from leaderboard.storage.backup import back_up
@@ -28,7 +30,6 @@ COMMAND_SETTINGS: dict[str, tuple[str, ...]] = {
         "state_dir",
         "db",
         "archives",
-        "dask_scheduler",
         "score_time",
         "score_memory",
         "lease_seconds",
@@ -36,7 +37,11 @@ COMMAND_SETTINGS: dict[str, tuple[str, ...]] = {
         "hidden_truth",
     ),
     "token": ("state_dir", "db"),
+    "tokens": ("state_dir", "db"),
+    "submissions": ("state_dir", "db"),
     "remove": ("state_dir", "db", "archives"),
+    "prune": ("data", "state_dir", "db", "archives", "archive_days", "archive_ranks"),
+    "check": ("data", "state_dir", "db", "archives"),
     "backup": ("state_dir", "db", "archives"),
 }
 """Settings that each command accepts as options; all can also be set in a TOML file or the environment."""
@@ -72,13 +77,18 @@ def _run(options: argparse.Namespace) -> None:
     elif options.command == "token":
         database = Database(settings.database_url)
         database.migrate()
+        if options.revoke:
+            revoke_token(database, options.name)
+            return
         make_token = replace_token if options.replace else create_token
         print(make_token(database, options.name))
         print("The token is not shown again; only its hash is stored.", file=sys.stderr)
     elif options.command == "remove":
         _remove(settings, options.id)
-    else:
+    elif options.command == "backup":
         print(back_up(settings, options.target))
+    else:
+        run_operation(options.command, settings, dry_run=getattr(options, "dry_run", False))
 
 
 def _remove(settings: Settings, submission_id: str) -> None:
@@ -87,18 +97,22 @@ def _remove(settings: Settings, submission_id: str) -> None:
     if submissions.find(database, submission_id) is None:
         raise InputError(f"there is no submission {submission_id!r}")
     submissions.remove(database, submission_id)
-    ArchiveStore(settings.archives_url).delete(submission_id)
+    ArchiveStore(settings.archive_dir).delete(submission_id)
 
 
 def _make_state_dir(folder: Path) -> None:
     """Create the state folder with mode 0700, because the ids in it give access to unpublished submissions.
 
-    Raises ``InputError`` or ``OutputError`` if it cannot be created.
+    Raises ``InputError`` if others may read an existing folder, and ``InputError`` or ``OutputError`` if it cannot
+    be created.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        mode = stat.S_IMODE(folder.stat().st_mode)
     except OSError as error:
         raise write_error(f"the state folder {folder}", error) from None
+    if mode & 0o077:
+        raise InputError(f"the state folder {folder}: has mode {mode:04o}, expected 0700; run: chmod 700 {folder}")
 
 
 def argument_parser() -> argparse.ArgumentParser:
@@ -119,9 +133,13 @@ def argument_parser() -> argparse.ArgumentParser:
             _add_setting(command, setting)
         if name == "token":
             command.add_argument("name", metavar="NAME", help="name of the submitter, shown on the leaderboard")
-            command.add_argument("--replace", action="store_true", help="revoke the existing token of NAME")
+            change = command.add_mutually_exclusive_group()
+            change.add_argument("--replace", action="store_true", help="revoke the existing token of NAME")
+            change.add_argument("--revoke", action="store_true", help="only revoke the existing token of NAME")
         if name == "remove":
             command.add_argument("id", metavar="ID", help="id of the submission, the last part of its URL")
+        if name == "prune":
+            command.add_argument("--dry-run", action="store_true", help="print the ids, but delete nothing")
         if name == "backup":
             command.add_argument("target", type=Path, metavar="FOLDER", help="folder to write the backup to")
     return parser
@@ -131,6 +149,10 @@ _COMMAND_HELP = {
     "serve": "run the web server and its local scoring workers",
     "score": "run a scoring worker for a server that uses the same database and archive storage",
     "token": "create a token for a submitter and print it",
+    "tokens": "list the tokens with their submissions and bytes as CSV",
+    "submissions": "list the submissions of all tokens as CSV",
+    "prune": "delete archives of ended submissions by age and rank, as the settings say",
+    "check": "check dataset, database, archives, disk and queue, and print what is wrong",
     "remove": "delete a submission of any owner, with its archive and results",
     "backup": "copy the database and the archives to a folder while the service is running",
 }

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.registry import Collector
 from sqlalchemy import func, select
 
-from leaderboard.db.engine import Database
+from leaderboard.db.engine import DATABASE_UNAVAILABLE, Database
 from leaderboard.db.models import SubmissionModel
 from leaderboard.db.submissions import DELETED, FAILED, QUEUED, SCORED, SCORING
 
@@ -15,7 +18,7 @@ from leaderboard.db.submissions import DELETED, FAILED, QUEUED, SCORED, SCORING
 class ServiceMetrics:
     """Prometheus counters, histograms and gauges in a separate registry."""
 
-    def __init__(self) -> None:
+    def __init__(self, database: Database) -> None:
         self.registry = CollectorRegistry()
         self.requests = Counter(
             "rebar_requests_total",
@@ -26,20 +29,30 @@ class ServiceMetrics:
         self.request_seconds = Histogram(
             "rebar_request_seconds", "Duration of HTTP requests", ["method", "route"], registry=self.registry
         )
-        self._submissions = Gauge(
-            "rebar_submissions", "Number of submissions by status", ["status"], registry=self.registry
-        )
-        self._oldest = Gauge(
-            "rebar_oldest_queued_seconds", "Waiting time of the oldest queued submission", registry=self.registry
-        )
+        self.registry.register(_QueueCollector(database))
 
-    def update_queue_gauges(self, database: Database) -> None:
-        """Set the gauges for submissions by status and for the waiting time of the oldest queued submission."""
+
+class _QueueCollector(Collector):
+    """Gauges for submissions by status and for the waiting time of the oldest queued submission."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def collect(self) -> Iterator[GaugeMetricFamily]:
+        """Yield the gauges; none while the database is unavailable."""
         query = select(SubmissionModel.status, func.count()).group_by(SubmissionModel.status)
         oldest_query = select(func.min(SubmissionModel.created_at)).where(SubmissionModel.status == QUEUED)
-        with database.read() as session:
-            counts = dict(row._tuple() for row in session.execute(query))
-            oldest = session.scalar(oldest_query)
-        self._oldest.set(0 if oldest is None else max(0.0, time.time() - oldest))
+        try:
+            with self._database.read() as session:
+                counts = dict(row._tuple() for row in session.execute(query))
+                oldest = session.scalar(oldest_query)
+        except DATABASE_UNAVAILABLE:
+            return
+        submissions = GaugeMetricFamily("rebar_submissions", "Number of submissions by status", labels=["status"])
         for status in (QUEUED, SCORING, SCORED, FAILED, DELETED):
-            self._submissions.labels(status).set(counts.get(status, 0))
+            submissions.add_metric([status], counts.get(status, 0))
+        yield submissions
+        waiting_s = 0.0 if oldest is None else max(0.0, time.time() - oldest)
+        yield GaugeMetricFamily(
+            "rebar_oldest_queued_seconds", "Waiting time of the oldest queued submission", waiting_s
+        )

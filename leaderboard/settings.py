@@ -6,6 +6,7 @@ import os
 import re
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import urlsplit
 
 from limits import parse_many
 from pydantic import ByteSize, Field, ValidationError, ValidationInfo, field_validator
@@ -18,13 +19,13 @@ from rebar_depth_bench.console import warn_deprecated
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import parse_toml, read_file
+from rebar_depth_bench.submission.metadata import is_http_url
 from rebar_depth_bench.validation import format_location, short_repr
 
 GIB = 1 << 30
 
 
 RENAMED_SETTINGS = {
-    "cluster": "dask_scheduler",
     "lease": "lease_seconds",
     "public": "default_visibility",
     "reads": "read_rate_limit",
@@ -46,36 +47,66 @@ class Settings(BaseSettings):
         Path("leaderboard-state"), description="folder for the database, archives and temporary files"
     )
     db: str = Field("", description="database URL; default: SQLite in the state folder")
-    archives: str = Field("", description="folder or fsspec URL for archives; default: in the state folder")
+    archives: str = Field("", description="folder for archives; default: in the state folder")
     host: str = Field("127.0.0.1", description="address to listen on")
     port: int = Field(8000, ge=0, le=65535, description="port to listen on; 0 selects a free port")
+    public_url: str = Field(
+        "",
+        description="address of the leaderboard behind a proxy, for links; requests for other hosts are refused",
+    )
+    metrics_port: int = Field(
+        0, ge=0, le=65535, description="port on 127.0.0.1 for Prometheus metrics; 0: no metrics"
+    )
     title: str = Field("Rebar depth leaderboard", description="title shown on the pages")
+    contact: str = Field("", description="how to reach the operator for a token, shown on the pages")
     default_visibility: Literal["owner", "always"] = Field(
         "always",
         description="always: every scored submission is public; owner: only after its owner publishes it",
     )
     quota: int = Field(10, ge=0, description="accepted submissions per token and day (UTC)")
+    quota_bytes: ByteSize = Field(
+        ByteSize(64 * GIB), ge=0, description="bytes of accepted archives per token and day (UTC)"
+    )
     max_upload: ByteSize = Field(ByteSize(16 * GIB), gt=0, description="maximum size of an archive")
+    upload_seconds: float = Field(14400.0, gt=0, description="time after which an upload is ended")
     upload_idle_seconds: float = Field(
         30.0, gt=0, description="time without a byte from the client after which an upload is ended"
+    )
+    archive_days: float = Field(
+        0.0,
+        ge=0,
+        description="age in days after which archives of ended submissions are deleted, so that these cannot be "
+        "scored again; 0: never",
+    )
+    archive_ranks: int = Field(
+        10, ge=0, description="archives of submissions up to this rank in any config are never deleted"
     )
     error_maps: int = Field(
         0,
         ge=0,
         le=100,
-        description="worst views per config shown as error maps; these let a submitter compute the ground truth",
+        description="worst views per config shown with pictures; these let a submitter compute the ground truth",
     )
     hidden_truth: bool = Field(
         False, description="return only rank error and coverage per config, rounded to three decimals"
     )
     rescore: bool = Field(False, description="score submissions for another dataset again, against this one")
     workers: int = Field(1, ge=0, le=64, description="number of scoring processes that `serve` starts")
-    dask_scheduler: str = Field("", description="address of a dask scheduler whose workers score the archives")
+    check_time: float = Field(1800.0, gt=0, description="time limit for checking an uploaded archive")
     score_time: float = Field(3600.0, gt=0, description="time limit for scoring an archive")
-    score_memory: ByteSize = Field(ByteSize(4 * GIB), gt=0, description="memory limit for scoring an archive")
+    score_memory: ByteSize = Field(
+        ByteSize(4 * GIB), gt=0, description="memory limit for checking or scoring an archive"
+    )
     lease_seconds: float = Field(
         20.0, gt=0, description="time without a heartbeat from a worker after which its job is reassigned"
     )
+    max_connections: int = Field(1000, ge=1, description="maximum number of open connections")
+    max_connections_per_address: int = Field(
+        100,
+        ge=0,
+        description="maximum number of open connections per client address; 0, behind a proxy: no limit",
+    )
+    head_seconds: float = Field(15.0, gt=0, description="time for a client to send the head of a request")
     read_rate_limit: str = Field("600/minute", description="read requests per client address")
     write_rate_limit: str = Field("60/minute", description="uploads and changes per client address")
 
@@ -91,11 +122,25 @@ class Settings(BaseSettings):
             raise ValueError(expected) from None
         return url
 
+    @field_validator("archives")
+    @classmethod
+    def _check_archive_folder(cls, archives: str) -> str:
+        if "://" in archives:
+            raise ValueError("expected a folder; remote storage can be mounted as one")
+        return archives
+
+    @field_validator("public_url")
+    @classmethod
+    def _check_public_url(cls, url: str) -> str:
+        if url and not (is_http_url(url) and not urlsplit(url).query and not urlsplit(url).fragment):
+            raise ValueError("expected an address such as https://leaderboard.example.org")
+        return url.rstrip("/")
+
     @field_validator("hidden_truth")
     @classmethod
     def _check_no_error_maps(cls, hidden_truth: bool, info: ValidationInfo) -> bool:
         if hidden_truth and info.data.get("error_maps"):
-            raise ValueError("expected error_maps 0, because error maps show the ground truth")
+            raise ValueError("expected error_maps 0, because the pictures show the ground truth")
         return hidden_truth
 
     @field_validator("read_rate_limit", "write_rate_limit")
@@ -117,9 +162,9 @@ class Settings(BaseSettings):
         return self.db.replace("postgresql://", "postgresql+psycopg://", 1)
 
     @property
-    def archives_url(self) -> str:
-        """URL of the archive folder in the form that ``fsspec`` expects, that is, without percent escapes."""
-        return self.archives or f"file://{self.state_dir.absolute() / 'archives'}"
+    def archive_dir(self) -> Path:
+        """Folder of the archives."""
+        return Path(self.archives or self.state_dir / "archives").absolute()
 
     @property
     def spool(self) -> Path:
@@ -172,7 +217,7 @@ def _renamed_from_environment() -> dict[str, str]:
     return values
 
 
-_SECRET_SETTINGS = ("db", "archives")
+_SECRET_SETTINGS = ("db",)
 """Settings whose value may contain a password."""
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any, BinaryIO, Self
@@ -18,9 +18,11 @@ from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.leaderboard_answers import (
     SUBMISSION_ID,
     AnswerError,
+    OwnSubmission,
     Response,
     ServiceError,
     Submission,
+    SubmissionList,
     TokenInfo,
     detail,
     server_text,
@@ -37,6 +39,7 @@ WAIT_S = 3600.0
 """Default time limit of ``LeaderboardClient.wait``, seconds."""
 REQUEST_TIMEOUT_S, RESULT_TIMEOUT_S = 60.0, 600.0
 """Time limits of a request, and of the download of a result, seconds."""
+_CHUNK_BYTES = 1 << 16
 UPLOAD_TIMEOUT_S = 3600.0
 """Time limit from the last byte of an upload to the end of the response, seconds: the archive is checked first."""
 
@@ -73,8 +76,8 @@ class LeaderboardClient:
                 if total > max_bytes:
                     raise InputError(f"{archive}: has {total} bytes, expected at most {max_bytes}")
                 upload = _Upload(stream, lambda done: progress("uploading", done, total))
-                files = {"archive": (archive.name, upload, "application/zip")}
-                response = self._call("POST", "submissions", upload.deadline, files=files)
+                headers = {"Content-Type": "application/zip", "Content-Length": str(total)}
+                response = self._call("PUT", "submissions", upload.deadline, headers=headers, content=upload)
         except OSError as error:
             raise InputError(f"{archive}: cannot be read: {error.strerror or error}") from None
         if response.status == 422:
@@ -90,6 +93,28 @@ class LeaderboardClient:
         Raises ``InputError`` for an unknown token or a wrong URL, ``ServiceError`` if the service does not answer.
         """
         return self._call("GET", "token", _deadline(REQUEST_TIMEOUT_S)).answer(TokenInfo, 200)
+
+    def submissions(self) -> tuple[OwnSubmission, ...]:
+        """Return the submissions of the token, newest first. Raises the errors of ``token``."""
+        answer = self._call("GET", "submissions", _deadline(REQUEST_TIMEOUT_S)).answer(SubmissionList, 200)
+        return answer.submissions
+
+    def change(self, submission_id: str, values: Mapping[str, object]) -> OwnSubmission:
+        """Change a submission of the token and return it: ``public`` and what is said about the method.
+
+        Raises ``InputError`` for another owner's or an unknown submission and for values that are refused, and
+        ``ServiceError`` if the service does not answer.
+        """
+        path = f"submissions/{_checked_id(submission_id)}"
+        response = self._call("PATCH", path, _deadline(REQUEST_TIMEOUT_S), json=dict(values))
+        return response.answer(OwnSubmission, 200)
+
+    def delete(self, submission_id: str) -> None:
+        """Delete a submission of the token with its archive and results. Raises the errors of ``change``."""
+        path = f"submissions/{_checked_id(submission_id)}"
+        response = self._call("DELETE", path, _deadline(REQUEST_TIMEOUT_S))
+        if response.status != 204:
+            response.answer(OwnSubmission, 204)
 
     def wait(self, submission_id: str, progress: Progress = silent, limit_s: float = WAIT_S) -> Submission:
         """Poll until the submission is scored or failed, and return it.
@@ -187,23 +212,19 @@ class LeaderboardClient:
 
 
 class _Upload:
-    """File-like object that reports the number of bytes read so far and computes their SHA-256.
-
-    It has no ``fileno``, so that the HTTP client reads it in chunks.
-    """
+    """Chunks of a file, which report the number of bytes read so far and compute their SHA-256."""
 
     def __init__(self, stream: BinaryIO, on_read: Callable[[int], None]) -> None:
         self._stream, self._on_read, self._bytes_read = stream, on_read, 0
         self._digest, self._last_read = hashlib.sha256(), time.monotonic()
 
-    def read(self, size: int = -1) -> bytes:
-        """Read up to ``size`` bytes and report the total."""
-        data = self._stream.read(size)
-        self._digest.update(data)
-        self._last_read = time.monotonic()
-        self._bytes_read += len(data)
-        self._on_read(self._bytes_read)
-        return data
+    def __iter__(self) -> Iterator[bytes]:
+        while data := self._stream.read(_CHUNK_BYTES):
+            self._digest.update(data)
+            self._last_read = time.monotonic()
+            self._bytes_read += len(data)
+            self._on_read(self._bytes_read)
+            yield data
 
     def sha256(self) -> str:
         """Return the hex SHA-256 of the bytes read so far."""

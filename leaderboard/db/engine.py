@@ -41,6 +41,8 @@ class Database:
             self._engine = _engine(url)
         except (ArgumentError, NoSuchModuleError, ImportError, OSError) as error:
             raise InputError(f"{without_password(url)}: invalid database URL: {error}") from None
+        self.file = sqlite_path(url)
+        """The file of an SQLite database, None for another database."""
         self._write_engine = self._engine.execution_options(**{_IMMEDIATE: True})
 
     @contextmanager

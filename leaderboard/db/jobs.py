@@ -9,17 +9,25 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, delete, func, or_, select, update
+from sqlalchemy import ColumnElement, and_, func, or_, select, update
 from sqlalchemy.engine import CursorResult
 from sqlalchemy.orm import Session
 
 from leaderboard.db.engine import Database
-from leaderboard.db.models import ErrorMapModel, LeaderboardRowModel, ResultModel, SubmissionModel
-from leaderboard.db.submissions import FAILED, QUEUED, SCORED, SCORING
+from leaderboard.db.models import (
+    LeaderboardRowModel,
+    PictureImageModel,
+    PictureModel,
+    ResultModel,
+    SubmissionModel,
+    increment_content_version,
+)
+from leaderboard.db.submissions import FAILED, QUEUED, SCORED, SCORING, delete_results
+from leaderboard.db.view_errors import view_errors
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 MAX_ATTEMPTS = 5
@@ -29,19 +37,21 @@ The limit is high enough for a service that is killed occasionally."""
 
 
 @dataclass(frozen=True)
-class Job:
-    """A submission to score, and the digest of the dataset that its archive was validated against."""
+class ViewPicture:
+    """Pictures of a view: WebP images by kind, and a JSON object with their size and the texts of colour bars."""
 
-    submission_id: str
-    dataset_digest: str
+    view_id: str
+    facts_json: str
+    images: Mapping[str, bytes]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of scoring: the result JSON and WebP error maps by view id, or the reason of the failure."""
+    """Outcome of scoring: the result JSON, notes on possible mistakes, pictures; or the reason of the failure."""
 
     result: bytes | None = None
-    error_maps: Mapping[str, bytes] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+    pictures: Sequence[ViewPicture] = ()
     reason: str | None = None
 
 
@@ -102,12 +112,23 @@ def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome
         if not _update_one(session, _has_lease(submission_id, scorer), values):
             return False
         if result is not None:
-            for table in (ErrorMapModel, LeaderboardRowModel, ResultModel):
-                session.execute(delete(table).where(table.submission_id == submission_id))
-            session.add(ResultModel(submission_id=submission_id, json=outcome.result, protocol=result["protocol"]))
-            session.add_all(_leaderboard_rows(submission_id, result["tables"]))
-        for view_id, webp in outcome.error_maps.items():
-            session.add(ErrorMapModel(submission_id=submission_id, view_id=view_id, webp=webp))
+            delete_results(session, submission_id)
+            notes = json.dumps(list(outcome.notes))
+            session.add(
+                ResultModel(
+                    submission_id=submission_id, json=outcome.result, protocol=result["protocol"], notes=notes
+                )
+            )
+            session.add_all(_leaderboard_rows(submission_id, result))
+        for picture in outcome.pictures:
+            session.add(
+                PictureModel(submission_id=submission_id, view_id=picture.view_id, facts=picture.facts_json)
+            )
+            session.add_all(
+                PictureImageModel(submission_id=submission_id, view_id=picture.view_id, kind=kind, webp=webp)
+                for kind, webp in picture.images.items()
+            )
+        increment_content_version(session)
     return True
 
 
@@ -122,6 +143,7 @@ def requeue_stale_submissions(database: Database, dataset_digest: str) -> None:
     with database.write() as session:
         values = {"status": QUEUED, "attempts": 0, "finished_at": None, "dataset_digest": dataset_digest}
         session.execute(update(SubmissionModel).where(_is_stale(dataset_digest)).values(**values))
+        increment_content_version(session)
 
 
 def requeue_other_protocols(database: Database, archive_ids: Collection[str]) -> int:
@@ -138,6 +160,7 @@ def requeue_other_protocols(database: Database, archive_ids: Collection[str]) ->
         requeued = [record for record in session.scalars(query) if record.id in archive_ids]
         for record in requeued:
             record.status, record.attempts, record.finished_at = QUEUED, 0, None
+        increment_content_version(session)
         return len(requeued)
 
 
@@ -146,7 +169,7 @@ def _is_stale(dataset_digest: str) -> ColumnElement[bool]:
     return and_(is_active, SubmissionModel.dataset_digest != dataset_digest)
 
 
-def _leaderboard_rows(submission_id: str, tables: Mapping[str, Any]) -> list[LeaderboardRowModel]:
+def _leaderboard_rows(submission_id: str, result: Mapping[str, Any]) -> list[LeaderboardRowModel]:
     return [
         LeaderboardRowModel(
             submission_id=submission_id,
@@ -154,8 +177,9 @@ def _leaderboard_rows(submission_id: str, tables: Mapping[str, Any]) -> list[Lea
             ranked=table["ranked"],
             rank_error=table["rank_error"],
             json=json.dumps(table),
+            view_errors=view_errors(result, config),
         )
-        for config, table in tables.items()
+        for config, table in result["tables"].items()
     ]
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from sqlalchemy import BigInteger, Boolean, Float, ForeignKey, Index, Integer, LargeBinary, String, Text
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+from sqlalchemy import BigInteger, Boolean, Float, ForeignKey, Index, Integer, LargeBinary, String, Text, update
+from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 
 from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL
 
@@ -21,15 +21,21 @@ class TokenModel(Base):
     name: Mapped[str] = mapped_column(String(100), unique=True)
     sha256: Mapped[str] = mapped_column(String(64), unique=True)
     created_at: Mapped[float] = mapped_column(Float)
+    revoked_at: Mapped[float | None] = mapped_column(Float)
 
 
 class SubmissionModel(Base):
-    """An accepted archive and its status. Deleted submissions keep their rows, which count for the quota."""
+    """An accepted archive and its status. Deleted submissions keep their rows, which count for the quota.
+
+    ``details`` is a JSON object with what the submitter says of the method; ``archive_deleted_at`` is set when the
+    archive of a submission that stays was deleted.
+    """
 
     __tablename__ = "submissions"
     __table_args__ = (
         Index("ix_submissions_status_created_at", "status", "created_at"),
         Index("ix_submissions_token_id_created_at", "token_id", "created_at"),
+        Index("ix_submissions_token_id_archive_sha256", "token_id", "archive_sha256"),
     )
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
@@ -51,20 +57,29 @@ class SubmissionModel(Base):
     scorer: Mapped[str | None] = mapped_column(String(64))
     lease_until: Mapped[float | None] = mapped_column(Float)
     dataset_digest: Mapped[str] = mapped_column(String(100))
+    details: Mapped[str] = mapped_column(Text, server_default="{}")
+    archive_deleted_at: Mapped[float | None] = mapped_column(Float)
 
 
 class ResultModel(Base):
-    """The result JSON of a scored submission, byte-identical to that of the command line, and its protocol."""
+    """The result JSON of a scored submission, byte-identical to that of the command line, and its protocol.
+
+    ``notes`` is a JSON array of sentences on possible mistakes in the submission.
+    """
 
     __tablename__ = "results"
 
     submission_id: Mapped[str] = mapped_column(ForeignKey("submissions.id"), primary_key=True)
     json: Mapped[bytes] = mapped_column(LargeBinary)
     protocol: Mapped[str] = mapped_column(String(20), server_default=OLD_PROTOCOL)
+    notes: Mapped[str] = mapped_column(Text, server_default="[]")
 
 
 class LeaderboardRowModel(Base):
-    """A submission's leaderboard row of one config: the table's JSON and the columns for filtering and sorting."""
+    """A submission's leaderboard row of one config: the table's JSON and the columns for filtering and sorting.
+
+    ``view_errors`` are the rank errors of the views, as ``view_errors.view_errors`` packs them.
+    """
 
     __tablename__ = "board_rows"
 
@@ -73,13 +88,39 @@ class LeaderboardRowModel(Base):
     ranked: Mapped[bool] = mapped_column(Boolean)
     rank_error: Mapped[float | None] = mapped_column(Float)
     json: Mapped[str] = mapped_column(Text)
+    view_errors: Mapped[bytes | None] = mapped_column(LargeBinary)
 
 
-class ErrorMapModel(Base):
-    """An error map of one view as a WebP image."""
+class PictureModel(Base):
+    """A view with pictures: their size in pixels and the texts of their colour bars, as a JSON object."""
 
-    __tablename__ = "pictures"
+    __tablename__ = "picture_views"
 
     submission_id: Mapped[str] = mapped_column(ForeignKey("submissions.id"), primary_key=True)
     view_id: Mapped[str] = mapped_column(String(201), primary_key=True)
+    facts: Mapped[str] = mapped_column(Text)
+
+
+class PictureImageModel(Base):
+    """A picture of a view as a WebP image."""
+
+    __tablename__ = "picture_images"
+
+    submission_id: Mapped[str] = mapped_column(ForeignKey("submissions.id"), primary_key=True)
+    view_id: Mapped[str] = mapped_column(String(201), primary_key=True)
+    kind: Mapped[str] = mapped_column(String(20), primary_key=True)
     webp: Mapped[bytes] = mapped_column(LargeBinary)
+
+
+class ContentVersionModel(Base):
+    """Counter in a single row that every change of a published page's content increments."""
+
+    __tablename__ = "content_version"
+
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    value: Mapped[int] = mapped_column(BigInteger)
+
+
+def increment_content_version(session: Session) -> None:
+    """Increment the version in the transaction of a change, so that both become visible together."""
+    session.execute(update(ContentVersionModel).values(value=ContentVersionModel.value + 1))

@@ -1,24 +1,34 @@
-"""Leaderboard queries: ranked rows of a config, ranks and queue position of a submission, error maps.
+"""Ranking queries: the rows of a config with their ranks, pictures of views, and the queue position.
 
 The queries select columns instead of ORM objects, so that a page with hundreds of rows takes milliseconds.
 
-If the ground truth is hidden, rows, order and ranks depend on the disclosed numbers only, and no error map is
+If the ground truth is hidden, rows, order and ranks depend on the disclosed numbers only, and no picture is
 returned.
 """
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
-from sqlalchemy import and_, false, func, or_, select
+from sqlalchemy import false, func, select
 
 from leaderboard.db.engine import Database
-from leaderboard.db.models import ErrorMapModel, LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
+from leaderboard.db.models import (
+    LeaderboardRowModel,
+    PictureImageModel,
+    PictureModel,
+    ResultModel,
+    SubmissionModel,
+    TokenModel,
+)
 from leaderboard.db.submissions import QUEUED, SCORED
-from rebar_depth_bench.scoring.disclosure import DisclosedTable, disclosed_number, smallest_disclosed_alike
+from leaderboard.db.view_errors import rank_ranges
+from rebar_depth_bench.scoring.disclosure import DisclosedTable, disclosed_number
 from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL, PROTOCOL
 
 
@@ -27,11 +37,13 @@ class LeaderboardEntry:
     """A submission's row of one config; ``rank`` is None if the row is not ranked.
 
     ``class_rank`` is the rank among the submissions that declare the same ``inputs``, None without a declaration.
-    ``table_json`` is the JSON text of the config's table in the result, or of its disclosed part.
+    ``rank_range`` holds the first and last rank that the paired 95 % differences allow, None where they are not
+    known. ``table_json`` is the JSON text of the config's table in the result, or of its disclosed part.
     """
 
     rank: int | None
     class_rank: int | None
+    rank_range: tuple[int, int] | None
     submission_id: str
     config: str
     method: str
@@ -41,14 +53,16 @@ class LeaderboardEntry:
     inputs: str | None
     uses_ground_truth: bool | None
     created_at: float
-    finished_at: float | None
     public: bool
+    details_json: str
     table_json: str
+    rank_error: float | None = field(default=None, kw_only=True)
 
 
 _COLUMNS = (
     LeaderboardRowModel.ranked,
     LeaderboardRowModel.rank_error,
+    LeaderboardRowModel.view_errors,
     SubmissionModel.id,
     LeaderboardRowModel.config,
     SubmissionModel.method,
@@ -58,52 +72,33 @@ _COLUMNS = (
     SubmissionModel.inputs,
     SubmissionModel.uses_ground_truth,
     SubmissionModel.created_at,
-    SubmissionModel.finished_at,
     SubmissionModel.public,
+    SubmissionModel.details,
     LeaderboardRowModel.json,
 )
-"""Columns selected for a ``LeaderboardEntry``: whether it is ranked, its rank error, then its other fields."""
-
-_IDS = func.aggregate_strings(LeaderboardRowModel.submission_id, " ")
+"""Columns of a row: whether it is ranked, its rank error, its view errors, then the fields of the entry."""
 
 
 @dataclass(frozen=True)
-class RankingVersion:
-    """Version of a config's public rows: their submission ids, and the time of the latest scoring.
+class Ranking:
+    """Rows of a config: ranked rows first, by rank error, then unranked ones; ties by age, oldest first."""
 
-    A row changes only when it is scored again, so that equal versions imply equal rows.
-    """
+    entries: tuple[LeaderboardEntry, ...]
 
-    ids: frozenset[str] = frozenset()
-    newest: float = 0.0
+    @cached_property
+    def by_id(self) -> dict[str, LeaderboardEntry]:
+        """Rows by submission id."""
+        return {entry.submission_id: entry for entry in self.entries}
 
-
-def ranking_versions(database: Database) -> dict[str, RankingVersion]:
-    """Return the version of each config that has a public row, in one query that does not read the tables."""
-    query = (
-        select(LeaderboardRowModel.config, _IDS, func.max(SubmissionModel.finished_at))
-        .join(SubmissionModel, SubmissionModel.id == LeaderboardRowModel.submission_id)
-        .where(SubmissionModel.status == SCORED, SubmissionModel.public)
-        .group_by(LeaderboardRowModel.config)
-    )
-    with database.read() as session:
-        rows = session.execute(query).all()
-    return {config: RankingVersion(frozenset(ids.split(" ")), newest or 0.0) for config, ids, newest in rows}
+    def of_class(self, inputs: str | None) -> list[LeaderboardEntry]:
+        """Return the rows that declare ``inputs``, all rows for None; their ranks are kept."""
+        return [entry for entry in self.entries if inputs is None or entry.inputs == inputs]
 
 
-def ranking_version(rows: Sequence[LeaderboardEntry]) -> RankingVersion:
-    """Return the version of the given public rows of a config."""
-    newest = max((row.finished_at or 0.0 for row in rows), default=0.0)
-    return RankingVersion(frozenset(row.submission_id for row in rows), newest)
-
-
-def leaderboard_entries(
-    database: Database, config: str, viewer: TokenModel | None = None
-) -> list[LeaderboardEntry]:
+def read_ranking(database: Database, config: str, viewer: TokenModel | None = None) -> Ranking:
     """Return the public rows of a config and those of ``viewer``, of results that this version can read.
 
-    Ranked rows come first, by rank error, then unranked ones; ties are ordered by age, oldest first, and share a
-    rank. A row that is not public has no rank and does not affect the ranks of others.
+    Equal rank errors share a rank. A row that is not public has no rank and does not affect the ranks of others.
     """
     own = false() if viewer is None else SubmissionModel.token_id == viewer.id
     query = (
@@ -125,27 +120,30 @@ def leaderboard_entries(
         rows = [_disclosed(row) for row in rows]
     # Sorted here, because databases round differently; the sort is stable.
     rows.sort(key=lambda row: (not row[0], row[1] is None, row[1]))
+    return Ranking(tuple(_ranked(rows)))
+
+
+def _ranked(rows: Sequence[tuple[Any, ...]]) -> list[LeaderboardEntry]:
     overall, by_inputs = _RankCounter(), defaultdict[str, _RankCounter](_RankCounter)
-    entries = []
-    for ranked, rank_error, *fields in rows:
-        entry = LeaderboardEntry(None, None, *fields)
-        if ranked and entry.public:
-            class_rank = by_inputs[entry.inputs].next(rank_error) if entry.inputs else None
-            entry = replace(entry, rank=overall.next(rank_error), class_rank=class_rank)
-        entries.append(entry)
+    entries = [LeaderboardEntry(None, None, None, *row[3:], rank_error=row[1]) for row in rows]
+    ranked = [index for index, row in enumerate(rows) if row[0] and entries[index].public]
+    ranges = rank_ranges([rows[index][2] for index in ranked])
+    for index, rank_range in zip(ranked, ranges, strict=True):
+        entry, error = entries[index], rows[index][1]
+        entries[index] = replace(
+            entry,
+            rank=overall.next(error),
+            class_rank=by_inputs[entry.inputs].next(error) if entry.inputs else None,
+            rank_range=rank_range,
+        )
     return entries
 
 
 def _disclosed(row: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return the values of ``_COLUMNS`` with the rank error and the table as they are disclosed."""
-    ranked, rank_error, *others, table_json = row
+    ranked, rank_error, _, *others, table_json = row
     shown = None if rank_error is None else disclosed_number(rank_error)
-    return ranked, shown, *others, DisclosedTable.model_validate_json(table_json).model_dump_json()
-
-
-def entries_of_class(entries: Sequence[LeaderboardEntry], inputs: str | None) -> list[LeaderboardEntry]:
-    """Return the rows that declare ``inputs``, all rows for None; their ranks are kept."""
-    return [entry for entry in entries if inputs is None or entry.inputs == inputs]
+    return ranked, shown, None, *others, DisclosedTable.model_validate_json(table_json).model_dump_json()
 
 
 @dataclass
@@ -164,21 +162,27 @@ class _RankCounter:
         return self.rank
 
 
-def error_map_views(database: Database, submission_id: str) -> list[str]:
-    """Return the ids of the views that have a stored error map, sorted."""
+def picture_facts(database: Database, submission_id: str) -> dict[str, tuple[dict[str, Any], list[str]]]:
+    """Return the facts and the kinds of the stored pictures by view id."""
     if database.hidden_truth:
-        return []
-    query = select(ErrorMapModel.view_id).where(ErrorMapModel.submission_id == submission_id)
+        return {}
+    facts = select(PictureModel.view_id, PictureModel.facts).where(PictureModel.submission_id == submission_id)
+    kinds = select(PictureImageModel.view_id, PictureImageModel.kind).where(
+        PictureImageModel.submission_id == submission_id
+    )
     with database.read() as session:
-        return list(session.scalars(query.order_by(ErrorMapModel.view_id)))
+        pictures = {view_id: (json.loads(text), list[str]()) for view_id, text in session.execute(facts)}
+        for view_id, kind in session.execute(kinds):
+            pictures[view_id][1].append(kind)
+    return pictures
 
 
-def error_map_webp(database: Database, submission_id: str, view_id: str) -> bytes | None:
-    """Return the error map of a view as WebP bytes, or None if none is stored."""
+def picture_webp(database: Database, submission_id: str, view_id: str, kind: str) -> bytes | None:
+    """Return a picture of a view as WebP bytes, or None if it is not stored."""
     if database.hidden_truth:
         return None
     with database.read() as session:
-        record = session.get(ErrorMapModel, (submission_id, view_id))
+        record = session.get(PictureImageModel, (submission_id, view_id, kind))
         return None if record is None else record.webp
 
 
@@ -188,29 +192,6 @@ class QueuePosition:
 
     number: int
     waiting: int
-
-
-def ranks(database: Database, submission: SubmissionModel) -> dict[str, int]:
-    """Return the ranks of a submission by config; configs where it is not ranked are left out."""
-    if not submission.public:
-        return {}
-    row = LeaderboardRowModel
-    own = select(row.config, row.rank_error).where(row.submission_id == submission.id, row.ranked)
-    with database.read() as session:
-        least_equal = {
-            config: smallest_disclosed_alike(error) if database.hidden_truth else error
-            for config, error in session.execute(own)
-            if error is not None
-        }
-        is_better = (and_(row.config == config, row.rank_error < error) for config, error in least_equal.items())
-        query = (
-            select(row.config, func.count())
-            .join(SubmissionModel, SubmissionModel.id == row.submission_id)
-            .where(or_(false(), *is_better), row.ranked, SubmissionModel.status == SCORED, SubmissionModel.public)
-            .group_by(row.config)
-        )
-        counts = dict(session.execute(query).all())
-    return {config: 1 + counts.get(config, 0) for config in least_equal}
 
 
 def queue_position(database: Database, submission: SubmissionModel) -> QueuePosition | None:

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import secrets
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-from sqlalchemy import delete, func, select
+from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
 from leaderboard.db.engine import Database
-from leaderboard.db.models import ErrorMapModel, LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
+from leaderboard.db.models import (
+    LeaderboardRowModel,
+    PictureImageModel,
+    PictureModel,
+    ResultModel,
+    SubmissionModel,
+    TokenModel,
+    increment_content_version,
+)
 from rebar_depth_bench.scoring.disclosure import disclosed_json
 from rebar_depth_bench.submission import SubmissionMeta
 
@@ -19,7 +30,23 @@ DAY_S = 86400
 
 
 class QuotaExceededError(Exception):
-    """Raised when a token has used its daily quota of submissions."""
+    """Raised when a token has used its daily quota; the message names it."""
+
+
+class DuplicateError(Exception):
+    """Raised when a token has sent the same archive before; ``record`` is the submission of that archive."""
+
+    def __init__(self, record: SubmissionModel) -> None:
+        self.record = record
+        super().__init__(record.id)
+
+
+@dataclass(frozen=True)
+class Quota:
+    """Number of submissions and bytes of archives that are accepted of a token per day (UTC)."""
+
+    submissions: int
+    size: int
 
 
 @dataclass(frozen=True)
@@ -46,17 +73,20 @@ def new_id() -> str:
 
 
 def accept(
-    database: Database, submission_id: str, token: TokenModel, upload: Upload, quota: int, public: bool
+    database: Database, submission_id: str, token: TokenModel, upload: Upload, quota: Quota, public: bool
 ) -> SubmissionModel:
     """Insert a queued submission, whose archive is stored already, and return its row. Durable on return.
 
-    Raises ``QuotaExceededError`` if the token has used its daily quota.
+    Raises ``DuplicateError`` if the token has a submission of the same archive, and ``QuotaExceededError`` if it
+    has used its daily quota.
     """
     with database.write() as session:
-        # The token's row is locked, so that concurrent uploads cannot exceed the quota.
+        # The token's row is locked, so that concurrent uploads are neither duplicates nor exceed the quota.
         session.execute(select(TokenModel).where(TokenModel.id == token.id).with_for_update())
-        if count_submissions_today(session, token.id) >= quota:
-            raise QuotaExceededError
+        if duplicate := find_duplicate(session, token, upload.sha256):
+            session.expunge(duplicate)  # The rollback would expire it.
+            raise DuplicateError(duplicate)
+        check_quota(session, token, quota, upload.size)
         record = SubmissionModel(
             id=submission_id,
             token_id=token.id,
@@ -73,18 +103,45 @@ def accept(
             created_at=time.time(),
             attempts=0,
             dataset_digest=upload.dataset_digest,
+            details=_details_json(upload.meta),
         )
         session.add(record)
     return record
 
 
-def count_submissions_today(session: Session, token_id: int) -> int:
-    """Return the number of submissions made with a token since midnight UTC, including deleted ones."""
-    midnight = time.time() // DAY_S * DAY_S
-    own_today = select(func.count()).where(
-        SubmissionModel.token_id == token_id, SubmissionModel.created_at >= midnight
+def _details_json(meta: SubmissionMeta) -> str:
+    """Return what the columns do not hold of what the submitter says about the method."""
+    details = meta.model_dump(include={"code_url", "licence", "training_data", "parameters"}, exclude_none=True)
+    if (seconds := meta.seconds_per_view) is not None:
+        details["seconds_per_view"] = seconds
+    return json.dumps(details)
+
+
+def find_duplicate(session: Session, token: TokenModel, sha256: str) -> SubmissionModel | None:
+    """Return the submission that a token has made of an archive, or None; failed ones may be sent again."""
+    is_own = (SubmissionModel.token_id == token.id, SubmissionModel.archive_sha256 == sha256)
+    return session.scalar(
+        select(SubmissionModel).where(*is_own, SubmissionModel.status.in_((QUEUED, SCORING, SCORED)))
     )
-    return session.scalar(own_today) or 0
+
+
+def quota_used(session: Session, token: TokenModel) -> Quota:
+    """Return the submissions made with a token since midnight UTC and their bytes, including deleted ones."""
+    midnight = time.time() // DAY_S * DAY_S
+    used = select(func.count(), func.coalesce(func.sum(SubmissionModel.archive_bytes), 0)).where(
+        SubmissionModel.token_id == token.id, SubmissionModel.created_at >= midnight
+    )
+    count, size = session.execute(used).one()
+    return Quota(count, int(size))
+
+
+def check_quota(session: Session, token: TokenModel, quota: Quota, size: int) -> None:
+    """Raise ``QuotaExceededError`` if an archive of ``size`` bytes is more than remains of today's quota."""
+    used = quota_used(session, token)
+    if used.submissions >= quota.submissions:
+        raise QuotaExceededError(f"{quota.submissions} submissions per day (UTC)")
+    if used.size + size > quota.size:
+        raise QuotaExceededError(f"{quota.size} bytes of archives per day (UTC)")
 
 
 def find(database: Database, submission_id: str) -> SubmissionModel | None:
@@ -109,19 +166,48 @@ def result_json(database: Database, submission_id: str) -> bytes | None:
     return disclosed_json(result) if result is not None and database.hidden_truth else result
 
 
+def result_notes(database: Database, submission_id: str) -> list[str]:
+    """Return the notes on possible mistakes in a scored submission; none if the ground truth is hidden."""
+    if database.hidden_truth:
+        return []
+    with database.read() as session:
+        record = session.get(ResultModel, submission_id)
+    notes: list[str] = [] if record is None else json.loads(record.notes)
+    return notes
+
+
 def publish(database: Database, submission_id: str, public: bool) -> None:
     """Set whether the rows of a submission are shown on the leaderboard."""
+    change(database, submission_id, {"public": public})
+
+
+def change(database: Database, submission_id: str, values: Mapping[str, Any]) -> None:
+    """Set columns of a submission that pages show."""
     with database.write() as session:
-        session.get_one(SubmissionModel, submission_id).public = public
+        session.execute(update(SubmissionModel).where(SubmissionModel.id == submission_id).values(**values))
+        increment_content_version(session)
+
+
+def of_token(database: Database, token: TokenModel) -> list[SubmissionModel]:
+    """Return the submissions of a token, newest first, without deleted ones."""
+    own = select(SubmissionModel).where(SubmissionModel.token_id == token.id, SubmissionModel.status != DELETED)
+    with database.read() as session:
+        return list(session.scalars(own.order_by(SubmissionModel.created_at.desc())))
+
+
+def delete_results(session: Session, submission_id: str) -> None:
+    """Delete what scoring has stored of a submission."""
+    for table in (PictureImageModel, PictureModel, LeaderboardRowModel, ResultModel):
+        session.execute(delete(table).where(table.submission_id == submission_id))
 
 
 def remove(database: Database, submission_id: str) -> None:
-    """Delete a submission's rows, result and error maps; its cleared own row still counts for the quota."""
+    """Delete a submission's rows, result and pictures; its cleared own row still counts for the quota."""
     with database.write() as session:
         # The row is locked, so that no worker finishes the submission meanwhile.
         record = session.get_one(SubmissionModel, submission_id, with_for_update=True)
-        for table in (ErrorMapModel, LeaderboardRowModel, ResultModel):
-            session.execute(delete(table).where(table.submission_id == submission_id))
-        record.status, record.public = DELETED, False
+        delete_results(session, submission_id)
+        increment_content_version(session)
+        record.status, record.public, record.details = DELETED, False, "{}"
         record.method, record.archive_sha256 = "", ""
         record.description = record.url = record.reason = None

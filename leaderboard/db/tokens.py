@@ -5,12 +5,15 @@ from __future__ import annotations
 import hashlib
 import secrets
 import time
+from dataclasses import dataclass
 
-from sqlalchemy import select
+from sqlalchemy import and_, func, select
 from sqlalchemy.exc import IntegrityError
 
 from leaderboard.db.engine import Database
-from leaderboard.db.models import TokenModel
+from leaderboard.db.models import SubmissionModel, TokenModel
+from leaderboard.db.submissions import DELETED
+from leaderboard.names import name_problem, normalised
 from rebar_depth_bench.errors import InputError
 
 PREFIX = "rdb_"
@@ -22,8 +25,10 @@ def create_token(database: Database, name: str) -> str:
 
     Raises ``InputError`` if the name is taken, blank, longer than ``MAX_NAME`` characters or not printable.
     """
-    if not name.strip() or len(name) > MAX_NAME or not name.isprintable():
-        raise InputError(f"the token name is {name!r}, expected 1 to {MAX_NAME} printable characters")
+    name = normalised(name)
+    if not name or len(name) > MAX_NAME or (problem := name_problem(name)):
+        expected = f"expected 1 to {MAX_NAME} printable characters"
+        raise InputError(f"the token name is {name!r}, {problem or expected}")
     token = PREFIX + secrets.token_urlsafe(32)
     try:
         with database.write() as session:
@@ -40,14 +45,55 @@ def replace_token(database: Database, name: str) -> str:
         record = session.scalar(select(TokenModel).where(TokenModel.name == name))
         if record is None:
             raise InputError(f"there is no token for {name!r}, expected the name of an existing token")
-        record.sha256 = digest(token)
+        record.sha256, record.revoked_at = digest(token), None
     return token
 
 
-def find_token(database: Database, token: str) -> TokenModel | None:
-    """Return the row of a token, or None if the token is unknown."""
+def revoke_token(database: Database, name: str) -> None:
+    """Revoke the token of ``name``, whose submissions stay. Raises ``InputError`` if there is none."""
+    with database.write() as session:
+        record = session.scalar(select(TokenModel).where(TokenModel.name == name))
+        if record is None:
+            raise InputError(f"there is no token for {name!r}, expected the name of an existing token")
+        record.revoked_at = time.time()
+
+
+@dataclass(frozen=True)
+class TokenUse:
+    """A token's name, creation and revocation (Unix timestamps), number of submissions and their bytes."""
+
+    name: str
+    created_at: float
+    revoked_at: float | None
+    submissions: int
+    size: int
+
+
+def list_tokens(database: Database) -> list[TokenUse]:
+    """Return all tokens, oldest first; submissions that were deleted are not counted."""
+    query = (
+        select(
+            TokenModel.name,
+            TokenModel.created_at,
+            TokenModel.revoked_at,
+            func.count(SubmissionModel.id),
+            func.coalesce(func.sum(SubmissionModel.archive_bytes), 0),
+        )
+        .outerjoin(
+            SubmissionModel, and_(SubmissionModel.token_id == TokenModel.id, SubmissionModel.status != DELETED)
+        )
+        .group_by(TokenModel.id)
+        .order_by(TokenModel.created_at)
+    )
     with database.read() as session:
-        return session.scalar(select(TokenModel).where(TokenModel.sha256 == digest(token)))
+        return [TokenUse(*row) for row in session.execute(query)]
+
+
+def find_token(database: Database, token: str) -> TokenModel | None:
+    """Return the row of a token, or None if the token is unknown or revoked."""
+    query = select(TokenModel).where(TokenModel.sha256 == digest(token), TokenModel.revoked_at.is_(None))
+    with database.read() as session:
+        return session.scalar(query)
 
 
 def digest(token: str) -> str:

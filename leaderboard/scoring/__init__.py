@@ -1,1 +1,1 @@
-"""Scoring of accepted archives: queue workers, the sandboxed scoring process and the dask backend."""
+"""Checking and scoring of archives in a sandboxed process, and the queue workers that score."""

@@ -9,7 +9,6 @@ import signal
 import sys
 import threading
 from contextlib import closing
-from pathlib import Path
 
 import structlog
 
@@ -17,8 +16,7 @@ from leaderboard.db.engine import Database, sqlite_path
 from leaderboard.log_setup import set_up_logs
 from leaderboard.redact import without_password
 from leaderboard.scoring.process_limits import die_with_parent
-from leaderboard.scoring.subprocess_backend import make_subprocess_backend
-from leaderboard.scoring.worker import ScoringBackend, process_queue
+from leaderboard.scoring.worker import process_queue
 from leaderboard.settings import Settings
 from leaderboard.storage.work_dirs import work_dir
 from rebar_depth_bench.console import run_command
@@ -37,7 +35,7 @@ def main() -> int:
 
 
 def run_worker(settings: Settings, *, migrate: bool) -> None:
-    """Score queued submissions, on this machine or on a dask cluster, until SIGTERM or SIGINT.
+    """Score queued submissions until SIGTERM or SIGINT.
 
     ``migrate`` upgrades the schema first, which the server has done for its own workers.
 
@@ -54,15 +52,7 @@ def run_worker(settings: Settings, *, migrate: bool) -> None:
         if migrate:
             database.migrate()
         _LOG.info("waiting for submissions", database=without_password(url), version=software_version())
-        process_queue(database, settings, _make_backend(settings, spool), stop)
-
-
-def _make_backend(settings: Settings, spool: Path) -> ScoringBackend:
-    if not settings.dask_scheduler:
-        return make_subprocess_backend(settings, spool)
-    from leaderboard.scoring.dask_backend import make_dask_backend
-
-    return make_dask_backend(settings)
+        process_queue(database, settings, spool, stop)
 
 
 if __name__ == "__main__":

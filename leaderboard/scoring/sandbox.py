@@ -1,90 +1,87 @@
-"""Sandboxed scoring process for one archive, so that a malicious archive cannot affect the rest of the service.
+"""Sandboxed process that checks or scores one archive, so that a malicious archive cannot affect the service.
 
-``python -m leaderboard.scoring.sandbox`` reads a ``ScoringTask`` as JSON from standard input and writes one of
-these to the task's output folder: ``result.json`` and error maps; ``problem.txt`` with the reason why the archive
-fails; or ``away.txt`` with the infrastructure error (dataset, storage, disk).
+``python -m leaderboard.scoring.sandbox`` reads a ``SandboxTask`` as JSON from standard input and writes its
+outcome to the task's output folder, in the files that ``task`` names.
 
-Error maps of the worst views are rendered as in the command line's report. A submitter can reconstruct the ground
-truth from their prediction and its error map, so error maps are only for leaderboards with public ground truth.
+Pictures of views are rendered as in the command line's report. A submitter can reconstruct the ground truth from
+them, so they are only for leaderboards with public ground truth.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from leaderboard.scoring.process_limits import limit_process
 from leaderboard.scoring.task import (
-    ERROR_MAPS_DIR,
-    NO_MEMORY,
-    PROBLEM_FILE,
+    META_FILE,
+    NOTES_FILE,
+    PICTURES_DIR,
+    PROBLEMS_FILE,
     RESULT_FILE,
     UNAVAILABLE_FILE,
-    ScoringTask,
+    SandboxTask,
 )
-from leaderboard.storage.archive_store import ArchiveNotFoundError, ArchiveStore
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import DatasetError, RebarDepthError, SubmissionError, problem_summary
-from rebar_depth_bench.reporting.html.page import iter_view_panels
-from rebar_depth_bench.reporting.html.view_images import error_webp
-from rebar_depth_bench.scoring.disclosure import check_view_coverage
-from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
-from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.score import score_evaluation
-from rebar_depth_bench.scoring.view_score import sort_key_worst_first
-from rebar_depth_bench.view_ids import config_of
+from rebar_depth_bench.errors import DatasetError, Problem, RebarDepthError, SubmissionError
+from rebar_depth_bench.submission import open_submission
+from rebar_depth_bench.view_ids import TEST_SPLIT
 
-
-def render_error_maps(evaluation: Evaluation, result: Result, count: int) -> Iterator[tuple[str, bytes]]:
-    """Yield (view id, WebP bytes) of the native error maps of the ``count`` worst views of each config."""
-    worst = {
-        config: sorted(
-            (view for view in result.views if config_of(view.view_id) == config),
-            key=sort_key_worst_first,
-            reverse=True,
-        )[:count]
-        for config in result.tables
-    }
-    for panels in iter_view_panels(worst, evaluation):
-        yield panels.view_id, error_webp(panels)
+NO_MEMORY = Problem("size", "", "the archive needs more memory than this service allows")
 
 
 def main() -> int:
-    """Score the task on standard input; return exit status 0, also if a problem was reported in a file."""
-    task = ScoringTask(**json.load(sys.stdin))
+    """Run the task on standard input; return exit status 0, also if the archive has problems."""
+    task = SandboxTask(**json.load(sys.stdin))
     limit_process(task.memory, task.parent)
     out = Path(task.out)
     try:
-        with ArchiveStore(task.archives).local_copy(task.submission_id, out) as archive:
-            _score(str(archive), task)
-    except ArchiveNotFoundError:
-        (out / PROBLEM_FILE).write_text("the archive is no longer in the archive storage")
-    except SubmissionError as error:  # Without the path of the archive on this machine.
-        (out / PROBLEM_FILE).write_text(problem_summary(error.problems))
+        problems = _check(task, out) if task.action == "check" else _score(task, out)
+    except SubmissionError as error:
+        problems = error.problems
     except MemoryError:
-        (out / PROBLEM_FILE).write_text(NO_MEMORY)
+        problems = [NO_MEMORY]
     except (RebarDepthError, OSError) as error:  # Dataset, cache or disk, not the archive.
         (out / UNAVAILABLE_FILE).write_text(str(error))
+        return 0
+    if problems:
+        (out / PROBLEMS_FILE).write_text(json.dumps([asdict(problem) for problem in problems]))
     return 0
 
 
-def _score(archive: str, task: ScoringTask) -> None:
+def _check(task: SandboxTask, out: Path) -> Sequence[Problem]:
+    """Return the problems of the archive; write its metadata if it has none."""
+    with open_submission(task.archive, open_folder(task.data).expected_views(TEST_SPLIT)) as submission:
+        problems = list(submission.problems())
+        if submission.meta is not None and not problems:
+            (out / META_FILE).write_text(submission.meta.model_dump_json())
+        return problems
+
+
+def _score(task: SandboxTask, out: Path) -> Sequence[Problem]:
+    """Write the result, notes and pictures. Raises ``SubmissionError`` with the problems of the archive."""
+    # Half a second to import, which a check does not need.
+    from leaderboard.scoring.pictures import write_pictures
+    from rebar_depth_bench.diagnosis.diagnose import diagnose
+    from rebar_depth_bench.scoring.disclosure import check_view_coverage
+    from rebar_depth_bench.scoring.evaluation import open_evaluation
+    from rebar_depth_bench.scoring.score import score_evaluation
+
     digest = open_folder(task.data).digest
     if digest != task.dataset_digest:  # Checked first: on another dataset, the archive could seem invalid.
         raise DatasetError(f"{task.data}: the digest is {digest}, expected {task.dataset_digest}")
-    with open_evaluation(archive, task.data) as evaluation:
+    with open_evaluation(task.archive, task.data) as evaluation:
         result = score_evaluation(evaluation)
         if task.hidden_truth:
             check_view_coverage(result.views)
+        (out / NOTES_FILE).write_text(json.dumps([mistake.text for mistake in diagnose(evaluation)]))
         if task.error_maps:
-            folder = Path(task.out) / ERROR_MAPS_DIR
-            folder.mkdir()
-            for number, (view_id, webp) in enumerate(render_error_maps(evaluation, result, task.error_maps)):
-                (folder / f"{number:04d}.webp").write_bytes(webp)
-                (folder / f"{number:04d}.txt").write_text(view_id)
-    (Path(task.out) / RESULT_FILE).write_bytes(result.to_json())
+            write_pictures(evaluation, result, task.error_maps, out / PICTURES_DIR)
+    (out / RESULT_FILE).write_bytes(result.to_json())
+    return []
 
 
 if __name__ == "__main__":

@@ -22,9 +22,10 @@ class WorkerSupervisor:
     """Context manager in which ``count`` worker processes run; workers that die are restarted."""
 
     def __init__(self, settings: Settings, count: int) -> None:
-        self._settings, self._count = settings, count
+        self._settings = settings
         self._stopping = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="supervisor", daemon=True)
+        self._workers: list[subprocess.Popen[bytes] | None] = [None] * count
 
     def __enter__(self) -> Self:
         self._watcher.start()
@@ -34,8 +35,12 @@ class WorkerSupervisor:
         self._stopping.set()
         self._watcher.join()
 
+    def running(self) -> int:
+        """Return the number of running workers."""
+        return sum(worker is not None and worker.poll() is None for worker in self._workers)
+
     def _watch(self) -> None:
-        workers: list[subprocess.Popen[bytes] | None] = [None] * self._count
+        workers = self._workers
         while True:
             for index, worker in enumerate(workers):
                 if worker is not None and worker.poll() is not None:

@@ -1,4 +1,4 @@
-"""Queue worker: leases submissions, scores them with a backend, renews the lease meanwhile, stores the outcome."""
+"""Queue worker: leases submissions, scores them, renews the lease meanwhile, stores the outcome."""
 
 from __future__ import annotations
 
@@ -7,33 +7,22 @@ import secrets
 import socket
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 import structlog
 
 from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import DATABASE_UNAVAILABLE, Database
-from leaderboard.db.jobs import Job, Outcome
+from leaderboard.db.jobs import Outcome
+from leaderboard.scoring.run_sandbox import POLL_INTERVAL_S, UnavailableError, score_archive
 from leaderboard.settings import Settings
+from leaderboard.storage.archive_store import ArchiveNotFoundError, ArchiveStore
 
-POLL_INTERVAL_S = 1.0
 RETRY_INTERVAL_S = 1.0
-RENEWALS_PER_LEASE = 4
 _LOG = structlog.get_logger("worker")
 
 T = TypeVar("T")
-ScoringBackend = Callable[[Job, Callable[[], bool]], Outcome | None]
-"""Function that scores a job.
-
-It calls its second argument regularly and stops when that returns False. It returns None if it was stopped or its
-process died, and raises ``BackendUnavailableError`` for an infrastructure failure."""
-
-
-class BackendUnavailableError(Exception):
-    """Raised when scoring is impossible for now: no backend, or archive or dataset unreachable.
-
-    The job is requeued without counting the attempt.
-    """
 
 
 def new_worker_name() -> str:
@@ -41,26 +30,28 @@ def new_worker_name() -> str:
     return f"{socket.gethostname()[:40]}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
-def process_queue(database: Database, settings: Settings, score: ScoringBackend, stop: threading.Event) -> None:
+def process_queue(database: Database, settings: Settings, spool: Path, stop: threading.Event) -> None:
     """Score queued submissions until ``stop`` is set; then requeue the current job.
 
-    While the database is unavailable its operations are retried, so that no outcome is lost.
+    While the database is unavailable its operations are retried, so that no outcome is lost. Temporary files are
+    in ``spool``. Raises ``InputError`` if the archive storage is unusable.
     """
-    name = new_worker_name()
+    name, archives = new_worker_name(), ArchiveStore(settings.archive_dir)
     while not stop.is_set():
         submission_id = _retry_until_available(lambda: jobs.claim(database, name, settings.lease_seconds), stop)
         if submission_id is None:
             stop.wait(POLL_INTERVAL_S)
         else:
-            _score_submission(submission_id, name, database, settings, score, stop)
+            _score_submission(submission_id, name, database, archives, settings, spool, stop)
 
 
 def _score_submission(
     submission_id: str,
     name: str,
     database: Database,
+    archives: ArchiveStore,
     settings: Settings,
-    score: ScoringBackend,
+    spool: Path,
     stop: threading.Event,
 ) -> None:
     log = _LOG.bind(submission=submission_id[:6], worker=name)
@@ -70,10 +61,13 @@ def _score_submission(
     log.info("scoring started")
     wait_s, outcome = 0.0, None
     try:
-        job = Job(submission_id, record.dataset_digest)
-        outcome = score(job, _make_heartbeat(database, submission_id, name, settings.lease_seconds, stop))
-    except BackendUnavailableError as error:
-        log.warning("scoring backend unavailable; job requeued", reason=str(error))
+        heartbeat = _make_heartbeat(database, submission_id, name, settings.lease_seconds, stop)
+        archive = archives.path(submission_id)
+        outcome = score_archive(archive, record.dataset_digest, settings, spool, heartbeat)
+    except ArchiveNotFoundError:
+        outcome = Outcome(reason="the archive is no longer in the archive storage")
+    except (UnavailableError, OSError) as error:  # The attempt does not count.
+        log.warning("scoring is unavailable; job requeued", reason=str(error))
         wait_s = settings.lease_seconds
     if outcome is not None:
         is_stored = _retry_until_available(lambda: jobs.finish(database, submission_id, name, outcome), stop)

@@ -44,7 +44,7 @@ def back_up(settings: Settings, target: Path) -> Path:
         target.mkdir(mode=0o700, parents=True, exist_ok=True)
         archive_dir.mkdir(exist_ok=True)
         _copy_database(source, target / DATABASE)
-        _copy_archives(ArchiveStore(settings.archives_url), _submission_ids(target / DATABASE), archive_dir)
+        _copy_archives(ArchiveStore(settings.archive_dir), _submission_ids(target / DATABASE), archive_dir)
     except OSError as error:
         raise write_error(target, error) from None
     return target
@@ -59,12 +59,8 @@ def _copy_archives(archives: ArchiveStore, submission_ids: Sequence[str], archiv
         copy = archive_dir / f"{submission_id}.zip"
         # A missing archive was deleted after the database was copied.
         if not copy.is_file():
-            with (
-                suppress(ArchiveNotFoundError),
-                archives.local_copy(submission_id, archive_dir.parent) as archive,
-                atomic_replace(copy) as temporary,
-            ):
-                shutil.copyfile(archive, temporary)
+            with suppress(ArchiveNotFoundError), atomic_replace(copy) as temporary:
+                shutil.copyfile(archives.path(submission_id), temporary)
 
 
 def _copy_database(source: Path, copy: Path) -> None:

@@ -1,65 +1,86 @@
-"""Upload pipeline: receive, validate, store and enqueue an archive; it is accepted only after the last step."""
+"""Upload pipeline: receive, check, store and enqueue an archive; it is accepted only after the last step."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping
+import hashlib
+import os
+import tempfile
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from pathlib import Path
 
 import structlog
 from anyio import fail_after, to_thread
 
 from leaderboard.db import submissions
 from leaderboard.db.models import SubmissionModel, TokenModel
-from leaderboard.db.submissions import QuotaExceededError, Upload
+from leaderboard.db.submissions import DuplicateError, Quota, QuotaExceededError, Upload
+from leaderboard.names import name_problem, normalised
+from leaderboard.scoring.run_sandbox import UnavailableError, Verdict, check_archive
 from leaderboard.service import Service
-from leaderboard.uploads.multipart import (
-    MAX_OVERHEAD_BYTES,
-    ReceivedArchive,
-    UploadRejectedError,
-    receive,
-    too_large_message,
-)
-from rebar_depth_bench.errors import RebarDepthError
+from leaderboard.settings import Settings
+from leaderboard.uploads.errors import UploadRejectedError, too_large
+from rebar_depth_bench.errors import Problem, RebarDepthError
 from rebar_depth_bench.reporting.formatting import counted
 
-UNAVAILABLE_MESSAGE = "the service cannot validate or store archives at the moment; try again later"
-"""Detail of the 503 response if the dataset is unreadable, the disk full or the archive storage unavailable."""
+UNAVAILABLE_MESSAGE = "the service cannot check or store archives at the moment; try again later"
+"""Detail of the 503 response if the dataset is unreadable or the disk full."""
+WRITE_CHUNK_BYTES = 1 << 20
+"""Number of buffered bytes that triggers a write, which runs in a worker thread."""
 _LOG = structlog.get_logger("uploads")
 
 
-async def accept_upload(
-    service: Service, token: TokenModel, body: AsyncIterator[bytes], headers: Mapping[str, str]
-) -> SubmissionModel:
-    """Accept an upload and return its database row; archive and row are on disk on return.
+@dataclass(frozen=True)
+class AcceptedUpload:
+    """Submission of an upload; it is not new if the token has sent the same archive before."""
+
+    record: SubmissionModel
+    is_new: bool
+
+
+@dataclass(frozen=True)
+class _ReceivedArchive:
+    """A received archive: its file, its SHA-256 in hexadecimal and its size in bytes."""
+
+    path: Path
+    sha256: str
+    size: int
+
+
+async def accept_upload(service: Service, token: TokenModel, archive: AsyncIterator[bytes]) -> AcceptedUpload:
+    """Accept an archive; archive and database row are on disk on return.
 
     Uploads with one token are received one after the other, so that they do not fill the disk. The quota is
     checked before the archive is read, and only accepted archives count. Raises ``UploadRejectedError``.
     """
-    async with service.upload_locks[token.id]:
-        return await _accept(service, token, body, headers)
-
-
-async def _accept(
-    service: Service, token: TokenModel, body: AsyncIterator[bytes], headers: Mapping[str, str]
-) -> SubmissionModel:
     settings = service.settings
-    if await to_thread.run_sync(quota_used, service, token) >= settings.quota:
-        raise _quota_exceeded(settings.quota)
-    if int(headers.get("content-length", 0)) > settings.max_upload + MAX_OVERHEAD_BYTES:
-        raise UploadRejectedError(413, too_large_message(settings.max_upload))
-    try:
-        body = _with_idle_timeout(body, settings.upload_idle_seconds)
-        received = await receive(body, headers.get("content-type", ""), service.spool, settings.max_upload)
+    async with service.upload_locks[token.id]:
+        await to_thread.run_sync(_check_quota, service, token)
         try:
-            return await _validate_and_store(service, token, received)
-        finally:
-            await to_thread.run_sync(received.path.unlink, True)
-    except (OSError, RebarDepthError) as error:
-        _LOG.error("upload failed: service unavailable", error=str(error))
-        raise UploadRejectedError(503, UNAVAILABLE_MESSAGE) from None
+            with fail_after(settings.upload_seconds):
+                received = await _receive(
+                    _with_idle_timeout(archive, settings), service.spool, settings.max_upload
+                )
+            try:
+                return await _check_and_store(service, token, received)
+            finally:
+                await to_thread.run_sync(received.path.unlink, True)
+        except TimeoutError:
+            message = f"the upload was ended, because it took longer than {settings.upload_seconds:g} seconds"
+            raise UploadRejectedError(408, message) from None
+        except DuplicateError as error:
+            _LOG.info("upload of a known archive", token=token.name, submission=error.record.id[:6])
+            return AcceptedUpload(error.record, is_new=False)
+        except QuotaExceededError as error:
+            raise _quota_exceeded(error) from None
+        except (OSError, RebarDepthError, UnavailableError) as error:
+            _LOG.error("upload failed: service unavailable", error=str(error))
+            raise UploadRejectedError(503, UNAVAILABLE_MESSAGE) from None
 
 
-async def _with_idle_timeout(body: AsyncIterator[bytes], seconds: float) -> AsyncIterator[bytes]:
-    """Yield the parts of ``body``. Raises ``UploadRejectedError`` (408) if none arrives for ``seconds``."""
+async def _with_idle_timeout(body: AsyncIterator[bytes], settings: Settings) -> AsyncIterator[bytes]:
+    """Yield the parts of ``body``. Raises ``UploadRejectedError`` (408) if none arrives for too long."""
+    seconds = settings.upload_idle_seconds
     while True:
         try:
             with fail_after(seconds):
@@ -72,40 +93,91 @@ async def _with_idle_timeout(body: AsyncIterator[bytes], seconds: float) -> Asyn
         yield part
 
 
-async def _validate_and_store(service: Service, token: TokenModel, received: ReceivedArchive) -> SubmissionModel:
-    verdict = await service.checker.check(received.path)
+async def _receive(archive: AsyncIterator[bytes], spool: Path, max_bytes: int) -> _ReceivedArchive:
+    """Write an archive to a new file in ``spool``.
+
+    Raises ``UploadRejectedError`` (413), and leaves no file, if it has more than ``max_bytes`` bytes.
+    """
+    descriptor, name = tempfile.mkstemp(dir=spool, suffix=".upload")
+    path, sha256, size, waiting = Path(name), hashlib.sha256(), 0, bytearray()
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+
+            def flush() -> None:
+                sha256.update(waiting)
+                file.write(waiting)
+                waiting.clear()
+
+            async for part in archive:
+                waiting += part
+                size += len(part)
+                if size > max_bytes:
+                    raise too_large(max_bytes)
+                if len(waiting) >= WRITE_CHUNK_BYTES:
+                    await to_thread.run_sync(flush)
+            await to_thread.run_sync(flush)
+        return _ReceivedArchive(path, sha256.hexdigest(), size)
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+
+
+async def _check_and_store(service: Service, token: TokenModel, received: _ReceivedArchive) -> AcceptedUpload:
+    settings = service.settings
+    await to_thread.run_sync(_raise_if_duplicate, service, token, received.sha256)
+    verdict = _with_name_problems(
+        await to_thread.run_sync(
+            check_archive, received.path, settings, service.spool, limiter=service.check_limiter
+        )
+    )
     if isinstance(verdict, tuple):
         _LOG.info("upload rejected", token=token.name, problems=len(verdict))
         raise UploadRejectedError(422, f"the archive is invalid: {counted(len(verdict), 'problem')}", verdict)
     submission_id = submissions.new_id()
     upload = Upload(verdict, received.sha256, received.size, service.folder.digest)
-    public = service.settings.default_visibility == "always"
+    public = settings.default_visibility == "always"
 
     def store() -> SubmissionModel:
         service.archives.put(submission_id, received.path)
         try:
-            return submissions.accept(
-                service.database, submission_id, token, upload, service.settings.quota, public
-            )
-        except QuotaExceededError:  # After any other error the row may exist, so its archive must be kept.
+            return submissions.accept(service.database, submission_id, token, upload, quota_of(settings), public)
+        except (QuotaExceededError, DuplicateError):  # After other errors the row may exist and needs its archive.
             service.archives.delete(submission_id)
             raise
 
-    try:
-        record = await to_thread.run_sync(store)
-    except QuotaExceededError:
-        raise _quota_exceeded(service.settings.quota) from None
+    record = await to_thread.run_sync(store)
     _LOG.info("upload accepted", token=token.name, submission=submission_id[:6], bytes=received.size)
-    return record
+    return AcceptedUpload(record, is_new=True)
 
 
-def quota_used(service: Service, token: TokenModel) -> int:
-    """Return the number of submissions that the token has made today (UTC)."""
+def _with_name_problems(verdict: Verdict) -> Verdict:
+    """Return the verdict with the method's name normalised, or with the problem of this name."""
+    if isinstance(verdict, tuple):
+        return verdict
+    method = normalised(verdict.method)
+    if problem := name_problem(method):
+        return (Problem("invalid", "submission.json: method", problem, "visible characters"),)
+    return verdict.model_copy(update={"method": method})
+
+
+def _raise_if_duplicate(service: Service, token: TokenModel, sha256: str) -> None:
     with service.database.read() as session:
-        return submissions.count_submissions_today(session, token.id)
+        if duplicate := submissions.find_duplicate(session, token, sha256):
+            raise DuplicateError(duplicate)
 
 
-def _quota_exceeded(quota: int) -> UploadRejectedError:
-    return UploadRejectedError(
-        429, f"the quota of {quota} submissions per day (UTC) is used up; rejected archives do not count"
-    )
+def quota_of(settings: Settings) -> Quota:
+    """Return the daily quota of every token."""
+    return Quota(settings.quota, settings.quota_bytes)
+
+
+def _check_quota(service: Service, token: TokenModel) -> None:
+    try:
+        with service.database.read() as session:
+            submissions.check_quota(session, token, quota_of(service.settings), 0)
+    except QuotaExceededError as error:
+        raise _quota_exceeded(error) from None
+
+
+def _quota_exceeded(error: QuotaExceededError) -> UploadRejectedError:
+    return UploadRejectedError(429, f"the quota of {error} is used up; rejected archives do not count")

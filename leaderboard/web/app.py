@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from urllib.parse import urlsplit
+
 import structlog
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
+from starlette.middleware.gzip import GZipMiddleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect
 
 from leaderboard.db.engine import DATABASE_UNAVAILABLE
 from leaderboard.service import Service
-from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES, UploadRejectedError
+from leaderboard.uploads.errors import UploadRejectedError
 from leaderboard.web.api import health, leaderboard, submissions, token
 from leaderboard.web.api.schemas import DATABASE_UNAVAILABLE_MESSAGE
-from leaderboard.web.cache import new_cache_state
-from leaderboard.web.middleware import DrainRequestBodyMiddleware, RequestMiddleware
-from leaderboard.web.pages import routes, static, submit
+from leaderboard.web.cache import CacheMiddleware
+from leaderboard.web.middleware import EarlyResponseMiddleware, RequestMiddleware
+from leaderboard.web.pages import account, routes, static, submit
 from leaderboard.web.pages.rendering import error_response, make_templates
 from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.version import software_version
@@ -32,30 +36,39 @@ HIDDEN_TRUTH = """
 
 The ground truth is hidden: of each result, only the rank error and the coverage of each config are returned, to
 three decimals, and ranks use these rounded numbers."""
+_LOCAL_HOSTS = ("localhost", "127.0.0.1", "[::1]")
+"""Hosts that are always allowed: health checks of the machine itself name them."""
+_MIN_GZIP_BYTES = 1024
 
 
 def make_app(service: Service) -> FastAPI:
     """Return the application that serves ``service``."""
+    settings = service.settings
     app = FastAPI(
-        title=service.settings.title,
+        title=settings.title,
         version=software_version(),
-        description=DESCRIPTION + (HIDDEN_TRUTH if service.settings.hidden_truth else ""),
+        description=DESCRIPTION + (HIDDEN_TRUTH if settings.hidden_truth else ""),
         docs_url=None,  # These pages load scripts from other hosts.
         redoc_url=None,
+        root_path=urlsplit(settings.public_url).path,
     )
     app.state.service = service
     app.state.templates = make_templates()
-    app.state.cache_state = new_cache_state(service.database)
-    settings = service.settings
+    for router in (submissions, leaderboard, token, health, routes, submit, account, static):
+        app.include_router(router.router)
+    identity = f"{software_version()} {service.folder.digest} {settings.model_dump_json()}"
+    app.add_middleware(CacheMiddleware, versions=service.versions, identity=identity)
+    # Outside the cache, whose responses are compressed already.
+    app.add_middleware(GZipMiddleware, minimum_size=_MIN_GZIP_BYTES, compresslevel=5)
+    if host := urlsplit(settings.public_url).hostname:
+        app.add_middleware(TrustedHostMiddleware, allowed_hosts=[host, *_LOCAL_HOSTS], www_redirect=False)
     app.add_middleware(
         RequestMiddleware,
         reads=settings.read_rate_limit,
         writes=settings.write_rate_limit,
         metrics=service.metrics,
     )
-    for router in (submissions, leaderboard, token, health, routes, submit, static):
-        app.include_router(router.router)
-    app.add_middleware(DrainRequestBodyMiddleware, max_bytes=settings.max_upload + MAX_OVERHEAD_BYTES)
+    app.add_middleware(EarlyResponseMiddleware)
     app.add_exception_handler(HTTPException, _handle_http_exception)
     app.add_exception_handler(UploadRejectedError, _handle_rejected_upload)
     app.add_exception_handler(ClientDisconnect, _handle_client_disconnect)

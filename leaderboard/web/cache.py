@@ -1,153 +1,181 @@
-"""In-memory cache of rendered leaderboard responses, keyed by a version of the underlying rows.
+"""Cache of responses, which are valid until the content version in the database changes.
 
-A leaderboard is rendered once per version instead of once per request. The version is read from the database for
-every request, because other processes may change the rows.
+The version is looked up for every request, because other processes change the content, too. A response is rendered
+and compressed once per version, and a browser that has the current version gets status 304. Cached responses do
+not pass through the routing of the application.
+
+The first request for a response after a change renders it and waits. Requests that arrive meanwhile get the
+previous response, which was current at most ``MAX_OUTDATED_S`` ago, so that a change does not delay all readers.
 """
 
 from __future__ import annotations
 
 import asyncio
+import gzip
 import hashlib
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping, Sequence
+import time
+from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any
 
-from anyio import CapacityLimiter, to_thread
-from fastapi import Request, Response
+from anyio import Lock, to_thread
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from leaderboard.db.engine import Database
-from leaderboard.db.rankings import RankingVersion, ranking_versions
+from leaderboard.db.engine import DATABASE_UNAVAILABLE
+from leaderboard.db.versions import VersionReader
 
-T = TypeVar("T")
-CacheKey = tuple[Hashable, ...]
-RenderedBody = tuple[CacheKey, bytes]
-"""A rendered body and the key of the content that it was rendered from."""
 REVALIDATE = "no-cache"
-"""Cache-Control of public responses: browsers may store them but must revalidate each time."""
+"""Cache-Control of public responses: stored here, and by browsers, which must revalidate each time."""
 NO_STORE = "no-store"
 """Cache-Control of responses with unpublished content: not stored anywhere."""
 MAX_CACHE_BYTES = 32 << 20
-"""Default limit for the total size of cached bodies."""
+MAX_OUTDATED_S = 2.0
+"""Time after which a previous response is no longer sent while the current one is rendered."""
+_GZIP_LEVEL = 5
+_RawHeaders = list[tuple[bytes, bytes]]
+_Key = tuple[bytes, bytes, str, str]
 
 
 @dataclass(frozen=True)
-class CachedBody:
-    """The bytes of a response body and their ETag."""
+class _CachedResponse:
+    """A response as sent and compressed; ``route`` is that of the request, for the access log."""
 
     content: bytes
-    etag: str
+    compressed: bytes
+    headers: _RawHeaders
+    route: Any
 
 
-class ResponseCache:
-    """Thread-safe LRU cache of response bodies, limited to ``max_bytes`` bytes in total."""
+class CacheMiddleware:
+    """ASGI middleware that keeps responses to GET without a token whose Cache-Control is ``REVALIDATE``.
 
-    def __init__(self, max_bytes: int = MAX_CACHE_BYTES) -> None:
-        self._bodies: OrderedDict[CacheKey, CachedBody] = OrderedDict()
-        self._max_bytes, self._size = max_bytes, 0
-        self._lock = threading.Lock()
-
-    def get(self, key: CacheKey, make: Callable[[], RenderedBody]) -> CachedBody:
-        """Return the cached body of ``key``, or render it with ``make`` and store it.
-
-        ``make`` returns the body's own key and the body. The body is stored under its own key, which differs from
-        ``key`` if the rows have changed since ``key`` was read.
-        """
-        if body := self.lookup(key):
-            return body
-        rendered_key, content = make()
-        body = CachedBody(content, f'"{hashlib.sha256(content).hexdigest()[:32]}"')
-        self._store(rendered_key, body)
-        return body
-
-    def lookup(self, key: CacheKey) -> CachedBody | None:
-        """Return the cached body of ``key``, or None."""
-        with self._lock:
-            if key in self._bodies:
-                self._bodies.move_to_end(key)
-            return self._bodies.get(key)
-
-    def _store(self, key: CacheKey, body: CachedBody) -> None:
-        with self._lock:
-            previous = self._bodies.pop(key, None)
-            self._size += len(body.content) - (len(previous.content) if previous else 0)
-            self._bodies[key] = body
-            while self._size > self._max_bytes:
-                self._size -= len(self._bodies.popitem(last=False)[1].content)
-
-
-class CoalescedRead(Generic[T]):
-    """Database read shared by concurrent requests: calls during a running read wait for the next one.
-
-    A returned value was therefore read after the call, and hundreds of concurrent calls cost one query.
+    ``identity`` names what responses depend on besides the content: software, settings, dataset. At most
+    ``max_bytes`` bytes of each of the last two versions are kept. Simultaneous requests for the same response
+    render it once.
     """
 
-    def __init__(self, read: Callable[[], T]) -> None:
-        self._read = read
-        self._running: asyncio.Task[T] | None = None
-        self._next: asyncio.Task[T] | None = None
+    def __init__(
+        self, app: ASGIApp, *, versions: VersionReader, identity: str, max_bytes: int = MAX_CACHE_BYTES
+    ) -> None:
+        self._app, self._max_bytes = app, max_bytes
+        self._read_version = SharedVersion(versions)
+        self._identity = hashlib.sha256(identity.encode()).hexdigest()[:16]
+        self._rendering = defaultdict[_Key, Lock](Lock)
+        self._responses: dict[_Key, _CachedResponse] = {}
+        self._outdated: dict[_Key, _CachedResponse] = {}
+        self._version, self._size = -1, 0
+        self._current_at_s = self._outdated_since_s = 0.0
 
-    async def get(self) -> T:
-        """Return the value of the next read, or raise its exception."""
+    def _set_version(self, version: int) -> None:
+        if version != self._version:
+            if self._responses:
+                self._outdated, self._outdated_since_s = self._responses, self._current_at_s
+            self._version, self._size, self._responses = version, 0, {}
+        self._current_at_s = time.monotonic()
+
+    def _available(self, key: _Key) -> _CachedResponse | None:
+        """Return the current response, or, while another request renders that, the previous one."""
+        may_be_outdated = key in self._rendering and time.monotonic() - self._outdated_since_s < MAX_OUTDATED_S
+        return self._responses.get(key) or (self._outdated.get(key) if may_be_outdated else None)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle a request."""
+        if scope["type"] != "http" or scope["method"] != "GET":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        if "authorization" in headers:
+            await self._app(scope, receive, send)
+            return
+        try:
+            version = await self._read_version.get()
+        except DATABASE_UNAVAILABLE:  # The application reports it.
+            await self._app(scope, receive, send)
+            return
+        self._set_version(version)
+        # Without a public URL, pages contain the address that the client has used.
+        key = (scope["raw_path"], scope["query_string"], headers.get("host", ""), scope["root_path"])
+        response = self._available(key)
+        if response is None:
+            try:
+                async with self._rendering[key]:
+                    response = self._responses.get(key) or await self._render(key, scope, receive, send)
+            finally:
+                self._rendering.pop(key, None)
+        if response is not None:
+            scope["route"] = response.route
+            await _send_response(response, headers, send)
+
+    async def _render(self, key: _Key, scope: Scope, receive: Receive, send: Send) -> _CachedResponse | None:
+        """Return the response of the application, or pass it on and return None if it must not be kept."""
+        version, messages = self._version, list[Message]()
+
+        async def collect(message: Message) -> None:
+            messages.append(message)
+
+        await self._app(scope, receive, collect)
+        start, *bodies = messages
+        headers = Headers(raw=start["headers"])
+        if start["status"] != 200 or headers.get("cache-control") != REVALIDATE:
+            for message in messages:
+                await send(message)
+            return None
+        content = b"".join(message.get("body", b"") for message in bodies)
+        etag = f'W/"{self._identity}-{version}"'.encode()
+        raw = [(name, value) for name, value in start["headers"] if name != b"content-length"]
+        raw += [(b"etag", etag), (b"vary", b"Accept-Encoding")]
+        compressed = await to_thread.run_sync(gzip.compress, content, _GZIP_LEVEL)
+        response = _CachedResponse(content, compressed, raw, scope.get("route"))
+        if version == self._version:
+            self._store(key, response)
+        return response
+
+    def _store(self, key: _Key, response: _CachedResponse) -> None:
+        size = len(response.content) + len(response.compressed)
+        if self._size + size > self._max_bytes:
+            self._responses, self._size = {}, 0
+        self._responses[key] = response
+        self._size += size
+
+
+async def _send_response(response: _CachedResponse, request_headers: Headers, send: Send) -> None:
+    """Send the response, compressed if the client accepts that, or status 304 if it has it already."""
+    headers, status, content = response.headers, 200, response.content
+    if dict(headers)[b"etag"].decode() in request_headers.get("if-none-match", ""):
+        status, content = 304, b""
+    elif "gzip" in request_headers.get("accept-encoding", ""):
+        content, headers = response.compressed, [*headers, (b"content-encoding", b"gzip")]
+    if status == 200:
+        headers = [*headers, (b"content-length", str(len(content)).encode())]
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": content})
+
+
+class SharedVersion:
+    """Content version whose read from the database is shared by concurrent requests.
+
+    Calls during a running read wait for the next one: a returned version was therefore read after the call, and
+    hundreds of concurrent calls cost one query.
+    """
+
+    def __init__(self, versions: VersionReader) -> None:
+        self._versions = versions
+        self._running: asyncio.Task[int] | None = None
+        self._next: asyncio.Task[int] | None = None
+
+    async def get(self) -> int:
+        """Return the version, or raise the exception of the database."""
+        if (version := self._versions.unchanged()) is not None:
+            return version
         if self._next is None:
             self._next = asyncio.create_task(self._read_after(self._running))
         return await asyncio.shield(self._next)  # A cancelled request must not cancel the others.
 
-    async def _read_after(self, running: asyncio.Task[T] | None) -> T:
+    async def _read_after(self, running: asyncio.Task[int] | None) -> int:
         if running is not None and not running.done():
             await asyncio.wait([running])
         self._running, self._next = self._next, None  # Later calls wait for the next read.
-        return await to_thread.run_sync(self._read)
-
-
-@dataclass(frozen=True)
-class CacheState:
-    """Cache shared by the routes: current versions by config, cached bodies, and the limit on rendering."""
-
-    versions: CoalescedRead[dict[str, RankingVersion]]
-    bodies: ResponseCache
-    render_limiter: CapacityLimiter
-
-
-def new_cache_state(database: Database) -> CacheState:
-    """Return an empty cache for the leaderboards of ``database``."""
-    return CacheState(CoalescedRead(lambda: ranking_versions(database)), ResponseCache(), CapacityLimiter(1))
-
-
-def cache_state_of(request: Request) -> CacheState:
-    """Return the cache of the application that handles ``request``."""
-    cache_state: CacheState = request.app.state.cache_state
-    return cache_state
-
-
-async def cached_public_body(
-    request: Request, configs: Sequence[str], key_prefix: CacheKey, make: Callable[[], RenderedBody]
-) -> CachedBody:
-    """Return the response body for the public rows of ``configs``; ``make`` is as in ``ResponseCache.get``.
-
-    The cache key is ``key_prefix`` followed by the version of each config. A worker thread is used only if the
-    body is not cached.
-    """
-    cache_state = cache_state_of(request)
-    versions = await cache_state.versions.get()
-    key = (*key_prefix, *(versions.get(name, RankingVersion()) for name in configs))
-    return await get_or_render(cache_state, key, make)
-
-
-async def get_or_render(cache_state: CacheState, key: CacheKey, make: Callable[[], RenderedBody]) -> CachedBody:
-    """Return the cached body of ``key``, or render it; concurrent requests for the same key render it once."""
-    if body := cache_state.bodies.lookup(key):
-        return body
-    # Rendering is serial: requests that wait, without occupying a thread, find the body cached.
-    return await to_thread.run_sync(cache_state.bodies.get, key, make, limiter=cache_state.render_limiter)
-
-
-def conditional_response(
-    request: Request, body: CachedBody, media_type: str, headers: Mapping[str, str]
-) -> Response:
-    """Return the response with ``body``, or 304 without content if the client's ETag matches."""
-    all_headers = {"ETag": body.etag, **headers}
-    if body.etag in request.headers.get("if-none-match", ""):
-        return Response(status_code=304, headers=all_headers)
-    return Response(body.content, media_type=media_type, headers=all_headers)
+        read: Callable[[], int] = self._versions.read
+        return await to_thread.run_sync(read)

@@ -1,17 +1,17 @@
-"""ASGI middleware: rate limits, security headers, access log and metrics, and draining of rejected uploads."""
+"""ASGI middleware: rate limits, security headers, access log, metrics, and early responses to uploads."""
 
 from __future__ import annotations
 
+import ipaddress
 import time
-from collections.abc import MutableMapping
-from typing import Any
+from collections.abc import Mapping
 
 import structlog
 from anyio import move_on_after
 from limits import parse
 from limits.storage import MemoryStorage
-from limits.strategies import MovingWindowRateLimiter
-from starlette.datastructures import Headers, MutableHeaders
+from limits.strategies import SlidingWindowCounterRateLimiter
+from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -32,10 +32,13 @@ SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
 }
+_RAW_HEADERS = [(name.lower().encode(), value.encode()) for name, value in SECURITY_HEADERS.items()]
 TOO_MANY_REQUESTS = "too many requests from this address"
+BODY_IDLE_S = 60.0
+"""Time without a byte of the body after which a request is regarded as given up."""
+_HEALTH_CHECKS = parse("600/minute")
 _READ_METHODS = ("GET", "HEAD", "OPTIONS")
 _KNOWN_METHODS = (*_READ_METHODS, "POST", "PUT", "PATCH", "DELETE")
-_UNLIMITED_PATHS = ("/healthz", "/metrics")
 _LOG = structlog.get_logger("http")
 
 
@@ -48,7 +51,7 @@ class RequestMiddleware:
 
     def __init__(self, app: ASGIApp, *, reads: str, writes: str, metrics: ServiceMetrics) -> None:
         self._app, self._metrics = app, metrics
-        self._limiter = MovingWindowRateLimiter(MemoryStorage())
+        self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
         self._reads, self._writes = parse(reads), parse(writes)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -62,14 +65,22 @@ class RequestMiddleware:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
-                _add_security_headers(message)
+                headers = list(message["headers"])
+                present = {name for name, _ in headers}
+                headers += [header for header in _RAW_HEADERS if header[0] not in present]
+                message = {**message, "headers": headers}
             await send(message)
 
+        async def receive_in_time() -> Message:
+            with move_on_after(BODY_IDLE_S):
+                return await receive()
+            return {"type": "http.disconnect"}
+
         # The server leaves out the body of responses to HEAD; FastAPI routes of GET do not take HEAD themselves.
-        scope = {**scope, "method": "GET"} if scope["method"] == "HEAD" else scope
+        scope = {**scope, "method": "GET"} if method == "HEAD" else scope
         try:
             if self._is_allowed(scope):
-                await self._app(scope, receive, send_with_headers)
+                await self._app(scope, receive_in_time, send_with_headers)
             else:
                 await error_response(Request(scope), 429, TOO_MANY_REQUESTS, {"Retry-After": "60"})(
                     scope, receive, send_with_headers
@@ -78,13 +89,12 @@ class RequestMiddleware:
             self._log_request(method, scope, status, time.perf_counter() - start)
 
     def _is_allowed(self, scope: Scope) -> bool:
-        if scope["path"] in _UNLIMITED_PATHS:
-            return True
         limit, kind = (self._reads, "read") if scope["method"] in _READ_METHODS else (self._writes, "write")
-        address = (scope.get("client") or ("unknown",))[0]
-        return self._limiter.hit(limit, kind, address)
+        if scope["path"] == "/healthz":  # A reader who exceeds the limit must not make the service look broken.
+            limit, kind = _HEALTH_CHECKS, "health"
+        return self._limiter.hit(limit, client_network(scope), kind)
 
-    def _log_request(self, method: str, scope: Scope, status: int, seconds: float) -> None:
+    def _log_request(self, method: str, scope: Mapping[str, object], status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", "none")  # Not the path, which may contain a private id.
         # Clients can send any method name, and each label value would create a permanent time series.
         method = method if method in _KNOWN_METHODS else "other"
@@ -93,52 +103,66 @@ class RequestMiddleware:
         _LOG.info("request", method=method, route=route, status=status, ms=round(1000 * seconds, 1))
 
 
-def _add_security_headers(message: MutableMapping[str, Any]) -> None:
-    headers = MutableHeaders(scope=message)
-    for name, value in SECURITY_HEADERS.items():
-        headers.setdefault(name, value)
+def client_network(scope: Mapping[str, object]) -> str:
+    """Return what identifies a client: its IPv4 address, or the /64 network of its IPv6 address."""
+    client = scope.get("client")
+    address = str(client[0]) if isinstance(client, list | tuple) and client else ""
+    if ":" not in address:
+        return address
+    try:
+        return str(ipaddress.ip_network(f"{address.partition('%')[0]}/64", strict=False))
+    except ValueError:
+        return address
 
 
 IDLE_TIMEOUT_S = 5.0
-MAX_DRAIN_S = 600.0
+MAX_DRAIN_S = 60.0
 
 
-class DrainRequestBodyMiddleware:
-    """ASGI middleware that reads the rest of the request body before an error response is sent.
+class EarlyResponseMiddleware:
+    """ASGI middleware that sends an error response at once and then reads the rest of the request body.
 
-    Otherwise a client that is still uploading would see a broken connection instead of the response. At most
-    ``max_bytes`` bytes are read, for at most ``MAX_DRAIN_S``; reading stops when the client has sent nothing for
-    ``IDLE_TIMEOUT_S``.
+    A client that is still uploading sees the response if it looks for one; without the reading, other clients
+    would see a broken connection instead. Reading ends after ``MAX_DRAIN_S``, or when the client has sent nothing
+    for ``IDLE_TIMEOUT_S``.
     """
 
-    def __init__(self, app: ASGIApp, *, max_bytes: int) -> None:
-        self._app, self._max_bytes = app, max_bytes
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle a request."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
+        headers = Headers(scope=scope)
         # A client that waits for 100 Continue has sent nothing yet, and sends nothing after an error response.
-        is_sending = "expect" not in Headers(scope=scope)
-        has_more = True
+        has_more = "expect" not in headers and ("transfer-encoding" in headers or "content-length" in headers)
+        is_refused = False
 
         async def receive_tracked() -> Message:
-            nonlocal is_sending, has_more
+            nonlocal has_more
             message = await receive()
-            is_sending = True
             has_more = message["type"] == "http.request" and message.get("more_body", False)
             return message
 
-        async def send_after_drain(message: Message) -> None:
-            if message["type"] == "http.response.start" and message["status"] >= 400:
-                remaining = self._max_bytes
+        async def send_early(message: Message) -> None:
+            nonlocal is_refused
+            if message["type"] == "http.response.start":
+                is_refused = message["status"] >= 400 and has_more
+                if is_refused:
+                    message = {**message, "headers": [*message["headers"], (b"connection", b"close")]}
+                await send(message)
+            elif is_refused and not message.get("more_body", False):
+                await send({**message, "more_body": True})
                 with move_on_after(MAX_DRAIN_S):
-                    while has_more and is_sending and remaining > 0:
+                    while has_more:
                         with move_on_after(IDLE_TIMEOUT_S) as idle:
-                            remaining -= len((await receive_tracked()).get("body", b""))
+                            await receive_tracked()
                         if idle.cancelled_caught:
                             break
-            await send(message)
+                await send({"type": "http.response.body", "body": b"", "more_body": False})
+            else:
+                await send(message)
 
-        await self._app(scope, receive_tracked, send_after_drain)
+        await self._app(scope, receive_tracked, send_early)

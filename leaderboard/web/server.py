@@ -5,20 +5,28 @@ from __future__ import annotations
 import signal
 import socket
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import structlog
 import uvicorn
+from prometheus_client import start_http_server
 
+from leaderboard.db.engine import DATABASE_UNAVAILABLE
 from leaderboard.redact import without_password
-from leaderboard.scoring.dask_backend import check_dask
-from leaderboard.scoring.supervisor import WorkerSupervisor
-from leaderboard.service import open_service
+from leaderboard.service import Service, open_service
 from leaderboard.settings import Settings
+from leaderboard.storage.retention import delete_archives, expired_archives
 from leaderboard.web.app import make_app
+from leaderboard.web.connections import limited_protocol, new_connection_counts
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
 
 SHUTDOWN_GRACE_S = 10
+RETENTION_INTERVAL_S = 3600.0
+_SWITCH_INTERVAL_S = 0.0005
+"""Interval of switches between threads; with Python's 5 ms, a response waits for several of them."""
 _LOG = structlog.get_logger("server")
 
 
@@ -27,8 +35,6 @@ def serve(settings: Settings) -> None:
 
     Open requests have ``SHUTDOWN_GRACE_S`` seconds. Raises ``InputError`` if the service cannot be started.
     """
-    if settings.dask_scheduler:
-        check_dask()
     with open_service(settings) as service, listening_socket(settings) as listener:
         config = uvicorn.Config(
             make_app(service),
@@ -37,11 +43,16 @@ def serve(settings: Settings) -> None:
             log_level="warning",
             timeout_graceful_shutdown=SHUTDOWN_GRACE_S,
             server_header=False,
+            # Only a proxy, which a public URL tells of, may state the address of the client.
+            proxy_headers=bool(settings.public_url),
+            http=limited_protocol(new_connection_counts(settings), settings.head_seconds),
         )
         host, port = listener.getsockname()[:2]
         url_host = f"[{host}]" if ":" in host else host
         print(f"http://{url_host}:{port}", file=sys.stderr, flush=True)
         server = uvicorn.Server(config)
+        # While pages are rendered in threads, the event loop gets the interpreter back after this time.
+        sys.setswitchinterval(_SWITCH_INTERVAL_S)
 
         def stop(*_: object) -> None:
             server.should_exit = True
@@ -52,9 +63,60 @@ def serve(settings: Settings) -> None:
         details = {"version": software_version(), "dataset": service.folder.digest, "scorers": settings.workers}
         details["hidden_truth"] = settings.hidden_truth
         _LOG.info("serving", database=without_password(settings.database_url), **details)
-        with WorkerSupervisor(settings, settings.workers):
+        with service.supervisor, metrics_server(service), archive_retention(service):
             server.run(sockets=[listener])
         _LOG.info("stopped")
+
+
+@contextmanager
+def metrics_server(service: Service) -> Iterator[None]:
+    """Serve the metrics on a port of their own, which only this machine can reach, if the settings name one.
+
+    Raises ``InputError`` if the port is in use.
+    """
+    port = service.settings.metrics_port
+    if not port:
+        yield
+        return
+    try:
+        server, thread = start_http_server(port, "127.0.0.1", service.metrics.registry)
+    except OSError as error:
+        raise InputError(f"127.0.0.1:{port}: cannot listen on this port for metrics: {error.strerror}") from None
+    try:
+        yield
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+@contextmanager
+def archive_retention(service: Service) -> Iterator[None]:
+    """Delete expired archives now and every hour in a thread, if the settings say after how many days."""
+    settings, stop = service.settings, threading.Event()
+
+    def delete_expired() -> None:
+        while True:
+            try:
+                expired = expired_archives(
+                    service.database, service.folder.configs, settings.archive_days, settings.archive_ranks
+                )
+                delete_archives(service.database, service.archives, expired)
+                _LOG.info("expired archives deleted", archives=len(expired))
+            except (*DATABASE_UNAVAILABLE, OSError) as error:
+                _LOG.warning("expired archives not deleted", error=type(error).__name__)
+            if stop.wait(RETENTION_INTERVAL_S):
+                return
+
+    thread = threading.Thread(target=delete_expired, name="retention", daemon=True)
+    if settings.archive_days:
+        thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        if thread.is_alive():
+            thread.join()
 
 
 def listening_socket(settings: Settings) -> socket.socket:

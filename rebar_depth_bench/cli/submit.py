@@ -31,6 +31,15 @@ _MAX_TOKEN_CHARACTERS = 10_000
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     add_archive(parser)
+    add_leaderboard(parser)
+    waiting = parser.add_mutually_exclusive_group()
+    waiting.add_argument("--no-wait", action="store_true", help="do not wait until the submission is scored")
+    add_seconds(waiting, "--wait", WAIT_S, "time limit on waiting until the submission is scored")
+    add_output_file(parser, "--json", "write the result as JSON")
+
+
+def add_leaderboard(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that name the leaderboard and the token."""
     parser.add_argument("--url", required=True, help="URL of the leaderboard")
     parser.add_argument(
         "--token-file",
@@ -38,10 +47,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help=f"file with the token (default: the environment variable {TOKEN_VARIABLE}, or a prompt)",
     )
-    waiting = parser.add_mutually_exclusive_group()
-    waiting.add_argument("--no-wait", action="store_true", help="do not wait until the submission is scored")
-    add_seconds(waiting, "--wait", WAIT_S, "time limit on waiting until the submission is scored")
-    add_output_file(parser, "--json", "write the result as JSON")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -50,7 +55,7 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(
             "--no-wait and --json are both given, expected at most one: without waiting there is no result"
         )
-    with LeaderboardClient(options.url, _read_token(options.token_file)) as leaderboard, ProgressBars() as bars:
+    with LeaderboardClient(options.url, read_token(options.token_file)) as leaderboard, ProgressBars() as bars:
         accepted = leaderboard.submit(Path(options.archive), bars.update)
         print(accepted.url, file=sys.stderr, flush=True)
         if options.no_wait:
@@ -84,7 +89,7 @@ def _print_disclosed(result: DisclosedResult) -> None:
         print(f"{printable(config)}: rank error {error}, coverage {coverage} %{note}")
 
 
-def _read_token(file: Path | None) -> str:
+def read_token(file: Path | None) -> str:
     """Return the token from ``file``, the environment or a prompt.
 
     It is never a command-line argument, which other users of the machine could read. Raises ``InputError`` if

@@ -50,6 +50,16 @@ NUMBER_TITLES: Mapping[str, tuple[str, int, float]] = _titles()
 """Title, number of decimals and factor from value to display, by name of the number."""
 
 
+COMPARISON_NOTE = (
+    "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
+    f"({BLOCK_VIEWS} steps of the protocol); none with fewer than {MIN_VIEWS} views. B is called better "
+    "or worse if the interval excludes zero, which happens by chance in about one of twenty comparisons. "
+    "Errors of valid predictions are not compared if either submission has a coverage below 95 %, a view "
+    "without prediction or an overflow; the rank error counts every scored pixel."
+)
+"""Explanation of the numbers of a comparison."""
+
+
 def print_comparison(comparison: Comparison, console: Console) -> None:
     """Print a table per config: both submissions, their paired difference, its interval and the verdict."""
     first, other = (printable(archive.method) for archive in comparison.provenance.archives)
@@ -57,18 +67,10 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
     console.print(plain_text(_provenance(comparison), style="dim"))
     for config, rows in comparison.configs.items():
         console.print()
-        console.print(plain_text(f"{printable(config)}, {_views_note(rows)}", style="italic"))
+        console.print(plain_text(f"{printable(config)}, {views_note(rows)}", style="italic"))
         console.print(_comparison_table(rows))
     console.print()
-    console.print(
-        plain_text(
-            "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
-            f"({BLOCK_VIEWS} steps of the protocol); none with fewer than {MIN_VIEWS} views. B is called better "
-            "or worse if the interval excludes zero, which happens by chance in about one of twenty comparisons. "
-            "Errors of valid predictions are not compared if either submission has a coverage below 95 %, a view "
-            "without prediction or an overflow; the rank error counts every scored pixel."
-        )
-    )
+    console.print(plain_text(COMPARISON_NOTE))
 
 
 def comparison_csv(comparisons: list[Comparison]) -> str:
@@ -90,7 +92,8 @@ def _provenance(comparison: Comparison) -> str:
     )
 
 
-def _views_note(rows: Sequence[Difference]) -> str:
+def views_note(rows: Sequence[Difference]) -> str:
+    """Return the number of views that the differences are computed on, as text."""
     counts = sorted({row.views for row in rows})
     if len(counts) == 1:
         return f"{counts[0]} views"
@@ -104,11 +107,12 @@ def _comparison_table(rows: Sequence[Difference]) -> RichTable:
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("B is")
     for row in rows:
-        table.add_row(*map(plain_text, _comparison_cells(row)))
+        table.add_row(*map(plain_text, comparison_cells(row)))
     return table
 
 
-def _comparison_cells(row: Difference) -> list[str]:
+def comparison_cells(row: Difference) -> list[str]:
+    """Return title, both values, difference, interval and verdict as text."""
     title, decimals, factor = NUMBER_TITLES[row.name]
     first, other = (_number(value, decimals, factor) for value in (row.first, row.other))
     change = _signed(row.difference, decimals, factor)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.resources import files
 
 from pydantic import TypeAdapter
@@ -105,8 +106,9 @@ OTHER_OPTICS_NOTE = (
 )
 
 
+@lru_cache(maxsize=1)
 def load_published() -> PublishedNumbers:
-    """Return the published numbers from the package's ``published.json``."""
+    """Return the published numbers from the package's ``published.json``, which is read once."""
     content = json.loads(files("rebar_depth_bench.reporting").joinpath("published.json").read_text("utf-8"))
     values = {
         "title": content.pop("title"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from dataclasses import dataclass
 from typing import Annotated, Any
 from urllib.parse import urlsplit
@@ -43,6 +44,17 @@ _Scale = Annotated[
     float, Expected("a finite number of metres per unit above 0", lambda value: 0 < value < math.inf)
 ]
 _Runtime = Annotated[dict[Any, Any] | str | int | float, Expected("an object, text or a number")]
+_Parameters = Annotated[
+    int | float | str,
+    Expected(
+        "a finite number from 0 or printable text of at most 100 characters",
+        lambda value: (
+            0 < len(value.strip()) <= 100 and value.isprintable()
+            if isinstance(value, str)
+            else 0 <= value < math.inf
+        ),
+    ),
+]
 
 
 INPUTS = ("rgb", "rgb+K", "stereo", "multi-view", "lidar")
@@ -69,7 +81,21 @@ NOT_DECLARED = Declaration()
 """Declaration of a submission that declares nothing."""
 
 
-class SubmissionMeta(StrictModel):
+class MethodDetails(StrictModel):
+    """What a submitter says about a method, without effect on scores; None where it is not given.
+
+    ``parameters`` is the number of learned parameters, or text.
+    """
+
+    description: _Description | None = None
+    url: _HttpUrl | None = None
+    code_url: _HttpUrl | None = None
+    licence: Annotated[str, text(100)] | None = None
+    training_data: Annotated[str, text(1000)] | None = None
+    parameters: _Parameters | None = None
+
+
+class SubmissionMeta(MethodDetails):
     """Values declared in ``submission.json``; None where a key is absent. Unknown keys are ignored.
 
     ``inputs`` and ``uses_ground_truth`` are those of ``Declaration``; ``uses_intrinsics``, which older archives
@@ -80,8 +106,6 @@ class SubmissionMeta(StrictModel):
     model_config = ConfigDict(extra="ignore")
 
     method: Annotated[str, text(MAX_METHOD_CHARACTERS, "a printable name")]
-    description: _Description | None = None
-    url: _HttpUrl | None = None
     inputs: Annotated[str, one_of(*INPUTS)] | None = None
     uses_ground_truth: Flag | None = None
     uses_intrinsics: Flag | None = None
@@ -92,6 +116,14 @@ class SubmissionMeta(StrictModel):
     def declaration(self) -> Declaration:
         """What the submission declares."""
         return Declaration(self.inputs, self.uses_ground_truth)
+
+    @property
+    def seconds_per_view(self) -> float | None:
+        """Median runtime per view in seconds, if ``runtime`` is a number or an object with the key ``seconds``."""
+        seconds = self.runtime.get("seconds") if isinstance(self.runtime, dict) else self.runtime
+        found = list(seconds.values()) if isinstance(seconds, dict) else [seconds]
+        values = [value for value in found if isinstance(value, int | float) and 0 <= value < math.inf]
+        return statistics.median(map(float, values)) if values and len(values) == len(found) else None
 
 
 def parse_metadata(data: bytes) -> tuple[SubmissionMeta | None, list[Problem]]:

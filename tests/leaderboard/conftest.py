@@ -17,7 +17,7 @@ from rebar_depth_bench import SubmissionWriter, load
 from tests.leaderboard import postgres as postgres_server
 from tests.leaderboard import serving
 from tests.leaderboard.postgres import Postgres, RunPostgres
-from tests.leaderboard.serving import RunScorer, RunServer, Server, make_token
+from tests.leaderboard.serving import RunScorer, RunServer, Server, distinct_archive, make_token
 
 HOSTILE = "<script>alert(1)</script>\"'&amp;{{ 7 * 7 }}"
 DESCRIPTION = "first line\n<b>second</b>\u202egnp\x1b[31m"
@@ -162,7 +162,10 @@ def waiting(
         assert server.wait_until_ended(scored)["status"] == "scored"
     with running_server(tiny_root, state, workers=0, quota=5, max_upload=2_000_000, **common) as server:
         ids = {"failed": failed, "scored": scored}
-        ids |= {name: server.submit_accepted(archive, token) for name in ("next", "later")}
+        ids |= {
+            name: server.submit_accepted(distinct_archive(archive, number), token)
+            for number, name in enumerate(("next", "later"))
+        }
         yield SharedServer(server, token, ids)
 
 

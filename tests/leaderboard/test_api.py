@@ -20,7 +20,7 @@ from rebar_depth_bench import load
 from rebar_depth_bench.errors import Problem
 from tests.leaderboard.conftest import SharedServer, WriteArchive, filled_board
 from tests.leaderboard.postgres import Postgres
-from tests.leaderboard.serving import RunServer, Server
+from tests.leaderboard.serving import RunServer, Server, distinct_archive
 
 API = "/api/v1/submissions"
 QUOTA = 6
@@ -177,11 +177,12 @@ def test_rejected_archive_lists_problems_and_keeps_quota(
 def test_quota_holds_for_concurrent_uploads_and_deletions(private_server: Server, small_archive: Path) -> None:
     token, other_token = private_server.token("eager"), private_server.token("patient")
     with ThreadPoolExecutor(10) as pool:
-        responses = list(pool.map(lambda _: private_server.submit(small_archive, token), range(10)))
+        archives = [distinct_archive(small_archive, number) for number in range(10)]
+        responses = list(pool.map(lambda archive: private_server.submit(archive, token), archives))
     accepted = [response.json()["id"] for response in responses if response.status_code == 202]
     assert sorted(response.status_code for response in responses) == [202] * QUOTA + [429] * 4
     assert call(private_server, "DELETE", f"{API}/{accepted[0]}", token).status_code == 204
-    rejected = private_server.submit(small_archive, token)
+    rejected = private_server.submit(distinct_archive(small_archive, 10), token)
     assert rejected.status_code == 429
     assert rejected.json()["detail"].startswith(f"the quota of {QUOTA} submissions per day (UTC) is used up")
     assert private_server.submit(small_archive, other_token).status_code == 202
@@ -200,7 +201,8 @@ def test_token_states_quota_and_limits(private_server: Server, small_archive: Pa
     private_server.submit_accepted(small_archive, token)
     after = call(private_server, "GET", "/api/v1/token", token).json()
     assert (before["name"], before["quota"], before["quota_left"]) == ("curious about limits", QUOTA, QUOTA)
-    assert after == before | {"quota_left": QUOTA - 1}
+    used = {"quota_left": QUOTA - 1, "quota_bytes_left": before["quota_bytes"] - small_archive.stat().st_size}
+    assert after == before | used
     assert before["write_rate_limit"] == "1000/minute"
     assert before["max_upload_bytes"] > 0
 
@@ -307,7 +309,7 @@ def test_all_responses_have_security_headers(board: SharedServer) -> None:
         assert "server" not in headers
 
 
-HEAD_PATHS = ("/", "/healthz", "/metrics", "/how-to-submit", "/static/page.css", "/openapi.json")
+HEAD_PATHS = ("/", "/healthz", "/how-to-submit", "/static/page.css", "/openapi.json")
 
 
 @pytest.mark.parametrize(

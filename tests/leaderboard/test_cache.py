@@ -3,35 +3,32 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 import json
 import random
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-from anyio import CapacityLimiter
 from fastapi import FastAPI
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import Database
 from leaderboard.db.jobs import Outcome
-from leaderboard.db.rankings import (
-    LeaderboardEntry,
-    RankingVersion,
-    leaderboard_entries,
-    ranking_version,
-    ranking_versions,
-)
-from leaderboard.db.submissions import Upload
+from leaderboard.db.models import increment_content_version
+from leaderboard.db.submissions import Quota, Upload
 from leaderboard.db.tokens import create_token, find_token
+from leaderboard.db.versions import VersionReader
 from leaderboard.service import open_service
 from leaderboard.settings import read_settings
+from leaderboard.web import cache
 from leaderboard.web.app import make_app
-from leaderboard.web.cache import CachedBody, CacheState, CoalescedRead, RenderedBody, ResponseCache, get_or_render
+from leaderboard.web.cache import CacheMiddleware, SharedVersion
 from rebar_depth_bench.submission import SubmissionMeta
 from tests.bench.reporting.results import result, scored_view
 from tests.synthetic_dataset import scale_errors, write_dataset
@@ -51,8 +48,8 @@ def add_scored_submission(
     record = find_token(database, token)
     assert record is not None
     submission_id = submissions.new_id()
-    upload = Upload(SubmissionMeta(method=method), "0" * 64, 1, "sha256:0")
-    submissions.accept(database, submission_id, record, upload, 1000, public)
+    upload = Upload(SubmissionMeta(method=method), submission_id * 2, 1, "sha256:0")
+    submissions.accept(database, submission_id, record, upload, Quota(1000, 1 << 40), public)
     finish_scoring(database, submission_id, method, error)
     return submission_id
 
@@ -92,15 +89,19 @@ def apps(data: Path, tmp_path: Path) -> Iterator[list[FastAPI]]:
         yield [make_app(stack.enter_context(open_service(settings))) for _ in range(2)]
 
 
-def get_response(app: FastAPI, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+def get_response(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
     """Call an ASGI application directly; return status, headers and body."""
-    path, _, query = address.partition("?")
-    messages: list[dict] = []
+    return asyncio.run(call(app, address, **headers))
 
-    async def receive() -> dict:
+
+async def call(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    path, _, query = address.partition("?")
+    messages: list[Message] = []
+
+    async def receive() -> Message:
         return {"type": "http.request", "body": b"", "more_body": False}
 
-    async def send(message: dict) -> None:
+    async def send(message: Message) -> None:
         messages.append(message)
 
     scope = {
@@ -117,40 +118,39 @@ def get_response(app: FastAPI, address: str, **headers: str) -> tuple[int, dict[
         "client": ("127.0.0.1", 1),
         "server": ("localhost", 80),
     }
-    asyncio.run(app(scope, receive, send))  # type: ignore[arg-type]
+    await app(scope, receive, send)
     response_headers = {name.decode(): value.decode() for name, value in messages[0]["headers"]}
     return messages[0]["status"], response_headers, b"".join(message.get("body", b"") for message in messages[1:])
 
 
-def test_ranking_versions_match_rows_after_random_changes(database: Database, token: str) -> None:
-    rng = random.Random(3)
-    ids: list[str] = []
-    rows_by_version: dict[tuple[str, RankingVersion], list[LeaderboardEntry]] = {}
-    for step in range(40):
-        action = rng.choice(["add", "add", "hide", "show", "remove"]) if ids else "add"
-        if action == "add":
-            ids.append(
-                add_scored_submission(database, token, f"m{step}", rng.uniform(0.5, 2), public=rng.random() < 0.7)
-            )
-        elif action == "remove":
-            submissions.remove(database, ids.pop(rng.randrange(len(ids))))
-        else:
-            submissions.publish(database, rng.choice(ids), action == "show")
-        versions = ranking_versions(database)
-        for config in CONFIGS:
-            rows = leaderboard_entries(database, config)
-            assert versions.get(config, RankingVersion()) == ranking_version(rows)
-            assert rows_by_version.setdefault((config, ranking_version(rows)), rows) == rows
+def content_version(database: Database) -> int:
+    with closing(VersionReader(database)) as versions:
+        return versions.read()
 
 
-def test_rescored_row_has_new_ranking_version(database: Database, token: str) -> None:
+def test_every_change_of_shown_content_increments_the_version(database: Database, token: str) -> None:
+    def version_after(change: Callable[[], object]) -> int:
+        before = content_version(database)
+        change()
+        return content_version(database) - before
+
     submission_id = add_scored_submission(database, token, "m", 1.0)
-    before = ranking_versions(database)["lattice"]
+    assert version_after(lambda: add_scored_submission(database, token, "n", 1.0)) > 0
+    assert version_after(lambda: submissions.publish(database, submission_id, False)) > 0
+    assert version_after(lambda: submissions.change(database, submission_id, {"description": "x"})) > 0
+    assert version_after(lambda: jobs.requeue_stale_submissions(database, "sha256:1")) > 0
+    assert version_after(lambda: finish_scoring(database, submission_id, "m", 2.0)) > 0
+    assert version_after(lambda: submissions.remove(database, submission_id)) > 0
+
+
+def test_claims_and_renewals_keep_the_version(database: Database, token: str) -> None:
+    submission_id = add_scored_submission(database, token, "m", 1.0)
     jobs.requeue_stale_submissions(database, "sha256:1")
-    finish_scoring(database, submission_id, "m", 2.0)
-    after = ranking_versions(database)["lattice"]
-    assert after.ids == before.ids
-    assert after != before
+    before = content_version(database)
+    assert jobs.claim(database, "scorer", 60) == submission_id
+    assert jobs.renew(database, submission_id, "scorer", 60)
+    jobs.release(database, submission_id, "scorer")
+    assert content_version(database) == before
 
 
 @pytest.mark.parametrize("address", ["/", BOARD, API, CSV])
@@ -168,6 +168,16 @@ def test_change_by_one_process_is_visible_in_other(
     assert all(b"first method" not in get_response(app, address)[2] for app in apps)
 
 
+@pytest.mark.parametrize("address", ["/", BOARD, API, "/openapi.json"])
+def test_responses_are_compressed_once(apps: list[FastAPI], database: Database, token: str, address: str) -> None:
+    add_scored_submission(database, token, "m", 2.0)
+    plain = get_response(apps[0], address)[2]
+    for _ in range(2):
+        _, headers, body = get_response(apps[0], address, accept_encoding="gzip")
+        assert headers["content-encoding"] == "gzip"
+        assert gzip.decompress(body) == plain
+
+
 @pytest.mark.parametrize("address", ["/", BOARD, API, CSV, "/submissions/{}"])
 def test_etag_returns_304_until_leaderboard_changes(
     apps: list[FastAPI], database: Database, token: str, address: str
@@ -177,7 +187,7 @@ def test_etag_returns_304_until_leaderboard_changes(
     assert (status, headers["cache-control"]) == (200, "no-cache")
     for app in apps:
         status, repeated_headers, repeated_body = get_response(
-            app, address, if_none_match=f'"x", W/{headers["etag"]}'
+            app, address, if_none_match=f'"x", {headers["etag"]}'
         )
         assert (status, repeated_body, repeated_headers["etag"]) == (304, b"", headers["etag"])
         assert "content-security-policy" in repeated_headers
@@ -214,45 +224,137 @@ def test_cache_separates_urls_and_sort_orders(apps: list[FastAPI], database: Dat
     assert [get_response(apps[0], address)[2] for address in addresses] == bodies
 
 
-def render(name: str, content: bytes) -> RenderedBody:
-    return (name,), content
+@dataclass
+class Renderer:
+    """ASGI application whose responses state the path and how often it was called."""
+
+    cache_control: bytes = b"no-cache"
+    status: int = 200
+    size: int = 1
+    delay_s: float = 0.0
+    calls: list[str] = field(default_factory=list)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        self.calls.append(scope["path"])
+        await asyncio.sleep(self.delay_s)
+        headers = [(b"cache-control", self.cache_control), (b"content-type", b"text/plain")]
+        await send({"type": "http.response.start", "status": self.status, "headers": headers})
+        body = f"{scope['path']} {len(self.calls)} ".encode() * self.size
+        await send({"type": "http.response.body", "body": body, "more_body": True})
+        await send({"type": "http.response.body", "body": b"end"})
 
 
-def test_cache_evicts_least_recently_used_bodies() -> None:
-    cache = ResponseCache(100)
-    for name in "abc":
-        cache.get((name,), partial(render, name, name.encode() * 40))
-        cache.get(("a",), lambda: render("a", b"a" * 40))
-    assert [bool(cache.lookup((name,))) for name in "abc"] == [True, False, True]
-    cache.get(("large",), lambda: render("large", bytes(101)))
-    assert not any(cache.lookup((name,)) for name in ("a", "b", "c", "large"))
+@pytest.fixture
+def versions(database: Database) -> Iterator[VersionReader]:
+    with closing(VersionReader(database)) as reader:
+        yield reader
 
 
-def test_body_is_cached_under_key_of_rendering() -> None:
-    cache = ResponseCache()
-    assert cache.get(("old",), lambda: render("new", b"x")).content == b"x"
-    assert cache.lookup(("old",)) is None
-    assert cache.lookup(("new",)) is not None
+def test_response_is_rendered_once_per_url_host_and_version(versions: VersionReader, database: Database) -> None:
+    renderer = Renderer()
+    app = CacheMiddleware(renderer, versions=versions, identity="")
+    for address in ("/a", "/a", "/b", "/a?x=1", "/a"):
+        get_response(app, address)
+    assert renderer.calls == ["/a", "/b", "/a"]
+    assert get_response(app, "/a")[2] == b"/a 1 end"
+    get_response(app, "/a", host="other.example")
+    assert len(renderer.calls) == 4, "pages may contain the address of the service"
+    with database.write() as session:
+        increment_content_version(session)
+    assert get_response(app, "/a")[2] == b"/a 5 end"
 
 
-def test_concurrent_requests_render_once() -> None:
-    cache, times = ResponseCache(), []
-
-    def slow_render() -> RenderedBody:
-        times.append(time.monotonic())
-        time.sleep(0.05)
-        return render("a", b"x")
-
-    async def request_all() -> list[CachedBody]:
-        cache_state = CacheState(CoalescedRead(dict), cache, CapacityLimiter(1))
-        return await asyncio.gather(*(get_or_render(cache_state, ("a",), slow_render) for _ in range(32)))
-
-    bodies = asyncio.run(request_all())
-    assert len(times) == 1
-    assert len({id(body) for body in bodies}) == 1
+@pytest.mark.parametrize(("cache_control", "status"), [(b"no-store", 200), (b"no-cache", 404)])
+def test_other_responses_are_passed_on(versions: VersionReader, cache_control: bytes, status: int) -> None:
+    renderer = Renderer(cache_control, status)
+    app = CacheMiddleware(renderer, versions=versions, identity="")
+    answers = [get_response(app, "/a") for _ in range(2)]
+    assert [(found, body) for found, _, body in answers] == [(status, b"/a 1 end"), (status, b"/a 2 end")]
+    assert all("etag" not in headers for _, headers, _ in answers)
 
 
-def test_coalesced_read_is_not_older_than_request() -> None:
+def test_request_with_token_is_passed_on(versions: VersionReader) -> None:
+    app = CacheMiddleware(Renderer(), versions=versions, identity="")
+    get_response(app, "/a")
+    assert get_response(app, "/a", authorization="Bearer x")[2] == b"/a 2 end"
+
+
+def test_full_cache_is_emptied_and_stays_correct(versions: VersionReader) -> None:
+    renderer = Renderer(size=20)
+    app = CacheMiddleware(renderer, versions=versions, identity="", max_bytes=400)
+    for name in "aabcab":
+        assert get_response(app, f"/{name}")[2].startswith(f"/{name} ".encode())
+    assert renderer.calls[:3] == ["/a", "/b", "/c"]
+    assert len(renderer.calls) > 3, "the limit holds fewer than three responses"
+
+
+def test_compressed_response_holds_the_same_content(versions: VersionReader) -> None:
+    app = CacheMiddleware(Renderer(size=500), versions=versions, identity="")
+    _, headers, body = get_response(app, "/a")
+    _, compressed_headers, compressed = get_response(app, "/a", accept_encoding="br, gzip")
+    assert (headers["vary"], headers["content-length"]) == ("Accept-Encoding", str(len(body)))
+    assert compressed_headers["content-encoding"] == "gzip"
+    assert int(compressed_headers["content-length"]) == len(compressed) < len(body) / 10
+    assert gzip.decompress(compressed) == body
+
+
+def test_concurrent_requests_render_once(versions: VersionReader) -> None:
+    renderer = Renderer(delay_s=0.05)
+    app = CacheMiddleware(renderer, versions=versions, identity="")
+
+    async def request_all() -> list[bytes]:
+        return [body for _, _, body in await asyncio.gather(*(call(app, "/a") for _ in range(32)))]
+
+    assert asyncio.run(request_all()) == [b"/a 1 end"] * 32
+
+
+@pytest.mark.parametrize(("since_s", "others"), [(0.0, b"/a 1 end"), (10.0, b"/a 2 end")])
+def test_readers_get_the_previous_response_while_one_renders(
+    versions: VersionReader, database: Database, monkeypatch: pytest.MonkeyPatch, since_s: float, others: bytes
+) -> None:
+    renderer = Renderer()
+    app = CacheMiddleware(renderer, versions=versions, identity="")
+    assert get_response(app, "/a")[2] == b"/a 1 end"
+    with database.write() as session:
+        increment_content_version(session)
+    monkeypatch.setattr(cache, "MAX_OUTDATED_S", cache.MAX_OUTDATED_S - since_s)
+    renderer.delay_s = 0.2
+
+    async def request_all() -> list[bytes]:
+        first = asyncio.create_task(call(app, "/a"))
+        await asyncio.sleep(0.05)
+        rest = await asyncio.gather(*(call(app, "/a") for _ in range(5)))
+        return [(await first)[2], *(body for _, _, body in rest)]
+
+    assert asyncio.run(request_all()) == [b"/a 2 end", *[others] * 5]
+    assert get_response(app, "/a")[2] == b"/a 2 end"
+
+
+def test_data_version_tells_of_commits_by_other_processes(versions: VersionReader, database: Database) -> None:
+    assert versions.unchanged() is None
+    before = versions.read()
+    assert versions.unchanged() == before
+    with database.write() as session:
+        increment_content_version(session)
+    assert versions.unchanged() is None
+    assert versions.read() == before + 1
+
+
+class Read:
+    """Version reader that calls a function for every read."""
+
+    def __init__(self, read: Callable[[], int]) -> None:
+        self.read = read
+
+    def unchanged(self) -> None:
+        return None
+
+
+def shared_version(read: Callable[[], int]) -> SharedVersion:
+    return SharedVersion(Read(read))  # type: ignore[arg-type]
+
+
+def test_shared_read_is_not_older_than_request() -> None:
     reads, lock = [0], threading.Lock()
 
     def read() -> int:
@@ -262,20 +364,20 @@ def test_coalesced_read_is_not_older_than_request() -> None:
         time.sleep(0.01)
         return number
 
-    async def is_fresh(shared: CoalescedRead[int], wait_s: float) -> bool:
+    async def is_fresh(shared: SharedVersion, wait_s: float) -> bool:
         await asyncio.sleep(wait_s)
         before = reads[0]
         return await shared.get() > before
 
     async def request_all() -> list[bool]:
-        shared, rng = CoalescedRead(read), random.Random(5)
+        shared, rng = shared_version(read), random.Random(5)
         return await asyncio.gather(*(is_fresh(shared, rng.uniform(0, 0.1)) for _ in range(200)))
 
     assert all(asyncio.run(request_all()))
     assert reads[0] < 200
 
 
-def test_failed_coalesced_read_raises_for_all_and_is_retried() -> None:
+def test_failed_shared_read_raises_for_all_and_is_retried() -> None:
     failures = [OSError("away")]
 
     def read() -> int:
@@ -284,7 +386,7 @@ def test_failed_coalesced_read_raises_for_all_and_is_retried() -> None:
         return 7
 
     async def ask_both() -> tuple[Sequence[BaseException | int], int]:
-        shared = CoalescedRead(read)
+        shared = shared_version(read)
         first = await asyncio.gather(shared.get(), shared.get(), return_exceptions=True)
         return first, await shared.get()
 
@@ -293,13 +395,13 @@ def test_failed_coalesced_read_raises_for_all_and_is_retried() -> None:
     assert second == 7
 
 
-def test_cancelled_request_does_not_cancel_coalesced_read() -> None:
+def test_cancelled_request_does_not_cancel_shared_read() -> None:
     def read() -> int:
         time.sleep(0.05)
         return 7
 
     async def cancel_one() -> int:
-        shared = CoalescedRead(read)
+        shared = shared_version(read)
         cancelled, waiting = asyncio.create_task(shared.get()), asyncio.create_task(shared.get())
         await asyncio.sleep(0.01)
         cancelled.cancel()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -21,7 +22,7 @@ import pytest
 from leaderboard.db.jobs import MAX_ATTEMPTS
 from tests.leaderboard.conftest import WriteArchive
 from tests.leaderboard.postgres import Postgres, RunPostgres
-from tests.leaderboard.serving import SCORER, SCORING, RunServer, Server, make_token
+from tests.leaderboard.serving import SCORER, SCORING, RunServer, Server, distinct_archive, make_token
 from tests.processes import descendants, is_running, processes_below, wait_until
 from tests.requirements import Repetitions
 
@@ -49,10 +50,12 @@ class Uploads:
     begun: list[str] = field(default_factory=list)
     answers: list[int] = field(default_factory=list)
     ended: threading.Event = field(default_factory=threading.Event)
+    numbers: Iterator[int] = field(default_factory=itertools.count)
 
     def run(self) -> None:
         while not self.ended.is_set():
-            with self.archive.open("rb") as stream, suppress(httpx2.HTTPError):
+            archive = distinct_archive(self.archive, next(self.numbers))
+            with archive.open("rb") as stream, suppress(httpx2.HTTPError):
                 self.begun.append(self.address())
                 response = httpx2.post(
                     f"{self.address()}/api/v1/submissions",
@@ -63,6 +66,7 @@ class Uploads:
                 self.answers.append(response.status_code)
                 if response.status_code == 202:
                     self.accepted.append(response.json()["id"])
+            archive.unlink()
             self.ended.wait(REST_S)
 
     def wait_for(self, more: int) -> None:
@@ -150,7 +154,7 @@ def service(
 def test_accepted_submissions_are_scored_once(
     service: Service, write_archive: WriteArchive, repetitions: Repetitions
 ) -> None:
-    num_kills = repetitions(3, 25)
+    num_kills = repetitions(3, 100)
     archive = write_archive("chaos", configs=("lattice-orbit",))
     uploads = Uploads(archive, make_token(service.state, "alice", service.db), service.url)
     threads = [threading.Thread(target=uploads.run) for _ in range(UPLOADERS)]
@@ -177,8 +181,10 @@ def test_accepted_submissions_are_scored_once(
             ]
             failed.append(submission_id)
             continue
-        expected = expected or submission["result"]
-        assert submission["result"] == expected
+        result = submission["result"]
+        assert result["submission"].pop("sha256") == submission["archive_sha256"]
+        expected = expected or result
+        assert result == expected
     assert len(failed) <= len(uploads.accepted) / 10
     assert len(uploads.accepted) >= num_kills // 2
     assert set(uploads.answers) <= {202, 503}

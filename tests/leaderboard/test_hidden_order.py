@@ -12,8 +12,8 @@ import pytest
 from fastapi import FastAPI
 
 from leaderboard.db.engine import Database
-from leaderboard.db.models import ErrorMapModel, LeaderboardRowModel, ResultModel, SubmissionModel
-from leaderboard.db.rankings import error_map_views, leaderboard_entries, ranks
+from leaderboard.db.models import LeaderboardRowModel, PictureImageModel, PictureModel, ResultModel
+from leaderboard.db.rankings import picture_facts, read_ranking
 from leaderboard.db.submissions import result_json
 from leaderboard.db.tokens import create_token
 from leaderboard.service import open_service
@@ -66,16 +66,13 @@ def test_order_and_ranks_use_rounded_errors(database: Database, hidden: Database
     exact = [0.0625, 0.0624, 0.0626, 0.06249, 0.0635, *(round(rng.uniform(0.06, 0.065), 12) for _ in range(15))]
     ids = [add_scored_submission(database, token, f"m{k}", 1.0) for k in range(len(exact))]
     set_errors(database, dict(zip(ids, exact, strict=True)))
-    entries = leaderboard_entries(hidden, "lattice")
+    entries = read_ranking(hidden, "lattice").entries
     shown = [json.loads(entry.table_json)["rank_error"] for entry in entries]
     assert shown == sorted(round(error, 3) for error in exact)
     assert [entry.rank for entry in entries] == [1 + sum(other < error for other in shown) for error in shown]
     ages = [(error, entry.created_at) for error, entry in zip(shown, entries, strict=True)]
     assert ages == sorted(ages), "rows with equal errors are in order of age, not of their exact errors"
-    with database.read() as session:
-        records = [session.get_one(SubmissionModel, entry.submission_id) for entry in entries]
-    assert [ranks(hidden, record)["lattice"] for record in records] == [entry.rank for entry in entries]
-    assert [entry.rank for entry in leaderboard_entries(database, "lattice")] == list(range(1, len(exact) + 1))
+    assert [entry.rank for entry in read_ranking(database, "lattice").entries] == list(range(1, len(exact) + 1))
 
 
 def test_option_changes_responses_of_the_same_database_and_their_etags(
@@ -97,12 +94,16 @@ def test_option_changes_responses_of_the_same_database_and_their_etags(
     assert json.loads(disclosed)["hidden_truth"] is True
 
 
-def test_stored_error_maps_are_not_returned(apps: list[FastAPI], database: Database, hidden: Database) -> None:
+def test_stored_pictures_are_not_returned(apps: list[FastAPI], database: Database, hidden: Database) -> None:
     submission_id = add_scored_submission(database, create_token(database, "alice"), "m", 1.0)
     with database.write() as session:
-        session.add(ErrorMapModel(submission_id=submission_id, view_id="lattice/0000", webp=b"webp"))
-    assert [error_map_views(one, submission_id) for one in (database, hidden)] == [["lattice/0000"], []]
-    path = f"/submissions/{submission_id}/error-maps/lattice/0000.webp"
+        session.add(PictureModel(submission_id=submission_id, view_id="lattice/0000", facts="{}"))
+        session.add(
+            PictureImageModel(submission_id=submission_id, view_id="lattice/0000", kind="error", webp=b"webp")
+        )
+    shown: dict[str, tuple[dict[str, str], list[str]]] = {"lattice/0000": ({}, ["error"])}
+    assert [picture_facts(one, submission_id) for one in (database, hidden)] == [shown, {}]
+    path = f"/submissions/{submission_id}/pictures/error/lattice/0000.webp"
     assert [get_response(app, path)[0] for app in apps] == [200, 404, 200]
 
 

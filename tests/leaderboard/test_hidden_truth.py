@@ -178,8 +178,10 @@ def get_paths(probes: Probes) -> Iterator[str]:
     )
     for submission_id in probes.ids.values():
         yield from (f"/submissions/{submission_id}", f"/submissions/{submission_id}?views={CONFIG}")
-    for submission_id, view_id in stored(probes, "SELECT submission_id, view_id FROM pictures"):
-        yield f"/submissions/{submission_id}/error-maps/{view_id}.webp"
+    for submission_id, view_id in stored(
+        probes, "SELECT submission_id, view_id FROM picture_images WHERE kind = 'error'"
+    ):
+        yield f"/submissions/{submission_id}/pictures/error/{view_id}.webp"
 
 
 def stored(probes: Probes, query: str) -> list[tuple[Any, ...]]:
@@ -202,8 +204,8 @@ def texts(probes: Probes) -> dict[str, str]:
             for path in get_paths(probes)
             for kind, headers in kinds.items()
         }
-    assert sum("error-maps" in path for path in responses) == 9
-    assert all(response.status_code == 404 for path, response in responses.items() if "error-maps" in path)
+    assert sum("/pictures/" in path for path in responses) == 18
+    assert all(response.status_code == 404 for path, response in responses.items() if "/pictures/" in path)
     assert all(
         response.headers["content-type"].startswith(("text/", "application/json"))
         for response in responses.values()
@@ -212,7 +214,7 @@ def texts(probes: Probes) -> dict[str, str]:
 
 
 _NO_SCORES = re.compile(
-    r"\d{4}-\d\d-\d\dT[\d:.]+Z|[\d.]+ (?:bytes|[KMG]iB)|\d+(?:\.\d+){2,}\S*|\b[0-9a-f]{32,64}\b"
+    r"\d{4}-\d\d-\d\dT[\d:.]+Z|[\d.]+ (?:bytes|[KMG]iB)|\d+(?:\.\d+){2,}\S*|cc-by-4\.0|\b[0-9a-f]{32,64}\b"
 )
 """Times, sizes, versions, addresses and digests."""
 
@@ -232,8 +234,10 @@ def test_responses_contain_no_other_numbers(probes: Probes, texts: Mapping[str, 
     shown = {value for table in tables for value in (table["coverage"], table["rank_error"])}
     assert all(value == round(value, 3) for value in shown)
     allowed = {text for value in shown for text in (str(value), f"{value:.3f}", f"{value * 100:.1f}")}
+    # The mean over the two configs, of which these submissions lack one, follows from the disclosed numbers.
+    allowed |= {f"{(table['rank_error'] + 1) / 2:.3f}" for table in tables}
     for path, text in texts.items():
-        assert path.startswith("/metrics") or decimals_in(text) <= allowed, path
+        assert decimals_in(text) <= allowed, path
 
 
 def leaves(part: Any) -> Iterator[int | float]:

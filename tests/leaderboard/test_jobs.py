@@ -13,11 +13,11 @@ import pytest
 
 from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import Database
-from leaderboard.db.jobs import MAX_ATTEMPTS, Outcome
+from leaderboard.db.jobs import MAX_ATTEMPTS, Outcome, ViewPicture
 from leaderboard.db.models import SubmissionModel, TokenModel
-from leaderboard.db.rankings import leaderboard_entries
-from leaderboard.db.submissions import QuotaExceededError, Upload
-from leaderboard.db.tokens import create_token, find_token, replace_token
+from leaderboard.db.rankings import picture_facts, picture_webp, read_ranking
+from leaderboard.db.submissions import DuplicateError, Quota, QuotaExceededError, Upload
+from leaderboard.db.tokens import create_token, find_token, list_tokens, replace_token, revoke_token
 from leaderboard.settings import read_settings
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.submission import SubmissionMeta
@@ -41,11 +41,13 @@ def alice(database: Database) -> TokenModel:
     return token
 
 
-def queue(database: Database, token: TokenModel, count: int, quota: int = 1000) -> list[str]:
+def queue(
+    database: Database, token: TokenModel, count: int, quota: int = 1000, quota_bytes: int = 1 << 40
+) -> list[str]:
     ids = [submissions.new_id() for _ in range(count)]
     for submission_id in ids:
-        upload = Upload(SubmissionMeta(method="m"), "0" * 64, 5, "sha256:0")
-        submissions.accept(database, submission_id, token, upload, quota, True)
+        upload = Upload(SubmissionMeta(method="m"), submission_id * 2, 5, "sha256:0")
+        submissions.accept(database, submission_id, token, upload, Quota(quota, quota_bytes), True)
     return ids
 
 
@@ -138,11 +140,14 @@ def test_job_scored_twice_has_one_result(database: Database, alice: TokenModel) 
     jobs.claim(database, "a", 0.0)
     time.sleep(0.01)
     jobs.claim(database, "b", LEASE_S)
-    error_maps = {"lattice/0000": b"webp"}
-    assert jobs.finish(database, submission_id, "b", Outcome(result=second, error_maps=error_maps))
+    pictures = [ViewPicture("lattice/0000", '{"near": "1 m"}', {"error": b"webp", "truth": b"true"})]
+    assert jobs.finish(database, submission_id, "b", Outcome(second, ["a note"], pictures))
     assert not jobs.finish(database, submission_id, "a", Outcome(result=first))
     assert submissions.result_json(database, submission_id) == second
-    [row] = leaderboard_entries(database, "lattice")
+    assert submissions.result_notes(database, submission_id) == ["a note"]
+    assert picture_facts(database, submission_id) == {"lattice/0000": ({"near": "1 m"}, ["error", "truth"])}
+    assert picture_webp(database, submission_id, "lattice/0000", "truth") == b"true"
+    [row] = read_ranking(database, "lattice").entries
     assert json.loads(row.table_json) == json.loads(second)["tables"]["lattice"]
 
 
@@ -156,7 +161,7 @@ def test_submission_deleted_while_scoring_stays_deleted(database: Database, alic
     )
     assert submissions.find(database, submission_id) is None
     assert submissions.result_json(database, submission_id) is None
-    assert leaderboard_entries(database, "lattice") == []
+    assert read_ranking(database, "lattice").entries == ()
 
 
 def test_concurrent_uploads_do_not_exceed_quota(database: Database, alice: TokenModel) -> None:
@@ -169,6 +174,52 @@ def test_concurrent_uploads_do_not_exceed_quota(database: Database, alice: Token
 
     with ThreadPoolExecutor(12) as pool:
         assert sum(pool.map(try_one, range(12))) == 3
+
+
+def test_quota_counts_bytes_of_accepted_archives(database: Database, alice: TokenModel) -> None:
+    queue(database, alice, 2, quota_bytes=10)
+    with pytest.raises(QuotaExceededError, match="14 bytes"):
+        queue(database, alice, 1, quota_bytes=14)
+    queue(database, alice, 1, quota_bytes=15)
+
+
+def test_concurrent_uploads_of_one_archive_are_one_submission(database: Database, alice: TokenModel) -> None:
+    upload = Upload(SubmissionMeta(method="m"), "ab" * 32, 5, "sha256:0")
+
+    def send(_: int) -> str:
+        try:
+            return submissions.accept(database, submissions.new_id(), alice, upload, Quota(100, 1000), True).id
+        except DuplicateError as error:
+            return error.record.id
+
+    with ThreadPoolExecutor(8) as pool:
+        assert len(set(pool.map(send, range(8)))) == 1
+    assert len(submissions.of_token(database, alice)) == 1
+
+
+def test_failed_and_deleted_archives_may_be_sent_again(database: Database, alice: TokenModel) -> None:
+    upload = Upload(SubmissionMeta(method="m"), "ab" * 32, 5, "sha256:0")
+
+    def send() -> str:
+        return submissions.accept(database, submissions.new_id(), alice, upload, Quota(100, 1000), True).id
+
+    first = send()
+    assert jobs.claim(database, "s", LEASE_S) == first
+    jobs.finish(database, first, "s", Outcome(reason="no time"))
+    second = send()
+    submissions.remove(database, second)
+    assert len({first, second, send()}) == 3
+
+
+def test_revoked_token_is_void_until_replaced(database: Database) -> None:
+    token = create_token(database, "bob")
+    revoke_token(database, "bob")
+    assert find_token(database, token) is None
+    [use] = list_tokens(database)
+    assert (use.name, use.submissions, use.revoked_at is None) == ("bob", 0, False)
+    assert find_token(database, replace_token(database, "bob")) is not None
+    with pytest.raises(InputError, match="no token for 'eve'"):
+        revoke_token(database, "eve")
 
 
 def test_token_is_found_only_by_exact_value(database: Database) -> None:

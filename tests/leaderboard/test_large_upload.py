@@ -20,7 +20,7 @@ from leaderboard.settings import read_settings
 from leaderboard.web.server import listening_socket
 from tests.leaderboard.conftest import WriteArchive
 from tests.leaderboard.raw_http import END, MULTIPART, connect, multipart_part, read_response, request_head
-from tests.leaderboard.serving import RunServer, Server
+from tests.leaderboard.serving import RunServer, Server, distinct_archive
 from tests.processes import descendants, memory_bytes, num_open_files
 from tests.requirements import Repetitions
 
@@ -187,12 +187,13 @@ def test_uploads_with_one_token_are_received_one_after_the_other(
 ) -> None:
     """Uploads with another token are not affected."""
     before, after = multipart_frame()
-    content = write_archive("slow", configs=("lattice-orbit",)).read_bytes()
+    archive = write_archive("slow", configs=("lattice-orbit",))
+    contents = [distinct_archive(archive, number).read_bytes() for number in range(4)]
     with running_server(tiny_root, tmp_path / "state", workers=0) as server, ExitStack() as stack:
         own, other = server.token("own"), server.token("other")
-        length = len(before) + len(content) + len(after)
         connections = []
-        for token in (own, own, own, other):
+        for token, content in zip((own, own, own, other), contents, strict=True):
+            length = len(before) + len(content) + len(after)
             connection = stack.enter_context(connect(server.url))
             headers = (f"Authorization: Bearer {token}", f"Content-Type: {MULTIPART}", f"Content-Length: {length}")
             connection.sendall(request_head(API, headers) + before + content[:1000])
@@ -200,7 +201,7 @@ def test_uploads_with_one_token_are_received_one_after_the_other(
         assert wait_for(lambda: len(spool_files(server)) == 2)
         time.sleep(0.5)
         assert len(spool_files(server)) == 2
-        for connection in connections:
+        for connection, content in zip(connections, contents, strict=True):
             connection.sendall(content[1000:] + after)
         for connection in connections:
             assert read_response(connection).status == 202

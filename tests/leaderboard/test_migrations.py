@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import subprocess
 import sys
@@ -9,17 +10,23 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
+from alembic import command
 from alembic.autogenerate import compare_metadata
+from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Column, Engine, MetaData, String, create_engine, inspect
+from sqlalchemy import Column, Engine, MetaData, String, create_engine, insert, inspect
 
 from leaderboard.db.engine import MIGRATIONS, Database
-from leaderboard.db.models import Base
-from leaderboard.db.tokens import create_token, find_token
+from leaderboard.db.models import Base, LeaderboardRowModel
+from leaderboard.db.rankings import picture_facts, picture_webp, read_ranking
+from leaderboard.db.tokens import create_token, digest, find_token
+from leaderboard.db.view_errors import unpack_view_errors
 from leaderboard.settings import Settings
+from tests.bench.reporting.results import result, scored_view
 
 _MIGRATE = """
 import sys
@@ -101,8 +108,8 @@ def sqlite_write_lock(engine: Engine) -> Iterator[None]:
 
 @pytest.mark.slow
 def test_concurrent_migrations_succeed(url: str, engine: Engine) -> None:
-    command, pipe = [sys.executable, "-c", _MIGRATE, url], subprocess.PIPE
-    processes = [subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) for _ in range(3)]
+    arguments, pipe = [sys.executable, "-c", _MIGRATE, url], subprocess.PIPE
+    processes = [subprocess.Popen(arguments, stdin=pipe, stdout=pipe, stderr=pipe, text=True) for _ in range(3)]
     try:
         for process in processes:
             assert process.stdout is not None
@@ -120,6 +127,57 @@ def test_concurrent_migrations_succeed(url: str, engine: Engine) -> None:
             process.kill()
             process.communicate()
     assert differences(engine, Base.metadata) == []
+
+
+def test_database_of_revision_2_keeps_error_maps_and_gets_view_errors(url: str, engine: Engine) -> None:
+    document = result(*(scored_view(f"lattice/{index:04d}") for index in range(3))).to_dict()
+    config = Config()
+    config.set_main_option("script_location", str(MIGRATIONS))
+    with engine.begin() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, "0002")
+        tables = MetaData()
+        tables.reflect(connection)
+        rows: dict[str, dict[str, Any]] = {
+            "tokens": {"id": 1, "name": "alice", "sha256": digest("a token"), "created_at": 1.0},
+            "submissions": {**SUBMISSION, "id": "one", "token_id": 1},
+            "results": {"submission_id": "one", "json": json.dumps(document).encode(), "protocol": "rebar-2"},
+            "board_rows": {
+                "submission_id": "one",
+                "config": "lattice",
+                "ranked": True,
+                "rank_error": 0.5,
+                "json": json.dumps(document["tables"]["lattice"]),
+            },
+            "pictures": {"submission_id": "one", "view_id": "lattice/0000", "webp": b"webp"},
+        }
+        for name, row in rows.items():
+            connection.execute(insert(tables.tables[name]), row)
+    migrate(url)
+    assert differences(engine, Base.metadata) == []
+    with closing(Database(url)) as database:
+        assert picture_webp(database, "one", "lattice/0000", "error") == b"webp"
+        assert picture_facts(database, "one") == {"lattice/0000": ({}, ["error"])}
+        [entry] = read_ranking(database, "lattice").entries
+        assert (entry.submission_id, entry.submitter, entry.rank, entry.details_json) == ("one", "alice", 1, "{}")
+        assert find_token(database, "a token") is not None
+        with database.read() as session:
+            packed = session.get_one(LeaderboardRowModel, ("one", "lattice")).view_errors
+    assert packed is not None
+    assert unpack_view_errors(packed)[1].tolist() == [view["rank_error"] for view in document["views"]]
+
+
+SUBMISSION = {
+    "method": "m",
+    "archive_sha256": "0" * 64,
+    "archive_bytes": 1,
+    "status": "scored",
+    "public": True,
+    "created_at": 1.0,
+    "finished_at": 2.0,
+    "attempts": 1,
+    "dataset_digest": "sha256:0",
+}
 
 
 def test_migrations_are_linear() -> None:

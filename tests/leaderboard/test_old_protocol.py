@@ -84,7 +84,7 @@ def test_old_results_are_rescored_if_their_archive_is_kept(
     write_archive(archive, ["lattice"], 3, "m", 1)
     db = new_database()
     settings = Settings(data=str(root), state_dir=state, db=db)  # type: ignore[call-arg]
-    state.mkdir()
+    state.mkdir(mode=0o700)
     write_old_database(
         settings.database_url,
         open_folder(root).digest,

@@ -20,7 +20,15 @@ import httpx2
 import pytest
 
 from tests.leaderboard.conftest import WriteArchive
-from tests.leaderboard.serving import SCORER, SCORING, RunServer, Server, make_token, submission_row
+from tests.leaderboard.serving import (
+    SCORER,
+    SCORING,
+    RunServer,
+    Server,
+    distinct_archive,
+    make_token,
+    submission_row,
+)
 from tests.processes import processes_below, wait_until
 
 NUM_UPLOADS = 2
@@ -127,7 +135,8 @@ def test_second_backup_copies_only_new_archives(
     after = inodes_and_mtimes(backup / "archives")
     assert set(after) == {*before, f"{second}.zip"}
     assert {name: after[name] for name in before} == before
-    assert (backup / "archives" / f"{second}.zip").read_bytes() == small_archive.read_bytes()
+    copies = [folder / "archives" / f"{second}.zip" for folder in (backup, state)]
+    assert copies[0].read_bytes() == copies[1].read_bytes()
     assert len(statuses(backup)) == 3
     assert sorted(path.name for path in backup.iterdir()) == ["archives", "leaderboard.sqlite"]
     assert run_command("remove", second, "--state-dir", state).returncode == 0
@@ -177,7 +186,7 @@ def test_sigterm_finishes_requests_and_requeues_job(
         (scoring,) = processes_below(server.process.pid, SCORING)
         os.kill(scoring, signal.SIGSTOP)  # It cannot finish before the service stops.
         assert submission_row(state, in_progress)["attempts"] == 1
-        future = threads.submit(SlowUpload(server, token, small_archive, go_on))
+        future = threads.submit(SlowUpload(server, token, distinct_archive(small_archive, 1), go_on))
         wait_until(lambda: is_receiving(state), "the upload is under way")
         server.process.send_signal(signal.SIGTERM)
         time.sleep(1)

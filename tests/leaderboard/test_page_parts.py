@@ -6,6 +6,7 @@ import asyncio
 import json
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
+from urllib.parse import parse_qsl
 
 import pytest
 from fastapi import Request
@@ -14,21 +15,20 @@ from hypothesis import strategies as st
 
 from leaderboard.db.engine import Database
 from leaderboard.db.models import LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
-from leaderboard.db.rankings import leaderboard_entries, queue_position, ranks
-from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadRejectedError, read_leading_field
+from leaderboard.db.rankings import LeaderboardEntry, queue_position, read_ranking
+from leaderboard.uploads.errors import UploadRejectedError
+from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadForm
 from leaderboard.web.pages.leaderboard import (
     COLUMNS,
-    MAX_PLOTTED,
     RANK,
-    Order,
+    Selection,
     make_config_ranking,
-    parse_order,
+    parse_selection,
     sort_indices,
 )
 from leaderboard.web.pages.rendering import clean_text, error_response, format_size, format_time, link
 from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.reporting.html.rows import table_row
-from rebar_depth_bench.scoring.result import tabulate
 from rebar_depth_bench.scoring.result_io import read_result
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 
@@ -81,17 +81,8 @@ def make_submission(
 
 
 def test_leaderboard_entries_are_public_and_in_order(database: Database) -> None:
-    shown = [(row.rank, row.submission_id) for row in leaderboard_entries(database, "lattice")]
+    shown = [(row.rank, row.submission_id) for row in read_ranking(database, "lattice").entries]
     assert shown == [(1, "s2"), (2, "s0"), (3, "s4"), (4, "s3"), (None, "s6"), (None, "s5")]
-
-
-def test_ranks_of_submission_match_leaderboard(database: Database) -> None:
-    expected = {row.submission_id: row.rank for row in leaderboard_entries(database, "lattice")}
-    with database.read() as session:
-        records = [session.get_one(SubmissionModel, f"s{index}") for index in range(len(ERRORS))]
-    ranks_by_id = {record.id: ranks(database, record) for record in records}
-    for name, submission_ranks in ranks_by_id.items():
-        assert submission_ranks == ({"lattice": expected[name]} if expected.get(name) else {})
 
 
 def test_queue_position_counts_earlier_submissions(database: Database) -> None:
@@ -111,27 +102,48 @@ def test_equal_errors_share_a_rank_overall_and_in_their_class(database: Database
             row.rank_error, row.ranked = error, True
             record = session.get_one(SubmissionModel, name)
             record.inputs, record.public = inputs, True
-    entries = {entry.submission_id: entry for entry in leaderboard_entries(database, "lattice")}
+    entries = {entry.submission_id: entry for entry in read_ranking(database, "lattice").entries}
     assert (entries["s0"].rank, entries["s2"].rank) == (1, 1)
     assert entries["s3"].rank is not None
     assert entries["s3"].rank >= 3
     assert (entries["s0"].class_rank, entries["s2"].class_rank, entries["s3"].class_rank) == (1, 1, 2)
     assert {entry.class_rank for entry in entries.values() if entry.inputs is None} == {None}
-    with database.read() as session:
-        records = [session.get_one(SubmissionModel, name) for name in ("s0", "s2", "s3")]
-    assert [ranks(database, record)["lattice"] for record in records] == [1, 1, entries["s3"].rank]
-    shown = make_config_ranking(database, "lattice", Order(), "rgb")
+    shown = make_config_ranking(read_ranking(database, "lattice"), "lattice", Selection(inputs="rgb"), False)
     assert [line.submission_id for line in shown.lines] == ["s0", "s3"]
     assert [line.rank for line in shown.lines] == [1, entries["s3"].rank]
 
 
-def test_limited_ranking_shows_first_rows_and_total_count(database: Database) -> None:
-    full, limited = (make_config_ranking(database, "lattice", Order(), None, max_rows) for max_rows in (None, 2))
-    assert [line.submission_id for line in limited.lines] == ["s2", "s0"]
-    assert (full.row_count, limited.row_count) == (6, 6)
-    assert [line.mark for line in full.lines] == ["1", "2", "3", "4", "a", "b"]
-    assert full.plotted == min(6, MAX_PLOTTED)
+def test_pages_divide_the_rows(database: Database) -> None:
+    ranking = read_ranking(database, "lattice")
+    full = make_config_ranking(ranking, "lattice", Selection(), False)
+    pages = [make_config_ranking(ranking, "lattice", Selection(page=page), False, 4) for page in (1, 2, 3)]
+    assert [[line.submission_id for line in page.lines] for page in pages] == [
+        ["s2", "s0", "s4", "s3"],
+        ["s6", "s5"],
+        ["s6", "s5"],
+    ]
+    assert [page.selection.page for page in pages] == [1, 2, 2]
+    assert {(page.row_count, page.pages, page.plotted) for page in pages} == {(6, 2, 6)}
+    assert full.pages == 1
     assert [row.mark for row in full.published] == list("ABCDEF")
+
+
+@pytest.mark.parametrize(("most", "has_chart"), [(None, True), (6, True), (5, False)])
+def test_chart_has_all_rows_or_is_left_out(database: Database, most: int | None, has_chart: bool) -> None:
+    ranking = read_ranking(database, "lattice")
+    shown = make_config_ranking(ranking, "lattice", Selection(), False, page_rows=2, max_plotted=most)
+    assert (shown.plotted, shown.chart is not None) == (6, has_chart)
+    if shown.chart:
+        assert shown.chart.count('class="native fill"') == 6
+
+
+def test_search_selects_by_method_and_submitter(database: Database) -> None:
+    ranking = read_ranking(database, "lattice")
+    found = {
+        text: make_config_ranking(ranking, "lattice", Selection(text=text), False).row_count
+        for text in ("S2", "alice", "nobody")
+    }
+    assert found == {"S2": 1, "alice": 6, "nobody": 0}
 
 
 @pytest.mark.slow
@@ -141,25 +153,53 @@ def test_missing_values_are_sorted_last_in_both_orders(errors: list[float | None
         scored_view("lattice/0000", error, coverage=error / 9) if error else unpredicted_view("lattice/0000")
         for error in errors
     ]
-    rows = [(None, table_row(f"m{k}", tabulate([view]))) for k, view in enumerate(views)]
-    for order in (Order(name), Order(name, True)):
-        values = [COLUMNS[name].value(rows[index][1]) for index in sort_indices(rows, order)]
+    tables = [result(view).to_dict()["tables"]["lattice"] for view in views]
+    rows = [(entry_of(f"m{k}"), table) for k, table in enumerate(tables)]
+    for selection in (Selection(name), Selection(name, inverted=True)):
+        values = [COLUMNS[name].value(rows[index][1]) for index in sort_indices(rows, selection)]
         present = [value for value in values if value is not None]
         assert values == present + [None] * (len(values) - len(present))
-        assert present == sorted(present, reverse=order.is_descending)
+        assert present == sorted(present, reverse=selection.is_descending)
+
+
+def entry_of(name: str) -> LeaderboardEntry:
+    return LeaderboardEntry(
+        None, None, None, name, "lattice", name, "alice", None, None, None, None, 0.0, True, "{}", "{}"
+    )
 
 
 def test_heading_link_reverses_sort_order() -> None:
-    assert (Order("rmse").link("rmse"), Order("rmse", True).link("rmse")) == ("-rmse", "rmse")
-    assert (Order("rmse").heading("rmse"), Order("delta1").heading("delta1")) == ("ascending", "descending")
-    assert Order("rmse").heading("mae") is None
-    assert [parse_order(text) for text in (None, "nope", "-", "-mae")] == [
-        Order(),
-        Order(),
-        Order(),
-        Order("mae", True),
+    rmse = Selection("rmse", page=3)
+    assert rmse.sorted_by("rmse").query() == "sort=-rmse"
+    assert rmse.sorted_by("rmse").sorted_by("rmse").query() == "sort=rmse"
+    assert (rmse.heading("rmse"), Selection("delta1").heading("delta1")) == ("ascending", "descending")
+    assert rmse.heading("mae") is None
+    assert [parse_selection(text, None, None, None) for text in (None, "nope", "-", "-mae", "-rank")] == [
+        Selection(),
+        Selection(),
+        Selection(),
+        Selection("mae", inverted=True),
+        Selection(RANK, inverted=True),
     ]
-    assert parse_order("-rank") == Order(RANK, True)
+
+
+@given(
+    st.sampled_from([RANK, "method", *COLUMNS]),
+    st.booleans(),
+    st.sampled_from([None, "rgb", "rgb+K"]),
+    st.text("ab &=?+%#äß", max_size=12),
+    st.integers(1, 99),
+)
+def test_query_of_a_selection_is_read_back(
+    order: str, inverted: bool, inputs: str | None, text: str, page: int
+) -> None:
+    selection = Selection(order, inverted, inputs, text.strip(), page)
+    values = dict(parse_qsl(selection.query(config="lattice")))
+    assert values.pop("config") == "lattice"
+    page_text = values.get("page")
+    assert selection == parse_selection(
+        values.get("sort"), values.get("inputs"), values.get("q"), int(page_text) if page_text else None
+    )
 
 
 def test_result_json_round_trips() -> None:
@@ -178,44 +218,55 @@ def multipart_body(*parts: tuple[str, bytes]) -> bytes:
     return encoded_parts + b"--B--\r\n"
 
 
-def first_field(content: bytes, step: int, kind: str = "multipart/form-data; boundary=B") -> tuple[str, bytes]:
+def read_form(
+    content: bytes, step: int, kind: str = "multipart/form-data; boundary=B", *, with_token: bool = True
+) -> tuple[str, bytes]:
+    """Return token and archive of a form that arrives in parts of ``step`` bytes."""
+
     async def read() -> tuple[str, bytes]:
         async def chunks() -> AsyncIterator[bytes]:
             for start in range(0, len(content), step):
                 yield content[start : start + step]
 
-        value, body_chunks = await read_leading_field(chunks(), kind, "token")
-        return value, b"".join([chunk async for chunk in body_chunks])
+        form = UploadForm(chunks(), kind)
+        token = await form.token() if with_token else ""
+        return token, b"".join([part async for part in form.archive()])
 
     return asyncio.run(read())
 
 
 @settings(max_examples=40)
-@given(st.binary(max_size=300), st.text("abcXYZ-_09", max_size=60), st.integers(1, 400))
-def test_first_field_is_read_and_body_is_replayed(archive: bytes, token: str, step: int) -> None:
+@given(st.binary(max_size=300), st.text("abcXYZ-_09", max_size=60), st.integers(1, 400), st.booleans())
+def test_form_is_read_in_any_parts(archive: bytes, token: str, step: int, with_token: bool) -> None:
     content = multipart_body(("token", token.encode()), ("archive", archive))
-    assert first_field(content, step) == (token, content)
+    assert read_form(content, step, with_token=with_token) == (token if with_token else "", archive)
 
 
 @pytest.mark.parametrize(
     "parts",
     [
         [("archive", b"zip"), ("token", b"late")],
-        [("token", b"x" * (MAX_FIELD_BYTES + 1))],
-        [("other", b"x"), ("token", b"second")],
+        [("token", b"x" * (MAX_FIELD_BYTES + 1)), ("archive", b"zip")],
+        [("other", b"x"), ("archive", b"zip")],
         [("archive", b"z" * 300_000), ("token", b"late")],
     ],
 )
-def test_other_or_too_long_first_field_is_empty(parts: list[tuple[str, bytes]]) -> None:
-    content = multipart_body(*parts)
-    assert first_field(content, 1000) == ("", content)
+def test_token_after_the_archive_or_too_long_is_empty(parts: list[tuple[str, bytes]]) -> None:
+    assert read_form(multipart_body(*parts), 1000) == ("", dict(parts)["archive"])
+
+
+def test_form_without_or_with_two_archives_is_rejected() -> None:
+    with pytest.raises(UploadRejectedError, match="no field 'archive'"):
+        read_form(multipart_body(("token", b"x")), 10)
+    with pytest.raises(UploadRejectedError, match="twice"):
+        read_form(multipart_body(("archive", b"a"), ("archive", b"b")), 10)
 
 
 def test_non_multipart_body_is_rejected() -> None:
     with pytest.raises(UploadRejectedError, match="expected multipart/form-data"):
-        first_field(b"{}", 10, "application/json")
+        read_form(b"{}", 10, "application/json")
     with pytest.raises(UploadRejectedError, match="not valid multipart/form-data"):
-        first_field(b"hello", 10)
+        read_form(b"hello", 10)
 
 
 @pytest.mark.parametrize("url", [None, "", "javascript:alert(1)", "data:text/html,x", "//x.org", "ftp://x.org"])

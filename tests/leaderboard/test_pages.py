@@ -11,9 +11,13 @@ from typing import Any
 import httpx2
 import pytest
 
+from rebar_depth_bench.reporting.comparison_tables import comparison_cells
+from rebar_depth_bench.scoring.comparison import compare
+from rebar_depth_bench.scoring.result_io import read_result
 from tests.bench.reporting.pages import Page
 from tests.leaderboard.conftest import HOSTILE, SharedServer, WriteArchive
 
+CONFIGS = ("lattice", "lattice-orbit")
 BROWSER = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
 
 
@@ -92,7 +96,7 @@ def test_sort_links_work_without_javascript(board: SharedServer, sort: str, key:
     response, parsed = page(f"{board.url}/?config=lattice&sort={sort}")
     ids = re.findall(r'<a href="/submissions/([^"]+)"><bdi>', response.text)
     shown = [key(row["table"]) for submission_id in ids for row in rows if row["id"] == submission_id]
-    assert shown == sorted(values, reverse=falls)
+    assert shown == sorted(values, reverse=falls), ids
     sort_directions = [head["aria-sort"] for head in parsed.attributes_of("th") if head.get("aria-sort")]
     assert sort_directions == ["descending" if falls else "ascending"]
 
@@ -135,18 +139,19 @@ def test_page_of_scored_submission(board: SharedServer) -> None:
     response, parsed = page(board.page("far"))
     rows = httpx2.get(f"{board.url}/api/v1/leaderboard?config=lattice").json()["rows"]
     rank = next(row["rank"] for row in rows if row["id"] == board.ids["far"])
-    assert f"Scored : lattice rank {rank}." in parsed.text
+    assert f"Scored : lattice rank {rank} " in parsed.text
     assert "http-equiv" not in response.text
     assert f"/api/v1/submissions/{board.ids['far']}/result.json" in response.text
     result = httpx2.get(f"{board.url}/api/v1/submissions/{board.ids['far']}/result.json").json()
     worst = max(result["views"], key=lambda view: view["rank_error"])["view_id"]
     table = response.text[response.text.index("the worst 9 of 9 views") :]
     assert re.findall(r'class="name">(lattice/\d{4})<', table)[0] == worst
-    maps = [image for image in parsed.attributes_of("img") if "error-maps" in str(image["src"])]
-    assert len(maps) == 2
-    error_map = get(f"{board.url}{maps[0]['src']}")
-    assert error_map.headers["content-type"] == "image/webp"
-    assert error_map.content[8:12] == b"WEBP"
+    pictures = [image for image in parsed.attributes_of("img") if "/pictures/" in str(image["src"])]
+    assert len(pictures) == 4 * 3, "four kinds of the two worst views and the median view"
+    for image in pictures:
+        picture = get(f"{board.url}{image['src']}")
+        assert picture.headers["content-type"] == "image/webp"
+        assert picture.content[8:12] == b"WEBP"
 
 
 def test_views_parameter_lists_all_views(board: SharedServer) -> None:
@@ -173,9 +178,79 @@ def test_private_submission_is_not_on_leaderboard_page(waiting: SharedServer) ->
     assert "No submission of lattice is on the leaderboard yet." in parsed.text
     assert waiting.ids["scored"] not in response.text
     assert "rank" not in page(waiting.page("scored"))[1].text.split("Submitted by")[0].replace("not ranked", "")
-    error_map = re.search(r'src="([^"]+error-maps[^"]+)"', get(waiting.page("scored")).text)
-    assert error_map is not None
-    assert get(waiting.url + error_map[1]).headers["cache-control"] == "no-store"
+    picture = re.search(r'src="([^"]+/pictures/[^"]+)"', get(waiting.page("scored")).text)
+    assert picture is not None
+    assert get(waiting.url + picture[1]).headers["cache-control"] == "no-store"
+
+
+def test_overview_orders_by_the_mean_over_configs(board: SharedServer) -> None:
+    text = get(f"{board.url}/").text
+    table = text[text.index('aria-label="Ranks in all configs"') :]
+    table = table[: table.index("</table>")]
+    api = f"{board.url}/api/v1/leaderboard"
+    rows = {config: httpx2.get(api, params={"config": config}).json()["rows"] for config in CONFIGS}
+    errors = {
+        config: {row["id"]: row["table"]["rank_error"] for row in config_rows}
+        for config, config_rows in rows.items()
+    }
+    ranked = {row["id"] for config_rows in rows.values() for row in config_rows if row["rank"]}
+    means = {one: sum(errors[config].get(one, 1.0) for config in CONFIGS) / len(CONFIGS) for one in ranked}
+    shown = re.findall(r'<a href="/submissions/([^"]+)">', table)
+    assert shown[: len(ranked)] == sorted(ranked, key=means.__getitem__)
+    assert set(shown[len(ranked) :]) == {board.ids["holes"]}
+    for submission_id, mean in means.items():
+        line = table[table.index(submission_id) :]
+        assert f'<td class="first">{mean:.4f}</td>' in line[: line.index("</tr>")]
+    assert board.ids["far"] not in errors["lattice-orbit"], "a config that is missing counts 1"
+    assert means[board.ids["far"]] > 0.5
+
+
+def test_comparison_page_shows_the_numbers_of_the_command_line(board: SharedServer) -> None:
+    first, other = (
+        read_result(httpx2.get(f"{board.url}/api/v1/submissions/{board.ids[name]}/result.json").content, name)
+        for name in ("good", "near")
+    )
+    _, parsed = page(f"{board.url}/compare?a={board.ids['good']}&b={board.ids['near']}")
+    for differences in compare(first, other).configs.values():
+        for difference in differences:
+            assert " ".join(filter(None, comparison_cells(difference))) in " ".join(parsed.text.split())
+    assert get(f"{board.url}/compare?a={board.ids['good']}&b=nobody").status_code == 404
+    far = f"{board.url}/compare?a={board.ids['far']}&b={board.ids['good']}"
+    assert "lattice-orbit" not in page(far)[1].text.split("Paired comparison")[1].split("B - A:")[0]
+
+
+def test_pages_name_dataset_licence_and_scenes(board: SharedServer) -> None:
+    _, parsed = page(board.url + "/")
+    assert "Industrial rebar metric depth , licence cc-by-4.0" in parsed.text
+    scenes = [str(image["src"]) for image in parsed.attributes_of("img") if "/scenes/" in str(image["src"])]
+    assert scenes == [f"/scenes/{config}.webp" for config in CONFIGS]
+    for source in scenes:
+        assert get(board.url + source).content[8:12] == b"WEBP"
+    assert get(f"{board.url}/scenes/nope.webp").status_code == 404
+
+
+def test_details_of_a_method_are_shown(board: SharedServer, write_archive: WriteArchive) -> None:
+    archive = write_archive(
+        "detailed",
+        configs=("lattice-orbit",),
+        code_url="https://code.example/x",
+        licence="Apache-2.0",
+        training_data="KITTI and <NYU>",
+        parameters=24_800_000,
+        runtime={"seconds": {"a": 0.5, "b": 0.25, "c": 0.75}},
+    )
+    submission_id = board.server.submit_accepted(archive, board.server.token("detailed owner"))
+    board.server.wait_until_ended(submission_id)
+    _, parsed = page(f"{board.url}/submissions/{submission_id}")
+    for text in ("KITTI and <NYU>", "24,800,000", "Apache-2.0", "0.5 s", "code.example"):
+        assert text in parsed.text
+
+
+def test_possible_mistakes_are_shown(board: SharedServer, write_archive: WriteArchive) -> None:
+    token = board.server.token("millimetre owner")
+    submission_id = board.server.submit_accepted(write_archive("millimetres", 1000.0), token)
+    board.server.wait_until_ended(submission_id)
+    assert "seem to be in millimetres" in page(f"{board.url}/submissions/{submission_id}")[1].text
 
 
 @pytest.mark.parametrize("path", ["/nope", "/submissions/nope", "/?config=nope", "/submissions/a%3Cb"])
@@ -258,7 +333,7 @@ def test_form_with_other_content_type_is_422(waiting: SharedServer) -> None:
 def test_how_to_submit_page_shows_command_and_form(waiting: SharedServer) -> None:
     _, parsed = page(f"{waiting.url}/how-to-submit")
     assert f"rebar-bench submit ARCHIVE --url {waiting.url}" in parsed.text
-    assert "5 submissions a day" in parsed.text
+    assert "5 submissions and 64 GiB a day" in parsed.text
     assert [field["name"] for field in parsed.attributes_of("input")] == ["token", "archive"]
     assert parsed.attributes_of("input")[0]["autocomplete"] == "off"
     assert parsed.attributes_of("form")[0]["enctype"] == "multipart/form-data"

@@ -101,10 +101,7 @@ CASES = {
     "port taken": Case("cannot listen on this address: Address already in use", "--port TAKEN"),
     "not our address": Case("cannot listen on this address", "--host 192.0.2.1"),
     "no address at all": Case("cannot listen on this address", f"--host {'x' * 70}"),
-    "unknown protocol": Case("Protocol not known: nope", f"--archives nope://u:{PASSWORD}@h/x"),
-    "archive storage unavailable": Case(
-        "cannot access the archive storage", f"--archives ftp://u:{PASSWORD}@127.0.0.1:1/x"
-    ),
+    "archives at a URL": Case("archives: expected a folder", "--archives s3://bucket/x"),
     "archives in a file": Case("cannot access the archive storage", "--archives HERE/type/x"),
     "backup of PostgreSQL": Case(
         "pg_dump", f"--db postgresql://u:{PASSWORD}@h/x", "backup HERE/b --state-dir HERE/state"
@@ -238,6 +235,7 @@ def example_value(name: str) -> str:
         "state_dir": "/elsewhere",
         "rescore": "true",
         "hidden_truth": "true",
+        "public_url": "https://example.org/board",
     }
     kind = Settings.model_fields[name].annotation
     return special.get(name, "17" if kind in (int, float, ByteSize) else "something")
@@ -302,7 +300,7 @@ def test_invalid_database_urls_are_rejected(url: str) -> None:
 
 def test_state_folder_name_may_have_special_characters(tmp_path: Path) -> None:
     settings = read_settings(None, {"data": "x", "state_dir": tmp_path / "a st%20ate"})
-    archives = ArchiveStore(settings.archives_url)
+    archives = ArchiveStore(settings.archive_dir)
     (tmp_path / "one.zip").write_bytes(b"zip")
     archives.put("one", tmp_path / "one.zip")
     assert (tmp_path / "a st%20ate" / "archives" / "one.zip").is_file()

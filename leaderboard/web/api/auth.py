@@ -1,9 +1,13 @@
-"""Bearer-token authentication dependencies."""
+"""Bearer-token authentication dependencies.
+
+They are coroutines, because FastAPI runs other functions in worker threads, which takes longer than what they do.
+"""
 
 from __future__ import annotations
 
 from typing import Annotated, Any
 
+from anyio import to_thread
 from fastapi import Depends, HTTPException, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
@@ -21,20 +25,24 @@ def service_of(request: Request) -> Service:
     return service
 
 
-ServiceDep = Annotated[Service, Depends(service_of)]
+async def _service(request: Request) -> Service:
+    return service_of(request)
 
 
-def optional_token(service: ServiceDep, credentials: _Credentials) -> TokenModel | None:
+ServiceDep = Annotated[Service, Depends(_service)]
+
+
+async def optional_token(request: Request, credentials: _Credentials) -> TokenModel | None:
     """Return the token of a request, or None if it has none. Raises status 401 for an unknown token."""
     if credentials is None:
         return None
-    token = find_token(service.database, credentials.credentials)
+    token = await to_thread.run_sync(find_token, service_of(request).database, credentials.credentials)
     if token is None:
         raise _unauthorised("the token is unknown")
     return token
 
 
-def required_token(token: Annotated[TokenModel | None, Depends(optional_token)]) -> TokenModel:
+async def required_token(token: Annotated[TokenModel | None, Depends(optional_token)]) -> TokenModel:
     """Return the token of a request. Raises status 401 if it has none or an unknown one."""
     if token is None:
         raise _unauthorised("no token, expected the header 'Authorization: Bearer TOKEN'")

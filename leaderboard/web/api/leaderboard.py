@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
-from anyio import to_thread
-from fastapi import APIRouter, HTTPException, Query, Request, Response
+from fastapi import APIRouter, HTTPException, Query, Response
 
 from leaderboard.db.models import TokenModel
-from leaderboard.db.rankings import LeaderboardEntry, entries_of_class, leaderboard_entries, ranking_version
-from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, service_of
+from leaderboard.db.rankings import LeaderboardEntry, read_ranking
+from leaderboard.service import Service
+from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, ServiceDep
 from leaderboard.web.api.schemas import (
     COMMON_RESPONSES,
     MALFORMED_RESPONSE,
@@ -21,7 +21,7 @@ from leaderboard.web.api.schemas import (
     Responses,
     row_schema,
 )
-from leaderboard.web.cache import NO_STORE, REVALIDATE, RenderedBody, cached_public_body, conditional_response
+from leaderboard.web.cache import NO_STORE, REVALIDATE
 from rebar_depth_bench.reporting.tables import csv_text
 from rebar_depth_bench.scoring.disclosure import DisclosedTable
 from rebar_depth_bench.scoring.frames import TABLE_COLUMNS, table_values
@@ -66,19 +66,14 @@ InputsQuery = Annotated[
 
 
 @router.get("/leaderboard", response_model=Leaderboard, responses=_ERROR_RESPONSES, openapi_extra=WITHOUT_TOKEN)
-async def leaderboard(
-    config: ConfigName, request: Request, token: OptionalToken, inputs: InputsQuery = None
+def leaderboard(
+    config: ConfigName, service: ServiceDep, token: OptionalToken, inputs: InputsQuery = None
 ) -> Response:
     """Return the public rows of a config and, with a token, those of its owner."""
-    folder = service_of(request).folder
-
-    def serialise(rows: list[LeaderboardEntry]) -> bytes:
-        dataset = {"digest": folder.digest, "version": folder.version}
-        models = [row_schema(row) for row in rows]
-        response = Leaderboard(config=config, protocol=PROTOCOL, dataset=dataset, rows=models)
-        return response.model_dump_json().encode()
-
-    return await _leaderboard_response(request, config, inputs, token, "application/json", serialise)
+    rows = [row_schema(row) for row in _rows(service, config, inputs, token)]
+    dataset = {"digest": service.folder.digest, "version": service.folder.version}
+    content = Leaderboard(config=config, protocol=PROTOCOL, dataset=dataset, rows=rows)
+    return _response(content.model_dump_json(), "application/json", token)
 
 
 @router.get(
@@ -87,42 +82,23 @@ async def leaderboard(
     response_class=Response,
     openapi_extra=WITHOUT_TOKEN,
 )
-async def leaderboard_csv(
-    config: ConfigName, request: Request, token: OptionalToken, inputs: InputsQuery = None
+def leaderboard_csv(
+    config: ConfigName, service: ServiceDep, token: OptionalToken, inputs: InputsQuery = None
 ) -> Response:
     """Return the rows of a config as CSV."""
-
-    def serialise(rows: list[LeaderboardEntry]) -> bytes:
-        return entries_to_csv(rows, service_of(request).settings.hidden_truth).encode()
-
-    return await _leaderboard_response(request, config, inputs, token, CSV, serialise)
+    rows = _rows(service, config, inputs, token)
+    return _response(entries_to_csv(rows, service.settings.hidden_truth), CSV, token)
 
 
-async def _leaderboard_response(
-    request: Request,
-    config: str,
-    inputs: str | None,
-    token: TokenModel | None,
-    media_type: str,
-    serialise: Callable[[list[LeaderboardEntry]], bytes],
-) -> Response:
-    """Return the serialised rows of ``config`` with declared ``inputs`` (None: all), cached without a token.
-
-    Raises status 404 for an unknown config.
-    """
-    service = service_of(request)
+def _rows(service: Service, config: str, inputs: str | None, token: TokenModel | None) -> list[LeaderboardEntry]:
+    """Return the rows with declared ``inputs`` (None: all). Raises status 404 for an unknown config."""
     if config not in service.folder.configs:
         known = ", ".join(service.folder.configs)
         raise HTTPException(404, f"the dataset has no config {config!r}, expected one of {known}")
-    if token is not None:
-        content = await to_thread.run_sync(
-            lambda: serialise(entries_of_class(leaderboard_entries(service.database, config, token), inputs))
-        )
-        return Response(content, media_type=media_type, headers={"Cache-Control": NO_STORE})
+    ranking = service.rankings.of(config) if token is None else read_ranking(service.database, config, token)
+    return ranking.of_class(inputs)
 
-    def make() -> RenderedBody:
-        rows = leaderboard_entries(service.database, config)
-        return (media_type, config, inputs, ranking_version(rows)), serialise(entries_of_class(rows, inputs))
 
-    body = await cached_public_body(request, [config], (media_type, config, inputs), make)
-    return conditional_response(request, body, media_type, {"Cache-Control": REVALIDATE})
+def _response(content: str, media_type: str, token: TokenModel | None) -> Response:
+    cache = REVALIDATE if token is None else NO_STORE
+    return Response(content, media_type=media_type, headers={"Cache-Control": cache})

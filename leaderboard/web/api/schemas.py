@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from leaderboard.db.models import SubmissionModel
 from leaderboard.db.rankings import LeaderboardEntry
 from rebar_depth_bench.errors import ProblemCode
+from rebar_depth_bench.submission.metadata import MethodDetails
 
 _ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
 
@@ -81,6 +82,8 @@ class Submission(BaseModel):
                 "finished_at": None,
                 "reason": None,
                 "archive_sha256": "9f" * 32,
+                "archive_bytes": 1234567,
+                "archive_kept": True,
                 "result": None,
             }
         }
@@ -90,12 +93,29 @@ class Submission(BaseModel):
     status: Literal["queued", "scoring", "scored", "failed"]
     url: str = Field(description="URL of its page, which anyone who knows the URL can read")
     method: str
+    description: str | None = None
+    method_url: str | None = Field(None, description="page or paper of the method")
+    code_url: str | None = None
+    licence: str | None = None
+    training_data: str | None = None
+    parameters: float | str | None = Field(None, description="number of learned parameters, or text")
+    seconds_per_view: float | None = Field(None, description="runtime as the submitter declares it")
+    inputs: str | None = Field(None, description="input class, as declared by the submitter")
+    uses_ground_truth: bool | None = None
     public: bool = Field(description="whether its rows are shown on the leaderboard")
     created_at: datetime
     finished_at: datetime | None
     reason: str | None = Field(description="reason of the failure; null if it has not failed")
     archive_sha256: str
+    archive_bytes: int
+    archive_kept: bool = Field(description="whether the archive is kept; without it nothing is scored again")
     result: dict[str, Any] | None = None
+
+
+class SubmissionList(BaseModel):
+    """Submissions of a token, newest first, without their results."""
+
+    submissions: list[Submission]
 
 
 class Token(BaseModel):
@@ -104,23 +124,33 @@ class Token(BaseModel):
     name: str = Field(description="name of the submitter, shown on the leaderboard")
     quota: int = Field(description="accepted submissions per day (UTC)")
     quota_left: int
+    quota_bytes: int = Field(description="bytes of accepted archives per day (UTC)")
+    quota_bytes_left: int
     max_upload_bytes: int
     read_rate_limit: str = Field(examples=["600/minute"])
     write_rate_limit: str = Field(examples=["60/minute"])
 
 
-class Publication(BaseModel):
-    """Visibility of a submission's rows on the leaderboard."""
+class SubmissionChange(MethodDetails):
+    """Change of a submission: its visibility on the leaderboard and what is said about the method.
 
-    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"example": {"public": True}})
+    Values that are absent stay; null removes a value. Declarations and scores cannot be changed.
+    """
 
-    public: bool
+    model_config = ConfigDict(
+        extra="forbid", strict=True, defer_build=False, json_schema_extra={"example": {"public": True}}
+    )
+
+    public: bool = False
 
 
 class LeaderboardRow(BaseModel):
     """Leaderboard row; ``table`` is the table of the config in the result JSON of the submission."""
 
     rank: int | None = Field(description="rank by rank error, shared by equal errors; null if not ranked")
+    rank_range: tuple[int, int] | None = Field(
+        description="first and last rank that the paired 95 % differences of the rank error allow"
+    )
     class_rank: int | None = Field(description="rank among the rows with the same declared inputs")
     id: str
     method: str
@@ -150,11 +180,18 @@ def submission_schema(record: SubmissionModel, url: str, result: dict[str, Any] 
         status=record.status,  # type: ignore[arg-type]
         url=url,
         method=record.method,
+        description=record.description,
+        method_url=record.url,
+        **json.loads(record.details),
+        inputs=record.inputs,
+        uses_ground_truth=record.uses_ground_truth,
         public=record.public,
         created_at=_utc_datetime(record.created_at),
         finished_at=None if record.finished_at is None else _utc_datetime(record.finished_at),
         reason=record.reason,
         archive_sha256=record.archive_sha256,
+        archive_bytes=record.archive_bytes,
+        archive_kept=record.archive_deleted_at is None,
         result=result,
     )
 
@@ -163,6 +200,7 @@ def row_schema(row: LeaderboardEntry) -> LeaderboardRow:
     """Return the API response for a leaderboard row."""
     return LeaderboardRow(
         rank=row.rank,
+        rank_range=row.rank_range,
         class_rank=row.class_rank,
         id=row.submission_id,
         method=row.method,

@@ -6,7 +6,7 @@ The docstrings of the endpoints are part of the OpenAPI document.
 from __future__ import annotations
 
 import json
-from typing import Annotated
+from typing import Annotated, Any
 
 import structlog
 from fastapi import APIRouter, HTTPException, Path, Request, Response
@@ -14,7 +14,9 @@ from fastapi import APIRouter, HTTPException, Path, Request, Response
 from leaderboard.db import submissions
 from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.service import Service
-from leaderboard.uploads.accept import accept_upload
+from leaderboard.uploads.accept import AcceptedUpload, accept_upload
+from leaderboard.uploads.errors import too_large
+from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES, UploadForm
 from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, RequiredToken, ServiceDep
 from leaderboard.web.api.schemas import (
     COMMON_RESPONSES,
@@ -22,28 +24,26 @@ from leaderboard.web.api.schemas import (
     MISSING_TOKEN_RESPONSE,
     UNKNOWN_TOKEN_RESPONSE,
     ErrorResponse,
-    Publication,
     RejectedResponse,
     Responses,
     Submission,
+    SubmissionChange,
+    SubmissionList,
     submission_schema,
 )
 
-MAX_PATCH_BYTES = 1 << 10
+MAX_PATCH_BYTES = 32 << 10
 _LOG = structlog.get_logger("submissions")
 router = APIRouter(prefix="/api/v1/submissions", tags=["submissions"], responses=COMMON_RESPONSES)
 
 SubmissionId = Annotated[str, Path(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9_-]+$")]
+_BINARY = {"type": "string", "format": "binary"}
 _UPLOAD_REQUEST_BODY = {
     "requestBody": {
         "required": True,
         "content": {
             "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["archive"],
-                    "properties": {"archive": {"type": "string", "format": "binary"}},
-                }
+                "schema": {"type": "object", "required": ["archive"], "properties": {"archive": _BINARY}}
             }
         },
     }
@@ -65,22 +65,49 @@ _OWNER_ERROR_RESPONSES: Responses = {
     **_NOT_FOUND_RESPONSES,
 }
 _ACCEPTED_RESPONSE: Responses = {
+    200: {"description": "the token has sent this archive before; its submission is returned"},
     202: {
         "description": "accepted; the archive and its database row are stored on disk",
         "headers": {"Location": {"description": "URL path of the submission", "schema": {"type": "string"}}},
-    }
+    },
 }
 _UNREADABLE_RESPONSE: Responses = {400: {"model": ErrorResponse, "description": "the body is not valid UTF-8"}}
+
+
+@router.put(
+    "",
+    status_code=202,
+    responses={**_ACCEPTED_RESPONSE, **_ERROR_RESPONSES},
+    openapi_extra={
+        "requestBody": {"required": True, "content": {"application/zip": {"schema": _BINARY}}},
+    },
+)
+async def upload(request: Request, response: Response, service: ServiceDep, token: RequiredToken) -> Submission:
+    """Upload an archive as the body. It is checked before it is accepted, and stored durably before 202 is sent.
+
+    If the token has sent the same archive before, status 200 and that submission are returned.
+    """
+    check_length(request, service.settings.max_upload)
+    return _accepted(request, response, await accept_upload(service, token, request.stream()))
 
 
 @router.post(
     "", status_code=202, responses={**_ACCEPTED_RESPONSE, **_ERROR_RESPONSES}, openapi_extra=_UPLOAD_REQUEST_BODY
 )
-async def upload(request: Request, response: Response, service: ServiceDep, token: RequiredToken) -> Submission:
-    """Upload an archive. It is validated before it is accepted, and stored durably before 202 is sent."""
-    record = await accept_upload(service, token, request.stream(), request.headers)
-    response.headers["Location"] = request.url_for("look_up", submission_id=record.id).path
-    return submission_schema(record, page_url(request, record))
+async def upload_form(
+    request: Request, response: Response, service: ServiceDep, token: RequiredToken
+) -> Submission:
+    """Upload an archive as the field `archive` of a form, with the checks and responses of `PUT`."""
+    check_length(request, service.settings.max_upload + MAX_OVERHEAD_BYTES)
+    form = UploadForm(request.stream(), request.headers.get("content-type", ""))
+    return _accepted(request, response, await accept_upload(service, token, form.archive()))
+
+
+@router.get("", responses=MISSING_TOKEN_RESPONSE)
+def list_own(request: Request, service: ServiceDep, token: RequiredToken) -> SubmissionList:
+    """Return the submissions of the token, newest first, without their results."""
+    records = submissions.of_token(service.database, token)
+    return SubmissionList(submissions=[submission_schema(record, page_url(request, record)) for record in records])
 
 
 @router.get(
@@ -113,27 +140,62 @@ def result(submission_id: SubmissionId, service: ServiceDep) -> Response:
 @router.patch(
     "/{submission_id}", responses={**_UNREADABLE_RESPONSE, **_OWNER_ERROR_RESPONSES}, max_body_size=MAX_PATCH_BYTES
 )
-def publish(
-    submission_id: SubmissionId, change: Publication, request: Request, service: ServiceDep, token: RequiredToken
+def edit(
+    submission_id: SubmissionId,
+    change: SubmissionChange,
+    request: Request,
+    service: ServiceDep,
+    token: RequiredToken,
 ) -> Submission:
-    """Publish a submission's rows on the leaderboard, or withdraw them; only the owner may do this."""
+    """Publish a submission's rows, withdraw them, or change what is said about the method; only as the owner."""
     record = get_own_submission(service, submission_id, token)
-    if service.settings.default_visibility == "always" and not change.public:
-        raise HTTPException(403, "every submission of this leaderboard is public")
-    submissions.publish(service.database, submission_id, change.public)
-    record.public = change.public
-    return submission_schema(record, page_url(request, record))
+    edit_submission(service, record, change)
+    return submission_schema(get_submission(service, submission_id), page_url(request, record))
 
 
 @router.delete("/{submission_id}", status_code=204, responses=_OWNER_ERROR_RESPONSES)
 def delete(submission_id: SubmissionId, service: ServiceDep, token: RequiredToken) -> None:
     """Delete a submission with its archive and results; only the owner may do this. The quota is not restored."""
-    get_own_submission(service, submission_id, token)
-    submissions.remove(service.database, submission_id)
+    delete_submission(service, get_own_submission(service, submission_id, token))
+
+
+def edit_submission(service: Service, record: SubmissionModel, change: SubmissionChange) -> None:
+    """Make the owner's change of a submission. Raises status 403 if the visibility cannot be changed."""
+    values = change.model_dump(include=change.model_fields_set)
+    if values.get("public") is False and service.settings.default_visibility == "always":
+        raise HTTPException(403, "every submission of this leaderboard is public")
+    columns: dict[str, Any] = {
+        name: values.pop(name) for name in ("public", "description", "url") if name in values
+    }
+    details = {**json.loads(record.details), **values}
+    columns["details"] = json.dumps({name: value for name, value in details.items() if value is not None})
+    submissions.change(service.database, record.id, columns)
+
+
+def delete_submission(service: Service, record: SubmissionModel) -> None:
+    """Delete a submission, its archive and its results."""
+    submissions.remove(service.database, record.id)
     try:
-        service.archives.delete(submission_id)
+        service.archives.delete(record.id)
     except OSError as error:  # Storage unavailable: the orphaned archive is removed at a later startup.
-        _LOG.warning("archive not deleted", submission=submission_id[:6], error=str(error))
+        _LOG.warning("archive not deleted", submission=record.id[:6], error=str(error))
+
+
+def check_length(request: Request, max_bytes: int) -> None:
+    """Raise ``UploadRejectedError`` (413) if the body is declared to be larger than ``max_bytes``.
+
+    A client that waits for 100 Continue then sends nothing of it.
+    """
+    length = request.headers.get("content-length", "")
+    if length.isdecimal() and int(length) > max_bytes:
+        raise too_large(request.app.state.service.settings.max_upload)
+
+
+def _accepted(request: Request, response: Response, accepted: AcceptedUpload) -> Submission:
+    record = accepted.record
+    response.status_code = 202 if accepted.is_new else 200
+    response.headers["Location"] = request.url_for("look_up", submission_id=record.id).path
+    return submission_schema(record, page_url(request, record))
 
 
 def get_submission(service: Service, submission_id: str) -> SubmissionModel:
@@ -153,5 +215,8 @@ def get_own_submission(service: Service, submission_id: str, token: TokenModel) 
 
 
 def page_url(request: Request, record: SubmissionModel) -> str:
-    """Return the URL of a submission's page."""
+    """Return the URL of a submission's page, below the public URL if the settings have one."""
+    url = request.app.state.service.settings.public_url
+    if url:
+        return f"{url}/submissions/{record.id}"
     return str(request.url_for("submission_page", submission_id=record.id))

@@ -18,6 +18,7 @@ from leaderboard.web.pages.static import static_path
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
+from rebar_depth_bench.reporting.published import load_published
 from rebar_depth_bench.scoring.disclosure import COVERAGE_RULE
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
 from rebar_depth_bench.submission.metadata import INPUTS, is_http_url
@@ -39,15 +40,10 @@ def render(
     **context: Any,
 ) -> HTMLResponse:
     """Return the page rendered from a template with ``context`` and the context common to all pages."""
-    content = page_content(request, template, **context)
-    return HTMLResponse(content, status_code, {"Cache-Control": cache, **(headers or {})})
-
-
-def page_content(request: Request, template: str, **context: Any) -> bytes:
-    """Return the page of ``render`` as bytes, which can be cached for requests with the same ``root_path``."""
     service: Service = request.app.state.service
     templates: Environment = request.app.state.templates
-    return templates.get_template(template).render({**_common_context(request, service), **context}).encode()
+    content = templates.get_template(template).render({**_common_context(request, service), **context})
+    return HTMLResponse(content, status_code, {"Cache-Control": cache, **(headers or {})})
 
 
 def root_path(request: Request) -> str:
@@ -59,8 +55,9 @@ def root_path(request: Request) -> str:
 
 
 def service_address(request: Request) -> str:
-    """Return the base URL of the service as seen by the client, without a trailing slash."""
-    return str(request.base_url).rstrip("/")
+    """Return the public URL of the settings, or the base URL as seen by the client, without a trailing slash."""
+    service: Service = request.app.state.service
+    return service.settings.public_url or str(request.base_url).rstrip("/")
 
 
 def _common_context(request: Request, service: Service) -> dict[str, Any]:
@@ -83,11 +80,23 @@ def _common_context(request: Request, service: Service) -> dict[str, Any]:
         "reference_note": formatting.REFERENCE_NOTE,
         "input_classes": INPUTS,
         "plural": formatting.plural,
+        "is_degenerate": lambda interval: len(set(interval.split(" – "))) == 1,
         "hidden_truth": service.settings.hidden_truth,
+        "contact": printable(service.settings.contact),
+        "dataset_name": printable(service.card.name),
+        "dataset_licence": printable(service.card.licence),
+        "view_counts": {name: len(config.view_ids) for name, config in service.folder.config_by_name.items()},
+        "picture_titles": PICTURE_TITLES,
+        "max_intervals": MAX_INTERVALS_PLOTTED,
+        "paper_title": load_published().title,
         "coverage_rule": COVERAGE_RULE,
     }
 
 
+MAX_INTERVALS_PLOTTED = 60
+"""Number of points up to which a plot has their intervals."""
+PICTURE_TITLES = {"colour": "Colour", "truth": "Ground truth", "prediction": "Prediction", "error": "Native error"}
+"""Headings of the pictures of a view by kind, in the order in which they are shown."""
 MAX_TEXT_CHARS = 4000
 _STEPS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
 

@@ -2,139 +2,138 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Literal
 
-from anyio import to_thread
 from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
-from leaderboard.db.rankings import error_map_webp, ranks
+from leaderboard.db.rankings import picture_webp
 from leaderboard.db.submissions import SCORED
-from leaderboard.web.api.auth import ServiceDep, service_of
+from leaderboard.web.api.auth import ServiceDep
 from leaderboard.web.api.submissions import SubmissionId, get_submission
-from leaderboard.web.cache import (
-    NO_STORE,
-    REVALIDATE,
-    RenderedBody,
-    cache_state_of,
-    cached_public_body,
-    conditional_response,
-    get_or_render,
-)
+from leaderboard.web.cache import NO_STORE, REVALIDATE
+from leaderboard.web.pages.comparison import comparison_context
 from leaderboard.web.pages.leaderboard import (
     NATIVE,
+    PAGE_ROWS,
     SCALED,
     WITHIN,
-    ConfigRanking,
     make_config_ranking,
-    parse_order,
-    published_numbers,
+    parse_selection,
 )
-from leaderboard.web.pages.rendering import page_content, render, root_path
+from leaderboard.web.pages.overview import make_overview
+from leaderboard.web.pages.rendering import render
+from leaderboard.web.pages.scenes import scene_webp
 from leaderboard.web.pages.submission import submission_context
 from leaderboard.web.pages.submit import how_to_page
-from rebar_depth_bench.submission.metadata import INPUTS
+from rebar_depth_bench.reporting.published import load_published
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
-HTML = "text/html; charset=utf-8"
-MAX_OVERVIEW_ROWS = 25
-"""Rows shown per config on a page of several configs, which links to the full rankings."""
+OVERVIEW_LIMITS = (10, 300)
+"""Rows and plotted points per config on the page of several configs, which links to the full rankings."""
+
+SCENE_AGE_S = 3600
+"""Time for which browsers keep the picture of a config, seconds."""
 
 _NameQuery = Annotated[str | None, Query(max_length=100)]
+_IdQuery = Annotated[str, Query(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9_-]+$")]
+_PageQuery = Annotated[int | None, Query(ge=1, le=1_000_000)]
 _PathPart = Annotated[str, Path(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
 
 @router.get("/", name="board_page")
-async def leaderboard_page(
-    request: Request, config: _NameQuery = None, sort: _NameQuery = None, inputs: _NameQuery = None
-) -> Response:
-    """Return the page with the rankings of all configs, or of ``config`` only, in the order ``sort``.
+def leaderboard_page(
+    request: Request,
+    service: ServiceDep,
+    config: _NameQuery = None,
+    sort: _NameQuery = None,
+    inputs: _NameQuery = None,
+    q: _NameQuery = None,
+    page: _PageQuery = None,
+) -> HTMLResponse:
+    """Return the page with an overview and the first rows of all configs, or with the rows of ``config``.
 
-    With ``inputs``, only the rows of this input class are shown.
+    The other parameters are those of ``parse_selection``.
     """
-    service = service_of(request)
     all_configs = service.folder.configs
     if config is not None and config not in all_configs:
         raise HTTPException(404, f"the dataset has no config {config!r}, expected one of {', '.join(all_configs)}")
     configs = all_configs if config is None else (config,)
-    max_rows = MAX_OVERVIEW_ROWS if len(configs) > 1 else None
-    order, inputs = parse_order(sort), inputs if inputs in INPUTS else None
-    key_prefix = (leaderboard_page, root_path(request), config, order, inputs)
-
-    def make() -> RenderedBody:
-        rankings = [make_config_ranking(service.database, name, order, inputs, max_rows) for name in configs]
-        return (*key_prefix, *(ranking.version for ranking in rankings)), _leaderboard_content(
-            request, all_configs, config, inputs, rankings
-        )
-
-    body = await cached_public_body(request, configs, key_prefix, make)
-    return conditional_response(request, body, HTML, {"Cache-Control": REVALIDATE})
+    selection = parse_selection(sort, inputs, q, page)
+    several = len(configs) > 1
+    shown, *limits = (selection.at_page(1), *OVERVIEW_LIMITS) if several else (selection, PAGE_ROWS, None)
+    hidden_truth = service.settings.hidden_truth
+    return render(
+        request,
+        "board.html.j2",
+        configs=all_configs,
+        chosen=config,
+        selection=selection,
+        overview=make_overview(service.rankings, configs, selection, hidden_truth) if several else None,
+        rankings=[
+            make_config_ranking(service.rankings.of(name), name, shown, hidden_truth, *limits) for name in configs
+        ],
+        columns={"native": NATIVE, "scaled": SCALED, "within": WITHIN},
+        paper_part=load_published().parts["synthetic"],
+    )
 
 
 @router.get("/submissions/{submission_id}", name="submission_page")
-async def submission_page(
+def submission_page(
     submission_id: SubmissionId, request: Request, service: ServiceDep, views: _NameQuery = None
-) -> Response:
+) -> HTMLResponse:
     """Return the page of a submission, which anyone who knows its URL may read.
 
     All views of the config ``views`` are listed, and the worst views of the others.
     """
-    record = await to_thread.run_sync(get_submission, service, submission_id)
-    if record.status != SCORED:
-        context = await to_thread.run_sync(submission_context, service, record, views)
-        return render(request, "submission.html.j2", cache=NO_STORE, **context)
-    views = views if views in service.folder.configs else None
-    cache_state = cache_state_of(request)
-    # The ranks on the page depend on the public rows of all configs.
-    versions = tuple(sorted((await cache_state.versions.get()).items()))
-    version = (record.id, record.finished_at, record.public, versions)
-    key = (submission_page, root_path(request), views, *version)
-
-    def make() -> RenderedBody:
-        context = submission_context(service, record, views, ranks(service.database, record))
-        return key, page_content(request, "submission.html.j2", **context)
-
-    body = await get_or_render(cache_state, key, make)
-    return conditional_response(request, body, HTML, {"Cache-Control": _cache_control(record.public)})
-
-
-@router.get("/submissions/{submission_id}/error-maps/{config}/{number}.webp", response_class=Response)
-def error_map(submission_id: SubmissionId, config: _PathPart, number: _PathPart, service: ServiceDep) -> Response:
-    """Return the error map of a view. Raises status 404 if none is stored."""
     record = get_submission(service, submission_id)
-    webp = error_map_webp(service.database, submission_id, f"{config}/{number}")
+    views = views if views in service.folder.configs else None
+    cache = _cache_control(record.public and record.status == SCORED)
+    return render(request, "submission.html.j2", cache=cache, **submission_context(service, record, views))
+
+
+@router.get("/submissions/{submission_id}/pictures/{kind}/{config}/{number}.webp", response_class=Response)
+def picture(
+    submission_id: SubmissionId,
+    kind: Literal["colour", "truth", "prediction", "error"],
+    config: _PathPart,
+    number: _PathPart,
+    service: ServiceDep,
+) -> Response:
+    """Return a picture of a view. Raises status 404 if it is not stored."""
+    record = get_submission(service, submission_id)
+    webp = picture_webp(service.database, submission_id, f"{config}/{number}", kind)
     if webp is None:
-        raise HTTPException(404, "there is no error map of this view")
+        raise HTTPException(404, "there is no such picture of this view")
     return Response(webp, media_type="image/webp", headers={"Cache-Control": _cache_control(record.public)})
 
 
+@router.get("/scenes/{config}.webp", response_class=Response)
+def scene(config: _PathPart, service: ServiceDep) -> Response:
+    """Return a picture of a config. Raises status 404 if the config is unknown or has no colour."""
+    if config not in service.folder.configs:
+        raise HTTPException(404, "the dataset has no such config")
+    if config not in service.scenes:
+        service.scenes[config] = scene_webp(service.folder, config)
+    webp = service.scenes[config]
+    if webp is None:
+        raise HTTPException(404, "the config has no colour")
+    return Response(webp, media_type="image/webp", headers={"Cache-Control": f"public, max-age={SCENE_AGE_S}"})
+
+
+@router.get("/compare")
+def compare_page(request: Request, service: ServiceDep, a: _IdQuery, b: _IdQuery) -> HTMLResponse:
+    """Return the comparison of two scored submissions, which anyone who knows their ids may read."""
+    public = all(get_submission(service, submission_id).public for submission_id in (a, b))
+    context = comparison_context(service, a, b)
+    return render(request, "comparison.html.j2", cache=_cache_control(public), **context)
+
+
 @router.get("/how-to-submit", name="how_to_submit")
-def how_to_submit(request: Request) -> HTMLResponse:
+async def how_to_submit(request: Request) -> HTMLResponse:
     """Return the page with submission instructions and the upload form."""
     return how_to_page(request)
-
-
-def _leaderboard_content(
-    request: Request,
-    all_configs: Sequence[str],
-    chosen: str | None,
-    inputs: str | None,
-    rankings: Sequence[ConfigRanking],
-) -> bytes:
-    published = published_numbers()
-    return page_content(
-        request,
-        "board.html.j2",
-        configs=all_configs,
-        chosen=chosen,
-        inputs=inputs,
-        rankings=rankings,
-        columns={"native": NATIVE, "scaled": SCALED, "within": WITHIN},
-        paper_title=published.title,
-        paper_part=published.parts["synthetic"],
-    )
 
 
 def _cache_control(public: bool) -> str:

@@ -13,15 +13,14 @@ from leaderboard.db.models import SubmissionModel
 from leaderboard.db.tokens import find_token
 from leaderboard.service import Service
 from leaderboard.uploads.accept import accept_upload
-from leaderboard.uploads.multipart import UploadRejectedError, read_leading_field
+from leaderboard.uploads.errors import UploadRejectedError
+from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES, UploadForm
 from leaderboard.web.api.auth import ServiceDep
-from leaderboard.web.api.submissions import page_url
+from leaderboard.web.api.submissions import check_length, page_url
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.pages.rendering import clean_text, format_size, problem_lines, render, service_address
 
 router = APIRouter(include_in_schema=False)
-
-TOKEN_FIELD = "token"
 
 
 @router.post("/submit", response_class=HTMLResponse)
@@ -32,6 +31,7 @@ async def submit(request: Request, service: ServiceDep) -> Response:
     form, which alone authenticates the request.
     """
     try:
+        check_length(request, service.settings.max_upload + MAX_OVERHEAD_BYTES)
         record = await _accept_form_upload(service, request.stream(), request)
     except UploadRejectedError as error:
         return how_to_page(request, error.status, error.detail, problem_lines(error.problems))
@@ -56,10 +56,12 @@ def how_to_page(
         problems=[clean_text(problem) for problem in problems if problem != message],
         address=service_address(request),
         quota=settings.quota,
+        quota_size=format_size(settings.quota_bytes),
         most=format_size(settings.max_upload),
         most_bytes=settings.max_upload,
         always_public=settings.default_visibility == "always",
         dataset_configs=service.folder.configs,
+        first_view=next(iter(service.folder.config(service.folder.configs[0]).view_ids)),
     )
 
 
@@ -68,10 +70,11 @@ async def _accept_form_upload(service: Service, body: AsyncIterator[bytes], requ
 
     Raises ``UploadRejectedError``.
     """
-    text, full_body = await read_leading_field(body, request.headers.get("content-type", ""), TOKEN_FIELD)
-    if not text.strip():
+    form = UploadForm(body, request.headers.get("content-type", ""))
+    text = (await form.token()).strip()
+    if not text:
         raise UploadRejectedError(401, "no token, expected the token that you received from the operator")
-    token = await to_thread.run_sync(find_token, service.database, text.strip())
+    token = await to_thread.run_sync(find_token, service.database, text)
     if token is None:
         raise UploadRejectedError(401, "the token is unknown")
-    return await accept_upload(service, token, full_body, request.headers)
+    return (await accept_upload(service, token, form.archive())).record

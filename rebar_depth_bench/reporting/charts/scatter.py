@@ -5,19 +5,22 @@ Published points are hollow, those of the submission are filled.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting.charts.axes import WIDTH, LogAxis, decade_axis, svg_figure, svg_text, tick_label
 from rebar_depth_bench.reporting.formatting import number
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52.0, WIDTH - 14.0, 14.0, 286.0
-_HALF_WIDTH, _HALF_HEIGHT = 8.0, 8.0
+_POINT_RADIUS_PX, _LABEL_RADIUS_PX, _CELL_PX = 5.0, 7.0, 2.0
+_MAX_DESCRIBED = 20
+_MAX_TITLE_CHARACTERS = 40
 _LABEL_DIRECTIONS = ((1, 0), (-1, 0), (0, -1), (0, 1), (1, -1), (-1, 1), (1, 1), (-1, -1))
-_LABEL_DISTANCES_PX = (15.0, 24.0, 34.0)
+_LABEL_DISTANCE_PX = 14.0
 _MARGIN_FACTORS = (0.93, 1.07)
 
 OptionalInterval = tuple[float, float] | None
@@ -47,41 +50,53 @@ def scatter_chart(title: str, points: Sequence[ScatterPoint]) -> Markup:
     points_px = [(x_axis.at(p.native), y_axis.at(p.scaled)) for p in points]
     marks = [_mark(point, *place, x_axis, y_axis) for point, place in zip(points, points_px, strict=True)]
     labels = [
-        svg_text(round(x, 1), round(y + 4.5, 1), point.mark, "middle" if point.published else "middle name")
-        for point, (x, y) in zip(points, place_labels(points_px), strict=True)
+        svg_text(
+            round(place[0], 1), round(place[1] + 4.5, 1), point.mark, "middle" + " name" * (not point.published)
+        )
+        for point, place in zip(points, place_labels(points_px), strict=True)
+        if place is not None
     ]
     body = _grid(x_axis, y_axis) + _diagonal(x_axis, y_axis) + "".join(marks) + "".join(labels)
     values_text = "; ".join(
         f"{p.mark}: {printable(p.name)}{', published' if p.published else ''}, "
         f"native {number(p.native, 4)}, scaled {number(p.scaled, 4)}"
-        for p in points
+        for p in points[:_MAX_DESCRIBED]
     )
+    if len(points) > _MAX_DESCRIBED:
+        values_text += f"; and {len(points) - _MAX_DESCRIBED} more"
     return svg_figure(title, f"AbsRel native and after the oracle scale. {values_text}.", _BOTTOM + 42, body)
 
 
-def place_labels(points_px: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the centre of each point's label, pixels.
+def place_labels(points_px: Sequence[tuple[float, float]]) -> list[tuple[float, float] | None]:
+    """Return the centre of each point's label, pixels, or None where it would overlap a point or another label.
 
-    This is the nearest candidate position with the fewest overlaps with points and labels already placed.
+    A label touches its point, so that it needs no line to it.
     """
-    labels: list[tuple[float, float]] = []
+    occupied = {cell for x, y in points_px for cell in _cells(x, y, _POINT_RADIUS_PX)}
+    labels: list[tuple[float, float] | None] = []
     for x, y in points_px:
-        candidates = [
-            (x + distance * dx, y + distance * dy)
-            for distance in _LABEL_DISTANCES_PX
-            for dx, dy in _LABEL_DIRECTIONS
-        ]
-        inside = [(cx, cy) for cx, cy in candidates if _LEFT + 8 < cx < _RIGHT - 8 and _TOP < cy < _BOTTOM - 8]
-        labels.append(
-            min(inside or candidates, key=lambda candidate: _overlap_count(candidate, [*points_px, *labels]))
+        candidates = ((x + _LABEL_DISTANCE_PX * dx, y + _LABEL_DISTANCE_PX * dy) for dx, dy in _LABEL_DIRECTIONS)
+        free = (
+            (cx, cy)
+            for cx, cy in candidates
+            if _LEFT + 8 < cx < _RIGHT - 8
+            and _TOP + 4 < cy < _BOTTOM - 8
+            and occupied.isdisjoint(_cells(cx, cy, _LABEL_RADIUS_PX))
         )
+        label = next(free, None)
+        if label is not None:
+            occupied.update(_cells(*label, _LABEL_RADIUS_PX))
+        labels.append(label)
     return labels
 
 
-def _overlap_count(centre: tuple[float, float], others: Iterable[tuple[float, float]]) -> int:
-    return sum(
-        abs(centre[0] - x) < 2 * _HALF_WIDTH - 2 and abs(centre[1] - y) < 2 * _HALF_HEIGHT - 2 for x, y in others
+def _cells(x: float, y: float, radius_px: float) -> list[tuple[int, int]]:
+    """Return the cells of a raster that a square of the half width ``radius_px`` overlaps."""
+    columns, rows = (
+        range(math.floor((centre - radius_px) / _CELL_PX), math.floor((centre + radius_px) / _CELL_PX) + 1)
+        for centre in (x, y)
     )
+    return [(column, row) for column in columns for row in rows]
 
 
 def _axis_values(values: Iterable[tuple[float, OptionalInterval]]) -> list[float]:
@@ -90,8 +105,9 @@ def _axis_values(values: Iterable[tuple[float, OptionalInterval]]) -> list[float
 
 
 def _mark(point: ScatterPoint, x: float, y: float, x_axis: LogAxis, y_axis: LogAxis) -> str:
+    title = f"<title>{escape(f'{point.mark} {printable(point.name, _MAX_TITLE_CHARACTERS)}')}</title>"
     if point.published:
-        return f'<circle class="published ring" cx="{x:.1f}" cy="{y:.1f}" r="5"/>'
+        return f'<circle class="published ring" cx="{x:.1f}" cy="{y:.1f}" r="5">{title}</circle>'
     bars = ""
     if point.native_interval:
         low, high = map(x_axis.at, point.native_interval)
@@ -99,7 +115,7 @@ def _mark(point: ScatterPoint, x: float, y: float, x_axis: LogAxis, y_axis: LogA
     if point.scaled_interval:
         low, high = map(y_axis.at, point.scaled_interval)
         bars += f'<path class="bars" d="M{x:.1f} {low:.1f}V{high:.1f}"/>'
-    return f'{bars}<circle class="native fill" cx="{x:.1f}" cy="{y:.1f}" r="6"/>'
+    return f'{bars}<circle class="native fill" cx="{x:.1f}" cy="{y:.1f}" r="5">{title}</circle>'
 
 
 def _diagonal(x_axis: LogAxis, y_axis: LogAxis) -> str:

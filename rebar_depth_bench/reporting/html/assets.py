@@ -37,7 +37,7 @@ def environment(*loaders: BaseLoader) -> Environment:
 
     All values are escaped, and undefined names raise an error.
     """
-    return Environment(
+    pages = Environment(
         loader=ChoiceLoader([*loaders, PackageLoader("rebar_depth_bench.reporting", "html")]),
         autoescape=True,
         undefined=StrictUndefined,
@@ -45,3 +45,10 @@ def environment(*loaders: BaseLoader) -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    pages.filters["data_uri"] = data_uri
+    return pages
+
+
+def data_uri(image: bytes, kind: str) -> str:
+    """Return an encoded image as a data URI; ``kind`` is the part of its media type after ``image/``."""
+    return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"

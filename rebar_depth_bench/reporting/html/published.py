@@ -53,17 +53,16 @@ def paper_scenes(result: Result) -> list[PaperScene]:
 
 
 def _paper_scene(name: str, scene: PublishedScene, tables: Mapping[str, Table]) -> PaperScene:
-    letters = [_letter_mark(index) for index in range(len(tables))]
-    numbers = [str(index + 1) for index in range(len(scene.rows))]
-    rows = [_own_row(*arguments) for arguments in zip(letters, tables.items(), strict=True)]
-    rows += [published_row(*arguments) for arguments in zip(numbers, scene.rows, strict=True)]
+    rows = [_own_row(str(index + 1), config) for index, config in enumerate(tables.items())]
+    rows += [published_row(published_mark(index), row) for index, row in enumerate(scene.rows)]
     heading = scene.title if scene.title.lower() == name else f"{scene.title} ({name})"
     chart = scatter_chart(f"{heading}: native and scaled AbsRel", scatter_points(rows, tables))
     other_optics = any(table.published and not table.published.same_optics for table in tables.values())
     return PaperScene(heading, scene.distance, chart, rows, other_optics)
 
 
-def _letter_mark(index: int) -> str:
+def published_mark(index: int) -> str:
+    """Return the capital letter of a published row; rows of submissions have numbers."""
     return chr(_FIRST_LETTER + index) if index < 26 else f"A{index - 25}"
 
 

@@ -66,7 +66,7 @@ def views_to_show(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
 
 def shown_views(panels: Iterable[ViewPanels], configs: Sequence[str]) -> list[ShownView]:
     """Return the encoded views in the order of ``configs``, the worst view of each config first."""
-    encoded = [(_worst_first_key(view, configs), _shown_view(view)) for view in panels]
+    encoded = [(_worst_first_key(view, configs), shown_view(view)) for view in panels]
     return [view for _, view in sorted(encoded, key=lambda pair: pair[0])]
 
 
@@ -88,7 +88,8 @@ def _worst_first_key(view: ViewPanels, configs: Sequence[str]) -> tuple[int, flo
     )
 
 
-def _shown_view(view: ViewPanels) -> ShownView:
+def shown_view(view: ViewPanels) -> ShownView:
+    """Return the encoded images of a view with its numbers and the texts of the colour bars."""
     images = view_images(view)
     predicted = images.predicted_m
     row = view_row(view.score)

@@ -5,7 +5,6 @@ All functions are pure; colours come from ``rebar_depth_bench.reporting.colormap
 
 from __future__ import annotations
 
-import base64
 import io
 import math
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from numpy import ndarray
 from PIL import Image
 
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS, colour_indices, robust_range
+from rebar_depth_bench.reporting.html.assets import data_uri
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.scoring.view_score import ViewScore
 
@@ -57,7 +57,7 @@ class ViewPanels:
 
 @dataclass(frozen=True)
 class ViewImages:
-    """Encoded panels of one view as data URIs, and the ranges of their colour bars.
+    """Encoded panels of one view as WebP, and the ranges of their colour bars.
 
     ``colour`` is None in a config without colour.
     Depth colours run from ``near_m`` to ``far_m`` for both ground truth and prediction, error colours from minus
@@ -67,11 +67,11 @@ class ViewImages:
 
     width: int
     height: int
-    colour: str | None
-    truth: str
-    prediction: str
-    native_error: str
-    scaled_error: str
+    colour: bytes | None
+    truth: bytes
+    prediction: bytes
+    native_error: bytes
+    scaled_error: bytes
     near_m: float
     far_m: float
     predicted_m: tuple[float, float] | None
@@ -92,26 +92,17 @@ def view_images(view: ViewPanels) -> ViewImages:
     return ViewImages(
         width=truth.shape[1],
         height=truth.shape[0],
-        colour=None if rgb is None else _data_uri(rgb, lossless=False),
-        truth=_data_uri(truth),
-        prediction=_data_uri(depth_image(view.prediction_m[::step, ::step], near_m, far_m)),
-        native_error=_data_uri(error_image(native_m[::step, ::step], steel, rgb, native_limit)),
-        scaled_error=_data_uri(error_image(scaled_m[::step, ::step], steel, rgb, scaled_limit)),
+        colour=None if rgb is None else _webp(rgb, lossless=False),
+        truth=_webp(truth),
+        prediction=_webp(depth_image(view.prediction_m[::step, ::step], near_m, far_m)),
+        native_error=_webp(error_image(native_m[::step, ::step], steel, rgb, native_limit)),
+        scaled_error=_webp(error_image(scaled_m[::step, ::step], steel, rgb, scaled_limit)),
         near_m=near_m,
         far_m=far_m,
         predicted_m=predicted_range(view.prediction_m, scored),
         native_limit_cm=native_limit,
         scaled_limit_cm=scaled_limit,
     )
-
-
-def error_webp(view: ViewPanels) -> bytes:
-    """Return a view's native error map as WebP, reduced like the other panels."""
-    step = max(1, round(view.truth_m.shape[1] / PANEL_WIDTH))
-    error_m = signed_error(view, 1.0)
-    limit_cm = error_limit_cm(error_m, scored_pixels(view.steel, view.truth_m))
-    steel, rgb = view.steel[::step, ::step], None if view.rgb is None else reduced_colour(view.rgb, step)
-    return _encoded(error_image(error_m[::step, ::step], steel, rgb, limit_cm))
 
 
 def depth_range(truth_m: Float32[ndarray, "h w"], scored: ndarray) -> tuple[float, float]:
@@ -205,7 +196,9 @@ def reduced_colour(rgb: UInt8[ndarray, "h w 3"], step: int) -> UInt8[ndarray, "h
 
 def colour_bar_uri(colours: UInt8[ndarray, "n 3"]) -> str:
     """Return a colour map as the data URI of a one-row PNG, first colour on the left."""
-    return _data_uri(colours[None], kind="PNG")
+    out = io.BytesIO()
+    Image.fromarray(colours[None]).save(out, "PNG", optimize=True)
+    return data_uri(out.getvalue(), "png")
 
 
 def _backdrop(rgb: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
@@ -220,15 +213,7 @@ def _rounded_up(value: float) -> float:
     return next(round(step * power, 6) for step in _ROUND_STEPS if step * power >= value * (1 - _LIMIT_TOLERANCE))
 
 
-def _data_uri(image: UInt8[ndarray, "h w 3"], *, kind: str = "WEBP", lossless: bool = True) -> str:
-    encoded = _encoded(image, kind=kind, lossless=lossless)
-    return f"data:image/{kind.lower()};base64,{base64.b64encode(encoded).decode()}"
-
-
-def _encoded(image: UInt8[ndarray, "h w 3"], *, kind: str = "WEBP", lossless: bool = True) -> bytes:
+def _webp(image: UInt8[ndarray, "h w 3"], *, lossless: bool = True) -> bytes:
     out = io.BytesIO()
-    if kind == "PNG":
-        Image.fromarray(image).save(out, "PNG", optimize=True)
-    else:
-        Image.fromarray(image).save(out, "WEBP", lossless=lossless, quality=70 if lossless else 80, method=4)
+    Image.fromarray(image).save(out, "WEBP", lossless=lossless, quality=70 if lossless else 80, method=4)
     return out.getvalue()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from html.parser import HTMLParser
 
-VOID_TAGS = {"meta", "img", "br", "path", "circle", "link", "input"}
+VOID_TAGS = {"meta", "img", "br", "path", "link", "input"}
 
 
 class Page(HTMLParser):

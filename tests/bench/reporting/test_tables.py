@@ -92,8 +92,8 @@ def test_published_rows_are_marked_and_not_sortable() -> None:
     ]
     lattice = scenes[0].rows
     assert [(row.mark, row.name, row.published) for row in lattice[:2]] == [
-        ("A", "lattice", False),
-        ("1", "FoundationStereo", True),
+        ("1", "lattice", False),
+        ("A", "FoundationStereo", True),
     ]
     assert [cell.text for cell in lattice[4].cells] == ["91.19", "3.145", "0.029", "0.25"]
     assert [cell.text for cell in lattice[0].cells] == ["20.09", "0.7500", "0.0613", "0.625"]
@@ -139,12 +139,20 @@ def test_scatter_chart_positions_and_describes_points() -> None:
 _PIXELS = st.tuples(st.floats(60, 440), st.floats(20, 280))
 
 
-@given(st.lists(_PIXELS, max_size=5))
-def test_scatter_labels_do_not_overlap(places: list[tuple[float, float]]) -> None:
+@given(st.lists(_PIXELS, max_size=30))
+def test_scatter_labels_touch_their_points_and_do_not_overlap(places: list[tuple[float, float]]) -> None:
     labels = place_labels(places)
-    for index, label in enumerate(labels):
-        for other in [*places, *labels[:index], *labels[index + 1 :]]:
+    assert len(labels) == len(places)
+    shown = [label for label in labels if label is not None]
+    for place, label in zip(places, labels, strict=True):
+        assert label is None or max(abs(label[0] - place[0]), abs(label[1] - place[1])) < 15
+    for index, label in enumerate(shown):
+        for other in [*places, *shown[:index], *shown[index + 1 :]]:
             assert abs(label[0] - other[0]) >= 9 or abs(label[1] - other[1]) >= 9
+
+
+def test_lonely_scatter_point_has_a_label() -> None:
+    assert place_labels([(200, 150)]) == [(214, 150)]
 
 
 def test_views_to_show_takes_worst_half_then_even_steps() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import socketserver
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -53,10 +54,8 @@ def scripted_server() -> Iterator[ScriptedServer]:
                 head += line
             if not head:
                 return
-            if b"chunked" in head.lower():
-                while size := int(self.rfile.readline(), 16):
-                    self.rfile.read(size + 2)
-                self.rfile.readline()
+            if length := re.search(rb"content-length: (\d+)", head, re.IGNORECASE):
+                self.rfile.read(int(length[1]))
             endpoint = _endpoint(head)
             script.requests.append((endpoint, head.decode("latin-1")))
             answers = script.answers[endpoint]
@@ -86,6 +85,6 @@ def _endpoint(head: bytes) -> str:
     method, path = head.split(b" ", 2)[:2]
     if path.endswith(b"/token"):
         return "token"
-    if method == b"POST":
+    if method == b"PUT":
         return "submit"
     return "result" if path.endswith(b"/result.json") else "status"

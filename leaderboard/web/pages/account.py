@@ -1,0 +1,128 @@
+"""Page for the owner of a token: list, publish, withdraw, edit and delete submissions.
+
+The token is a field of every form, and nothing is stored in the browser. Other sites do not know the token, so the
+forms need no further protection against forged requests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import parse_qsl
+
+from anyio import to_thread
+from fastapi import APIRouter, HTTPException, Request
+from fastapi.responses import HTMLResponse
+from pydantic import ValidationError
+
+from leaderboard.db import submissions
+from leaderboard.db.models import SubmissionModel, TokenModel
+from leaderboard.db.tokens import find_token
+from leaderboard.service import Service
+from leaderboard.web.api.auth import ServiceDep
+from leaderboard.web.api.schemas import SubmissionChange, submission_schema
+from leaderboard.web.api.submissions import (
+    MAX_PATCH_BYTES,
+    delete_submission,
+    edit_submission,
+    get_own_submission,
+    page_url,
+)
+from leaderboard.web.cache import NO_STORE
+from leaderboard.web.pages.rendering import format_size, format_time, render
+from rebar_depth_bench.errors import printable
+
+router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
+
+EDITABLE = ("description", "url", "code_url", "licence", "training_data", "parameters")
+
+
+@router.get("/account", name="account_page")
+async def account_page(request: Request) -> HTMLResponse:
+    """Return the form that asks for the token."""
+    return render(request, "account.html.j2", token="", name="", message="", own=[], editable=EDITABLE)
+
+
+@router.post("/account", max_body_size=MAX_PATCH_BYTES)
+async def account(request: Request, service: ServiceDep) -> HTMLResponse:
+    """Make the change of a form, if any, and return the list of the token's submissions."""
+    fields = dict(parse_qsl((await request.body()).decode(errors="replace"), keep_blank_values=True))
+    text = fields.get("token", "").strip()
+    token = await to_thread.run_sync(find_token, service.database, text)
+    if token is None:
+        return render(
+            request,
+            "account.html.j2",
+            status_code=401,
+            cache=NO_STORE,
+            headers={"WWW-Authenticate": "Bearer"},
+            token="",
+            name="",
+            message="The token is unknown.",
+            own=[],
+            editable=EDITABLE,
+        )
+    status, message = await to_thread.run_sync(_change, service, token, fields)
+    records = await to_thread.run_sync(submissions.of_token, service.database, token)
+    return render(
+        request,
+        "account.html.j2",
+        status_code=status,
+        cache=NO_STORE,
+        token=text,
+        name=printable(token.name),
+        message=message,
+        own=[_line(service, request, record) for record in records],
+        editable=EDITABLE,
+    )
+
+
+def _change(service: Service, token: TokenModel, fields: Mapping[str, str]) -> tuple[int, str]:
+    """Make the change that a form asks for; return the status and a message, which is empty without a change."""
+    action, submission_id = fields.get("action", ""), fields.get("id", "")
+    if not action:
+        return 200, ""
+    try:
+        record = get_own_submission(service, submission_id, token)
+        if action == "delete":
+            delete_submission(service, record)
+            return 200, f"{printable(record.method)} is deleted."
+        change = _change_of(action, fields)
+        edit_submission(service, record, change)
+    except HTTPException as error:
+        return error.status_code, f"Not changed: {error.detail}."
+    except ValidationError as error:
+        wrong = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors())
+        return 422, f"Not changed: {printable(wrong, 500)}."
+    return 200, f"{printable(record.method)} is changed."
+
+
+def _change_of(action: str, fields: Mapping[str, str]) -> SubmissionChange:
+    """Return the change of a form. Raises status 422 for an unknown action and ``ValidationError``."""
+    if action in ("publish", "withdraw"):
+        return SubmissionChange(public=action == "publish")
+    if action != "edit":
+        raise HTTPException(422, "there is no such action")
+    values: dict[str, Any] = {name: fields[name].strip() or None for name in EDITABLE if name in fields}
+    return SubmissionChange.model_validate(values)
+
+
+def _line(service: Service, request: Request, record: SubmissionModel) -> dict[str, Any]:
+    submission = submission_schema(record, page_url(request, record))
+    return {
+        "id": record.id,
+        "method": printable(record.method),
+        "status": record.status,
+        "public": record.public,
+        "can_withdraw": service.settings.default_visibility != "always",
+        "created": format_time(record.created_at),
+        "size": format_size(record.archive_bytes),
+        "values": {
+            "description": submission.description or "",
+            "url": submission.method_url or "",
+            "code_url": submission.code_url or "",
+            "licence": submission.licence or "",
+            "training_data": submission.training_data or "",
+            "parameters": "" if submission.parameters is None else submission.parameters,
+        },
+    }

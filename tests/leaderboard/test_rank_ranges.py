@@ -1,0 +1,65 @@
+"""Ranges of ranks: agreement with the paired comparison of the command line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from leaderboard.db.view_errors import rank_ranges, unpack_view_errors, view_errors
+from rebar_depth_bench.scoring.comparison import compare
+from rebar_depth_bench.scoring.result import Result
+from tests.bench.reporting.results import result, scored_view
+
+VIEWS = 40
+
+
+def random_results(count: int, spread: float, seed: int) -> list[Result]:
+    """Return results whose errors vary in common with the view and on their own."""
+    rng = np.random.default_rng(seed)
+    difficulty = rng.uniform(0.1, 0.3, VIEWS)
+    results = []
+    for number in range(count):
+        errors = np.clip(difficulty + spread * number + rng.normal(0, 0.05, VIEWS), 0.01, 0.9)
+        views = [scored_view(f"lattice/{index:04d}", float(error)) for index, error in enumerate(errors)]
+        results.append(result(*views, method=f"m{number}"))
+    return results
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.01, 0.05])
+def test_ranges_agree_with_the_paired_comparison(spread: float) -> None:
+    results = random_results(8, spread, seed=3)
+    ranges = rank_ranges([view_errors(one.to_dict(), "lattice") for one in results])
+    for index, one in enumerate(results):
+        verdicts = [
+            next(row for row in compare(one, other).configs["lattice"] if row.name == "rank_error").verdict
+            for number, other in enumerate(results)
+            if number != index
+        ]
+        assert ranges[index] == (1 + verdicts.count("better"), len(results) - verdicts.count("worse"))
+
+
+def test_range_contains_the_rank() -> None:
+    results = random_results(60, 0.002, seed=5)
+    errors = [one.tables["lattice"].rank_error or 0.0 for one in results]
+    ranges = rank_ranges([view_errors(one.to_dict(), "lattice") for one in results])
+    for error, rank_range in zip(errors, ranges, strict=True):
+        assert rank_range is not None
+        assert rank_range[0] <= 1 + sum(other < error for other in errors) <= rank_range[1]
+
+
+def test_too_few_views_allow_every_rank() -> None:
+    results = [result(scored_view("lattice/0000", error)) for error in (0.1, 0.5)]
+    assert rank_ranges([view_errors(one.to_dict(), "lattice") for one in results]) == [(1, 2), (1, 2)]
+
+
+def test_rows_without_view_errors_or_with_other_views_have_no_range() -> None:
+    full, part = random_results(1, 0, 1)[0], result(scored_view("lattice/0000"))
+    packed = [view_errors(one.to_dict(), "lattice") for one in (full, full, part)]
+    assert rank_ranges([*packed, None])[2:] == [None, None]
+    assert rank_ranges(packed)[:2] == [(1, 2), (1, 2)]
+    assert rank_ranges(packed[:1]) == [None]
+    indices, errors = unpack_view_errors(packed[2] or b"")
+    assert (np.frombuffer(indices, "<i4").tolist(), errors.tolist()) == (
+        [0],
+        [pytest.approx(part.views[0].rank_error)],
+    )
