@@ -55,7 +55,23 @@ class PierSpec:
     tie_diameter_m: float = 0.016
 
 
-AssemblySpec = LatticeSpec | PileSpec | PierSpec | CageFileSpec | MeshFileSpec
+@dataclass(frozen=True)
+class GeneratedCageSpec:
+    """Reinforcement cage from the generator (``scene.cages``): cage ``number`` of a split, from a seed.
+
+    ``family`` restricts the draw; ``version`` is that of the generator, with which the same numbers give the same
+    cage.
+    """
+
+    split: str
+    number: int
+    seed: int = 0
+    family: str | None = None
+    version: int = 1
+    kind: str = "generated-cage"
+
+
+AssemblySpec = LatticeSpec | PileSpec | PierSpec | CageFileSpec | MeshFileSpec | GeneratedCageSpec
 
 
 @dataclass(frozen=True)

@@ -87,6 +87,12 @@ def inspection_picture(inspection: Inspection) -> bytes:
     return stream.getvalue()
 
 
+def corner_view(inspection: Inspection) -> Image.Image:
+    """Return a picture of a cage from the front, the right and above."""
+    bars = inspection.cage.bars
+    return _panel(inspection, _strokes(bars, _colours(bars)), _SIDES[-1])
+
+
 def _diameter_mm(bar: CageBar) -> float | None:
     return round(bar.bar.diameter_m * 1000, 2) if bar.bar.has_axis else None
 

@@ -13,6 +13,7 @@ from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.specs import (
     AssemblySpec,
     ConfigSpec,
+    GeneratedCageSpec,
     LatticeSpec,
     PierSpec,
     PileSpec,
@@ -20,6 +21,7 @@ from dataset_builder.config.specs import (
 )
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.scene.assemblies.cage_file import load_cage
+from dataset_builder.scene.assemblies.generated import generated_assembly
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.assemblies.pile import pile_assembly
@@ -30,6 +32,7 @@ from rebar_depth_bench.errors import InputError, MeshError
 
 _BUILDERS: Mapping[type, Callable[[Any], Assembly]] = {
     CageFileSpec: load_cage,
+    GeneratedCageSpec: generated_assembly,
     LatticeSpec: lattice_assembly,
     MeshFileSpec: load_cage,
     PierSpec: pier_assembly,

@@ -42,13 +42,13 @@ _BEND_MARGIN_DIAMETERS = 1.0
 
 def with_ribs_chosen(bars: Sequence[CageBar]) -> list[CageBar]:
     """Return the bars with ``ribs`` set by the limits per row and per cage."""
-    ribs = [_ribs_per_row(bar) if bar.ribs and bar.mesh is None else 0.0 for bar in bars]
+    ribs = [ribs_per_row(bar) if bar.ribs and bar.mesh is None else 0.0 for bar in bars]
     is_ribbed = [0 < count <= MAX_RIBS_PER_ROW for count in ribs]
     too_many = sum(count for count, ribbed in zip(ribs, is_ribbed, strict=True) if ribbed) > MAX_RIBS_PER_CAGE
     return [replace(bar, ribs=ribbed and not too_many) for bar, ribbed in zip(bars, is_ribbed, strict=True)]
 
 
-def _ribs_per_row(bar: CageBar) -> float:
+def ribs_per_row(bar: CageBar) -> float:
     """Return the number of ribs in one row along the bar."""
     length_m = np.linalg.norm(np.diff(np.array(bar.bar.axis_m), axis=0), axis=1).sum()
     return float(length_m / bar.bar.diameter_m / RibPattern.spacing)
@@ -73,7 +73,7 @@ def estimated_triangles(bar: CageBar) -> int:
         return len(bar.mesh.faces)
     if bar.ribs:  # A bar has two rows of ribs, with four mesh rings per rib.
         ring = 2 * (RibPattern.segments_per_row + 3)
-        return int((8 * _ribs_per_row(bar) + 24) * 2 * ring)
+        return int((8 * ribs_per_row(bar) + 24) * 2 * ring)
     return (3 * len(bar.bar.axis_m) + 2) * 2 * _PLAIN_BAR_SEGMENTS
 
 

@@ -23,90 +23,9 @@ from numpy import ndarray
 from dataset_builder.config.specs import PileSpec
 from dataset_builder.scene.model import Assembly, Mesh, axis_of
 from dataset_builder.scene.shapes.bar_mesh import RibPattern, outer_radius_m, ribbed_bar_mesh
-from dataset_builder.scene.shapes.bending import bend_radius_m, bent_line_m
+from dataset_builder.scene.shapes.links import stirrup_centreline_m
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import MeshError
-
-HOOK_DEG = 135.0
-"""Bend angle of each end round its corner, into the core: the seismic hook of ACI 318-19, section 25.3.4 (from a
-secondary source)."""
-
-SELF_GAP_M = 3e-4
-"""Clear distance of the two ends where they pass each other at the hooks' corner, metres."""
-
-BEND_STEP_DEG = 5.0
-"""Largest angle between sampled points of a bend: chords of a 25 mm radius lie within 0.024 mm of its arc."""
-
-
-def hook_extension_m(diameter_m: float) -> float:
-    """Return the straight length beyond a seismic hook's bend: max(6 d, 75 mm), metres.
-
-    The usual rule for seismic hooks, as in ISO and ACI standards [unverified: not checked against the standards].
-    """
-    return max(6 * diameter_m, 0.075)
-
-
-def stirrup_centreline_m(
-    size_m: tuple[float, float], diameter_m: float, outer_radius_m: float
-) -> Float64[ndarray, "n 3"]:
-    """Return the centreline of a stirrup of outside ``size_m`` (along x, along y; nominal diameter), metres.
-
-    Bends have the smallest mandrel of EN 1992-1-1. The line rises along z at a constant slope from tip to tip,
-    like one turn of a coil, so that its ends pass each other with ``SELF_GAP_M`` between surfaces at
-    ``outer_radius_m`` from the axis. Raises ``ValueError`` if the bar has no thickness or the hoop is too small
-    for its own hooks.
-    """
-    if not 0 < diameter_m <= 2 * outer_radius_m:
-        raise ValueError(f"a bar of {diameter_m} m cannot have an outer radius of {outer_radius_m} m")
-    half_m = (np.array(size_m) - diameter_m) / 2
-    radius_m = bend_radius_m(diameter_m)
-    flat_m = bent_line_m(_corners_m(half_m, diameter_m, outer_radius_m), radius_m, BEND_STEP_DEG)
-    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(flat_m, axis=0), axis=1))])
-    # The two ends are one turn of the hoop apart along the line where they pass each other.
-    turn_m = 4 * half_m.sum() - (8 - 2 * np.pi) * radius_m
-    flat_m[:, 2] = along_m * _climb_per_turn_m(outer_radius_m, turn_m) / turn_m
-    return np.asarray(flat_m - _centroid_m(flat_m))
-
-
-def _climb_per_turn_m(outer_radius_m: float, turn_m: float) -> float:
-    """Return the rise along z of one turn, metres.
-
-    It slightly exceeds the clear distance, because inclined lines are closer together than their vertical offset.
-    """
-    clear_m = 2 * outer_radius_m + SELF_GAP_M
-    return float(clear_m / np.sqrt(1 - (clear_m / turn_m) ** 2))
-
-
-def _corners_m(
-    half_m: Float64[ndarray, " 2"], diameter_m: float, outer_radius_m: float
-) -> Float64[ndarray, "7 3"]:
-    """Return the tips and corners of the unbent path at z = 0: tip, hook, three hoop corners, hook, tip."""
-    x_m, y_m = (float(half) for half in half_m)
-    radius_m = bend_radius_m(diameter_m)
-    turn = np.deg2rad(HOOK_DEG)
-    tangent_m = radius_m * np.tan(turn / 2)
-    # Both ends bend round the centre (radius - x, y - radius), towards the opposite corner.
-    first_hook = np.array([-x_m, y_m - radius_m + tangent_m])
-    last_hook = np.array([radius_m - x_m - tangent_m, y_m])
-    inward = np.array([1.0, -1.0]) / np.sqrt(2)
-    reach_m = tangent_m + hook_extension_m(diameter_m)
-    first_tip, last_tip = first_hook + reach_m * inward, last_hook + reach_m * inward
-    max_tip_m = np.array([x_m, y_m]) - 2 * outer_radius_m - SELF_GAP_M
-    # The negated comparison also rejects NaN.
-    if not (first_tip[0] <= max_tip_m[0] and -last_tip[1] <= max_tip_m[1]):
-        raise ValueError(
-            f"a hoop of {2 * x_m + diameter_m:.4g} x {2 * y_m + diameter_m:.4g} m has no room for hooks of a "
-            f"{diameter_m} m bar: their tips reach x = {first_tip[0]:.4g}, y = {last_tip[1]:.4g} m from its middle"
-        )
-    corners = [first_tip, first_hook, [-x_m, -y_m], [x_m, -y_m], [x_m, y_m], last_hook, last_tip]
-    return np.column_stack([np.array(corners), np.zeros(len(corners))])
-
-
-def _centroid_m(line_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, " 3"]:
-    """Return the centroid of a polyline, weighted by length."""
-    lengths_m = np.linalg.norm(np.diff(line_m, axis=0), axis=1)
-    return np.asarray(np.average((line_m[:-1] + line_m[1:]) / 2, axis=0, weights=lengths_m))
-
 
 STATES_DIR = Path(__file__).with_name("settled")
 """Directory of stored states, ``<name>.json``; a stored state never changes, a new pile gets a new name."""

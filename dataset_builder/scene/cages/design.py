@@ -1,0 +1,100 @@
+"""Design of a cage: its bars along their nominal axes, and helpers to draw and to make them. Metres."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from dataset_builder.scene.shapes.bending import bend_radius_m, bent_line_m
+
+Line = Float64[ndarray, "n 3"]
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
+
+class InfeasibleError(ValueError):
+    """Raised for drawn parameters with which no cage can be made; the message is the reason, without numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class DesignBar:
+    """Bar of a design: role, nominal diameter and nominal axis.
+
+    ``spaced_along`` is the unit vector along which bars of its kind are spaced, or None: only in this direction
+    may it be off by the tolerance of the spacing. ``is_structural`` bars are never left out.
+    """
+
+    role: str
+    diameter_m: float
+    line_m: Line
+    spaced_along: tuple[float, float, float] | None = None
+    is_structural: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Bars of a cage, world frame, and what was drawn: names and values of its parameters, metres.
+
+    ``ground_m`` is the height of the lowest point of its steel above z = 0: bars that stand on the ground, or the
+    cover of a cage on spacers.
+    """
+
+    family: str
+    bars: tuple[DesignBar, ...]
+    parameters: dict[str, float | str]
+    ground_m: float
+
+
+def straight(start_m: Sequence[float], end_m: Sequence[float]) -> Line:
+    """Return the line between two points."""
+    return np.array([start_m, end_m], dtype=np.float64)
+
+
+def bent(corners_m: Sequence[Sequence[float]], diameter_m: float) -> Line:
+    """Return the line through corners with the least bends of EN 1992-1-1. Raises ``ValueError``."""
+    return bent_line_m(np.array(corners_m, dtype=np.float64), bend_radius_m(diameter_m))
+
+
+def spaced(first_m: float, last_m: float, spacing_m: float) -> list[float]:
+    """Return evenly spaced positions from the first to the last, at most ``spacing_m`` apart."""
+    count = max(1, int(np.ceil((last_m - first_m) / spacing_m - 1e-9)))
+    positions: list[float] = np.linspace(first_m, last_m, count + 1).tolist()
+    return positions
+
+
+def drawn_step(rng: np.random.Generator, low_m: float, high_m: float, step_m: float) -> float:
+    """Return a multiple of ``step_m`` between the limits, which is rounded to the micrometre."""
+    low, high = int(np.ceil(low_m / step_m - 1e-9)), int(np.floor(high_m / step_m + 1e-9))
+    if high < low:
+        raise InfeasibleError("no multiple of the step lies between the limits")
+    return round(int(rng.integers(low, high + 1)) * step_m, 6)
+
+
+def drawn_of(rng: np.random.Generator, choices: Sequence[float]) -> float:
+    """Return one of the choices. Raises ``InfeasibleError`` if there is none."""
+    if not choices:
+        raise InfeasibleError("no diameter fits")
+    return float(choices[int(rng.integers(len(choices)))])
+
+
+def turned(
+    bars: Sequence[DesignBar], rotation: Float64[ndarray, "3 3"], shift_m: Sequence[float]
+) -> list[DesignBar]:
+    """Return bars rotated about the origin and then moved."""
+    return [
+        replace(
+            bar,
+            line_m=bar.line_m @ rotation.T + np.asarray(shift_m),
+            spaced_along=None
+            if bar.spaced_along is None
+            else tuple((rotation @ np.array(bar.spaced_along)).tolist()),
+        )
+        for bar in bars
+    ]
+
+
+LYING = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Rotation that takes z, the axis of a member, to x; its x to y and its y to z."""

@@ -1,0 +1,100 @@
+"""Generator of reinforcement cages: a design of a family, and the cage as it was built, from a seed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from dataset_builder.scene.cages.as_built import BuiltBar, build_as
+from dataset_builder.scene.cages.design import InfeasibleError
+from dataset_builder.scene.cages.families import FAMILIES
+from dataset_builder.scene.cages.rules import radius_m
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.view_ids import SPLITS
+
+VERSION = 1
+"""Version of the generator: it changes when the same seed gives another cage."""
+
+MAX_ATTEMPTS = 200
+"""Number of designs that are drawn before a cage is given up."""
+
+
+@dataclass(frozen=True, eq=False)
+class GeneratedCage:
+    """Cage of a family, centred above the world's origin: its bars, and a record of how it was generated.
+
+    ``record`` holds the parameters of the design, the bars that were left out with their nominal axes, the number
+    of doubled bars, and how many designs and deviations were refused, as JSON values.
+    """
+
+    family: str
+    bars: tuple[BuiltBar, ...]
+    record: dict[str, Any]
+
+
+def generate_cage(split: str, number: int, seed: int = 0, family: str | None = None) -> GeneratedCage:
+    """Return cage ``number`` of a split; the same arguments give the same cage, whatever other cages there are.
+
+    ``family`` restricts the draw to one of ``FAMILIES``. Raises ``InputError`` for an unknown split or family, and
+    if no design can be built in ``MAX_ATTEMPTS`` attempts.
+    """
+    for name, found, known in (("split", split, SPLITS), ("family", family, (None, *FAMILIES))):
+        if found not in known:
+            expected = ", ".join(str(choice) for choice in known if choice is not None)
+            raise InputError(f"the {name} of a cage is {found!r}, expected one of {expected}")
+    rng = np.random.default_rng([VERSION, seed, SPLITS.index(split), number])
+    drawn_family = str(rng.choice(list(FAMILIES)))
+    chosen = drawn_family if family is None else family
+    refused: Counter[str] = Counter()
+    for _ in range(MAX_ATTEMPTS):
+        try:
+            design = FAMILIES[chosen](rng)
+            built = build_as(design, rng)
+        except InfeasibleError as error:
+            refused[str(error)] += 1
+            continue
+        except ValueError as error:
+            refused[f"a bar cannot be bent: {str(error).split()[0]}"] += 1
+            continue
+        offset_m = _offset_m(built.bars, design.ground_m)
+        record = {
+            "family": design.family,
+            "parameters": design.parameters,
+            "left_out": [
+                {"role": bar.role, "diameter_m": bar.diameter_m, "nominal_axis": (bar.line_m + offset_m).tolist()}
+                for bar in built.left_out
+            ],
+            "doubled": built.doubled,
+            "deviations_reduced": built.deviations_reduced,
+            "deviations_refused": built.deviations_refused,
+            "designs_refused": dict(sorted(refused.items())),
+        }
+        return GeneratedCage(design.family, tuple(_moved(bar, offset_m) for bar in built.bars), record)
+    reasons = ", ".join(f"{reason} ({count})" for reason, count in refused.most_common(3))
+    raise InputError(f"no cage of the family {chosen} for {split} {number}, seed {seed}: {reasons}")
+
+
+def _offset_m(bars: tuple[BuiltBar, ...], ground_m: float) -> Float64[ndarray, " 3"]:
+    """Return the displacement that centres a cage above the origin and sets its lowest steel at ``ground_m``."""
+    points = np.concatenate([bar.line_m for bar in bars])
+    lowest_m = min(_lowest_m(bar) for bar in bars)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    return np.array([-round(float(middle[0]), 3), -round(float(middle[1]), 3), ground_m - lowest_m])
+
+
+def _lowest_m(bar: BuiltBar) -> float:
+    """Return the height of the lowest point of a bar's surface, whose ends are flat discs."""
+    line_m, radius = bar.line_m, radius_m(bar.diameter_m)
+    tangents = np.gradient(line_m, axis=0)
+    level = np.linalg.norm(tangents[:, :2], axis=1) / np.linalg.norm(tangents, axis=1)
+    return float((line_m[:, 2] - radius * level).min())
+
+
+def _moved(bar: BuiltBar, offset_m: Float64[ndarray, " 3"]) -> BuiltBar:
+    nominal_m = None if bar.nominal_m is None else bar.nominal_m + offset_m
+    return BuiltBar(bar.role, bar.diameter_m, bar.line_m + offset_m, nominal_m)
