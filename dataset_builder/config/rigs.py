@@ -17,6 +17,7 @@ from rebar_depth_bench.geometry.cameras import (
     NOMINAL_WIDTH,
     Camera,
     ideal_K,
+    matrix_product,
     right_camera_pose,
     rigid,
 )
@@ -71,7 +72,7 @@ def _ideal_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
 
 def _raw_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
     calibration = _scaled_calibration(rig)
-    right = right_from_left(calibration) @ left
+    right = matrix_product(right_from_left(calibration), left)
     eyes = {"left": (calibration.left, left), "right": (calibration.right, right)}
     return {
         eye: Camera(lens_K(lens), lens_distortion(lens), pose, rig.width, rig.height)
@@ -83,7 +84,7 @@ def _rectified_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
     from rebar_depth_bench.geometry.rectification import rectify
 
     rectified = rectify(_scaled_calibration(rig))
-    return _pinholes(rig, rectified.K, rigid(rectified.R_left, np.zeros(3)) @ left)
+    return _pinholes(rig, rectified.K, matrix_product(rigid(rectified.R_left, np.zeros(3)), left))
 
 
 def _pinholes(rig: RigSpec, K: Float64[ndarray, "3 3"], left: Pose) -> dict[str, Camera]:

@@ -21,7 +21,7 @@ from dataset_builder.config.specs import (
 from dataset_builder.scene.steel_distance import radii_at_steel_distance_m
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.trajectory import NEAREST_STEEL
-from rebar_depth_bench.geometry.cameras import look_at, rigid
+from rebar_depth_bench.geometry.cameras import look_at, matrix_product, rigid, vector_length
 
 GOLDEN_TURN_DEG = 360.0 * (5**0.5 - 1) / 2
 """Azimuth offset between successive rings of a dome, degrees (golden angle): no two rings share azimuths."""
@@ -119,11 +119,11 @@ def look_at_with_rig(
     images at short range.
     """
     centred_from_world = look_at(left_centre_m, target_m)
-    distance_m = float(np.linalg.norm(target_m - left_centre_m))
+    distance_m = vector_length(target_m - left_centre_m)
     sine = baseline_m / 2 / distance_m
     cosine = (1.0 - sine * sine) ** 0.5
     yaw = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
-    return np.asarray(rigid(yaw, np.zeros(3)) @ centred_from_world)
+    return matrix_product(rigid(yaw, np.zeros(3)), centred_from_world)
 
 
 def subset(total: int, count: int | None) -> list[int]:

@@ -23,7 +23,7 @@ from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.shapes.segments import closest_points_m
 from rebar_depth_bench.data.eye_view import EyeView
 from rebar_depth_bench.errors import BuildError
-from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid
+from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, matrix_product
 
 _MISS = -1
 _OUTSIDE_M = 1e-4
@@ -68,7 +68,7 @@ class RayCaster:
         """
         rays_cam = camera.rays() if rays_cam is None else rays_cam
         world_from_cam = inverse_rigid(camera.cam_from_world)
-        directions = rays_cam.reshape(-1, 3) @ world_from_cam[:3, :3].T
+        directions = matrix_product(rays_cam.reshape(-1, 3), world_from_cam[:3, :3].T)
         centre_m = world_from_cam[:3, 3]
         face = self._first_face(centre_m, directions)
         hit = face != _MISS

@@ -3,12 +3,16 @@
 Camera axes are OpenCV's: x right, y down, z forward, with pixel centres at integer coordinates. Lengths are
 metres, pixels are ``(u, v)`` with u along the width, and a pose is ``cam_from_world``, a float64 4 x 4 matrix with
 ``x_cam = cam_from_world @ x_world``.
+
+Poses do not depend on the processor to the last bit: BLAS, which has other kernels for each, multiplies none of
+them (``matrix_product``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import cos, sin
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -64,14 +68,24 @@ def look_at(
     """
     up = np.array([0.0, 0.0, 1.0]) if up is None else up
     forward = np.asarray(target_m, float) - np.asarray(eye_m, float)
-    forward /= np.linalg.norm(forward)
+    forward /= vector_length(forward)
     right = np.cross(forward, up)
-    norm = np.linalg.norm(right)
+    norm = vector_length(right)
     if norm < 1e-9:
         raise ValueError(f"the optical axis {forward} is parallel to the up direction {up}")
     right /= norm
     rotation = np.stack([right, np.cross(forward, right), forward])
-    return rigid(rotation, -rotation @ np.asarray(eye_m, float))
+    return rigid(rotation, matrix_product(-rotation, np.asarray(eye_m, float)))
+
+
+def matrix_product(a: Float[ndarray, "*n k"], b: Float[ndarray, "k *m"]) -> Float[ndarray, "*n *m"]:
+    """Return ``a @ b`` for small matrices or many rows ``a``, with the same bits on every processor."""
+    return np.einsum("...k,k...->..." if b.ndim == 1 else "...k,km->...m", a, b)
+
+
+def vector_length(vector: Float[ndarray, " k"]) -> float:
+    """Return the Euclidean norm of a vector, with the same bits on every processor."""
+    return float(np.sqrt(np.einsum("k,k->", vector, vector)))
 
 
 def rigid(rotation: Float[ndarray, "3 3"], translation: Float[ndarray, 3]) -> Float[ndarray, "4 4"]:
@@ -84,7 +98,7 @@ def rigid(rotation: Float[ndarray, "3 3"], translation: Float[ndarray, 3]) -> Fl
 
 def inverse_rigid(pose: Float[ndarray, "4 4"]) -> Float[ndarray, "4 4"]:
     """Return the inverse of a rigid 4 x 4 matrix, computed by transposition, so that it is rigid as well."""
-    return rigid(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3])
+    return rigid(pose[:3, :3].T, matrix_product(-pose[:3, :3].T, pose[:3, 3]))
 
 
 def camera_centre(cam_from_world: Float[ndarray, "4 4"]) -> Float[ndarray, 3]:
@@ -107,12 +121,12 @@ def transform(pose: Float[ndarray, "4 4"], points: Float[ndarray, "*n 3"]) -> Fl
 def rotation_matrix(rotation_rad: Sequence[float] | Float[ndarray, 3]) -> Float64[ndarray, "3 3"]:
     """Return the rotation matrix of a rotation vector, axis times angle in radians (Rodrigues' formula)."""
     vector = np.asarray(rotation_rad, dtype=np.float64)
-    angle = float(np.linalg.norm(vector))
+    angle = vector_length(vector)
     if angle == 0.0:
         return np.eye(3)
     x, y, z = vector / angle
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross))
+    return np.asarray(np.eye(3) + sin(angle) * cross + (1.0 - cos(angle)) * matrix_product(cross, cross))
 
 
 def rotation_vector(rotation: Float[ndarray, "3 3"]) -> Float64[ndarray, 3]:
