@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from datasets import Dataset, IterableDataset
 
+from rebar_depth_bench.data.augmentation import Augmentation
 from rebar_depth_bench.errors import MethodError
 
 try:
@@ -26,6 +27,8 @@ _LEFT = {
     "K": "left_K",
     "poses": "left_cam_from_world",
 }
+SHUFFLE_BUFFER = 32
+"""Views of a streamed dataset among which the next one is drawn."""
 _RIGHT = {f"right_{key}": column.replace("left", "right") for key, column in _LEFT.items()}
 
 
@@ -36,6 +39,9 @@ def torch_loader(
     *,
     shuffle: bool = False,
     stereo: bool = False,
+    crop: tuple[int, int] | None = None,
+    flip: bool = False,
+    seed: int = 0,
 ) -> DataLoader[Batch]:
     """Return a ``DataLoader`` over a dataset returned by ``load``, streaming or not.
 
@@ -46,28 +52,60 @@ def torch_loader(
     colour lack ``rgb`` and ``right_rgb``, and those of an imported config all that it lacks.
 
     Columns that a batch does not need are not decoded, except in a streamed dataset, whose columns are already
-    decoded; pass ``columns`` to ``load`` to select them. ``shuffle`` requires a dataset that is not streamed.
-    Importing this module without torch raises ``MethodError``.
+    decoded; pass ``columns`` to ``load`` to select them.
+
+    For training, ``shuffle`` changes the order in every epoch. A streamed dataset is shuffled by shard, and then
+    in a buffer of ``SHUFFLE_BUFFER`` views. ``crop`` (height, width) takes a random part of each view, and
+    ``flip`` mirrors half of the views: see ``augmentation`` for K, poses and stereo pairs. The order of shuffled
+    views depends on ``seed`` and the epoch, and for a streamed dataset on the number of workers; crops and flips
+    depend on ``seed``, the epoch and the view id.
+
+    Importing this module without torch raises ``MethodError``. Raises ``InputError`` for an invalid crop or seed.
     """
     keys = {**_LEFT, **_RIGHT, "baseline_m": "baseline_m"} if stereo else _LEFT
     rows = ds.select_columns(["view_id", *keys.values()])
-    source = _StreamedRows(rows) if isinstance(rows, IterableDataset) else rows
-    return DataLoader(
-        source,
-        batch_size=batch_size,
-        num_workers=num_workers,
-        shuffle=shuffle,
-        collate_fn=_Collate(keys),
-    )
+    collate = _Collate(keys, Augmentation(crop, flip, seed))
+    if not isinstance(rows, IterableDataset):
+        return _EpochLoader(rows, batch_size, shuffle, collate, num_workers)
+    shuffled = rows.shuffle(seed, buffer_size=SHUFFLE_BUFFER) if shuffle else rows
+    return _EpochLoader(_StreamedRows(shuffled), batch_size, False, collate, num_workers)
+
+
+class _EpochLoader(DataLoader[Any]):
+    """Data loader that counts its iterations, on which the order, crops and flips depend."""
+
+    def __init__(
+        self, source: Dataset | _StreamedRows, batch_size: int, shuffle: bool, collate: _Collate, num_workers: int
+    ) -> None:
+        super().__init__(
+            source,
+            batch_size=batch_size,
+            shuffle=shuffle,
+            collate_fn=collate,
+            num_workers=num_workers,
+            generator=torch.Generator(),
+        )
+        self._collate = collate
+        self._rows = source.rows if isinstance(source, _StreamedRows) else None
+
+    def __iter__(self) -> Any:
+        self._collate.epoch += 1
+        self.generator.manual_seed(self._collate.augmentation.seed + self._collate.epoch)
+        if self._rows is not None:
+            self._rows.set_epoch(self._collate.epoch)
+        return super().__iter__()
 
 
 class _Collate:
-    """Collate function that stacks decoded rows into tensors; a class, so that it can be pickled for workers."""
+    """Collate function that changes decoded rows and stacks them into tensors; it is pickled for workers."""
 
-    def __init__(self, keys: Mapping[str, str]) -> None:
+    def __init__(self, keys: Mapping[str, str], augmentation: Augmentation) -> None:
         self._keys = keys
+        self.augmentation = augmentation
+        self.epoch = -1
 
     def __call__(self, rows: Sequence[Mapping[str, Any]]) -> Batch:
+        rows = [self.augmentation(row, self.epoch) for row in rows]
         batch: Batch = {
             key: _tensor(key, np.stack([np.asarray(row[column]) for row in rows]))
             for key, column in self._keys.items()
@@ -93,7 +131,7 @@ class _StreamedRows(TorchIterableDataset[Mapping[str, Any]]):
     """Torch iterable over a streamed dataset; ``datasets`` assigns separate shards to each worker."""
 
     def __init__(self, rows: IterableDataset) -> None:
-        self._rows = rows
+        self.rows = rows
 
     def __iter__(self) -> Iterator[Mapping[str, Any]]:
-        return iter(self._rows)
+        return iter(self.rows)
