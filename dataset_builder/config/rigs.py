@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import RigSpec
+from dataset_builder.config.specs import FocalRigSpec, RigSpec
 from rebar_depth_bench.geometry.calibration import read_calibration
 from rebar_depth_bench.geometry.cameras import (
+    NOMINAL_FOCAL_PX,
     NOMINAL_HEIGHT,
     NOMINAL_WIDTH,
     Camera,
@@ -67,7 +68,8 @@ def rig_cameras(rig: RigSpec, cam_from_world: Float64[ndarray, "4 4"]) -> dict[s
 def _ideal_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
     if rig.calibration is not None:
         raise ValueError("the grid of a rig with a calibration is 'ideal', expected 'raw' or 'rectified'")
-    return _pinholes(rig, ideal_K(rig.width, rig.height), left)
+    focal_px = rig.focal_px if isinstance(rig, FocalRigSpec) else NOMINAL_FOCAL_PX
+    return _pinholes(rig, ideal_K(rig.width, rig.height, focal_px), left)
 
 
 def _raw_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dataset_builder.config.camera_site import CameraSpace
 from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.scene_name import scene_name_of
@@ -25,7 +26,7 @@ from dataset_builder.config.specs import (
     SurveySpec,
     TrajectorySpec,
 )
-from dataset_builder.config.survey import CameraSpace, with_stations
+from dataset_builder.config.survey import with_stations
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.scene.assemblies import aim_point_m, check_above_ground, check_fits, make_assembly
 from dataset_builder.scene.assemblies.cage import Cage

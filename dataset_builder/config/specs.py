@@ -9,8 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
-from rebar_depth_bench.data.trajectory import CENTRE, SURVEY
+from rebar_depth_bench.data.trajectory import CENTRE, RANDOM_VIEWS, SURVEY
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
+from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration
 
 
@@ -156,7 +157,27 @@ class SurveySpec:
     kind: str = SURVEY
 
 
-TrajectorySpec = DomeSpec | RingSpec | DistanceSweepSpec | SurveySpec
+RolledStation = tuple[Point, Point, float]
+"""Place of a random view: a ``Station``, and the roll of the rig about its axis, degrees clockwise."""
+
+
+@dataclass(frozen=True)
+class RandomViewsSpec:
+    """Random views of steel: cameras at distances between the two ``distances_m`` from points of the steel.
+
+    ``stations`` are the places of the views in order. They follow from the other fields, the assembly and the rig
+    (``config.random_views``), each view from its own number, so that the views of a longer list begin with those
+    of a shorter one.
+    """
+
+    views: int
+    distances_m: tuple[float, float] = (0.25, 8.0)
+    seed: int = 0
+    stations: tuple[RolledStation, ...] = ()
+    kind: str = RANDOM_VIEWS
+
+
+TrajectorySpec = DomeSpec | RingSpec | DistanceSweepSpec | SurveySpec | RandomViewsSpec
 
 
 @dataclass(frozen=True)
@@ -173,6 +194,14 @@ class RigSpec:
     baseline_m: float = 0.120
     calibration: StereoCalibration | None = None
     grid: str = "ideal"
+
+
+@dataclass(frozen=True)
+class FocalRigSpec(RigSpec):
+    """Ideal rig with the ``focal_px`` of a named ``camera``, in pixels of an image 1280 x 720 pixels large."""
+
+    camera: str = ""
+    focal_px: float = NOMINAL_FOCAL_PX
 
 
 CPU = "cpu"

@@ -14,19 +14,12 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from dataset_builder.config.camera_site import GROUND_CLEARANCE_M, CameraSite, CameraSpace
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import RigSpec, Station, SurveySpec
 from dataset_builder.config.trajectories import look_at_with_rig
-from dataset_builder.scene.model import Assembly, WorldMesh
-from dataset_builder.scene.raycast import RayCaster
-from dataset_builder.scene.shapes.point_sets import (
-    SurfacePoints,
-    SurfaceSampler,
-    covering_points,
-    farthest_points,
-    short_path,
-)
-from dataset_builder.scene.shapes.solids import merge_meshes
+from dataset_builder.scene.model import Assembly
+from dataset_builder.scene.shapes.point_sets import SurfacePoints, farthest_points, short_path
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.geometry.cameras import inverse_rigid
@@ -34,12 +27,6 @@ from rebar_depth_bench.geometry.cameras import inverse_rigid
 STEEL_CLEARANCE_M = 0.3
 STEEL_CLEARANCE = 0.5
 """Least distance of an eye from steel: 0.3 m, or half the distance of the view if that is less."""
-
-GROUND_CLEARANCE_M = 0.1
-"""Least height of an eye above the ground, or above objects that stand there, metres."""
-
-SIGHT_TOLERANCE_M = 0.01
-"""Largest distance along the line of sight between its first hit and the aimed point: about a bar's radius."""
 
 NEAR = 0.5
 MAX_NEAR_SHARE = 0.02
@@ -65,24 +52,6 @@ _ACCEPTABLE_PER_VIEW = 16
 _POINTS_PER_VIEW = 256
 _MIN_POINTS = 8 * _BATCH
 """Number of acceptable views per view after which no more points are tried, and limits of the points tried."""
-
-
-@dataclass(frozen=True)
-class CameraSpace:
-    """Space for cameras: within ``radius_m`` of the world origin in plan, and above the ground.
-
-    Objects up to ``objects_m`` high stand on the ground beyond ``clear_radius_m``.
-    """
-
-    radius_m: float
-    clear_radius_m: float
-    objects_m: float = 0.0
-
-    def contains(self, points_m: Float64[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
-        """Return which points are in the space."""
-        plan_m = np.hypot(points_m[:, 0], points_m[:, 1])
-        lowest_m = GROUND_CLEARANCE_M + np.where(plan_m > self.clear_radius_m, self.objects_m, 0.0)
-        return np.asarray((plan_m <= self.radius_m) & (points_m[:, 2] >= lowest_m))
 
 
 def with_stations(
@@ -147,17 +116,11 @@ class _Views:
 
 
 class _Site:
-    """Steel of a scene with the space for cameras: tests of views."""
+    """Steel of a scene with the space for cameras: tests of survey views."""
 
     def __init__(self, assembly: Assembly, space: CameraSpace, rig: RigSpec, clearance_m: float) -> None:
-        from scipy.spatial import cKDTree  # Imported when needed: it takes a while.
-
-        steel = merge_meshes([part.mesh for part in assembly.parts])
-        self.surface = SurfaceSampler(steel)
-        self._caster = RayCaster(WorldMesh(steel.vertices_m, steel.faces, np.ones(len(steel.faces), np.uint16)))
-        self._spacing_m = clearance_m / 5
-        self._steel_points = cKDTree(covering_points(steel, self._spacing_m))
-        self._space = space
+        self._cameras = CameraSite(assembly, space, clearance_m / 5)
+        self.surface = self._cameras.surface
         width, height = _GRID
         self._rig = replace(rig, width=width, height=height)
         self._rays = {
@@ -191,36 +154,17 @@ class _Site:
         self, eyes_m: Float64[ndarray, "n 3"], points_m: Float64[ndarray, "n 3"], distance_m: float
     ) -> Bool[ndarray, " n"]:
         """Return which eyes are in the space for cameras, clear of steel, and see their points."""
-        is_usable = self._is_clear(eyes_m, distance_m)
-        is_usable[is_usable] = self._sees(eyes_m[is_usable], points_m[is_usable])
+        is_usable = self._cameras.is_clear(eyes_m, steel_clearance_m(distance_m))
+        is_usable[is_usable] = self._cameras.sees(eyes_m[is_usable], points_m[is_usable])
         return is_usable
-
-    def _is_clear(self, eyes_m: Float64[ndarray, "n 3"], distance_m: float) -> Bool[ndarray, " n"]:
-        """Return which eyes are in the space for cameras and clear of steel."""
-        is_clear = self._space.contains(eyes_m)
-        least_m = steel_clearance_m(distance_m) + self._spacing_m
-        nearest_m, _ = self._steel_points.query(eyes_m[is_clear], distance_upper_bound=least_m)
-        is_clear[is_clear] = nearest_m >= least_m
-        return is_clear
-
-    def _sees(self, eyes_m: Float64[ndarray, "n 3"], points_m: Float64[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
-        """Return from which eyes the points are seen: they are where the line of sight first meets steel."""
-        sight_m = points_m - eyes_m
-        range_m = self._caster.hits(eyes_m, sight_m).range_m
-        return np.asarray(np.abs(range_m - np.linalg.norm(sight_m, axis=1)) <= SIGHT_TOLERANCE_M)
 
     def _steel_shares(
         self, eye: str, world_from_eye: Float64[ndarray, "n 4 4"], distance_m: float
     ) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
         """Return the shares of an eye's image that are near steel, and steel at about the distance."""
-        rays = self._rays[eye]
-        directions = np.einsum("nij,rj->nri", world_from_eye[:, :3, :3], rays)
-        origins_m = np.repeat(world_from_eye[:, :3, 3], len(rays), axis=0)
-        range_m = self._caster.hits(origins_m, directions.reshape(-1, 3)).range_m.reshape(-1, len(rays))
-        is_near = range_m < NEAR * distance_m
-        return is_near.mean(axis=1), ((range_m >= _MIDDLE * distance_m) & (range_m <= _FAR * distance_m)).mean(
-            axis=1
-        )
+        range_m = self._cameras.ranges_m(world_from_eye, self._rays[eye])
+        is_middle = (range_m >= _MIDDLE * distance_m) & (range_m <= _FAR * distance_m)
+        return (range_m < NEAR * distance_m).mean(axis=1), is_middle.mean(axis=1)
 
 
 def _acceptable_views(site: _Site, distance_m: float, count: int, rng: np.random.Generator) -> _Views:

@@ -13,6 +13,7 @@ from numpy import ndarray
 from dataset_builder.config.specs import (
     DistanceSweepSpec,
     DomeSpec,
+    RandomViewsSpec,
     RigSpec,
     RingSpec,
     SurveySpec,
@@ -43,13 +44,13 @@ def poses(
 ) -> list[Float64[ndarray, "4 4"]]:
     """Return ``cam_from_world`` of the left camera for every view of the full trajectory, in order.
 
-    Each is aimed at the target, or at the point of its own station in a survey. Arguments and errors are those of
-    ``camera_offsets_m``.
+    Each is aimed at the target, or at the point of its own station if it has one. Arguments and errors are those
+    of ``camera_offsets_m``.
     """
-    if isinstance(trajectory, SurveySpec):
+    if isinstance(trajectory, SurveySpec | RandomViewsSpec):
         return [
-            look_at_with_rig(np.array(centre_m), np.array(aimed_m), rig.baseline_m)
-            for centre_m, aimed_m in trajectory.stations
+            look_at_with_rig(np.array(centre_m), np.array(aimed_m), rig.baseline_m, *roll_deg)
+            for centre_m, aimed_m, *roll_deg in trajectory.stations
         ]
     return [
         look_at_with_rig(target_m + direction, target_m, rig.baseline_m)
@@ -69,10 +70,11 @@ def camera_offsets_m(
 
     The views of a dome are ordered by shell, then ring, then azimuth, so that consecutive views are close to each
     other. The views of a sweep are ordered by distance, then azimuth; the first azimuth is half a step off the
-    x axis, so that square cages are not seen face-on. The views of a survey are those of its stations.
+    x axis, so that square cages are not seen face-on. The views of a survey and random views are those of their
+    stations.
     """
-    if isinstance(trajectory, SurveySpec):
-        return [np.array(centre_m) - target_m for centre_m, _ in trajectory.stations]
+    if isinstance(trajectory, SurveySpec | RandomViewsSpec):
+        return [np.array(centre_m) - target_m for centre_m, *_ in trajectory.stations]
     places = _places(trajectory)
     if isinstance(trajectory, DomeSpec) and trajectory.distance_to == NEAREST_STEEL:
         directions = np.array([_spherical(1.0, *angles) for _, *angles in places])
@@ -85,7 +87,11 @@ def camera_offsets_m(
 
 def view_count(trajectory: TrajectorySpec) -> int:
     """Return the number of views of the full trajectory."""
-    return len(trajectory.stations if isinstance(trajectory, SurveySpec) else _places(trajectory))
+    if isinstance(trajectory, SurveySpec):
+        return len(trajectory.stations)
+    if isinstance(trajectory, RandomViewsSpec):
+        return trajectory.views
+    return len(_places(trajectory))
 
 
 def _places(trajectory: DomeSpec | RingSpec | DistanceSweepSpec) -> list[_Place]:
@@ -110,20 +116,27 @@ def _places(trajectory: DomeSpec | RingSpec | DistanceSweepSpec) -> list[_Place]
 
 
 def look_at_with_rig(
-    left_centre_m: Float64[ndarray, 3], target_m: Float64[ndarray, 3], baseline_m: float
+    left_centre_m: Float64[ndarray, 3], target_m: Float64[ndarray, 3], baseline_m: float, roll_deg: float = 0.0
 ) -> Float64[ndarray, "4 4"]:
     """Return ``cam_from_world`` of a left camera at ``left_centre_m`` whose rig is aimed at the target.
 
     The central axis of the rig, not the axis of the left camera, passes through the target. The target is thus at
     x = baseline / 2 in the left camera and at x = -baseline / 2 in the right one, which keeps the assembly in both
-    images at short range.
+    images at short range. The rig is turned by ``roll_deg`` clockwise about the line from the left camera to the
+    target, so that the scene turns counter-clockwise in the images.
     """
-    centred_from_world = look_at(left_centre_m, target_m)
+    centred_from_world = matrix_product(_roll(roll_deg), look_at(left_centre_m, target_m))
     distance_m = vector_length(target_m - left_centre_m)
     sine = baseline_m / 2 / distance_m
     cosine = (1.0 - sine * sine) ** 0.5
     yaw = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
     return matrix_product(rigid(yaw, np.zeros(3)), centred_from_world)
+
+
+def _roll(roll_deg: float) -> Float64[ndarray, "4 4"]:
+    """Return the rotation of camera coordinates that a clockwise turn of the camera about its axis causes."""
+    c, s = cos(radians(roll_deg)), sin(radians(roll_deg))
+    return rigid(np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
 
 
 def subset(total: int, count: int | None) -> list[int]:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Bool, Float64, Int32
+from jaxtyping import Bool, Float64, Int32, UInt16
 from numpy import ndarray
 
 from dataset_builder.scene.model import WorldMesh
@@ -34,10 +34,11 @@ _OUTSIDE_RATIO = 2e-6
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
-    """Ray intersections: range along the ray in metres and cosine of incidence (infinity and 0 without a hit)."""
+    """Ray intersections: range in metres, cosine of incidence and bar id (infinity, 0, 0 without a hit)."""
 
     range_m: Float64[ndarray, " n"]
     cos_incidence: Float64[ndarray, " n"]
+    bar_id: UInt16[ndarray, " n"]
 
 
 class RayCaster:
@@ -95,7 +96,9 @@ class RayCaster:
         range_m[hit] = self._ray_parameter(origins_m[hit], along, face[hit]) * length
         cross = np.einsum("ij,ij->i", normal, along)
         cos_incidence[hit] = np.abs(cross) / (length * np.linalg.norm(normal, axis=1))
-        return RayHits(range_m, cos_incidence)
+        bar_id = np.zeros(len(face), np.uint16)
+        bar_id[hit] = self._face_bar_id[face[hit]]
+        return RayHits(range_m, cos_incidence, bar_id)
 
     def _first_face(
         self, centre_m: Float64[ndarray, "*n 3"], directions: Float64[ndarray, "n 3"]

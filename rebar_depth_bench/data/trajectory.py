@@ -14,6 +14,8 @@ CENTRE, NEAREST_STEEL = "centre", "nearest steel"
 """Values of ``Trajectory.distance_to``."""
 SURVEY = "survey"
 """Kind of the trajectories that are a ``Survey``."""
+RANDOM_VIEWS = "random views"
+"""Kind of the trajectories that are ``RandomViews``."""
 _Distance = Annotated[float, number(0)]
 _Point = Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers, [x, y, z]")]
 _Station = Annotated[

@@ -47,14 +47,14 @@ class Camera:
         return pixel_rays(self.K, self.width, self.height, self.distortion)
 
 
-def ideal_K(width: int, height: int) -> Float[ndarray, "3 3"]:
+def ideal_K(width: int, height: int, focal_px: float = NOMINAL_FOCAL_PX) -> Float[ndarray, "3 3"]:
     """Return the ideal pinhole matrix of a ``width`` x ``height`` image, in pixels.
 
-    The nominal focal length of 700 px at 1280 x 720 is scaled with each side; the principal point is the image
+    ``focal_px``, the focal length at 1280 x 720, is scaled with each side; the principal point is the image
     centre.
     """
-    fx = NOMINAL_FOCAL_PX * width / NOMINAL_WIDTH
-    fy = NOMINAL_FOCAL_PX * height / NOMINAL_HEIGHT
+    fx = focal_px * width / NOMINAL_WIDTH
+    fy = focal_px * height / NOMINAL_HEIGHT
     return np.array([[fx, 0.0, (width - 1) / 2], [0.0, fy, (height - 1) / 2], [0.0, 0.0, 1.0]])
 
 
@@ -78,9 +78,9 @@ def look_at(
     return rigid(rotation, matrix_product(-rotation, np.asarray(eye_m, float)))
 
 
-def matrix_product(a: Float[ndarray, "*n k"], b: Float[ndarray, "k *m"]) -> Float[ndarray, "*n *m"]:
-    """Return ``a @ b`` for small matrices or many rows ``a``, with the same bits on every processor."""
-    return np.einsum("...k,k...->..." if b.ndim == 1 else "...k,km->...m", a, b)
+def matrix_product(a: Float[ndarray, "*n k"], b: Float[ndarray, "k ..."]) -> Float[ndarray, ...]:
+    """Return ``a @ b``, for a vector or matrix ``b``, with the same bits on every processor."""
+    return np.asarray(np.einsum("...k,k->..." if b.ndim == 1 else "...k,km->...m", a, b))
 
 
 def vector_length(vector: Float[ndarray, " k"]) -> float:

@@ -17,6 +17,7 @@ from dataset_builder.config.specs import (
     LatticeSpec,
     PierSpec,
     PileSpec,
+    RandomViewsSpec,
     SurveySpec,
 )
 from dataset_builder.config.trajectories import camera_offsets_m
@@ -59,14 +60,14 @@ def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
 
     Raises ``MeshError`` if it reaches more than 1 mm below z = 0 or as far as the nearest camera, and
     ``InputError`` if the screen of the variant ``shadows`` would be among the cameras. The cameras of a survey
-    may be nearer, since each is clear of the steel by itself.
+    and random views may be nearer, since each is clear of the steel by itself.
     """
     check_above_ground(assembly, config.name)
     vertices_m, aim_m = assembly.vertices_m, aim_point_m(assembly)
     reach_m = float(np.linalg.norm(vertices_m - aim_m, axis=1).max())
     camera_distances_m = np.linalg.norm(camera_offsets_m(config.protocol, aim_m, assembly.bars), axis=1)
     nearest_m = float(camera_distances_m.min())
-    if reach_m >= nearest_m and not isinstance(config.protocol, SurveySpec):
+    if reach_m >= nearest_m and not isinstance(config.protocol, SurveySpec | RandomViewsSpec):
         raise MeshError(
             f"the assembly extends {reach_m:.4g} m from its centre, expected less than {nearest_m:.4g} m, "
             f"the distance of the nearest camera of {config.name}: is the unit right?"
