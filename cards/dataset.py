@@ -11,6 +11,7 @@ from huggingface_hub import DatasetCardData
 from cards.steel import depth_text, steel_by_config
 from cards.templates import render
 from rebar_depth_bench.data.columns import COLUMN_DESCRIPTIONS, column_kind, features
+from rebar_depth_bench.data.config_tables import References
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.shards import SCENE_COLUMN, lacks_scene_column
 from rebar_depth_bench.data.trajectory import CENTRE, NEAREST_STEEL, SURVEY
@@ -43,7 +44,7 @@ def dataset_card(version: str, digest: str, configs: Sequence[DatasetConfig]) ->
         version=version,
         digest=digest,
         protocol=PROTOCOL,
-        configs=[_config_row(config) for config in configs],
+        configs=[row for config in configs for row in _config_rows(config)],
         has_rendered=bool(_rendered(configs)),
         columns=column_rows(),
     )
@@ -88,7 +89,10 @@ def _card_metadata(version: str, configs: Sequence[DatasetConfig]) -> DatasetCar
     infos = {config.name: _dataset_info(config, version) for config in configs}
     DatasetInfosDict(infos).to_dataset_card_data(card)
     card["configs"] = [
-        {"config_name": config.name, "data_files": [{"split": TEST_SPLIT, "path": _shard_pattern(config.shards)}]}
+        {
+            "config_name": config.name,
+            "data_files": [{"split": split, "path": _shard_paths(config, split)} for split in config.splits],
+        }
         for config in configs
     ]
     return card
@@ -98,10 +102,15 @@ def _dataset_info(config: DatasetConfig, version: str) -> DatasetInfo:
     from datasets import DatasetInfo, SplitDict, SplitInfo
 
     size = config.manifest_entry["bytes"]
-    split = SplitInfo(TEST_SPLIT, num_examples=len(config.views), num_bytes=size)
+    splits = {
+        split: SplitInfo(
+            split, num_examples=len(config.of_split(split).views), num_bytes=_split_bytes(config, split)
+        )
+        for split in config.splits
+    }
     return DatasetInfo(
         features=_stored_features(config),
-        splits=SplitDict({TEST_SPLIT: split}),
+        splits=SplitDict(splits),
         config_name=config.name,
         version=version,
         dataset_size=size,
@@ -117,39 +126,87 @@ def _stored_features(config: DatasetConfig) -> Features:
     return Features({name: kind for name, kind in features().items() if not is_old or name != SCENE_COLUMN})
 
 
-def _shard_pattern(shards: Iterable[str]) -> str:
-    """Return the glob pattern of a config's shards, ``<config>/test-*-<digest>.parquet``."""
-    shard = next(iter(shards))
-    return f"{shard.partition('/')[0]}/{TEST_SPLIT}-*-{shard.rpartition('-')[2]}"
+def _split_bytes(config: DatasetConfig, split: str) -> int:
+    """Return the size of the shards of a split."""
+    scenes = config.manifest_entry.get("scenes", [config.manifest_entry])
+    return sum(scene["bytes"] for scene in scenes if scene.get("split", TEST_SPLIT) == split)
+
+
+def _shard_paths(config: DatasetConfig, split: str) -> str | list[str]:
+    """Return the glob pattern of the shards, ``<config>/test-*-<digest>.parquet``, or the shards of a split.
+
+    Scenes of a config with splits have digests of their own.
+    """
+    shards = config.of_split(split).shards
+    if config.has_splits:
+        return list(shards)
+    return f"{config.name}/{TEST_SPLIT}-*-{shards[0].rpartition('-')[2]}"
+
+
+def _config_rows(config: DatasetConfig) -> list[dict[str, Any]]:
+    """Return the rows of a config in the tables: one, or one for each split of a config with splits."""
+    if config.has_splits:
+        return [_split_row(config.of_split(split), split) for split in config.splits]
+    return [_imported_row(config) if config.imported is not None else _config_row(config)]
+
+
+def _split_row(config: DatasetConfig, split: str) -> dict[str, Any]:
+    """Return the row of a config that is restricted to a split of generated scenes."""
+    names = {scene.name for scene in config.scenes}
+    scenes = [scene for scene in config.manifest_entry["scenes"] if scene["name"] in names]
+    distances_m = [distance_m for scene in scenes for distance_m in scene["protocol"]["distances_m"]]
+    cameras = dict.fromkeys(scene["rig"]["camera"] for scene in scenes)
+    references = References.model_validate(config.manifest_entry["references"][split])
+    return {
+        **_shared_row(config),
+        "name": f"{config.name}, {split}",
+        "steel_source": f"{len(scenes)} generated cages",
+        "distance": f"{min(distances_m):g}-{max(distances_m):g} m, random views",
+        "steel_depth": DASH,
+        "sheet": config.sheet if split == config.manifest_entry["scenes"][0]["split"] else None,
+        **dict.fromkeys(("variants", "panorama")),
+        "optics": f"ideal pinholes with baseline and field of view of {', '.join(sorted(cameras))}",
+        "constant": _reference(references, "constant"),
+        "one_pixel": _reference(references, "one_pixel"),
+        "megabytes": f"{sum(scene['bytes'] for scene in scenes) / 1e6:.1f}",
+    }
 
 
 def _config_row(config: DatasetConfig) -> dict[str, Any]:
-    entry, rig, views = config.manifest_entry, config.rig, config.views
-    if config.imported is not None:
-        return _imported_row(config)
+    """Return the row of a config of one scene that was rendered."""
+    entry = config.manifest_entry
+    return {
+        **_shared_row(config),
+        "name": config.name,
+        "views": f"{len(config.views)} of {entry['protocol_views']}",
+        "steel_source": _steel_source(entry["scene"]["assembly"]),
+        "distance": _distance(entry["protocol"]),
+        "steel_depth": _steel_depth(config),
+        "sheet": config.sheet,
+        "variants": config.scene.appearance.variants,
+        "panorama": entry["scene"].get("appearance", {}).get("image_light", {}).get("image"),
+        "optics": _OPTICS_TEXTS[entry["rig"]["grid"]],
+        "constant": _reference(config.reference, "constant"),
+        "one_pixel": _reference(config.reference, "one_pixel"),
+        "megabytes": f"{entry['bytes'] / 1e6:.1f}",
+    }
+
+
+def _shared_row(config: DatasetConfig) -> dict[str, Any]:
+    """Return the columns that all rows of rendered configs compute alike."""
+    rig, views = config.rig, config.views
     steel = np.array([view.steel_px for view in views], float)
     scored = np.array([view.scored_px for view in views], float)
     with_steel = steel > 0
     return {
-        "name": config.name,
-        "views": f"{len(views)} of {entry['protocol_views']}",
+        "views": f"{len(views)}",
         "samples": "no colour" if config.colour is None else _samples(config.colour),
         "has_colour": config.colour is not None,
-        "steel_source": _steel_source(entry["scene"]["assembly"]),
         "grid": f"{rig.width} x {rig.height}",
-        "distance": _distance(entry["protocol"]),
-        "steel_depth": _steel_depth(config),
         "steel": f"{100 * np.mean(steel) / (rig.width * rig.height):.1f} %",
         "kept": f"{100 * np.mean(scored[with_steel] / steel[with_steel]):.0f} %" if with_steel.any() else "none",
         "out_of_protocol": int(np.count_nonzero(scored == 0)),
-        "sheet": config.sheet,
-        "variants": config.scene.appearance.variants,
         "imported": None,
-        "panorama": entry["scene"].get("appearance", {}).get("image_light", {}).get("image"),
-        "optics": _OPTICS_TEXTS[entry["rig"]["grid"]],
-        "constant": _reference(config, "constant"),
-        "one_pixel": _reference(config, "one_pixel"),
-        "megabytes": f"{entry['bytes'] / 1e6:.1f}",
     }
 
 
@@ -167,15 +224,15 @@ def _imported_row(config: DatasetConfig) -> dict[str, Any]:
         "out_of_protocol": scored.count(0),
         "sheet": config.sheet,
         "imported": config.manifest_entry["imported"],
-        "constant": _reference(config, "constant"),
-        "one_pixel": _reference(config, "one_pixel"),
+        "constant": _reference(config.reference, "constant"),
+        "one_pixel": _reference(config.reference, "one_pixel"),
         "megabytes": f"{config.manifest_entry['bytes'] / 1e6:.1f}",
     }
 
 
-def _reference(config: DatasetConfig, name: str) -> str:
+def _reference(references: References | None, name: str) -> str:
     """Return AbsRel and RMSE of a reference; a dash if the manifest has none."""
-    errors = getattr(config.reference, name, None)
+    errors = getattr(references, name, None)
     if errors is None or errors.abs_rel is None or errors.rmse_cm is None:
         return DASH
     return f"{errors.abs_rel:.4f}, {errors.rmse_cm:.2f} cm"

@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dataset_builder.config.cages import CAGES, CagesRequest
 from dataset_builder.config.catalog import CONFIGS, SWEEPS, BuildRequest
 from dataset_builder.config.quality import DEFAULT_QUALITY, QUALITIES, SAMPLINGS
 from dataset_builder.config.specs import CPU, GPU_TYPES
 from dataset_builder.scene.variants import VARIANTS
+from rebar_depth_bench.view_ids import SPLITS
 
 
 def add_build_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,7 +21,7 @@ def add_build_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         action="extend",
         metavar="NAME",
-        help=f"configs to build: {', '.join(CONFIGS)} (default: all of these), or {', '.join(SWEEPS)}",
+        help=f"configs to build: {', '.join(CONFIGS)} (default: all of these), or {', '.join((*SWEEPS, CAGES))}",
     )
     parser.add_argument(
         "--views",
@@ -73,7 +75,25 @@ def add_build_arguments(parser: argparse.ArgumentParser) -> None:
         help="address of a dask scheduler whose workers render the views, such as tcp://host:8786",
     )
     parser.add_argument(
-        "--seed", type=int, default=0, help="random seed of surfaces and noise (default: %(default)s)"
+        "--seed",
+        type=int,
+        default=0,
+        help=f"random seed of surfaces and noise, and of all of {CAGES} (default: %(default)s)",
+    )
+    cages = parser.add_argument_group(f"scenes of the config {CAGES}")
+    cages.add_argument(
+        "--split",
+        metavar="NAME",
+        help=f"split of the scenes: {', '.join(SPLITS)} (default: {CagesRequest.split})",
+    )
+    cages.add_argument(
+        "--scenes", type=int, metavar="N", help=f"number of scenes of the split (default: {CagesRequest.scenes})"
+    )
+    cages.add_argument(
+        "--views-per-scene",
+        type=int,
+        metavar="N",
+        help=f"number of views of each scene (default: {CagesRequest.views_per_scene})",
     )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dataset_builder.build_options import add_build_arguments, add_mesh_unit, add_scene_arguments
+from dataset_builder.config.cages import CAGES, CagesRequest
 from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, BuildRequest
 from dataset_builder.config.quality import colour_spec
 from dataset_builder.config.specs import CPU
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
 _EXTRA_MODULES = ("bpy", "cv2", "embreex", "trimesh")
 
 
+CAGES_OPTIONS = ("split", "scenes", "views_per_scene")
+"""Options of the scenes of ``cages``; each is None if it is not given."""
 COLOUR_OPTIONS = ("sampling", "quality", "samples", "device")
 """Options that only colour has; each is None if it is not given."""
 RENAMED_OPTIONS = {"--to": "--out"}
@@ -137,7 +140,22 @@ def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
         mesh=mesh_file_spec(options.mesh, options.mesh_unit) if options.mesh else None,
         variants=tuple(options.variant or ()),
         scenes=tuple(scene_config(path) for path in options.scene or ()),
+        cages=_cages_request(options),
     )
+
+
+def _cages_request(options: argparse.Namespace) -> CagesRequest | None:
+    """Return the request for scenes of ``cages``, or None if that is not among the configs.
+
+    Raises ``InputError`` if options of its scenes are given without it.
+    """
+    given = {name: value for name in CAGES_OPTIONS if (value := getattr(options, name)) is not None}
+    if CAGES in (options.config or ()):
+        return CagesRequest(**given)
+    if given:
+        names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise InputError(f"{names}: only {CAGES} has such scenes, expected --config {CAGES}")
+    return None
 
 
 def _colour_spec(options: argparse.Namespace, device: str) -> ColourSpec | None:

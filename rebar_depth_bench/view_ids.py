@@ -11,6 +11,19 @@ TEST_SPLIT = "test"
 _SPLIT = re.compile(f"({'|'.join(SPLITS)})-.*-[0-9]{{4,}}")
 
 
+def view_id(config: str, index: int, scene_prefix: str = "") -> str:
+    """Return the id of a view from its index in the full trajectory.
+
+    ``scene_prefix`` is ``<split>-<scene>-`` in configs of several scenes.
+    """
+    return f"{config}/{scene_prefix}{index:04d}"
+
+
+def scene_prefix(split: str, scene: str) -> str:
+    """Return the part of the view ids of a scene between config and index."""
+    return f"{split}-{scene}-"
+
+
 def config_of(view_id: str) -> str:
     """Return the config of a view: the part of ``view_id`` before the slash."""
     return view_id.partition("/")[0]

@@ -20,11 +20,12 @@ from numpy import ndarray
 
 from dataset_builder.audit.report import Check
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
-from dataset_builder.config.catalog import view_id
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import (
     DistanceSweepSpec,
     DomeSpec,
+    FocalRigSpec,
+    RandomViewsSpec,
     RigSpec,
     RingSpec,
     SurveySpec,
@@ -38,10 +39,12 @@ from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS
+from rebar_depth_bench.data.trajectory import RANDOM_VIEWS
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera, camera_centre
 from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
 from rebar_depth_bench.validation import short_repr
+from rebar_depth_bench.view_ids import scene_prefix, view_id
 
 _Spec = TypeVar("_Spec")
 _TRAJECTORY_SPECS: Mapping[str, Callable[..., TrajectorySpec]] = {
@@ -49,6 +52,7 @@ _TRAJECTORY_SPECS: Mapping[str, Callable[..., TrajectorySpec]] = {
     "ring": RingSpec,
     "sweep": DistanceSweepSpec,
     "survey": SurveySpec,
+    RANDOM_VIEWS: RandomViewsSpec,
 }
 
 
@@ -62,12 +66,20 @@ def rig_spec(config: DatasetConfig) -> RigSpec:
     return _spec_from_manifest(config, "rig", _rig_from_json)
 
 
+def entry_of_scene(config: DatasetConfig) -> Mapping[str, Any]:
+    """Return the part of the manifest entry with the parameters of a config that is restricted to one scene."""
+    if not config.has_splits:
+        return config.manifest_entry
+    return next(entry for entry in config.manifest_entry["scenes"] if entry["name"] == config.scene.name)
+
+
 def _spec_from_manifest(config: DatasetConfig, key: str, make_spec: Callable[[Any], _Spec]) -> _Spec:
+    entry = entry_of_scene(config)
     try:
-        return make_spec(config.manifest_entry[key])
+        return make_spec(entry[key])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DatasetError(
-            f"manifest: the {key} of config {config.name} is {short_repr(config.manifest_entry.get(key))}, "
+            f"manifest: the {key} of config {config.label} is {short_repr(entry.get(key))}, "
             f"expected a value that this version writes: {type(error).__name__}: {error}"
         ) from None
 
@@ -78,9 +90,8 @@ def _trajectory_from_json(values: Mapping[str, Any]) -> TrajectorySpec:
 
 def _rig_from_json(values: Mapping[str, Any]) -> RigSpec:
     calibration = values.get("calibration")
-    return RigSpec(
-        **{**values, "calibration": None if calibration is None else _calibration_from_json(calibration)}
-    )
+    spec = FocalRigSpec if "focal_px" in values else RigSpec
+    return spec(**{**values, "calibration": None if calibration is None else _calibration_from_json(calibration)})
 
 
 def _calibration_from_json(values: Mapping[str, Any]) -> StereoCalibration:
@@ -157,8 +168,9 @@ def expected_views(
     trajectory = trajectory_spec(config)
     try:
         left_poses = poses(trajectory, aim_m, rig, bars)
+        prefix = scene_prefix(config.scene.split, config.scene.name) if config.has_splits else ""
         return [
-            ExpectedView(view_id(config.name, index), rig_cameras(rig, left_poses[index]), rig.baseline_m)
+            ExpectedView(view_id(config.name, index, prefix), rig_cameras(rig, left_poses[index]), rig.baseline_m)
             for index in subset(len(left_poses), len(config.views))
         ]
     except ValueError as error:

@@ -23,6 +23,7 @@ from dataset_builder.audit.imported import imported_checks
 from dataset_builder.audit.markers import detect_view_markers, marker_verdict
 from dataset_builder.audit.photometric import photometric_fit, photometric_verdict
 from dataset_builder.audit.report import AuditReport, Check
+from dataset_builder.audit.scenes import cage_checks, merged_checks
 from dataset_builder.audit.stereo_consistency import epipolar_counts, epipolar_verdict
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView, RayCache, view_from_row
 from dataset_builder.config.trajectories import subset
@@ -62,6 +63,8 @@ VIEW_CHECKS: tuple[ViewCheck, ...] = (
 
 
 _NOT_AUDITED = {"left_preview"}
+SAMPLED_SCENES = 8
+"""Scenes of a config of several scenes in which colour is checked and depth is rendered again."""
 
 
 def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent) -> AuditReport:
@@ -88,14 +91,40 @@ def _config_checks(config: DatasetConfig, root: Path, depth_views: int, progress
     if config.imported is not None:
         bars = read_bars(root / BARS_FILE).get(config.scene.name, ())
         yield from imported_checks(config, config.imported, bars, progress)
-        return
-    name, mesh = config.name, root / config.mesh
+    elif config.has_splits:
+        yield from _scenes_checks(config, root, depth_views, progress)
+    else:
+        yield from _scene_checks(config, root, depth_views, progress)
+
+
+def _scenes_checks(config: DatasetConfig, root: Path, depth_views: int, progress: Progress) -> Iterator[Check]:
+    """Yield the checks of a config of several scenes, each of all scenes together.
+
+    Colour is checked, and depth rendered again, in ``SAMPLED_SCENES`` of them.
+    """
+    scenes = config.by_scene()
+    sampled = set(subset(len(scenes), SAMPLED_SCENES))
+    checks: list[Check] = []
+    for number, scene in enumerate(scenes):
+        views = depth_views if number in sampled else 0
+        steel = read_bars(root / BARS_FILE)[scene.scene.name]
+        checks += cage_checks(scene, steel)
+        checks += _scene_checks(scene, root, views, silent, with_colour=number in sampled)
+        progress(f"audit of {config.name}", number + 1, len(scenes))
+    yield from merged_checks(config.name, checks)
+
+
+def _scene_checks(
+    config: DatasetConfig, root: Path, depth_views: int, progress: Progress, *, with_colour: bool = True
+) -> Iterator[Check]:
+    """Yield the checks of a config of one scene, or restricted to one scene."""
+    name, mesh = config.label, root / config.mesh
     steel = read_bars(root / BARS_FILE)[config.scene.name]
     variants, board = config.scene.appearance.variants, config.scene.board
     audited = AuditedConfig(name, variants, steel, board, config.colour is not None)
     aim_m, aim_problems = checked_aim_point_m(config, mesh)
     expected = expected_views(config, aim_m, steel)
-    accumulator = _AuditAccumulator(config, audited, expected, depth_views)
+    accumulator = _AuditAccumulator(config, audited, expected, depth_views, with_colour)
     for row in iterate_rows(config, [column for column in COLUMNS if column not in _NOT_AUDITED]):
         accumulator.add(row)
         progress(f"audit of {name}", accumulator.rows, len(config.views))
@@ -115,13 +144,20 @@ class _AuditAccumulator:
     """Accumulator over a config's rows: problems, measurements of every check, and eyes to render in Cycles."""
 
     def __init__(
-        self, config: DatasetConfig, audited: AuditedConfig, expected: Sequence[ExpectedView], depth_views: int
+        self,
+        config: DatasetConfig,
+        audited: AuditedConfig,
+        expected: Sequence[ExpectedView],
+        depth_views: int,
+        with_colour: bool,
     ) -> None:
         self._config, self._audited, self._expected = config, audited, expected
         self._bar_ids = {bar.bar_id for bar in audited.steel}
         self._rays = RayCache()
         self._measured = [
-            set() if check.needs_colour and config.colour is None else set(subset(len(config.views), check.views))
+            set()
+            if check.needs_colour and not (with_colour and audited.has_colour)
+            else set(subset(len(config.views), check.views))
             for check in VIEW_CHECKS
         ]
         self._cycles_indices = set(subset(len(config.views), depth_views) if depth_views else ())
@@ -149,4 +185,4 @@ class _AuditAccumulator:
 
     def rows_check(self) -> Check:
         """Return the check of the rows' invariants."""
-        return Check(f"{self._config.name}: rows", f"{self.rows} views", "all invariants", tuple(self._problems))
+        return Check(f"{self._config.label}: rows", f"{self.rows} views", "all invariants", tuple(self._problems))

@@ -29,7 +29,6 @@ from dataset_builder.blender.devices import select_device
 from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
 from dataset_builder.blender.render import render_depth, use_cycles
 from dataset_builder.blender.scene import add_object, build_scene, mesh_data
-from dataset_builder.config.catalog import view_id
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import ConfigSpec
 from dataset_builder.config.trajectories import poses
@@ -131,12 +130,12 @@ def _render_view(
                 rgb = render_colour(camera, truth.mask, config.colour, seed, context.scratch)
                 rgb = recorded(rgb, config.scene, seed)
         eyes[eye] = replace(truth, rgb=rgb)
-    return View(view_id(config.name, index), config.scene.name, eyes["left"], eyes["right"], config.rig.baseline_m)
+    return View(config.view_id(index), config.scene.name, eyes["left"], eyes["right"], config.rig.baseline_m)
 
 
 def _cycles_seed(config: ConfigSpec, index: int, eye_index: int) -> int:
     """Return a separate seed for each image, so that noise does not repeat from view to view."""
-    entropy = [config.scene.seed, *config.name.encode(), index, eye_index]
+    entropy = [config.scene.seed, *config.label.encode(), index, eye_index]
     return int(np.random.SeedSequence(entropy).generate_state(1)[0] >> 1)
 
 

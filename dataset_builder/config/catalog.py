@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from dataset_builder.config.cages import CAGES, CagesRequest, cage_scenes
 from dataset_builder.config.file_specs import MeshFileSpec
 from dataset_builder.config.rigs import zed_rig
 from dataset_builder.config.specs import (
@@ -22,6 +23,7 @@ from dataset_builder.config.specs import (
     PileSpec,
     RigSpec,
     RingSpec,
+    SceneConfigSpec,
     SceneSpec,
 )
 from dataset_builder.scene.variants import VARIANTS, check_variants
@@ -123,7 +125,7 @@ class BuildRequest:
     ``views`` is the number of views per config, spread evenly over the trajectory; None selects all views.
     ``colour`` None builds no colour. ``mesh`` replaces the rods of the lattice. ``variants`` are names of
     ``scene.variants.VARIANTS``; they are appended to the names of configs and scenes. ``scenes`` are the configs
-    of user scene files.
+    of user scene files. ``cages`` are the scenes of the config of that name, if it is among the ``configs``.
     """
 
     configs: tuple[str, ...] = tuple(CONFIGS)
@@ -135,6 +137,7 @@ class BuildRequest:
     mesh: MeshFileSpec | None = None
     variants: tuple[str, ...] = ()
     scenes: tuple[ConfigSpec, ...] = ()
+    cages: CagesRequest | None = None
 
     def config_specs(self) -> list[ConfigSpec]:
         """Return the specs of all requested configs.
@@ -145,7 +148,8 @@ class BuildRequest:
         """
         self._check_ranges()
         check_variants(self.variants)
-        specs = [self._with_request(spec) for spec in (*_known_configs(self.configs), *self.scenes)]
+        known = _known_configs([name for name in self.configs if name != CAGES])
+        specs = [self._with_request(spec) for spec in (*known, *self.scenes)]
         self._check_device(specs)
         names = [spec.name for spec in specs]
         duplicates = sorted({name for name in names if names.count(name) > 1})
@@ -153,7 +157,21 @@ class BuildRequest:
             raise InputError(
                 f"more than one config is named {', '.join(duplicates)}, expected unique names: rename the scene"
             )
-        return specs
+        return [*specs, *self._cage_scenes()]
+
+    def _cage_scenes(self) -> list[SceneConfigSpec]:
+        """Return the scenes of ``cages``, if it is requested; each draws its own variants and takes no mesh."""
+        if CAGES not in self.configs:
+            return []
+        unusable = {"--mesh": self.mesh, "--variant": self.variants, "--views": self.views}
+        problems = [
+            Problem("conflict", name, f"is combined with --config {CAGES}", "only one of them")
+            for name, value in unusable.items()
+            if value
+        ]
+        if problems:
+            raise InputError.from_problems("build request", problems)
+        return cage_scenes(self.cages or CagesRequest(), self.seed, self.width, self.height, self.colour)
 
     def _check_ranges(self) -> None:
         limits: Sequence[tuple[str, int | None, int, int]] = (
@@ -219,12 +237,7 @@ def _known_configs(names: Sequence[str]) -> list[ConfigSpec]:
     known = {**CONFIGS, **SWEEPS}
     unknown = [name for name in dict.fromkeys(names) if name not in known]
     if unknown:
-        expected = f"one of {', '.join(known)}"
+        expected = f"one of {', '.join((*known, CAGES))}"
         problems = [Problem("unknown", "--config", f"got {name!r}", expected) for name in unknown]
         raise InputError.from_problems("build request", problems)
     return [known[name]() for name in dict.fromkeys(names)]
-
-
-def view_id(config: str, index: int) -> str:
-    """Return the id of a view, ``<config>/<index>``, from its index in the full trajectory."""
-    return f"{config}/{index:04d}"

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dataset_builder.config.camera_site import CameraSpace
+from dataset_builder.config.cages import CAGES
+from dataset_builder.config.camera_site import CAMERA_SPACES, LABORATORY_CAMERA_RADIUS_M, OUTDOORS_CAMERA_RADIUS_M
 from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.scene_name import scene_name_of
@@ -39,7 +40,7 @@ from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import read_file
 
-RESERVED_NAMES = (*CONFIGS, *SWEEPS, "meshes", "pictures", "scenes")
+RESERVED_NAMES = (*CONFIGS, *SWEEPS, CAGES, "meshes", "pictures", "scenes")
 """Names that a user scene cannot have: names of configs and of other entries of the dataset folder."""
 
 NEAREST_RADIUS_PER_REACH = 2.5
@@ -49,23 +50,7 @@ At this distance the whole assembly is in the frame and fills much of it.
 """
 
 LABORATORY_STEEL_RADIUS_M = 0.45
-LABORATORY_CAMERA_RADIUS_M = 1.6
-"""Maximum horizontal distances of steel and of cameras from the centre of the laboratory, metres.
-
-Objects lie on the bench beyond the first, furniture stands beyond the second.
-"""
-
-OUTDOORS_CAMERA_RADIUS_M = 20.5
-"""Maximum horizontal distance of cameras, and of steel that is surveyed, from the world origin outdoors, metres.
-
-The ground is clear within it.
-"""
-
-_CAMERA_SPACES = {
-    "laboratory": CameraSpace(LABORATORY_CAMERA_RADIUS_M, clear_radius_m=0.6, objects_m=0.2),
-    "outdoors": CameraSpace(OUTDOORS_CAMERA_RADIUS_M, clear_radius_m=OUTDOORS_CAMERA_RADIUS_M),
-}
-"""Spaces for the cameras of a survey by environment; the objects of the laboratory are those on its bench."""
+"""Maximum horizontal distance of steel from the centre of the laboratory, metres; objects lie beyond it."""
 
 _DEFAULT_MARKERS = {"laboratory": 6, "outdoors": 0}
 
@@ -102,7 +87,7 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     try:
         check_above_ground(assembly, name)
         if isinstance(trajectory, SurveySpec):
-            trajectory = with_stations(trajectory, assembly, _CAMERA_SPACES[environment], RigSpec(), str(path))
+            trajectory = with_stations(trajectory, assembly, CAMERA_SPACES[environment], RigSpec(), str(path))
         config = ConfigSpec(name, SceneSpec(name, assembly_spec, None, environment), trajectory)
         check_fits(assembly, config)
     except MeshError as error:

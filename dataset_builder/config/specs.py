@@ -13,6 +13,7 @@ from rebar_depth_bench.data.trajectory import CENTRE, RANDOM_VIEWS, SURVEY
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration
+from rebar_depth_bench.view_ids import TEST_SPLIT, scene_prefix, view_id
 
 
 @dataclass(frozen=True)
@@ -234,3 +235,34 @@ class ConfigSpec:
     protocol: TrajectorySpec
     rig: RigSpec = field(default_factory=RigSpec)
     colour: ColourSpec | None = field(default_factory=ColourSpec)
+
+    @property
+    def label(self) -> str:
+        """Name in messages and of staging folders."""
+        return self.name
+
+    @property
+    def scene_prefix(self) -> str:
+        """Part of the view ids between config and index."""
+        return ""
+
+    def view_id(self, index: int) -> str:
+        """Return the id of a view from its index in the full trajectory."""
+        return view_id(self.name, index, self.scene_prefix)
+
+
+@dataclass(frozen=True)
+class SceneConfigSpec(ConfigSpec):
+    """One scene of a config that has several, in one of its splits."""
+
+    split: str = TEST_SPLIT
+
+    @property
+    def label(self) -> str:
+        """Name in messages and of staging folders: config and scene."""
+        return f"{self.name}-{self.scene.name}"
+
+    @property
+    def scene_prefix(self) -> str:
+        """Part of the view ids between config and index: split and scene."""
+        return scene_prefix(self.split, self.scene.name)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from dataset_builder.config.catalog import view_id
 from dataset_builder.config.scene_file import RESERVED_NAMES
 from dataset_builder.config.scene_name import scene_name_of
 from dataset_builder.importing.bars_file import read_bars_file
@@ -29,6 +28,7 @@ from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.paths import remove_folder
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.protocol import scored_pixels
+from rebar_depth_bench.view_ids import view_id
 
 _KEY_CHARACTERS = 16
 _ROLE = "not surveyed"

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import defaultdict
 from collections.abc import Sequence
-from concurrent.futures import FIRST_COMPLETED, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import groupby
 from pathlib import Path
 
 from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.config.specs import SceneConfigSpec
 from dataset_builder.pipeline.disk_space import check_fits_on_disk
 from dataset_builder.pipeline.folder import check_folder, remove_build_folder, remove_stagings
 from dataset_builder.pipeline.local_renderer import Renderer, local_processes
 from dataset_builder.pipeline.notes import print_notes
+from dataset_builder.pipeline.place_cameras import place_cameras
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, plan_config
 from dataset_builder.pipeline.publish import (
     build_lock,
@@ -23,8 +28,9 @@ from dataset_builder.pipeline.publish import (
     remove_leftovers,
     repair_metadata,
 )
+from dataset_builder.pipeline.publish_scenes import publish_scenes
 from dataset_builder.pipeline.retained import check_retained_configs
-from dataset_builder.pipeline.work_units import accept_result, remaining_units
+from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, accept_result, remaining_units
 from dataset_builder.scene.assemblies import check_fits
 from rebar_depth_bench.progress import Progress, silent
 
@@ -60,6 +66,7 @@ def build(
     """
     plans = plan_build(request, out)
     check_fits_on_disk(out, plans)
+    plans = place_cameras(plans, out, os.cpu_count() or 1, progress)
     with build_lock(out / BUILD_FOLDER):
         try:
             check_retained_configs(out, plans)
@@ -76,58 +83,77 @@ def plan_build(request: BuildRequest, out: Path) -> list[ConfigPlan]:
     Raises ``InputError`` for a request that cannot be built in the folder ``out``, such as an unusable mesh file.
     """
     plans = [plan_config(spec, request.views, out) for spec in request.config_specs()]
-    for plan in plans:
+    # Cameras of generated scenes are placed later, so that they fit.
+    with_cameras = [plan for plan in plans if not isinstance(plan.spec, SceneConfigSpec)]
+    for plan in with_cameras:
         check_fits(plan.assembly, plan.spec)
-    print_notes(list(dict.fromkeys(note for plan in plans for note in plan.assembly.notes)))
+    print_notes(list(dict.fromkeys(note for plan in with_cameras for note in plan.assembly.notes)))
     check_folder(out, plans)
     return plans
 
 
 def _build_plans(plans: Sequence[ConfigPlan], out: Path, renderer: Renderer, progress: Progress) -> BuildSummary:
     summary = BuildSummary()
-    for plan in plans:
-        if is_published(out, plan):
-            repair_metadata(out, plan)
-            summary.up_to_date.append(plan.spec.name)
+    for name, group in groupby(plans, key=lambda plan: plan.spec.name):
+        plans_of_config = list(group)
+        missing = [plan for plan in plans_of_config if not is_published(out, plan)]
+        if not missing:
+            repair_metadata(out, plans_of_config)
+            summary.up_to_date.append(name)
         else:
-            _render(plan, renderer, progress, summary)
-            publish_config(out, plan)
-            summary.built.append(plan.spec.name)
-        remove_stagings(plan)
+            _render(missing, renderer, progress, summary)
+            _publish(out, missing)
+            summary.built.append(name)
+        for plan in plans_of_config:
+            remove_stagings(plan)
     return summary
 
 
-class _ViewCount:
-    """Thread-safe counter of the distinct staged views of a plan, which reports to a progress callback."""
+def _publish(out: Path, plans: Sequence[ConfigPlan]) -> None:
+    """Publish the plan of a config of one scene, or those of scenes of one config."""
+    if isinstance(plans[0].spec, SceneConfigSpec):
+        publish_scenes(out, plans)
+    else:
+        publish_config(out, plans[0])
 
-    def __init__(self, plan: ConfigPlan, progress: Progress) -> None:
-        self._plan = plan
+
+class _ViewCount:
+    """Thread-safe counter of the distinct staged views of a config, which reports to a progress callback."""
+
+    def __init__(self, plans: Sequence[ConfigPlan], progress: Progress) -> None:
+        self._name = plans[0].spec.name
+        self._total = sum(len(plan.indices) for plan in plans)
         self._progress = progress
-        self._done = {index for index in plan.indices if plan.staging.row(index).is_file()}
+        self._done = {
+            (plan.key, index) for plan in plans for index in plan.indices if plan.staging.row(index).is_file()
+        }
         self._lock = threading.Lock()
 
-    def add(self, *indices: int) -> None:
-        """Mark views as done and report the progress; without ``indices``, only report it."""
+    def add(self, key: str, *indices: int) -> None:
+        """Mark views of the plan with a ``key`` as done and report the progress; without any, only report it."""
         with self._lock:
-            self._done.update(indices)
-            self._progress(self._plan.spec.name, len(self._done), len(self._plan.indices))
+            self._done.update((key, index) for index in indices)
+            self._progress(self._name, len(self._done), self._total)
 
 
-def _render(plan: ConfigPlan, renderer: Renderer, progress: Progress, summary: BuildSummary) -> None:
-    """Render and stage the remaining work units of the plan; on failure or interrupt, cancel those not started."""
-    plan.staging.root.mkdir(parents=True, exist_ok=True)
-    count = _ViewCount(plan, progress)
-    count.add()
-    unit_of_future = {renderer.submit(unit, plan.staging, count.add): unit for unit in remaining_units(plan)}
+def _render(plans: Sequence[ConfigPlan], renderer: Renderer, progress: Progress, summary: BuildSummary) -> None:
+    """Render and stage the remaining work units of a config's plans; on failure, cancel those not started."""
+    count = _ViewCount(plans, progress)
+    count.add("")
+    waiting: dict[Future[UnitResult], tuple[ConfigPlan, WorkUnit]] = {}
+    for plan in plans:
+        plan.staging.root.mkdir(parents=True, exist_ok=True)
+        for unit in remaining_units(plan):
+            waiting[renderer.submit(unit, plan.staging, partial(count.add, plan.key))] = plan, unit
     try:
-        while unit_of_future:
-            for future in wait(unit_of_future, return_when=FIRST_COMPLETED).done:
-                unit = unit_of_future.pop(future)  # Drop the future, which holds the rendered bytes.
+        while waiting:
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                plan, unit = waiting.pop(future)  # Drop the future, which holds the rendered bytes.
                 result = future.result()
                 accept_result(unit, result, plan.staging)
                 for stage, duration_s in result.seconds.items():
                     summary.seconds[stage] += duration_s
-                count.add(*unit.indices)
+                count.add(plan.key, *unit.indices)
     finally:
-        for future in unit_of_future:
+        for future in waiting:
             future.cancel()

@@ -56,7 +56,7 @@ class ClusterRenderer:
 
         The worker reports rendered views in a dask topic named by the key of the unit.
         """
-        key = f"render-{unit.config.name}-{uuid.uuid4().hex}"
+        key = f"render-{unit.config.label}-{uuid.uuid4().hex}"
         self.keys[key] = unit
         self.client.subscribe_topic(key, lambda event: on_view_done(event[1]))
         future: Future[UnitResult] = self.client.get_executor(pure=False).submit(

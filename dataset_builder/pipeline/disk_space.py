@@ -15,11 +15,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from dataset_builder.config.specs import RigSpec
+from dataset_builder.config.specs import RigSpec, SceneConfigSpec
 from dataset_builder.pipeline.folder import SHARD_NAME, existing_ancestor
 from dataset_builder.pipeline.plan import ConfigPlan
 from dataset_builder.pipeline.publish import is_published
-from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.errors import OutputError
 
 _MEASURED_PIXELS = 640 * 360
@@ -38,6 +37,10 @@ _MARGIN = 1.15
 """Margin for views with more detail than those of these scenes, whose sizes are estimated 1.2 to 1.5 times."""
 _SURROUNDINGS_BYTES = 1_000_000
 """Allowance for surfaces in the mesh of a scene that are no steel (0.1 MB), contact sheet and metadata."""
+
+
+_CAGE_BYTES = 6_000_000
+"""Allowance for the mesh of a generated cage, which is not made for an estimate: the mean of 40 is 4 MB."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,7 @@ def config_space(plan: ConfigPlan, out: Path) -> ConfigSpace:
     return ConfigSpace(
         _size(staged),
         (len(plan.indices) - len(staged)) * view_bytes(plan.spec.rig, plan.spec.colour is not None),
-        _mesh_bytes(plan.assembly),
+        _mesh_bytes(plan),
         _size(shards) + _size(other_files),
     )
 
@@ -128,9 +131,11 @@ def bytes_text(count: float) -> str:
     return f"{count / 1000:.3g} TB"
 
 
-def _mesh_bytes(assembly: Assembly) -> int:
+def _mesh_bytes(plan: ConfigPlan) -> int:
     """Return the size of the mesh file: 24 bytes per vertex and 15 per face."""
-    meshes = [part.mesh for part in assembly.parts]
+    if isinstance(plan.spec, SceneConfigSpec):
+        return _SURROUNDINGS_BYTES + _CAGE_BYTES
+    meshes = [part.mesh for part in plan.assembly.parts]
     return _SURROUNDINGS_BYTES + sum(24 * len(mesh.vertices_m) + 15 * len(mesh.faces) for mesh in meshes)
 
 

@@ -13,8 +13,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from dataset_builder.config.specs import ColourSpec, ConfigSpec
+from dataset_builder.config.specs import ColourSpec, ConfigSpec, SceneConfigSpec
 from dataset_builder.pipeline.disk_space import ConfigSpace, bytes_text, config_space, free_bytes, needed_bytes
+from dataset_builder.pipeline.place_cameras import with_cameras
 from dataset_builder.pipeline.plan import ConfigPlan
 from dataset_builder.pipeline.publish import is_published
 from dataset_builder.pipeline.trial import Trial, run_trial
@@ -71,9 +72,10 @@ def _estimate_config(plan: ConfigPlan, out: Path, threads: int, trials: dict[obj
         return ConfigEstimate(plan.spec, len(plan.indices))
     spec = plan.spec
     unit_views = tuple(len(unit.indices) for unit in remaining_units(plan) if unit.indices)
-    key = (spec.scene, spec.rig, spec.colour)
+    # One generated scene stands for all of them.
+    key = spec.name if isinstance(spec, SceneConfigSpec) else (spec.scene, spec.rig, spec.colour)
     if unit_views and key not in trials:
-        trials[key] = run_trial(spec, plan.indices, threads)
+        trials[key] = run_trial(with_cameras(plan).spec, plan.indices, threads)
     return ConfigEstimate(spec, len(plan.indices), unit_views, config_space(plan, out), trials.get(key))
 
 

@@ -18,6 +18,7 @@ from rebar_depth_bench.data.bars import BARS_FILE
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.errors import InputError, OutputError
 from rebar_depth_bench.paths import check_no_links, remove_file, remove_folder
+from rebar_depth_bench.view_ids import SPLITS
 
 MESHES = "meshes"
 PICTURES = "pictures"
@@ -29,8 +30,10 @@ SHARD_DIGEST_CHARACTERS = 12
 _NAME = "[a-z0-9][a-z0-9-]{0,199}"
 _OWN_NAMES = {MESHES: re.compile(rf"{_NAME}\.ply"), PICTURES: re.compile(rf"{_NAME}\.webp")}
 """Names of the files in the folders that all configs share."""
-SHARD_NAME = re.compile(rf"test-\d{{5}}-of-\d{{5}}-[0-9a-f]{{{SHARD_DIGEST_CHARACTERS}}}\.parquet")
-"""Names of the files in the folder of a config."""
+SHARD_NAME = re.compile(
+    rf"(?:test|(?:{'|'.join(SPLITS)})-{_NAME})-\d{{5}}-of-\d{{5}}-[0-9a-f]{{{SHARD_DIGEST_CHARACTERS}}}\.parquet"
+)
+"""Names of the files in the folder of a config; those of a config of several scenes name split and scene."""
 
 
 def check_folder(out: Path, plans: Sequence[ConfigPlan]) -> None:

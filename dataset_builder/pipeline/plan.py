@@ -45,7 +45,7 @@ class ConfigPlan:
 
     def all_stagings(self) -> list[Path]:
         """Return all staging folders of this config, including those of abandoned builds with other parameters."""
-        return list(self.staging.root.parent.glob(f"{self.spec.name}-{'[0-9a-f]' * _KEY_CHARACTERS}"))
+        return list(self.staging.root.parent.glob(f"{self.spec.label}-{'[0-9a-f]' * _KEY_CHARACTERS}"))
 
     @cached_property
     def assembly(self) -> Assembly:
@@ -54,11 +54,15 @@ class ConfigPlan:
 
 
 def plan_config(spec: ConfigSpec, views: int | None, out: Path) -> ConfigPlan:
-    """Return the plan of one config in the dataset folder ``out``; ``views`` limits the number of views."""
+    """Return the plan of one config in the dataset folder ``out``; ``views`` limits the number of views.
+
+    The key of a generated scene, whose cameras are not placed yet, does not depend on their places: these follow
+    from the other parameters.
+    """
     indices = tuple(subset(view_count(spec.protocol), views))
     key_inputs = [config_parameters(spec), indices, VIEWS_PER_SHARD, ROW_SCHEMA.names, generator_versions()]
     key = parameters_digest(key_inputs)
-    return ConfigPlan(spec, indices, key, Staging(out / BUILD_FOLDER / f"{spec.name}-{key[:_KEY_CHARACTERS]}"))
+    return ConfigPlan(spec, indices, key, Staging(out / BUILD_FOLDER / f"{spec.label}-{key[:_KEY_CHARACTERS]}"))
 
 
 def config_parameters(spec: ConfigSpec) -> dict[str, Any]:

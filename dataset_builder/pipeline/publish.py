@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from cards import benchmark_tasks, dataset_card
-from dataset_builder.config.catalog import CONFIGS, view_id
+from dataset_builder.config.catalog import CONFIGS
+from dataset_builder.config.specs import SceneConfigSpec
 from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.contact_sheet import write_contact_sheet, write_scenes_strip
 from dataset_builder.pipeline.folder import (
@@ -32,7 +33,7 @@ from dataset_builder.pipeline.folder import (
 from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.retained import entry_problems, published_configs
 from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_record, split_into_shards
-from dataset_builder.scene.assemblies import aim_point_m
+from dataset_builder.scene.assemblies import aim_point_m, assembly_bars
 from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.atomic_io import exclusive_lock, write_bytes, write_error, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, write_bars
@@ -43,6 +44,7 @@ from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.ground_truth import reference_errors
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.version import software_version
+from rebar_depth_bench.view_ids import TEST_SPLIT, view_id
 
 STRIP = f"{PICTURES}/scenes.webp"
 """Strip with one view of each kind of assembly."""
@@ -72,19 +74,33 @@ def is_published(out: Path, plan: ConfigPlan) -> bool:
         return False
     folder = open_folder(out)
     config = folder.config_by_name.get(plan.spec.name)
-    if config is None or config.key != plan.key or any(entry_problems(config)):
+    if config is None or any(entry_problems(config)):
         return False
-    return _files_match(folder, (*config.shards, config.mesh))
+    scenes = {scene.name: scene for scene in config.scenes}
+    scene, key = scenes.get(plan.spec.scene.name), config.key
+    if isinstance(plan.spec, SceneConfigSpec):
+        key = scene_entries(config).get(plan.spec.scene.name, {}).get("key", "")
+    if scene is None or scene.mesh is None or key != plan.key:
+        return False
+    return _files_match(folder, (*scene.shards, scene.mesh))
 
 
-def repair_metadata(out: Path, plan: ConfigPlan) -> None:
-    """Rewrite bars, card, ``eval.yaml``, pictures and manifest if any of them does not match the manifest."""
+def scene_entries(config: DatasetConfig) -> Mapping[str, Mapping[str, Any]]:
+    """Return the entries of the scenes of a config of several, by name, as its manifest has them."""
+    return {entry["name"]: entry for entry in config.manifest_entry.get("scenes", ())}
+
+
+def repair_metadata(out: Path, plans: Sequence[ConfigPlan]) -> None:
+    """Rewrite bars, card, ``eval.yaml``, pictures and manifest if any of them does not match the manifest.
+
+    ``plans`` are those of one config.
+    """
     folder = open_folder(out)
-    config = folder.config(plan.spec.name)
+    config = folder.config(plans[0].spec.name)
     if not _files_match(folder, (BARS_FILE, CARD, EVAL_FILE, STRIP, config.sheet)):
         write_contact_sheet(config, out / config.sheet)
-        _write_bars(out, {plan.spec.scene.name: plan.assembly.bars})
-        _write_manifest(out, folder.config_by_name)
+        write_scene_bars(out, {plan.spec.scene.name: assembly_bars(plan.spec.scene.assembly) for plan in plans})
+        write_manifest(out, folder.config_by_name)
 
 
 def _files_match(folder: DatasetFolder, names: Iterable[str]) -> bool:
@@ -119,7 +135,7 @@ def publish_entry(
 ) -> None:
     """Publish a config: the staged rows, an entry with the ``parameters``, and the ``bars`` by scene."""
     records = [read_staged_record(staging.row(index), view_id(name, index)) for index in indices]
-    shards = _publish_shards(out, name, staging, indices)
+    shards = publish_shards(out, name, TEST_SPLIT, staging, indices)
     entry = {
         **parameters,
         "sheet": f"{PICTURES}/{name}.webp",
@@ -132,8 +148,8 @@ def publish_entry(
     entry["reference"] = reference_errors(without_reference).to_dict()
     config = DatasetConfig(**DatasetConfig.fields_of_entry(name, entry), root=str(out))
     write_contact_sheet(config, out / config.sheet)
-    _write_bars(out, bars)
-    _write_manifest(out, {**published_configs(out), config.name: config})
+    write_scene_bars(out, bars)
+    write_manifest(out, {**published_configs(out), config.name: config})
 
 
 def _placement(assembly: Assembly) -> dict[str, Any]:
@@ -142,7 +158,8 @@ def _placement(assembly: Assembly) -> dict[str, Any]:
     return {} if matrix is None else {"world_from_source": matrix.tolist()}
 
 
-def _write_bars(out: Path, bars: Mapping[str, tuple[Bar, ...]]) -> None:
+def write_scene_bars(out: Path, bars: Mapping[str, tuple[Bar, ...]]) -> None:
+    """Add the bars of scenes to ``bars.parquet``, in place of those that it has of these scenes."""
     path = out / BARS_FILE
     published = read_bars(path) if path.is_file() else {}
     write_bars(path, {**published, **bars})
@@ -154,15 +171,20 @@ def remove_leftovers(out: Path) -> None:
     remove_temporary_files(out)
 
 
-def _publish_shards(out: Path, config: str, staging: Staging, view_indices: Sequence[int]) -> list[str]:
-    """Pack the shards and give each its name in the folder, which carries the digest of all of them."""
+def publish_shards(
+    out: Path, config: str, prefix: str, staging: Staging, view_indices: Sequence[int]
+) -> list[str]:
+    """Pack the shards and give each its name in the folder, which carries the digest of all of them.
+
+    ``prefix`` is the beginning of the names of the files: the split, and the scene if the config has several.
+    """
     shard_indices = split_into_shards(view_indices)
     packed_paths = [staging.shard(shard) for shard in range(len(shard_indices))]
     for target, indices in zip(packed_paths, shard_indices, strict=True):
         pack_shard([staging.row(index) for index in indices], target)
     digest = parameters_digest([file_sha256(path) for path in packed_paths])[:SHARD_DIGEST_CHARACTERS]
     names = [
-        f"{config}/test-{shard:05d}-of-{len(shard_indices):05d}-{digest}.parquet"
+        f"{config}/{prefix}-{shard:05d}-of-{len(shard_indices):05d}-{digest}.parquet"
         for shard in range(len(shard_indices))
     ]
     (out / config).mkdir(exist_ok=True)
@@ -171,7 +193,8 @@ def _publish_shards(out: Path, config: str, staging: Staging, view_indices: Sequ
     return names
 
 
-def _write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
+def write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
+    """Write contact sheets that are missing, strip, card, ``eval.yaml`` and manifest; remove files not listed."""
     order = [*CONFIGS, *sorted(set(configs) - set(CONFIGS))]
     ordered = [configs[name] for name in order if name in configs]
     version, digest = software_version(), views_digest(view for config in ordered for view in config.views)
@@ -181,7 +204,9 @@ def _write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
     by_scene = {_strip_key(config): config for config in reversed(ordered)}
     write_scenes_strip(list(reversed(by_scene.values())), out / STRIP)
     write_text(out / CARD, dataset_card(version, digest, ordered))
-    write_text(out / EVAL_FILE, benchmark_tasks([config.name for config in ordered]))
+    write_text(
+        out / EVAL_FILE, benchmark_tasks([config.name for config in ordered if TEST_SPLIT in config.splits])
+    )
     metadata = {CARD, EVAL_FILE, BARS_FILE}
     manifest = {
         "format": MANIFEST_FORMAT,
@@ -197,7 +222,7 @@ def _write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
 
 def _strip_key(config: DatasetConfig) -> str:
     """Return the key of a panel of the strip: assembly kind, digest of a user's file, or an imported config."""
-    if config.imported is not None:
+    if config.imported is not None or config.has_splits:
         return config.name
     assembly = config.manifest_entry["scene"]["assembly"]
     return str(assembly.get("sha256", assembly["kind"]))

@@ -13,13 +13,16 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from dataset_builder.config.rigs import GRIDS
+from dataset_builder.config.specs import SceneConfigSpec
 from dataset_builder.pipeline.folder import MESHES, PICTURES, SHARD_NAME
 from dataset_builder.pipeline.plan import ConfigPlan, config_parameters
+from rebar_depth_bench.data.config_tables import References
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
-from rebar_depth_bench.data.trajectory import SURVEY
+from rebar_depth_bench.data.trajectory import RANDOM_VIEWS, SURVEY
 from rebar_depth_bench.errors import DatasetError, InputError, Problem
 from rebar_depth_bench.validation import StrictModel, format_location, number, one_of, text, validate_table
+from rebar_depth_bench.view_ids import TEST_SPLIT
 
 _Count = Annotated[int, Field(ge=0)]
 _Distance = Annotated[float, number(0)]
@@ -50,7 +53,7 @@ class _Rig(_Table):
 
 
 class _Protocol(_Table):
-    kind: Annotated[str, one_of("dome", "ring", "sweep", SURVEY)]
+    kind: Annotated[str, one_of("dome", "ring", "sweep", SURVEY, RANDOM_VIEWS)]
     radius_m: _Distance = 1.0
 
 
@@ -59,6 +62,34 @@ class _ImportedEntry(_Table):
 
     bytes: _Count
     protocol_views: _Count
+
+
+class _GeneratedCage(_Assembly):
+    number: _Count
+    seed: _Count
+    version: _Count
+
+
+class _SceneOfSplit(_Table):
+    """Keys of the entry of a scene in a config of several scenes that the card and a build use."""
+
+    name: Annotated[str, text(200)]
+    family: Annotated[str, text(60)]
+    assembly: _GeneratedCage
+    key: Annotated[str, text(64)]
+    bytes: _Count
+    protocol: _Protocol
+    rig: _Rig
+
+
+class _ScenesEntry(_Table):
+    """Keys of the manifest entry of a config of several scenes that the card and a build use."""
+
+    bytes: _Count
+    protocol_views: _Count
+    colour: _Colour | None
+    scenes: list[_SceneOfSplit]
+    references: dict[str, References]
 
 
 class _Entry(_Table):
@@ -83,7 +114,9 @@ def check_retained_configs(out: Path, plans: Sequence[ConfigPlan], replaced: Col
     It also raises ``InputError`` if the scene of such a config is being changed.
     """
     planned = {plan.spec.name for plan in plans} | set(replaced)
-    retained = [config for name, config in published_configs(out).items() if name not in planned]
+    published = published_configs(out)
+    _check_retained_scenes(out, published, plans)
+    retained = [config for name, config in published.items() if name not in planned]
     problems = [problem for config in retained for problem in entry_problems(config)]
     if problems:
         raise DatasetError.from_problems(out / MANIFEST_FILE, problems)
@@ -103,28 +136,67 @@ def entry_problems(config: DatasetConfig) -> Iterator[Problem]:
     """Yield the problems of a config's manifest entry, whose files have the names that a build gives them."""
     where = format_location("configs", config.name)
     problems: list[Problem] = []
-    validate_table(_Entry if config.imported is None else _ImportedEntry, config.manifest_entry, problems, where)
+    model = _ImportedEntry if config.imported is not None else _ScenesEntry if config.has_splits else _Entry
+    validate_table(model, config.manifest_entry, problems, where)
     yield from problems
     if not config.views or not config.shards:
         yield Problem("missing", where, "no views", "at least one view")
     names = [("sheet", config.sheet, f"{PICTURES}/{config.name}.webp")]
     if config.imported is None:
-        names.append(("mesh", config.mesh, f"{MESHES}/{config.scene.name}.ply"))
+        names += [("mesh", str(scene.mesh), f"{MESHES}/{scene.name}.ply") for scene in config.scenes]
     for key, found, expected in names:
         if found != expected:
             yield Problem("name", f"{where}.{key}", f"got {found}", expected)
     for shard in config.shards:
         folder, _, name = shard.partition("/")
         if folder != config.name or not SHARD_NAME.fullmatch(name):
-            expected = f"{config.name}/test-NNNNN-of-NNNNN-DIGEST.parquet"
+            split = "SPLIT-SCENE" if config.has_splits else TEST_SPLIT
+            expected = f"{config.name}/{split}-NNNNN-of-NNNNN-DIGEST.parquet"
             yield Problem("name", f"{where}.shards", f"got {shard}", expected)
 
 
 def _check_scene(out: Path, config: DatasetConfig, plans: Sequence[ConfigPlan]) -> None:
     for plan in plans:
         scene: Any = json.loads(json.dumps(config_parameters(plan.spec)["scene"]))
-        if config.scene.name == scene["name"] and config.manifest_entry["scene"] != scene:
+        is_named = scene["name"] in {published.name for published in config.scenes}
+        if is_named and config.manifest_entry.get("scene") != scene:
             raise InputError(
                 f"{out}: config {config.name} was built with other parameters of scene {scene['name']!r}; "
                 f"rebuild it too (--config {config.name} {plan.spec.name}) or choose another folder"
             )
+
+
+def _check_retained_scenes(out: Path, published: Mapping[str, DatasetConfig], plans: Sequence[ConfigPlan]) -> None:
+    """Raise ``InputError`` if scenes that a config keeps do not fit to those that are planned, or lack a file.
+
+    All scenes of a config have the same image size, colour, seed and version of the generator.
+    """
+    planned = [plan.spec for plan in plans if isinstance(plan.spec, SceneConfigSpec)]
+    if not planned or planned[0].name not in published:
+        return
+    spec, config = planned[0], published[planned[0].name]
+    if problems := list(entry_problems(config)):
+        raise DatasetError.from_problems(out / MANIFEST_FILE, problems)
+    names = {spec.scene.name for spec in planned}
+    kept = [scene for scene in config.scenes if scene.name not in names]
+    entries = {entry["name"]: entry for entry in config.manifest_entry["scenes"]}
+    found = {(config.grid, _json(config.colour), *_generator(entries[scene.name]["assembly"])) for scene in kept}
+    parameters = config_parameters(spec)
+    grid = (spec.rig.height, spec.rig.width)
+    if found - {(grid, _json(parameters["colour"]), *_generator(parameters["scene"]["assembly"]))}:
+        raise InputError(
+            f"{out}: contains {len(kept)} other scenes of {spec.name} with another image size, colour, seed or "
+            "version of the generator; choose another folder (--out)"
+        )
+    for scene in kept:
+        missing = [file for file in (*scene.shards, scene.mesh) if file is None or not (out / file).is_file()]
+        if missing:
+            raise InputError(f"{out}: {missing[0]} of scene {scene.name} of {spec.name} is missing; build it too")
+
+
+def _generator(assembly: Mapping[str, Any]) -> tuple[int, int]:
+    return assembly["seed"], assembly["version"]
+
+
+def _json(values: object) -> str:
+    return json.dumps(values, sort_keys=True)

@@ -51,8 +51,8 @@ class WorkUnit:
     def label(self) -> str:
         """Name of the unit in messages."""
         if not self.indices:
-            return f"the mesh of {self.config.name}"
-        return f"{self.config.name} views {self.indices[0]} to {self.indices[-1]}"
+            return f"the mesh of {self.config.label}"
+        return f"{self.config.label} views {self.indices[0]} to {self.indices[-1]}"
 
 
 @dataclass(frozen=True)

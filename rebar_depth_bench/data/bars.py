@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 BARS_FILE = "bars.parquet"
 _MEASURES = ("diameter_m", "axis")
+NOMINAL_AXIS = "nominal_axis"
+_Line = tuple[tuple[float, float, float], ...]
 _CONTROL_CHARACTER = r"[\x00-\x1f\x7f-\x9f]"
 BARS_SCHEMA = pa.schema(
     [
@@ -36,12 +38,15 @@ BARS_SCHEMA = pa.schema(
         ("role", pa.string()),
         ("diameter_m", pa.float64()),
         ("axis", pa.list_(pa.list_(pa.float64(), 3))),
+        (NOMINAL_AXIS, pa.list_(pa.list_(pa.float64(), 3))),
     ]
 )
 """Schema of ``bars.parquet``; ``axis`` is the centreline as a polyline in the world frame, metres.
 
-Axis and diameter are null for steel whose surface is not that of one round bar.
+Axis and diameter are null for steel whose surface is not that of one round bar. ``nominal_axis`` is the centreline
+in the design, null for bars that are not in a design; files of earlier versions have no such column.
 """
+_OPTIONAL = frozenset({NOMINAL_AXIS})
 
 
 @dataclass(frozen=True)
@@ -49,13 +54,15 @@ class Bar:
     """Reinforcing bar: id (1 or more), role, nominal diameter in metres and centreline.
 
     ``axis_m`` is the centreline as a polyline in the world frame, metres. Where none could be fitted to the bar's
-    surface, it is empty and the diameter is NaN (both null in the table).
+    surface, it is empty and the diameter is NaN (both null in the table). ``nominal_axis_m`` is the centreline in
+    the design, of which the bar as built deviates; it is empty for a bar that is not in a design.
     """
 
     bar_id: int
     role: str
     diameter_m: float
-    axis_m: tuple[tuple[float, float, float], ...]
+    axis_m: _Line
+    nominal_axis_m: _Line = ()
 
     @classmethod
     def without_axis(cls, bar_id: int, role: str) -> Bar:
@@ -87,7 +94,8 @@ def read_bars(path: Path) -> dict[str, tuple[Bar, ...]]:
     an invalid bar or a repeated id.
     """
     max_bytes = TABLE_BYTES.value()
-    table = Table(BARS_SCHEMA, max_bytes // 64, max_bytes, max_values={"axis": max_bytes})
+    max_values = {"axis": max_bytes, NOMINAL_AXIS: max_bytes}
+    table = Table(BARS_SCHEMA, max_bytes // 64, max_bytes, max_values, _OPTIONAL)
     scenes: dict[str, dict[int, Bar]] = {}
     try:
         with open_regular(path) as stream, open_parquet(stream, table) as (file, _):
@@ -130,6 +138,7 @@ def write_bars(path: Path, scenes: Mapping[str, tuple[Bar, ...]]) -> None:
             "role": bar.role,
             "diameter_m": bar.diameter_m if bar.has_axis else None,
             "axis": [list(point) for point in bar.axis_m] if bar.has_axis else None,
+            NOMINAL_AXIS: [list(point) for point in bar.nominal_axis_m] or None,
         }
         for scene, bars in sorted(scenes.items())
         for bar in bars
@@ -143,7 +152,10 @@ def _bar_from_row(path: Path, row: Mapping[str, Any]) -> Bar:
     where = f"{path}: bar {row['bar_id']} of scene {short_repr(row['scene'])}"
     diameter_m, axis = row["diameter_m"], row["axis"]
     has_axis = diameter_m is not None or axis is not None  # Both are null, or neither.
-    empty = [name for name in BARS_SCHEMA.names if row[name] is None and (has_axis or name not in _MEASURES)]
+    required = (
+        name for name in BARS_SCHEMA.names if name not in _OPTIONAL and (has_axis or name not in _MEASURES)
+    )
+    empty = [name for name in required if row[name] is None]
     if empty or (axis is not None and any(point is None for point in axis)):
         raise DatasetError(f"{where} has no {', '.join(empty) or 'complete axis'}")
     if not re.fullmatch(NAME_PATTERN, row["scene"]):
@@ -156,9 +168,14 @@ def _bar_from_row(path: Path, row: Mapping[str, Any]) -> Bar:
         return Bar.without_axis(row["bar_id"], row["role"])
     if not 0 < diameter_m < math.inf:
         raise DatasetError(f"{where}: diameter_m is {diameter_m}, expected a positive length")
-    axis_m = tuple((x, y, z) for x, y, z in axis)
-    if len(axis_m) < 2 or not all(
-        value is not None and math.isfinite(value) for point in axis_m for value in point
-    ):
-        raise DatasetError(f"{where}: axis is {short_repr(axis_m)}, expected two or more finite points")
-    return Bar(row["bar_id"], row["role"], diameter_m, axis_m)
+    nominal = row.get(NOMINAL_AXIS)
+    nominal_m = () if nominal is None else _line(nominal, where, NOMINAL_AXIS)
+    return Bar(row["bar_id"], row["role"], diameter_m, _line(axis, where, "axis"), nominal_m)
+
+
+def _line(points: Sequence[Any], where: str, name: str) -> _Line:
+    """Return a polyline of a row; raise ``DatasetError`` unless it has two or more finite points."""
+    values = [value for point in points for value in point or (None,)]
+    if len(points) < 2 or not all(value is not None and math.isfinite(value) for value in values):
+        raise DatasetError(f"{where}: {name} is {short_repr(points)}, expected two or more finite points")
+    return tuple((x, y, z) for x, y, z in points)

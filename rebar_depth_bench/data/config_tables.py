@@ -106,10 +106,12 @@ class Scene(ManifestTable):
     """Scene of a config, with its mesh and its shards, which hold the rows of no other scene.
 
     ``board`` is the ArUco board under the assembly, or None; ``mesh`` is None in a config that was imported.
+    ``family`` is the kind of cage in a config of generated scenes, otherwise None.
     """
 
     name: Name
     split: Annotated[str, one_of(*SPLITS)] = TEST_SPLIT
+    family: Name | None = None
     board: BoardSpec | None
     appearance: Appearance = Appearance()
     mesh: RelativePath | None

@@ -25,7 +25,7 @@ from rebar_depth_bench.data.location import Located
 from rebar_depth_bench.data.trajectory import Survey, Trajectory, trajectory_of
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.validation import Expected, check_unique, field_error, whole_number
-from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
+from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT, scene_prefix
 
 
 class DatasetConfig(Located):
@@ -84,7 +84,9 @@ class DatasetConfig(Located):
     def _check_views(cls, views: tuple[ViewRecord, ...], info: ValidationInfo) -> tuple[ViewRecord, ...]:
         check_unique([view.view_id for view in views], "view")
         name, rig, scenes = info.data.get("name"), info.data.get("rig"), info.data.get("scenes")
-        prefixes = {f"{scene.split}-{scene.name}-" for scene in scenes or ()} if info.data["has_splits"] else set()
+        prefixes = (
+            {scene_prefix(scene.split, scene.name) for scene in scenes or ()} if info.data["has_splits"] else set()
+        )
         imported: Imported | None = info.data.get("imported")
         absent = imported.absent_columns if imported is not None else ()
         for view in views:
@@ -166,8 +168,8 @@ class DatasetConfig(Located):
         """Name of the scene of each view, by view id."""
         if not self.has_splits:
             return dict.fromkeys(self.view_ids, self.scene.name)
-        names = {f"{self.name}/{scene.split}-{scene.name}": scene.name for scene in self.scenes}
-        return {view_id: names[view_id.rpartition("-")[0]] for view_id in self.view_ids}
+        names = {f"{self.name}/{scene_prefix(scene.split, scene.name)}": scene.name for scene in self.scenes}
+        return {view_id: names[view_id.rstrip("0123456789")] for view_id in self.view_ids}
 
     def of_split(self, split: str) -> Self:
         """Return the scenes of a split. Raises ``DatasetError`` if there are none."""

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dataset_builder.config.catalog import BuildRequest, view_id
+from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import ColourSpec
 from dataset_builder.config.trajectories import poses
@@ -60,7 +60,7 @@ class StoredImages:
                 eyes[name] = replace(caster.cast(camera), rgb=rgb)
             row, record = encode_view(
                 View(
-                    view_id(config.name, index),
+                    config.view_id(index),
                     config.scene.name,
                     eyes["left"],
                     eyes["right"],

@@ -22,13 +22,14 @@ from dataset_builder.config.specs import (
 )
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.scene.assemblies.cage_file import load_cage
-from dataset_builder.scene.assemblies.generated import generated_assembly
+from dataset_builder.scene.assemblies.generated import cage_bars, generated_assembly, spec_cage
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.assemblies.pile import pile_assembly
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.variants import SHADOWS
 from dataset_builder.scene.variants.panels import SCREEN_DISTANCE
+from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import InputError, MeshError
 
 _BUILDERS: Mapping[type, Callable[[Any], Assembly]] = {
@@ -53,6 +54,13 @@ def make_assembly(spec: AssemblySpec) -> Assembly:
     would collide or not fit.
     """
     return _BUILDERS[type(spec)](spec)
+
+
+def assembly_bars(spec: AssemblySpec) -> tuple[Bar, ...]:
+    """Return the bars of an assembly; for a generated cage, without making meshes. Raises as ``make_assembly``."""
+    if isinstance(spec, GeneratedCageSpec):
+        return tuple(bar.bar for bar in cage_bars(spec_cage(spec)))
+    return make_assembly(spec).bars
 
 
 def check_fits(assembly: Assembly, config: ConfigSpec) -> None:

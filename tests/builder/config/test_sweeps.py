@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dataset_builder.cli import argument_parser
+from dataset_builder.config.camera_site import LABORATORY_CAMERA_RADIUS_M, OUTDOORS_CAMERA_RADIUS_M
 from dataset_builder.config.catalog import CONFIGS, SWEEPS, BuildRequest
-from dataset_builder.config.scene_file import LABORATORY_CAMERA_RADIUS_M, OUTDOORS_CAMERA_RADIUS_M
 from dataset_builder.config.specs import ConfigSpec, DistanceSweepSpec
 from dataset_builder.config.trajectories import camera_offsets_m, poses, subset
 from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
