@@ -45,7 +45,9 @@ def manifest_config(view_ids: Sequence[str] = (), **entry: Any) -> DatasetConfig
     """Return a config with the given views and manifest entry, after a JSON round trip."""
     truth = {"left": "0" * 64, "right": "0" * 64, "steel_px": 0, "scored_px": 0}
     views = tuple(ViewRecord.model_validate({"view_id": view_id, **truth}) for view_id in view_ids)
-    return DatasetConfig.model_construct(name="c", views=views, manifest_entry=json.loads(json.dumps(entry)))
+    return DatasetConfig.model_construct(
+        name="c", has_splits=False, views=views, manifest_entry=json.loads(json.dumps(entry))
+    )
 
 
 @pytest.mark.parametrize("name", RIGS)
