@@ -38,7 +38,7 @@ from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.view_score import protocol_indices
+from rebar_depth_bench.scoring.view_score import resample_views
 from rebar_depth_bench.submission import SubmissionReader
 
 ONCE, NATIVE, SCALED = "once", "native", "scaled"
@@ -152,15 +152,14 @@ def score_extended(
     views: list[ViewNumbers] = []
     for config in evaluation.configs:
         if not has_bar_ids(config):
-            tables[config.name] = tabulate_extended([], protocol_indices([]), measures)
+            tables[config.name] = tabulate_extended([], resample_views([], by_scene=False), measures)
             continue
         steel = load_steel_truth(evaluation.folder, config, progress)
         work = partial(_view, evaluation.submission, steel, scales)
         task = f"extended measures of {config.name}"
         config_views = map_with_progress(work, range(len(steel)), workers, progress, task, len(steel))
-        tables[config.name] = tabulate_extended(
-            config_views, protocol_indices([view.view_id for view in config_views]), measures
-        )
+        resampling = resample_views([view.view_id for view in config_views], by_scene=config.has_splits)
+        tables[config.name] = tabulate_extended(config_views, resampling, measures)
         views += [view_numbers(view, measures) for view in config_views]
     return ExtendedResult(measures, tables, views)
 
