@@ -20,6 +20,7 @@ from rebar_depth_bench.extended import (
     single_bar,
 )
 from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, SceneBars, has_bar_ids, load_steel_truth
+from rebar_depth_bench.extended.inspection import as_built
 from rebar_depth_bench.extended.inspection import evaluate as inspection
 from rebar_depth_bench.extended.inspection import measures as inspection_measures
 from rebar_depth_bench.extended.inspection.visible_segments import visible_segments
@@ -85,6 +86,11 @@ def _inspection(predictions: Predictions, truth: SteelTruth, bars: SceneBars) ->
     return [inspection.inspection_samples(p_m, truth, bars.cage, visible) for p_m in predictions]
 
 
+def _as_built(predictions: Predictions, truth: SteelTruth, bars: SceneBars) -> list[Samples]:
+    """Return the samples of deviations from the design of each prediction."""
+    return [as_built.as_built_samples(p_m, truth, bars.cage, bars.axes) for p_m in predictions]
+
+
 def _profile(predictions: Predictions, truth: SteelTruth, bars: SceneBars) -> list[Samples]:
     """Return the profile samples of each prediction."""
     return [profiles.profile_samples(p_m, truth, bars.diameter_m) for p_m in predictions]
@@ -116,6 +122,7 @@ MEASURE_FAMILIES: Mapping[str, MeasureFamily] = {
         _inspection,
         _BOTH,
     ),
+    "as_built": MeasureFamily("As built against as designed", as_built.MEASURES, _as_built, _BOTH),
     "profile": MeasureFamily("Against distance and bar width", profiles.MEASURES, _profile, _BOTH),
 }
 """Measure families by key, in report order."""
