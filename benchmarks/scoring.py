@@ -118,7 +118,7 @@ def main(root: str, config: str = "lattice") -> None:
     folder = open_folder(root)
     rows = list(rdb.load(root, config, columns=["view_id", "left_depth", "left_mask"]))
     truths = {row["view_id"]: (row["left_depth"], row["left_mask"]) for row in rows}
-    scored = config_truth(folder.config(config))
+    scored = config_truth(folder, folder.config(config))
     pixels = sum(len(truth.index) for truth in scored) / len(scored)
     print(f"{len(rows)} views, {pixels:.0f} scored pixels each; {machine_description()}\n")
     with tempfile.TemporaryDirectory() as scratch:

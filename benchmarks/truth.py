@@ -18,6 +18,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.evaluate import NATIVE, ONCE, measures_by_alignment, view_samples
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.result import ExtendedView, tabulate_extended
+from rebar_depth_bench.scoring.bootstrap import resample
 
 COLUMNS = ["view_id", "left_depth"]
 SCORES = ("boundary_f1", "cloud_f_1mm", "layer_confusion", "full_mask_abs_rel", "shifted_rmse_cm")
@@ -45,7 +46,7 @@ def main(root: str, *configs: str) -> None:
             )
             for truth in truths
         ]
-        table = tabulate_extended(views, range(len(views)), measures)
+        table = tabulate_extended(views, resample(range(len(views))), measures)
         numbers = {**table.numbers[ONCE], **table.numbers[NATIVE]}
         score_rows.append((config, len(views), *(f"{numbers[name].value:g}" for name in (*SCORES, *BAR_SCORES))))
         pooled = [np.concatenate([view.samples[NATIVE][name] for view in views]) for name in ERROR_SAMPLES]

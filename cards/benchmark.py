@@ -18,6 +18,7 @@ from rebar_depth_bench.extended.inspection.tolerances import PROFILES
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, own_methods
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_VIEWS, RESAMPLES
+from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import DELTA1_RATIO, MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.rounding import SIGNIFICANT_DIGITS
 from rebar_depth_bench.submission import INPUTS
@@ -73,6 +74,7 @@ def benchmark_card() -> str:
         draws=RESAMPLES,
         ring_views=BLOCK_VIEWS,
         min_views=MIN_VIEWS,
+        groupings=GROUPINGS,
         extended_protocol=EXTENDED_PROTOCOL,
         families=[_family_rows(family) for family in MEASURE_FAMILIES.values()],
         profiles=PROFILES,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +26,7 @@ from leaderboard.storage.archive_store import ArchiveStore
 from leaderboard.storage.work_dirs import work_dir
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, open_folder
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.view_ids import TEST_SPLIT, config_of
 
 ORPHAN_AGE_S = 3600.0
 """Age in seconds after which an archive without a submission is regarded as an interrupted upload."""
@@ -43,7 +44,10 @@ class DatasetCard:
 
 @dataclass(frozen=True)
 class Service:
-    """Dependencies of the request handlers. ``spool`` is the folder for incomplete uploads."""
+    """Dependencies of the request handlers.
+
+    ``spool`` is the folder for incomplete uploads, ``view_counts`` has the number of views to predict by config.
+    """
 
     settings: Settings
     folder: DatasetFolder
@@ -56,6 +60,7 @@ class Service:
     rankings: CurrentRankings
     card: DatasetCard
     manifest_state: tuple[int, int] | None
+    view_counts: Mapping[str, int]
     upload_locks: defaultdict[int, Lock] = field(default_factory=lambda: defaultdict(Lock))
     """Locks by id of a token, held while an archive is received and checked; used on the event loop only."""
     scenes: dict[str, bytes | None] = field(default_factory=dict)
@@ -97,6 +102,7 @@ def open_service(settings: Settings) -> Iterator[Service]:
             rankings=CurrentRankings(database, versions),
             card=card,
             manifest_state=manifest,
+            view_counts=Counter(map(config_of, folder.expected_views(TEST_SPLIT))),
         )
 
 

@@ -33,3 +33,8 @@ def split_of(view_id: str) -> str | None:
     """Return the split that a view id names; None if it names none."""
     match = _SPLIT.fullmatch(view_id.partition("/")[2])
     return match[1] if match else None
+
+
+def scene_of(view_id: str) -> str:
+    """Return what all view ids of a scene have in common: config, and split and scene if it has several."""
+    return view_id.rstrip("0123456789")

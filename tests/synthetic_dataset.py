@@ -54,16 +54,27 @@ def _write_manifest(
     (root / MANIFEST_FILE).write_text(json.dumps(manifest))
 
 
-def write_split_dataset(root: Path, scenes: Mapping[str, str], views: int) -> None:
+def write_split_dataset(
+    root: Path,
+    scenes: Mapping[str, str],
+    views: int,
+    *,
+    families: Mapping[str, str] | None = None,
+    numbers: Mapping[str, int] | None = None,
+    diameters_m: Mapping[str, float] | None = None,
+) -> None:
     """Write a dataset folder with the config ``cages``; ``scenes`` are its scenes with their splits.
 
-    Each scene has ``views`` views, a shard, and one bar in ``bars.parquet`` whose diameter in mm is the number of
-    the scene, counted from 1.
+    Each scene has ``views`` views, a shard, and one bar in ``bars.parquet``. Its number is counted from 1, unless
+    ``numbers`` has it; it is the diameter of the bar in mm, unless ``diameters_m`` has that, and 10 times the
+    number is the index of its first view in ``_depth_m``. ``families`` has the families of scenes that have one.
     """
     (root / "cages").mkdir(parents=True)
     records: list[ViewRecord] = []
     entries = []
-    for number, (scene, split) in enumerate(scenes.items(), start=1):
+    number_of = {scene: number for number, scene in enumerate(scenes, start=1)} | dict(numbers or {})
+    for scene, split in scenes.items():
+        number = number_of[scene]
         ids = [f"cages/{split}-{scene}-{index:04d}" for index in range(views)]
         encoded = [
             encode_view(replace(_view(view_id, 10 * number + n), scene=scene)) for n, view_id in enumerate(ids)
@@ -71,9 +82,12 @@ def write_split_dataset(root: Path, scenes: Mapping[str, str], views: int) -> No
         shard = f"cages/{split}-{scene}.parquet"
         pq.write_table(pa.concat_tables([table for table, _ in encoded]), root / shard, row_group_size=1)
         records += [record for _, record in encoded]
-        entries.append({"name": scene, "split": split, "board": None, "mesh": f"{scene}.ply", "shards": [shard]})
+        files = {"mesh": f"{scene}.ply", "shards": [shard]}
+        family = (families or {}).get(scene)
+        entries.append({"name": scene, "split": split, "family": family, "board": None, **files})
     axis_m = ((0.0, 0.0, 0.3), (0.0, 1.0, 0.3))
-    bars = {scene: (Bar(1, "vertical", 0.001 * n, axis_m),) for n, scene in enumerate(scenes, start=1)}
+    known_m = {scene: 0.001 * number for scene, number in number_of.items()} | dict(diameters_m or {})
+    bars = {scene: (Bar(1, "vertical", known_m[scene], axis_m),) for scene in scenes}
     write_bars(root / BARS_FILE, bars)
     entry = {
         **_config_entry("cages", records),

@@ -66,15 +66,8 @@ def rig_spec(config: DatasetConfig) -> RigSpec:
     return _spec_from_manifest(config, "rig", _rig_from_json)
 
 
-def entry_of_scene(config: DatasetConfig) -> Mapping[str, Any]:
-    """Return the part of the manifest entry with the parameters of a config that is restricted to one scene."""
-    if not config.has_splits:
-        return config.manifest_entry
-    return next(entry for entry in config.manifest_entry["scenes"] if entry["name"] == config.scene.name)
-
-
 def _spec_from_manifest(config: DatasetConfig, key: str, make_spec: Callable[[Any], _Spec]) -> _Spec:
-    entry = entry_of_scene(config)
+    entry = config.scene_entry
     try:
         return make_spec(entry[key])
     except (AttributeError, KeyError, TypeError, ValueError) as error:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy import ndarray
 
-from dataset_builder.audit.cameras import entry_of_scene, trajectory_spec
+from dataset_builder.audit.cameras import trajectory_spec
 from dataset_builder.audit.geometry import polyline_distance_m
 from dataset_builder.audit.report import Check
 from dataset_builder.config.random_views import STEEL_CLEARANCE, STEEL_CLEARANCE_M
@@ -52,7 +52,7 @@ def merged_checks(config: str, checks: Sequence[Check]) -> Iterator[Check]:
 def _bars_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
     """Return the check of the bars against those that the generator makes from the parameters in the manifest."""
     name = f"{scene.label}: bars and their designs"
-    spec = GeneratedCageSpec(**entry_of_scene(scene)["assembly"])
+    spec = GeneratedCageSpec(**scene.scene_entry["assembly"])
     if spec.version != VERSION:
         return Check.skip(name, f"made by version {spec.version} of the generator, this is {VERSION}")
     expected = assembly_bars(spec)

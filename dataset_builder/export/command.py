@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from rebar_depth_bench.console import ProgressBars
+from rebar_depth_bench.view_ids import SPLITS
 
 SUMMARY = "export a dataset folder as plain files, as a capture, or as KITTI's raw data"
 
@@ -20,10 +21,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--config", nargs="+", action="extend", metavar="NAME", help="configs to export (default: all)"
     )
     parser.add_argument(
+        "--split", choices=SPLITS, metavar="NAME", help="split to export: train, validation or test (default: all)"
+    )
+    parser.add_argument(
         "--views",
         type=int,
         metavar="N",
-        help="number of views per config, evenly spaced over the views of the folder (default: all)",
+        help="number of views per config, or per scene of a config with splits, evenly spaced over the views of "
+        "the folder (default: all)",
     )
     parser.add_argument(
         "--layout",
@@ -40,7 +45,13 @@ def run(options: argparse.Namespace) -> None:
 
     with ProgressBars() as bars:
         summary = export(
-            options.root, options.out, options.config, options.views, options.layout, progress=bars.update
+            options.root,
+            options.out,
+            options.config,
+            options.views,
+            options.layout,
+            progress=bars.update,
+            split=options.split,
         )
     for config in summary.configs:
         print(f"{config.config}: {config.views} views, {config.written} files written, {config.kept} kept")

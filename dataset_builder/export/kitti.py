@@ -1,13 +1,13 @@
 """Layout ``kitti``: raw data of KITTI with rectified colour images, and its depth maps.
 
-One config is one day, and each of its scenes one drive. The depth maps are those of KITTI's depth prediction
-benchmark: 16-bit PNG of metres times 256, 0 without depth. Laser scans are not written. ``images.txt`` lists the
-images for ``rebar-bench predict --images`` and ``rebar-bench study kitti --images``.
+A config of one scene, or a scene of another, is one day with one drive. The depth maps are those of KITTI's depth
+prediction benchmark: 16-bit PNG of metres times 256, 0 without depth. Laser scans are not written. ``images.txt``
+lists the images for ``rebar-bench predict --images`` and ``rebar-bench study kitti --images``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from jaxtyping import Float32
@@ -22,6 +22,8 @@ from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.errors import InputError
 
 DATE = "2000_01_01"
+_DRIVE = f"{DATE}_drive_0001_sync"
+_DEPTH = f"{_DRIVE}/proj_depth/groundtruth/image_02"
 _UNITS_PER_METRE = 256
 _LARGEST = np.iinfo(np.uint16).max
 
@@ -32,37 +34,35 @@ class KittiLayout(Layout):
     def check(self, config: DatasetConfig) -> None:
         """Raise ``InputError`` for a config without colour or on the raw grid: KITTI's images are rectified."""
         check_layout(config, "kitti")
-        grid = config.manifest_entry["rig"].get("grid")
+        grid = (config.scene_entry.get("rig") or {}).get("grid")
         if grid == "raw":
             raise InputError(
                 f"{config.root}: config {config.name} is on the raw grid, expected rectified images for "
                 "--layout kitti"
             )
 
-    def folders(self, config: DatasetConfig, view_ids: Collection[str]) -> Iterable[str]:
+    def folders(self, config: DatasetConfig) -> Iterable[str]:
         """Return the folders with files."""
-        drives = {_drive(config, view_id) for view_id in view_ids}
-        names = ("image_02/data", "image_03/data", "proj_depth/groundtruth/image_02")
-        days = [f"{DATE}/{drive}/{name}" for drive in sorted(drives) for name in names[:2]]
-        return (".", DATE, *days, *(f"{drive}/{names[2]}" for drive in sorted(drives)))
+        del config
+        return (".", DATE, *(f"{DATE}/{_DRIVE}/{name}" for name in ("image_02/data", "image_03/data")), _DEPTH)
 
     def images(self, config: DatasetConfig, view: CameraView) -> Iterable[ImageFile]:
         """Return the images of both cameras, and the depth map of the left one."""
-        drive, frame = _drive(config, view.view_id), f"{_frame(view.view_id)}.png"
+        del config
+        frame = f"{_frame(view)}.png"
         return [
-            ImageFile(f"{DATE}/{drive}/image_02/data/{frame}", "left_rgb", plain_png),
-            ImageFile(f"{DATE}/{drive}/image_03/data/{frame}", "right_rgb", plain_png),
-            ImageFile(f"{drive}/proj_depth/groundtruth/image_02/{frame}", "left_depth", kitti_depth_png),
+            ImageFile(f"{DATE}/{_DRIVE}/image_02/data/{frame}", "left_rgb", plain_png),
+            ImageFile(f"{DATE}/{_DRIVE}/image_03/data/{frame}", "right_rgb", plain_png),
+            ImageFile(f"{_DEPTH}/{frame}", "left_depth", kitti_depth_png),
         ]
 
     def texts(self, exported: ExportedConfig) -> Mapping[str, str]:
         """Return the calibration of the day and the list of images."""
         calibration = shared_calibration(exported.config, exported.views)
-        names = [(_drive(exported.config, view.view_id), _frame(view.view_id)) for view in exported.views]
         return {
             f"{DATE}/calib_cam_to_cam.txt": kitti_cam_to_cam(calibration),
             f"{DATE}/calib_velo_to_cam.txt": kitti_velo_to_cam(),
-            "images.txt": "".join(f"{DATE}/{drive} {frame} l\n" for drive, frame in names),
+            "images.txt": "".join(f"{DATE}/{_DRIVE} {_frame(view)} l\n" for view in exported.views),
         }
 
 
@@ -76,11 +76,6 @@ def kitti_depth_png(depth_m: Float32[ndarray, "h w"]) -> bytes:
     return plain_png(np.where(units <= _LARGEST, units, 0).astype(np.uint16))
 
 
-def _drive(config: DatasetConfig, view_id: str) -> str:
-    names = [scene.name for scene in config.scenes]
-    return f"{DATE}_drive_{1 + names.index(config.scene_by_view[view_id]):04d}_sync"
-
-
-def _frame(view_id: str) -> str:
+def _frame(view: CameraView) -> str:
     """Return the frame's number: that of the view in its full protocol."""
-    return view_id.rpartition("/")[2].rpartition("-")[2].zfill(10)
+    return view.index.zfill(10)

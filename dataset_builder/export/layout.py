@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,7 @@ class ImageFile:
 
 @dataclass(frozen=True, eq=False)
 class ExportedConfig:
-    """Config of a dataset, the cameras of its exported views, and the bars of its scenes."""
+    """Config of a dataset with one scene, or one scene of another, its exported views, and the bars by scene."""
 
     folder: DatasetFolder
     config: DatasetConfig
@@ -40,7 +40,7 @@ class Layout(ABC):
         """Raise ``InputError`` if a config cannot be exported in this layout."""
 
     @abstractmethod
-    def folders(self, config: DatasetConfig, view_ids: Collection[str]) -> Iterable[str]:
+    def folders(self, config: DatasetConfig) -> Iterable[str]:
         """Return the folders with files, relative to the config's folder, which is "."."""
 
     @abstractmethod

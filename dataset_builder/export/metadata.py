@@ -43,9 +43,8 @@ def cameras_json(folder: DatasetFolder, config: DatasetConfig, views: Sequence[C
         "conventions": CONVENTIONS,
         "dataset": {"digest": folder.digest, "version": folder.version},
         "config": config.name,
-        "parameters": {
-            name: value for name, value in config.manifest_entry.items() if name not in _NOT_PARAMETERS
-        },
+        **({"split": config.scene.split, "scene": config.scene.name} if config.has_splits else {}),
+        "parameters": {name: value for name, value in config.scene_entry.items() if name not in _NOT_PARAMETERS},
         "licence": LICENCE,
     }
     cameras = [_camera(config, view, eye, camera) for view in views for eye, camera in view.cameras.items()]
@@ -70,7 +69,7 @@ def _camera(config: DatasetConfig, view: CameraView, eye: str, camera: Camera) -
 def readme_txt(folder: DatasetFolder, config: DatasetConfig, views: int) -> str:
     """Return ``README.txt``: the content, unit and frame of each file."""
     return _README.format(
-        config=config.name,
+        config=config.label,
         views=views,
         digest=folder.digest,
         version=folder.version,

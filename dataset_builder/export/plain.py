@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 from dataset_builder.export.colmap import cameras_txt, images_txt, points_txt
 from dataset_builder.export.images import EXPORT_FILES
@@ -19,9 +19,9 @@ class PlainLayout(Layout):
     def check(self, config: DatasetConfig) -> None:
         """Accept every config."""
 
-    def folders(self, config: DatasetConfig, view_ids: Collection[str]) -> Iterable[str]:
+    def folders(self, config: DatasetConfig) -> Iterable[str]:
         """Return the folders with files."""
-        del config, view_ids
+        del config
         return (".", "sparse/0", *sorted({file.folder for file in EXPORT_FILES.values()}))
 
     def images(self, config: DatasetConfig, view: CameraView) -> Iterator[ImageFile]:

@@ -10,7 +10,7 @@ from dataset_builder.config.trajectories import subset
 from dataset_builder.export.kitti import KittiLayout
 from dataset_builder.export.layout import ExportedConfig, Layout
 from dataset_builder.export.plain import PlainLayout
-from dataset_builder.export.target import export_target
+from dataset_builder.export.target import ExportedPart, export_target
 from dataset_builder.export.views import CameraView, StoredView, stored_views
 from dataset_builder.export.zed import ZedLayout
 from rebar_depth_bench.atomic_io import write_bytes, write_error, write_text
@@ -27,7 +27,10 @@ DEFAULT_LAYOUT = "plain"
 
 @dataclass(frozen=True)
 class ConfigExport:
-    """Export summary of one config: the number of views, and of image files written and already present."""
+    """Export summary of one config, or of one scene of a config with splits, whose name is that of its folder.
+
+    It has the number of views, and of image files written and already present.
+    """
 
     config: str
     views: int
@@ -50,35 +53,43 @@ def export(
     views: int | None = None,
     layout: str = DEFAULT_LAYOUT,
     progress: Progress = silent,
+    split: str | None = None,
 ) -> ExportSummary:
     """Export configs (default: all) of the dataset folder ``root``, each into its own folder below ``to``.
 
-    ``layout`` is a name in ``LAYOUTS``. ``views`` selects that many of a config's views, spread evenly. Files are
-    written atomically, images before the metadata that refers to them. An interrupted export is resumed by calling
-    it again: images that exist are kept, and the result is byte-identical to that of an uninterrupted export.
-    ``progress`` counts views.
+    ``layout`` is a name in ``LAYOUTS``. A scene of a config with splits has a folder of its own,
+    ``<config>/<split>-<scene>``, since each has its own cameras. ``split`` chooses the scenes of one split
+    (default: all) and leaves out configs that lack it, unless they are named. ``views`` selects that many views
+    of a config, or of each scene, spread evenly. Files are written atomically, images before the metadata that
+    refers to them. An interrupted export is resumed by calling it again: images that exist are kept, and the result
+    is byte-identical to that of an uninterrupted export. ``progress`` counts views.
 
-    Raises ``DatasetError`` for a folder that is not a complete local dataset folder, an unknown config or data
-    that contradicts the manifest; ``InputError`` for fewer than one view, for a config that the layout cannot hold
-    and for a ``to`` that contains anything but an earlier export of the same data in this layout; ``OutputError``
-    for one that cannot be written.
+    Raises ``DatasetError`` for a folder that is not a complete local dataset folder, an unknown config or split,
+    or data that contradict the manifest; ``InputError`` for fewer than one view, for a config that the layout
+    cannot hold and for a ``to`` that contains anything but an earlier export of the same data in this layout;
+    ``OutputError`` for one that cannot be written.
     """
     folder = _local_folder(root)
-    chosen = [folder.config(name) for name in dict.fromkeys(configs or folder.configs)]
+    chosen = [folder.config(name) for name in dict.fromkeys(configs or _with_split(folder, split))]
     for config in chosen:
         if config.imported is not None:
             raise InputError(f"{root}: config {config.name} was imported, expected configs that were rendered")
+    parts = _by_folder(chosen, split)
+    for config in parts.values():
         LAYOUTS[layout].check(config)
-    wanted = {config.name: _select_view_ids(config, views) for config in chosen}
-    folders = {config.name: tuple(LAYOUTS[layout].folders(config, wanted[config.name])) for config in chosen}
+    wanted = {name: _select_view_ids(config, views) for name, config in parts.items()}
+    targets = {
+        name: ExportedPart(_key(config), wanted[name], tuple(LAYOUTS[layout].folders(config)))
+        for name, config in parts.items()
+    }
     has_bars = BARS_FILE in folder.files
     bars = read_bars(folder.verified_file(BARS_FILE)) if has_bars else {}
     target = Path(to)
     try:
-        with export_target(target, folder, layout, wanted, folders):
+        with export_target(target, folder, layout, targets):
             exported = [
-                _export_config(LAYOUTS[layout], folder, config, wanted[config.name], bars, target, progress)
-                for config in chosen
+                _export_config(LAYOUTS[layout], folder, name, config, wanted[name], bars, target, progress)
+                for name, config in parts.items()
             ]
     except OSError as error:  # Only writing raises OSError here: reading raises DatasetError.
         raise write_error(error.filename or to, error) from error
@@ -104,27 +115,56 @@ def _select_view_ids(config: DatasetConfig, views: int | None) -> list[str]:
     return [config.views[index].view_id for index in subset(len(config.views), views)]
 
 
+def _with_split(folder: DatasetFolder, split: str | None) -> list[str]:
+    """Return the names of the configs that have a split, or of all. Raises ``DatasetError`` if there are none."""
+    names = [name for name, config in folder.config_by_name.items() if split is None or split in config.splits]
+    if not names:
+        raise DatasetError(f"{folder.root}: no config has the split {split}")
+    return names
+
+
+def _by_folder(chosen: Sequence[DatasetConfig], split: str | None) -> dict[str, DatasetConfig]:
+    """Return what is exported into each folder: a config, or a scene of a config with splits.
+
+    Raises ``DatasetError`` if a config has no such split.
+    """
+    parts = {}
+    for config in chosen:
+        if config.has_splits:
+            for scene in (config if split is None else config.of_split(split)).by_scene():
+                parts[f"{config.name}/{scene.scene.split}-{scene.scene.name}"] = scene
+        else:
+            parts[config.name] = config if split is None else config.of_split(split)
+    return parts
+
+
+def _key(config: DatasetConfig) -> str:
+    """Return the key of the build of a config or of a scene of it."""
+    return str(config.scene_entry.get("key", config.key))
+
+
 def _export_config(
     layout: Layout,
     folder: DatasetFolder,
+    name: str,
     config: DatasetConfig,
     wanted: Sequence[str],
     bars: dict[str, tuple[Bar, ...]],
     to: Path,
     progress: Progress,
 ) -> ConfigExport:
-    """Write a config's images, then the texts that refer to them."""
+    """Write the images of what is exported into the folder ``name``, then the texts that refer to them."""
     views: list[CameraView] = []
-    into = to / config.name
+    into = to / name
     written = files = 0
     for stored in stored_views(config, wanted):
         view_files, view_written = _write_missing(layout, stored, into)
         files, written = files + view_files, written + view_written
         views.append(stored.view)
-        progress(f"export of {config.name}", len(views), len(wanted))
-    for name, text in layout.texts(ExportedConfig(folder, config, views, bars)).items():
-        write_text(into / name, text)
-    return ConfigExport(config.name, len(views), written, files - written)
+        progress(f"export of {name}", len(views), len(wanted))
+    for path, text in layout.texts(ExportedConfig(folder, config, views, bars)).items():
+        write_text(into / path, text)
+    return ConfigExport(name, len(views), written, files - written)
 
 
 def _write_missing(layout: Layout, stored: StoredView, into: Path) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -25,8 +26,20 @@ FORMAT = "rebar-depth-export-1"
 """Format version of ``MARKER``."""
 
 
+@dataclass(frozen=True)
+class ExportedPart:
+    """What is exported into one folder, a config or a scene: the key of its build and the ids of its views.
+
+    ``folders`` are those that the export writes to, relative to it.
+    """
+
+    key: str
+    view_ids: Sequence[str]
+    folders: tuple[str, ...]
+
+
 class _ExportedConfig(StrictModel):
-    """Content of the target for one config: the key of its build and the ids of its views."""
+    """Content of the target for one config or scene: the key of its build and the ids of its views."""
 
     key: str
     views: Annotated[tuple[str, ...], Strict(False)]
@@ -46,12 +59,9 @@ def export_target(
     to: Path,
     folder: DatasetFolder,
     layout: str,
-    wanted: Mapping[str, Sequence[str]],
-    folders: Mapping[str, Sequence[str]],
+    parts: Mapping[str, ExportedPart],
 ) -> Iterator[None]:
-    """Prepare and lock ``to`` for an export of the wanted view ids of each config in a layout.
-
-    ``folders`` are those of each config that the export writes to, relative to the config's own.
+    """Prepare and lock ``to`` for an export of ``parts`` in a layout; their keys are folders below ``to``.
 
     Context manager; the lock is held until it exits. ``export.json`` in the folder records the dataset and, for
     each config, its build and its views. Temporary files left by a killed export are removed. Raises
@@ -59,7 +69,8 @@ def export_target(
     wanted now, a link in place of a folder that the export writes to, or if another export holds the lock.
     """
     _check_target(to, folder)
-    check_no_links(to, *(f"{name}/{part}" for name in wanted for part in folders[name]))
+    folders = [f"{name}/{folder}" for name, part in parts.items() for folder in part.folders]
+    check_no_links(to, *folders)
     try:
         to.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -69,9 +80,9 @@ def export_target(
             stack.enter_context(exclusive_lock(to))  # Locking the folder itself leaves no file behind.
         except BlockingIOError:
             raise InputError(f"{to}: another export is using this folder") from None
-        exported = _merged_configs(to, folder, layout, wanted)
-        for part in (to, *(to / name / part for name in wanted for part in folders[name])):
-            _remove_temporary_files(part, MARKER if part == to else None)
+        exported = _merged_configs(to, folder, layout, parts)
+        for path in (to, *(to / name for name in folders)):
+            _remove_temporary_files(path, MARKER if path == to else None)
         marker = _Marker(format=FORMAT, layout=layout, dataset=folder.digest, configs=exported)
         write_text(to / MARKER, json.dumps(marker.model_dump()) + "\n")
         yield
@@ -102,12 +113,10 @@ def _check_target(to: Path, folder: DatasetFolder) -> None:
 
 
 def _merged_configs(
-    to: Path, folder: DatasetFolder, layout: str, wanted: Mapping[str, Sequence[str]]
+    to: Path, folder: DatasetFolder, layout: str, parts: Mapping[str, ExportedPart]
 ) -> dict[str, _ExportedConfig]:
     """Return the configs in ``to`` after the export: earlier ones remain, wanted ones are added or extended."""
-    configs = {
-        name: _ExportedConfig(key=folder.config(name).key, views=tuple(views)) for name, views in wanted.items()
-    }
+    configs = {name: _ExportedConfig(key=part.key, views=tuple(part.view_ids)) for name, part in parts.items()}
     earlier = _read_marker(to / MARKER, folder, layout) if (to / MARKER).is_file() else {}
     for name in earlier.keys() & configs.keys():
         _check_same_build(to, name, earlier[name], configs[name])

@@ -14,6 +14,7 @@ from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.eye_view import camera_from_row, truth_columns, truth_from_row
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera
+from rebar_depth_bench.view_ids import scene_of
 
 _COLUMNS = ("view_id", "baseline_m", *(name for eye in EYES for name in (f"{eye}_rgb", *truth_columns(eye))))
 
@@ -26,9 +27,14 @@ class CameraView:
     baseline_m: float
     cameras: Mapping[str, Camera]
 
+    @property
+    def index(self) -> str:
+        """Number of the view in the full protocol of its scene, with the digits of its id."""
+        return self.view_id.removeprefix(scene_of(self.view_id))
+
     def stem(self, eye: str) -> str:
         """Return the common file name of one eye's files, without folder and suffix, e.g. ``0000_left``."""
-        return f"{self.view_id.rpartition('/')[2]}_{eye}"
+        return f"{self.index}_{eye}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,12 +1,13 @@
 """Layout ``zed``: a capture of a ZED camera, with ``left/``, ``right/`` and Stereolabs' ``calibration.conf``.
 
-The id of a view of the capture is that in the dataset. ``cameras.toml`` names the calibration and states what the
+The id of a view of the capture is that in the dataset; of a scene of a config with splits it is
+``<split>-<scene>/<0000>``. ``cameras.toml`` names the calibration and states what the
 calibration cannot: the board. The true poses are left out, as no capture has them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 
 from dataset_builder.export.calibration_text import stereolabs_conf
@@ -27,16 +28,15 @@ class ZedLayout(Layout):
         """Raise ``InputError`` for a config without colour."""
         check_layout(config, "zed")
 
-    def folders(self, config: DatasetConfig, view_ids: Collection[str]) -> Iterable[str]:
+    def folders(self, config: DatasetConfig) -> Iterable[str]:
         """Return the folders with files."""
-        del config, view_ids
+        del config
         return (".", *EYES)
 
     def images(self, config: DatasetConfig, view: CameraView) -> Iterable[ImageFile]:
         """Return the images of both eyes."""
         del config
-        name = view.view_id.partition("/")[2]
-        return [ImageFile(f"{eye}/{name}.png", f"{eye}_rgb", plain_png) for eye in EYES]
+        return [ImageFile(f"{eye}/{view.index}.png", f"{eye}_rgb", plain_png) for eye in EYES]
 
     def texts(self, exported: ExportedConfig) -> Mapping[str, str]:
         """Return the calibration and ``cameras.toml``."""
@@ -46,7 +46,7 @@ class ZedLayout(Layout):
 
 def _cameras_toml(exported: ExportedConfig) -> str:
     lines = [f'calibration = "{_CALIBRATION}"']
-    board = exported.config.scenes[0].board
+    board = exported.config.scene.board
     if board is not None:
         values = asdict(board)
         values["dictionary"] = f'"{board.dictionary}"'

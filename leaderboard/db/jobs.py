@@ -176,7 +176,7 @@ def _leaderboard_rows(submission_id: str, result: Mapping[str, Any]) -> list[Lea
             config=config,
             ranked=table["ranked"],
             rank_error=table["rank_error"],
-            json=json.dumps(table),
+            json=json.dumps({name: value for name, value in table.items() if name != "groups"}),
             view_errors=view_errors(result, config),
         )
         for config, table in result["tables"].items()

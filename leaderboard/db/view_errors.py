@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.bootstrap import CONFIDENCE_LEVEL, Resampling, resample
+from rebar_depth_bench.scoring.bootstrap import CONFIDENCE_LEVEL, Resampling, resample, resample_scenes
 from rebar_depth_bench.scoring.view_score import protocol_indices
-from rebar_depth_bench.view_ids import config_of
+from rebar_depth_bench.view_ids import config_of, scene_of
 
 _CLEAR_Z, _UNCLEAR_Z = 2.6, 1.5
 """Differences in standard errors from which a pair is decided, and below which it is undecided, without draws."""
@@ -28,14 +28,23 @@ def view_errors(result: Mapping[str, Any], config: str) -> bytes | None:
     """Return the rank errors of the views of a config, packed, or None if a view has none.
 
     ``result`` is the result JSON. The indices of the views in their protocol (int32) are followed by the rank
-    errors (float64), both little-endian.
+    errors (float64), both little-endian. In a config of several scenes, the number -1 - i of the view's scene i
+    takes the place of the index.
     """
     views = [view for view in result["views"] if config_of(view["view_id"]) == config]
     errors = [view.get("rank_error") for view in views]
     if not errors or None in errors:
         return None
-    indices = np.array(protocol_indices([view["view_id"] for view in views]), "<i4")
+    view_ids = [view["view_id"] for view in views]
+    by_scene = result["tables"][config].get("split") is not None
+    indices = np.array(_scene_numbers(view_ids) if by_scene else protocol_indices(view_ids), "<i4")
     return indices.tobytes() + np.array(errors, "<f8").tobytes()
+
+
+def _scene_numbers(view_ids: Sequence[str]) -> list[int]:
+    """Return -1 - i for the views of scene i, in the order of their first views."""
+    number = {scene: -1 - index for index, scene in enumerate(dict.fromkeys(map(scene_of, view_ids)))}
+    return [number[scene_of(view_id)] for view_id in view_ids]
 
 
 def unpack_view_errors(packed: bytes) -> tuple[bytes, Float64[ndarray, " n"]]:
@@ -75,7 +84,8 @@ def _resampled_means(packed: bytes) -> Float64[ndarray, " draws"]:
 
 @lru_cache(maxsize=4)
 def _resampling(indices: bytes) -> Resampling:
-    return resample(np.frombuffer(indices, "<i4").tolist())
+    numbers: list[int] = np.frombuffer(indices, "<i4").tolist()
+    return resample_scenes(list(map(str, numbers))) if min(numbers) < 0 else resample(numbers)
 
 
 def _is_better(means: Float64[ndarray, "n draws"]) -> ndarray:

@@ -18,7 +18,7 @@ from rebar_depth_bench.reporting.eval_results import check_hub_id, eval_results
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.html.view_browser import VIEWS_SHOWN
-from rebar_depth_bench.reporting.tables import print_table, result_csv
+from rebar_depth_bench.reporting.tables import groups_csv, print_table, result_csv
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.score import score_evaluation
@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="views per config shown as images (default: %(default)s)",
     )
     add_output_file(parser, "--csv", "write the tables as CSV")
+    add_output_file(parser, "--groups-csv", "write the tables of groups of views, of configs with splits, as CSV")
     parser.add_argument(
         "--extended",
         action="store_true",
@@ -84,6 +85,8 @@ def run(options: argparse.Namespace) -> None:
         write_output(options.json, result.to_json())
     if options.csv:
         write_output(options.csv, result_csv(result))
+    if options.groups_csv:
+        write_output(options.groups_csv, groups_csv(result))
     if options.extended_csv:
         write_output(options.extended_csv, extended_csv(result))
     if prints_table(options):

@@ -147,6 +147,17 @@ class DatasetConfig(Located):
         return self.scenes[0]
 
     @property
+    def scene_entry(self) -> Mapping[str, Any]:
+        """Part of ``manifest_entry`` with the parameters of the only scene: all of it in a config without splits.
+
+        Raises ``DatasetError`` as ``scene``.
+        """
+        if not self.has_splits:
+            return self.manifest_entry
+        entries: dict[str, dict[str, Any]] = {entry["name"]: entry for entry in self.manifest_entry["scenes"]}
+        return entries[self.scene.name]
+
+    @property
     def mesh(self) -> str:
         """Name of the mesh of the only scene. Raises ``DatasetError`` as ``scene``, and if there is none."""
         if self.scene.mesh is None:

@@ -20,6 +20,7 @@ from rebar_depth_bench.extended import (
     single_bar,
 )
 from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, SceneBars, has_bar_ids, load_steel_truth
+from rebar_depth_bench.extended.inspection import as_built
 from rebar_depth_bench.extended.inspection import evaluate as inspection
 from rebar_depth_bench.extended.inspection import measures as inspection_measures
 from rebar_depth_bench.extended.inspection.visible_segments import visible_segments
@@ -38,7 +39,7 @@ from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.view_score import protocol_indices
+from rebar_depth_bench.scoring.view_score import resample_views
 from rebar_depth_bench.submission import SubmissionReader
 
 ONCE, NATIVE, SCALED = "once", "native", "scaled"
@@ -85,6 +86,11 @@ def _inspection(predictions: Predictions, truth: SteelTruth, bars: SceneBars) ->
     return [inspection.inspection_samples(p_m, truth, bars.cage, visible) for p_m in predictions]
 
 
+def _as_built(predictions: Predictions, truth: SteelTruth, bars: SceneBars) -> list[Samples]:
+    """Return the samples of deviations from the design of each prediction."""
+    return [as_built.as_built_samples(p_m, truth, bars.cage, bars.axes) for p_m in predictions]
+
+
 def _profile(predictions: Predictions, truth: SteelTruth, bars: SceneBars) -> list[Samples]:
     """Return the profile samples of each prediction."""
     return [profiles.profile_samples(p_m, truth, bars.diameter_m) for p_m in predictions]
@@ -116,6 +122,7 @@ MEASURE_FAMILIES: Mapping[str, MeasureFamily] = {
         _inspection,
         _BOTH,
     ),
+    "as_built": MeasureFamily("As built against as designed", as_built.MEASURES, _as_built, _BOTH),
     "profile": MeasureFamily("Against distance and bar width", profiles.MEASURES, _profile, _BOTH),
 }
 """Measure families by key, in report order."""
@@ -152,15 +159,14 @@ def score_extended(
     views: list[ViewNumbers] = []
     for config in evaluation.configs:
         if not has_bar_ids(config):
-            tables[config.name] = tabulate_extended([], protocol_indices([]), measures)
+            tables[config.name] = tabulate_extended([], resample_views([], by_scene=False), measures)
             continue
         steel = load_steel_truth(evaluation.folder, config, progress)
         work = partial(_view, evaluation.submission, steel, scales)
         task = f"extended measures of {config.name}"
         config_views = map_with_progress(work, range(len(steel)), workers, progress, task, len(steel))
-        tables[config.name] = tabulate_extended(
-            config_views, protocol_indices([view.view_id for view in config_views]), measures
-        )
+        resampling = resample_views([view.view_id for view in config_views], by_scene=config.has_splits)
+        tables[config.name] = tabulate_extended(config_views, resampling, measures)
         views += [view_numbers(view, measures) for view in config_views]
     return ExtendedResult(measures, tables, views)
 

@@ -18,6 +18,7 @@ from rebar_depth_bench.data.eye_view import EyeTruth
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.extended.depth_layers import other_layers
+from rebar_depth_bench.extended.inspection.as_built import BarAxes, bar_axes
 from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_segments, cage_truth
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
 from rebar_depth_bench.extended.steel_truth import SteelTruth
@@ -50,10 +51,14 @@ _LENS_NUMBERS, _CAMERA_NUMBERS = 9 + 5, 9 + 5 + 16
 
 @dataclass(frozen=True, eq=False)
 class SceneBars:
-    """Bars of a scene: their segments, and the nominal diameter by bar id (NaN for ids without a bar)."""
+    """Bars of a scene: their segments, and the nominal diameter by bar id (NaN for ids without a bar).
+
+    ``axes`` has the axes of the bars with a nominal axis, by bar id.
+    """
 
     cage: CageTruth
     diameter_m: Float64[ndarray, " ids"]
+    axes: Mapping[int, BarAxes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +140,7 @@ def _bars_by_view(folder: DatasetFolder, config: DatasetConfig) -> dict[str, Sce
         diameter_m = np.full(np.iinfo(np.uint16).max + 1, np.nan)
         measured = with_axis(bars)
         diameter_m[[bar.bar_id for bar in measured]] = [bar.diameter_m for bar in measured]
-        scenes[scene.name] = SceneBars(cage_truth(bars), diameter_m)
+        scenes[scene.name] = SceneBars(cage_truth(bars), diameter_m, bar_axes(bars))
     return {view_id: scenes[scene] for view_id, scene in config.scene_by_view.items()}
 
 

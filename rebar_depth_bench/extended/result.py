@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
-from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample
+from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
 from rebar_depth_bench.scoring.frames import frame_of_values
 from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
 
@@ -111,13 +111,9 @@ def view_value(view: ExtendedView, alignment: str, measure: Measure) -> float | 
 
 
 def tabulate_extended(
-    views: Sequence[ExtendedView], indices: Sequence[int], measures: Mapping[str, Sequence[Measure]]
+    views: Sequence[ExtendedView], resampling: Resampling, measures: Mapping[str, Sequence[Measure]]
 ) -> ExtendedTable:
-    """Return a config's table.
-
-    ``indices`` are the positions of the views in the full protocol, ascending.
-    """
-    resampling = resample(indices)
+    """Return a config's table; ``resampling`` are the resamples of the views, from which its intervals follow."""
     numbers = {
         alignment: _estimates(alignment_measures, [view.samples[alignment] for view in views], resampling)
         for alignment, alignment_measures in measures.items()

@@ -52,7 +52,8 @@ NUMBER_TITLES: Mapping[str, tuple[str, int, float]] = _titles()
 
 COMPARISON_NOTE = (
     "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
-    f"({BLOCK_VIEWS} steps of the protocol); none with fewer than {MIN_VIEWS} views. B is called better "
+    f"({BLOCK_VIEWS} steps of the protocol), of whole scenes in configs with splits; none with fewer than "
+    f"{MIN_VIEWS} views or, with splits, scenes. B is called better "
     "or worse if the interval excludes zero, which happens by chance in about one of twenty comparisons. "
     "Errors of valid predictions are not compared if either submission has a coverage below 95 %, a view "
     "without prediction or an overflow; the rank error counts every scored pixel."

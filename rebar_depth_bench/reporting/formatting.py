@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping
 from decimal import ROUND_DOWN, Decimal
 
 from rebar_depth_bench.errors import printable
+from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS
+from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.metrics import METRICS, DepthMetrics
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, OLD_PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.reference import Reference
@@ -35,8 +37,19 @@ INTERVAL_NOTE = (
     "Small figures: 95 % interval, block bootstrap over views (other views of the same scene, not other scenes)."
 )
 
+_SCENES_NOTE = "bootstrap over scenes (other scenes of the same generator)."
+
 METRIC_HEADS = tuple((info.title, info.unit, "↑" if info.higher_is_better else "↓") for info in METRICS.values())
 """Name, unit and better direction of each number that ``metric_cells`` formats."""
+
+GROUP_METRICS = ("abs_rel", "rmse_cm")
+"""Metrics in tables of groups: those that have reference errors."""
+
+GROUP_NOTE = (
+    "The group of a view follows from its ground truth. Beside the errors of a group are the reference errors of "
+    f"its views: {ONE_PIXEL_TITLE} for native, {CONSTANT_TITLE} for scaled errors. A group with views of fewer "
+    f"than {MIN_VIEWS} scenes has no intervals."
+)
 
 
 def number(value: float | None, decimals: int) -> str:
@@ -142,6 +155,14 @@ def metric_interval_cells(intervals: Mapping[str, tuple[float, float] | None], a
     return [interval_cell(intervals.get(f"{alignment}.{name}"), info.decimals) for name, info in METRICS.items()]
 
 
+def interval_note(tables: Iterable[Table]) -> str:
+    """Return the sentence on intervals: how those of configs of one scene, and of several, are determined."""
+    by_scene = {table.split is not None for table in tables}
+    if by_scene == {True}:
+        return f"Small figures: 95 % interval, {_SCENES_NOTE}"
+    return f"{INTERVAL_NOTE} In configs with splits: {_SCENES_NOTE}" if True in by_scene else INTERVAL_NOTE
+
+
 def short_digest(digest: str, digits: int = 12) -> str:
     """Return ``sha256:`` and the first digits of a digest, which suffice to distinguish two datasets."""
     algorithm, colon, value = digest.rpartition(":")
@@ -190,6 +211,20 @@ def incomparable_reasons(table: Table) -> list[str]:
     if any(metrics is not None and not metrics.is_finite for metrics in (table.native, table.scaled)):
         reasons.append("a number overflowed")
     return reasons
+
+
+def group_reference_cells(reference: Reference) -> tuple[list[str], list[str]]:
+    """Return the errors ``GROUP_METRICS`` of the references one pixel and constant as text."""
+    one_pixel = (reference.one_pixel_abs_rel, reference.one_pixel_rmse_cm)
+    constant = (reference.constant_abs_rel, reference.constant_rmse_cm)
+    decimals = [METRICS[name].decimals for name in GROUP_METRICS]
+    shifted, flat = (list(map(number, values, decimals)) for values in (one_pixel, constant))
+    return shifted, flat
+
+
+def grouping_title(grouping: str) -> str:
+    """Return the printable title of a grouping, which is its key if a later version has defined it."""
+    return GROUPINGS[grouping].title if grouping in GROUPINGS else printable(grouping)
 
 
 def reference_rows(reference: Reference) -> list[tuple[str, list[str], list[str]]]:

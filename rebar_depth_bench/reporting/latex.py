@@ -80,6 +80,7 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
         undeclared=any(result.declared.uses_ground_truth is None for result in results),
         unranked_mark=_UNRANKED_MARK,
         intervals=intervals,
+        resampled=_resampled(tables.values()),
         anchored=any(row.median_anchored for row in paper_rows),
         anchored_mark=_ANCHORED_MARK,
         published=bool(paper_rows),
@@ -109,6 +110,14 @@ def _template() -> Template:
     latex_environment = environment(loader).overlay("<%", "%>", "<<", ">>", "<#", "#>", autoescape=False)
     latex_environment.filters["tex"] = escape_latex
     return latex_environment.get_template("table.tex.j2")
+
+
+def _resampled(tables: Iterable[Table]) -> str:
+    """Return how intervals are determined."""
+    by_scene = {table.split is not None for table in tables}
+    if by_scene == {True}:
+        return "bootstrap over scenes"
+    return "block bootstrap over views" + (", with splits over scenes" if True in by_scene else "")
 
 
 def _config_name(config: str, table: Table) -> str:

@@ -19,6 +19,7 @@ from rich.text import Text
 from rebar_depth_bench.errors import printable, terminal_text
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.scoring.frames import tables_frame
+from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Result, Table
 
@@ -39,6 +40,15 @@ class _ColumnGroup:
     title: str
     heads: Sequence[str]
     cells: Callable[[Table], Sequence[str]]
+
+
+@dataclass(frozen=True)
+class _Row:
+    """Row of a config or of a group of its views; ``references`` are rows of reference errors below it."""
+
+    name: str
+    table: Table
+    references: Sequence[tuple[str, list[str], list[str]]] = ()
 
 
 _METRIC_HEADS = [f"{name} {better}\n{unit}" for name, unit, better in formatting.METRIC_HEADS]
@@ -73,21 +83,58 @@ _LAYOUTS = (
 )
 """Column groups of each table to print, from the widest to the narrowest layout."""
 
+_ERROR_POSITIONS = [METRIC_NAMES.index(name) for name in formatting.GROUP_METRICS]
+_ERROR_HEADS = [_METRIC_HEADS[position] for position in _ERROR_POSITIONS]
+_REFERENCE_HEADS = [head.replace(" ↓", "") for head in _ERROR_HEADS]
+_GROUP_NATIVE = _ColumnGroup(
+    "",
+    [f"native\n{head}" for head in _ERROR_HEADS],
+    lambda table: [formatting.metric_cell(table.native, name) for name in formatting.GROUP_METRICS],
+)
+_GROUP_ONE_PIXEL = _ColumnGroup(
+    "",
+    [f"1 pixel\n{head}" for head in _REFERENCE_HEADS],
+    lambda table: formatting.group_reference_cells(table.reference)[0],
+)
+_GROUP_SCALED = _ColumnGroup(
+    "",
+    [f"scaled\n{head}" for head in _ERROR_HEADS],
+    lambda table: [formatting.metric_cell(table.scaled, name) for name in formatting.GROUP_METRICS],
+)
+_GROUP_CONSTANT = _ColumnGroup(
+    "",
+    [*(f"const.\n{head}" for head in _REFERENCE_HEADS), "scale\ns\n"],
+    lambda table: [
+        *formatting.group_reference_cells(table.reference)[1],
+        formatting.scale_cell(table.scale_median),
+    ],
+)
+_GROUP_LAYOUTS = (
+    [[_BASE, _GROUP_NATIVE, _GROUP_ONE_PIXEL, _GROUP_SCALED, _GROUP_CONSTANT]],
+    [[_BASE, _GROUP_NATIVE, _GROUP_ONE_PIXEL], [_GROUP_SCALED, _GROUP_CONSTANT]],
+)
+"""Column groups of the tables of groups of views."""
+
 
 def print_table(result: Result, console: Console) -> None:
     """Print one row per config, followed by its reference errors: in one table if it fits, else in two or three.
 
-    Numbers are never truncated: a console narrower than the narrowest layout gets longer lines.
+    The groups of views of a config with splits follow, one row per group. Numbers are never truncated: a console
+    narrower than the narrowest layout gets longer lines.
     """
     _print_line(console, _headline(result), style="bold")
     _print_line(console, _provenance(result), style="dim")
     _print_line(console, formatting.declaration_text(result.declared), style="dim")
-    for groups in _fitting_layout(result.tables, console):
+    config_rows = _config_rows(result.tables)
+    for groups in _fitting_layout(config_rows, console, _LAYOUTS):
         console.print()
         for group in groups:
             if group.title:
                 _print_line(console, group.title, style="italic")
-        print_unwrapped(console, _rich_table(result.tables, groups))
+        print_unwrapped(console, _rich_table(config_rows, groups))
+    for config, table in result.tables.items():
+        if table.groups:
+            _print_groups(config, table, console)
     _print_notes(result, console)
 
 
@@ -100,10 +147,18 @@ def result_csv(result: Result) -> str:
     return results_csv([result])
 
 
+def groups_csv(result: Result) -> str:
+    """Return the tables of groups of views as CSV, one row per group, in the format of ``result_csv``."""
+    return frame_csv(_without_intervals(result.to_pandas("groups")))
+
+
 def results_csv(results: Sequence[Result]) -> str:
     """Return the tables of several results as one CSV, in the format of ``result_csv``."""
-    frame = tables_frame([result.to_dict() for result in results])
-    return frame_csv(frame[[name for name in frame if not name.endswith(("_low", "_high"))]])
+    return frame_csv(_without_intervals(tables_frame([result.to_dict() for result in results])))
+
+
+def _without_intervals(frame: DataFrame) -> DataFrame:
+    return frame[[name for name in frame if not name.endswith(("_low", "_high"))]]
 
 
 def _headline(result: Result) -> str:
@@ -144,30 +199,59 @@ def _print_notes(result: Result, console: Console) -> None:
     for name, table in result.tables.items():
         for note in (*formatting.table_notes(table), *formatting.reference_findings(table)):
             _print_line(console, f"{printable(name)}: {note}", style="yellow")
+    if any(table.groups for table in result.tables.values()):
+        _print_line(console, f"{formatting.GROUP_NOTE} Intervals: in JSON and the report.")
     [all_groups] = _LAYOUTS[0]
     if formatting.has_dash(group.cells(table) for group in all_groups for table in result.tables.values()):
         _print_line(console, formatting.DASH_NOTE)
 
 
-def _fitting_layout(tables: Mapping[str, Table], console: Console) -> list[list[_ColumnGroup]]:
+def _config_rows(tables: Mapping[str, Table]) -> list[_Row | str]:
+    return [
+        _Row(formatting.config_title(name, table.split), table, formatting.reference_rows(table.reference))
+        for name, table in tables.items()
+    ]
+
+
+def _print_groups(config: str, table: Table, console: Console) -> None:
+    """Print the groups of views of a config, a section for each grouping."""
+    rows: list[_Row | str] = []
+    for grouping, groups_of_views in table.groups.items():
+        rows.append(formatting.grouping_title(grouping))
+        rows += [_Row(f"  {printable(group)}", of_group) for group, of_group in groups_of_views.items()]
+    console.print()
+    _print_line(console, f"{formatting.config_title(config, table.split)}: groups of views", style="bold")
+    for groups in _fitting_layout(rows, console, _GROUP_LAYOUTS):
+        console.print()
+        print_unwrapped(console, _rich_table(rows, groups, "group"))
+
+
+def _fitting_layout(
+    rows: Sequence[_Row | str], console: Console, layouts: Sequence[list[list[_ColumnGroup]]]
+) -> list[list[_ColumnGroup]]:
     """Return the layout with as few tables as the console's width allows."""
-    for layout in _LAYOUTS[:-1]:
-        if all(_width(_rich_table(tables, groups), console) <= console.width for groups in layout):
+    for layout in layouts[:-1]:
+        if all(_width(_rich_table(rows, groups), console) <= console.width for groups in layout):
             return layout
-    return _LAYOUTS[-1]
+    return layouts[-1]
 
 
-def _rich_table(tables: Mapping[str, Table], groups: Sequence[_ColumnGroup]) -> RichTable:
+def _rich_table(rows: Sequence[_Row | str], groups: Sequence[_ColumnGroup], head: str = "config") -> RichTable:
+    """Return the table of rows; a text among the rows is the heading of a section."""
     table = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
     heads = [head for group in groups for head in group.heads]
     lines = max(head.count("\n") for head in heads)
-    table.add_column(_header("config", lines), no_wrap=True)
-    for head in heads:
-        table.add_column(_header(head, lines), justify="right", no_wrap=True)
-    for name, config_table in tables.items():
-        cells = [cell for group in groups for cell in group.cells(config_table)]
-        table.add_row(*map(plain_text, [formatting.config_title(name, config_table.split), *cells]))
-        for title, native, scaled in formatting.reference_rows(config_table.reference):
+    table.add_column(_header(head, lines), no_wrap=True)
+    for column_head in heads:
+        table.add_column(_header(column_head, lines), justify="right", no_wrap=True)
+    for row in rows:
+        if isinstance(row, str):
+            table.add_section()
+            table.add_row(plain_text(row, style="italic"))
+            continue
+        cells = [cell for group in groups for cell in group.cells(row.table)]
+        table.add_row(*map(plain_text, [row.name, *cells]))
+        for title, native, scaled in row.references:
             errors = {_NATIVE.title: native, _SCALED.title: scaled}
             filled = [errors.get(group.title, []) for group in groups]
             if any(map(any, filled)):

@@ -1,11 +1,14 @@
-"""Block bootstrap of table metrics: 95 % percentile intervals over resampled views.
+"""Block bootstrap of table metrics: 95 % percentile intervals over resampled views or scenes.
 
 Neighbouring views show nearly the same steel, so their errors are correlated, and resampling single views would
 give intervals that are too narrow. Resampling blocks of consecutive views preserves the correlation: circular
-block bootstrap of Politis and Romano ("A circular block-resampling procedure for stationary data", 1992).
+block bootstrap of Politis and Romano ("A circular block-resampling procedure for stationary data", 1992). These
+intervals describe the variation with other views of the same scene from the same camera protocol, not with other
+cages, lights or cameras.
 
-The intervals describe the variation with other views of the same scenes from the same camera protocol. They do not
-describe the variation with other cages, lights or cameras.
+In a config of several scenes, which are drawn independently of each other, whole scenes with all of their views
+are resampled: cluster bootstrap of Field and Welsh ("Bootstrapping clustered data", Journal of the Royal
+Statistical Society B 69, 2007). These intervals describe the variation with other scenes of the same generator.
 """
 
 from __future__ import annotations
@@ -27,7 +30,10 @@ BLOCK_VIEWS = 12
 """Block length in steps of the full camera protocol: one ring of azimuths of the dome."""
 
 MIN_VIEWS = 5
-"""Smallest number of views for which an interval is computed; fewer values do not determine their spread."""
+"""Smallest number of views for which an interval is computed; fewer values do not determine their spread.
+
+Where scenes are resampled, it is the smallest number of scenes.
+"""
 
 _MIN_BLOCKS = 4
 _SEED = 0
@@ -38,38 +44,49 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class Resampling:
-    """Bootstrap resamples of n views in protocol order.
+    """Bootstrap resamples of n views, in which units are drawn: single views, or scenes with all of their views.
 
-    ``counts[i, j]`` is the number of times that view j occurs in resample i; there are ``RESAMPLES`` resamples.
+    ``counts[i, j]`` is the number of times that unit j occurs in resample i; there are ``RESAMPLES`` resamples.
+    ``unit`` holds the unit of each view; None if each view is a unit of its own.
     """
 
-    counts: Float64[ndarray, "draws n"]
+    counts: Float64[ndarray, "draws units"]
+    unit: Int64[ndarray, " n"] | None = None
 
     def means(self, values: Float64[ndarray, "n k"]) -> Float64[ndarray, "draws k"]:
         """Return the mean of each column in each resample; NaN in ``values`` marks a view without a value.
 
-        The result is NaN where a resample has no value, and in columns with fewer than ``MIN_VIEWS`` values or
-        with an infinite value.
+        The result is NaN where a resample has no value, in columns with values in fewer than ``MIN_VIEWS`` units,
+        and in columns with an infinite value.
         """
-        present = ~np.isnan(values)
-        sums = self.counts @ np.where(np.isfinite(values), values, 0.0)
+        present = self.sums((~np.isnan(values)).astype(np.float64))
+        sums = self.counts @ self.sums(np.where(np.isfinite(values), values, 0.0))
         with np.errstate(invalid="ignore", divide="ignore"):
-            means = sums / (self.counts @ present.astype(np.float64))
-        usable = (present.sum(axis=0) >= MIN_VIEWS) & ~np.isinf(values).any(axis=0)
+            means = sums / (self.counts @ present)
+        usable = ((present > 0).sum(axis=0) >= MIN_VIEWS) & ~np.isinf(values).any(axis=0)
         return np.where(usable, means, np.nan)
+
+    def sums(self, values: Float64[ndarray, "n k"]) -> Float64[ndarray, "units k"]:
+        """Return the sums of each column over the views of each unit."""
+        if self.unit is None:
+            return values
+        sums = np.zeros((self.counts.shape[1], values.shape[1]))
+        np.add.at(sums, self.unit, values)
+        return sums
 
     def pooled_means(
         self, samples: Float64[ndarray, " m"], view: Int64[ndarray, " m"]
     ) -> Float64[ndarray, " draws"]:
         """Return the mean of samples pooled over views in each resample; ``view`` is each sample's view index.
 
-        The result is NaN where a resample has no sample, and everywhere if fewer than ``MIN_VIEWS`` views have
+        The result is NaN where a resample has no sample, and everywhere if fewer than ``MIN_VIEWS`` units have
         samples or a sample is not finite.
         """
-        if len(np.unique(view)) < MIN_VIEWS or not np.isfinite(samples).all():
+        unit = self._units(view)
+        if len(np.unique(unit)) < MIN_VIEWS or not np.isfinite(samples).all():
             return np.full(len(self.counts), np.nan)
-        views = self.counts.shape[1]
-        totals = np.stack([np.bincount(view, weights, views) for weights in (samples, np.ones(len(samples)))], 1)
+        units = self.counts.shape[1]
+        totals = np.stack([np.bincount(unit, weights, units) for weights in (samples, np.ones(len(samples)))], 1)
         sums = self.counts @ totals
         with np.errstate(invalid="ignore", divide="ignore"):
             means = sums[:, 0] / sums[:, 1]
@@ -92,19 +109,23 @@ class Resampling:
         median (``percent`` = 50), if exactly half of the samples are at or below it, the mean of this sample and
         the next one is returned.
 
-        The result is NaN where a resample has no sample, and everywhere if fewer than ``MIN_VIEWS`` views have
+        The result is NaN where a resample has no sample, and everywhere if fewer than ``MIN_VIEWS`` units have
         samples or a sample is not finite.
         """
-        if len(np.unique(view)) < MIN_VIEWS or not np.isfinite(samples).all():
+        unit = self._units(view)
+        if len(np.unique(unit)) < MIN_VIEWS or not np.isfinite(samples).all():
             return np.full(len(self.counts), np.nan)
         order = np.argsort(samples, kind="stable")
-        ordered, ordered_view = samples[order], view[order]
+        ordered, ordered_unit = samples[order], unit[order]
         chunk_draws = max(1, _CHUNK_ELEMENTS // len(samples))
         chunks = [
-            _weighted_percentile(ordered, self.counts[start : start + chunk_draws, ordered_view], percent)
+            _weighted_percentile(ordered, self.counts[start : start + chunk_draws, ordered_unit], percent)
             for start in range(0, len(self.counts), chunk_draws)
         ]
         return np.concatenate(chunks)
+
+    def _units(self, view: Int64[ndarray, " m"]) -> Int64[ndarray, " m"]:
+        return view if self.unit is None else self.unit[view]
 
 
 def interval(estimates: Float64[ndarray, " draws"]) -> Interval | None:
@@ -127,9 +148,19 @@ def resample(indices: Sequence[int]) -> Resampling:
     blocks = -(-n // length)
     starts = (np.random.PCG64(_SEED).random_raw(RESAMPLES * blocks) % max(n, 1)).astype(np.int64)
     views = (starts.reshape(RESAMPLES, blocks, 1) + np.arange(length)).reshape(RESAMPLES, -1)[:, :n] % max(n, 1)
-    flat = views + n * np.arange(RESAMPLES)[:, None]
-    counts = np.bincount(flat.ravel(), minlength=RESAMPLES * n).reshape(RESAMPLES, n)
-    return Resampling(counts.astype(np.float64))
+    return Resampling(_counts(views, n))
+
+
+def resample_scenes(scenes: Sequence[str]) -> Resampling:
+    """Return the resamples of whole scenes, given the scene of each view.
+
+    Each resample draws as many scenes as there are, with replacement. The same order of the scenes gives the same
+    resamples on every machine.
+    """
+    number = {scene: index for index, scene in enumerate(dict.fromkeys(scenes))}
+    n = len(number)
+    drawn = (np.random.PCG64(_SEED).random_raw(RESAMPLES * n) % max(n, 1)).astype(np.int64).reshape(RESAMPLES, n)
+    return Resampling(_counts(drawn, n), np.array([number[scene] for scene in scenes], np.int64))
 
 
 def block_length(indices: Sequence[int]) -> int:
@@ -143,6 +174,12 @@ def block_length(indices: Sequence[int]) -> int:
         return 1
     stride = max(1.0, (indices[-1] - indices[0]) / (n - 1))
     return max(1, min(round(BLOCK_VIEWS / stride), n // _MIN_BLOCKS))
+
+
+def _counts(drawn: Int64[ndarray, "draws n"], units: int) -> Float64[ndarray, "draws units"]:
+    """Return how often each of the units occurs in each row of ``drawn``."""
+    flat = drawn + units * np.arange(RESAMPLES)[:, None]
+    return np.bincount(flat.ravel(), minlength=RESAMPLES * units).reshape(RESAMPLES, units).astype(np.float64)
 
 
 def _weighted_percentile(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.scoring.bootstrap import Interval, interval, resample
+from rebar_depth_bench.scoring.bootstrap import Interval, interval
 from rebar_depth_bench.scoring.frames import ALIGNMENTS, differences_frame
 from rebar_depth_bench.scoring.metrics import METRICS
 from rebar_depth_bench.scoring.protocol import PROTOCOL
@@ -25,7 +25,7 @@ from rebar_depth_bench.scoring.view_score import (
     VIEW_METRICS,
     ViewScore,
     bootstrap_estimates,
-    protocol_indices,
+    resample_views,
 )
 from rebar_depth_bench.view_ids import config_of
 
@@ -127,7 +127,8 @@ def check_same_splits(results: Sequence[Result]) -> None:
 
 
 def _config_differences(first: Result, other: Result, config: str) -> list[Difference]:
-    differences = _differences(_views_by_id(first, config), _views_by_id(other, config))
+    by_scene = first.tables[config].split is not None
+    differences = _differences(_views_by_id(first, config), _views_by_id(other, config), by_scene)
     if first.tables[config].is_comparable and other.tables[config].is_comparable:
         return differences
     return [
@@ -142,11 +143,13 @@ def _views_by_id(result: Result, config: str) -> dict[str, ViewScore]:
     return {view.view_id: view for view in result.views if config_of(view.view_id) == config}
 
 
-def _differences(first: Mapping[str, ViewScore], other: Mapping[str, ViewScore]) -> list[Difference]:
+def _differences(
+    first: Mapping[str, ViewScore], other: Mapping[str, ViewScore], by_scene: bool
+) -> list[Difference]:
     """Return one difference per metric; error metrics use only the views where both submissions have a value."""
     predicted_by_both = [view_id for view_id in first if first[view_id].native and other[view_id].native]
     on_all_views, on_predicted_by_both = (
-        _differences_on_views([first[v] for v in ids], [other[v] for v in ids])
+        _differences_on_views([first[v] for v in ids], [other[v] for v in ids], by_scene)
         for ids in (list(first), predicted_by_both)
     )
     return [
@@ -155,9 +158,11 @@ def _differences(first: Mapping[str, ViewScore], other: Mapping[str, ViewScore])
     ]
 
 
-def _differences_on_views(first: Sequence[ViewScore], other: Sequence[ViewScore]) -> dict[str, Difference]:
+def _differences_on_views(
+    first: Sequence[ViewScore], other: Sequence[ViewScore], by_scene: bool
+) -> dict[str, Difference]:
     """Return the differences on the given views by metric name, with the same resamples for both submissions."""
-    resampling = resample(protocol_indices([view.view_id for view in first]))
+    resampling = resample_views([view.view_id for view in first], by_scene=by_scene)
     draws = bootstrap_estimates(other, resampling) - bootstrap_estimates(first, resampling)
     differences = {}
     for k, name in enumerate(VIEW_METRICS):

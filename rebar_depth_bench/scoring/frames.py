@@ -39,11 +39,14 @@ TABLE_COLUMNS = (
 )
 """Column names of the numbers of a config's table, without intervals."""
 
-_TABLE_FRAME_COLUMNS = (
-    *("protocol", "method", "inputs", "uses_ground_truth", "config", *TABLE_COLUMNS),
+_DECLARED_COLUMNS = ("protocol", "method", "inputs", "uses_ground_truth")
+_NUMBER_COLUMNS = (
+    *TABLE_COLUMNS,
     *(f"{column}_{end}" for column in METRIC_COLUMNS.values() for end in ("low", "high")),
     *("dataset_digest", "dataset_version", "submission_sha256", "software_version"),
 )
+_TABLE_FRAME_COLUMNS = (*_DECLARED_COLUMNS, "config", *_NUMBER_COLUMNS)
+_GROUP_FRAME_COLUMNS = (*_DECLARED_COLUMNS, "config", "split", "grouping", "group", *_NUMBER_COLUMNS)
 _DIFFERENCE_COLUMNS = (
     *("first_method", "other_method", "config", "number", "views", "first", "other", "difference", "low", "high"),
     *("verdict", "protocol", "dataset_digest", "software_version", "first_sha256", "other_sha256"),
@@ -96,19 +99,35 @@ def tables_frame(documents: Sequence[Mapping[str, Any]]) -> DataFrame:
     The 95 % interval of a metric is in the columns ``<metric>_low`` and ``<metric>_high``.
     """
     rows = [
-        (
-            document["protocol"],
-            *(document["submission"][key] for key in ("method", "inputs", "uses_ground_truth")),
-            config,
-            *table_values(table),
-            *_interval_bounds(table["ci95"]),
-            *(document["dataset"]["digest"], document["dataset"]["version"]),
-            *(document["submission"]["sha256"], document["software"]["version"]),
-        )
+        _table_row(document, table, (config,))
         for document in documents
         for config, table in document["tables"].items()
     ]
     return frame_of_values(_TABLE_FRAME_COLUMNS, rows)
+
+
+def groups_frame(documents: Sequence[Mapping[str, Any]]) -> DataFrame:
+    """Return one row per result, config, grouping and group as ``tables_frame``; others have none."""
+    rows = [
+        _table_row(document, group_table, (config, table.get("split"), grouping, group))
+        for document in documents
+        for config, table in document["tables"].items()
+        for grouping, tables in table.get("groups", {}).items()
+        for group, group_table in tables.items()
+    ]
+    return frame_of_values(_GROUP_FRAME_COLUMNS, rows)
+
+
+def _table_row(document: Mapping[str, Any], table: Mapping[str, Any], names: Sequence[Any]) -> tuple[Any, ...]:
+    return (
+        document["protocol"],
+        *(document["submission"][key] for key in ("method", "inputs", "uses_ground_truth")),
+        *names,
+        *table_values(table),
+        *_interval_bounds(table["ci95"]),
+        *(document["dataset"]["digest"], document["dataset"]["version"]),
+        *(document["submission"]["sha256"], document["software"]["version"]),
+    )
 
 
 def views_frame(document: Mapping[str, Any]) -> DataFrame:

@@ -7,7 +7,7 @@ read the cache one view at a time.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,13 +16,16 @@ from jaxtyping import Bool, Float32, UInt32
 from numpy import ndarray
 
 from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
+from rebar_depth_bench.data.bars import BARS_FILE, read_bars, with_axis
 from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
 from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import EyeTruth, truth_columns, truth_from_row
+from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.groups import ViewTraits, bar_width_px
 from rebar_depth_bench.scoring.metrics import median
 from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels, single_bar_pixels
 from rebar_depth_bench.scoring.reference import (
@@ -32,6 +35,11 @@ from rebar_depth_bench.scoring.reference import (
     reference_of_numbers,
     view_reference,
 )
+
+_REFERENCE = slice(1, 1 + REFERENCE_NUMBERS)
+_WIDTH = 1 + REFERENCE_NUMBERS
+"""Places of the reference errors and of the bar width among the cached numbers; the median depth is the first."""
+_NO_WIDTH = -1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +58,13 @@ class ViewTruth:
 
 @dataclass(frozen=True, eq=False)
 class ConfigTruth:
-    """Views of a config that have scored pixels, each read from the cache on access."""
+    """Views of a config that have scored pixels, each read from the cache on access.
+
+    ``family_by_view`` has the family of the scene of each view.
+    """
 
     cache: ArrayCache
+    family_by_view: Mapping[str, str | None]
 
     @property
     def view_ids(self) -> tuple[str, ...]:
@@ -69,9 +81,20 @@ class ConfigTruth:
         return tuple(median_m for median_m, *_ in self.cache.numbers)
 
     @property
-    def reference(self) -> Reference:
-        """Means over the views of the reference errors."""
-        return mean_reference(reference_of_numbers(numbers) for _, *numbers in self.cache.numbers)
+    def references(self) -> tuple[Reference, ...]:
+        """Reference errors of each view."""
+        return tuple(reference_of_numbers(numbers[_REFERENCE]) for numbers in self.cache.numbers)
+
+    @property
+    def traits(self) -> tuple[ViewTraits, ...]:
+        """Properties of each view by which views are grouped, without bar widths in a config of one scene."""
+        widths_px = (numbers[_WIDTH:] for numbers in self.cache.numbers)
+        return tuple(
+            ViewTraits(
+                self.family_by_view[view_id], median_m, width_px[0] if width_px and width_px[0] > 0 else None
+            )
+            for view_id, median_m, width_px in zip(self.view_ids, self.medians_m, widths_px, strict=True)
+        )
 
     def __len__(self) -> int:
         return len(self.cache)
@@ -86,29 +109,38 @@ class ConfigTruth:
         return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], median_m)
 
 
-def config_truth(config: DatasetConfig, progress: Progress = silent) -> ConfigTruth:
+def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progress = silent) -> ConfigTruth:
     """Return the ground truth of a config, from the cache or else extracted from the dataset.
 
-    Views without scored pixels are omitted. Raises ``DatasetError`` naming the view if its ground truth does not
-    match its digest in the manifest.
+    Views without scored pixels are omitted. A config with splits that has bar ids also needs the table of bars.
+    Raises ``DatasetError`` naming the view if its ground truth does not match its digest in the manifest, and if
+    the table of bars is missing or damaged.
     """
     scored_px = scored_counts(config)
+    has_widths = config.has_splits and "left_bars" not in config.absent_columns
+    diameters = _diameters_by_scene(folder) if has_widths else None
 
     def is_sound(view: ViewArrays) -> bool:
-        has_counts = (
-            len(view.arrays["index"]) == scored_px[view.view_id] and len(view.numbers) == 1 + REFERENCE_NUMBERS
-        )
-        return has_counts and are_pixels_inside(view, config)
+        has_counts = len(view.arrays["index"]) == scored_px[view.view_id]
+        return has_counts and len(view.numbers) == _WIDTH + has_widths and are_pixels_inside(view, config)
 
     content = CacheContent(
         source=config.root,
-        inputs=cache_inputs(config, PROTOCOL),
+        inputs=cache_inputs(config, PROTOCOL, folder.files[BARS_FILE] if has_widths else ""),
         dtypes={"index": np.uint32, "depth_m": np.float32, "single_bar": np.bool_},
         view_ids=tuple(scored_px),
-        extract=lambda: _extract_views(config, progress),
+        extract=lambda: _extract_views(config, progress, diameters),
         is_sound=is_sound,
     )
-    return ConfigTruth(open_cache(content))
+    family_by_scene = {scene.name: scene.family for scene in config.scenes}
+    families = {view_id: family_by_scene[scene] for view_id, scene in config.scene_by_view.items()}
+    return ConfigTruth(open_cache(content), families)
+
+
+def _diameters_by_scene(folder: DatasetFolder) -> dict[str, dict[int, float]]:
+    """Return the nominal diameters of the bars whose axis is known, metres, by scene and bar id."""
+    scenes = read_bars(folder.verified_file(BARS_FILE))
+    return {name: {bar.bar_id: bar.diameter_m for bar in with_axis(bars)} for name, bars in scenes.items()}
 
 
 def reference_errors(config: DatasetConfig) -> Reference:
@@ -116,7 +148,8 @@ def reference_errors(config: DatasetConfig) -> Reference:
 
     Raises ``DatasetError`` as ``config_truth``.
     """
-    return mean_reference(reference_of_numbers(view.numbers[1:]) for view in _extract_views(config, silent))
+    views = _extract_views(config, silent, None)
+    return mean_reference(reference_of_numbers(view.numbers[_REFERENCE]) for view in views)
 
 
 def cache_inputs(config: DatasetConfig, protocol: str, extra_digest: str = "") -> dict[str, Any]:
@@ -161,13 +194,24 @@ def verified_views(
         progress(f"{task} of {config.name}", done, len(records))
 
 
-def _extract_views(config: DatasetConfig, progress: Progress) -> Iterator[ViewArrays]:
+def _extract_views(
+    config: DatasetConfig, progress: Progress, diameters: Mapping[str, Mapping[int, float]] | None
+) -> Iterator[ViewArrays]:
+    """Yield the cached arrays and numbers of every view with scored pixels.
+
+    With ``diameters``, the diameters of the bars by scene, the last number is the bar width in pixels.
+    """
     for view_id, left, pixels in verified_views(config, progress, "ground truth"):
         if len(pixels):
             depth_m = left.depth_m.ravel()[pixels]
             median_m = median(depth_m)
             reference = view_reference(left.depth_m, pixels, median_m)
             numbers = (median_m, *reference.to_numbers())
+            if diameters is not None:
+                known_m = diameters.get(config.scene_by_view[view_id], {})
+                assert left.bars is not None
+                bar_id, focal_px = left.bars.ravel()[pixels], float(left.camera.K[0, 0])
+                numbers += (bar_width_px(depth_m, bar_id, known_m, focal_px) or _NO_WIDTH,)
             single_bar = single_bar_pixels(left.bars, pixels)
             arrays = {"index": pixels, "depth_m": depth_m, "single_bar": single_bar}
             yield ViewArrays(view_id, arrays, numbers)

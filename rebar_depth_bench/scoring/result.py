@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.scoring.bootstrap import Interval
-from rebar_depth_bench.scoring.frames import tables_frame, views_frame
+from rebar_depth_bench.scoring.frames import groups_frame, tables_frame, views_frame
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics, mean, mean_metrics
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.published_match import PublishedMatch
@@ -40,6 +40,8 @@ class Table:
     and ``published`` is the scene of the paper's Table I that it shows, if any. ``split`` is None for a config of
     one scene. ``truth_sigma_m`` is the standard deviation of the ground truth's depth, None where it is exact.
     ``intervals`` has the 95 % block bootstrap interval of each of ``VIEW_METRICS``, None where it is undefined.
+    ``groups`` has the tables of groups of views by grouping (see ``groups.GROUPINGS``) and group, of a config with
+    splits; they have no groups.
     """
 
     views: int
@@ -56,6 +58,7 @@ class Table:
     split: str | None = None
     truth_sigma_m: float | None = None
     intervals: Mapping[str, Interval | None] = field(default_factory=dict)
+    groups: Mapping[str, Mapping[str, Table]] = field(default_factory=dict)
 
     @property
     def is_comparable(self) -> bool:
@@ -104,21 +107,25 @@ class Result:
             **extended,
         }
 
-    def to_pandas(self, rows: Literal["tables", "views", "extended"] = "tables") -> DataFrame:
+    def to_pandas(self, rows: Literal["tables", "groups", "views", "extended"] = "tables") -> DataFrame:
         """Return the numbers of the JSON as a frame.
 
         ``"tables"`` has one row per config, with the 95 % interval of each metric in the columns
-        ``<metric>_low`` and ``<metric>_high``; ``"views"`` has one row per view; ``"extended"`` has one row per
-        config, alignment and extended measure. Raises ``ValueError`` for other rows, and for ``"extended"`` if the
-        result has no extended measures.
+        ``<metric>_low`` and ``<metric>_high``; ``"groups"`` has one row per group of views of each config with
+        splits, with the same columns; ``"views"`` has one row per view; ``"extended"`` has one row per config,
+        alignment and extended measure. Raises ``ValueError`` for other rows, and for ``"extended"`` if the result
+        has no extended measures.
         """
         if rows == "tables":
             return tables_frame([self.to_dict()])
+        if rows == "groups":
+            return groups_frame([self.to_dict()])
         if rows == "views":
             return views_frame(self.to_dict())
         if rows == "extended" and self.extended is not None:
             return self.extended.to_pandas()
-        raise ValueError(f"rows is {rows!r}, expected 'tables', 'views', or 'extended' for a result that has them")
+        expected = "'tables', 'groups', 'views', or 'extended' for a result that has them"
+        raise ValueError(f"rows is {rows!r}, expected {expected}")
 
     def __repr__(self) -> str:
         """Return the method, the numbers of the first ten configs, and the number of views."""
@@ -148,8 +155,9 @@ def tabulate(
     split: str | None = None,
     truth_sigma_m: float | None = None,
 ) -> Table:
-    """Return the table of a config from the scores of its scored views.
+    """Return the table of a config, or of a group of its views, from the scores of its scored views.
 
+    The intervals of a config with splits are those of resampled scenes, of others those of consecutive views.
     A config without views is not ranked, and neither is a submission that declares the use of ground truth. An
     infinite metric (of a prediction so large that its square overflows) is written as null; the rank error is
     always finite.
@@ -171,7 +179,7 @@ def tabulate(
         published=published,
         split=split,
         truth_sigma_m=truth_sigma_m,
-        intervals=view_intervals(views) if views else dict.fromkeys(VIEW_METRICS),
+        intervals=view_intervals(views, by_scene=split is not None) if views else dict.fromkeys(VIEW_METRICS),
     )
 
 
@@ -207,6 +215,14 @@ def _table_dict(table: Table) -> dict[str, Any]:
         "reference": table.reference.to_dict(),
         "published": None if table.published is None else table.published.to_dict(),
         "ci95": _intervals_dict(table.intervals),
+        **({"groups": _groups_dict(table.groups)} if table.groups else {}),
+    }
+
+
+def _groups_dict(groups: Mapping[str, Mapping[str, Table]]) -> dict[str, dict[str, Any]]:
+    return {
+        grouping: {group: _table_dict(table) for group, table in tables.items()}
+        for grouping, tables in groups.items()
     }
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Any, Self
 
 from pydantic import BeforeValidator, ConfigDict, FailFast, Field, Strict, model_validator
@@ -52,7 +53,10 @@ def read_result(data: bytes, where: str) -> Result:
 
 
 def read_table(table: Mapping[str, Any]) -> Table:
-    """Return the table of a config from its JSON object. Raises ``InputError`` if it is invalid."""
+    """Return the table of a config from its JSON object, without groups.
+
+    Raises ``InputError`` if it is invalid.
+    """
     problems: list[Problem] = []
     content = validate_table(_TableJson, table, problems)
     if content is None:
@@ -188,7 +192,7 @@ def _defined(interval: tuple[float | None, float | None] | None) -> tuple[float,
 
 
 class _TableJson(_AlignedJson):
-    """Table of a config."""
+    """Table of a config or of a group of its views."""
 
     views: _Count
     views_scored: _Count
@@ -225,6 +229,39 @@ class _TableJson(_AlignedJson):
             within_mm={tolerance_mm: self.within_mm[key] for key, tolerance_mm in _TOLERANCES.items()},
             intervals=self.ci95.content(),
         )
+
+
+_Groups = dict[Name, dict[Name, _TableJson]]
+
+
+class _ConfigTableJson(_TableJson):
+    """Table of a config, with the tables of groups of its views, which have no groups of their own."""
+
+    groups: _Groups = Field(default={})
+
+    def content(self) -> Table:
+        """Return the table."""
+        groups = {
+            grouping: {group: table.content() for group, table in tables.items()}
+            for grouping, tables in self.groups.items()
+        }
+        return replace(super().content(), groups=groups)
+
+
+def _check_tables(tables: object) -> object:
+    """Return ``tables``; raise the error of a field if they are too many, those of groups included."""
+    count = sum(_group_tables(table) for table in tables.values()) if isinstance(tables, dict) else 0
+    if count > _MAX_ENTRIES:
+        raise field_error(f"got {count} tables of groups", f"at most {_MAX_ENTRIES}", "size")
+    return _check_length(tables)
+
+
+def _group_tables(table: object) -> int:
+    """Return the number of groupings and groups of a table that has not been validated."""
+    groups = table.get("groups") if isinstance(table, dict) else None
+    if not isinstance(groups, dict):
+        return 0
+    return len(groups) + sum(len(of_grouping) for of_grouping in groups.values() if isinstance(of_grouping, dict))
 
 
 class _ViewJson(_AlignedJson):
@@ -285,7 +322,7 @@ class _ResultJson(StoredModel):
     dataset: DatasetJson
     submission: SubmissionJson
     software: SoftwareJson
-    tables: Annotated[dict[Name, _TableJson], LIMITED]
+    tables: Annotated[dict[Name, _ConfigTableJson], BeforeValidator(_check_tables)]
     views: Annotated[list[_ViewJson], FailFast()]
 
     @model_validator(mode="after")
@@ -296,7 +333,13 @@ class _ResultJson(StoredModel):
         if not {config_of(view_id) for view_id in view_ids} <= self.tables.keys():
             raise field_error("views: a view belongs to no config of the tables", "views of these", "conflict")
         errors = [view.rank_error for view in self.views]
-        errors += [table.rank_error for table in self.tables.values() if table.views]
+        groups = [
+            table
+            for tables in self.tables.values()
+            for group in tables.groups.values()
+            for table in group.values()
+        ]
+        errors += [table.rank_error for table in (*self.tables.values(), *groups) if table.views]
         if self.protocol == PROTOCOL and None in errors:
             raise field_error("a view or table has no rank_error", f"one in results of {PROTOCOL}", "missing")
         return self

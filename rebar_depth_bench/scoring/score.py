@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,11 +13,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.errors import Problem, SubmissionError
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.ground_truth import ConfigTruth, ViewTruth, config_truth
+from rebar_depth_bench.scoring.groups import GROUPINGS, positions_by_group
 from rebar_depth_bench.scoring.metrics import (
     is_valid_prediction,
     median,
@@ -26,9 +29,10 @@ from rebar_depth_bench.scoring.metrics import (
 )
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.published_match import published_match
+from rebar_depth_bench.scoring.reference import mean_reference
 from rebar_depth_bench.scoring.result import Result, Table, tabulate
 from rebar_depth_bench.scoring.view_score import ViewScore
-from rebar_depth_bench.submission import EntryError, SubmissionReader
+from rebar_depth_bench.submission import Declaration, EntryError, SubmissionReader
 from rebar_depth_bench.version import software_version
 
 
@@ -107,27 +111,51 @@ def _score_all(
     tables: dict[str, Table] = {}
     views: list[ViewScore] = []
     for config in evaluation.configs:
-        truths = config_truth(config, progress)
+        truths = config_truth(evaluation.folder, config, progress)
         work = partial(_score_or_problem, submission, truths)
         scored = map_with_progress(
             work, range(len(truths)), workers, progress, f"scoring {config.name}", len(truths)
         )
         scores = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
-        tables[config.name] = tabulate(
-            scores,
-            evaluation.declared,
-            truths.reference,
-            published_match(config),
-            config.scenes[0].split if config.has_splits else None,
-            config.truth_sigma_m,
-        )
         views += scores
         problems += [outcome for outcome in scored if isinstance(outcome, Problem)]
         unread.difference_update(truths.view_ids)
+        if not problems:
+            tables[config.name] = _tabulate_config(config, truths, scores, evaluation.declared)
     problems += _unscored_view_problems(submission, unread)
     if problems:
         raise SubmissionError.from_problems(submission.path, problems)
     return tables, views
+
+
+def _tabulate_config(
+    config: DatasetConfig, truths: ConfigTruth, scores: Sequence[ViewScore], declared: Declaration
+) -> Table:
+    """Return the table of a config, with the tables of groups of its views if it has splits."""
+    references = truths.references
+    table = tabulate(
+        scores,
+        declared,
+        mean_reference(references),
+        published_match(config),
+        config.scenes[0].split if config.has_splits else None,
+        config.truth_sigma_m,
+    )
+    if not config.has_splits:
+        return table
+
+    def of_group(positions: Sequence[int]) -> Table:
+        reference = mean_reference(references[position] for position in positions)
+        group = [scores[position] for position in positions]
+        return tabulate(group, declared, reference, None, table.split, table.truth_sigma_m)
+
+    groups = {
+        key: {
+            group: of_group(positions) for group, positions in positions_by_group(grouping, truths.traits).items()
+        }
+        for key, grouping in GROUPINGS.items()
+    }
+    return replace(table, groups=groups)
 
 
 def _score_or_problem(submission: SubmissionReader, truths: ConfigTruth, index: int) -> ViewScore | Problem:

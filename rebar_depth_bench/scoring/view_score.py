@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample
+from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample, resample_scenes
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
+from rebar_depth_bench.view_ids import scene_of
 
 SCALE_MEDIAN = "scale_median"
 """Key of the median over views of the scale factor in ``VIEW_METRICS``."""
@@ -60,9 +61,9 @@ VIEW_METRICS: Mapping[str, Callable[[ViewScore], float | None]] = {
 """Functions that return a view's value of each table metric, by metric name; None where the view has no value."""
 
 
-def view_intervals(views: Sequence[ViewScore]) -> dict[str, Interval | None]:
-    """Return the 95 % interval of every table metric of the given views."""
-    estimates = bootstrap_estimates(views, resample(protocol_indices([view.view_id for view in views])))
+def view_intervals(views: Sequence[ViewScore], *, by_scene: bool) -> dict[str, Interval | None]:
+    """Return the 95 % interval of every table metric of the given views; ``by_scene`` as in ``resample_views``."""
+    estimates = bootstrap_estimates(views, resample_views([view.view_id for view in views], by_scene=by_scene))
     return {name: interval(estimates[:, k]) for k, name in enumerate(VIEW_METRICS)}
 
 
@@ -79,6 +80,16 @@ def view_metric_values(views: Sequence[ViewScore]) -> Float64[ndarray, "n k"]:
     """Return the ``VIEW_METRICS`` of each view, one row per view; NaN where it has no value."""
     rows = [[get(view) for get in VIEW_METRICS.values()] for view in views]
     return np.array(rows, dtype=np.float64).reshape(len(views), len(VIEW_METRICS))
+
+
+def resample_views(view_ids: Sequence[str], *, by_scene: bool) -> Resampling:
+    """Return the resamples of views: of whole scenes if ``by_scene``, otherwise of blocks of consecutive views.
+
+    Scenes are resampled in configs of several scenes, which are those with splits.
+    """
+    if by_scene:
+        return resample_scenes([scene_of(view_id) for view_id in view_ids])
+    return resample(protocol_indices(view_ids))
 
 
 def protocol_indices(view_ids: Sequence[str]) -> list[int]:

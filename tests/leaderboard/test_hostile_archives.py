@@ -17,9 +17,8 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench import load
-from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem
-from rebar_depth_bench.scoring.ground_truth import config_truth
+from tests.ground_truth import truth_of
 from tests.leaderboard.hostile_zips import (
     KINDS,
     ValidArchive,
@@ -72,7 +71,7 @@ def attack(
     repetitions: Repetitions,
 ) -> Iterator[AttackResult]:
     folder = tmp_path_factory.mktemp("siege")
-    config_truth(open_folder(tiny_root).config("lattice-orbit"))  # The attack finds the cache complete.
+    truth_of(tiny_root, "lattice-orbit")  # The attack finds the cache complete.
     state = folder / "state"
     for name in ("cwd", "home", "tmp", "forbidden"):
         (folder / name).mkdir()

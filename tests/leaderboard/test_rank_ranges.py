@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from leaderboard.db.view_errors import rank_ranges, unpack_view_errors, view_errors
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.result import Result, tabulate
 from tests.bench.reporting.results import result, scored_view
 
 VIEWS = 40
@@ -45,6 +47,26 @@ def test_range_contains_the_rank() -> None:
     for error, rank_range in zip(errors, ranges, strict=True):
         assert rank_range is not None
         assert rank_range[0] <= 1 + sum(other < error for other in errors) <= rank_range[1]
+
+
+def test_scenes_are_resampled_in_a_config_with_splits() -> None:
+    """Views of a scene share their error: two submissions that differ in few scenes are not told apart."""
+    rng = np.random.default_rng(4)
+    scenes, results = 10, []
+    for number in range(3):
+        of_scene = rng.uniform(0.1, 0.3, scenes) + 0.03 * number
+        ids = [f"cages/test-s{scene}-{index:04d}" for scene in range(scenes) for index in range(8)]
+        views = [scored_view(view_id, float(of_scene[n // 8])) for n, view_id in enumerate(ids)]
+        results.append(replace(result(), tables={"cages": tabulate(views, split="test")}, views=views))
+    ranges = rank_ranges([view_errors(one.to_dict(), "cages") for one in results])
+    for index, one in enumerate(results):
+        verdicts = [
+            next(row for row in compare(one, other).configs["cages"] if row.name == "rank_error").verdict
+            for number, other in enumerate(results)
+            if number != index
+        ]
+        assert ranges[index] == (1 + verdicts.count("better"), len(results) - verdicts.count("worse"))
+    assert "undecided" in verdicts
 
 
 def test_too_few_views_allow_every_rank() -> None:

@@ -22,7 +22,7 @@ from leaderboard.web.pages.disclosed import disclosed_row
 from leaderboard.web.pages.rendering import MAX_INTERVALS_PLOTTED, DisplayTime, Link, format_time, link
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
-from rebar_depth_bench.reporting.formatting import reference_rows
+from rebar_depth_bench.reporting.formatting import interval_note, reference_rows
 from rebar_depth_bench.reporting.html.published import (
     PaperRow,
     finite_interval,
@@ -187,7 +187,8 @@ class ConfigRanking:
 
     ``row_count`` is the number of rows that pass the filters, ``lines`` the rows of the page, ``references`` the
     rows of reference errors (name, native and scaled cells), ``published`` the rows of the paper and ``distance``
-    their camera distance. ``plotted`` is the number of points of submissions.
+    their camera distance. ``plotted`` is the number of points of submissions. ``interval_note`` explains the
+    confidence intervals.
     """
 
     config: str
@@ -200,6 +201,7 @@ class ConfigRanking:
     distance: str
     chart: Markup | None
     plotted: int
+    interval_note: str
 
     @property
     def interval(self) -> bool:
@@ -265,6 +267,7 @@ def make_config_ranking(
         distance=distance,
         chart=chart,
         plotted=len(points),
+        interval_note=interval_note(row.table for row in formatted if row.table),
     )
 
 
@@ -287,7 +290,7 @@ def _format_row(method: str, table_json: str, hidden_truth: bool) -> _FormattedR
     if hidden_truth:
         return _FormattedRow(None, disclosed_row(method, DisclosedTable.model_validate_json(table_json)))
     table = read_table(json.loads(table_json))
-    return _FormattedRow(table, table_row(method, table))
+    return _FormattedRow(table, table_row(method, replace(table, split=None)))
 
 
 def _ranking_line(entry: LeaderboardEntry, row: ScoreRow) -> RankingLine:

@@ -19,6 +19,7 @@ from leaderboard.web.api.auth import ServiceDep
 from leaderboard.web.api.submissions import check_length, page_url
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.pages.rendering import clean_text, format_size, problem_lines, render, service_address
+from rebar_depth_bench.view_ids import TEST_SPLIT
 
 router = APIRouter(include_in_schema=False)
 
@@ -61,7 +62,7 @@ def how_to_page(
         most_bytes=settings.max_upload,
         always_public=settings.default_visibility == "always",
         dataset_configs=service.folder.configs,
-        first_view=next(iter(service.folder.config(service.folder.configs[0]).view_ids)),
+        first_view=next(iter(service.folder.expected_views(TEST_SPLIT)), ""),
     )
 
 

@@ -34,7 +34,7 @@ _MM = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
-class _FittedAxes:
+class FittedAxes:
     """Fitted axis of each visible segment and its deviation from the true axis.
 
     ``found`` marks the segments whose axis was accepted. An axis is a point and a unit direction in the camera
@@ -75,12 +75,7 @@ def inspection_samples(
     if p_m.shape != truth.index.shape:
         raise ValueError(f"p_m has shape {p_m.shape}, expected {truth.index.shape} as truth.index has")
     visible = visible or visible_segments(truth, cage)
-    points_m, predicted = _predicted_points_m(p_m, visible)
-    start_m = _initial_offset_m(points_m, predicted, visible)
-    fits = fit_cylinders(
-        points_m, predicted, start_m, visible.half_m, visible.diameter_m / 2, visible.can_fit_diameter
-    )
-    fitted = _compare_with_truth(fits, predicted, visible)
+    fits, fitted = fit_axes(p_m, visible)
     pairs = _visible_pairs(visible, cage)
     spacing_m, layer_m = _pair_errors_m(pairs, visible, fitted)
     cover_m = (fitted.point_m - visible.middle_m)[:, 2]
@@ -93,12 +88,25 @@ def inspection_samples(
     return {
         "bar_found": fitted.found.astype(np.float64),
         "axis_offset_mm": fitted.offset_m[fitted.found] * _MM,
-        "axis_offset_judged_mm": _with_misses_mm(np.where(fitted.found, fitted.offset_m * _MM, np.nan)),
+        "axis_offset_judged_mm": with_misses_mm(np.where(fitted.found, fitted.offset_m * _MM, np.nan)),
         "axis_tilt_deg": fitted.tilt_deg[fitted.found],
         **_error_samples(errors_mm),
         **_error_samples({"diameter": diameter_error_m[visible.can_fit_diameter] * _MM}),
         **_pass_samples(errors_mm),
     }
+
+
+def fit_axes(p_m: Float64[ndarray, " n"], visible: VisibleSegments) -> tuple[CylinderFits, FittedAxes]:
+    """Fit a cylinder to the predicted points of each visible segment; return the fits and their axes.
+
+    ``p_m`` is the predicted planar depth in metres on the pixels of the ground truth of ``visible``.
+    """
+    points_m, predicted = _predicted_points_m(p_m, visible)
+    start_m = _initial_offset_m(points_m, predicted, visible)
+    fits = fit_cylinders(
+        points_m, predicted, start_m, visible.half_m, visible.diameter_m / 2, visible.can_fit_diameter
+    )
+    return fits, _compare_with_truth(fits, predicted, visible)
 
 
 def _predicted_points_m(
@@ -134,7 +142,7 @@ def _initial_offset_m(
 
 def _compare_with_truth(
     fits: CylinderFits, predicted: Bool[ndarray, "r k"], visible: VisibleSegments
-) -> _FittedAxes:
+) -> FittedAxes:
     """Return the fitted axes in the camera frame and their deviations from the true ones."""
     with np.errstate(over="ignore", invalid="ignore"):
         squared_slope = (fits.slope**2).sum(axis=1)
@@ -146,7 +154,7 @@ def _compare_with_truth(
         farthest_m = np.maximum(offset_m, np.maximum(*ends_m))
         found = enough & fits.converged & (farthest_m < visible.match_radius_m)
         local = np.column_stack([fits.slope, np.ones(len(fits.slope))]) / np.sqrt(1 + squared_slope)[:, None]
-        return _FittedAxes(
+        return FittedAxes(
             found=found,
             point_m=visible.middle_m + np.einsum("rc,rci->ri", fits.offset_m, visible.frame[:, :2]),
             direction=np.einsum("rc,rci->ri", local, visible.frame),
@@ -174,7 +182,7 @@ def _visible_pairs(visible: VisibleSegments, cage: CageTruth) -> _SegmentPairs:
 
 
 def _pair_errors_m(
-    pairs: _SegmentPairs, visible: VisibleSegments, fitted: _FittedAxes
+    pairs: _SegmentPairs, visible: VisibleSegments, fitted: FittedAxes
 ) -> tuple[Float64[ndarray, " s"], Float64[ndarray, " l"]]:
     """Return the separation errors of pairs across the line of sight, and of pairs along the optical axis.
 
@@ -205,7 +213,7 @@ def _separation_m(
     return np.asarray(intersections_m[1] - intersections_m[0])
 
 
-def _with_misses_mm(error_mm: Float64[ndarray, " n"]) -> Float64[ndarray, " n"]:
+def with_misses_mm(error_mm: Float64[ndarray, " n"]) -> Float64[ndarray, " n"]:
     """Return absolute errors, capped at ``MISS_MM``, and ``MISS_MM`` for what was not found."""
     return np.where(np.isnan(error_mm), MISS_MM, np.minimum(np.abs(error_mm), MISS_MM))
 
@@ -217,14 +225,14 @@ def _error_samples(
     samples = {}
     for kind, error_mm in errors_mm.items():
         samples[f"{kind}_error_mm"] = error_mm[~np.isnan(error_mm)]
-        samples[f"{kind}_judged_mm"] = _with_misses_mm(error_mm)
+        samples[f"{kind}_judged_mm"] = with_misses_mm(error_mm)
     return samples
 
 
 def _pass_samples(errors_mm: Mapping[ErrorKind, Float64[ndarray, " n"]]) -> dict[str, Float64[ndarray, " n"]]:
     """Return for each tolerance 1 for errors within it, 0 for larger ones and for what was not found."""
     return {
-        pass_sample(tolerance): (_with_misses_mm(errors_mm[tolerance.kind]) <= tolerance.limit_mm).astype(
+        pass_sample(tolerance): (with_misses_mm(errors_mm[tolerance.kind]) <= tolerance.limit_mm).astype(
             np.float64
         )
         for _, tolerance in TOLERANCES

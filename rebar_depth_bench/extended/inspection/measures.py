@@ -35,11 +35,11 @@ The position and spacing errors of bars and pairs that were found are smaller.
 MIN_VISIBLE_OVERLAP_DIAMETERS = 2.0
 """Minimum overlap of the visible parts of a judged pair along the axis, in larger diameters."""
 
-_JUDGED_NOTE = (
+JUDGED_NOTE = (
     f"Judged are straight runs of bars with {MIN_PIXELS} interior pixels or more over "
     f"{MIN_VISIBLE_DIAMETERS:g} diameters or more of their length, by the ground truth alone."
 )
-_MISSED_NOTE = f"What was not found counts as {MISS_MM:g} mm."
+MISSED_NOTE = f"What was not found counts as {MISS_MM:g} mm."
 
 _SEPARATION = (
     "separation of fitted axes minus that of the true ones, along the true one, in the middle of what is seen of "
@@ -85,11 +85,11 @@ def _error_measures(kind: str) -> tuple[Measure, ...]:
         ),
         Measure(
             f"{kind}_median_mm", judged_sample, "median", f"{title}: median error", "mm", "lower",
-            f"Median of the absolute value: {definition}. {_MISSED_NOTE}",
+            f"Median of the absolute value: {definition}. {MISSED_NOTE}",
         ),
         Measure(
             f"{kind}_p95_mm", judged_sample, "p95", f"{title}: p95 error", "mm", "lower",
-            f"95th percentile of the absolute value: {definition}. {_MISSED_NOTE}",
+            f"95th percentile of the absolute value: {definition}. {MISSED_NOTE}",
         ),
     )  # fmt: skip
 
@@ -99,16 +99,16 @@ _POSITION_MEASURES: tuple[Measure, ...] = (
         "bars_found", "bar_found", "mean", "bars found", "%", "higher",
         f"Share of judged runs with predictions on {MIN_PREDICTED_SHARE:.0%} or more of their pixels whose fitted "
         "cylinder converged, its axis everywhere along what is seen nearer to the true one than half way to the "
-        f"nearest parallel run, and within {1000 * MAX_MATCH_RADIUS_M:g} mm. {_JUDGED_NOTE}",
+        f"nearest parallel run, and within {1000 * MAX_MATCH_RADIUS_M:g} mm. {JUDGED_NOTE}",
     ),
     Measure(
         "axis_offset_median_mm", "axis_offset_judged_mm", "median", "axis offset: median", "mm", "lower",
-        f"Median distance of the fitted axis from the middle of what is seen of the true one. {_MISSED_NOTE}",
+        f"Median distance of the fitted axis from the middle of what is seen of the true one. {MISSED_NOTE}",
     ),
     Measure(
         "axis_offset_p95_mm", "axis_offset_judged_mm", "p95", "axis offset: p95", "mm", "lower",
         "95th percentile of the distance of the fitted axis from the middle of what is seen of the true one. "
-        + _MISSED_NOTE,
+        + MISSED_NOTE,
     ),
     Measure(
         "axis_offset_found_mm", "axis_offset_mm", "mean", "axis offset of found bars: mean", "mm", "",

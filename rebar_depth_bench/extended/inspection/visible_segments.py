@@ -5,7 +5,7 @@ Determined from the ground truth alone. Frame: the camera's (OpenCV axes), metre
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -60,6 +60,10 @@ class VisibleSegments:
     rays: Float64[ndarray, "r k 3"]
     truth_m: Float64[ndarray, "r k 3"]
     can_fit_diameter: Bool[ndarray, " r"]
+
+    def of(self, rows: Bool[ndarray, " r"] | Int64[ndarray, " s"]) -> VisibleSegments:
+        """Return the selected segments."""
+        return VisibleSegments(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def local_points_m(self, depth_m: Float64[ndarray, "r k"]) -> Float64[ndarray, "r k 3"]:
         """Return the points at planar ``depth_m`` on the rays of ``pixels``, in ``frame`` from ``middle_m``."""

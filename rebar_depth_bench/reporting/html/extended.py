@@ -128,7 +128,7 @@ _AXIS_TITLES: Mapping[str, tuple[str, str]] = {
     "m": ("distance", "m"),
     "px": ("bar width in the picture", "pixels"),
 }
-_FOLDED_FAMILIES = ("alignment", "full_mask", "single_bar", "boundary", "layers", "clouds")
+_FOLDED_FAMILIES = ("as_built", "alignment", "full_mask", "single_bar", "boundary", "layers", "clouds")
 
 MAIN_INSPECTION_MEASURES = (
     "bars_found",

@@ -25,6 +25,7 @@ from rebar_depth_bench.reporting.charts import score_charts
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.assets import environment, inline_script
 from rebar_depth_bench.reporting.html.extended import extended_section
+from rebar_depth_bench.reporting.html.groups import config_groups
 from rebar_depth_bench.reporting.html.published import paper_scenes
 from rebar_depth_bench.reporting.html.rows import ScoreRow, table_row, view_row
 from rebar_depth_bench.reporting.html.view_browser import (
@@ -104,7 +105,11 @@ def results_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) ->
         ],
         "reference_note": formatting.REFERENCE_NOTE,
         "dash_in_results": any(row.has_dash() for row in rows),
-        "interval_note": formatting.INTERVAL_NOTE if any(row.has_interval() for row in rows) else "",
+        "interval_note": (
+            formatting.interval_note(result.tables.values()) if any(row.has_interval() for row in rows) else ""
+        ),
+        "groups": config_groups(result.tables),
+        "group_note": formatting.GROUP_NOTE,
         "alignment_chart": score_charts.alignment_chart(result.tables),
         "scale_chart": score_charts.scale_chart(result.tables, views),
     }

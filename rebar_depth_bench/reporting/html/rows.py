@@ -108,6 +108,11 @@ def view_row(view: ViewScore) -> ScoreRow:
     )
 
 
+def number_cells(texts: Sequence[str], values: Sequence[float | None]) -> list[Cell]:
+    """Return cells of numbers without intervals."""
+    return _cells(texts, values, [""] * len(texts))
+
+
 def _metric_cells(metrics: DepthMetrics | None, intervals: Sequence[str]) -> list[Cell]:
     values = [getattr(metrics, name, None) for name in METRIC_NAMES]
     return _cells(formatting.metric_cells(metrics), values, intervals)

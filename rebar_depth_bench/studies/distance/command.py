@@ -118,7 +118,7 @@ def _select_configs(archive: str | os.PathLike[str], result: Result, configs: Se
 
 
 def _distance_points(evaluation: Evaluation, result: Result, config: DatasetConfig) -> list[DistancePoint]:
-    truths = config_truth(config)
+    truths = config_truth(evaluation.folder, config)
     scores = {view.view_id: view for view in result.views}
     points = []
     for position, index in enumerate(protocol_indices(truths.view_ids)):

@@ -258,7 +258,8 @@ def _notes(study: DistanceStudy) -> list[str]:
     notes = [
         "Distance of a view: the median true depth of its scored pixels. z: truth, p: prediction.",
         "Intervals: bootstrap over blocks of neighbouring views; they hold for other views of the same scenes, "
-        f"not for other scenes. {formatting.DASH}: undefined, or no interval from fewer than {MIN_VIEWS} views.",
+        "not for other scenes. In configs with splits: bootstrap over scenes; they hold for others of the same "
+        f"generator. {formatting.DASH}: undefined, or no interval from fewer than {MIN_VIEWS} views or scenes.",
     ]
     without = sum(point.score.scale is None for point in study.points)
     if without:

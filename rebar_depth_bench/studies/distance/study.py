@@ -24,7 +24,8 @@ from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS, Interval, Resampling,
 from rebar_depth_bench.scoring.metrics import DepthMetrics, mean
 from rebar_depth_bench.scoring.provenance import Provenance
 from rebar_depth_bench.scoring.single_bar import SingleBarScore, mean_single_bar
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.scoring.view_score import ViewScore, resample_views
+from rebar_depth_bench.view_ids import split_of
 
 MIN_DISTANCE_RATIO = 1.05
 """Minimum ratio of the farthest to the nearest view distance for which a slope is fitted."""
@@ -129,7 +130,7 @@ def fit_scale_slope(name: str, configs: Mapping[str, Sequence[DistancePoint]]) -
 
     For the interval, the views of each config are resampled separately. The value of the slope is None if fewer
     than two views have a scale or if their distances differ by less than a factor of ``MIN_DISTANCE_RATIO``; its
-    interval is None if a config has fewer than ``MIN_VIEWS`` such views.
+    interval is None if a config has fewer than ``MIN_VIEWS`` such views, or scenes of them if it has several.
     """
     usable = [scaled for points in configs.values() if (scaled := [p for p in points if _has_usable_scale(p)])]
     all_points = [point for points in usable for point in points]
@@ -143,8 +144,9 @@ def fit_scale_slope(name: str, configs: Mapping[str, Sequence[DistancePoint]]) -
         _least_squares_slopes(np.sum([view_moments.sum(axis=0) for view_moments in moments], axis=0)[None])[0]
     )
     slope_interval = None
-    if min(map(len, usable)) >= MIN_VIEWS:
-        sums = [resample(_view_indices(p)).counts @ m for p, m in zip(usable, moments, strict=True)]
+    resamplings = list(map(_resampling, usable))
+    if min(resampling.counts.shape[1] for resampling in resamplings) >= MIN_VIEWS:
+        sums = [one.counts @ one.sums(of_views) for one, of_views in zip(resamplings, moments, strict=True)]
         slope_interval = interval(_least_squares_slopes(np.sum(sums, axis=0)))
     return ScaleSlope(name, len(all_points), nearest_m, farthest_m, IntervalEstimate(value, slope_interval))
 
@@ -152,7 +154,7 @@ def fit_scale_slope(name: str, configs: Mapping[str, Sequence[DistancePoint]]) -
 def _make_bin(points: Sequence[DistancePoint], low_m: float, high_m: float) -> DistanceBin:
     scales = np.array([scale for point in points if (scale := point.score.scale) is not None])
     with_scale = np.flatnonzero([point.score.scale is not None for point in points])
-    resampling = resample(_view_indices(points))
+    resampling = _resampling(points)
     medians = resampling.percentile(scales, with_scale, 50)
     native_abs_rel, scaled_abs_rel = _mean_abs_rels(points, resampling)
     return DistanceBin(
@@ -184,8 +186,12 @@ def _abs_rel(metrics: DepthMetrics | None) -> float:
     return metrics.abs_rel if metrics else math.nan
 
 
-def _view_indices(points: Sequence[DistancePoint]) -> list[int]:
-    return [point.index for point in points]
+def _resampling(points: Sequence[DistancePoint]) -> Resampling:
+    """Return the resamples of the views of one config: of whole scenes if it has several."""
+    view_ids = [point.score.view_id for point in points]
+    if split_of(view_ids[0]) is not None:
+        return resample_views(view_ids, by_scene=True)
+    return resample([point.index for point in points])
 
 
 def _has_usable_scale(point: DistancePoint) -> bool:

@@ -118,7 +118,7 @@ def run_anchor_study(
         evaluation.check_entries(progress)
         submission = evaluation.submission
         chosen = select_config(evaluation, config)
-        name, truths = chosen.name, config_truth(chosen, progress)
+        name, truths = chosen.name, config_truth(evaluation.folder, chosen, progress)
         view_ratios = map_views(submission, truths, len(truths), view_ratio, f"ratios of {name}", progress)
         ratios = np.array([view.ratio for view in view_ratios if view.ratio is not None])
         usable_counts = [k for k in sorted(set(counts)) if k <= len(ratios)]

@@ -163,7 +163,8 @@ def test_table_is_at_most_100_columns(tiny_truth: Depths, tiny_root: Path, archi
     console = Console(width=100, record=True, file=io.StringIO())
     print_extended(extended(archive_of(tiny_truth), tiny_root), console)
     text = console.export_text()
-    assert all(family.title in text for family in MEASURE_FAMILIES.values())
+    shown = {key for key, family in MEASURE_FAMILIES.items() if family.title in text}
+    assert shown == MEASURE_FAMILIES.keys() - {"as_built"}, "the lattice has no design"
     assert max(map(len, text.splitlines())) <= 100
 
 

@@ -34,6 +34,7 @@ from rebar_depth_bench.extended.result import (
     view_value,
 )
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
+from rebar_depth_bench.scoring.bootstrap import resample
 from tests.bench.reporting.results import result, scored_view
 
 SPACING, STIRRUPS = GB_50204.tolerances[:2]
@@ -54,7 +55,7 @@ def view(index: int, filled: Mapping[str, np.ndarray]) -> ExtendedView:
 
 def table_of(filled: list[dict[str, np.ndarray]]) -> ExtendedTable:
     views = [view(100 * index, samples) for index, samples in enumerate(filled)]
-    return tabulate_extended(views, [100 * index for index in range(len(views))], measures_by_alignment())
+    return tabulate_extended(views, resample(range(0, 100 * len(views), 100)), measures_by_alignment())
 
 
 def spacings(scale: float = 1.0) -> list[dict[str, np.ndarray]]:
@@ -162,7 +163,7 @@ def test_single_view_has_capability() -> None:
 
 def extended_of(filled: list[dict[str, np.ndarray]]) -> ExtendedResult:
     views = [view(100 * index, samples) for index, samples in enumerate(filled)]
-    table = tabulate_extended(views, [100 * index for index in range(len(views))], measures_by_alignment())
+    table = tabulate_extended(views, resample(range(0, 100 * len(views), 100)), measures_by_alignment())
     return ExtendedResult(
         measures_by_alignment(),
         {"lattice": table},

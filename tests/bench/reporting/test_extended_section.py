@@ -27,6 +27,7 @@ from rebar_depth_bench.reporting.html.extended import (
     measure_definitions,
 )
 from rebar_depth_bench.reporting.html.page import render_report
+from rebar_depth_bench.scoring.bootstrap import resample
 from rebar_depth_bench.scoring.result import Result
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, panels, result, scored_view
@@ -80,7 +81,7 @@ def make_extended(*configs: str, levels: dict[str, float] | None = None, views: 
         for config in configs
     }
     tables = {
-        config: tabulate_extended(config_views, INDICES[:views], measures)
+        config: tabulate_extended(config_views, resample(INDICES[:views]), measures)
         for config, config_views in by_config.items()
     }
     return ExtendedResult(

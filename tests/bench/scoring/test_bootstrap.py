@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS, RESAMPLES, Resampling, block_length, interval, resample
+from rebar_depth_bench.scoring.bootstrap import (
+    MIN_VIEWS,
+    RESAMPLES,
+    Resampling,
+    block_length,
+    interval,
+    resample,
+    resample_scenes,
+)
 
 
 def mean_interval(values: np.ndarray, indices: range) -> tuple[float, float] | None:
@@ -110,3 +118,63 @@ def test_interval_is_within_values_and_follows_their_unit(
     assert moved_bounds == pytest.approx(
         [factor * bound + shift for bound in bounds], rel=1e-6, abs=1e-6 + 1e3 * slack
     )
+
+
+SCENES = np.repeat(np.arange(7), [3, 1, 4, 2, 2, 5, 1])
+"""Scene of each view."""
+
+
+def test_whole_scenes_are_drawn() -> None:
+    resampling = resample_scenes([f"cages/test-{scene}-" for scene in SCENES])
+    assert resampling.counts.shape == (RESAMPLES, 7)
+    assert (resampling.counts.sum(axis=1) == 7).all()
+    assert abs(resampling.counts.mean(axis=0) - 1.0).max() < 0.1
+    # Draws with replacement: two scenes have the covariance -1/7 of a multinomial distribution.
+    assert np.cov(resampling.counts.T)[0, 1] == pytest.approx(-1 / 7, abs=0.05)
+
+
+def test_statistics_of_drawn_scenes_equal_numpy() -> None:
+    rng = np.random.default_rng(6)
+    values = rng.normal(size=len(SCENES))
+    values[[0, 4, 5]] = np.nan
+    resampling = resample_scenes([str(scene) for scene in SCENES])
+    view = np.repeat(np.arange(len(SCENES)), rng.integers(0, 4, len(SCENES)))
+    samples = rng.normal(size=len(view))
+    means, medians = resampling.means(values[:, None])[:, 0], resampling.medians(values)
+    pooled, upper = resampling.pooled_means(samples, view), resampling.percentile(samples, view, 95)
+    for draw in range(0, RESAMPLES, 97):
+        drawn = np.repeat(np.arange(7), resampling.counts[draw].astype(int))
+        views = np.concatenate([np.flatnonzero(scene == SCENES) for scene in drawn])
+        assert means[draw] == pytest.approx(np.nanmean(values[views]))
+        assert medians[draw] == pytest.approx(np.nanmedian(values[views]))
+        pool = np.sort(np.concatenate([samples[view == one] for one in views]))
+        assert pooled[draw] == pytest.approx(pool.mean())
+        assert upper[draw] == pool[math.ceil(0.95 * len(pool)) - 1]
+
+
+def test_few_scenes_have_no_interval_however_many_views() -> None:
+    few = resample_scenes([str(index % (MIN_VIEWS - 1)) for index in range(100)])
+    values = np.random.default_rng(2).normal(size=100)
+    view = np.arange(100)
+    assert interval(few.means(values[:, None])[:, 0]) is None
+    assert interval(few.medians(values)) is None
+    assert interval(few.pooled_means(values, view)) is None
+    enough = resample_scenes([str(index % MIN_VIEWS) for index in range(100)])
+    assert interval(enough.means(values[:, None])[:, 0]) is not None
+    in_four_scenes = np.where(view % MIN_VIEWS == 0, np.nan, values)
+    assert interval(enough.means(in_four_scenes[:, None])[:, 0]) is None
+    assert interval(resample_scenes([]).medians(np.empty(0))) is None
+
+
+def test_scenes_give_the_interval_of_clustered_means() -> None:
+    """Errors that views of a scene share make the interval as wide as that of the means of the scenes."""
+    rng = np.random.default_rng(9)
+    of_scene = rng.normal(size=60)
+    values = np.repeat(of_scene, 8) + 0.01 * rng.normal(size=480)
+    by_scene = interval(resample_scenes([str(n // 8) for n in range(480)]).means(values[:, None])[:, 0])
+    by_block = mean_interval(values, range(0, 480 * 12, 12))
+    assert by_scene is not None
+    assert by_block is not None
+    half_width = 1.96 * of_scene.std() / math.sqrt(60)
+    assert by_scene == pytest.approx((values.mean() - half_width, values.mean() + half_width), abs=0.03)
+    assert by_block[1] - by_block[0] < 0.5 * (by_scene[1] - by_scene[0])

@@ -56,7 +56,7 @@ def test_views_have_one_row_each(two_configs: Result) -> None:
 
 def test_unknown_or_missing_rows_raise_value_error(two_configs: Result) -> None:
     for rows in ("bars", "extended"):
-        with pytest.raises(ValueError, match="expected 'tables', 'views'"):
+        with pytest.raises(ValueError, match="expected 'tables', 'groups', 'views'"):
             two_configs.to_pandas(rows)  # type: ignore[arg-type]
 
 

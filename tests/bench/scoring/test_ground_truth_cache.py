@@ -28,6 +28,7 @@ from rebar_depth_bench.progress import silent
 from rebar_depth_bench.scoring.ground_truth import config_truth, verified_views
 from tests.commands import run_in_process
 from tests.damage import change_manifest
+from tests.ground_truth import truth_of
 from tests.requirements import Repetitions
 
 GRID = (90, 160)
@@ -96,7 +97,7 @@ def test_changed_digit_of_median_is_detected(
 ) -> None:
     expected = score(archive, tiny_root).to_json()
     [path] = empty_cache.iterdir()
-    [*_, median_m] = config_truth(open_folder(tiny_root).config(CONFIG)).medians_m
+    [*_, median_m] = truth_of(tiny_root, CONFIG).medians_m
     content = path.read_bytes()
     digits = str(median_m).encode()
     changed = digits.replace(b"0.", b"9.", 1)
@@ -110,7 +111,7 @@ def test_changed_digit_of_median_is_detected(
 def test_cache_of_other_views_is_refused(tiny_root: Path, archive: Path, empty_cache: Path) -> None:
     expected = score(archive, tiny_root).to_json()
     [path] = empty_cache.iterdir()
-    config_truth(open_folder(tiny_root).config("lattice"))
+    truth_of(tiny_root, "lattice")
     [other] = {*empty_cache.iterdir()} - {path}
     other.replace(path)
     assert score(archive, tiny_root).to_json() == expected
@@ -118,7 +119,7 @@ def test_cache_of_other_views_is_refused(tiny_root: Path, archive: Path, empty_c
 
 def write_old_cache(config: DatasetConfig, folder: Path) -> None:
     """Write a cache as earlier versions kept it in the dataset folder, with a false depth and sound checksums."""
-    truth = config_truth(config)
+    truth = config_truth(open_folder(config.root), config)
     path = folder / ".rebar-cache" / f"rebar-1-{config.name}-{config.ground_truth_digest[7:39]}"
     path.mkdir(parents=True, exist_ok=True)
     starts, checksums, arrays = [0], [], []
@@ -167,7 +168,7 @@ def test_digest_in_manifest_is_no_path(tiny_root: Path, tmp_path: Path, empty_ca
         update={"ground_truth_digest": "/../../../Documents", "name": "../../Documents"}
     )
     for _ in range(2):  # The second run deleted the folder.
-        config_truth(hostile)
+        config_truth(folder, hostile)
         load_steel_truth(folder, hostile)
     assert tree(documents) == {"letter.txt": b"precious"}
     assert len([*empty_cache.iterdir()]) == 2
@@ -176,9 +177,9 @@ def test_digest_in_manifest_is_no_path(tiny_root: Path, tmp_path: Path, empty_ca
 
 def test_other_views_have_an_entry_of_their_own(tiny_root: Path, copy: Path, empty_cache: Path) -> None:
     change_manifest(copy, lambda _, config: config["views"].pop(), CONFIG)
-    assert len(config_truth(open_folder(tiny_root).config(CONFIG))) == 2
+    assert len(truth_of(tiny_root, CONFIG)) == 2
     with pytest.raises(DatasetError, match="the file has 2 rows"):
-        config_truth(open_folder(copy).config(CONFIG))
+        truth_of(copy, CONFIG)
     assert len([*empty_cache.iterdir()]) == 1
 
 
@@ -192,13 +193,13 @@ def test_dataset_folder_is_not_written(copy: Path, archive: Path) -> None:
 
 @pytest.mark.usefixtures("empty_cache")
 def test_shuffled_rows_give_the_same_order(tiny_root: Path, copy: Path) -> None:
-    expected = config_truth(open_folder(tiny_root).config("lattice")).view_ids
+    expected = truth_of(tiny_root, "lattice").view_ids
     for path in copy.glob("lattice/*.parquet"):
         table = pq.read_table(path)
         pq.write_table(table.take(np.arange(len(table))[::-1]), path)
     for path in Path(os.environ["XDG_CACHE_HOME"]).glob("*/*"):
         path.unlink()
-    truths = config_truth(open_folder(copy).config("lattice"))
+    truths = truth_of(copy, "lattice")
     assert tuple(truth.view_id for truth in truths) == truths.view_ids == expected
 
 
@@ -206,7 +207,7 @@ def test_shuffled_rows_give_the_same_order(tiny_root: Path, copy: Path) -> None:
 def test_infinite_depth_of_scored_pixel_names_view(copy: Path) -> None:
     change_depth(copy, lambda depth_m: np.where(depth_m > 0, np.float32(np.inf), depth_m))
     with pytest.raises(DatasetError, match=rf"view {CONFIG}/\d+: left_depth is damaged"):
-        config_truth(open_folder(copy).config(CONFIG))
+        truth_of(copy, CONFIG)
 
 
 @pytest.mark.usefixtures("empty_cache")
@@ -216,7 +217,7 @@ def test_grid_that_differs_from_images_names_view(copy: Path) -> None:
 
     change_manifest(copy, turn, CONFIG)
     with pytest.raises(DatasetError, match=rf"view {CONFIG}/\d+: left_depth is damaged: its size"):
-        config_truth(open_folder(copy).config(CONFIG))
+        truth_of(copy, CONFIG)
 
 
 def change_depth(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
@@ -257,7 +258,7 @@ def test_cache_command_shows_and_clears(tiny_root: Path, empty_cache: Path) -> N
 
     limit = "of at most 21474836480 (REBAR_MAX_CACHE_BYTES)"
     assert lines() == f"{empty_cache}: 0 files, 0 bytes {limit}\n"
-    config_truth(open_folder(tiny_root).config(CONFIG))
+    truth_of(tiny_root, CONFIG)
     [path] = empty_cache.iterdir()
     size = f"1 file, {path.stat().st_size} bytes"
     assert lines() == f"{empty_cache}: {size} {limit}\n"

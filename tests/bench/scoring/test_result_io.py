@@ -122,6 +122,48 @@ def test_wrong_value_is_refused_with_its_place(change: Change, location: str) ->
     assert location in refused(json.dumps(document).encode())
 
 
+def with_groups(groups: object) -> bytes:
+    document = json.loads(SOUND)
+    document["tables"]["lattice"]["groups"] = groups
+    return json.dumps(document).encode()
+
+
+TABLE = json.loads(SOUND)["tables"]["lattice"]
+
+
+@pytest.mark.parametrize(
+    ("groups", "location"),
+    [
+        ([], "invalid tables.lattice.groups"),
+        (None, "invalid tables.lattice.groups"),
+        ({"family": [TABLE]}, "invalid tables.lattice.groups.family"),
+        ({"family": {"wall": None}}, "invalid tables.lattice.groups.family.wall"),
+        ({"family": {"wall": TABLE | {"views": -1}}}, "invalid tables.lattice.groups.family.wall.views"),
+        ({"family": {"wall": TABLE | {"native": None}}}, "conflict tables.lattice.groups.family.wall"),
+        ({"family": {"a\x1b[2J": TABLE}}, r"invalid tables.lattice.groups.family.'a\x1b[2J'"),
+        ({"a" * 800_000: {}}, "invalid tables.lattice.groups"),
+        ({"family": {str(key): 0 for key in range(20_000)}}, "size tables"),
+        ({str(key): {str(group): 0 for group in range(100)} for key in range(1000)}, "size tables"),
+        ({"family": {"wall": TABLE | {"rank_error": None}}}, "missing "),
+    ],
+)
+def test_wrong_groups_are_refused_with_their_place(groups: object, location: str) -> None:
+    assert any(found.startswith(location) for found in refused(with_groups(groups)))
+
+
+def test_groups_of_groups_are_ignored() -> None:
+    """Nothing depends on how deep a hostile file nests groups."""
+    nested: dict[str, Any] = {"family": {"wall": TABLE}}
+    read = read_result(with_groups({"family": {"wall": TABLE | {"groups": nested}}}), "x")
+    assert read.tables["lattice"].groups["family"]["wall"].groups == {}
+    assert read.to_json() == read_result(with_groups({"family": {"wall": TABLE}}), "x").to_json()
+
+
+def test_groups_of_later_versions_are_kept() -> None:
+    read = read_result(with_groups({"weather": {"rain": TABLE}}), "x")
+    assert json.loads(read.to_json())["tables"]["lattice"]["groups"] == {"weather": {"rain": TABLE}}
+
+
 def test_result_beyond_the_limit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REBAR_MAX_JSON_BYTES", str(len(SOUND) - 1))
     assert refused(SOUND) == ["size "]

@@ -21,12 +21,13 @@ from hypothesis import strategies as st
 from rebar_depth_bench import DatasetError, SubmissionError, score
 from rebar_depth_bench.data.codecs import decode_depth, decode_mask, encode_depth, encode_mask
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.scoring.ground_truth import ViewTruth, config_truth
+from rebar_depth_bench.scoring.ground_truth import ViewTruth
 from rebar_depth_bench.scoring.protocol import interior
 from rebar_depth_bench.scoring.result import Table, tabulate
 from rebar_depth_bench.scoring.rounding import rounded
 from rebar_depth_bench.scoring.score import score_view
 from tests.damage import change_manifest
+from tests.ground_truth import truth_of
 
 Depths = dict[str, np.ndarray]
 Archive = Callable[..., Path]
@@ -213,4 +214,4 @@ def test_ground_truth_images_of_other_size_name_view(
     rows[1][column] = damage(rows[1][column])
     pq.write_table(pa.Table.from_pylist(rows, table.schema), shard)
     with pytest.raises(DatasetError, match=f"view {rows[1]['view_id']}: {column} is damaged: its size is"):
-        config_truth(open_folder(copy).config("lattice-orbit"))
+        truth_of(copy, "lattice-orbit")

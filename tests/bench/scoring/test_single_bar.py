@@ -15,16 +15,15 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.full_mask import REGION_NUMBERS, full_mask_samples
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, MIN_PIXELS, profile_samples
 from rebar_depth_bench.extended.single_bar import single_bar_samples
-from rebar_depth_bench.scoring.ground_truth import config_truth
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels
 from rebar_depth_bench.scoring.single_bar import SingleBarScore
 from rebar_depth_bench.studies.distance.command import run_distance_study
 from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth
+from tests.ground_truth import truth_of
 
 Depths = dict[str, ndarray]
 Archive = Callable[..., Path]
@@ -171,7 +170,7 @@ def rendered(root: Path, config: str) -> Mapping[str, tuple[ndarray, ndarray, nd
 
 
 def test_rendered_views(tiny_root: Path) -> None:
-    truths = config_truth(open_folder(tiny_root).config("lattice"))
+    truths = truth_of(tiny_root, "lattice")
     images = rendered(tiny_root, "lattice")
     shares = []
     for position, truth in enumerate(truths):

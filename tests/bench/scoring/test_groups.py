@@ -1,0 +1,284 @@
+"""Tables of groups of views: independent formulas, groups scored alone, and what configs of one scene keep."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.ndimage import binary_erosion
+
+import rebar_depth_bench as rdb
+from rebar_depth_bench.data.bars import BARS_FILE
+from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.scoring.bootstrap import resample_scenes
+from rebar_depth_bench.scoring.comparison import compare
+from rebar_depth_bench.scoring.disclosure import disclosed_json
+from rebar_depth_bench.scoring.groups import (
+    DISTANCE_EDGES_M,
+    GROUPINGS,
+    WIDTH_EDGES_PX,
+    ViewTraits,
+    bar_width_px,
+    bin_names,
+    positions_by_group,
+)
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.result_io import read_result, read_table
+from tests.synthetic_dataset import write_archive, write_dataset, write_split_dataset
+
+# The depth of a bar is 0.3 m + 0.01 m times ten times the number of its scene, and more downwards.
+NUMBERS = {"a1": 1, "b1": 2, "a2": 5, "b2": 9, "a3": 10, "b3": 18, "a4": 25, "b4": 38, "a5": 3, "a6": 5}
+FAMILIES = {name: {"a": "wall", "b": "beam"}[name[0]] for name in NUMBERS}
+DIAMETERS_M = {name: 0.006 * number for number, name in enumerate(NUMBERS, start=1)}
+SCENES = dict.fromkeys(NUMBERS, "test")
+VIEWS = 2
+FOCAL_PX = 100.0
+
+
+def write_cages(root: Path, names: list[str]) -> Path:
+    chosen = {name: split for name, split in SCENES.items() if name in names}
+    write_split_dataset(root, chosen, VIEWS, families=FAMILIES, numbers=NUMBERS, diameters_m=DIAMETERS_M)
+    return root
+
+
+def write_noisy(root: Path, archive: Path, method: str = "noisy", factor: float = 1.0) -> Path:
+    """Write predictions that depend on the id of the view alone; a quarter of the pixels have none."""
+    with rdb.SubmissionWriter(archive, method, inputs="rgb", uses_ground_truth=False) as writer:
+        for row in rdb.load(root, "cages", columns=["view_id", "left_depth"], streaming=True):
+            rng = np.random.default_rng(list(row["view_id"].encode()))
+            noise = factor * (1.02 + 0.05 * rng.standard_normal(row["left_depth"].shape))
+            noise[rng.random(noise.shape) < 0.25] = np.nan
+            writer.add(row["view_id"], (row["left_depth"] * noise).astype(np.float32))
+    return archive
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_cages(tmp_path_factory.mktemp("groups") / "dataset", list(SCENES))
+
+
+@pytest.fixture(scope="module")
+def archive(root: Path) -> Path:
+    return write_noisy(root, root.parent / "noisy.zip")
+
+
+@pytest.fixture(scope="module")
+def scored(root: Path, archive: Path) -> Result:
+    return rdb.score(archive, root)
+
+
+def median_of_four(z: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[float, float]:
+    """Return AbsRel and RMSE (cm) of exact depth one pixel aside, means of four directions."""
+    errors = []
+    for v, u in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        inside = (rows + v >= 0) & (rows + v < z.shape[0]) & (columns + u >= 0) & (columns + u < z.shape[1])
+        near, own = z[rows[inside] + v, columns[inside] + u], z[rows[inside], columns[inside]]
+        near, own = near[near > 0].astype(float), own[near > 0].astype(float)
+        errors.append((np.mean(np.abs(near - own) / own), 100 * np.sqrt(np.mean((near - own) ** 2))))
+    return tuple(np.mean(errors, axis=0))
+
+
+def expected_numbers(root: Path, archive: Path) -> dict[str, dict[str, Any]]:
+    """Return family, distance, width and errors of each view, from the rows and the formulas of the protocol."""
+    numbers = {}
+    with np.load(archive) as predictions:
+        for row in rdb.load(root, "cages"):
+            z = row["left_depth"]
+            inside = binary_erosion(row["left_mask"], np.ones((3, 3))) & (z > 0)
+            scored_m, p = z[inside].astype(float), predictions[row["view_id"]][inside].astype(float)
+            valid = np.isfinite(p) & (p > 0)
+            ratio = np.minimum(p[valid] / scored_m[valid], scored_m[valid] / p[valid])
+            middle = np.median(scored_m)
+            numbers[row["view_id"]] = {
+                "family": FAMILIES[row["scene"]],
+                "distance": middle,
+                "width": np.median(FOCAL_PX * DIAMETERS_M[row["scene"]] / scored_m),
+                "rank_error": ((1 - ratio).sum() + (~valid).sum()) / len(p),
+                "abs_rel": np.mean(np.abs(p[valid] - scored_m[valid]) / scored_m[valid]),
+                "constant": np.mean(np.abs(middle - scored_m) / scored_m),
+                "one_pixel": median_of_four(z, *np.nonzero(inside))[0],
+            }
+    return numbers
+
+
+def test_tables_of_groups_equal_independent_formulas(root: Path, archive: Path, scored: Result) -> None:
+    views = expected_numbers(root, archive)
+
+    def bin_of(value: float, edges: tuple[float, ...], unit: str) -> str:
+        low = max(edge for edge in edges if edge <= value)
+        high = min(edge for edge in edges if edge > value)
+        return f"{low:g}+ {unit}" if high == math.inf else f"{low:g}-{high:g} {unit}"
+
+    expected: dict[str, dict[str, list[str]]] = {"family": {}, "distance": {}, "bar_width": {}}
+    for view_id, view in views.items():
+        expected["family"].setdefault(view["family"], []).append(view_id)
+        expected["distance"].setdefault(bin_of(view["distance"], (0, 0.5, 1, 2, 4, math.inf), "m"), []).append(
+            view_id
+        )
+        width = bin_of(view["width"], (0, 2, 4, 8, 16, math.inf), "px")
+        expected["bar_width"].setdefault(width, []).append(view_id)
+    assert {key: len(groups) for key, groups in expected.items()} == {"family": 2, "distance": 5, "bar_width": 4}
+
+    groups = json.loads(scored.to_json())["tables"]["cages"]["groups"]
+    assert {key: set(tables) for key, tables in groups.items()} == {
+        key: set(of_grouping) for key, of_grouping in expected.items()
+    }
+    for key, of_grouping in expected.items():
+        for group, view_ids in of_grouping.items():
+            table = groups[key][group]
+            means = {
+                name: np.mean([views[view_id][name] for view_id in view_ids])
+                for name in ("rank_error", "abs_rel", "constant", "one_pixel")
+            }
+            assert (table["views"], table["split"]) == (len(view_ids), "test")
+            assert table["rank_error"] == pytest.approx(means["rank_error"], rel=1e-9)
+            assert table["native"]["abs_rel"] == pytest.approx(means["abs_rel"], rel=1e-9)
+            assert table["reference"]["constant"]["abs_rel"] == pytest.approx(means["constant"], rel=1e-9)
+            assert table["reference"]["one_pixel"]["abs_rel"] == pytest.approx(means["one_pixel"], rel=1e-9)
+
+
+def test_groups_are_in_order(scored: Result) -> None:
+    groups = scored.tables["cages"].groups
+    assert list(groups) == ["family", "distance", "bar_width"]
+    assert list(groups["family"]) == ["beam", "wall"]
+    assert list(groups["distance"]) == ["0-0.5 m", "0.5-1 m", "1-2 m", "2-4 m", "4+ m"]
+    for tables in groups.values():
+        assert sum(table.views for table in tables.values()) == scored.tables["cages"].views
+
+
+@pytest.mark.parametrize(
+    ("key", "group"), [("family", "wall"), ("family", "beam"), ("distance", "0.5-1 m"), ("distance", "4+ m")]
+)
+def test_table_of_a_group_is_that_of_its_views_scored_alone(
+    scored: Result, tmp_path: Path, key: str, group: str
+) -> None:
+    """Score the same predictions on a dataset that has the scenes of the group alone."""
+    names = {
+        "wall": [name for name in SCENES if name[0] == "a"],
+        "beam": [name for name in SCENES if name[0] == "b"],
+        "0.5-1 m": ["b1", "a2", "a5", "a6"],
+        "4+ m": ["b4"],
+    }[group]
+    alone_root = write_cages(tmp_path / "alone", names)
+    alone = rdb.score(write_noisy(alone_root, tmp_path / "alone.zip"), alone_root).to_dict()["tables"]["cages"]
+    del alone["groups"]
+    of_group = scored.to_dict()["tables"]["cages"]["groups"][key][group]
+    assert of_group == alone
+    has_interval = len(names) >= 5
+    assert (of_group["ci95"]["rank_error"] is not None) == has_interval
+
+
+def test_result_with_groups_is_read_unchanged(scored: Result) -> None:
+    assert read_result(scored.to_json(), "x").to_json() == scored.to_json()
+    table = scored.to_dict()["tables"]["cages"]
+    assert read_table(table).groups == {}
+
+
+def test_frame_of_groups_has_the_numbers_of_the_json(scored: Result) -> None:
+    frame = scored.to_pandas("groups").set_index(["config", "split", "grouping", "group"])
+    groups = scored.to_dict()["tables"]["cages"]["groups"]
+    assert list(frame.index) == [("cages", "test", key, group) for key in groups for group in groups[key]]
+    for key, tables in groups.items():
+        for group, table in tables.items():
+            row = frame.loc[("cages", "test", key, group)]
+            assert row["scaled_rmse_cm"] == table["scaled"]["rmse_cm"]
+            assert row["one_pixel_abs_rel"] == table["reference"]["one_pixel"]["abs_rel"]
+    wall = frame.loc[("cages", "test", "family", "wall")]
+    assert [wall["rank_error_low"], wall["rank_error_high"]] == groups["family"]["wall"]["ci95"]["rank_error"]
+
+
+def test_configs_of_one_scene_have_no_groups_and_need_no_bars(tmp_path: Path) -> None:
+    write_dataset(tmp_path / "one", ["lattice"], 6)
+    assert not (tmp_path / "one" / BARS_FILE).exists()
+    write_archive(tmp_path / "a.zip", ["lattice"], 6, "noisy", 0)
+    result = rdb.score(tmp_path / "a.zip", tmp_path / "one")
+    assert result.tables["lattice"].groups == {}
+    assert b"groups" not in result.to_json()
+    frame = result.to_pandas("groups")
+    assert frame.empty
+    assert {"grouping", "group", "rank_error", "rank_error_low"} <= set(frame.columns)
+
+
+@pytest.mark.parametrize("damage", ["removed", "changed"])
+def test_split_without_sound_bars_is_refused(tmp_path: Path, damage: str) -> None:
+    copy = write_cages(tmp_path / "copy", ["a1", "b1"])
+    archive = write_noisy(copy, tmp_path / "a.zip")
+    bars = copy / BARS_FILE
+    if damage == "removed":
+        bars.unlink()
+    else:
+        bars.write_bytes(bars.read_bytes() + b"x")
+    with pytest.raises(DatasetError, match=r"bars\.parquet"):
+        rdb.score(archive, copy)
+
+
+def test_groups_are_not_disclosed(scored: Result) -> None:
+    disclosed = disclosed_json(scored.to_json())
+    assert b"groups" not in disclosed
+    assert b"wall" not in disclosed
+
+
+def test_comparison_resamples_scenes(root: Path, archive: Path, tmp_path: Path, scored: Result) -> None:
+    other = rdb.score(write_noisy(root, tmp_path / "b.zip", "other", 1.05), root)
+    [row] = [row for row in compare(scored, other).configs["cages"] if row.name == "rank_error"]
+    change = [b.rank_error - a.rank_error for a, b in zip(scored.views, other.views, strict=True)]  # type: ignore[operator]
+    by_scene = np.reshape(change, (len(SCENES), VIEWS))
+    counts = resample_scenes(list(SCENES)).counts
+    means = [np.repeat(by_scene, drawn.astype(int), axis=0).mean() for drawn in counts]
+    assert row.interval == pytest.approx(np.percentile(means, [2.5, 97.5]))
+
+
+traits = st.builds(
+    ViewTraits,
+    st.sampled_from([None, "wall", "slab", "column"]),
+    st.floats(1e-3, 1e3),
+    st.none() | st.floats(1e-3, 1e3),
+)
+
+
+@given(st.lists(traits, max_size=30))
+def test_groups_are_a_partition_of_the_views_that_have_the_property(views: list[ViewTraits]) -> None:
+    values: dict[str, list[object]] = {
+        "family": [view.family for view in views],
+        "distance": [view.distance_m for view in views],
+        "bar_width": [view.bar_width_px for view in views],
+    }
+    for key, grouping in GROUPINGS.items():
+        groups = positions_by_group(grouping, views)
+        placed = [position for positions in groups.values() for position in positions]
+        assert sorted(placed) == [position for position, value in enumerate(values[key]) if value is not None]
+        assert all(positions == sorted(positions) and positions for positions in groups.values())
+        known = [group for group in grouping.order if group in groups]
+        assert list(groups) == (known or sorted(groups))
+
+
+@pytest.mark.parametrize(("edges", "unit"), [(DISTANCE_EDGES_M, "m"), (WIDTH_EDGES_PX, "px")])
+def test_bins_include_their_lower_edge(edges: tuple[float, ...], unit: str) -> None:
+    names = bin_names(edges, unit)
+    grouping = GROUPINGS["distance" if unit == "m" else "bar_width"]
+    for name, edge in zip(names[1:], edges[1:-1], strict=True):
+        below = math.nextafter(edge, 0)
+        at, before = (grouping.group_of(ViewTraits("wall", value, value)) for value in (edge, below))
+        assert (before, at) == (names[names.index(name) - 1], name)
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.125, 10, width=32), st.integers(0, 5)), min_size=1, max_size=40),
+    st.dictionaries(st.integers(1, 5), st.floats(0.004, 0.05)),
+)
+def test_bar_width_is_the_median_over_pixels_of_known_bars(
+    pixels: list[tuple[float, int]], diameter_m: Mapping[int, float]
+) -> None:
+    depth_m, bar_id = np.array([z for z, _ in pixels], np.float32), np.array([bar for _, bar in pixels], np.uint16)
+    widths = [700 * diameter_m[bar] / z for z, bar in pixels if bar in diameter_m]
+    found = bar_width_px(depth_m, bar_id, diameter_m, 700.0)
+    assert (found is None) == (not widths)
+    if found is not None:
+        assert found == pytest.approx(np.median(widths), rel=1e-12)
