@@ -47,6 +47,8 @@ def dataset_card(version: str, digest: str, configs: Sequence[DatasetConfig]) ->
         configs=[row for config in configs for row in _config_rows(config)],
         has_rendered=bool(_rendered(configs)),
         columns=column_rows(),
+        example=configs[0].name,
+        example_split=configs[0].splits[0],
     )
 
 

@@ -139,16 +139,18 @@ def _view_id(config: str, index: int) -> str:
 
 
 def _view(view_id: str, index: int) -> View:
-    eye = _eye(index)
-    return View(view_id, config_of(view_id), eye, eye, BASELINE_M)
+    return View(view_id, config_of(view_id), _eye(index, 0.0), _eye(index, BASELINE_M), BASELINE_M)
 
 
-def _eye(index: int) -> EyeView:
+def _eye(index: int, x_m: float) -> EyeView:
+    """Return what a camera sees that is displaced by ``x_m``; the scene moves with the camera."""
     mask = np.broadcast_to(_is_bar(), (HEIGHT, WIDTH))
     K = np.array([[100.0, 0.0, (WIDTH - 1) / 2], [0.0, 100.0, (HEIGHT - 1) / 2], [0.0, 0.0, 1.0]])
+    cam_from_world = np.eye(4)
+    cam_from_world[0, 3] = -x_m
     return EyeView(
-        Camera(K, np.zeros(5), np.eye(4), WIDTH, HEIGHT),
-        rgb=np.full((HEIGHT, WIDTH, 3), 128, dtype=np.uint8),
+        Camera(K, np.zeros(5), cam_from_world, WIDTH, HEIGHT),
+        rgb=np.where(mask[..., None], 200, 60).astype(np.uint8).repeat(3, axis=2),
         depth_m=_depth_m(index),
         mask=mask,
         bars=mask.astype(np.uint16),

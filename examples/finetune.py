@@ -1,0 +1,360 @@
+"""Training of a small depth network on generated cages, its export to ONNX, and its score beside SGBM.
+
+    SIZE="--width 320 --height 180 --quality preview"
+    rebar-build --out ROOT --config cages --split train --scenes 40 --views-per-scene 6 $SIZE
+    rebar-build --out ROOT --config cages --split validation --scenes 8 --views-per-scene 6 $SIZE
+    rebar-build --out ROOT --config lattice pile --views 24 $SIZE
+    python examples/finetune.py ROOT --out finetuned --minutes 10
+
+It needs ``pip install 'rebar-depth-bench[torch,onnx,methods]' onnx`` and torch 2.5 or later. ``finetuned/`` then
+holds the weights of the last epoch (``checkpoint.pt``), the network as ``finetuned.onnx`` with ``finetuned.toml``,
+which ``rebar-bench predict finetuned/finetuned.toml --data ROOT`` takes, and one archive for each method and
+config of the table that is printed.
+
+**What the network predicts.** An image shows the ratio of bar diameter to distance, times the focal length: it
+cannot tell a long focal length from a short distance. The network therefore predicts canonical depth, the depth
+that a camera of ``FOCAL_PX`` would need for the same image, and the TOML file says so (Yin et al., "Metric3D",
+ICCV 2023, section 3.2). Crops and flips do not change it. The output is a logarithm, so that relative errors
+count alike at 0.3 m and 8 m.
+
+**What it is trained for.** The loss is the mean absolute error of the logarithm on steel, averaged over images as
+the protocol does, plus ``FRAME_WEIGHT`` times that of all pixels with a surface. For a logarithmic error e, the
+rank error of a pixel is 1 - exp(-|e|). Both images of each stereo pair are used, and no other data or weights.
+
+The same command continues an interrupted training after its last complete epoch, with the result that an
+uninterrupted one has. The same ``--seed``, ``--epochs``, ``--batch`` and ``--crop`` give the same weights on the
+same machine, unless ``--minutes`` ends the training.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+import rebar_depth_bench as rdb
+from rebar_depth_bench.atomic_io import atomic_replace, write_text
+from rebar_depth_bench.console import ProgressBars, duration_text, print_notice, run_command
+from rebar_depth_bench.data.dataset import check_columns
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.methods import find_method
+from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.reporting.formatting import coverage_percent, metric_cell, number, rank_error_cell
+
+CONFIG = "cages"
+TARGETS = ((CONFIG, "validation"), ("lattice", "test"), ("pile", "test"))
+"""Configs and splits that are scored, if the folder has them."""
+FOCAL_PX = 200.0
+"""Focal length of the canonical camera, pixels of the images that the network is trained on."""
+MEAN, STD = 0.5, 0.25
+"""Normalisation of colour, in units of white."""
+CHANNELS = (8, 16, 32, 64, 96, 128)
+"""Channels at full, half, quarter, ... resolution: 620,000 parameters."""
+FRAME_WEIGHT = 0.2
+LEARNING_RATE, WEIGHT_DECAY, WARM_UP = 2e-3, 1e-2, 0.05
+"""Peak of the learning rate, which rises over the share ``WARM_UP`` of the training and falls as a cosine."""
+GAINS = (0.6, 1.5)
+"""Range of the random factors of brightness in training."""
+
+
+KEYS = ("rgb", "depth", "mask", "K")
+COLUMNS = [
+    *("view_id", "baseline_m"),
+    *(f"{eye}_{kind}" for eye in ("left", "right") for kind in (*KEYS, "cam_from_world")),
+]
+"""Keys of a batch that are trained with, and the columns of its rows."""
+
+
+def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), nn.GroupNorm(8, outputs), nn.ReLU()
+    )
+
+
+class DepthNet(nn.Module):
+    """U-Net for images of any size: normalised colour B x 3 x H x W to log canonical depth B x 1 x H x W.
+
+    Each resolution is reached by a convolution with stride 2. Features of the coarser one are enlarged to the
+    nearest neighbour, which keeps the edges of bars, and added to those of the finer one.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = _convolution(3, CHANNELS[0])
+        steps = list(itertools.pairwise(CHANNELS))
+        self.down = nn.ModuleList(
+            nn.Sequential(_convolution(fine, coarse, 2), _convolution(coarse, coarse)) for fine, coarse in steps
+        )
+        self.narrow = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in steps)
+        self.merge = nn.ModuleList(_convolution(fine, fine) for fine, _ in steps)
+        self.head = nn.Conv2d(CHANNELS[0], 1, 3, padding=1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Return the logarithm of canonical depth in metres."""
+        levels = [self.stem(image)]
+        for down in self.down:
+            levels.append(down(levels[-1]))
+        features = levels.pop()
+        for narrow, merge in zip(reversed(self.narrow), reversed(self.merge), strict=True):
+            finer = levels.pop()
+            features = merge(finer + functional.interpolate(narrow(features), size=finer.shape[-2:]))
+        log_depth: Tensor = self.head(features)
+        return log_depth
+
+
+class _Exported(nn.Module):
+    """Network whose output is canonical depth in metres, as the TOML file describes."""
+
+    def __init__(self, net: DepthNet) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, image: Tensor) -> Tensor:
+        log_depth: Tensor = self.net(image)
+        return log_depth.exp()
+
+
+@dataclass
+class Training:
+    """State of a training: network, optimiser, complete epochs, and the seconds that they took.
+
+    ``plan`` holds what determines the weights: training continues a checkpoint of the same plan only.
+    """
+
+    plan: dict[str, Any]
+    net: DepthNet
+    optimiser: torch.optim.Optimizer
+    epoch: int = 0
+    seconds: float = 0.0
+
+    @classmethod
+    def start(cls, plan: dict[str, Any]) -> Training:
+        """Return a training with random weights of the seed."""
+        torch.manual_seed(plan["seed"])
+        net = DepthNet()
+        optimiser = torch.optim.AdamW(net.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+        return cls(plan, net, optimiser)
+
+    @classmethod
+    def open(cls, path: Path, plan: dict[str, Any]) -> Training:
+        """Return the training of a checkpoint, or a new one. Raises ``InputError`` if it is of another plan."""
+        training = cls.start(plan)
+        if path.exists():
+            try:
+                saved = torch.load(path, weights_only=True)
+            except Exception as error:  # torch raises many types, which depend on the damage.
+                raise InputError(
+                    f"{path}: cannot be read ({type(error).__name__}); delete it to start over"
+                ) from None
+            if saved["plan"] != plan:
+                changed = [name for name in plan if saved["plan"].get(name) != plan[name]]
+                raise InputError(f"{path}: was trained with other {', '.join(changed)}; choose another --out")
+            training.net.load_state_dict(saved["net"])
+            training.optimiser.load_state_dict(saved["optimiser"])
+            training.epoch, training.seconds = saved["epoch"], saved["seconds"]
+        return training
+
+    def save(self, path: Path) -> None:
+        """Write the checkpoint atomically."""
+        saved = {"net": self.net.state_dict(), "optimiser": self.optimiser.state_dict()}
+        with atomic_replace(path) as temporary:
+            torch.save({"plan": self.plan, "epoch": self.epoch, "seconds": self.seconds, **saved}, temporary)
+
+
+def images(batch: dict[str, Any]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return colour (0 to 1), log canonical depth, and masks of steel and of all surfaces of both eyes.
+
+    All are float32, B x C x H x W with C = 3 or 1, where B is twice the number of pairs.
+    """
+    rgb, depth_m, steel, K = (torch.cat([batch[f"{eye}{key}"] for eye in ("", "right_")]) for key in KEYS)
+    is_surface = depth_m > 0
+    factor = (FOCAL_PX / K[:, 0, 0]).float()[:, None, None, None]
+    target = torch.where(is_surface, depth_m * factor, torch.ones_like(depth_m)).log()
+    return rgb.float() / 255, target, (steel & is_surface).float(), is_surface.float()
+
+
+def image_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Return the mean over the images that have masked pixels of the mean over these pixels."""
+    pixels = mask.sum((1, 2, 3))
+    means = (values * mask).sum((1, 2, 3)) / pixels.clamp(min=1)
+    return means.sum() / (pixels > 0).sum().clamp(min=1)
+
+
+def train_epoch(
+    training: Training, batches: Sequence[dict[str, Any]] | Any, share_done: Callable[[int], float]
+) -> tuple[float, float]:
+    """Train one epoch, and return the mean errors of the logarithm on steel and on all surfaces.
+
+    ``share_done`` returns the share of the training that is done before a step of this epoch; at 1 it ends.
+    """
+    random = torch.Generator().manual_seed(training.plan["seed"] + training.epoch)
+    sums, steps = [0.0, 0.0], 0
+    for step, batch in enumerate(batches):
+        if (share := share_done(step)) >= 1:
+            break
+        for group in training.optimiser.param_groups:
+            group["lr"] = LEARNING_RATE * min(share / WARM_UP + 0.01, 0.5 + 0.5 * math.cos(math.pi * share))
+        rgb, target, steel, surface = images(batch)
+        low, high = GAINS
+        gain = low + (high - low) * torch.rand(len(rgb), 1, 1, 1, generator=random)
+        error = (training.net((rgb * gain).clamp(max=1).sub(MEAN).div(STD)) - target).abs()
+        steel_error, frame_error = image_mean(error, steel), image_mean(error, surface)
+        training.optimiser.zero_grad()
+        (steel_error + FRAME_WEIGHT * frame_error).backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(training.net.parameters(), 1.0)
+        training.optimiser.step()
+        sums, steps = [sums[0] + steel_error.item(), sums[1] + frame_error.item()], steps + 1
+    return sums[0] / max(steps, 1), sums[1] / max(steps, 1)
+
+
+def train(options: argparse.Namespace, checkpoint: Path) -> DepthNet:
+    """Return the network, trained until ``--epochs`` or ``--minutes``; print the errors of each epoch."""
+    views = rdb.load(options.root, CONFIG, split="train", columns=COLUMNS)
+    plan = {name: getattr(options, name) for name in ("seed", "epochs", "crop", "batch")}
+    training = Training.open(checkpoint, plan | {"views": list(views["view_id"]), "channels": list(CHANNELS)})
+    steps = -(-len(views) // options.batch)
+    limit_s = 60 * (options.minutes or math.inf)
+    start = time.monotonic() - training.seconds
+    while training.epoch < options.epochs and training.seconds < limit_s:
+        # A loader of its own for each epoch: order and crops do not depend on interruptions.
+        seed = options.seed * 100_000 + training.epoch
+        loader = rdb.torch_loader(
+            views,
+            options.batch,
+            options.workers,
+            shuffle=True,
+            stereo=True,
+            crop=options.crop,
+            flip=True,
+            seed=seed,
+        )
+
+        def share_done(step: int) -> float:
+            by_steps: float = (training.epoch + step / steps) / options.epochs
+            return max(by_steps, (time.monotonic() - start) / limit_s)
+
+        steel, frame = train_epoch(training, loader, share_done)
+        training.epoch, training.seconds = training.epoch + 1, time.monotonic() - start
+        training.save(checkpoint)
+        left_s = min(limit_s - training.seconds, training.seconds * (options.epochs / training.epoch - 1))
+        print_notice(
+            f"epoch {training.epoch} of {options.epochs}: mean error of log depth {steel:.3f} on steel, "
+            f"{frame:.3f} on all surfaces; {duration_text(max(left_s, 0.0))} left"
+        )
+    return training.net
+
+
+def export(net: DepthNet, out: Path, width: int, height: int) -> Path:
+    """Write ``finetuned.onnx`` for images of any size, and ``finetuned.toml``, whose path is returned."""
+    sides = {2: "height", 3: "width"}
+    with warnings.catch_warnings(), atomic_replace(out / "finetuned.onnx") as temporary:
+        # This exporter is deprecated, but the new one needs onnxscript; and the trace leaves out checks of sizes.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            _Exported(net).eval(),
+            (torch.zeros(1, 3, height, width),),
+            str(temporary),
+            dynamo=False,
+            input_names=["image"],
+            output_names=["canonical_depth"],
+            dynamic_axes={"image": sides, "canonical_depth": sides},
+        )
+    toml = out / "finetuned.toml"
+    write_text(
+        toml,
+        f"""model = "finetuned.onnx"
+name = "finetuned"
+summary = "small U-Net trained on generated cages"
+source = "examples/finetune.py of rebar-depth-bench"
+licence = "CC-BY-4.0"
+
+[input]
+longest_side = {width}
+resize = "stretch"
+range = 1
+mean = [{MEAN}, {MEAN}, {MEAN}]
+std = [{STD}, {STD}, {STD}]
+
+[output]
+meaning = "canonical-depth"
+focal_canonical_px = {FOCAL_PX:g}
+""",
+    )
+    return toml
+
+
+def score_rows(root: str, method_names: Sequence[str], out: Path) -> Iterator[Sequence[str]]:
+    """Yield the rows of the table: for each config of the folder, those of the methods and of the constant.
+
+    The constant is the reference row: it is the best constant for each view, from ground truth.
+    """
+    configs = open_folder(root).config_by_name
+    for config, split in TARGETS:
+        if config not in configs or split not in configs[config].splits:
+            continue
+        title = f"{config}, {split}" if configs[config].has_splits else config
+        for name in method_names:
+            method = find_method(name)
+            archive = out / f"{method.info.name.partition(' ')[0]}-{config}.zip"
+            with ProgressBars() as bars:
+                predict(method, root, archive, configs=[config], split=split, progress=bars.update)
+            table = rdb.score(archive, root).tables[config]
+            errors = (metric_cell(metrics, "abs_rel") for metrics in (table.native, table.scaled))
+            cells = (rank_error_cell(table.rank_error), *errors, coverage_percent(table.coverage))
+            yield (title, method.info.name.partition(" ")[0], str(table.views), *cells)
+        yield (
+            title,
+            "constant, scaled",
+            str(table.views),
+            "",
+            "",
+            number(table.reference.constant_abs_rel, 4),
+            "",
+        )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Train, export, predict and score; print the table as Markdown."""
+    config = open_folder(options.root).config(CONFIG).of_split("train")
+    check_columns(config, COLUMNS, "the training")
+    options.out.mkdir(parents=True, exist_ok=True)
+    net = train(options, options.out / "checkpoint.pt")
+    height, width = config.grid
+    toml = export(net, options.out, width, height)
+    print("| config | method | views | rank error | AbsRel native | AbsRel scaled | coverage % |")
+    print("|---|---|---|---|---|---|---|")
+    for row in score_rows(options.root, (str(toml), "sgbm"), options.out):
+        print(f"| {' | '.join(row)} |", flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the example and return its exit status."""
+    parser = argparse.ArgumentParser(description="train a small depth network on the config cages and score it")
+    parser.add_argument("root", metavar="ROOT", help="dataset folder with the split train of cages")
+    parser.add_argument("--out", type=Path, default=Path("finetuned"), metavar="FOLDER", help="default: finetuned")
+    parser.add_argument("--epochs", type=int, default=30, help="number of passes over the views (default: 30)")
+    parser.add_argument("--minutes", type=float, help="end the training after this time (default: no limit)")
+    parser.add_argument("--crop", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="size of random crops")
+    parser.add_argument("--batch", type=int, default=4, help="stereo pairs in a batch (default: 4)")
+    parser.add_argument("--workers", type=int, default=1, help="processes that load views (default: 1)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of weights, order, crops and flips (default: 0)")
+    options = parser.parse_args(arguments)
+    if min(options.epochs, options.batch) < 1 or options.workers < 0 or not (options.minutes or 1) > 0:
+        parser.error("--epochs and --batch must be 1 or more, --workers 0 or more, --minutes above 0")
+    return run_command(lambda: run(options), "interrupted; the same command continues after the last epoch")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

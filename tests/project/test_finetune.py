@@ -1,0 +1,148 @@
+"""The training example at toy size: what it learns, exports, prints and refuses, and how it continues."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.bench.methods.predictors import load_predictor
+from tests.synthetic_dataset import write_split_dataset
+
+torch = pytest.importorskip("torch")
+
+OPTIONS = ("--batch", "2", "--workers", "0", "--crop", "64", "96")
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder without the configs lattice and pile."""
+    folder = tmp_path_factory.mktemp("cages") / "dataset"
+    write_split_dataset(folder, {"a": "train", "b": "train", "c": "validation"}, 2)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def example() -> dict[str, Any]:
+    return runpy.run_path("examples/finetune.py")
+
+
+@pytest.fixture(scope="module")
+def trained(root: Path, example: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("trained")
+    assert example["main"]([str(root), "--out", str(out), "--epochs", "6", *OPTIONS]) == 0
+    return out
+
+
+def weights(out: Path) -> dict[str, Any]:
+    net: dict[str, Any] = torch.load(out / "checkpoint.pt", weights_only=True)["net"]
+    return net
+
+
+def test_errors_fall_and_the_table_has_every_method(
+    root: Path, example: dict[str, Any], trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(trained, tmp_path / "out")
+    (tmp_path / "out" / "checkpoint.pt").unlink()
+    assert example["main"]([str(root), "--out", str(tmp_path / "out"), "--epochs", "6", *OPTIONS]) == 0
+    printed = capsys.readouterr()
+    errors = [float(text) for text in re.findall(r"depth ([0-9.]+) on steel", printed.err)]
+    assert len(errors) == 6
+    assert errors[-1] < 0.6 * errors[0]
+    _, _, *rows = printed.out.splitlines()
+    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+    assert [row[:3] for row in cells] == [
+        ["cages, validation", method, "2"] for method in ("finetuned", "sgbm", "constant, scaled")
+    ]
+    assert 0 < float(cells[0][3]) < float(cells[1][3]) == 1
+    # The same seed and options give the same weights.
+    assert all(torch.equal(value, weights(trained)[name]) for name, value in weights(tmp_path / "out").items())
+
+
+def test_interrupted_training_continues_to_the_same_weights(
+    root: Path, example: dict[str, Any], trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = [str(root), "--out", str(tmp_path), "--epochs", "6", *OPTIONS]
+    namespace, real = example["train"].__globals__, example["train_epoch"]
+
+    def interrupted(training: Any, *rest: Any) -> Any:
+        if training.epoch == 2:
+            raise KeyboardInterrupt
+        return real(training, *rest)
+
+    monkeypatch.setitem(namespace, "train_epoch", interrupted)
+    assert example["main"](arguments) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
+    monkeypatch.setitem(namespace, "train_epoch", real)
+    assert example["main"](arguments) == 0
+    assert all(torch.equal(value, weights(trained)[name]) for name, value in weights(tmp_path).items())
+
+
+@pytest.mark.parametrize("size", [(320, 180), (320, 221)])
+def test_exported_network_predicts_the_depth_of_the_trained_one(
+    example: dict[str, Any], trained: Path, tmp_path: Path, size: tuple[int, int]
+) -> None:
+    width, height = size
+    net = example["DepthNet"]()
+    net.load_state_dict(weights(trained))
+    toml = example["export"](net, tmp_path, width, height)
+    rgb = np.random.default_rng(3).integers(0, 256, (height // 20, width // 20, 3), np.uint8)
+    rgb = np.asarray(rgb.repeat(20, 0).repeat(20, 1))
+    rgb = np.pad(rgb, ((0, height - rgb.shape[0]), (0, 0), (0, 0)))
+    with torch.no_grad():
+        image = torch.from_numpy((rgb / 255 - example["MEAN"]) / example["STD"]).float().permute(2, 0, 1)[None]
+        expected = net(image).exp()[0, 0].numpy() * 260 / example["FOCAL_PX"]
+    found = load_predictor(str(toml))({"left_rgb": rgb, "left_K": np.diag([260.0, 260.0, 1.0])})
+    assert np.ptp(expected) > 0.01
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+
+
+def test_target_is_canonical_depth_of_both_eyes(example: dict[str, Any]) -> None:
+    """A longer focal length and a longer distance of the same image have the same target."""
+    depth = torch.tensor([[[[2.0, 0.0], [4.0, 1.0]]]])
+    batch: dict[str, Any] = {}
+    for eye, factor in (("", 1.0), ("right_", 3.0)):
+        batch |= {f"{eye}rgb": torch.full((1, 3, 2, 2), 255, dtype=torch.uint8), f"{eye}depth": depth * factor}
+        batch |= {f"{eye}mask": torch.tensor([[[[True, True], [False, False]]]])}
+        batch |= {f"{eye}K": torch.eye(3, dtype=torch.float64)[None] * example["FOCAL_PX"] * factor}
+    rgb, target, steel, surface = example["images"](batch)
+    assert rgb.max() == 1
+    torch.testing.assert_close(target[1], target[0])
+    torch.testing.assert_close(target[0].exp()[surface[0] > 0], depth[depth > 0])
+    assert steel[0].tolist() == [[[1, 0], [0, 0]]]
+    error = torch.tensor([1.0, 9.0, 5.0, 9.0]).reshape(1, 1, 2, 2).repeat(2, 1, 1, 1)
+    assert example["image_mean"](error, steel) == 1
+    assert example["image_mean"](error, torch.cat([steel[:1], torch.zeros_like(steel[:1])])) == 1
+
+
+def test_other_options_do_not_continue_a_checkpoint(
+    root: Path, example: dict[str, Any], trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (trained / "checkpoint.pt").read_bytes()
+    assert example["main"]([str(root), "--out", str(trained), "--epochs", "6", "--seed", "1", *OPTIONS]) == 2
+    assert "other seed" in capsys.readouterr().err
+    assert (trained / "checkpoint.pt").read_bytes() == before
+
+
+def test_folder_without_cages_is_refused(
+    example: dict[str, Any], tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert example["main"]([str(tiny_root), "--out", str(tmp_path / "out")]) == 2
+    assert "cages" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_damaged_checkpoint_is_refused(
+    root: Path, example: dict[str, Any], trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = (trained / "checkpoint.pt").read_bytes()
+    (tmp_path / "checkpoint.pt").write_bytes(whole[: len(whole) // 2])
+    assert example["main"]([str(root), "--out", str(tmp_path), *OPTIONS]) == 2
+    assert "checkpoint.pt: cannot be read" in capsys.readouterr().err
