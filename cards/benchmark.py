@@ -13,6 +13,7 @@ from typing import Any
 from cards.reference import FULL_SETS, SUBSET, number, percent, reference_context
 from cards.steel import STEEL_RESULTS, depth_text, range_text
 from cards.templates import render
+from rebar_depth_bench.bar_crossings.definition import crossing_parameters
 from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, ONCE, MeasureFamily
 from rebar_depth_bench.extended.inspection.tolerances import PROFILES
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
@@ -74,6 +75,7 @@ def benchmark_card() -> str:
         ring_views=BLOCK_VIEWS,
         min_views=MIN_VIEWS,
         extended_protocol=EXTENDED_PROTOCOL,
+        crossings=crossing_parameters(),
         families=[_family_rows(family) for family in MEASURE_FAMILIES.values()],
         profiles=PROFILES,
     )

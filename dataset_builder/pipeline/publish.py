@@ -1,10 +1,10 @@
 """Publishing of staged configs into the dataset folder, and the lock that allows one build per folder.
 
 Files are written in an order that can be repaired after an interruption at any point: first the shards, whose
-names contain the digest of their content; then mesh, contact sheet and bars; then the other pictures, the card and
-``eval.yaml``; the manifest last. Files that the new manifest does not list are removed afterwards. If the card,
-``eval.yaml``, bars or pictures of a folder do not match its manifest, a build was interrupted in between or an
-earlier version built it, and the next build repairs them.
+names contain the digest of their content; then mesh, contact sheet, bars and crossings; then the other pictures,
+the card and ``eval.yaml``; the manifest last. Files that the new manifest does not list are removed afterwards. If
+the card, ``eval.yaml``, bars, crossings or pictures of a folder do not match its manifest, a build was interrupted
+in between or an earlier version built it, and the next build repairs them.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_rec
 from dataset_builder.scene.assemblies import aim_point_m
 from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.atomic_io import exclusive_lock, write_bytes, write_error, write_text
+from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE, crossings_entry, write_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, write_bars
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest, views_digest
@@ -78,10 +79,10 @@ def is_published(out: Path, plan: ConfigPlan) -> bool:
 
 
 def repair_metadata(out: Path, plan: ConfigPlan) -> None:
-    """Rewrite bars, card, ``eval.yaml``, pictures and manifest if any of them does not match the manifest."""
+    """Rewrite bars, crossings, card, ``eval.yaml``, pictures and manifest if any of them does not match."""
     folder = open_folder(out)
     config = folder.config(plan.spec.name)
-    if not _files_match(folder, (BARS_FILE, CARD, EVAL_FILE, STRIP, config.sheet)):
+    if not _files_match(folder, (BARS_FILE, CROSSINGS_FILE, CARD, EVAL_FILE, STRIP, config.sheet)):
         write_contact_sheet(config, out / config.sheet)
         _write_bars(out, {plan.spec.scene.name: plan.assembly.bars})
         _write_manifest(out, folder.config_by_name)
@@ -143,9 +144,11 @@ def _placement(assembly: Assembly) -> dict[str, Any]:
 
 
 def _write_bars(out: Path, bars: Mapping[str, tuple[Bar, ...]]) -> None:
+    """Write the bars of some scenes into the table of bars, and the crossings of all scenes."""
     path = out / BARS_FILE
     published = read_bars(path) if path.is_file() else {}
     write_bars(path, {**published, **bars})
+    write_crossings(out / CROSSINGS_FILE, {**published, **bars})
 
 
 def remove_leftovers(out: Path) -> None:
@@ -182,12 +185,13 @@ def _write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
     write_scenes_strip(list(reversed(by_scene.values())), out / STRIP)
     write_text(out / CARD, dataset_card(version, digest, ordered))
     write_text(out / EVAL_FILE, benchmark_tasks([config.name for config in ordered]))
-    metadata = {CARD, EVAL_FILE, BARS_FILE}
+    metadata = {CARD, EVAL_FILE, BARS_FILE, CROSSINGS_FILE}
     manifest = {
         "format": MANIFEST_FORMAT,
         "version": version,
         "protocol": PROTOCOL,
         "ground_truth": {"digest": digest},
+        "crossings": crossings_entry(out / CROSSINGS_FILE),
         "configs": {config.name: config.manifest_entry for config in ordered},
         "files": {name: file_sha256(out / name) for name in sorted(metadata | _listed_files(ordered))},
     }
