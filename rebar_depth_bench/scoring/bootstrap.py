@@ -4,8 +4,10 @@ Neighbouring views show nearly the same steel, so their errors are correlated, a
 give intervals that are too narrow. Resampling blocks of consecutive views preserves the correlation: circular
 block bootstrap of Politis and Romano ("A circular block-resampling procedure for stationary data", 1992).
 
-The intervals describe the variation with other views of the same scenes from the same camera protocol. They do not
-describe the variation with other cages, lights or cameras.
+The intervals describe the variation with other views of the same scenes from the same camera protocol. They do
+not describe the variation with other cages, lights or cameras. Where a number describes a config of many scenes,
+whole scenes are resampled (``resample_scenes``), and its interval describes the variation with other scenes of
+this kind.
 """
 
 from __future__ import annotations
@@ -130,6 +132,20 @@ def resample(indices: Sequence[int]) -> Resampling:
     flat = views + n * np.arange(RESAMPLES)[:, None]
     counts = np.bincount(flat.ravel(), minlength=RESAMPLES * n).reshape(RESAMPLES, n)
     return Resampling(counts.astype(np.float64))
+
+
+def resample_scenes(scenes: Sequence[str]) -> Resampling:
+    """Return resamples of views of which all views of a scene are drawn together; ``scenes`` has one name per
+    view.
+
+    Fewer than ``MIN_VIEWS`` scenes do not determine a spread; then there is no resample.
+    """
+    names, scene = np.unique(np.array(scenes, dtype=np.str_), return_inverse=True)
+    draws = RESAMPLES if len(names) >= MIN_VIEWS else 0
+    chosen = (np.random.PCG64(_SEED).random_raw(draws * len(names)) % max(len(names), 1)).astype(np.int64)
+    flat = chosen + len(names) * np.repeat(np.arange(draws), len(names))
+    counts = np.bincount(flat, minlength=draws * len(names)).reshape(draws, len(names))
+    return Resampling(counts[:, scene].astype(np.float64))
 
 
 def block_length(indices: Sequence[int]) -> int:

@@ -11,7 +11,8 @@ from itertools import pairwise
 from markupsafe import Markup
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, NATIVE, ONCE, SCALED, MeasureFamily
+from rebar_depth_bench.extended.crossings.measures import MISS_DEG
+from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
 from rebar_depth_bench.extended.inspection.measures import INSPECTION_MEASURES, MISS_MM, capability_name
 from rebar_depth_bench.extended.inspection.tolerances import (
     PROFILES,
@@ -22,6 +23,7 @@ from rebar_depth_bench.extended.inspection.tolerances import (
 )
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.point_cloud import TOLERANCES_MM
+from rebar_depth_bench.extended.predictions import NATIVE, ONCE, SCALED
 from rebar_depth_bench.extended.profiles import AXES, bin_names
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting.charts.profile import ProfileBin, profile_chart
@@ -32,7 +34,7 @@ from rebar_depth_bench.reporting.html.rows import Cell
 _DECIMALS: Mapping[str, int] = {"mm": 2, "cm": 2, "m": 3, "%": 1, "": 4}
 _RATIO_DECIMALS = 2
 _ARROWS: Mapping[str, str] = {"lower": "↓", "higher": "↑", "": ""}
-_TITLE_NUMBER = re.compile(r"\d[\d.]*(?:-[\d.]+)?(?= (?:mm|%|m|px)(?!\w))")
+_TITLE_NUMBER = re.compile(r"\d[\d.]*(?:-[\d.]+)?(?= (?:mm|%|m|px|degrees)(?!\w))")
 """Tolerance, threshold or bin in a measure's title: a number followed by a unit."""
 
 
@@ -247,8 +249,9 @@ def _measure_table(
     table: ExtendedTable, title: str, family: MeasureFamily, measures: Sequence[Measure], once_aside: str = ""
 ) -> ExtendedMeasureTable:
     rows = measure_rows(table, measures, family.alignments)
-    has_miss = any(cell.text == MISSED for row in rows for cell in row.cells)
-    note = f"{MISSED}: not found, counted as {MISS_MM:g} mm." if has_miss else ""
+    units = {row.unit for row in rows if any(cell.text == MISSED for cell in row.cells)}
+    values = " or ".join(f"{MISS_MM:g} mm" if unit else f"{MISS_DEG:g} degrees" for unit in sorted(units)[::-1])
+    note = f"{MISSED}: not found, counted as {values}." if units else ""
     heads = _alignment_heads(family, once_aside)
     return ExtendedMeasureTable(title, "rows", heads, rows, measure_definitions(measures), note)
 
