@@ -92,7 +92,13 @@ class ConfigSteelTruth:
     def view(self, position: int) -> SteelTruth:
         """Return the view at ``position`` in protocol order."""
         truth = _steel_truth(self.cache.view(position), (self.height, self.width), self.rays)
-        return replace(truth, judged=_judged(self.judged_cache.view(position)))
+        return replace(truth, judged=self.judged(position))
+
+    def judged(self, position: int) -> JudgedCrossings:
+        """Return the judged crossings of the view at ``position``."""
+        view = self.judged_cache.view(position)
+        crossing = view.arrays["crossing"][:: 2 * SAMPLED_PIXELS].astype(np.int64)
+        return JudgedCrossings(crossing, view.arrays["pixel"].astype(np.int64).reshape(-1, 2, SAMPLED_PIXELS))
 
 
 def _steel_truth(view: ViewArrays, grid: tuple[int, int], rays: Mapping[Lens, Rays]) -> SteelTruth:
@@ -193,12 +199,6 @@ def _judged_arrays(
         arrays = {"crossing": np.repeat(judged.crossing, 2 * SAMPLED_PIXELS), "pixel": pixel}
         yield ViewArrays(truth.view_id, arrays, ())
         progress(f"crossings in the views of {config.name}", position + 1, len(cache))
-
-
-def _judged(view: ViewArrays) -> JudgedCrossings:
-    """Return the judged crossings of a cached view."""
-    crossing = view.arrays["crossing"][:: 2 * SAMPLED_PIXELS].astype(np.int64)
-    return JudgedCrossings(crossing, view.arrays["pixel"].astype(np.int64).reshape(-1, 2, SAMPLED_PIXELS))
 
 
 def _view_arrays(

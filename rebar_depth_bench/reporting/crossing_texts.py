@@ -40,5 +40,6 @@ def reach_sentence(alignment: str, reach: Reach) -> str:
     head = f"{alignment.capitalize()}: {100 * SHARE:g} % of the judged crossings within {reach.limit_mm} mm"
     if reach.verdict == "none tested":
         return f"{head}: none tested."
-    interval = "" if reach.interval is None else f"95 % interval {reach_interval_text(reach)} m; "
+    informative = reach.interval is not None and reach.interval[0] < reach.interval[1]
+    interval = f"95 % interval {reach_interval_text(reach)} m; " if informative else ""
     return f"{head} {reach_text(reach)} ({interval}tested {tested_text(reach)} m)."

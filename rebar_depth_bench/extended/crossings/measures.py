@@ -15,11 +15,12 @@ WITHIN_MM = (2, 5, 10)
 MISS_DEG = 90.0
 """Error of angle and normal of a crossing that was not located, degrees: the largest one of undirected lines."""
 
+CROSSING_EDGES_M = (0.1, 0.15, *DISTANCE_EDGES_M)
 ANGLE_EDGES_DEG = (20.0, 30.0, 45.0, 60.0, 75.0, 90.0)
 GAP_EDGES_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 
 BINS: Mapping[str, tuple[float, ...]] = {
-    "m": DISTANCE_EDGES_M,
+    "m": CROSSING_EDGES_M,
     "deg": ANGLE_EDGES_DEG,
     "mm": GAP_EDGES_MM,
     "px": WIDTH_EDGES_PX,

@@ -1,6 +1,6 @@
 """Reach of a depth method: the distance up to which nearly all judged crossings are within a limit.
 
-Judged crossings are binned by the true depth z of their tie points (``DISTANCE_EDGES_M``). A bin is tested if it
+Judged crossings are binned by the true depth z of their tie points (``CROSSING_EDGES_M``). A bin is tested if it
 has ``MIN_CROSSINGS`` or more judged crossings from ``MIN_REACH_VIEWS`` or more views, and it fulfils the limit
 if at least ``SHARE`` of them are within it; a crossing that is not located fails. From the nearest tested bin
 on, the reach is the farthest edge up to which every bin is tested and fulfils the limit.
@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from rebar_depth_bench.extended.crossings.measures import CROSSING_EDGES_M
 from rebar_depth_bench.extended.measures import Samples
-from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample, resample_scenes
 from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
 from rebar_depth_bench.scoring.view_score import protocol_indices
@@ -132,7 +132,7 @@ def _reach(
     z_m: Float64[ndarray, " m"], passes: ndarray, view: ndarray, resampling: Resampling, limit_mm: int
 ) -> Reach:
     bins, draws = [], []
-    for low_m, high_m in pairwise(DISTANCE_EDGES_M):
+    for low_m, high_m in pairwise(CROSSING_EDGES_M):
         inside = (z_m >= low_m) & (z_m < high_m)
         if not inside.any():
             continue

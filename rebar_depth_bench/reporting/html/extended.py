@@ -221,17 +221,17 @@ def _extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
     profile = MEASURE_FAMILIES["profile"]
     folded = [
         *(_folded_table(table, key) for key in _FOLDED_FAMILIES),
-        _measure_table(table, f"{profile.title}: values", profile, profile.measures),
+        measure_table(table, f"{profile.title}: values", profile, profile.measures),
     ]
     charts = [(_AXIS_TITLES[axis][0], _profile_chart(table, axis)) for axis in AXES]
     return ExtendedConfig(
         name=printable(name),
         views=table.views,
         charts=[(title, chart) for title, chart in charts if chart],
-        main_inspection=_measure_table(
+        main_inspection=measure_table(
             table, inspection.title, inspection, [inspection.by_name[name] for name in MAIN_INSPECTION_MEASURES]
         ),
-        other_inspection=_measure_table(table, "Inspection: spread, median, found bars only", inspection, other),
+        other_inspection=measure_table(table, "Inspection: spread, median, found bars only", inspection, other),
         tolerances=[_tolerance_row(table, *line) for line in TOLERANCES],
         families=[family for family in folded if family.rows],
         single_bar=single_bar_sentence(table),
@@ -242,12 +242,13 @@ def _folded_table(table: ExtendedTable, key: str) -> ExtendedMeasureTable:
     family = MEASURE_FAMILIES[key]
     if key == "clouds":
         return _cloud_table(table, family)
-    return _measure_table(table, family.title, family, family.measures, _ONCE_NOTES.get(key, ""))
+    return measure_table(table, family.title, family, family.measures, _ONCE_NOTES.get(key, ""))
 
 
-def _measure_table(
+def measure_table(
     table: ExtendedTable, title: str, family: MeasureFamily, measures: Sequence[Measure], once_aside: str = ""
 ) -> ExtendedMeasureTable:
+    """Return the table of some measures of a family, those without samples left out."""
     rows = measure_rows(table, measures, family.alignments)
     units = {row.unit for row in rows if any(cell.text == MISSED for cell in row.cells)}
     values = " or ".join(f"{MISS_MM:g} mm" if unit else f"{MISS_DEG:g} degrees" for unit in sorted(units)[::-1])

@@ -63,7 +63,8 @@ def test_untested_gap_ends_the_reach() -> None:
 def test_not_met_and_none_tested() -> None:
     found = reach({0.22: (6, 0.5), 0.27: (6, 1)})
     assert (found.verdict, found.distance_m, found.interval) == ("not met", None, (0.0, 0.0))
-    for bins, views in (({}, 10), ({0.22: (20, 1)}, 4), ({0.22: (4, 1)}, 10), ({30.0: (9, 1)}, 10)):
+    cases: list[tuple[dict[float, tuple[int, float]], int]] = [({}, 10)]
+    for bins, views in (*cases, ({0.22: (20, 1.0)}, 4), ({0.22: (4, 1.0)}, 10), ({30.0: (9, 1.0)}, 10)):
         found = reach(bins, views)
         assert (found.verdict, found.distance_m, found.interval, found.tested_m) == (
             "none tested",
