@@ -15,20 +15,25 @@ import numpy as np
 import rebar_depth_bench as rdb
 from benchmarks.timing import print_markdown
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.extended.evaluate import NATIVE, ONCE, measures_by_alignment, view_samples
+from rebar_depth_bench.extended.evaluate import measures_by_alignment, view_samples
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
+from rebar_depth_bench.extended.predictions import NATIVE, ONCE
 from rebar_depth_bench.extended.result import ExtendedView, tabulate_extended
 from rebar_depth_bench.scoring.bootstrap import resample
 
 COLUMNS = ["view_id", "left_depth"]
 SCORES = ("boundary_f1", "cloud_f_1mm", "layer_confusion", "full_mask_abs_rel", "shifted_rmse_cm")
-BAR_SCORES = ("bars_found", "pass_gb50204_cover_slab")
+BAR_SCORES = ("bars_found", "pass_gb50204_cover_slab", "crossings_judged", "crossings_located")
 ERROR_SAMPLES = (
     "axis_offset_judged_mm",
     "spacing_judged_mm",
     "layer_judged_mm",
     "cover_judged_mm",
     "diameter_judged_mm",
+    "tie_judged_mm",
+    "crossing_gap_judged_mm",
+    "crossing_angle_judged_deg",
+    "crossing_normal_judged_deg",
 )
 
 
@@ -48,12 +53,16 @@ def main(root: str, *configs: str) -> None:
         ]
         table = tabulate_extended(views, resample(range(len(views))), measures)
         numbers = {**table.numbers[ONCE], **table.numbers[NATIVE]}
-        score_rows.append((config, len(views), *(f"{numbers[name].value:g}" for name in (*SCORES, *BAR_SCORES))))
+        score_rows.append((config, len(views), *(_value(numbers[name].value) for name in (*SCORES, *BAR_SCORES))))
         pooled = [np.concatenate([view.samples[NATIVE][name] for view in views]) for name in ERROR_SAMPLES]
         error_rows.append((config, *map(_spread, pooled)))
     print_markdown(["config", "views", *SCORES, *BAR_SCORES], score_rows)
-    print("\nmm, over all bars or pairs judged: median / 95th percentile / largest (how many)\n")
+    print("\nmm or degrees, over everything judged: median / 95th percentile / largest (how many)\n")
     print_markdown(["config", *ERROR_SAMPLES], error_rows)
+
+
+def _value(value: float | None) -> str:
+    return "none" if value is None else f"{value:g}"
 
 
 def _spread(values: np.ndarray) -> str:

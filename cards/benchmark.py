@@ -13,15 +13,21 @@ from typing import Any
 from cards.reference import FULL_SETS, SUBSET, number, percent, reference_context
 from cards.steel import STEEL_RESULTS, depth_text, range_text
 from cards.templates import render
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, ONCE, MeasureFamily
+from rebar_depth_bench.bar_crossings.definition import crossing_parameters
+from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
 from rebar_depth_bench.extended.inspection.tolerances import PROFILES
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
+from rebar_depth_bench.extended.predictions import ONCE
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, own_methods
+from rebar_depth_bench.reporting.crossing_texts import FITS_NOTE, REACH_NOTE
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_VIEWS, RESAMPLES
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import DELTA1_RATIO, MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.rounding import SIGNIFICANT_DIGITS
 from rebar_depth_bench.submission import INPUTS
+
+_CONTACTS = {"lattice": "375", "pier": "4,860", "pile": "15"}
+"""Numbers of crossings of the scenes, as `tests/builder/config/test_configs.py` expects them."""
 
 
 def steel_context() -> dict[str, Any]:
@@ -53,7 +59,7 @@ def _errors(errors: Mapping[str, float]) -> str:
     return f"{errors['abs_rel']:.3f}, {number(rmse_cm, 1 if rmse_cm < 10 else 0, ' cm')}"
 
 
-_PARAMETER = re.compile(r"(?<=_)\d[\d.]*(?:-[\d.]+)?(?=(?:mm|pct|m|px)$)")
+_PARAMETER = re.compile(r"(?<=_)\d[\d.]*(?:-[\d.]+)?(?=(?:mm|pct|m|px|deg)$)")
 """Pattern of the tolerance, threshold or bin at the end of a measure's name, without its unit."""
 
 
@@ -76,6 +82,10 @@ def benchmark_card() -> str:
         min_views=MIN_VIEWS,
         groupings=GROUPINGS,
         extended_protocol=EXTENDED_PROTOCOL,
+        crossings=crossing_parameters(),
+        fits_note=FITS_NOTE,
+        reach_note=REACH_NOTE,
+        contacts=_CONTACTS,
         families=[_family_rows(family) for family in MEASURE_FAMILIES.values()],
         profiles=PROFILES,
     )
@@ -107,7 +117,7 @@ def _measure_row(name: str, measures: Sequence[Measure]) -> dict[str, str]:
     parameter = _PARAMETER.search(first.name)
     if parameter is not None:
         values = ", ".join(match[0] for measure in measures if (match := _PARAMETER.search(measure.name)))
-        pattern = rf" {re.escape(parameter[0])} (?=mm|m\b|px|%)"
+        pattern = rf" {re.escape(parameter[0])} (?=mm|m\b|px|%|degrees)"
         definition = f"{re.sub(pattern, ' N ', definition, count=1)}; N = {values}"
     return {
         "name": name,

@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rebar_depth_bench.bar_crossings.table import crossings
     from rebar_depth_bench.data.bars import bars
     from rebar_depth_bench.data.dataset import load
     from rebar_depth_bench.data.torch_loader import torch_loader
@@ -36,6 +37,7 @@ __all__ = [
     "Table",
     "ViewScore",
     "bars",
+    "crossings",
     "load",
     "score",
     "torch_loader",
@@ -43,6 +45,7 @@ __all__ = [
 
 _MODULE_BY_NAME = {
     "bars": "data.bars",
+    "crossings": "bar_crossings.table",
     "load": "data.dataset",
     "score": "scoring.score",
     "torch_loader": "data.torch_loader",

@@ -43,7 +43,7 @@ class Limit:
 
 JSON_BYTES = Limit("json_bytes", 64 * _MIB, "a JSON file or answer: manifest, result, export record")
 TOML_BYTES = Limit("toml_bytes", _MIB, "a scene, calibration or model description, and any other small text file")
-TABLE_BYTES = Limit("table_bytes", _GIB, "the decoded size of `bars.parquet`")
+TABLE_BYTES = Limit("table_bytes", _GIB, "the decoded size of `bars.parquet` and of `crossings.parquet`")
 CELL_BYTES = Limit("cell_bytes", 256 * _MIB, "an encoded image or depth map of a dataset row")
 IMAGE_PIXELS = Limit("image_pixels", 100_000_000, "an image of a capture or of KITTI, before it is decoded")
 MESH_BYTES = Limit("mesh_bytes", _GIB, "a PLY, STL, OBJ or glTF file")

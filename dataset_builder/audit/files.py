@@ -1,8 +1,9 @@
-"""File and row checks of the audit: SHA-256, masks, bar ids and pixel counts."""
+"""File and row checks of the audit: SHA-256, crossings of bars, masks, bar ids and pixel counts."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,9 @@ import numpy as np
 
 from dataset_builder.audit.report import Check
 from dataset_builder.pipeline.plan import BUILD_FOLDER
+from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
+from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE, folder_crossings
+from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
@@ -27,6 +31,36 @@ def check_files(folder: DatasetFolder, root: Path, progress: Progress) -> Check:
             f"{BUILD_FOLDER}: the folder contains an unfinished build; run rebar-build again or remove it"
         )
     return Check("files against the manifest", f"{len(folder.files)} files", "all SHA-256 equal", tuple(problems))
+
+
+def check_crossings(folder: DatasetFolder, root: Path) -> Check:
+    """Check that the table of crossings holds the crossings of the bars, to ``_CROSSING_TOLERANCE_M``."""
+    bars = read_bars(root / BARS_FILE)
+    if CROSSINGS_FILE not in folder.files:
+        return Check("crossings of the bars", "none", "written by an earlier version")
+    stored = folder_crossings(folder, bars).by_scene
+    expected = {
+        scene: crossings for scene, of_scene in bars.items() if len(crossings := scene_crossings(of_scene))
+    }
+    problems = [
+        f"{CROSSINGS_FILE}: scene {scene} differs from the crossings of its bars"
+        for scene in sorted({*stored, *expected})
+        if not _are_equal(stored.get(scene), expected.get(scene))
+    ]
+    total = sum(len(crossings) for crossings in expected.values())
+    return Check("crossings of the bars", f"{total} crossings", "equal to 1 nm", tuple(problems))
+
+
+_CROSSING_TOLERANCE_M = 1e-9
+
+
+def _are_equal(stored: Crossings | None, expected: Crossings | None) -> bool:
+    if stored is None or expected is None or len(stored) != len(expected):
+        return False
+    return all(
+        np.allclose(getattr(stored, field.name), getattr(expected, field.name), rtol=0, atol=_CROSSING_TOLERANCE_M)
+        for field in fields(Crossings)
+    )
 
 
 def row_problems(row: Mapping[str, Any], record: ViewRecord, bar_ids: set[int]) -> Iterator[str]:

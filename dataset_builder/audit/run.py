@@ -17,7 +17,7 @@ from dataset_builder.audit.cameras import (
     view_projection_error_px,
 )
 from dataset_builder.audit.cycles_depth import cycles_difference_m, cycles_verdict
-from dataset_builder.audit.files import check_files, row_problems
+from dataset_builder.audit.files import check_crossings, check_files, row_problems
 from dataset_builder.audit.geometry import axis_verdict, board_verdict, max_axis_distance_ratio, view_board_error
 from dataset_builder.audit.imported import imported_checks
 from dataset_builder.audit.markers import detect_view_markers, marker_verdict
@@ -82,6 +82,7 @@ def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent
     files = check_files(folder, folder.local, progress)
     checks = [files]
     if files.passed:  # Rows of damaged files cannot be checked.
+        checks.append(check_crossings(folder, folder.local))
         for config in folder.config_by_name.values():
             checks += _config_checks(config, folder.local, depth_views, progress)
     return AuditReport(str(root), tuple(checks))

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan
 from rebar_depth_bench.atomic_io import temporary_target
+from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE
 from rebar_depth_bench.data.bars import BARS_FILE
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.errors import InputError, OutputError
@@ -100,7 +101,7 @@ def remove_unlisted_files(out: Path, listed: Collection[str]) -> None:
 
 def remove_temporary_files(out: Path) -> None:
     """Delete the temporary files that a killed build left."""
-    top_names = re.compile("|".join(map(re.escape, (MANIFEST_FILE, BARS_FILE, CARD, EVAL_FILE))))
+    top_names = re.compile("|".join(map(re.escape, (MANIFEST_FILE, BARS_FILE, CROSSINGS_FILE, CARD, EVAL_FILE))))
     for folder, own_name in [(out, top_names), *_own_folders(out)]:
         for path in list(folder.iterdir()):
             target = temporary_target(path.name)

@@ -1,10 +1,10 @@
 """Publishing of staged configs into the dataset folder, and the lock that allows one build per folder.
 
 Files are written in an order that can be repaired after an interruption at any point: first the shards, whose
-names contain the digest of their content; then mesh, contact sheet and bars; then the other pictures, the card and
-``eval.yaml``; the manifest last. Files that the new manifest does not list are removed afterwards. If the card,
-``eval.yaml``, bars or pictures of a folder do not match its manifest, a build was interrupted in between or an
-earlier version built it, and the next build repairs them.
+names contain the digest of their content; then mesh, contact sheet, bars and crossings; then the other pictures,
+the card and ``eval.yaml``; the manifest last. Files that the new manifest does not list are removed afterwards. If
+the card, ``eval.yaml``, bars, crossings or pictures of a folder do not match its manifest, a build was interrupted
+in between or an earlier version built it, and the next build repairs them.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_rec
 from dataset_builder.scene.assemblies import aim_point_m, assembly_bars
 from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.atomic_io import exclusive_lock, write_bytes, write_error, write_text
+from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE, crossings_entry, write_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, write_bars
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest, views_digest
@@ -91,13 +92,13 @@ def scene_entries(config: DatasetConfig) -> Mapping[str, Mapping[str, Any]]:
 
 
 def repair_metadata(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    """Rewrite bars, card, ``eval.yaml``, pictures and manifest if any of them does not match the manifest.
+    """Rewrite bars, crossings, card, ``eval.yaml``, pictures and manifest if any of them does not match.
 
     ``plans`` are those of one config.
     """
     folder = open_folder(out)
     config = folder.config(plans[0].spec.name)
-    if not _files_match(folder, (BARS_FILE, CARD, EVAL_FILE, STRIP, config.sheet)):
+    if not _files_match(folder, (BARS_FILE, CROSSINGS_FILE, CARD, EVAL_FILE, STRIP, config.sheet)):
         write_contact_sheet(config, out / config.sheet)
         write_scene_bars(out, {plan.spec.scene.name: assembly_bars(plan.spec.scene.assembly) for plan in plans})
         write_manifest(out, folder.config_by_name)
@@ -159,10 +160,11 @@ def _placement(assembly: Assembly) -> dict[str, Any]:
 
 
 def write_scene_bars(out: Path, bars: Mapping[str, tuple[Bar, ...]]) -> None:
-    """Add the bars of scenes to ``bars.parquet``, in place of those that it has of these scenes."""
+    """Write the bars of some scenes into the table of bars, and the crossings of all scenes."""
     path = out / BARS_FILE
     published = read_bars(path) if path.is_file() else {}
     write_bars(path, {**published, **bars})
+    write_crossings(out / CROSSINGS_FILE, {**published, **bars})
 
 
 def remove_leftovers(out: Path) -> None:
@@ -207,12 +209,13 @@ def write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
     write_text(
         out / EVAL_FILE, benchmark_tasks([config.name for config in ordered if TEST_SPLIT in config.splits])
     )
-    metadata = {CARD, EVAL_FILE, BARS_FILE}
+    metadata = {CARD, EVAL_FILE, BARS_FILE, CROSSINGS_FILE}
     manifest = {
         "format": MANIFEST_FORMAT,
         "version": version,
         "protocol": PROTOCOL,
         "ground_truth": {"digest": digest},
+        "crossings": crossings_entry(out / CROSSINGS_FILE),
         "configs": {config.name: config.manifest_entry for config in ordered},
         "files": {name: file_sha256(out / name) for name in sorted(metadata | _listed_files(ordered))},
     }

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-import numpy as np
 from jaxtyping import Float, Float64
 from numpy import ndarray
 
@@ -19,13 +18,17 @@ from rebar_depth_bench.extended import (
     profiles,
     single_bar,
 )
+from rebar_depth_bench.extended.crossings import measures as crossing_measures
+from rebar_depth_bench.extended.crossings.evaluate import crossing_samples, view_crossings
 from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, SceneBars, has_bar_ids, load_steel_truth
 from rebar_depth_bench.extended.inspection import as_built
 from rebar_depth_bench.extended.inspection import evaluate as inspection
 from rebar_depth_bench.extended.inspection import measures as inspection_measures
 from rebar_depth_bench.extended.inspection.visible_segments import visible_segments
 from rebar_depth_bench.extended.measures import Measure, Samples
+from rebar_depth_bench.extended.predictions import NATIVE, ONCE, SCALED, aligned_predictions
 from rebar_depth_bench.extended.result import (
+    CrossingsSource,
     ExtendedResult,
     ExtendedTable,
     ExtendedView,
@@ -37,17 +40,9 @@ from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation
-from rebar_depth_bench.scoring.metrics import is_valid_prediction
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.view_score import resample_views
 from rebar_depth_bench.submission import SubmissionReader
-
-ONCE, NATIVE, SCALED = "once", "native", "scaled"
-"""Alignments of a prediction (keys of the result's JSON).
-
-``ONCE``: measures that are invariant to scale or apply their own alignment, computed from the native prediction.
-``NATIVE``: the prediction as submitted. ``SCALED``: the prediction times the median scale s.
-"""
 
 Predictions = Sequence[Float64[ndarray, " n"]]
 """Predictions of one view under several alignments: metres on ``truth.index``, NaN where missing."""
@@ -91,6 +86,12 @@ def _as_built(predictions: Predictions, truth: SteelTruth, bars: SceneBars) -> l
     return [as_built.as_built_samples(p_m, truth, bars.cage, bars.axes) for p_m in predictions]
 
 
+def _crossings(predictions: Predictions, truth: SteelTruth, bars: SceneBars) -> list[Samples]:
+    """Return the crossing samples of each prediction; the visible parts of bars are computed once."""
+    view = view_crossings(truth, bars.crossings)
+    return [crossing_samples(p_m, view) for p_m in predictions]
+
+
 def _profile(predictions: Predictions, truth: SteelTruth, bars: SceneBars) -> list[Samples]:
     """Return the profile samples of each prediction."""
     return [profiles.profile_samples(p_m, truth, bars.diameter_m) for p_m in predictions]
@@ -123,6 +124,9 @@ MEASURE_FAMILIES: Mapping[str, MeasureFamily] = {
         _BOTH,
     ),
     "as_built": MeasureFamily("As built against as designed", as_built.MEASURES, _as_built, _BOTH),
+    "crossings": MeasureFamily(
+        "Crossings", (*crossing_measures.MAIN_MEASURES, *crossing_measures.BINNED_MEASURES), _crossings, _BOTH
+    ),
     "profile": MeasureFamily("Against distance and bar width", profiles.MEASURES, _profile, _BOTH),
 }
 """Measure families by key, in report order."""
@@ -157,18 +161,20 @@ def score_extended(
     measures = measures_by_alignment()
     tables: dict[str, ExtendedTable] = {}
     views: list[ViewNumbers] = []
+    source: CrossingsSource | None = None
     for config in evaluation.configs:
         if not has_bar_ids(config):
             tables[config.name] = tabulate_extended([], resample_views([], by_scene=False), measures)
             continue
         steel = load_steel_truth(evaluation.folder, config, progress)
+        source = CrossingsSource(steel.crossings_source, steel.crossings_sha256)
         work = partial(_view, evaluation.submission, steel, scales)
         task = f"extended measures of {config.name}"
         config_views = map_with_progress(work, range(len(steel)), workers, progress, task, len(steel))
         resampling = resample_views([view.view_id for view in config_views], by_scene=config.has_splits)
         tables[config.name] = tabulate_extended(config_views, resampling, measures)
         views += [view_numbers(view, measures) for view in config_views]
-    return ExtendedResult(measures, tables, views)
+    return ExtendedResult(measures, tables, views, source)
 
 
 def _view(
@@ -188,12 +194,7 @@ def view_samples(
 
     ``scale`` is the view's median scale s, None if it has none.
     """
-    predicted_m = prediction_m.ravel().take(truth.index.astype(np.intp))
-    native_m = np.where(is_valid_prediction(predicted_m), predicted_m.astype(np.float64), np.nan)
-    with np.errstate(over="ignore"):
-        scaled_m = native_m * (np.nan if scale is None else scale)
-    scaled_m[~is_valid_prediction(scaled_m)] = np.nan
-    predictions = {ONCE: native_m, NATIVE: native_m, SCALED: scaled_m}
+    predictions = aligned_predictions(prediction_m, truth, scale)
     samples: dict[str, dict[str, Float64[ndarray, " n"]]] = {name: {} for name in predictions}
     for family in MEASURE_FAMILIES.values():
         samples_by_alignment = family.evaluate([predictions[name] for name in family.alignments], truth, bars)

@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
+from rebar_depth_bench.bar_crossings.table import FolderCrossings, folder_crossings
 from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
-from rebar_depth_bench.data.bars import BARS_FILE, read_bars, with_axis
+from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, with_axis
 from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import EyeTruth
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.extended.crossings.judged import SAMPLED_PIXELS, judged_crossings
+from rebar_depth_bench.extended.crossings.scene import SceneCrossings, no_crossings, prepared_crossings
 from rebar_depth_bench.extended.depth_layers import other_layers
 from rebar_depth_bench.extended.inspection.as_built import BarAxes, bar_axes
 from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_segments, cage_truth
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel_truth import JudgedCrossings, SteelTruth
 from rebar_depth_bench.geometry.cameras import Camera, pixel_rays
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.ground_truth import are_pixels_inside, cache_inputs, scored_counts, verified_views
@@ -51,7 +56,7 @@ _LENS_NUMBERS, _CAMERA_NUMBERS = 9 + 5, 9 + 5 + 16
 
 @dataclass(frozen=True, eq=False)
 class SceneBars:
-    """Bars of a scene: their segments, and the nominal diameter by bar id (NaN for ids without a bar).
+    """Bars of a scene: their segments, nominal diameter by bar id (NaN for ids without a bar), and crossings.
 
     ``axes`` has the axes of the bars with a nominal axis, by bar id.
     """
@@ -59,6 +64,7 @@ class SceneBars:
     cage: CageTruth
     diameter_m: Float64[ndarray, " ids"]
     axes: Mapping[int, BarAxes]
+    crossings: SceneCrossings
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +72,8 @@ class ConfigSteelTruth:
     """Steel ground truth of all views of a config that have scored pixels.
 
     ``bars_by_view`` holds the bars of each view's scene. ``rays`` holds the rays of each distinct lens (K and
-    distortion), which views share.
+    distortion), which views share. ``crossings_source`` and ``crossings_sha256`` are the file that the crossings
+    come from and its digest.
     """
 
     height: int
@@ -74,24 +81,45 @@ class ConfigSteelTruth:
     bars_by_view: Mapping[str, SceneBars]
     rays: Mapping[Lens, Rays]
     cache: ArrayCache
+    judged_cache: ArrayCache
+    crossings_source: str
+    crossings_sha256: str
 
     def __len__(self) -> int:
         """Return the number of views."""
         return len(self.cache)
 
+    @property
+    def view_ids(self) -> tuple[str, ...]:
+        """Ids of the views, in order."""
+        return self.cache.view_ids
+
     def view(self, position: int) -> SteelTruth:
         """Return the view at ``position`` in protocol order."""
-        view = self.cache.view(position)
-        lens, pose = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
-        return SteelTruth(
-            view_id=view.view_id,
-            height=self.height,
-            width=self.width,
-            K=np.array(lens[:9]).reshape(3, 3),
-            cam_from_world=np.array(pose).reshape(4, 4),
-            rays=self.rays[lens][view.arrays["index"]],
-            **view.arrays,
-        )
+        truth = _steel_truth(self.cache.view(position), (self.height, self.width), self.rays)
+        return replace(truth, judged=self.judged(position))
+
+    def judged(self, position: int) -> JudgedCrossings:
+        """Return the judged crossings of the view at ``position``."""
+        view = self.judged_cache.view(position)
+        crossing = view.arrays["crossing"][:: 2 * SAMPLED_PIXELS].astype(np.int64)
+        return JudgedCrossings(crossing, view.arrays["pixel"].astype(np.int64).reshape(-1, 2, SAMPLED_PIXELS))
+
+
+def _steel_truth(view: ViewArrays, grid: tuple[int, int], rays: Mapping[Lens, Rays]) -> SteelTruth:
+    """Return a cached view without its judged crossings; ``grid`` is (height, width)."""
+    lens, pose = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
+    return SteelTruth(
+        view_id=view.view_id,
+        height=grid[0],
+        width=grid[1],
+        K=np.array(lens[:9]).reshape(3, 3),
+        cam_from_world=np.array(pose).reshape(4, 4),
+        rays=rays[lens][view.arrays["index"]],
+        distortion=np.array(lens[9:]),
+        judged=JudgedCrossings.none(),
+        **view.arrays,
+    )
 
 
 def has_bar_ids(config: DatasetConfig) -> bool:
@@ -106,7 +134,10 @@ def load_steel_truth(
 
     Raises ``DatasetError`` if the bars of a scene are missing, or if the bars or a view contradict the manifest.
     """
-    bars_by_view = _bars_by_view(folder, config)
+    path = folder.verified_file(BARS_FILE)
+    bars = read_bars(path)
+    found = folder_crossings(folder, bars)
+    bars_by_view = _bars_by_view(path, config, bars, found)
     height, width = config.grid
     scored_px = scored_counts(config)
 
@@ -125,13 +156,25 @@ def load_steel_truth(
     )
     cache = open_cache(content)
     rays = {lens: _rays(lens, height, width) for lens in {numbers[:_LENS_NUMBERS] for numbers in cache.numbers}}
-    return ConfigSteelTruth(height, width, bars_by_view, rays, cache)
+    protocol = f"{EXTENDED_PROTOCOL} {CROSSINGS_PROTOCOL}"
+    judged = CacheContent(
+        source=config.root,
+        inputs=cache_inputs(config, protocol, f"{folder.files[BARS_FILE]} {found.sha256}"),
+        dtypes={"crossing": np.uint32, "pixel": np.uint32},
+        view_ids=tuple(scored_px),
+        extract=lambda: _judged_arrays(cache, config, rays, bars_by_view, progress),
+        is_sound=lambda view: len(view.arrays["pixel"]) % (2 * SAMPLED_PIXELS) == 0,
+    )
+    return ConfigSteelTruth(
+        height, width, bars_by_view, rays, cache, open_cache(judged), found.source, found.sha256
+    )
 
 
-def _bars_by_view(folder: DatasetFolder, config: DatasetConfig) -> dict[str, SceneBars]:
+def _bars_by_view(
+    path: Path, config: DatasetConfig, bars_by_scene: Mapping[str, tuple[Bar, ...]], found: FolderCrossings
+) -> dict[str, SceneBars]:
     """Return the bars of each view's scene, by view id."""
-    path = folder.verified_file(BARS_FILE)
-    bars_by_scene, scenes = read_bars(path), {}
+    scenes = {}
     for scene in config.scenes:
         bars = bars_by_scene.get(scene.name, None if config.imported is None else ())
         if bars is None:
@@ -140,8 +183,27 @@ def _bars_by_view(folder: DatasetFolder, config: DatasetConfig) -> dict[str, Sce
         diameter_m = np.full(np.iinfo(np.uint16).max + 1, np.nan)
         measured = with_axis(bars)
         diameter_m[[bar.bar_id for bar in measured]] = [bar.diameter_m for bar in measured]
-        scenes[scene.name] = SceneBars(cage_truth(bars), diameter_m, bar_axes(bars))
+        cage, crossings = cage_truth(bars), found.by_scene.get(scene.name)
+        prepared = no_crossings() if crossings is None else prepared_crossings(crossings, bars, cage)
+        scenes[scene.name] = SceneBars(cage, diameter_m, bar_axes(bars), prepared)
     return {view_id: scenes[scene] for view_id, scene in config.scene_by_view.items()}
+
+
+def _judged_arrays(
+    cache: ArrayCache,
+    config: DatasetConfig,
+    rays: Mapping[Lens, Rays],
+    bars_by_view: Mapping[str, SceneBars],
+    progress: Progress,
+) -> Iterator[ViewArrays]:
+    """Yield the judged crossings of every view: their sampled pixels, each with the index of its crossing."""
+    for position in range(len(cache)):
+        truth = _steel_truth(cache.view(position), config.grid, rays)
+        judged = judged_crossings(truth, bars_by_view[truth.view_id].crossings)
+        pixel = judged.pixels.ravel()
+        arrays = {"crossing": np.repeat(judged.crossing, 2 * SAMPLED_PIXELS), "pixel": pixel}
+        yield ViewArrays(truth.view_id, arrays, ())
+        progress(f"crossings in the views of {config.name}", position + 1, len(cache))
 
 
 def _view_arrays(

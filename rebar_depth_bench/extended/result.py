@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
+from rebar_depth_bench.extended.crossings.reach import Reach, reaches
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
 from rebar_depth_bench.scoring.frames import frame_of_values
@@ -53,24 +54,38 @@ class ViewNumbers:
 
 @dataclass(frozen=True)
 class ExtendedTable:
-    """Estimates of one config by alignment and measure name."""
+    """Estimates of one config by alignment and measure name, and the reaches at its crossings by alignment."""
 
     views: int
     numbers: Mapping[str, Mapping[str, MeasureEstimate]]
+    reaches: Mapping[str, tuple[Reach, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class CrossingsSource:
+    """File of the dataset folder that the crossings come from, and its hex SHA-256."""
+
+    file: str
+    sha256: str
 
 
 @dataclass(frozen=True, eq=False)
 class ExtendedResult:
-    """Extended measures of a submission; ``measures`` holds the definitions of each alignment, in order."""
+    """Extended measures of a submission; ``measures`` holds the definitions of each alignment, in order.
+
+    ``crossings`` is None if no config has bar ids.
+    """
 
     measures: Mapping[str, Sequence[Measure]]
     tables: Mapping[str, ExtendedTable]
     views: Sequence[ViewNumbers]
+    crossings: CrossingsSource | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the ``extended`` object of the result's JSON."""
         return {
             "protocol": EXTENDED_PROTOCOL,
+            "crossings": None if self.crossings is None else asdict(self.crossings),
             "tables": {name: _table_dict(table) for name, table in self.tables.items()},
             "views": [_view_dict(view) for view in self.views],
         }
@@ -118,7 +133,12 @@ def tabulate_extended(
         alignment: _estimates(alignment_measures, [view.samples[alignment] for view in views], resampling)
         for alignment, alignment_measures in measures.items()
     }
-    return ExtendedTable(len(views), numbers)
+    found = {
+        alignment: reaches([view.samples[alignment] for view in views], resampling)
+        for alignment in measures
+        if views and "crossing_z_m" in views[0].samples[alignment]
+    }
+    return ExtendedTable(len(views), numbers, found)
 
 
 def _estimates(
@@ -192,7 +212,8 @@ def _table_dict(table: ExtendedTable) -> dict[str, Any]:
         alignment: {name: _estimate_dict(entry) for name, entry in alignment_estimates.items()}
         for alignment, alignment_estimates in table.numbers.items()
     }
-    return {"views": table.views, **numbers}
+    found = {name: [reach.to_dict() for reach in of_alignment] for name, of_alignment in table.reaches.items()}
+    return {"views": table.views, **numbers, "crossing_reach": found}
 
 
 def _estimate_dict(entry: MeasureEstimate) -> dict[str, Any]:

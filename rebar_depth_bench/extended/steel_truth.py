@@ -2,10 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from jaxtyping import Bool, Float32, Float64, UInt16, UInt32
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt16, UInt32
 from numpy import ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedCrossings:
+    """Judged crossings of a view: see ``crossings.judged``.
+
+    ``crossing`` holds indices into the scene's crossings, ascending. ``pixels`` are positions in the arrays of
+    ``SteelTruth``: k sampled pixels of bar a, and of bar b.
+    """
+
+    crossing: Int64[ndarray, " m"]
+    pixels: Int64[ndarray, "m 2 k"]
+
+    @classmethod
+    def none(cls) -> JudgedCrossings:
+        """Return no crossings."""
+        return cls(np.empty(0, np.int64), np.empty((0, 2, 1), np.int64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +37,7 @@ class SteelTruth:
     0], rays[:, 1], 1)``. ``run`` is the straight bar segment whose axis is nearest to the true point (an index
     into ``CageTruth.segments``), -1 where the point is on no segment. ``front_m`` and ``behind_m`` are the depths
     of the closest other layer in front of and behind the pixel, NaN where none is visible: see
-    ``depth_layers.other_layers``.
+    ``depth_layers.other_layers``. ``distortion`` is that of the grid (``cameras.distort``), zeros on an ideal one.
     """
 
     view_id: str
@@ -36,3 +54,5 @@ class SteelTruth:
     run: ndarray  # Int16 n
     front_m: Float32[ndarray, " n"]
     behind_m: Float32[ndarray, " n"]
+    distortion: Float64[ndarray, " 5"] = field(default_factory=lambda: np.zeros(5))
+    judged: JudgedCrossings = field(default_factory=JudgedCrossings.none)

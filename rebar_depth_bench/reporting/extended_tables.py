@@ -11,11 +11,14 @@ from rich.padding import Padding
 from rich.table import Table as RichTable
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, NATIVE, SCALED, MeasureFamily
+from rebar_depth_bench.extended.crossings.measures import MISS_DEG
+from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
 from rebar_depth_bench.extended.inspection.measures import MISS_MM
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
+from rebar_depth_bench.extended.predictions import NATIVE, SCALED
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting import formatting
+from rebar_depth_bench.reporting.crossing_texts import reach_sentence
 from rebar_depth_bench.reporting.tables import frame_csv, plain_text
 from rebar_depth_bench.scoring.bootstrap import Interval
 from rebar_depth_bench.scoring.result import Result
@@ -59,9 +62,14 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
                     *map(plain_text, texts if wide else texts[::2]),
                 )
         console.print(grid)
+        for alignment, of_alignment in table.reaches.items():
+            for reach in of_alignment:
+                console.print(plain_text(reach_sentence(alignment, reach)))
     numbers = [(measure, estimate) for _, _, measure, estimate in extended.estimates()]
     if any(is_miss(estimate, measure) for measure, estimate in numbers):
-        console.print(plain_text(f"{MISSED}: not found, recorded as {MISS_MM:g} mm in CSV and JSON."))
+        console.print(
+            plain_text(f"{MISSED}: not found, recorded as {MISS_MM:g} mm or {MISS_DEG:g} degrees in CSV and JSON.")
+        )
     if any(estimate.value is None and estimate.samples for _, estimate in numbers):
         console.print(plain_text(f"{UNDEFINED}: 5 % or more were not found, so the capability is undefined."))
     if not wide:
@@ -101,8 +109,10 @@ def measure_cells(table: ExtendedTable, family: MeasureFamily, measure: Measure)
 
 
 def is_miss(estimate: MeasureEstimate, measure: Measure) -> bool:
-    """Return whether an error has the value ``MISS_MM`` of bars that were not found."""
-    return measure.sample.endswith("_judged_mm") and measure.convert is None and estimate.value == MISS_MM
+    """Return whether an error has the value ``MISS_MM`` or ``MISS_DEG`` of what was not found."""
+    misses = (("_judged_mm", MISS_MM), ("_judged_deg", MISS_DEG))
+    is_error = any(measure.sample.endswith(suffix) and estimate.value == miss for suffix, miss in misses)
+    return is_error and measure.convert is None
 
 
 def format_value(value: float | None, measure: Measure, digits: int = 4) -> str:

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.extended.inspection.evaluate import fit_axes, with_misses_mm
+from rebar_depth_bench.extended.inspection.axis_fits import fit_axes, with_misses
 from rebar_depth_bench.extended.inspection.measures import JUDGED_NOTE, MISSED_NOTE
 from rebar_depth_bench.extended.inspection.segments import CageTruth
 from rebar_depth_bench.extended.inspection.visible_segments import visible_segments
@@ -85,7 +85,7 @@ def as_built_samples(
     )
     is_off, is_reported = true_mm > OFF_MM, measured_mm > OFF_MM
     return {
-        "deviation_judged_mm": with_misses_mm(error_mm),
+        "deviation_judged_mm": with_misses(error_mm),
         "deviation_excess_mm": (measured_mm - true_mm)[deviations.found],
         "deviation_true_mm": true_mm,
         "off_reported": is_reported[is_off].astype(np.float64),
@@ -113,7 +113,8 @@ def _deviations(
             direction.append(nominal.direction)
     if not judged:
         return None
-    _, fitted = fit_axes(p_m, visible.of(np.array(judged)))
+    shown = visible.of(np.array(judged))
+    fitted = fit_axes(p_m, shown, np.zeros(len(judged), dtype=bool))
     nominal_m, nominal_direction = np.array(foot_m), np.array(direction)
     fitted_m = np.where(fitted.found[:, None], fitted.point_m, np.nan)
     return _Deviations(

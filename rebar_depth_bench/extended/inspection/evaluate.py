@@ -12,40 +12,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.inspection.cylinder_fit import CylinderFits, fit_cylinders
-from rebar_depth_bench.extended.inspection.measures import (
-    MIN_PREDICTED_SHARE,
-    MIN_VISIBLE_OVERLAP_DIAMETERS,
-    MISS_MM,
-)
+from rebar_depth_bench.extended.inspection.axis_fits import FittedAxes, fit_axes, with_misses
+from rebar_depth_bench.extended.inspection.measures import MIN_VISIBLE_OVERLAP_DIAMETERS
 from rebar_depth_bench.extended.inspection.segments import CageTruth
 from rebar_depth_bench.extended.inspection.tolerances import TOLERANCES, ErrorKind, pass_sample
 from rebar_depth_bench.extended.inspection.visible_segments import VisibleSegments, visible_segments
 from rebar_depth_bench.extended.measures import Samples
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 
-MAX_DEPTH_M = 1e6
-"""Upper bound applied to predicted depth, metres, so that its squares do not overflow."""
-
 _MM = 1000.0
-
-
-@dataclass(frozen=True, eq=False)
-class FittedAxes:
-    """Fitted axis of each visible segment and its deviation from the true axis.
-
-    ``found`` marks the segments whose axis was accepted. An axis is a point and a unit direction in the camera
-    frame. ``offset_m`` is the distance of the fitted axis from the middle of the visible part of the true one.
-    """
-
-    found: Bool[ndarray, " r"]
-    point_m: Float64[ndarray, "r 3"]
-    direction: Float64[ndarray, "r 3"]
-    offset_m: Float64[ndarray, " r"]
-    tilt_deg: Float64[ndarray, " r"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +53,7 @@ def inspection_samples(
     if p_m.shape != truth.index.shape:
         raise ValueError(f"p_m has shape {p_m.shape}, expected {truth.index.shape} as truth.index has")
     visible = visible or visible_segments(truth, cage)
-    fits, fitted = fit_axes(p_m, visible)
+    fitted = fit_axes(p_m, visible, visible.can_fit_diameter)
     pairs = _visible_pairs(visible, cage)
     spacing_m, layer_m = _pair_errors_m(pairs, visible, fitted)
     cover_m = (fitted.point_m - visible.middle_m)[:, 2]
@@ -84,83 +62,16 @@ def inspection_samples(
         "layer": layer_m * _MM,
         "cover": np.where(fitted.found, cover_m, np.nan) * _MM,
     }
-    diameter_error_m = np.where(fitted.found, fits.diameter_m - visible.diameter_m, np.nan)
+    diameter_error_m = np.where(fitted.found, fitted.diameter_m - visible.diameter_m, np.nan)
     return {
         "bar_found": fitted.found.astype(np.float64),
         "axis_offset_mm": fitted.offset_m[fitted.found] * _MM,
-        "axis_offset_judged_mm": with_misses_mm(np.where(fitted.found, fitted.offset_m * _MM, np.nan)),
+        "axis_offset_judged_mm": with_misses(np.where(fitted.found, fitted.offset_m * _MM, np.nan)),
         "axis_tilt_deg": fitted.tilt_deg[fitted.found],
         **_error_samples(errors_mm),
         **_error_samples({"diameter": diameter_error_m[visible.can_fit_diameter] * _MM}),
         **_pass_samples(errors_mm),
     }
-
-
-def fit_axes(p_m: Float64[ndarray, " n"], visible: VisibleSegments) -> tuple[CylinderFits, FittedAxes]:
-    """Fit a cylinder to the predicted points of each visible segment; return the fits and their axes.
-
-    ``p_m`` is the predicted planar depth in metres on the pixels of the ground truth of ``visible``.
-    """
-    points_m, predicted = _predicted_points_m(p_m, visible)
-    start_m = _initial_offset_m(points_m, predicted, visible)
-    fits = fit_cylinders(
-        points_m, predicted, start_m, visible.half_m, visible.diameter_m / 2, visible.can_fit_diameter
-    )
-    return fits, _compare_with_truth(fits, predicted, visible)
-
-
-def _predicted_points_m(
-    p_m: Float64[ndarray, " n"], visible: VisibleSegments
-) -> tuple[Float64[ndarray, "r k 3"], Bool[ndarray, "r k"]]:
-    """Return the predicted points of each visible segment in its own frame, and which of them exist.
-
-    A point's position along the axis is taken from the true point of its pixel, not from the predicted depth:
-    where a bar runs away from the camera, depth noise would shift points along and away from the camera together
-    and tilt the fitted axis.
-    """
-    depth_m = p_m.take(visible.pixels)
-    with np.errstate(invalid="ignore"):
-        predicted = visible.used & np.isfinite(depth_m) & (depth_m > 0)
-        known_m = np.where(predicted, np.minimum(depth_m, MAX_DEPTH_M), 0.0)
-    points_m = visible.local_points_m(known_m)
-    points_m[..., 2] = visible.truth_m[..., 2]
-    return points_m, predicted
-
-
-def _initial_offset_m(
-    points_m: Float64[ndarray, "r k 3"], predicted: Bool[ndarray, "r k"], visible: VisibleSegments
-) -> Float64[ndarray, "r 2"]:
-    """Return the start of each fit: the median displacement (across, away) of predicted from true points."""
-    displacement_m = np.where(predicted[..., None], (points_m - visible.truth_m)[..., :2], np.inf)
-    ordered_m = np.sort(displacement_m, axis=1)
-    count = predicted.sum(axis=1)
-    lower, upper = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, np.maximum(count - 1, 0))
-    row = np.arange(len(count))
-    median_m = (ordered_m[row, lower] + ordered_m[row, upper]) / 2
-    return np.where((count > 0)[:, None], median_m, 0.0)
-
-
-def _compare_with_truth(
-    fits: CylinderFits, predicted: Bool[ndarray, "r k"], visible: VisibleSegments
-) -> FittedAxes:
-    """Return the fitted axes in the camera frame and their deviations from the true ones."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        squared_slope = (fits.slope**2).sum(axis=1)
-        lean_m = (fits.offset_m * fits.slope).sum(axis=1)
-        offset_m = np.sqrt(np.maximum((fits.offset_m**2).sum(axis=1) - lean_m**2 / (1 + squared_slope), 0.0))
-        enough = predicted.sum(axis=1) >= MIN_PREDICTED_SHARE * visible.used.sum(axis=1)
-        to_end_m = fits.slope * visible.half_m[:, None]
-        ends_m = (np.linalg.norm(fits.offset_m + side * to_end_m, axis=1) for side in (-1, 1))
-        farthest_m = np.maximum(offset_m, np.maximum(*ends_m))
-        found = enough & fits.converged & (farthest_m < visible.match_radius_m)
-        local = np.column_stack([fits.slope, np.ones(len(fits.slope))]) / np.sqrt(1 + squared_slope)[:, None]
-        return FittedAxes(
-            found=found,
-            point_m=visible.middle_m + np.einsum("rc,rci->ri", fits.offset_m, visible.frame[:, :2]),
-            direction=np.einsum("rc,rci->ri", local, visible.frame),
-            offset_m=offset_m,
-            tilt_deg=np.rad2deg(np.arctan(np.sqrt(squared_slope))),
-        )
 
 
 def _visible_pairs(visible: VisibleSegments, cage: CageTruth) -> _SegmentPairs:
@@ -213,11 +124,6 @@ def _separation_m(
     return np.asarray(intersections_m[1] - intersections_m[0])
 
 
-def with_misses_mm(error_mm: Float64[ndarray, " n"]) -> Float64[ndarray, " n"]:
-    """Return absolute errors, capped at ``MISS_MM``, and ``MISS_MM`` for what was not found."""
-    return np.where(np.isnan(error_mm), MISS_MM, np.minimum(np.abs(error_mm), MISS_MM))
-
-
 def _error_samples(
     errors_mm: Mapping[ErrorKind, Float64[ndarray, " n"]] | Mapping[str, Float64[ndarray, " n"]],
 ) -> dict[str, Float64[ndarray, " n"]]:
@@ -225,15 +131,13 @@ def _error_samples(
     samples = {}
     for kind, error_mm in errors_mm.items():
         samples[f"{kind}_error_mm"] = error_mm[~np.isnan(error_mm)]
-        samples[f"{kind}_judged_mm"] = with_misses_mm(error_mm)
+        samples[f"{kind}_judged_mm"] = with_misses(error_mm)
     return samples
 
 
 def _pass_samples(errors_mm: Mapping[ErrorKind, Float64[ndarray, " n"]]) -> dict[str, Float64[ndarray, " n"]]:
     """Return for each tolerance 1 for errors within it, 0 for larger ones and for what was not found."""
     return {
-        pass_sample(tolerance): (with_misses_mm(errors_mm[tolerance.kind]) <= tolerance.limit_mm).astype(
-            np.float64
-        )
+        pass_sample(tolerance): (with_misses(errors_mm[tolerance.kind]) <= tolerance.limit_mm).astype(np.float64)
         for _, tolerance in TOLERANCES
     }

@@ -33,7 +33,7 @@ At least this share (second value) of the sampled pixels lies beyond this many r
 either side.
 """
 
-_GOLDEN = (np.sqrt(5.0) - 1) / 2
+GOLDEN = (np.sqrt(5.0) - 1) / 2
 """Golden ratio minus 1."""
 
 
@@ -81,23 +81,52 @@ def visible_segments(truth: SteelTruth, cage: CageTruth) -> VisibleSegments:
     rotation, shift_m = truth.cam_from_world[:3, :3], truth.cam_from_world[:3, 3]
     start_m = cage.start_m[segment] @ rotation.T + shift_m
     axis_m = (cage.end_m[segment] - cage.start_m[segment]) @ rotation.T
-    direction = axis_m / np.linalg.norm(axis_m, axis=1, keepdims=True)
+    runs = AxisLines(
+        segment,
+        cage.diameter_m[segment],
+        cage.match_radius_m[segment],
+        start_m,
+        axis_m / np.linalg.norm(axis_m, axis=1, keepdims=True),
+    )
+    visible = visible_parts(truth, runs, pixels, used)
+    return visible.of(2 * visible.half_m >= MIN_VISIBLE_DIAMETERS * visible.diameter_m)
+
+
+@dataclass(frozen=True, eq=False)
+class AxisLines:
+    """Straight parts of axes: their bars' diameters, and a point and the unit direction in the camera frame.
+
+    ``segment`` holds indices into ``CageTruth.segments`` or other items, and ``match_radius_m`` is the distance
+    within which a fitted axis belongs to the part.
+    """
+
+    segment: Int64[ndarray, " r"]
+    diameter_m: Float64[ndarray, " r"]
+    match_radius_m: Float64[ndarray, " r"]
+    start_m: Float64[ndarray, "r 3"]
+    direction: Float64[ndarray, "r 3"]
+
+
+def visible_parts(
+    truth: SteelTruth, lines: AxisLines, pixels: Int64[ndarray, "r k"], used: Bool[ndarray, "r k"]
+) -> VisibleSegments:
+    """Return the visible part of each line as its ``pixels`` show it: positions in the arrays of ``truth``."""
+    direction = lines.direction
     rays = np.concatenate([truth.rays.take(pixels, axis=0), np.ones((*pixels.shape, 1))], axis=-1)
     depth_m = truth.depth_m.take(pixels).astype(np.float64)
-    along_m = depth_m * (rays @ direction[..., None])[..., 0] - np.einsum("ri,ri->r", start_m, direction)[:, None]
+    start_along_m = np.einsum("ri,ri->r", lines.start_m, direction)
+    along_m = depth_m * (rays @ direction[..., None])[..., 0] - start_along_m[:, None]
     low_m = np.where(used, along_m, np.inf).min(axis=1, initial=np.inf)
     high_m = np.where(used, along_m, -np.inf).max(axis=1, initial=-np.inf)
-    middle_m = start_m + ((low_m + high_m) / 2)[:, None] * direction
+    middle_m = lines.start_m + ((low_m + high_m) / 2)[:, None] * direction
     frame = _frames(middle_m, direction)
     local_rays = rays @ frame.transpose(0, 2, 1)
     truth_m = depth_m[..., None] * local_rays - np.einsum("rij,rj->ri", frame, middle_m)[:, None]
-    diameter_m = cage.diameter_m[segment]
-    can_fit_diameter = _can_fit_diameter(truth_m[..., 0], used, diameter_m, float(truth.K[0, 0]), middle_m[:, 2])
-    long_enough = high_m - low_m >= MIN_VISIBLE_DIAMETERS * diameter_m
-    arrays = (segment, diameter_m, cage.match_radius_m[segment], middle_m, (high_m - low_m) / 2, frame)
+    focal_px, diameter_m = float(truth.K[0, 0]), lines.diameter_m
     return VisibleSegments(
-        *(values[long_enough] for values in (*arrays, pixels, used, local_rays, truth_m, can_fit_diameter))
-    )
+        lines.segment, diameter_m, lines.match_radius_m, middle_m, (high_m - low_m) / 2, frame, pixels, used,
+        local_rays, truth_m, _can_fit_diameter(truth_m[..., 0], used, diameter_m, focal_px, middle_m[:, 2]),
+    )  # fmt: skip
 
 
 def _sampled_pixels(
@@ -116,7 +145,7 @@ def _sampled_pixels(
     first = (np.cumsum(counts) - counts)[segment]
     total = counts[segment][:, None]
     slot = np.arange(MAX_SAMPLES)
-    spread = np.floor(total * ((slot + 0.5) * _GOLDEN % 1.0)).astype(np.int64)
+    spread = np.floor(total * ((slot + 0.5) * GOLDEN % 1.0)).astype(np.int64)
     used = slot < total
     chosen = np.where(total > MAX_SAMPLES, spread, np.where(used, slot, 0))
     return segment, by_segment.take(first[:, None] + chosen), used

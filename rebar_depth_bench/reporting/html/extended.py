@@ -11,7 +11,8 @@ from itertools import pairwise
 from markupsafe import Markup
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, NATIVE, ONCE, SCALED, MeasureFamily
+from rebar_depth_bench.extended.crossings.measures import MISS_DEG
+from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
 from rebar_depth_bench.extended.inspection.measures import INSPECTION_MEASURES, MISS_MM, capability_name
 from rebar_depth_bench.extended.inspection.tolerances import (
     PROFILES,
@@ -22,6 +23,7 @@ from rebar_depth_bench.extended.inspection.tolerances import (
 )
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.point_cloud import TOLERANCES_MM
+from rebar_depth_bench.extended.predictions import NATIVE, ONCE, SCALED
 from rebar_depth_bench.extended.profiles import AXES, bin_names
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting.charts.profile import ProfileBin, profile_chart
@@ -32,7 +34,7 @@ from rebar_depth_bench.reporting.html.rows import Cell
 _DECIMALS: Mapping[str, int] = {"mm": 2, "cm": 2, "m": 3, "%": 1, "": 4}
 _RATIO_DECIMALS = 2
 _ARROWS: Mapping[str, str] = {"lower": "↓", "higher": "↑", "": ""}
-_TITLE_NUMBER = re.compile(r"\d[\d.]*(?:-[\d.]+)?(?= (?:mm|%|m|px)(?!\w))")
+_TITLE_NUMBER = re.compile(r"\d[\d.]*(?:-[\d.]+)?(?= (?:mm|%|m|px|degrees)(?!\w))")
 """Tolerance, threshold or bin in a measure's title: a number followed by a unit."""
 
 
@@ -219,17 +221,17 @@ def _extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
     profile = MEASURE_FAMILIES["profile"]
     folded = [
         *(_folded_table(table, key) for key in _FOLDED_FAMILIES),
-        _measure_table(table, f"{profile.title}: values", profile, profile.measures),
+        measure_table(table, f"{profile.title}: values", profile, profile.measures),
     ]
     charts = [(_AXIS_TITLES[axis][0], _profile_chart(table, axis)) for axis in AXES]
     return ExtendedConfig(
         name=printable(name),
         views=table.views,
         charts=[(title, chart) for title, chart in charts if chart],
-        main_inspection=_measure_table(
+        main_inspection=measure_table(
             table, inspection.title, inspection, [inspection.by_name[name] for name in MAIN_INSPECTION_MEASURES]
         ),
-        other_inspection=_measure_table(table, "Inspection: spread, median, found bars only", inspection, other),
+        other_inspection=measure_table(table, "Inspection: spread, median, found bars only", inspection, other),
         tolerances=[_tolerance_row(table, *line) for line in TOLERANCES],
         families=[family for family in folded if family.rows],
         single_bar=single_bar_sentence(table),
@@ -240,15 +242,17 @@ def _folded_table(table: ExtendedTable, key: str) -> ExtendedMeasureTable:
     family = MEASURE_FAMILIES[key]
     if key == "clouds":
         return _cloud_table(table, family)
-    return _measure_table(table, family.title, family, family.measures, _ONCE_NOTES.get(key, ""))
+    return measure_table(table, family.title, family, family.measures, _ONCE_NOTES.get(key, ""))
 
 
-def _measure_table(
+def measure_table(
     table: ExtendedTable, title: str, family: MeasureFamily, measures: Sequence[Measure], once_aside: str = ""
 ) -> ExtendedMeasureTable:
+    """Return the table of some measures of a family, those without samples left out."""
     rows = measure_rows(table, measures, family.alignments)
-    has_miss = any(cell.text == MISSED for row in rows for cell in row.cells)
-    note = f"{MISSED}: not found, counted as {MISS_MM:g} mm." if has_miss else ""
+    units = {row.unit for row in rows if any(cell.text == MISSED for cell in row.cells)}
+    values = " or ".join(f"{MISS_MM:g} mm" if unit else f"{MISS_DEG:g} degrees" for unit in sorted(units)[::-1])
+    note = f"{MISSED}: not found, counted as {values}." if units else ""
     heads = _alignment_heads(family, once_aside)
     return ExtendedMeasureTable(title, "rows", heads, rows, measure_definitions(measures), note)
 

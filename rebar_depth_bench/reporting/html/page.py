@@ -24,6 +24,8 @@ from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import score_charts
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.assets import environment, inline_script
+from rebar_depth_bench.reporting.html.crossing_picture import crossing_pictures
+from rebar_depth_bench.reporting.html.crossings import CrossingPicture, crossing_section
 from rebar_depth_bench.reporting.html.extended import extended_section
 from rebar_depth_bench.reporting.html.groups import config_groups
 from rebar_depth_bench.reporting.html.published import paper_scenes
@@ -62,11 +64,16 @@ class ConfigViewTables:
     views: int
 
 
-def render_report(result: Result, panels: Iterable[ViewPanels], mistakes: Sequence[PossibleMistake] = ()) -> str:
+def render_report(
+    result: Result,
+    panels: Iterable[ViewPanels],
+    mistakes: Sequence[PossibleMistake] = (),
+    pictures: Mapping[str, CrossingPicture] | None = None,
+) -> str:
     """Return the HTML report of ``result`` with the images of ``panels``, by config, worst view first.
 
     ``panels`` may be in any order and is iterated once; only the encoded images stay in memory. ``mistakes`` are
-    the possible mistakes in the submission.
+    the possible mistakes in the submission, and ``pictures`` the views with their crossings, by config.
     """
     views = views_by_config(result)
     shown = shown_views(panels, list(result.tables))
@@ -87,6 +94,7 @@ def render_report(result: Result, panels: Iterable[ViewPanels], mistakes: Sequen
             **results_context(result, views),
             **paper_context(result),
             extended=None if result.extended is None else extended_section(result.extended),
+            crossings=None if result.extended is None else crossing_section(result.extended, pictures or {}),
             **_browser_context(shown, views),
             **_views_context(result, views),
         )
@@ -193,7 +201,8 @@ def write_report(
         config: views_to_show([view for view in result.views if config_of(view.view_id) == config], views_shown)
         for config in result.tables
     }
-    write_output(target, render_report(result, iter_view_panels(chosen, evaluation), mistakes))
+    pictures = crossing_pictures(evaluation) if result.extended is not None else {}
+    write_output(target, render_report(result, iter_view_panels(chosen, evaluation), mistakes, pictures))
 
 
 def iter_view_panels(chosen: Mapping[str, list[ViewScore]], evaluation: Evaluation) -> Iterator[ViewPanels]:

@@ -105,6 +105,15 @@ def view_images(view: ViewPanels) -> ViewImages:
     )
 
 
+def backdrop_image(
+    rgb: UInt8[ndarray, "h w 3"] | None, truth_m: Float32[ndarray, "h w"], steel: Bool[ndarray, "h w"]
+) -> bytes:
+    """Return the colour image of a view as WebP, or its true depth in a config without colour, to draw over."""
+    if rgb is not None:
+        return _webp(rgb, lossless=False)
+    return _webp(depth_image(truth_m, *depth_range(truth_m, scored_pixels(steel, truth_m))))
+
+
 def depth_range(truth_m: Float32[ndarray, "h w"], scored: ndarray) -> tuple[float, float]:
     """Return (near, far), metres: the robust range of true depth at the flat indices ``scored``, widened.
 

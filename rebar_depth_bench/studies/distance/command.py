@@ -1,4 +1,4 @@
-"""Command ``rebar-bench study distance``: scale correction and error of predictions over distance."""
+"""Command ``rebar-bench study distance``: scale, error and reach at crossings of predictions over distance."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from pathlib import Path
 from rebar_depth_bench.console import ProgressBars, add_archive, add_data
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.extended.crossings.config import config_reaches
+from rebar_depth_bench.extended.ground_truth import has_bar_ids
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.ground_truth import config_truth
@@ -27,7 +29,7 @@ from rebar_depth_bench.studies.distance.study import (
     fit_scale_slope,
 )
 
-SUMMARY = "scale factor and error of predictions over distance"
+SUMMARY = "scale factor and error of predictions over distance, and the reach at crossings of bars"
 
 DEFAULT_BINS_PER_DECADE = 10
 """Distance bins per factor of ten, evenly spaced in the logarithm."""
@@ -90,6 +92,12 @@ def run_distance_study(
         names = _select_configs(archive, result, configs)
         config_by_name = {config.name: config for config in evaluation.configs}
         points = {name: _distance_points(evaluation, result, config_by_name[name]) for name in names}
+        scales = {view.view_id: view.scale for view in result.views}
+        reaches = {
+            name: config_reaches(evaluation, config_by_name[name], scales, progress=progress)
+            for name in names
+            if has_bar_ids(config_by_name[name])
+        }
         provenance = evaluation.provenance()
     empty = [name for name, views in points.items() if not views]
     if empty:
@@ -103,6 +111,7 @@ def run_distance_study(
         points=tuple(point for views in points.values() for point in views),
         bins=tuple(bin_ for views in points.values() for bin_ in bin_views(views, bins_per_decade)),
         slopes=tuple(slopes),
+        reaches=reaches,
     )
 
 

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.lines import HEIGHT, LEFT, RIGHT, TOP, ChartText, Series, chart, log_axis
+from rebar_depth_bench.reporting.crossing_texts import FITS_NOTE, REACH_NOTE
 from rebar_depth_bench.reporting.html.study_page import Columns, PageFigure, PageTable, StudyPage, page_table
 from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS
 from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.single_bar import SingleBarScore
+from rebar_depth_bench.studies.distance.reach_output import reach_sentences, reach_tables, reaches_json
 from rebar_depth_bench.studies.distance.study import (
     ALL_CONFIGS,
     DistanceBin,
@@ -35,6 +37,7 @@ def to_json(study: DistanceStudy) -> dict[str, Any]:
         "bins_per_decade": study.bins_per_decade,
         "slopes": [asdict(slope) for slope in study.slopes],
         "bins": [asdict(bin_) for bin_ in study.bins],
+        "crossing_reach": {config: reaches_json(found) for config, found in study.reaches.items()},
         "views": [_view_json(point) for point in study.points],
     }
 
@@ -71,10 +74,21 @@ def to_page(study: DistanceStudy) -> StudyPage:
     return StudyPage(
         study="distance",
         title=f"{method} over distance: native, and scaled by an oracle median per view",
-        lead=" ".join([_slope_sentence(study.slopes[-1]), *_reversal_sentence(study.slopes[-1], study.bins)]),
+        lead=" ".join(
+            [
+                _slope_sentence(study.slopes[-1]),
+                *_reversal_sentence(study.slopes[-1], study.bins),
+                *reach_sentences(study.reaches),
+            ]
+        ),
         stamps=study.provenance.lines(),
         figures=(_scale_figure(study), _error_figure(study)),
-        tables=(_slope_table(study.slopes), _bin_table(study.bins), _single_bar_table(study.bins)),
+        tables=(
+            *(reach_tables(study.reaches) if study.reaches else ()),
+            _slope_table(study.slopes),
+            _bin_table(study.bins),
+            _single_bar_table(study.bins),
+        ),
         notes=_notes(study),
     )
 
@@ -261,6 +275,8 @@ def _notes(study: DistanceStudy) -> list[str]:
         "not for other scenes. In configs with splits: bootstrap over scenes; they hold for others of the same "
         f"generator. {formatting.DASH}: undefined, or no interval from fewer than {MIN_VIEWS} views or scenes.",
     ]
+    if study.reaches:
+        notes += [f"Crossings: {REACH_NOTE}", FITS_NOTE]
     without = sum(point.score.scale is None for point in study.points)
     if without:
         notes.append(

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from rebar_depth_bench.extended.crossings.config import ConfigReaches
 from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS, Interval, Resampling, interval, resample
 from rebar_depth_bench.scoring.metrics import DepthMetrics, mean
 from rebar_depth_bench.scoring.provenance import Provenance
@@ -102,6 +103,7 @@ class DistanceStudy:
     """Result of the distance study.
 
     ``slopes`` has one slope per config and, if there are several configs, a last one over all configs together.
+    ``reaches`` holds the reaches at the crossings of bars, by config with bar ids.
     """
 
     provenance: Provenance
@@ -109,6 +111,7 @@ class DistanceStudy:
     points: tuple[DistancePoint, ...]
     bins: tuple[DistanceBin, ...]
     slopes: tuple[ScaleSlope, ...]
+    reaches: Mapping[str, ConfigReaches]
 
 
 def bin_views(points: Sequence[DistancePoint], per_decade: int) -> list[DistanceBin]:

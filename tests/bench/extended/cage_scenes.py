@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from rebar_depth_bench.bar_crossings.definition import scene_crossings
 from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.extended.crossings.judged import judged_crossings
+from rebar_depth_bench.extended.crossings.scene import SceneCrossings, prepared_crossings
 from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_segments, cage_truth
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.scoring.protocol import interior
+from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 
 WIDTH, HEIGHT, FOCAL_PX = 240, 160, 210.0
 CAMERA_AT_ORIGIN = np.eye(4)
@@ -88,11 +92,23 @@ def view(bars: Sequence[Bar], cam_from_world: np.ndarray = CAMERA_AT_ORIGIN) -> 
     inside = interior((ids > 0).reshape(HEIGHT, WIDTH)).ravel()[index]
     K = np.array([[FOCAL_PX, 0, (WIDTH - 1) / 2], [0, FOCAL_PX, (HEIGHT - 1) / 2], [0, 0, 1.0]])
     run = assign_segments(world_m, bar_id, cage)
+    single_bar = np.zeros_like(inside)
+    scored = index[inside].astype(np.uint32)
+    single_bar[inside] = single_bar_pixels(ids.reshape(HEIGHT, WIDTH).astype(np.uint16), scored)
     truth = SteelTruth(
         "lattice/0000", HEIGHT, WIDTH, K, cam_from_world, index.astype(np.uint32), z_m, bar_id, inside,
-        np.zeros_like(inside), rays, run, no_layer, no_layer,
+        single_bar, rays, run, no_layer, no_layer,
     )  # fmt: skip
     return truth, cage
+
+
+def view_with_crossings(
+    bars: Sequence[Bar], cam_from_world: np.ndarray = CAMERA_AT_ORIGIN
+) -> tuple[SteelTruth, SceneCrossings]:
+    """Return the truth of one view of bars with its judged crossings, and the crossings of the bars."""
+    truth, cage = view([item for item in bars if item.has_axis], cam_from_world)
+    scene = prepared_crossings(scene_crossings(bars), bars, cage)
+    return replace(truth, judged=judged_crossings(truth, scene)), scene
 
 
 def predicted_m(moved: Sequence[Bar], truth: SteelTruth) -> np.ndarray:

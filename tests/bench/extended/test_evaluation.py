@@ -20,16 +20,10 @@ from rebar_depth_bench import DatasetError, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import bars, read_bars, write_bars
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.extended.evaluate import (
-    MEASURE_FAMILIES,
-    NATIVE,
-    ONCE,
-    SCALED,
-    measures_by_alignment,
-    score_extended,
-)
+from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, measures_by_alignment, score_extended
 from rebar_depth_bench.extended.ground_truth import dilate_mask, load_steel_truth
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
+from rebar_depth_bench.extended.predictions import NATIVE, ONCE, SCALED
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import print_extended
 from rebar_depth_bench.scoring.evaluation import open_evaluation

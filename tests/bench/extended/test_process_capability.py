@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from rebar_depth_bench.extended.evaluate import NATIVE, ONCE, SCALED, measures_by_alignment
+from rebar_depth_bench.extended.evaluate import measures_by_alignment
 from rebar_depth_bench.extended.inspection.measures import (
     CAPABILITY_MEASURES,
     MISS_MM,
@@ -23,6 +23,7 @@ from rebar_depth_bench.extended.inspection.measures import (
 )
 from rebar_depth_bench.extended.inspection.tolerances import GB_50204, TOLERANCES
 from rebar_depth_bench.extended.measures import Measure
+from rebar_depth_bench.extended.predictions import NATIVE, ONCE, SCALED
 from rebar_depth_bench.extended.result import (
     ExtendedResult,
     ExtendedTable,

@@ -9,10 +9,11 @@ import re
 import numpy as np
 import pytest
 
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, NATIVE, SCALED, measures_by_alignment
+from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, measures_by_alignment
 from rebar_depth_bench.extended.inspection.measures import CAPABILITY_MEASURES, MISS_MM
 from rebar_depth_bench.extended.inspection.tolerances import PROFILES
 from rebar_depth_bench.extended.measures import Measure, Statistic
+from rebar_depth_bench.extended.predictions import NATIVE, SCALED
 from rebar_depth_bench.extended.result import (
     ExtendedResult,
     ExtendedView,

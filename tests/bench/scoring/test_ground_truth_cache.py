@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from rebar_depth_bench import DatasetError, score
+from rebar_depth_bench.bar_crossings.table import write_crossings
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import read_bars, write_bars
 from rebar_depth_bench.data.codecs import decode_depth, encode_depth
@@ -77,11 +78,11 @@ def test_changed_bytes_of_cache_never_change_results(
     expected, warnings = result(archive, tiny_root, target, *options)
     assert warnings == ""
     intact = tree(empty_cache)
-    assert len(intact) == 1 + len(options)
+    assert len(intact) == 1 + 2 * len(options)  # Extended: bars and layers, and judged crossings.
     for number in range(repetitions(12, 500)):
         path = sorted(empty_cache.iterdir())[number % len(intact)]
         content = bytearray(path.read_bytes())
-        bytes_from_end = len(content) if number % 4 < 2 else 900  # The index is at the end.
+        bytes_from_end = len(content) if number % 4 < 2 else min(900, len(content))  # The index is at the end.
         position = len(content) - 1 - int(rng.integers(bytes_from_end))
         content[position] ^= int(rng.integers(1, 256))
         path.write_bytes(content)
@@ -171,7 +172,7 @@ def test_digest_in_manifest_is_no_path(tiny_root: Path, tmp_path: Path, empty_ca
         config_truth(folder, hostile)
         load_steel_truth(folder, hostile)
     assert tree(documents) == {"letter.txt": b"precious"}
-    assert len([*empty_cache.iterdir()]) == 2
+    assert len([*empty_cache.iterdir()]) == 3
     assert {path.name for path in tmp_path.iterdir()} == {"Documents", "caches"}
 
 
@@ -242,8 +243,9 @@ def change_depth(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None
 def test_images_may_show_bars_that_the_table_lacks(copy: Path) -> None:
     bars = read_bars(copy / "bars.parquet")
     write_bars(copy / "bars.parquet", {scene: of_scene[: len(of_scene) // 2] for scene, of_scene in bars.items()})
-    sha256 = file_sha256(copy / "bars.parquet")
-    change_manifest(copy, lambda manifest, _: manifest["files"].update({"bars.parquet": sha256}), CONFIG)
+    write_crossings(copy / "crossings.parquet", read_bars(copy / "bars.parquet"))
+    digests = {name: file_sha256(copy / name) for name in ("bars.parquet", "crossings.parquet")}
+    change_manifest(copy, lambda manifest, _: manifest["files"].update(digests), CONFIG)
     folder = open_folder(copy)
     steel = load_steel_truth(folder, folder.config(CONFIG))
     truth = steel.view(0)

@@ -17,8 +17,9 @@ import pytest
 
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
-from dataset_builder.audit.files import row_problems
+from dataset_builder.audit.files import check_crossings, row_problems
 from dataset_builder.audit.run import VIEW_CHECKS
+from rebar_depth_bench.bar_crossings.table import write_crossings
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import open_folder
 
@@ -45,7 +46,7 @@ def test_correct_dataset_passes_with_measured_values(tiny_root: Path) -> None:
     assert process.returncode == 0, process.stdout + process.stderr
     assert "FAILED" not in process.stdout
     # At 160 x 90 no marker is wide enough to be checked.
-    assert (process.stdout.count(" ok "), process.stdout.count("skipped")) == (1 + 2 * (2 + len(VIEW_CHECKS)), 2)
+    assert (process.stdout.count(" ok "), process.stdout.count("skipped")) == (2 + 2 * (2 + len(VIEW_CHECKS)), 2)
     assert "2 views: median 0.0" in process.stdout  # micrometre agreement with Cycles
 
 
@@ -63,6 +64,21 @@ def test_changed_missing_and_extra_files_are_reported(copy: Path) -> None:
     assert any(problem.startswith("meshes/lattice.ply: SHA-256 is") for problem in problems)
     assert "bars.parquet: is missing" in problems
     assert "lattice/extra.txt: is not in the manifest" in problems
+
+
+def test_crossings_that_are_not_those_of_the_bars_are_reported(copy: Path) -> None:
+    bars = read_bars(copy / "bars.parquet")
+    write_crossings(copy / "crossings.parquet", {scene: of_scene[:-1] for scene, of_scene in bars.items()})
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["files"]["crossings.parquet"] = hashlib.sha256((copy / "crossings.parquet").read_bytes()).hexdigest()
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    folder = open_folder(copy)
+    check = check_crossings(folder, copy)
+    assert check.problems == ("crossings.parquet: scene lattice differs from the crossings of its bars",)
+    write_crossings(copy / "crossings.parquet", bars)
+    folder.files["crossings.parquet"] = hashlib.sha256((copy / "crossings.parquet").read_bytes()).hexdigest()
+    assert check_crossings(folder, copy).measured == "375 crossings"
+    assert check_crossings(folder, copy).passed
 
 
 def with_cells(row: Row, **cells: Any) -> Row:

@@ -21,6 +21,7 @@ from dataset_builder.config.specs import ColourSpec, DomeSpec, RigSpec, RingSpec
 from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.contact_sheet import STRIP_PANEL_PX, TILE_PX
 from dataset_builder.scene.assemblies import check_fits, make_assembly
+from rebar_depth_bench.bar_crossings.table import read_crossings
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
@@ -87,6 +88,13 @@ def test_every_config_has_its_scene_and_optics(full_root: Path) -> None:
         "lattice-12": 75,
         "pile": 6,
         "pier": 231,
+    }
+    crossings = read_crossings(full_root / "crossings.parquet")
+    assert {scene: (len(found), found.nodes) for scene, found in crossings.items()} == {
+        "lattice": (375, 375),
+        "lattice-12": (375, 375),
+        "pile": (15, 15),
+        "pier": (4860, 4365),
     }
     rows = {name: rdb.load(full_root, name)[0] for name in VIEWS}
     for name, row in rows.items():

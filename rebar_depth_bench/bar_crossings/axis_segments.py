@@ -1,0 +1,134 @@
+"""Segments of the axes of bars in flat arrays, and the pairs of segments that come near each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from numpy import ndarray
+
+from rebar_depth_bench.data.bars import Bar
+
+ROUNDING_M = 1e-9
+"""Distance below which two points or lengths are equal, metres."""
+
+_MIN_PIECE_M = 0.02
+_MAX_PIECES = 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class AxisSegments:
+    """Segments of the axes of all bars of a scene (world, metres), bar by bar, in order along the axes.
+
+    ``bar`` is the position of a segment's bar, and ``along_m`` the length of the axis before the segment.
+    ``before`` and ``after`` are the neighbouring segments of the same axis, -1 at the ends of an open one. An axis
+    is closed if it ends where it starts. ``length_m``, ``closed`` and ``diameter_m`` have one value for each bar.
+    """
+
+    start_m: Float64[ndarray, "s 3"]
+    vector_m: Float64[ndarray, "s 3"]
+    bar: Int64[ndarray, " s"]
+    along_m: Float64[ndarray, " s"]
+    before: Int64[ndarray, " s"]
+    after: Int64[ndarray, " s"]
+    length_m: Float64[ndarray, " b"]
+    closed: ndarray  # Bool b
+    diameter_m: Float64[ndarray, " b"]
+
+    @classmethod
+    def of_bars(cls, bars: Sequence[Bar]) -> AxisSegments:
+        """Return the segments of bars that have an axis; repeated points of an axis are left out."""
+        starts, vectors, along, before, after, lengths, closed = ([] for _ in range(7))
+        first = 0
+        for bar in bars:
+            points_m = _without_repeated(np.array(bar.axis_m, dtype=np.float64))
+            steps_m = np.diff(points_m, axis=0)
+            step_lengths_m = np.linalg.norm(steps_m, axis=1)
+            ends = np.cumsum(step_lengths_m)
+            number = first + np.arange(len(steps_m))
+            is_closed = len(steps_m) > 2 and bool(np.linalg.norm(points_m[-1] - points_m[0]) <= ROUNDING_M)
+            starts.append(points_m[:-1])
+            vectors.append(steps_m)
+            along.append(ends - step_lengths_m)
+            before.append(np.concatenate([[number[-1] if is_closed else -1], number[:-1]])[: len(number)])
+            after.append(np.concatenate([number[1:], [first if is_closed else -1]])[: len(number)])
+            lengths.append(float(ends[-1]) if len(ends) else 0.0)
+            closed.append(is_closed)
+            first += len(steps_m)
+        counts = [len(values) for values in along]
+        return cls(
+            np.concatenate([np.empty((0, 3)), *starts]),
+            np.concatenate([np.empty((0, 3)), *vectors]),
+            np.repeat(np.arange(len(bars)), counts),
+            np.concatenate([np.empty(0), *along]),
+            np.concatenate([np.empty(0, np.int64), *before]),
+            np.concatenate([np.empty(0, np.int64), *after]),
+            np.array(lengths),
+            np.array(closed, dtype=bool),
+            np.array([bar.diameter_m for bar in bars]),
+        )
+
+    def lengths_m(self, segments: Int64[ndarray, " n"]) -> Float64[ndarray, " n"]:
+        """Return the lengths of some segments."""
+        return np.asarray(np.linalg.norm(self.vector_m[segments], axis=1))
+
+    def near_pairs(self, max_gap_m: float) -> Int64[ndarray, "p 2"]:
+        """Return the pairs of segments (lower first, ascending) that can have ``max_gap_m`` or less between bars.
+
+        All such pairs are returned, and some whose bars are farther apart. Long segments are searched in pieces.
+        """
+        from scipy.spatial import cKDTree  # A quarter of a second to import.
+
+        lengths_m = np.linalg.norm(self.vector_m, axis=1)
+        if not len(lengths_m):
+            return np.empty((0, 2), np.int64)
+        piece_m = max(_MIN_PIECE_M, float(lengths_m.sum()) / _MAX_PIECES)
+        pieces = np.maximum(np.ceil(lengths_m / piece_m), 1).astype(np.int64)
+        segment = np.repeat(np.arange(len(pieces)), pieces)
+        number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        share = (number + 0.5) / pieces[segment]
+        middles_m = self.start_m[segment] + share[:, None] * self.vector_m[segment]
+        reach_m = piece_m + float(self.diameter_m.max()) + max_gap_m
+        found = segment[cKDTree(middles_m).query_pairs(reach_m, output_type="ndarray")].reshape(-1, 2)
+        found = np.sort(found[found[:, 0] != found[:, 1]], axis=1)
+        keys = np.unique(found[:, 0] * len(pieces) + found[:, 1])
+        return np.column_stack([keys // len(pieces), keys % len(pieces)])
+
+
+def _without_repeated(points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "m 3"]:
+    """Return points without those that repeat the point before."""
+    if len(points_m) < 2:
+        return points_m
+    differs = np.linalg.norm(np.diff(points_m, axis=0), axis=1) > 0
+    return np.asarray(points_m[np.concatenate([[True], differs])])
+
+
+def closest_on_segments(
+    start_a: Float64[ndarray, "p 3"],
+    vector_a: Float64[ndarray, "p 3"],
+    start_b: Float64[ndarray, "p 3"],
+    vector_b: Float64[ndarray, "p 3"],
+) -> tuple[Float64[ndarray, " p"], Float64[ndarray, " p"]]:
+    """Return the shares (0 to 1) along two segments at which they are closest to each other.
+
+    Of parallel segments, one of the closest pairs of points is returned. Source: Ericson, "Real-Time Collision
+    Detection", 2005, section 5.1.9.
+    """
+    between = start_a - start_b
+    aa, bb = _dot(vector_a, vector_a), _dot(vector_b, vector_b)
+    ab, a_between, b_between = _dot(vector_a, vector_b), _dot(vector_a, between), _dot(vector_b, between)
+    determinant = aa * bb - ab**2
+    oblique = determinant > 1e-12 * aa * bb
+    share_a = np.where(oblique, (ab * b_between - a_between * bb) / np.where(oblique, determinant, 1.0), 0.0).clip(
+        0, 1
+    )
+    share_b = (ab * share_a + b_between) / bb
+    clipped_b = share_b.clip(0, 1)
+    share_a = np.where(share_b == clipped_b, share_a, ((ab * clipped_b - a_between) / aa).clip(0, 1))
+    return share_a, clipped_b
+
+
+def _dot(a: Float64[ndarray, "n 3"], b: Float64[ndarray, "n 3"]) -> Float64[ndarray, " n"]:
+    return np.asarray(np.einsum("ni,ni->n", a, b))

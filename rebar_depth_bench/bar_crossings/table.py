@@ -1,0 +1,180 @@
+"""Table ``crossings.parquet``: the crossings of the bars of every scene of a dataset folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from rebar_depth_bench.atomic_io import atomic_replace
+from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters, scene_crossings
+from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
+from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.parquet import Table, open_parquet, read_rows
+from rebar_depth_bench.errors import DatasetError, escape_text
+from rebar_depth_bench.limits import TABLE_BYTES
+from rebar_depth_bench.reading import open_regular
+from rebar_depth_bench.validation import short_repr
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+CROSSINGS_FILE = "crossings.parquet"
+
+_POINT = pa.list_(pa.float64(), 3)
+_POINTS = ("point_a", "point_b", "tie_point", "normal")
+CROSSINGS_SCHEMA = pa.schema(
+    [
+        ("scene", pa.string()),
+        ("crossing_id", pa.uint32()),
+        ("node_id", pa.uint32()),
+        ("bar_a", pa.uint16()),
+        ("bar_b", pa.uint16()),
+        ("point_a", _POINT),
+        ("point_b", _POINT),
+        ("tie_point", _POINT),
+        ("gap_m", pa.float64()),
+        ("angle_deg", pa.float64()),
+        ("normal", _POINT),
+    ]
+)
+"""Schema of ``crossings.parquet``; points and ``normal`` (from a to b) in the world frame, metres."""
+
+_MIN_ROW_BYTES = 100
+_UNIT_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class FolderCrossings:
+    """Crossings of the scenes of a dataset folder, and the file that they come from, with its hex SHA-256.
+
+    ``source`` is ``crossings.parquet``, or ``bars.parquet`` in folders of versions that wrote no crossings.
+    """
+
+    by_scene: Mapping[str, Crossings]
+    source: str
+    sha256: str
+
+
+def folder_crossings(folder: DatasetFolder, bars: Mapping[str, Sequence[Bar]] | None = None) -> FolderCrossings:
+    """Return the crossings of all scenes, read from ``crossings.parquet`` or else computed from ``bars.parquet``.
+
+    ``bars`` are those of ``bars.parquet``, if already read. Raises ``DatasetError`` if a file cannot be read or
+    does not match the manifest, and if a crossing names a bar that has no axis.
+    """
+    bars = read_bars(folder.verified_file(BARS_FILE)) if bars is None else bars
+    if CROSSINGS_FILE not in folder.files:
+        computed = {scene: scene_crossings(of_scene) for scene, of_scene in bars.items()}
+        return FolderCrossings(computed, BARS_FILE, folder.files[BARS_FILE])
+    path = folder.verified_file(CROSSINGS_FILE)
+    by_scene = read_crossings(path)
+    for scene, crossings in by_scene.items():
+        known = {bar.bar_id for bar in bars.get(scene, ()) if bar.has_axis}
+        if unknown := sorted({*crossings.bar_a.tolist(), *crossings.bar_b.tolist()} - known):
+            where = f"{path}: scene {short_repr(scene)}"
+            raise DatasetError(f"{where} has a crossing of bar {unknown[0]}, expected bars with an axis")
+    return FolderCrossings(by_scene, CROSSINGS_FILE, folder.files[CROSSINGS_FILE])
+
+
+def write_crossings(path: Path, bars: Mapping[str, Sequence[Bar]]) -> None:
+    """Write the crossings of the bars of all scenes, sorted by scene name."""
+    rows = [row for scene, of_scene in sorted(bars.items()) for row in _rows(scene, scene_crossings(of_scene))]
+    with atomic_replace(path) as temporary:
+        pq.write_table(pa.Table.from_pylist(rows, schema=CROSSINGS_SCHEMA), temporary)
+
+
+def crossings_entry(path: Path) -> dict[str, Any]:
+    """Return the manifest's entry ``crossings``: the parameters of the definition, and the digest of the table."""
+    return {**crossing_parameters(), "file": path.name, "digest": f"sha256:{file_sha256(path)}"}
+
+
+def read_crossings(path: Path) -> dict[str, Crossings]:
+    """Read a ``crossings.parquet`` and return the crossings of each scene that has any, keyed by scene name.
+
+    Raises ``DatasetError`` if the file is missing, is not such a table, is larger than ``TABLE_BYTES``, or holds
+    an invalid crossing.
+    """
+    max_bytes = TABLE_BYTES.value()
+    max_values = dict.fromkeys(_POINTS, 3)
+    table = Table(CROSSINGS_SCHEMA, max_bytes // _MIN_ROW_BYTES, max_bytes, max_values=max_values)
+    rows: dict[str, list[dict[str, Any]]] = {}
+    try:
+        with open_regular(path) as stream, open_parquet(stream, table) as (file, _):
+            for row in read_rows(file, CROSSINGS_SCHEMA, batch_rows=1000):
+                if None in row.values() or any(None in row[name] for name in _POINTS):
+                    raise DatasetError(f"{path}: a crossing has no value in a column, expected one in each")
+                rows.setdefault(row["scene"], []).append(row)
+    except DatasetError:
+        raise
+    except Exception as error:  # pyarrow raises many types, which depend on the damage.
+        reason = escape_text(str(error) or type(error).__name__)
+        raise DatasetError(f"{path}: cannot be read as a table of crossings: {reason}") from error
+    return {scene: _crossings(path, scene, of_scene) for scene, of_scene in rows.items()}
+
+
+def crossings(root: str | Path) -> DataFrame:
+    """Return the crossings of every scene of a dataset folder or Hub repository as a frame, one row per crossing.
+
+    Columns as in ``crossings.parquet``; points and ``normal`` are float64 arrays of 3, world frame, metres. For
+    folders without the file, crossings are computed from the bars. Raises ``DatasetError`` as ``open_folder`` and
+    ``folder_crossings``.
+    """
+    import pandas as pd  # Half a second to import, which reading crossings for scoring does not need.
+
+    by_scene = folder_crossings(open_folder(root)).by_scene
+    rows = [row for scene, of_scene in sorted(by_scene.items()) for row in _rows(scene, of_scene)]
+    frame = pd.DataFrame(rows, columns=CROSSINGS_SCHEMA.names)
+    for name in _POINTS:
+        frame[name] = [np.array(point) for point in frame[name]]
+    return frame
+
+
+def _rows(scene: str, crossings: Crossings) -> list[dict[str, Any]]:
+    """Return the rows of a scene's crossings."""
+    columns = {
+        "crossing_id": crossings.crossing_id,
+        "node_id": crossings.node_id,
+        "bar_a": crossings.bar_a,
+        "bar_b": crossings.bar_b,
+        "point_a": crossings.point_a_m,
+        "point_b": crossings.point_b_m,
+        "tie_point": crossings.tie_point_m,
+        "gap_m": crossings.gap_m,
+        "angle_deg": crossings.angle_deg,
+        "normal": crossings.normal,
+    }
+    values = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return [{"scene": scene, **dict(zip(columns, row, strict=True))} for row in values]
+
+
+def _crossings(path: Path, scene: str, rows: Sequence[Mapping[str, Any]]) -> Crossings:
+    """Return the crossings of a scene's rows; raise ``DatasetError`` if a value is invalid."""
+    columns = {name: np.array([row[name] for row in rows]) for name in CROSSINGS_SCHEMA.names[1:]}
+    numbers = [columns[name].reshape(len(rows), -1) for name in (*_POINTS, "gap_m", "angle_deg")]
+    lengths = np.linalg.norm(columns["normal"], axis=1)
+    for valid, expected in (
+        ((columns["crossing_id"] == np.arange(1, len(rows) + 1)).all(), "crossing_id to count from 1"),
+        ((columns["node_id"] >= 1).all(), "node_id of 1 or more"),
+        ((columns["bar_a"] >= 1).all() and (columns["bar_a"] <= columns["bar_b"]).all(), "1 <= bar_a <= bar_b"),
+        (np.isfinite(np.concatenate(numbers, axis=1)).all(), "finite numbers"),
+        ((np.abs(lengths - 1) <= _UNIT_TOLERANCE).all(), "normals of length 1"),
+    ):
+        if not valid:
+            raise DatasetError(f"{path}: scene {short_repr(scene)}: invalid crossings, expected {expected}")
+    return Crossings(
+        node_id=columns["node_id"],
+        bar_a=columns["bar_a"],
+        bar_b=columns["bar_b"],
+        point_a_m=columns["point_a"],
+        point_b_m=columns["point_b"],
+        tie_point_m=columns["tie_point"],
+        gap_m=columns["gap_m"],
+        angle_deg=columns["angle_deg"],
+        normal=columns["normal"],
+    )

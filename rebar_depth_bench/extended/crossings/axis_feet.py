@@ -1,0 +1,104 @@
+"""Axes of bars by arc length: feet of points, tangents and straightness. Frame: world, metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from numpy import ndarray
+
+from rebar_depth_bench.bar_crossings.axis_segments import AxisSegments
+from rebar_depth_bench.data.bars import Bar
+
+_TANGENT_STEP_M = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """Axis of one bar as a polyline: segments from ``start_m`` by ``vector_m``, ``along_m`` of their starts."""
+
+    start_m: Float64[ndarray, "s 3"]
+    vector_m: Float64[ndarray, "s 3"]
+    along_m: Float64[ndarray, " s"]
+    length_m: float
+    closed: bool
+    diameter_m: float
+
+    @classmethod
+    def of_bar(cls, bar: Bar) -> Axis:
+        """Return the axis of a bar that has one."""
+        segments = AxisSegments.of_bars([bar])
+        return cls(
+            segments.start_m,
+            segments.vector_m,
+            segments.along_m,
+            float(segments.length_m[0]),
+            bool(segments.closed[0]),
+            bar.diameter_m,
+        )
+
+    def feet(self, points_m: Float64[ndarray, "n 3"]) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
+        """Return for each point the length along the axis at the nearest point of the axis, and its distance.
+
+        The nearest of close samples of the axis is found first, then the foot on the segments around it.
+        """
+        tree, segments = self._samples
+        _, nearest = tree.query(points_m)
+        best_along_m, best_m = np.zeros(len(points_m)), np.full(len(points_m), np.inf)
+        for step in (-1, 0, 1):
+            sample = nearest + step
+            segment = segments[sample % len(segments) if self.closed else np.clip(sample, 0, len(segments) - 1)]
+            start_m, vector_m = self.start_m[segment], self.vector_m[segment]
+            squared_m2 = np.einsum("ni,ni->n", vector_m, vector_m)
+            share = np.clip(np.einsum("ni,ni->n", points_m - start_m, vector_m) / squared_m2, 0, 1)
+            distance_m = np.linalg.norm(points_m - start_m - share[:, None] * vector_m, axis=1)
+            closer = distance_m < best_m
+            along_m = self.along_m[segment] + share * np.sqrt(squared_m2)
+            best_along_m, best_m = np.where(closer, along_m, best_along_m), np.minimum(distance_m, best_m)
+        return best_along_m, best_m
+
+    @cached_property
+    def _samples(self) -> tuple[Any, ndarray]:
+        """Return a k-d tree of samples along the axis, a quarter of a diameter apart, and their segments."""
+        from scipy.spatial import cKDTree
+
+        length_m = np.linalg.norm(self.vector_m, axis=1)
+        counts = np.maximum(np.ceil(length_m / (self.diameter_m / 4)), 1).astype(np.int64)
+        segment = np.repeat(np.arange(len(counts)), counts)
+        number = np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)
+        share = (number + 0.5) / counts[segment]
+        return cKDTree(self.start_m[segment] + share[:, None] * self.vector_m[segment]), segment
+
+    def tangents(self, along_m: Float64[ndarray, " n"]) -> Float64[ndarray, "n 3"]:
+        """Return the unit tangent at lengths along the axis; at a vertex, the bisector of its edges."""
+        direction = self.vector_m / np.linalg.norm(self.vector_m, axis=1, keepdims=True)
+        before, after = (self._segment_at(along_m + step_m) for step_m in (-_TANGENT_STEP_M, _TANGENT_STEP_M))
+        bisector = direction[before] + direction[after]
+        norm = np.linalg.norm(bisector, axis=1, keepdims=True)
+        return np.where(norm > 1e-6, bisector / np.where(norm > 1e-6, norm, 1.0), direction[after])
+
+    def _segment_at(self, along_m: Float64[ndarray, " n"]) -> ndarray:
+        if self.closed:
+            along_m = along_m % self.length_m
+        return np.clip(np.searchsorted(self.along_m, along_m, side="right") - 1, 0, len(self.along_m) - 1)
+
+    def relative_m(self, along_m: ndarray, origin_m: ndarray | float) -> ndarray:
+        """Return lengths along the axis from ``origin_m``; around a closed axis, the shorter way."""
+        relative_m = np.asarray(along_m - origin_m)
+        if not self.closed:
+            return relative_m
+        return np.asarray((relative_m + self.length_m / 2) % self.length_m - self.length_m / 2)
+
+    def is_straight(
+        self, along_m: Float64[ndarray, " n"], tangent: Float64[ndarray, "n 3"], reach_m: float, max_deg: float
+    ) -> Bool[ndarray, " n"]:
+        """Return where all edges within ``reach_m`` along the axis are at most ``max_deg`` from the tangent."""
+        lengths_m = np.linalg.norm(self.vector_m, axis=1)
+        middle_m = self.relative_m((self.along_m + lengths_m / 2)[None], along_m[:, None])
+        touched = np.abs(middle_m) - lengths_m / 2 < reach_m - _TANGENT_STEP_M
+        cosine = tangent @ (self.vector_m / lengths_m[:, None]).T
+        bends = cosine < np.cos(np.deg2rad(max_deg)) - 1e-12
+        return np.asarray(~(touched & bends).any(axis=1))

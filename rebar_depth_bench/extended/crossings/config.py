@@ -1,0 +1,54 @@
+"""Reaches at the crossings of a config, without the other extended measures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.extended.crossings.evaluate import crossing_samples, view_crossings
+from rebar_depth_bench.extended.crossings.reach import Reach, reaches
+from rebar_depth_bench.extended.ground_truth import load_steel_truth
+from rebar_depth_bench.extended.measures import Samples
+from rebar_depth_bench.extended.predictions import NATIVE, SCALED, aligned_predictions
+from rebar_depth_bench.extended.result import CrossingsSource
+from rebar_depth_bench.parallel import map_with_progress
+from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.evaluation import Evaluation
+from rebar_depth_bench.scoring.view_score import resample_views
+
+
+@dataclass(frozen=True)
+class ConfigReaches:
+    """Reaches of a submission on one config, by alignment, and the file that the crossings come from."""
+
+    source: CrossingsSource
+    by_alignment: Mapping[str, tuple[Reach, ...]]
+
+
+def config_reaches(
+    evaluation: Evaluation,
+    config: DatasetConfig,
+    scales: Mapping[str, float | None],
+    *,
+    workers: int | None = None,
+    progress: Progress = silent,
+) -> ConfigReaches:
+    """Return the reaches on a config that ``has_bar_ids``, native and scaled; ``scales`` holds s by view id.
+
+    Raises ``DatasetError`` as ``load_steel_truth``.
+    """
+    steel = load_steel_truth(evaluation.folder, config, progress)
+
+    def view_samples(position: int) -> dict[str, Samples]:
+        truth = steel.view(position)
+        crossings = view_crossings(truth, steel.bars_by_view[truth.view_id].crossings)
+        prediction_m = evaluation.submission.read(truth.view_id)
+        predictions = aligned_predictions(prediction_m, truth, scales[truth.view_id])
+        return {name: crossing_samples(predictions[name], crossings) for name in (NATIVE, SCALED)}
+
+    task = f"crossings of {config.name}"
+    views = map_with_progress(view_samples, range(len(steel)), workers, progress, task, len(steel))
+    resampling = resample_views(steel.view_ids, by_scene=config.has_splits)
+    found = {name: reaches([samples[name] for samples in views], resampling) for name in (NATIVE, SCALED)}
+    return ConfigReaches(CrossingsSource(steel.crossings_source, steel.crossings_sha256), found)
