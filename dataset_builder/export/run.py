@@ -61,8 +61,8 @@ def export(
     ``<config>/<split>-<scene>``, since each has its own cameras. ``split`` chooses the scenes of one split
     (default: all) and leaves out configs that lack it, unless they are named. ``views`` selects that many views
     of a config, or of each scene, spread evenly. Files are written atomically, images before the metadata that
-    refers to them. An interrupted export is resumed by calling it again: images that exist are kept, and the result
-    is byte-identical to that of an uninterrupted export. ``progress`` counts views.
+    refers to them. An interrupted export is resumed by calling it again: images that exist are kept, and the
+    result is byte-identical to that of an uninterrupted export. ``progress`` counts views.
 
     Raises ``DatasetError`` for a folder that is not a complete local dataset folder, an unknown config or split,
     or data that contradict the manifest; ``InputError`` for fewer than one view, for a config that the layout
