@@ -55,7 +55,7 @@ def test_documented_commands_parse(command: str) -> None:
 
 
 def test_documented_python_runs(tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first, second = blocks(Path("README.md"), "python")
+    first, second, *_ = blocks(Path("README.md"), "python")
     monkeypatch.chdir(tmp_path)
     shown = first.replace('"demo-output/dataset"', repr(str(tiny_root)))
     assert shown != first
