@@ -26,7 +26,7 @@ SIGHT_TOLERANCE_M = 0.01
 
 @dataclass(frozen=True)
 class CameraSpace:
-    """Space for cameras: within ``radius_m`` of the world origin in plan, and above the ground.
+    """Space for cameras: within ``radius_m`` of the origin in plan, above the ground, not above ``ceiling_m``.
 
     Objects up to ``objects_m`` high stand on the ground beyond ``clear_radius_m``.
     """
@@ -34,12 +34,14 @@ class CameraSpace:
     radius_m: float
     clear_radius_m: float
     objects_m: float = 0.0
+    ceiling_m: float = np.inf
 
     def contains(self, points_m: Float64[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
         """Return which points are in the space."""
         plan_m = np.hypot(points_m[:, 0], points_m[:, 1])
         lowest_m = GROUND_CLEARANCE_M + np.where(plan_m > self.clear_radius_m, self.objects_m, 0.0)
-        return np.asarray((plan_m <= self.radius_m) & (points_m[:, 2] >= lowest_m))
+        is_between = (points_m[:, 2] >= lowest_m) & (points_m[:, 2] <= self.ceiling_m)
+        return np.asarray((plan_m <= self.radius_m) & is_between)
 
 
 class CameraSite:

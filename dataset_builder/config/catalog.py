@@ -24,6 +24,7 @@ from dataset_builder.config.specs import (
     RingSpec,
     SceneSpec,
 )
+from dataset_builder.config.surroundings import check_suitable
 from dataset_builder.scene.variants import VARIANTS, check_variants
 from rebar_depth_bench.data.trajectory import NEAREST_STEEL
 from rebar_depth_bench.errors import InputError, Problem
@@ -146,6 +147,8 @@ class BuildRequest:
         self._check_ranges()
         check_variants(self.variants)
         specs = [self._with_request(spec) for spec in (*_known_configs(self.configs), *self.scenes)]
+        for spec in specs:
+            check_suitable(spec.scene.environment, self.variants)
         self._check_device(specs)
         names = [spec.name for spec in specs]
         duplicates = sorted({name for name in names if names.count(name) > 1})
