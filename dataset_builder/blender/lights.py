@@ -65,10 +65,11 @@ class Spot:
 
 @dataclass(frozen=True)
 class LightRig:
-    """The sky and the lamp of a scene."""
+    """The sky and the lamp of a scene; ``glow`` is that of surfaces which look like lamps, 1 if they are lit."""
 
     sky: Sky
     lamp: Panel | Sun | Spot
+    glow: float = 0.0
 
 
 def add_light(rig: LightRig) -> None:
@@ -180,3 +181,27 @@ OUTDOOR_LIGHT: Mapping[str | None, LightRig] = {
     SHADOWS: LightRig(_DAY, Sun(SUN_FROM, 0.5, 3.8, WARM)),
 }
 """Lights of the building site by light variant; None is the default."""
+
+HALL_LIGHT: Mapping[str | None, LightRig] = {
+    None: LightRig(
+        _uniform_sky((0.86, 0.93, 1.0), 0.64),
+        Panel((1.5, -1.0, 7.05), (1.5, -1.0, 0.0), (9.0, 1.6), 1350.0, WARM),
+        glow=1.0,
+    ),
+    "dusk": LightRig(
+        _uniform_sky((0.42, 0.55, 1.0), 0.17),
+        Panel((-5.0, -10.2, 4.2), (0.0, 0.0, 0.8), (6.0, 2.0), 700.0, EMBER),
+    ),
+    "spotlight": LightRig(
+        _uniform_sky((0.7, 0.8, 1.0), 0.06),
+        Spot((-7.5, -6.5, 6.6), (0.0, 0.0, 0.7), 0.12, 50.0, 9000.0, WHITE),
+    ),
+    "backlight": LightRig(
+        _uniform_sky((0.86, 0.93, 1.0), 0.09),
+        Panel((2.0, 11.2, 2.9), (0.0, 0.0, 0.7), (5.5, 4.0), 2600.0, WHITE),
+    ),
+}
+"""Lights of the hall by light variant; None is the default."""
+
+DECK_LIGHT: Mapping[str | None, LightRig] = {name: rig for name, rig in OUTDOOR_LIGHT.items() if name != SHADOWS}
+"""Lights of the deck by light variant; the screen of ``shadows`` would stand beside the deck, above the ground."""

@@ -15,6 +15,11 @@ from dataset_builder.blender.shader_nodes import Colour, MaterialBuilder
 RUST_PROPERTY, PATTERN_PROPERTY, TONE_PROPERTY = "rust_amount", "pattern_shift_m", "scale_tone"
 """Names of the custom properties of a steel object that its material reads."""
 
+GLOW_PROPERTY = "glow"
+"""Name of the custom property of an object with the material ``LAMP``: 1 if it is lit, 0 if not."""
+LAMP = "lamp"
+"""Name of the material of lamps, which are lit or not."""
+
 STEEL_VARIANT_MATERIALS = {"mill-scale": "steel, mill-scale", "rusted": "steel, rusted", "wet": "steel, wet"}
 """Material name of each steel variant."""
 
@@ -137,6 +142,37 @@ def _grained(
     return shader.matt(shader.mix(shader.step(grain, 0.25, 0.75), dark, light))
 
 
+def _anchored(
+    light: Colour, dark: Colour, axes: tuple[float, float, float], shader: MaterialBuilder
+) -> bpy.types.Material:
+    """Return worn concrete with anchor holes in steel sleeves, one per square metre.
+
+    ``axes`` are 1 along the axes of its plane, and 0 along the other.
+    """
+    point = shader.position()
+    wear = shader.step(shader.noise(point, 1.1, 4.0), 0.35, 0.75)
+    paint = shader.mix(shader.step(shader.noise(point, 45.0), 0.3, 0.7), dark, light)
+    worn = shader.mix(wear, paint, dark)
+    distance_m = shader.length(shader.stretched(shader.wrapped(point, 1.0), axes))
+    sleeve = shader.mix(shader.step(distance_m, 0.060, 0.064), (0.065, 0.065, 0.065), worn)
+    return shader.matt(shader.mix(shader.step(distance_m, 0.036, 0.040), (0.012, 0.012, 0.012), sleeve))
+
+
+def _panel(colour: Colour, shader: MaterialBuilder) -> bpy.types.Material:
+    """Return plywood of formwork with the grain along x, and stains of cement."""
+    point = shader.position()
+    dark = (0.80 * colour[0], 0.77 * colour[1], 0.72 * colour[2])
+    grain = shader.noise(shader.stretched(point, (1.3, 22.0, 22.0)), 1.0, 3.0)
+    wood = shader.mix(shader.step(grain, 0.25, 0.75), dark, colour)
+    stains = shader.step(shader.noise(point, 2.3, 4.0), 0.50, 0.80)
+    return shader.matt(shader.mix(stains, wood, (0.42, 0.37, 0.29)))
+
+
+def _lamp(shader: MaterialBuilder) -> bpy.types.Material:
+    """Return white glass that emits light where the object's ``GLOW_PROPERTY`` is not 0."""
+    return shader.glowing((0.80, 0.79, 0.76), shader.product(shader.object_value(GLOW_PROPERTY), 4.0))
+
+
 def _matt(colour: Colour, shader: MaterialBuilder) -> bpy.types.Material:
     """Return a matt material of one colour."""
     return shader.matt(colour)
@@ -183,4 +219,18 @@ _MATERIAL_BUILDERS: dict[str, Callable[[MaterialBuilder], bpy.types.Material]] =
     "container sand": partial(_matt, (0.45, 0.37, 0.24)),
     "hoarding white": partial(_matt, (0.66, 0.66, 0.64)),
     "hoarding blue": partial(_matt, (0.06, 0.17, 0.42)),
+    LAMP: _lamp,
+    "strong floor": partial(_anchored, (0.125, 0.15, 0.143), (0.09, 0.108, 0.103), (1.0, 1.0, 0.0)),
+    "reaction wall": partial(_anchored, (0.43, 0.43, 0.42), (0.36, 0.36, 0.35), (0.0, 1.0, 1.0)),
+    "cast wall": partial(_anchored, (0.44, 0.43, 0.41), (0.36, 0.355, 0.34), (1.0, 0.0, 1.0)),
+    "cladding": partial(_mottled, (0.42, 0.43, 0.425), (0.39, 0.40, 0.395), 1.5, 0.25, (0.36, 0.37, 0.37)),
+    "window": partial(_matt, (0.52, 0.64, 0.72)),
+    "gate": partial(_matt, (0.16, 0.27, 0.38)),
+    "yellow paint": partial(_matt, (0.66, 0.44, 0.03)),
+    "deck panel, fresh": partial(_panel, (0.60, 0.42, 0.17)),
+    "deck panel, used": partial(_panel, (0.53, 0.37, 0.17)),
+    "deck panel, worn": partial(_panel, (0.47, 0.345, 0.19)),
+    "glued timber": partial(_grained, (0.47, 0.32, 0.165), (0.38, 0.25, 0.125), (18.0, 0.7, 18.0)),
+    "yellow timber": partial(_grained, (0.64, 0.46, 0.09), (0.54, 0.37, 0.07), (2.0, 30.0, 30.0)),
+    "hills": partial(_mottled, (0.115, 0.155, 0.075), (0.055, 0.085, 0.045), 0.35, 0.05, (0.09, 0.125, 0.07)),
 }

@@ -42,22 +42,31 @@ _PROP_BASE_M = GROUND_M + 0.002
 
 def outdoors() -> tuple[Part, ...]:
     """Return all surfaces of the site; none is steel."""
-    return (*_ground(), *_containers(), *_hoarding(), *_stacks(), _spoil_heap(), _trees())
+    return (*_footing(), *site())
 
 
-def _placed(name: str, mesh: Mesh, at_m: Point, turn_deg: float, material: str) -> Part:
+def site() -> tuple[Part, ...]:
+    """Return the surfaces of the site without the footing slab: the ground, objects beyond ``CLEAR_M``, trees."""
+    return (_ground(), *_containers(), *_hoarding(), *_stacks(), _spoil_heap(), _trees())
+
+
+def placed(name: str, mesh: Mesh, at_m: Point, turn_deg: float, material: str) -> Part:
     """Return the part whose mesh is rotated about the vertical by ``turn_deg`` and moved to ``at_m``."""
     return surface(name, transformed(mesh, rotation_about_z(turn_deg), at_m), material)
 
 
-def _ground() -> tuple[Part, ...]:
-    """Return the footing slab on its blinding, and the ground, into which the slab extends."""
-    s, g, b = SLAB_HALF_M, GROUND_HALF_M, SLAB_HALF_M + 0.35
+def _footing() -> tuple[Part, ...]:
+    """Return the footing slab on its blinding; both extend into the ground."""
+    s, b = SLAB_HALF_M, SLAB_HALF_M + 0.35
     return (
         surface("slab", box((-s, -s, -0.6), (s, s, 0.0)), "site concrete"),
         surface("blinding", box((-b, -b, -0.5), (b, b, -0.075)), "blinding"),
-        surface("ground", box((-g, -g, GROUND_M - 1.0), (g, g, GROUND_M)), "gravel"),
     )
+
+
+def _ground() -> Part:
+    g = GROUND_HALF_M
+    return surface("ground", box((-g, -g, GROUND_M - 1.0), (g, g, GROUND_M)), "gravel")
 
 
 def _containers() -> tuple[Part, ...]:
@@ -65,7 +74,7 @@ def _containers() -> tuple[Part, ...]:
     places = {"blue": ((-17.0, 21.0), 12.0), "sand": ((-8.5, 25.0), -6.0)}
     door = box((3.035, -1.0, 0.2), (3.06, 1.0, 2.35))
     return tuple(
-        _placed(f"container-{name}-{piece}", mesh, (x, y, _PROP_BASE_M), turn_deg, material)
+        placed(f"container-{name}-{piece}", mesh, (x, y, _PROP_BASE_M), turn_deg, material)
         for name, ((x, y), turn_deg) in places.items()
         for piece, mesh, material in (
             ("body", _corrugated(5.9, 2.3, 2.45), f"container {name}"),
@@ -148,9 +157,9 @@ def _stacks() -> tuple[Part, ...]:
     ]
     timber_at_m = (22.5, 7.5, _PROP_BASE_M)
     return (
-        _placed("timber", merge_meshes(timber), timber_at_m, 35.0, "timber"),
-        _placed("bearers", merge_meshes(bearers), timber_at_m, 35.0, "timber"),
-        _placed("blocks", merge_meshes(blocks), (-25.0, -6.5, _PROP_BASE_M), -64.0, "site concrete"),
+        placed("timber", merge_meshes(timber), timber_at_m, 35.0, "timber"),
+        placed("bearers", merge_meshes(bearers), timber_at_m, 35.0, "timber"),
+        placed("blocks", merge_meshes(blocks), (-25.0, -6.5, _PROP_BASE_M), -64.0, "site concrete"),
     )
 
 
@@ -198,10 +207,10 @@ def _trees() -> Part:
         (top_m, crest_m),
         (inner_m, 0.5 * crest_m),
     ]
-    return surface("trees", _ring(outline, angle), "trees")
+    return surface("trees", ring(outline, angle), "trees")
 
 
-def _ring(
+def ring(
     outline: list[tuple[Float64[ndarray, " c"], Float64[ndarray, " c"]]], angle: Float64[ndarray, " c"]
 ) -> Mesh:
     """Return a closed ring about z from an outline of (radius, height), metres, given for each angle (radians)."""

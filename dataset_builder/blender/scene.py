@@ -10,12 +10,30 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.blender.deck import deck
+from dataset_builder.blender.hall import ROOF, hall
+from dataset_builder.blender.hall import WALLS as HALL_WALLS
 from dataset_builder.blender.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M, WALLS, laboratory
-from dataset_builder.blender.lights import LABORATORY_LIGHT, OUTDOOR_LIGHT, LightRig, add_light
-from dataset_builder.blender.materials import STEEL_VARIANT_MATERIALS, material, paper, surface_variation
+from dataset_builder.blender.lights import (
+    DECK_LIGHT,
+    HALL_LIGHT,
+    LABORATORY_LIGHT,
+    OUTDOOR_LIGHT,
+    LightRig,
+    add_light,
+)
+from dataset_builder.blender.materials import (
+    GLOW_PROPERTY,
+    LAMP,
+    STEEL_VARIANT_MATERIALS,
+    material,
+    paper,
+    surface_variation,
+)
 from dataset_builder.blender.outdoors import outdoors
 from dataset_builder.blender.panorama import add_panorama, let_light_through
 from dataset_builder.config.specs import SceneSpec
+from dataset_builder.config.surroundings import check_suitable
 from dataset_builder.scene.board_texture import board_texture
 from dataset_builder.scene.model import Assembly, Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box
@@ -29,7 +47,8 @@ from rebar_depth_bench.geometry.aruco_board import BoardSpec
 class Environment:
     """Surroundings of the steel: surfaces (world, none is steel) and lights by light variant (None: default).
 
-    ``enclosure`` are the first words of the names of surfaces that would keep the light of a panorama out.
+    ``enclosure`` and ``roof`` are the first words of the names of surfaces that would keep out the light of a
+    panorama, and that of any sky or lamp.
     """
 
     parts: Callable[[], tuple[Part, ...]]
@@ -37,11 +56,14 @@ class Environment:
     floor_m: float
     """Height of the surface that a board lies on."""
     enclosure: tuple[str, ...]
+    roof: tuple[str, ...] = ()
 
 
 ENVIRONMENTS: Mapping[str, Environment] = {
     "laboratory": Environment(laboratory, LABORATORY_LIGHT, BENCH_TOP_M, WALLS),
     "outdoors": Environment(outdoors, OUTDOOR_LIGHT, 0.0, ("trees",)),
+    "hall": Environment(hall, HALL_LIGHT, 0.0, HALL_WALLS, ROOF),
+    "deck": Environment(deck, DECK_LIGHT, 0.0, ("trees", "hills", "core")),
 }
 
 
@@ -62,10 +84,11 @@ def build_scene(assembly: Assembly, spec: SceneSpec, *, colour: bool = True) -> 
     """Replace Blender's open file with the scene: one object per steel part, environment, props, board and lights.
 
     Without ``colour``, the scene has the same meshes but neither materials nor lights.
-    Raises ``InputError`` if the appearance variants do not pass ``check_variants``.
+    Raises ``InputError`` if the appearance variants do not pass ``check_variants`` or do not suit the environment.
     """
     variants = spec.appearance.variants
     check_variants(variants)
+    check_suitable(spec.environment, variants)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     for part, mesh, origin_m in _with_shared_meshes(
         _with_material(assembly.parts, exclusive_variant(variants, STEEL_SLOT)), colour
@@ -77,19 +100,22 @@ def build_scene(assembly: Assembly, spec: SceneSpec, *, colour: bool = True) -> 
     # A floor at z = 0 would coincide with the top of the sheet, so it is lowered under a board.
     offset_z_m = 0.0 if spec.board is None else min(0.0, BENCH_TOP_M - environment.floor_m)
     panorama = image_light(spec)
+    rig = None if panorama is not None else environment.light[exclusive_variant(variants, LIGHT_SLOT)]
+    opened = environment.roof if panorama is None else (*environment.enclosure, *environment.roof)
     for part in environment.parts():
-        mesh = _part_data(part, part.mesh, colour)
-        added = add_object(part, mesh, np.array([0.0, 0.0, offset_z_m]))
-        if panorama is not None and part.name.partition("-")[0] in environment.enclosure:
+        added = add_object(part, _part_data(part, part.mesh, colour), np.array([0.0, 0.0, offset_z_m]))
+        if part.name.partition("-")[0] in opened:
             let_light_through(added)
+        if part.material == LAMP:
+            added[GLOW_PROPERTY] = 0.0 if rig is None else rig.glow
     for part in make_props(assembly, spec):
         add_object(part, _part_data(part, part.mesh, colour), np.zeros(3))
     if spec.board is not None:
         _add_board(spec.board, colour)
     if colour and panorama is not None:
         add_panorama(panorama)
-    elif colour:
-        add_light(environment.light[exclusive_variant(variants, LIGHT_SLOT)])
+    elif colour and rig is not None:
+        add_light(rig)
     bpy.context.view_layer.update()
 
 

@@ -67,6 +67,17 @@ class NodeTreeBuilder:
         """Return ``position`` shifted by ``offset_m`` along all three axes, to select another part of a noise."""
         return self.node("ShaderNodeVectorMath", {0: position, 1: offset_m}, operation="ADD").outputs[0]
 
+    def wrapped(self, position: Socket, period_m: float) -> Socket:
+        """Return ``position`` from the middle of its cell of a grid of cubes, whose corner is the origin."""
+        half = (period_m / 2,) * 3
+        inputs: dict[str | int, Any] = {0: position, 1: (period_m,) * 3, 2: (0.0,) * 3}
+        cell = self.node("ShaderNodeVectorMath", inputs, operation="WRAP").outputs[0]
+        return self.node("ShaderNodeVectorMath", {0: cell, 1: half}, operation="SUBTRACT").outputs[0]
+
+    def length(self, vector: Socket) -> Socket:
+        """Return the length of a vector."""
+        return self.node("ShaderNodeVectorMath", {0: vector}, operation="LENGTH").outputs["Value"]
+
     def noise(self, position: Socket, per_metre: float, detail: float = 2.0) -> Socket:
         """Return fractal noise round 0.5 with ``per_metre`` features per metre and ``detail`` further octaves."""
         inputs: dict[str | int, Any] = {
@@ -124,6 +135,16 @@ class MaterialBuilder(NodeTreeBuilder):
         """Add a Principled surface and return the material; keywords are its inputs, with ``_`` for a space."""
         named: dict[str | int, Any] = {key.replace("_", " "): value for key, value in inputs.items()}
         return self._finish(self.node("ShaderNodeBsdfPrincipled", named).outputs["BSDF"])
+
+    def glowing(self, colour: Socket | Colour, strength: Socket) -> bpy.types.Material:
+        """Add a surface that is matt and emits ``colour`` times ``strength``, and return the material.
+
+        Shadow rays do not seek it: scenes are lit by lamps and the sky, and it only looks lit.
+        """
+        diffuse = self.node("ShaderNodeBsdfDiffuse", {"Color": colour}).outputs["BSDF"]
+        emission = self.node("ShaderNodeEmission", {"Color": colour, "Strength": strength}).outputs["Emission"]
+        self.material.cycles.emission_sampling = "NONE"
+        return self._finish(self.node("ShaderNodeAddShader", {0: diffuse, 1: emission}).outputs["Shader"])
 
     def _finish(self, shader: Socket) -> bpy.types.Material:
         self.node("ShaderNodeOutputMaterial", {"Surface": shader})

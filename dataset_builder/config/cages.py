@@ -5,7 +5,7 @@ Every scene has its own random numbers, so that it does not depend on which othe
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,8 +20,9 @@ from dataset_builder.config.specs import (
     SceneSpec,
 )
 from dataset_builder.config.stereo_cameras import STEREO_CAMERAS
+from dataset_builder.config.surroundings import FORMWORK_FAMILIES, LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
 from dataset_builder.scene.cages.generate import drawn_family
-from dataset_builder.scene.variants import SENSOR, VARIANTS
+from dataset_builder.scene.variants import EXCLUSIVE_SLOTS, SENSOR, SHADOWS, VARIANTS
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
 
@@ -34,13 +35,10 @@ MAX_VIEWS_PER_SCENE = 1000
 _STREAM = 1
 """First number of the seed of a scene's random numbers; those of the cage itself begin with the version."""
 
-_LIGHTS: Mapping[str, Sequence[str | None]] = {
-    "outdoors": (None, None, None, "dusk", "backlight", "city", "courtyard", "forest", "sunrise", "sunset"),
-}
-"""Light variants that are drawn in each environment; None is its default light."""
-
-_STEEL: Sequence[str | None] = (None, None, "mill-scale", "rusted", "wet")
-_PROPS: Mapping[str, float] = {"clutter": 0.25, "formwork": 0.25, "spacers": 0.3, "tie-wire": 0.5}
+_DEFAULT_SHARE = 0.3
+"""Probabilities of the default light, and of the default steel; the variants share the rest equally."""
+FORMWORK = "formwork"
+_PROPS: Mapping[str, float] = {"clutter": 0.25, FORMWORK: 0.25, "spacers": 0.3, "tie-wire": 0.5}
 """Probability of each variant of things on and round the steel."""
 _SENSOR_SHARE = 0.3
 """Probability of the variant of the camera's sensor."""
@@ -83,18 +81,16 @@ def cage_scenes(
 
 def _scene(request: CagesRequest, number: int, seed: int) -> SceneConfigSpec:
     rng = np.random.default_rng([_STREAM, seed, SPLITS.index(request.split), number])
-    environment = str(rng.choice(list(_LIGHTS)))
-    light, steel = (_one_of(rng, choices) for choices in (_LIGHTS[environment], _STEEL))
-    drawn = {light, steel, *(name for name, share in _PROPS.items() if rng.random() < share)}
-    if rng.random() < _SENSOR_SHARE:
-        drawn.add(SENSOR)
+    family = drawn_family(request.split, number, seed)
+    environment = str(rng.choice(LIFE_SIZE_ENVIRONMENTS))
+    variants = _variants(rng, environment, family)
     surface_seed, views_seed = (int(rng.integers(2**31)) for _ in range(2))
     scene = SceneSpec(
-        name=f"{drawn_family(request.split, number, seed)}-{request.split}{number:04d}",
+        name=f"{family}-{request.split}{number:04d}",
         assembly=GeneratedCageSpec(request.split, number, seed),
         board=None,
         environment=environment,
-        appearance=AppearanceSpec(tuple(name for name in VARIANTS if name in drawn)),
+        appearance=AppearanceSpec(variants),
         seed=surface_seed,
     )
     return SceneConfigSpec(
@@ -106,8 +102,19 @@ def _scene(request: CagesRequest, number: int, seed: int) -> SceneConfigSpec:
     )
 
 
-def _one_of(rng: np.random.Generator, choices: Sequence[str | None]) -> str | None:
-    return choices[int(rng.integers(len(choices)))]
+def _variants(rng: np.random.Generator, environment: str, family: str) -> tuple[str, ...]:
+    """Return the names of drawn variants that suit the environment and the family of the cage, in their order."""
+    drawn = {name for name, share in _PROPS.items() if rng.random() < share}
+    if family not in FORMWORK_FAMILIES:
+        drawn.discard(FORMWORK)
+    if rng.random() < _SENSOR_SHARE:
+        drawn.add(SENSOR)
+    for slot in EXCLUSIVE_SLOTS:
+        choices = [name for name in SURROUNDINGS[environment].variants(slot) if name != SHADOWS]
+        choice = choices[int(rng.integers(len(choices)))]
+        if rng.random() >= _DEFAULT_SHARE:
+            drawn.add(choice)
+    return tuple(name for name in VARIANTS if name in drawn)
 
 
 def _rig(rng: np.random.Generator) -> RigSpec:

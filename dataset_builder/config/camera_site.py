@@ -5,7 +5,7 @@ World frame, metres.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,22 +20,13 @@ from dataset_builder.scene.shapes.solids import merge_meshes
 GROUND_CLEARANCE_M = 0.1
 """Least height of an eye above the ground, or above objects that stand there, metres."""
 
-LABORATORY_CAMERA_RADIUS_M = 1.6
-"""Maximum horizontal distance of cameras from the centre of the laboratory, metres; furniture stands beyond it."""
-
-OUTDOORS_CAMERA_RADIUS_M = 20.5
-"""Maximum horizontal distance of cameras, and of steel that is surveyed, from the world origin outdoors, metres.
-
-The ground is clear within it.
-"""
-
 SIGHT_TOLERANCE_M = 0.01
 """Largest distance along the line of sight between its first hit and the aimed point: about a bar's radius."""
 
 
 @dataclass(frozen=True)
 class CameraSpace:
-    """Space for cameras: within ``radius_m`` of the world origin in plan, and above the ground.
+    """Space for cameras: within ``radius_m`` of the origin in plan, above the ground, not above ``ceiling_m``.
 
     Objects up to ``objects_m`` high stand on the ground beyond ``clear_radius_m``.
     """
@@ -43,19 +34,14 @@ class CameraSpace:
     radius_m: float
     clear_radius_m: float
     objects_m: float = 0.0
+    ceiling_m: float = np.inf
 
     def contains(self, points_m: Float64[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
         """Return which points are in the space."""
         plan_m = np.hypot(points_m[:, 0], points_m[:, 1])
         lowest_m = GROUND_CLEARANCE_M + np.where(plan_m > self.clear_radius_m, self.objects_m, 0.0)
-        return np.asarray((plan_m <= self.radius_m) & (points_m[:, 2] >= lowest_m))
-
-
-CAMERA_SPACES: Mapping[str, CameraSpace] = {
-    "laboratory": CameraSpace(LABORATORY_CAMERA_RADIUS_M, clear_radius_m=0.6, objects_m=0.2),
-    "outdoors": CameraSpace(OUTDOORS_CAMERA_RADIUS_M, clear_radius_m=OUTDOORS_CAMERA_RADIUS_M),
-}
-"""Spaces for cameras that are placed one by one, by environment; objects lie on the bench of the laboratory."""
+        is_between = (points_m[:, 2] >= lowest_m) & (points_m[:, 2] <= self.ceiling_m)
+        return np.asarray((plan_m <= self.radius_m) & is_between)
 
 
 class CameraSite:

@@ -26,6 +26,7 @@ from dataset_builder.config.specs import (
     SceneConfigSpec,
     SceneSpec,
 )
+from dataset_builder.config.surroundings import check_suitable
 from dataset_builder.scene.variants import VARIANTS, check_variants
 from rebar_depth_bench.data.trajectory import NEAREST_STEEL
 from rebar_depth_bench.errors import InputError, Problem
@@ -150,6 +151,8 @@ class BuildRequest:
         check_variants(self.variants)
         known = _known_configs([name for name in self.configs if name != CAGES])
         specs = [self._with_request(spec) for spec in (*known, *self.scenes)]
+        for spec in specs:
+            check_suitable(spec.scene.environment, self.variants)
         self._check_device(specs)
         names = [spec.name for spec in specs]
         duplicates = sorted({name for name in names if names.count(name) > 1})

@@ -12,9 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
 
 from dataset_builder.config.cages import CAGES
-from dataset_builder.config.camera_site import CAMERA_SPACES, LABORATORY_CAMERA_RADIUS_M, OUTDOORS_CAMERA_RADIUS_M
 from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.scene_name import scene_name_of
@@ -27,6 +28,7 @@ from dataset_builder.config.specs import (
     SurveySpec,
     TrajectorySpec,
 )
+from dataset_builder.config.surroundings import LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
 from dataset_builder.config.survey import with_stations
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.scene.assemblies import aim_point_m, check_above_ground, check_fits, make_assembly
@@ -49,19 +51,21 @@ NEAREST_RADIUS_PER_REACH = 2.5
 At this distance the whole assembly is in the frame and fills much of it.
 """
 
-LABORATORY_STEEL_RADIUS_M = 0.45
-"""Maximum horizontal distance of steel from the centre of the laboratory, metres; objects lie beyond it."""
+OUTDOORS_CAMERA_RADIUS_M = SURROUNDINGS["outdoors"].cameras.radius_m
+"""Maximum horizontal distance of cameras, and of steel that is surveyed, from the world origin, metres."""
 
-_DEFAULT_MARKERS = {"laboratory": 6, "outdoors": 0}
+_SMALL = "laboratory"
+"""Environment of steel and cameras that fit in it; for others it is outdoors."""
 
 
 def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     """Return the config of a scene file, with the default rig, colour settings and seed.
 
     Defaults of omitted keys: the name is that of the file in lower case, with hyphens; the cameras are
-    ``default_dome``, or a survey if that does not fit outdoors; the environment is the laboratory if all steel is
-    within 0.45 m and all cameras are within 1.6 m of its centre (wherever a survey places them), otherwise
-    outdoors; the board has 6 markers in the laboratory, and there is no board outdoors.
+    ``default_dome``, or a survey if that does not fit outdoors, or into the hall or onto the deck where these are
+    named; the environment is the laboratory if all steel is within 0.45 m and all cameras are within 1.6 m of its
+    centre (wherever a survey places them), otherwise outdoors; the board has 6 markers in the laboratory, and
+    there is no board elsewhere.
 
     Raises ``InputError`` if the file is neither TOML nor IFC, listing every missing, unknown or invalid key, for
     an invalid name, and if the assembly or the cameras do not fit. Raises ``MeshError`` if the cage or mesh is
@@ -74,25 +78,24 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     with _scene_and_key_named(scene_toml, path):
         assembly_spec = _assembly_spec(scene_toml, path)
         assembly = make_assembly(assembly_spec)
-    trajectory = scene_toml.trajectory or _default_trajectory(assembly)
-    camera_radius_m = _camera_radius_m(assembly, trajectory)
-    misfit = _laboratory_misfit(assembly, camera_radius_m)
-    environment = scene_toml.environment or ("outdoors" if misfit else "laboratory")
-    if environment == "laboratory" and misfit:
+    trajectory = scene_toml.trajectory or _default_trajectory(assembly, scene_toml.environment)
+    environment = scene_toml.environment or ("outdoors" if _misfit(_SMALL, assembly, trajectory) else _SMALL)
+    if environment != "outdoors" and (misfit := _misfit(environment, assembly, trajectory)):
         raise InputError(f'{path}: {misfit}: place the cage at the origin, or set environment = "outdoors"')
     if isinstance(trajectory, SurveySpec):
         _check_outdoors_radius(path, "the steel extends", _steel_radius_m(assembly))
     else:
-        _check_outdoors_radius(path, "cameras are", camera_radius_m)
+        _check_outdoors_radius(path, "cameras are", _camera_radius_m(assembly, trajectory))
     try:
         check_above_ground(assembly, name)
         if isinstance(trajectory, SurveySpec):
-            trajectory = with_stations(trajectory, assembly, CAMERA_SPACES[environment], RigSpec(), str(path))
+            space = SURROUNDINGS[environment].cameras
+            trajectory = with_stations(trajectory, assembly, space, RigSpec(), str(path))
         config = ConfigSpec(name, SceneSpec(name, assembly_spec, None, environment), trajectory)
         check_fits(assembly, config)
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from None
-    markers = _DEFAULT_MARKERS[environment] if scene_toml.board is None else scene_toml.board
+    markers = SURROUNDINGS[environment].markers if scene_toml.board is None else scene_toml.board
     board = BoardSpec(markers=markers) if markers else None
     return replace(config, scene=replace(config.scene, board=board))
 
@@ -122,10 +125,14 @@ def files_of_scene(path: str | os.PathLike[str]) -> list[Path]:
     return [path] if named is None else [path, path.parent / named]
 
 
-def _default_trajectory(assembly: Assembly) -> DomeSpec | SurveySpec:
-    """Return the default dome, or a survey without its stations if the dome does not fit outdoors."""
+def _default_trajectory(assembly: Assembly, environment: str | None) -> DomeSpec | SurveySpec:
+    """Return the default dome, or a survey without its stations if the dome does not fit.
+
+    It must fit outdoors; in the laboratory, which is too small for a survey of what has no dome there, as well.
+    """
     dome = default_dome(assembly)
-    return dome if _camera_radius_m(assembly, dome) <= OUTDOORS_CAMERA_RADIUS_M else SurveySpec()
+    place = "outdoors" if environment in (None, _SMALL) else environment
+    return dome if _cameras_misfit(str(place), assembly, dome) is None else SurveySpec()
 
 
 def default_dome(assembly: Assembly) -> DomeSpec:
@@ -188,9 +195,13 @@ def _camera_radius_m(assembly: Assembly, trajectory: TrajectorySpec) -> float:
     """
     if isinstance(trajectory, SurveySpec):
         return _steel_radius_m(assembly) + max(trajectory.distances_m)
+    return max(float(np.linalg.norm(centre_m[:2])) for centre_m in _camera_centres_m(assembly, trajectory))
+
+
+def _camera_centres_m(assembly: Assembly, trajectory: TrajectorySpec) -> list[Float64[ndarray, " 3"]]:
+    """Return the centres of the left cameras of a trajectory that is no survey, world, metres."""
     aim_m = aim_point_m(assembly)
-    offsets_m = camera_offsets_m(trajectory, aim_m, assembly.bars)
-    return max(float(np.linalg.norm((aim_m + offset_m)[:2])) for offset_m in offsets_m)
+    return [aim_m + offset_m for offset_m in camera_offsets_m(trajectory, aim_m, assembly.bars)]
 
 
 def _steel_radius_m(assembly: Assembly) -> float:
@@ -208,17 +219,32 @@ def _check_outdoors_radius(path: Path, what: str, radius_m: float) -> None:
         )
 
 
-def _laboratory_misfit(assembly: Assembly, camera_radius_m: float) -> str | None:
-    """Return why the assembly or its cameras do not fit into the laboratory, or None if they do."""
-    steel_radius_m = _steel_radius_m(assembly)
-    if steel_radius_m > LABORATORY_STEEL_RADIUS_M:
+def _misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> str | None:
+    """Return why the assembly or its cameras do not fit into an environment, or None if they do."""
+    steel_radius_m, limit_m = _steel_radius_m(assembly), SURROUNDINGS[environment].steel_radius_m
+    if steel_radius_m > limit_m:
         return (
-            f"the steel extends {steel_radius_m:.4g} m from the laboratory's centre, "
-            f"expected at most {LABORATORY_STEEL_RADIUS_M} m"
+            f"the steel extends {steel_radius_m:.4g} m from the {environment}'s centre, "
+            f"expected at most {limit_m:g} m"
         )
-    if camera_radius_m > LABORATORY_CAMERA_RADIUS_M:
+    return _cameras_misfit(environment, assembly, trajectory)
+
+
+def _cameras_misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> str | None:
+    """Return why the cameras do not fit into an environment, or None if they do.
+
+    In the hall and on the deck, the cameras of a survey are placed where they fit.
+    """
+    space = SURROUNDINGS[environment].cameras
+    if isinstance(trajectory, SurveySpec) and environment in LIFE_SIZE_ENVIRONMENTS:
+        return None
+    radius_m = _camera_radius_m(assembly, trajectory)
+    if radius_m > space.radius_m:
         return (
-            f"cameras are {camera_radius_m:.4g} m from the laboratory's centre, "
-            f"expected at most {LABORATORY_CAMERA_RADIUS_M} m"
+            f"cameras are {radius_m:.4g} m from the {environment}'s centre, expected at most {space.radius_m:g} m"
         )
+    if np.isfinite(space.ceiling_m):
+        height_m = max(float(centre_m[2]) for centre_m in _camera_centres_m(assembly, trajectory))
+        if height_m > space.ceiling_m:
+            return f"cameras are {height_m:.4g} m high, expected at most {space.ceiling_m:g} m"
     return None

@@ -3,7 +3,7 @@
 ```toml
 name = "my-beam"              # default: the file name; lower-case letters, digits and hyphens
 unit = "mm"                   # of every length: m, cm, mm, in, ft; default with ifc: m
-environment = "laboratory"    # or "outdoors"
+environment = "laboratory"    # or "outdoors", "hall", "deck"
 board = 6                     # markers on the A3 sheet: 6, 12, or false for no sheet
 
 [cameras]                     # default: a dome around the assembly, or a survey of large steel
@@ -47,6 +47,7 @@ from dataset_builder.config.source_tables import (
     selection_conflicts,
 )
 from dataset_builder.config.specs import TrajectorySpec
+from dataset_builder.config.surroundings import SURROUNDINGS
 from dataset_builder.scene.model import MAX_BARS, to_metres
 from dataset_builder.scene.selection import Selection
 from dataset_builder.scene.variants import VARIANTS
@@ -70,7 +71,6 @@ from rebar_depth_bench.validation import (
 UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 """Length of one unit in metres, by unit name."""
 
-ENVIRONMENTS = ("laboratory", "outdoors")
 SOURCES = ("bar", "mesh", "ifc")
 
 
@@ -157,7 +157,7 @@ class SceneToml(StrictModel):
     bar: Annotated[tuple[BarTable, ...], Strict(False)] = ()
     mesh: _File | None = None
     ifc: _File | None = None
-    environment: Annotated[str, one_of(*ENVIRONMENTS)] | None = None
+    environment: Annotated[str, one_of(*SURROUNDINGS)] | None = None
     board: Annotated[int | bool, Expected("6, 12 or false", lambda markers: markers in (0, 6, 12))] | None = None
     cameras: AnyCamerasTable | None = None
     up: UpKey | None = None

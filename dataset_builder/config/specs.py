@@ -90,7 +90,7 @@ class AppearanceSpec:
 class SceneSpec:
     """Scene: assembly, ArUco board (None: no board), environment, and the seed of its surface variation.
 
-    ``environment`` is a name of ``blender.scene.ENVIRONMENTS``: ``laboratory`` or ``outdoors``.
+    ``environment`` is a name of ``config.surroundings.SURROUNDINGS``.
     """
 
     name: str

@@ -13,9 +13,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
-from dataset_builder.config.camera_site import CAMERA_SPACES, CameraSite
+from dataset_builder.config.camera_site import CameraSite
 from dataset_builder.config.random_views import SPACING_M, with_random_stations
 from dataset_builder.config.specs import GeneratedCageSpec, RandomViewsSpec, SceneConfigSpec
+from dataset_builder.config.surroundings import SURROUNDINGS
 from dataset_builder.pipeline.plan import ConfigPlan
 from dataset_builder.pipeline.publish import is_published
 from dataset_builder.scene.assemblies.generated import cage_assembly, spec_cage
@@ -68,7 +69,8 @@ def with_cameras(plan: ConfigPlan) -> ConfigPlan:
     spec = plan.spec
     cage = spec_cage(cast(GeneratedCageSpec, spec.scene.assembly))
     assembly = cage_assembly(cage)
-    site = CameraSite(assembly, CAMERA_SPACES[spec.scene.environment], SPACING_M, make_props(assembly, spec.scene))
+    space, props = SURROUNDINGS[spec.scene.environment].cameras, make_props(assembly, spec.scene)
+    site = CameraSite(assembly, space, SPACING_M, props)
     views = with_random_stations(cast(RandomViewsSpec, spec.protocol), site, spec.rig, f"scene {spec.label}")
     return ScenePlan(
         spec=replace(spec, protocol=views),

@@ -34,15 +34,31 @@ class _Item:
     pieces: Callable[[], list[Piece]]
 
 
+LIFE_SIZE_UNIT_M = 0.36
+"""Unit of life-size objects: the buckets are 0.3 m high."""
+LIFE_SIZE_BAND_M = 1.6
+"""Width of the band round the steel in which life-size objects lie."""
+
+
 def clutter(context: PlacementContext) -> tuple[Part, ...]:
     """Return the objects, placed clear of the steel, the markers, earlier props and each other.
 
     All objects are within 0.9 spans (at most 0.7 m) of the bounding box of the steel and at most 0.23 spans high.
     Objects for which no free position is found are omitted.
     """
-    rng = context.rng("clutter")
     unit_m = float(np.clip(0.25 * context.span_m, 0.015, 0.4))
-    allowed = context.footprint.expanded(min(0.9 * context.span_m, 0.7))
+    return _scattered(context, unit_m, min(0.9 * context.span_m, 0.7))
+
+
+def life_size_clutter(context: PlacementContext) -> tuple[Part, ...]:
+    """Return the objects of ``clutter`` in their real sizes, at most 0.3 m high and further apart."""
+    return _scattered(context, LIFE_SIZE_UNIT_M, LIFE_SIZE_BAND_M)
+
+
+def _scattered(context: PlacementContext, unit_m: float, band_m: float) -> tuple[Part, ...]:
+    """Return the objects, in the unit of their sizes and within a band round the bounding box of the steel."""
+    rng = context.rng("clutter")
+    allowed = context.footprint.expanded(band_m)
     blocked = (context.footprint.expanded(CLEARANCE * context.span_m), *context.occupied)
     circles: list[tuple[Float64[ndarray, "k 2"], float]] = []
     parts: list[Part] = []

@@ -145,13 +145,17 @@ class Rect:
 
 @dataclass(frozen=True, eq=False)
 class PlacementContext:
-    """Bars with an axis and bounding box of all steel, occupied ground rectangles, and seed of the scene."""
+    """Bars with an axis and bounding box of all steel, occupied ground rectangles, and seed of the scene.
+
+    ``environment`` is that of the scene.
+    """
 
     bars: tuple[Bar, ...]
     low_m: Float64[ndarray, " 3"]
     high_m: Float64[ndarray, " 3"]
     occupied: tuple[Rect, ...]
     seed: int
+    environment: str
 
     @classmethod
     def from_assembly(cls, assembly: Assembly, spec: SceneSpec) -> PlacementContext:
@@ -159,7 +163,8 @@ class PlacementContext:
         vertices_m = assembly.vertices_m
         markers = marker_corners_m(spec.board).values() if spec.board else ()
         occupied = tuple(_footprint(corners_m) for corners_m in markers)
-        return cls(with_axis(assembly.bars), vertices_m.min(axis=0), vertices_m.max(axis=0), occupied, spec.seed)
+        low_m, high_m = vertices_m.min(axis=0), vertices_m.max(axis=0)
+        return cls(with_axis(assembly.bars), low_m, high_m, occupied, spec.seed, spec.environment)
 
     def with_parts(self, parts: tuple[Part, ...]) -> PlacementContext:
         """Return the context in which the footprints of ``parts`` are occupied too."""

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dataset_builder.cli import argument_parser
-from dataset_builder.config.camera_site import LABORATORY_CAMERA_RADIUS_M, OUTDOORS_CAMERA_RADIUS_M
 from dataset_builder.config.catalog import CONFIGS, SWEEPS, BuildRequest
 from dataset_builder.config.specs import ConfigSpec, DistanceSweepSpec
+from dataset_builder.config.surroundings import SURROUNDINGS
 from dataset_builder.config.trajectories import camera_offsets_m, poses, subset
 from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
 from dataset_builder.scene.model import WorldMesh
@@ -64,9 +64,7 @@ def test_subset_of_12_has_every_distance_once() -> None:
 def test_cameras_are_inside_environment(config: ConfigSpec) -> None:
     assembly = make_assembly(config.scene.assembly)
     check_fits(assembly, config)
-    max_radius_m = {"laboratory": LABORATORY_CAMERA_RADIUS_M, "outdoors": OUTDOORS_CAMERA_RADIUS_M}[
-        config.scene.environment
-    ]
+    max_radius_m = SURROUNDINGS[config.scene.environment].cameras.radius_m
     aim_m = aim_point_m(assembly)
     centres_m = aim_m + np.array(camera_offsets_m(config.protocol, aim_m, assembly.bars))
     assert np.linalg.norm(centres_m[:, :2], axis=1).max() <= max_radius_m
