@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -37,19 +38,25 @@ class GeneratedCage:
     record: dict[str, Any]
 
 
+def drawn_family(split: str, number: int, seed: int = 0) -> str:
+    """Return the family that ``generate_cage`` draws for cage ``number`` of a split, without making the cage.
+
+    Raises ``InputError`` for an unknown split or a negative number.
+    """
+    return _drawn_family(_cage_rng(split, number, seed))
+
+
 def generate_cage(split: str, number: int, seed: int = 0, family: str | None = None) -> GeneratedCage:
     """Return cage ``number`` of a split; the same arguments give the same cage, whatever other cages there are.
 
-    ``family`` restricts the draw to one of ``FAMILIES``. Raises ``InputError`` for an unknown split or family, and
-    if no design can be built in ``MAX_ATTEMPTS`` attempts.
+    ``family`` restricts the draw to one of ``FAMILIES``. Raises ``InputError`` for an unknown split or family, a
+    negative number, and if no design can be built in ``MAX_ATTEMPTS`` attempts.
     """
-    for name, found, known in (("split", split, SPLITS), ("family", family, (None, *FAMILIES))):
-        if found not in known:
-            expected = ", ".join(str(choice) for choice in known if choice is not None)
-            raise InputError(f"the {name} of a cage is {found!r}, expected one of {expected}")
-    rng = np.random.default_rng([VERSION, seed, SPLITS.index(split), number])
-    drawn_family = str(rng.choice(list(FAMILIES)))
-    chosen = drawn_family if family is None else family
+    if family not in (None, *FAMILIES):
+        raise InputError(f"the family of a cage is {family!r}, expected one of {', '.join(FAMILIES)}")
+    rng = _cage_rng(split, number, seed)
+    drawn = _drawn_family(rng)
+    chosen = drawn if family is None else family
     refused: Counter[str] = Counter()
     for _ in range(MAX_ATTEMPTS):
         try:
@@ -77,6 +84,25 @@ def generate_cage(split: str, number: int, seed: int = 0, family: str | None = N
         return GeneratedCage(design.family, tuple(_moved(bar, offset_m) for bar in built.bars), record)
     reasons = ", ".join(f"{reason} ({count})" for reason, count in refused.most_common(3))
     raise InputError(f"no cage of the family {chosen} for {split} {number}, seed {seed}: {reasons}")
+
+
+def _cage_rng(split: str, number: int, seed: int) -> np.random.Generator:
+    """Return the generator of a cage, whose seed is a digest of all that identifies the cage.
+
+    NumPy joins the 32-bit words of several seeds without their lengths, so that ``[seed, split, number]`` with a
+    seed past 32 bits could be those of another split.
+    """
+    if split not in SPLITS:
+        raise InputError(f"the split of a cage is {split!r}, expected one of {', '.join(SPLITS)}")
+    if number < 0:
+        raise InputError(f"the number of a cage is {number}, expected 0 or more")
+    name = f"cage version {VERSION} seed {seed} split {split} number {number}"
+    return np.random.default_rng(int.from_bytes(sha256(name.encode()).digest(), "little"))
+
+
+def _drawn_family(rng: np.random.Generator) -> str:
+    """Return the family of a cage, the first that is drawn from its generator."""
+    return list(FAMILIES)[int(rng.integers(len(FAMILIES)))]
 
 
 def _offset_m(bars: tuple[BuiltBar, ...], ground_m: float) -> Float64[ndarray, " 3"]:

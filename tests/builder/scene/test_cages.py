@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping
 
@@ -25,9 +26,10 @@ from dataset_builder.scene.cages.as_built import (
 from dataset_builder.scene.cages.clearance import NEAR_M, Clearances
 from dataset_builder.scene.cages.design import Design, DesignBar, InfeasibleError, straight
 from dataset_builder.scene.cages.families import FAMILIES
-from dataset_builder.scene.cages.generate import GeneratedCage, generate_cage
+from dataset_builder.scene.cages.generate import GeneratedCage, drawn_family, generate_cage
 from dataset_builder.scene.cages.rules import DIAMETERS_M, radius_m
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.view_ids import SPLITS
 from tests.builder.scene.test_pile import segment_distances_m
 
 Line = Float64[ndarray, "n 3"]
@@ -51,6 +53,12 @@ def clearances_m(cage: GeneratedCage) -> Float64[ndarray, "n n"]:
                 distance_m = segment_distances_m(a.line_m, b.line_m).min()
                 clear_m[i, j] = clear_m[j, i] = distance_m - radius_m(a.diameter_m) - radius_m(b.diameter_m)
     return clear_m
+
+
+def cage_state(split: str, number: int, seed: int) -> tuple[int, int]:
+    """Return the state and the increment of the random generator with which a cage starts."""
+    state = generate_module._cage_rng(split, number, seed).bit_generator.state["state"]
+    return state["state"], state["inc"]
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -120,10 +128,28 @@ def test_diameters_and_records_are_those_of_the_rules(
             assert len(missing["nominal_axis"]) >= 2
 
 
+@pytest.mark.parametrize("split", SPLITS)
+def test_family_is_known_without_the_cage(split: str) -> None:
+    for number in range(2):
+        assert generate_cage(split, number, 5).family == drawn_family(split, number, 5)
+    drawn = [drawn_family(split, number) for number in range(350)]
+    assert min(drawn.count(family) for family in FAMILIES) >= 25
+    assert set(drawn) == set(FAMILIES)
+
+
+def test_no_two_cages_share_their_random_numbers() -> None:
+    """Seeds past 32 bits are those that NumPy's seed sequence of several integers would confuse."""
+    seeds, numbers = [0, 1, 7, 2**32, 1 + 2**32, 2**40, 2**64 - 1], [*range(400), 2**32, 1 + 2**32]
+    states = [cage_state(split, number, seed) for split, number, seed in itertools.product(SPLITS, numbers, seeds)]
+    assert len(states) == len(set(states)) == len(SPLITS) * len(numbers) * len(seeds)
+
+
 @pytest.mark.parametrize(("split", "family"), [("val", None), ("train", "bridge")])
 def test_unknown_names_are_refused(split: str, family: str | None) -> None:
     with pytest.raises(InputError, match="expected one of"):
         generate_cage(split, 0, family=family)
+    with pytest.raises(InputError, match="expected 0 or more"):
+        drawn_family("train", -1)
 
 
 def test_cage_that_cannot_be_made_is_refused_with_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
