@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 
 import numpy as np
@@ -242,13 +244,45 @@ def test_steel_stays_within_the_cover(family: str, shape: str) -> None:
             assert high[axis] - low[axis] <= room_m + 0.002, (name, design.parameters)
 
 
-def test_areas_of_steel_are_within_the_limits_of_columns() -> None:
-    for shape in FAMILIES["column"].shapes:
-        for design in designs("column", shape):
-            parameters = design.parameters
-            steel_m2 = sum(np.pi / 4 * bar.diameter_m**2 for bar in of(design, "main"))
-            if shape in ("square", "rectangular"):
-                concrete_m2 = float(parameters["side_x_m"]) * float(parameters["side_y_m"])
-            else:
-                concrete_m2 = np.pi / 4 * float(parameters["diameter_m"]) ** 2
-            assert 0.002 <= steel_m2 / concrete_m2 <= 0.04
+def drawn(family: str, shape: str, count: int) -> Iterator[Design]:
+    """Yield the designs of ``count`` draws, also those whose bars touch."""
+    rng = np.random.default_rng(5)
+    for _ in range(count):
+        with suppress(InfeasibleError):
+            yield FAMILIES[family].draw(rng, shape)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", FAMILIES["column"].shapes)
+def test_areas_of_steel_are_within_the_limits_of_columns(shape: str) -> None:
+    shares = []
+    for design in drawn("column", shape, 60):
+        parameters = design.parameters
+        steel_m2 = sum(np.pi / 4 * bar.diameter_m**2 for bar in of(design, "main"))
+        if shape in ("square", "rectangular"):
+            concrete_m2 = float(parameters["side_x_m"]) * float(parameters["side_y_m"])
+        else:
+            concrete_m2 = np.pi / 4 * float(parameters["diameter_m"]) ** 2
+        shares.append(steel_m2 / concrete_m2)
+    assert len(shares) > 20
+    assert 0.002 <= min(shares) < 0.006
+    assert 0.025 < max(shares) <= 0.04
+
+
+def test_bars_of_a_second_layer_lie_on_spacers() -> None:
+    checked = 0
+    for design in drawn("beam", "straight", 60):
+        spacers = of(design, "spacer")
+        if design.parameters["layers"] != 2.0 or checked > 3:
+            assert checked > 3 or not spacers
+            continue
+        checked += 1
+        assert len(spacers) >= 2
+        for spacer in spacers:
+            touching = [bar for bar in of(design, "bottom") if touched(bar, [spacer], 0.005).any()]
+            above = [bar for bar in touching if bar.line_m[0, 2] > spacer.line_m[0, 2]]
+            assert len(above) == float(design.parameters["bars_x"])
+            assert len(touching) > len(above)
+        starts_m = np.sort([spacer.line_m[0, 0] for spacer in spacers])
+        assert np.diff(starts_m).max() < 1.5
+    assert checked
