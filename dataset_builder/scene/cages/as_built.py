@@ -2,7 +2,8 @@
 
 The tolerances are those of common execution rules: cover -10 mm and more inwards (EN 13670:2009, 10.6, from a
 secondary source), and ours for spacing, tilt and bow. A deviation is taken only if the bar stays clear of all
-others; otherwise a smaller one is tried.
+others; otherwise a smaller one is tried. Bars that rest on others or are tied into a mat (``held_along``) deviate
+within the plane of the mat, so that they do not hover.
 """
 
 from __future__ import annotations
@@ -32,11 +33,17 @@ BOW_TOLERANCE = 1 / 250
 MIN_CLEAR_M = 1e-4
 """Least clear distance of two bars as built."""
 
+_NEEDED_M = MIN_CLEAR_M + 1e-8
+"""Clear distance that is checked; axes are rounded to the nanometre afterwards."""
+
 _SHARES = ((1.0, 1.0), (0.5, 1.0), (0.25, 1.0), (0.1, 1.0), (0.1, 0.3), (0.0, 1.0), (0.0, 0.3))
 """Shares that are tried of the drawn deviation, and of its part along the direction of the spacing."""
 
 _BOWED_FROM = 30.0
 """Least length, in diameters, of a straight bar that is bowed."""
+
+_DOUBLED_FROM_M = 0.5
+"""Least length of a bar that is doubled."""
 
 _RING_SPACING_M = 0.1
 _LEFT_OUT, _DOUBLED = 0.35, 0.35
@@ -68,15 +75,15 @@ def build_as(design: Design, rng: np.random.Generator) -> BuiltCage:
     """Return the cage as it is built. Raises ``InfeasibleError`` if bars of the design touch each other."""
     bars, left_out = _some_left_out(design.bars, rng)
     clearances = Clearances([bar.line_m for bar in bars], [radius_m(bar.diameter_m) for bar in bars])
-    if clearances.least_of_all_m() < MIN_CLEAR_M:
+    if clearances.least_of_all_m() < _NEEDED_M:
         raise InfeasibleError("bars of the design touch each other")
     lines, reduced, refused = [bar.line_m for bar in bars], 0, 0
     for index in rng.permutation(len(bars)).tolist():
         bar = bars[index]
-        deviation = _drawn_deviation(bar, rng, stands=design.ground_m < 1e-3)
+        deviation = _drawn_deviation(bar, rng, stands=design.stands)
         for share, spacing_share in _SHARES:
             line_m = deviation.applied(share, spacing_share)
-            if clearances.least_m(line_m, radius_m(bar.diameter_m), index) >= MIN_CLEAR_M:
+            if clearances.least_m(line_m, radius_m(bar.diameter_m), index) >= _NEEDED_M:
                 lines[index] = line_m
                 clearances.replace(index, line_m)
                 reduced += (share, spacing_share) != _SHARES[0]
@@ -105,7 +112,13 @@ def _doubled(built: list[BuiltBar], clearances: Clearances, rng: np.random.Gener
     """Return a straight bar that lies beside another one and is not in the design, or none."""
     if rng.random() >= _DOUBLED:
         return []
-    straight = [bar for bar in built if bar.nominal_m is not None and len(bar.nominal_m) == 2]
+    straight = [
+        bar
+        for bar in built
+        if bar.nominal_m is not None
+        and len(bar.nominal_m) == 2
+        and np.linalg.norm(np.diff(bar.nominal_m, axis=0)) >= _DOUBLED_FROM_M
+    ]
     for _ in range(8 if straight else 0):
         bar = straight[int(rng.integers(len(straight)))]
         along = bar.line_m[-1] - bar.line_m[0]
@@ -114,7 +127,7 @@ def _doubled(built: list[BuiltBar], clearances: Clearances, rng: np.random.Gener
         beside = np.cross(along, side) * rng.choice([-1.0, 1.0])
         distance_m = contact_m(bar.diameter_m, bar.diameter_m) + MIN_CLEAR_M
         line_m = bar.line_m + beside / np.linalg.norm(beside) * distance_m
-        if clearances.least_m(line_m, radius_m(bar.diameter_m)) >= MIN_CLEAR_M:
+        if clearances.least_m(line_m, radius_m(bar.diameter_m)) >= _NEEDED_M:
             clearances.append(line_m, radius_m(bar.diameter_m))
             return [BuiltBar(bar.role, bar.diameter_m, line_m, None)]
     return []
@@ -160,9 +173,12 @@ def _drawn_deviation(bar: DesignBar, rng: np.random.Generator, *, stands: bool) 
     most_rad = min(np.deg2rad(TILT_TOLERANCE_DEG), 2 * PLACE_TOLERANCE_M / size_m * 1.5)
     tilt_rad = _within_ball(rng) * most_rad
     bow_m, side = np.zeros(3), rng.normal(size=3)
+    if bar.held_along is not None:
+        held = np.array(bar.held_along)
+        shift_m, tilt_rad, side = shift_m - held * (shift_m @ held), held * (tilt_rad @ held), held
     if len(line_m) == 2 and length_m > _BOWED_FROM * bar.diameter_m:
         side = np.cross(line_m[1] - line_m[0], side)
-        bow_m = side / np.linalg.norm(side) * rng.uniform(0, BOW_TOLERANCE) * length_m
+        bow_m = side / np.linalg.norm(side) * rng.uniform(-BOW_TOLERANCE, BOW_TOLERANCE) * length_m
     is_standing = stands and float(line_m[:, 2].min()) < 1e-9 and bar.spaced_along != (0.0, 0.0, 1.0)
     return _Deviation(line_m, spacing_m, shift_m, tilt_rad, bow_m, is_standing)
 

@@ -12,7 +12,14 @@ from numpy import ndarray
 from dataset_builder.scene.shapes.bending import bend_radius_m, bent_line_m
 
 Line = Float64[ndarray, "n 3"]
-X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+Direction = tuple[float, float, float]
+X: Direction = (1.0, 0.0, 0.0)
+Y: Direction = (0.0, 1.0, 0.0)
+Z: Direction = (0.0, 0.0, 1.0)
+
+
+STANDING_M = 5e-5
+"""Height of the ends of standing bars above z = 0, so that they do not coincide with the ground."""
 
 
 class InfeasibleError(ValueError):
@@ -24,28 +31,36 @@ class DesignBar:
     """Bar of a design: role, nominal diameter and nominal axis.
 
     ``spaced_along`` is the unit vector along which bars of its kind are spaced, or None: only in this direction
-    may it be off by the tolerance of the spacing. ``is_structural`` bars are never left out.
+    may it be off by the tolerance of the spacing. ``is_structural`` bars are never left out. ``held_along`` is the
+    unit vector along which a bar is held by those that it rests on or is tied to, or None: it is neither displaced
+    along it nor tilted out of the plane perpendicular to it.
     """
 
     role: str
     diameter_m: float
     line_m: Line
-    spaced_along: tuple[float, float, float] | None = None
+    spaced_along: Direction | None = None
     is_structural: bool = True
+    held_along: Direction | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Design:
     """Bars of a cage, world frame, and what was drawn: names and values of its parameters, metres.
 
-    ``ground_m`` is the height of the lowest point of its steel above z = 0: bars that stand on the ground, or the
-    cover of a cage on spacers.
+    ``ground_m`` is the height of the lowest point of its steel above z = 0: ``STANDING_M`` if bars stand on the
+    ground, or the cover of a cage on spacers.
     """
 
     family: str
     bars: tuple[DesignBar, ...]
     parameters: dict[str, float | str]
     ground_m: float
+
+    @property
+    def stands(self) -> bool:
+        """True if bars stand on the ground."""
+        return self.ground_m == STANDING_M
 
 
 def straight(start_m: Sequence[float], end_m: Sequence[float]) -> Line:
@@ -60,6 +75,8 @@ def bent(corners_m: Sequence[Sequence[float]], diameter_m: float) -> Line:
 
 def spaced(first_m: float, last_m: float, spacing_m: float) -> list[float]:
     """Return evenly spaced positions from the first to the last, at most ``spacing_m`` apart."""
+    if last_m - first_m < 1e-9:
+        return [first_m]
     count = max(1, int(np.ceil((last_m - first_m) / spacing_m - 1e-9)))
     positions: list[float] = np.linspace(first_m, last_m, count + 1).tolist()
     return positions
@@ -88,12 +105,24 @@ def turned(
         replace(
             bar,
             line_m=bar.line_m @ rotation.T + np.asarray(shift_m),
-            spaced_along=None
-            if bar.spaced_along is None
-            else tuple((rotation @ np.array(bar.spaced_along)).tolist()),
+            spaced_along=_rotated(bar.spaced_along, rotation),
+            held_along=_rotated(bar.held_along, rotation),
         )
         for bar in bars
     ]
+
+
+def _rotated(direction: Direction | None, rotation: Float64[ndarray, "3 3"]) -> Direction | None:
+    if direction is None:
+        return None
+    x, y, z = (rotation @ np.array(direction)).tolist()
+    return (x, y, z)
+
+
+def check_steel(steel_m2: float, concrete_m2: float, shares: tuple[float, float]) -> None:
+    """Raise ``InfeasibleError`` unless the area of steel per area of concrete is within ``shares``."""
+    if not shares[0] <= steel_m2 / concrete_m2 <= shares[1]:
+        raise InfeasibleError(f"too {'little' if steel_m2 < shares[0] * concrete_m2 else 'much'} steel")
 
 
 LYING = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

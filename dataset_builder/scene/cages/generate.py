@@ -57,10 +57,12 @@ def generate_cage(split: str, number: int, seed: int = 0, family: str | None = N
     rng = _cage_rng(split, number, seed)
     drawn = _drawn_family(rng)
     chosen = drawn if family is None else family
+    shapes = FAMILIES[chosen].shapes
+    shape = shapes[int(rng.integers(len(shapes)))]
     refused: Counter[str] = Counter()
     for _ in range(MAX_ATTEMPTS):
         try:
-            design = FAMILIES[chosen](rng)
+            design = FAMILIES[chosen].draw(rng, shape)
             built = build_as(design, rng)
         except InfeasibleError as error:
             refused[str(error)] += 1
@@ -73,7 +75,11 @@ def generate_cage(split: str, number: int, seed: int = 0, family: str | None = N
             "family": design.family,
             "parameters": design.parameters,
             "left_out": [
-                {"role": bar.role, "diameter_m": bar.diameter_m, "nominal_axis": (bar.line_m + offset_m).tolist()}
+                {
+                    "role": bar.role,
+                    "diameter_m": bar.diameter_m,
+                    "nominal_axis": _placed(bar.line_m, offset_m).tolist(),
+                }
                 for bar in built.left_out
             ],
             "doubled": built.doubled,
@@ -83,7 +89,9 @@ def generate_cage(split: str, number: int, seed: int = 0, family: str | None = N
         }
         return GeneratedCage(design.family, tuple(_moved(bar, offset_m) for bar in built.bars), record)
     reasons = ", ".join(f"{reason} ({count})" for reason, count in refused.most_common(3))
-    raise InputError(f"no cage of the family {chosen} for {split} {number}, seed {seed}: {reasons}")
+    raise InputError(
+        f"no cage of the family {chosen}, shape {shape}, for {split} {number}, seed {seed}: {reasons}"
+    )
 
 
 def _cage_rng(split: str, number: int, seed: int) -> np.random.Generator:
@@ -122,5 +130,14 @@ def _lowest_m(bar: BuiltBar) -> float:
 
 
 def _moved(bar: BuiltBar, offset_m: Float64[ndarray, " 3"]) -> BuiltBar:
-    nominal_m = None if bar.nominal_m is None else bar.nominal_m + offset_m
-    return BuiltBar(bar.role, bar.diameter_m, bar.line_m + offset_m, nominal_m)
+    nominal_m = None if bar.nominal_m is None else _placed(bar.nominal_m, offset_m)
+    return BuiltBar(bar.role, bar.diameter_m, _placed(bar.line_m, offset_m), nominal_m)
+
+
+def _placed(line_m: Float64[ndarray, "n 3"], offset_m: Float64[ndarray, " 3"]) -> Float64[ndarray, "n 3"]:
+    """Return a displaced line, rounded to the nanometre.
+
+    Products of matrices and sines differ in the last bit between processors; the rounded line does not. Adding
+    zero removes the sign of zeros.
+    """
+    return np.asarray(np.round(line_m + offset_m, 9) + 0.0)

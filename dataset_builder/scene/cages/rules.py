@@ -7,6 +7,8 @@ They were taken from secondary sources, not from the text of the standards.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
+from math import pi
 
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.bending import bend_radius_m
@@ -33,6 +35,21 @@ LINK_SLACK_M = 0.003
 of BS 8666 for sides up to 1 m, from a secondary source)."""
 
 
+COLUMN_STEEL, BEAM_STEEL, WALL_STEEL, SLAB_STEEL = (0.002, 0.04), (0.0015, 0.04), (0.002, 0.04), (0.0013, 0.04)
+"""Least and largest areas of main bars per area of concrete (EN 1992-1-1, 9.5.2, 9.2.1.1, 9.6.2, 9.3.1.1).
+
+Those of beams and slabs are for the bars at the side in tension and the effective depth; the least area of beams
+is that of concrete C30/37.
+"""
+
+MOST_UNHELD_M = 0.150
+"""Largest distance of a compressed bar of a column from one in the bend of a link or tie (EN 1992-1-1, 9.5.3)."""
+
+CRANK_SLOPE = 1 / 6
+"""Slope at which a bar is bent sideways to lap with another one (ACI 318-19, 10.7.4.1; secondary source)."""
+
+
+@cache
 def radius_m(diameter_m: float) -> float:
     """Return the largest distance of a bar's surface from its axis, ribs included."""
     return outer_radius_m(diameter_m)
@@ -56,6 +73,18 @@ def lap_m(diameter_m: float) -> float:
 def hook_end_m(diameter_m: float) -> float:
     """Return the straight end of a link's hook of 135 degrees or more: 5 d, 50 mm (EN 1992-1-1, 8.5)."""
     return max(5 * diameter_m, 0.050)
+
+
+def area_m2(diameter_m: float, count: float = 1.0) -> float:
+    """Return the nominal area of ``count`` bars."""
+    return count * pi / 4 * diameter_m**2
+
+
+def least_pile_steel_m2(concrete_m2: float) -> float:
+    """Return the least area of main bars of a bored pile (EN 1992-1-1, 9.8.5, table 9.6N)."""
+    if concrete_m2 <= 0.5:
+        return 0.005 * concrete_m2
+    return max(0.0025, 0.0025 * concrete_m2)
 
 
 def square_end_m(diameter_m: float) -> float:

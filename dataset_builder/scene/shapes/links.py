@@ -63,15 +63,17 @@ def stirrup_centreline_m(
     return np.asarray(flat_m - _centroid_m(flat_m))
 
 
-def tie_centreline_m(half_length_m: float, radius_m: float, extension_m: float) -> Float64[ndarray, "n 3"]:
+def tie_centreline_m(
+    half_length_m: float, radius_m: float, extension_m: float, second_deg: float = SQUARE_HOOK_DEG
+) -> Float64[ndarray, "n 3"]:
     """Return the centreline of a tie along x that holds two bars at x = -/+ ``half_length_m``, y = 0; metres.
 
     Its hooks bend round the two bars with ``radius_m``, the first by ``HOOK_DEG`` and the second by
-    ``SQUARE_HOOK_DEG``, with straight ends of ``extension_m``; its leg is at y = -``radius_m``, and all of it is
+    ``second_deg``, with straight ends of ``extension_m``; its leg is at y = -``radius_m``, and all of it is
     at z = 0. Raises ``ValueError`` as ``bent_line_m``.
     """
     ends = [_hook_m(half_length_m, -1, HOOK_DEG, radius_m, extension_m)[::-1]]
-    ends.append(_hook_m(half_length_m, 1, SQUARE_HOOK_DEG, radius_m, extension_m))
+    ends.append(_hook_m(half_length_m, 1, second_deg, radius_m, extension_m))
     return bent_line_m(np.concatenate(ends), radius_m, BEND_STEP_DEG)
 
 

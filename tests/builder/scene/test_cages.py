@@ -25,7 +25,7 @@ from dataset_builder.scene.cages.as_built import (
 )
 from dataset_builder.scene.cages.clearance import NEAR_M, Clearances
 from dataset_builder.scene.cages.design import Design, DesignBar, InfeasibleError, straight
-from dataset_builder.scene.cages.families import FAMILIES
+from dataset_builder.scene.cages.families import FAMILIES, Family
 from dataset_builder.scene.cages.generate import GeneratedCage, drawn_family, generate_cage
 from dataset_builder.scene.cages.rules import DIAMETERS_M, radius_m
 from rebar_depth_bench.errors import InputError
@@ -153,11 +153,11 @@ def test_unknown_names_are_refused(split: str, family: str | None) -> None:
 
 
 def test_cage_that_cannot_be_made_is_refused_with_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
-    def impossible(_: np.random.Generator) -> Design:
-        raise InfeasibleError("no bar fits")
+    def impossible(_: np.random.Generator, shape: str) -> Design:
+        raise InfeasibleError(f"no bar fits {shape}")
 
-    monkeypatch.setattr(generate_module, "FAMILIES", {"wall": impossible})
-    with pytest.raises(InputError, match=r"no bar fits \(200\)"):
+    monkeypatch.setattr(generate_module, "FAMILIES", {"wall": Family(impossible, ("plain",))})
+    with pytest.raises(InputError, match=r"no bar fits plain \(200\)"):
         generate_cage("train", 0)
 
 

@@ -1,175 +1,207 @@
-"""Cages of beams, and of joints of a beam with a column. Beams lie along x, on spacers."""
+"""Cages of beams, which lie along x on spacers."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dataset_builder.scene.cages.clearance import Clearances
 from dataset_builder.scene.cages.design import (
     LYING,
     Design,
     DesignBar,
     InfeasibleError,
     Line,
+    X,
+    Y,
+    Z,
     bent,
+    check_steel,
     drawn_of,
     drawn_step,
     spaced,
     straight,
     turned,
 )
-from dataset_builder.scene.cages.families.columns import STANDING_M, drawn_section
-from dataset_builder.scene.cages.members import LINK, MAIN, SIDE, Section, main_bars, stirrups
+from dataset_builder.scene.cages.families.columns import drawn_section
+from dataset_builder.scene.cages.linear import rise_m
+from dataset_builder.scene.cages.rectangular import Section, stirrups
 from dataset_builder.scene.cages.rules import (
+    BEAM_STEEL,
     COVER_M,
     DIAMETERS_M,
+    area_m2,
     beam_link_spacing_m,
-    column_link_spacing_m,
     contact_m,
     inside_link_m,
     least_clear_m,
     link_diameters_m,
-    radius_m,
     square_end_m,
 )
 from dataset_builder.scene.shapes.bending import bend_radius_m
 
-BOTTOM, TOP = "bottom", "top"
-_MAX_LEFT_OUT = 0.4
-"""Largest share of a column's links that a joint may leave out where the beam passes."""
+BOTTOM, TOP, SIDE, SPACER = "bottom", "top", "side", "spacer"
+
+SIDE_DIAMETER_M, SIDE_SPACING_M, SIDES_FROM_M = 0.012, 0.25, 0.6
+"""Bars along the sides: diameter, largest spacing, and the least depth of beams that have them.
+
+Deep beams need such bars (EN 1992-1-1, 7.3.3 (3)); the numbers are ours.
+"""
+
+_SPACER_SPACING_M = 1.0
+_HOOK_STEP = 1.5
+"""Distance between the ends of successive layers of hooked bars, in distances of touching bars."""
 
 
-def beam(rng: np.random.Generator) -> Design:
+@dataclass(frozen=True)
+class BeamLayout:
+    """Layout of a beam: length, whether its bars have hooks at its start and its end, and its main bars.
+
+    The main bars, in one or two layers, are those below, or above if a beam is ``hogging`` over a support.
+    """
+
+    length_m: float
+    hooks: tuple[bool, bool]
+    two_layers: bool = False
+    hogging: bool = False
+
+
+def beam(rng: np.random.Generator, shape: str) -> Design:
     """Draw a beam: one or two layers below, one above, side bars in deep beams, hooked or straight ends."""
     bar_m = drawn_of(rng, [d for d in DIAMETERS_M if 0.012 <= d <= 0.032])
     link_m = drawn_of(rng, [d for d in link_diameters_m(bar_m) if d <= 0.012])
     cover_m = drawn_step(rng, *COVER_M, 0.005)
     width_m, depth_m = drawn_step(rng, 0.20, 0.45, 0.05), drawn_step(rng, 0.30, 0.80, 0.05)
-    length_m = drawn_step(rng, 1.5, 4.0, 0.1)
-    is_hooked = bool(rng.random() < 0.6)
-    two_layers = bool(rng.random() < 0.3)
-    section = _beam_section(rng, bar_m, link_m, cover_m, width_m, depth_m)
-    bars, drawn = _beam_bars(rng, section, length_m, is_hooked=is_hooked, two_layers=two_layers)
-    return Design("beam", tuple(bars), drawn, cover_m)
-
-
-def _beam_bars(
-    rng: np.random.Generator,
-    section: Section,
-    length_m: float,
-    *,
-    is_hooked: bool,
-    two_layers: bool,
-) -> tuple[list[DesignBar], dict[str, float | str]]:
-    """Return the bars of a beam along x, centred in x and y, whose concrete is from z = 0 up, and what was drawn.
-
-    The x of the section is the width of the beam, its y the depth.
-    """
-    bar_m, link_m, width_m, depth_m = section.bar_m, section.link_m, section.side_x_m, section.side_y_m
-    if depth_m > 3 * width_m or (two_layers and depth_m < 0.45):
+    is_hooked, two_layers = shape == "hooked", bool(rng.random() < 0.3)
+    if depth_m > 3 * width_m or depth_m < width_m or (two_layers and depth_m < 0.45):
         raise InfeasibleError("the proportions of a beam do not fit")
-    spacing_m = drawn_step(rng, 0.08, min(beam_link_spacing_m(depth_m), 0.30), 0.01)
-    links = stirrups(section, spaced(0.05, length_m - 0.05, spacing_m))
-    places = section.bar_positions_m()
-
-    def line(x: float, y: float, behind: float) -> Line:
-        out_m = behind * contact_m(bar_m, bar_m)
-        return _hooked(x, y, bar_m, length_m, out_m) if is_hooked else straight((x, y, 0.0), (x, y, length_m))
-
-    if two_layers:
-        lift_m = bar_m + least_clear_m(bar_m)
-        places += [(x, y + lift_m) for x, y in places if y < 0]
-    bars = [
-        # The hooks of lower bars stand behind those of upper ones, and those along a side behind those of corners.
-        DesignBar(TOP, bar_m, line(x, y, 1.5 * (index >= 4)))
-        if y > 0
-        else DesignBar(BOTTOM, bar_m, line(x, y, 3.0 + 1.5 * (index >= 4)))
-        for index, (x, y) in enumerate(places)
-    ]
-    side_m = 0.012
-    if depth_m >= 0.6:  # Skin reinforcement of deep beams (EN 1992-1-1, 7.3.3 (3)).
-        x = section.link_half_m[0] - inside_link_m(link_m, side_m)
-        for y in np.linspace(-depth_m / 2, depth_m / 2, 2 + int(depth_m / 0.25))[1:-1].tolist():
-            bars += [
-                DesignBar(SIDE, side_m, straight((sign * x, y, 0.0), (sign * x, y, length_m)), is_structural=False)
-                for sign in (1, -1)
-            ]
-    drawn: dict[str, float | str] = {
-        "shape": "hooked" if is_hooked else "straight",
-        "bar_m": bar_m,
-        "link_m": link_m,
-        "cover_m": section.cover_m,
-        "side_x_m": width_m,
-        "side_y_m": depth_m,
-        "length_m": length_m,
-        "bars_x": float(section.bars_x),
-        "spacing_m": spacing_m,
-        "layers": 1.0 + two_layers,
-    }
-    return turned([*bars, *links], LYING, (-length_m / 2, 0.0, depth_m / 2)), drawn
+    layout = BeamLayout(drawn_step(rng, 1.5, 4.0, 0.1), (is_hooked, is_hooked), two_layers)
+    section = beam_section(rng, bar_m, link_m, cover_m, width_m, depth_m)
+    bars, drawn = beam_bars(rng, section, layout, first_link_m=0.05)
+    lying = turned(bars, LYING, (-layout.length_m / 2, 0.0, depth_m / 2))
+    return Design("beam", tuple(lying), {"shape": shape, **drawn}, cover_m)
 
 
-def _beam_section(
+def beam_section(
     rng: np.random.Generator, bar_m: float, link_m: float, cover_m: float, width_m: float, depth_m: float
 ) -> Section:
     """Return the section of a beam, which has bars along its upper and lower sides only."""
     return replace(drawn_section(rng, bar_m, link_m, cover_m, width_m, depth_m), bars_y=2)
 
 
-def _hooked(x: float, y: float, bar_m: float, length_m: float, out_m: float) -> Line:
-    """Return a bar along the member, ``out_m`` longer at both ends, which are bent towards the other face."""
-    inward = -1.0 if y > 0 else 1.0
-    reach_m = bend_radius_m(bar_m) + square_end_m(bar_m)
-    if reach_m > 2 * abs(y) - 2 * contact_m(bar_m, bar_m):
-        raise InfeasibleError("a beam is too shallow for the hooks of its bars")
-    tip = y + inward * reach_m
-    return bent([(x, tip, -out_m), (x, y, -out_m), (x, y, length_m + out_m), (x, tip, length_m + out_m)], bar_m)
+def beam_bars(
+    rng: np.random.Generator, section: Section, layout: BeamLayout, first_link_m: float
+) -> tuple[list[DesignBar], dict[str, float | str]]:
+    """Return the bars of a beam along z from 0 up, and what was drawn; its x is the width and its y the depth.
 
-
-def joint(rng: np.random.Generator) -> Design:
-    """Draw a column with a beam anchored in it; links of the column that the beam would cut are left out."""
-    bar_m = drawn_of(rng, [0.016, 0.020, 0.025])
-    link_m = drawn_of(rng, link_diameters_m(bar_m))
-    cover_m = drawn_step(rng, 0.03, 0.05, 0.005)
-    side_m = drawn_step(rng, 0.40, 0.60, 0.05)
-    column = drawn_section(rng, bar_m, link_m, cover_m, side_m, side_m)
-    height_m, level_m = drawn_step(rng, 1.8, 2.6, 0.1), drawn_step(rng, 0.8, 1.2, 0.05)
-    spacing_m = drawn_step(rng, 0.08, column_link_spacing_m(bar_m, side_m), 0.01)
-    width_m = drawn_step(rng, 0.20, side_m - 0.10, 0.05)
-    depth_m, length_m = drawn_step(rng, 0.35, 0.60, 0.05), drawn_step(rng, 1.2, 2.0, 0.1)
-    beam_bar_m = drawn_of(rng, [0.012, 0.016, 0.020])
-    beam_link_m = drawn_of(rng, [d for d in link_diameters_m(beam_bar_m) if d <= 0.010])
-    section = _beam_section(rng, beam_bar_m, beam_link_m, cover_m, width_m, depth_m)
-    beam_bars, drawn = _beam_bars(rng, section, length_m, is_hooked=True, two_layers=False)
-    # The beam's far hooks are in the column, behind its axis; its links begin at the column's face.
-    start_m = column.link_half_m[0] - column.corner_inset_m - contact_m(bar_m, beam_bar_m) - 0.02
-    shift_m = (length_m / 2 - start_m, 0.0, level_m)
-    beam_bars = [
-        bar
-        for bar in turned(beam_bars, np.eye(3), shift_m)
-        if bar.role != LINK or bar.line_m[:, 0].min() > side_m / 2 + 0.02
-    ]
-    standing = main_bars(column, height_m, MAIN)
-    fixed = Clearances(
-        [bar.line_m for bar in (*standing, *beam_bars)],
-        [radius_m(bar.diameter_m) for bar in (*standing, *beam_bars)],
-    )
-    links = stirrups(column, spaced(0.05, height_m - 0.05, spacing_m))
-    kept = [bar for bar in links if fixed.least_m(bar.line_m, radius_m(link_m)) > 0]
-    if len(kept) < (1 - _MAX_LEFT_OUT) * len(links):
-        raise InfeasibleError("the beam of a joint leaves too few links of its column")
-    drawn = {f"beam_{name}": value for name, value in drawn.items()} | {
-        "shape": "corner",
+    The links start at ``first_link_m``. Raises ``InfeasibleError`` if the parts of the beam do not fit.
+    """
+    bar_m, width_m, depth_m, length_m = section.bar_m, section.side_x_m, section.side_y_m, layout.length_m
+    spacing_m = drawn_step(rng, 0.08, min(beam_link_spacing_m(depth_m), 0.30), 0.01)
+    other_m = drawn_of(rng, [d for d in DIAMETERS_M if max(0.010, bar_m / 2) <= d <= bar_m])
+    others = int(rng.integers(2, section.bars_x + 1))
+    check_steel(area_m2(bar_m, section.bars_x * (1 + layout.two_layers)), 0.9 * width_m * depth_m, BEAM_STEEL)
+    links = stirrups(section, spaced(first_link_m, length_m - 0.05, spacing_m), corners=2)
+    role, other_role, side = (TOP, BOTTOM, 1.0) if layout.hogging else (BOTTOM, TOP, -1.0)
+    outer = _layer_m(section, bar_m, section.bars_x, side)
+    opposite = _layer_m(section, other_m, others, -side)
+    step_m = _HOOK_STEP * contact_m(bar_m, bar_m)
+    bend_m = bend_radius_m(bar_m)  # Hooks bend beyond the ends, so that all links hold the bars.
+    bars = [_bar(other_role, other_m, place, layout, bend_m) for place in opposite]
+    inner_m = outer[0][1]
+    if layout.two_layers:
+        spacers, inner_m = _spacers(section, links, inner_m)
+        face_x = section.half_m(bar_m)[1][0]
+        places = [(x, inner_m, abs(x) == face_x) for x in np.linspace(-face_x, face_x, section.bars_x).tolist()]
+        bars += [*(_bar(role, bar_m, place, layout, bend_m + step_m) for place in places), *spacers]
+    bars += [_bar(role, bar_m, place, layout, hook_reach_m(section, layout)) for place in outer]
+    if depth_m >= SIDES_FROM_M:
+        bars += _side_bars(section, layout, *sorted((inner_m, opposite[0][1])))
+    drawn: dict[str, float | str] = {
         "bar_m": bar_m,
-        "link_m": link_m,
-        "cover_m": cover_m,
-        "side_x_m": side_m,
-        "side_y_m": side_m,
-        "length_m": height_m,
-        "level_m": level_m,
+        "link_m": section.link_m,
+        "cover_m": section.cover_m,
+        "side_x_m": width_m,
+        "side_y_m": depth_m,
+        "length_m": length_m,
+        "bars_x": float(section.bars_x),
+        "other_bar_m": other_m,
+        "other_bars_x": float(others),
         "spacing_m": spacing_m,
-        "links_left_out": float(len(links) - len(kept)),
+        "layers": 1.0 + layout.two_layers,
     }
-    return Design("joint", (*standing, *kept, *beam_bars), drawn, STANDING_M)
+    return [*bars, *links], drawn
+
+
+def hook_reach_m(section: Section, layout: BeamLayout) -> float:
+    """Return how far the farthest hooked bars reach beyond the ends of a beam."""
+    layers = 1 + layout.two_layers
+    return bend_radius_m(section.bar_m) + layers * _HOOK_STEP * contact_m(section.bar_m, section.bar_m)
+
+
+def _layer_m(section: Section, bar_m: float, count: int, side: float) -> list[tuple[float, float, bool]]:
+    """Return the places of bars along the upper (``side`` 1) or lower (-1) legs: x, y, and whether in a corner."""
+    (corner_x, corner_y), (_, face_y) = section.half_m(bar_m)
+    along_m = np.linspace(-corner_x, corner_x, count)
+    if float(along_m[1] - along_m[0]) - bar_m < least_clear_m(bar_m):
+        raise InfeasibleError("bars along a side are too close to each other")
+    inner = [(x, side * face_y, False) for x in along_m[1:-1].tolist()]
+    return [*((x, side * corner_y, True) for x in (-corner_x, corner_x)), *inner]
+
+
+def _bar(role: str, bar_m: float, place: tuple[float, float, bool], layout: BeamLayout, out_m: float) -> DesignBar:
+    x, y, is_corner = place
+    return DesignBar(role, bar_m, _hooked((x, y), bar_m, layout, out_m), None if is_corner else X)
+
+
+def _hooked(place: tuple[float, float], bar_m: float, layout: BeamLayout, out_m: float) -> Line:
+    """Return a bar along the member, ``out_m`` longer at hooked ends, which are bent towards the other side."""
+    x, y = place
+    tip = y - np.sign(y) * (bend_radius_m(bar_m) + square_end_m(bar_m))
+    if any(layout.hooks) and abs(tip) > abs(y) + bar_m / 2:
+        raise InfeasibleError("a beam is too shallow for the hooks of its bars")
+    ends = [-out_m if layout.hooks[0] else 0.0, layout.length_m + (out_m if layout.hooks[1] else 0.0)]
+    line_m = [(x, y, ends[0]), (x, y, ends[1])]
+    line_m = [(x, tip, ends[0])] * layout.hooks[0] + line_m + [(x, tip, ends[1])] * layout.hooks[1]
+    return bent(line_m, bar_m)
+
+
+def _spacers(section: Section, links: Sequence[DesignBar], below_m: float) -> tuple[list[DesignBar], float]:
+    """Return bars across a layer at y = ``below_m``, beside links, and the y of the layer that they carry."""
+    bar_m = section.bar_m
+    spacer_m = min(d for d in DIAMETERS_M if d >= least_clear_m(bar_m))
+    y = below_m + contact_m(bar_m, spacer_m)
+    half_m = section.link_half_m[0] - contact_m(section.link_m, spacer_m) - 0.003
+    levels_m = [float(link.line_m[:, 2].mean()) for link in links]
+    count = 2 + int((levels_m[-1] - levels_m[0]) / _SPACER_SPACING_M)
+    chosen = np.linspace(1, len(links) - 2, count).round().astype(int)
+    beside_m = rise_m(links) + contact_m(section.link_m, spacer_m)
+    made = [
+        DesignBar(
+            SPACER,
+            spacer_m,
+            straight((-half_m, y, levels_m[index] + beside_m), (half_m, y, levels_m[index] + beside_m)),
+            Z,
+            False,
+            Y,
+        )
+        for index in sorted(set(chosen.tolist()))
+    ]
+    return made, y + contact_m(spacer_m, bar_m)
+
+
+def _side_bars(section: Section, layout: BeamLayout, low_m: float, high_m: float) -> list[DesignBar]:
+    """Return bars along both sides between layers at y = ``low_m`` and ``high_m``, inside of hooks at the ends."""
+    x = section.link_half_m[0] - inside_link_m(section.link_m, SIDE_DIAMETER_M)
+    start_m, end_m = (0.03 if is_hooked else 0.0 for is_hooked in layout.hooks)
+    return [
+        DesignBar(
+            SIDE,
+            SIDE_DIAMETER_M,
+            straight((sign * x, y, start_m), (sign * x, y, layout.length_m - end_m)),
+            is_structural=False,
+        )
+        for y in spaced(low_m, high_m, SIDE_SPACING_M)[1:-1]
+        for sign in (1, -1)
+    ]

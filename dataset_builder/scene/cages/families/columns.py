@@ -2,39 +2,49 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from dataset_builder.scene.cages.design import LYING, Design, DesignBar, drawn_of, drawn_step, turned
-from dataset_builder.scene.cages.members import (
-    RoundSection,
-    Section,
-    bundled,
-    lapped,
-    link_levels_m,
-    main_bars,
-    rise_m,
-    stirrups,
-    ties,
+from dataset_builder.scene.cages.design import (
+    LYING,
+    STANDING_M,
+    Design,
+    DesignBar,
+    InfeasibleError,
+    check_steel,
+    drawn_of,
+    drawn_step,
+    turned,
 )
+from dataset_builder.scene.cages.linear import Lap, lapped, link_levels_m, rise_m
+from dataset_builder.scene.cages.rectangular import Section, bundled, main_bars, stirrups, ties
+from dataset_builder.scene.cages.round_section import RoundSection
 from dataset_builder.scene.cages.rules import (
+    COLUMN_STEEL,
     COVER_M,
     DIAMETERS_M,
     GROUND_COVER_M,
+    area_m2,
     column_link_spacing_m,
-    lap_m,
+    least_pile_steel_m2,
     link_diameters_m,
 )
 
-STANDING_M = 5e-5
-"""Height of the ends of standing bars above z = 0, so that they do not coincide with the ground."""
+LYING_M = 2e-4
+"""Height above the ground of the lowest steel of a cage that lies."""
+
+MOST_CLEAR_M = 0.300
+"""Largest distance of main bars of a column (common practice)."""
 
 MOST_CLEAR_PILE_M = 0.200
 """Largest clear distance of the bars of a bored pile along its periphery (EN 1992-1-1, 9.8.5)."""
 
+_EXTRAS = ("none", "none", "laps", "bundles")
 
-def column(rng: np.random.Generator) -> Design:
+
+def column(rng: np.random.Generator, shape: str) -> Design:
     """Draw a column: square, rectangular, round with ties, or round with a spiral; starters may be lapped."""
-    shape = str(rng.choice(["square", "rectangular", "round-ties", "spiral"]))
     bar_m = drawn_of(rng, [d for d in DIAMETERS_M if 0.012 <= d <= 0.032])
     link_m = drawn_of(rng, link_diameters_m(bar_m))
     cover_m = drawn_step(rng, *COVER_M, 0.005)
@@ -43,31 +53,39 @@ def column(rng: np.random.Generator) -> Design:
     common |= {"length_m": length_m}
     if shape in ("square", "rectangular"):
         return _rectangular(rng, shape, common)
-    side_m = drawn_step(rng, 0.30, 0.80, 0.05)
-    section = RoundSection(side_m, cover_m, link_m, bar_m, int(rng.integers(6, 15)))
-    section.check(0.300)
-    most_m = min(column_link_spacing_m(bar_m, side_m), 0.15 if shape == "spiral" else 0.4)
+    diameter_m = drawn_step(rng, 0.30, 0.80, 0.05)
+    section = RoundSection(diameter_m, cover_m, link_m, bar_m, int(rng.integers(6, 15)))
+    section.check(MOST_CLEAR_M)
+    check_steel(area_m2(bar_m, section.bars), section.concrete_m2, COLUMN_STEEL)
+    most_m = min(column_link_spacing_m(bar_m, diameter_m), 0.15 if shape == "spiral" else 0.4)
     spacing_m = drawn_step(rng, 0.06, most_m, 0.01)
     bars: list[DesignBar] = section.main_bars(length_m)
-    if shape == "spiral":
-        bars.append(section.spiral(length_m, spacing_m))
-    else:
-        bars += section.rings(link_levels_m(length_m, spacing_m, side_m, max(0.06, 0.6 * spacing_m)))
-    drawn = {**common, "diameter_m": side_m, "bars": float(section.bars), "spacing_m": spacing_m}
+    lap = _drawn_lap(rng, bar_m, float(rng.random()) < 0.25)
+    levels = link_levels_m(length_m, spacing_m, diameter_m, max(0.06, 0.6 * spacing_m), lap)
+    if lap is not None:
+        bars = lapped(bars, [(-x, -y) for x, y in section.outward().tolist()], lap)
+    bars += [section.spiral(length_m, spacing_m)] if shape == "spiral" else section.rings(levels)
+    drawn = {**common, "diameter_m": diameter_m, "bars": float(section.bars), "spacing_m": spacing_m}
+    drawn |= {"extra": "none"} if lap is None else {"extra": "laps", "lap_start_m": lap.start_m}
     return Design("column", tuple(bars), drawn, STANDING_M)
+
+
+def _drawn_lap(rng: np.random.Generator, bar_m: float, has_laps: bool) -> Lap | None:
+    """Return a lap that starts a little above the ground, or None."""
+    lap = Lap(bar_m, drawn_step(rng, 0.01, 0.10, 0.01))
+    return lap if has_laps else None
 
 
 def drawn_section(
     rng: np.random.Generator, bar_m: float, link_m: float, cover_m: float, side_x_m: float, side_y_m: float
 ) -> Section:
     """Return a section with a drawn number of bars, at most 0.3 m apart. Raises ``InfeasibleError``."""
-    empty = Section(side_x_m, side_y_m, cover_m, link_m, bar_m, 2, 2)
+    section = Section(side_x_m, side_y_m, cover_m, link_m, bar_m, 2, 2)
     counts = []
-    for half_m in empty.link_half_m:
-        span_m = 2 * (half_m - empty.corner_inset_m)
-        least = max(2, 1 + int(np.ceil(span_m / 0.30)))
+    for half_m in section.half_m(bar_m)[0]:
+        least = max(2, 1 + int(np.ceil(2 * half_m / MOST_CLEAR_M)))
         counts.append(least + int(rng.integers(0, 3)))
-    section = Section(side_x_m, side_y_m, cover_m, link_m, bar_m, counts[0], counts[1])
+    section = replace(section, bars_x=counts[0], bars_y=counts[1])
     section.check()
     return section
 
@@ -76,17 +94,21 @@ def _rectangular(rng: np.random.Generator, shape: str, common: dict[str, float |
     bar_m, link_m, cover_m, length_m = (float(common[name]) for name in ("bar_m", "link_m", "cover_m", "length_m"))
     side_x_m = drawn_step(rng, 0.25, 0.60, 0.05)
     side_y_m = side_x_m if shape == "square" else drawn_step(rng, 0.25, 0.80, 0.05)
+    if shape == "rectangular" and side_x_m == side_y_m:
+        raise InfeasibleError("a rectangular section is square")
+    extra = str(rng.choice(_EXTRAS))
     section = drawn_section(rng, bar_m, link_m, cover_m, side_x_m, side_y_m)
+    section.check_column(section.count + (4 if extra == "bundles" else 0))
     spacing_m = drawn_step(rng, 0.08, column_link_spacing_m(bar_m, min(side_x_m, side_y_m)), 0.01)
-    levels = link_levels_m(length_m, spacing_m, max(side_x_m, side_y_m), max(0.08, 0.6 * spacing_m))
+    lap = _drawn_lap(rng, bar_m, extra == "laps")
+    levels = link_levels_m(length_m, spacing_m, max(side_x_m, side_y_m), max(0.08, 0.6 * spacing_m), lap)
     links = stirrups(section, levels)
     bars = main_bars(section, length_m)
-    extra = str(rng.choice(["none", "none", "laps", "bundles"]))
-    if extra == "laps":
-        bars = lapped(bars, drawn_step(rng, 0.0, max(0.0, length_m - 2.1 * lap_m(bar_m)), 0.05))
+    if lap is not None:
+        bars = lapped(bars, section.inward(), lap)
     elif extra == "bundles":
         bars = bundled(bars, section)
-    with_ties = bool(rng.random() < 0.6) and max(section.bars_x, section.bars_y) > 2
+    with_ties = section.needs_ties() or (bool(rng.random() < 0.4) and section.count > 4)
     bars += [*links, *(ties(section, levels, rise_m(links)) if with_ties else [])]
     drawn = {
         **common,
@@ -98,10 +120,11 @@ def _rectangular(rng: np.random.Generator, shape: str, common: dict[str, float |
         "extra": extra,
         "ties": float(with_ties),
     }
+    drawn |= {} if lap is None else {"lap_start_m": lap.start_m}
     return Design("column", tuple(bars), drawn, STANDING_M)
 
 
-def pile_cage(rng: np.random.Generator) -> Design:
+def pile_cage(rng: np.random.Generator, shape: str) -> Design:
     """Draw the cage of a bored pile, with a spiral or rings and stiffeners inside; it lies, or stands."""
     diameter_m = drawn_step(rng, 0.40, 1.00, 0.05)
     cover_m = drawn_step(rng, *GROUND_COVER_M, 0.005)
@@ -109,8 +132,9 @@ def pile_cage(rng: np.random.Generator) -> Design:
     link_m = drawn_of(rng, link_diameters_m(bar_m))
     section = RoundSection(diameter_m, cover_m, link_m, bar_m, int(rng.integers(6, 19)))
     section.check(MOST_CLEAR_PILE_M)
+    least_share = least_pile_steel_m2(section.concrete_m2) / section.concrete_m2
+    check_steel(area_m2(bar_m, section.bars), section.concrete_m2, (least_share, COLUMN_STEEL[1]))
     length_m = drawn_step(rng, 2.0, 4.5, 0.1)
-    shape = str(rng.choice(["spiral", "rings"]))
     pitch_m = drawn_step(rng, 0.10, 0.25, 0.01)
     bars = section.main_bars(length_m)
     bars += (
@@ -118,7 +142,7 @@ def pile_cage(rng: np.random.Generator) -> Design:
         if shape == "spiral"
         else section.rings(link_levels_m(length_m, pitch_m, 0.0, pitch_m))
     )
-    stiffener_m = drawn_of(rng, [0.012, 0.016, 0.020])
+    stiffener_m = drawn_of(rng, [0.012, 0.016] if diameter_m < 0.6 else [0.016, 0.020, 0.025])
     bars += section.stiffeners(np.linspace(0.3, length_m - 0.3, 2 + int(length_m / 1.5)).tolist(), stiffener_m)
     lies = bool(rng.random() < 0.7)
     if lies:
@@ -135,4 +159,4 @@ def pile_cage(rng: np.random.Generator) -> Design:
         "stiffener_m": stiffener_m,
         "lies": float(lies),
     }
-    return Design("pile-cage", tuple(bars), drawn, 2e-4 if lies else STANDING_M)
+    return Design("pile-cage", tuple(bars), drawn, LYING_M if lies else STANDING_M)

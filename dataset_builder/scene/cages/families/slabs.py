@@ -1,0 +1,121 @@
+"""Cages of slabs: a lower and an upper mat of two layers each, and chairs that carry the upper mat."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dataset_builder.scene.cages.design import (
+    Design,
+    DesignBar,
+    InfeasibleError,
+    X,
+    Y,
+    Z,
+    bent,
+    check_steel,
+    drawn_of,
+    drawn_step,
+    spaced,
+    straight,
+)
+from dataset_builder.scene.cages.rules import DIAMETERS_M, SLAB_STEEL, area_m2, contact_m, slab_spacing_m
+
+LOWER, UPPER, CHAIR = "lower", "upper", "chair"
+_EDGE_M = 0.05
+"""Distance of the outermost bars of a mat from the ends of the bars that cross them."""
+
+_CHAIR_SPACING_M = 0.7
+_CLOSE_M = 0.150
+"""Largest spacing of bars of which a chair carries two, or stands on two, instead of one."""
+
+_FOOT_END_M = 0.03
+"""Length of a chair's foot beyond the last bar that it stands on."""
+
+
+def slab(rng: np.random.Generator, shape: str) -> Design:
+    """Draw a slab on spacers, of bars of one diameter and spacing."""
+    thickness_m, cover_m = drawn_step(rng, 0.16, 0.40, 0.01), drawn_step(rng, 0.020, 0.040, 0.005)
+    side_x_m, side_y_m = drawn_step(rng, 1.0, 2.4, 0.1), drawn_step(rng, 1.0, 2.4, 0.1)
+    bar_m = drawn_of(rng, [d for d in DIAMETERS_M if 0.008 <= d <= 0.016])
+    spacing_m = drawn_step(rng, 0.10, min(0.25, slab_spacing_m(thickness_m)), 0.025)
+    chair_m = drawn_of(rng, [0.008, 0.010, 0.012])
+    step_m = contact_m(bar_m, bar_m)
+    low = [cover_m + bar_m / 2, cover_m + bar_m / 2 + step_m]
+    high = [thickness_m - cover_m - bar_m / 2 - step_m, thickness_m - cover_m - bar_m / 2]
+    check_steel(area_m2(bar_m) / spacing_m, high[0], SLAB_STEEL)
+    across_x = spaced(_EDGE_M - side_x_m / 2, side_x_m / 2 - _EDGE_M, spacing_m)
+    across_y = spaced(_EDGE_M - side_y_m / 2, side_y_m / 2 - _EDGE_M, spacing_m)
+    bars = [
+        *_mat(LOWER, bar_m, 0, across_y, side_x_m / 2, low[0]),
+        *_mat(LOWER, bar_m, 1, across_x, side_y_m / 2, low[1]),
+        *_mat(UPPER, bar_m, 1, across_x, side_y_m / 2, high[0]),
+        *_mat(UPPER, bar_m, 0, across_y, side_x_m / 2, high[1]),
+    ]
+    between_m = contact_m(bar_m, chair_m)
+    bars += _chairs(chair_m, across_x, across_y, low[0] + between_m, high[0] - between_m)
+    drawn: dict[str, float | str] = {
+        "shape": shape,
+        "thickness_m": thickness_m,
+        "cover_m": cover_m,
+        "length_m": side_x_m,
+        "width_m": side_y_m,
+        "bar_m": bar_m,
+        "link_m": chair_m,
+        "spacing_m": spacing_m,
+    }
+    return Design("slab", tuple(bars), drawn, cover_m)
+
+
+def _mat(
+    role: str, diameter_m: float, along: int, positions_m: Sequence[float], half_m: float, z_m: float
+) -> list[DesignBar]:
+    """Return parallel straight bars along x (``along`` 0) or y (1) at these positions of the other axis."""
+    bars = []
+    for position in positions_m:
+        first, last = ((end, position, z_m) if along == 0 else (position, end, z_m) for end in (-half_m, half_m))
+        bars.append(DesignBar(role, diameter_m, straight(first, last), (Y, X)[along], False, Z))
+    return bars
+
+
+def _chairs(
+    diameter_m: float, across_x: Sequence[float], across_y: Sequence[float], foot_z: float, top_z: float
+) -> list[DesignBar]:
+    """Return chairs whose feet stand on bars along x of the lowest layer and whose tops carry bars along y.
+
+    The top of a chair is along x. Its feet are along y between bars of the second layer, one to each side, so that
+    the chair does not fall over. Raises ``InfeasibleError`` if bars are too few, or too close for the bends.
+    """
+    pitch_x, pitch_y = across_x[1] - across_x[0], across_y[1] - across_y[0]
+    carried, under = (2 if pitch <= _CLOSE_M + 1e-9 else 1 for pitch in (pitch_x, pitch_y))
+    firsts = _spread_indices(0, len(across_x) - 2 - carried, pitch_x, carried + 1)
+    rows = _spread_indices(under - 1, len(across_y) - 1 - under, pitch_y, under + 1)
+    foot_m = (under - 0.5) * pitch_y + _FOOT_END_M
+    chairs = []
+    for row in rows:
+        y = (across_y[row] + across_y[row + 1]) / 2
+        for first in firsts:
+            x = across_x[first] + pitch_x / 2
+            end_x = x + carried * pitch_x
+            places = [(x, y + foot_m, foot_z), (x, y, foot_z), (x, y, top_z)]
+            places += [(end_x, y, top_z), (end_x, y, foot_z), (end_x, y - foot_m, foot_z)]
+            try:
+                line_m = bent(places, diameter_m)
+            except ValueError:
+                raise InfeasibleError("a slab is too thin or its bars are too close for chairs") from None
+            chairs.append(DesignBar(CHAIR, diameter_m, line_m, Y, False, Z))
+    return chairs
+
+
+def _spread_indices(first: int, last: int, step_m: float, least: int) -> list[int]:
+    """Return indices from ``first`` to ``last``, about ``_CHAIR_SPACING_M`` and at least ``least`` steps apart.
+
+    The first and the last one are left out if others remain. Raises ``InfeasibleError`` if only one fits.
+    """
+    if last - first >= least + 2:
+        first, last = first + 1, last - 1
+    if last - first < least:
+        raise InfeasibleError("a slab has too few bars for chairs")
+    intervals = min((last - first) // least, max(1, round((last - first) * step_m / _CHAIR_SPACING_M)))
+    return [first + (last - first) * number // intervals for number in range(intervals + 1)]

@@ -1,0 +1,211 @@
+"""Cages of members of rectangular section: main bars in links. The member's axis is z, from 0 up. Metres."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dataset_builder.scene.cages.design import DesignBar, InfeasibleError, Line, X, Y, Z, check_steel, straight
+from dataset_builder.scene.cages.rules import (
+    COLUMN_STEEL,
+    MOST_UNHELD_M,
+    area_m2,
+    contact_m,
+    hook_end_m,
+    inside_link_m,
+    least_clear_m,
+    link_bend_m,
+    radius_m,
+)
+from dataset_builder.scene.shapes.links import HOOK_DEG, stirrup_centreline_m, tie_centreline_m
+
+MAIN, LINK, TIE = "main", "link", "tie"
+"""Roles of bars."""
+
+CORNERS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
+"""Signs of x and y with which successive links are turned, so that their hooks alternate between the corners.
+
+The first two turn the hooks to the corners at +y.
+"""
+
+
+@dataclass(frozen=True)
+class Section:
+    """Rectangular section: sides of the concrete (x, y), cover of the links, diameters of links and main bars.
+
+    ``bars_x`` and ``bars_y`` are the numbers of bars along a side in each direction, corners included.
+    """
+
+    side_x_m: float
+    side_y_m: float
+    cover_m: float
+    link_m: float
+    bar_m: float
+    bars_x: int
+    bars_y: int
+
+    @property
+    def link_half_m(self) -> tuple[float, float]:
+        """Half of the distances between the axes of opposite legs of a link."""
+        around_m = self.cover_m + self.link_m / 2
+        return self.side_x_m / 2 - around_m, self.side_y_m / 2 - around_m
+
+    @property
+    def bend_m(self) -> float:
+        """Axis radius of the bends of a link."""
+        return link_bend_m(self.link_m, self.bar_m)
+
+    @property
+    def count(self) -> int:
+        """Number of main bars."""
+        return 2 * (self.bars_x + self.bars_y) - 4
+
+    def corner_inset_m(self, bar_m: float) -> float:
+        """Return the distance of a corner bar from the axes of both legs of a link, where the bend holds it."""
+        return self.bend_m - (self.bend_m - inside_link_m(self.link_m, bar_m)) / 2**0.5
+
+    def half_m(self, bar_m: float) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return the distances (x, y) from the middle of bars in the corners, and of bars along the sides."""
+        corner_m, face_m = self.corner_inset_m(bar_m), inside_link_m(self.link_m, bar_m)
+        x, y = self.link_half_m
+        return (x - corner_m, y - corner_m), (x - face_m, y - face_m)
+
+    def check(self) -> None:
+        """Raise ``InfeasibleError`` unless parallel bars have the least clear distance."""
+        if min(self.bars_x, self.bars_y) < 2:
+            raise InfeasibleError("fewer than two bars along a side")
+        for half_m, count in zip(self.half_m(self.bar_m)[0], (self.bars_x, self.bars_y), strict=True):
+            if 2 * half_m / (count - 1) - self.bar_m < least_clear_m(self.bar_m):
+                raise InfeasibleError("bars along a side are too close to each other")
+
+    def check_column(self, bars: int) -> None:
+        """Raise ``InfeasibleError`` unless ``bars`` main bars are neither too little nor too much for a column."""
+        check_steel(area_m2(self.bar_m, bars), self.side_x_m * self.side_y_m, COLUMN_STEEL)
+
+    def along_m(self) -> tuple[list[float], list[float]]:
+        """Return the positions along x and along y of the bars between the corners."""
+        corner_x, corner_y = self.half_m(self.bar_m)[0]
+        along_x = np.linspace(-corner_x, corner_x, self.bars_x)[1:-1].tolist()
+        return along_x, np.linspace(-corner_y, corner_y, self.bars_y)[1:-1].tolist()
+
+    def places_m(self) -> list[tuple[float, float]]:
+        """Return the positions (x, y) of the main bars: corners first, then those along the sides."""
+        (corner_x, corner_y), (face_x, face_y) = self.half_m(self.bar_m)
+        along_x, along_y = self.along_m()
+        return [
+            *((sx * corner_x, sy * corner_y) for sx, sy in CORNERS),
+            *((x, sign * face_y) for x in along_x for sign in (1, -1)),
+            *((sign * face_x, y) for y in along_y for sign in (1, -1)),
+        ]
+
+    def inward(self) -> list[tuple[float, float]]:
+        """Return the unit vectors (x, y) from the link to the inside at each of the ``places_m``."""
+        along_x, along_y = self.along_m()
+        return [
+            *((-sx / 2**0.5, -sy / 2**0.5) for sx, sy in CORNERS),
+            *((0.0, -float(sign)) for _ in along_x for sign in (1, -1)),
+            *((-float(sign), 0.0) for _ in along_y for sign in (1, -1)),
+        ]
+
+    def needs_ties(self) -> bool:
+        """Return True if bars along a side are too far from the corners to be held by the links."""
+        (corner_x, corner_y), (along_x, along_y) = self.half_m(self.bar_m)[0], self.along_m()
+        unheld_m = [corner_x - abs(x) for x in along_x] + [corner_y - abs(y) for y in along_y]
+        return max(unheld_m, default=0.0) > MOST_UNHELD_M
+
+
+def main_bars(section: Section, length_m: float) -> list[DesignBar]:
+    """Return the straight main bars of a section; the first four are those of the corners."""
+    return [
+        DesignBar(
+            MAIN,
+            section.bar_m,
+            straight((x, y, 0.0), (x, y, length_m)),
+            None if index < 4 else X if inward_x == 0 else Y,
+            index < 4,
+        )
+        for index, ((x, y), (inward_x, _)) in enumerate(zip(section.places_m(), section.inward(), strict=True))
+    ]
+
+
+def bundled(bars: Sequence[DesignBar], section: Section) -> list[DesignBar]:
+    """Return the bars with a second one inside of each corner bar (EN 1992-1-1, 8.9: bundles of two).
+
+    Raises ``InfeasibleError`` if other bars are nearer than the diameter of one bar with the area of both.
+    """
+    equivalent_m = 2**0.5 * section.bar_m
+    twins = []
+    for bar, (inward_x, inward_y) in zip(bars[:4], section.inward(), strict=False):
+        shift_m = contact_m(section.bar_m, section.bar_m) * np.array([inward_x, inward_y, 0.0])
+        line_m = bar.line_m + shift_m
+        others_m = [other.line_m[0] for other in bars if other is not bar]
+        clear_m = min(float(np.linalg.norm(line_m[0] - other_m)) for other_m in others_m) - section.bar_m
+        if clear_m < least_clear_m(equivalent_m) or equivalent_m > 0.055:
+            raise InfeasibleError("a bundle is too close to other bars")
+        twins.append(DesignBar(bar.role, bar.diameter_m, line_m))
+    return [*bars, *twins]
+
+
+def stirrups(section: Section, levels_m: Sequence[float], corners: int = 4) -> list[DesignBar]:
+    """Return closed links at these levels, whose hooks alternate between the first ``corners`` of ``CORNERS``.
+
+    Raises ``InfeasibleError`` if the section has no room for the hooks.
+    """
+    size = (section.side_x_m - 2 * section.cover_m, section.side_y_m - 2 * section.cover_m)
+    try:
+        line_m = stirrup_centreline_m(
+            size, section.link_m, radius_m(section.link_m), section.bend_m, hook_end_m(section.link_m)
+        )
+    except ValueError:
+        raise InfeasibleError("a link has no room for its hooks") from None
+    centre = np.array([(line_m[:, axis].min() + line_m[:, axis].max()) / 2 for axis in (0, 1)])
+    line_m[:, :2] -= centre  # The centroid of a link is not the middle of its legs.
+    return [
+        DesignBar(
+            LINK,
+            section.link_m,
+            line_m * np.array([*CORNERS[n % corners], 1.0]) + np.array([0.0, 0.0, z_m]),
+            Z,
+            False,
+        )
+        for n, z_m in enumerate(levels_m)
+    ]
+
+
+def ties(section: Section, levels_m: Sequence[float], link_rise_m: float) -> list[DesignBar]:
+    """Return ties between opposite bars along the sides, on top of the links at these levels.
+
+    ``link_rise_m`` is half the height that the axis of a link takes. Ties along x lie on those along y; the
+    straight ends of both hooks of a tie point to one side, which alternates.
+    """
+    face_x, face_y = section.half_m(section.bar_m)[1]
+    along_x, along_y = section.along_m()
+    step_m = contact_m(section.link_m, section.link_m)
+    above_m = link_rise_m + step_m
+    made = []
+    for n, z_m in enumerate(levels_m):
+        side = np.array([1.0, (-1.0) ** n, 1.0])
+        for x in along_x:
+            line_m = (held_tie_m(face_y, section.link_m, section.bar_m) * side)[:, [1, 0, 2]]
+            made.append(DesignBar(TIE, section.link_m, line_m + np.array([x, 0.0, z_m + above_m]), Z, False))
+        for y in along_y:
+            line_m = held_tie_m(face_x, section.link_m, section.bar_m) * side
+            height_m = z_m + above_m + (step_m if along_x else 0.0)
+            made.append(DesignBar(TIE, section.link_m, line_m + np.array([0.0, y, height_m]), Z, False))
+    return made
+
+
+def links_height_m(section: Section, link_rise_m: float, *, with_ties: bool) -> tuple[float, float]:
+    """Return how far the steel of a link and of the ties on it reaches below and above the level of the link."""
+    layers = sum(map(bool, section.along_m())) if with_ties else 0
+    below_m = link_rise_m + radius_m(section.link_m)
+    return below_m, below_m + layers * contact_m(section.link_m, section.link_m)
+
+
+def held_tie_m(half_m: float, tie_m: float, bar_m: float) -> Line:
+    """Return a tie along x whose hooks of 135 degrees hold two bars at x = -/+ ``half_m``, y = 0."""
+    bend_m = link_bend_m(tie_m, bar_m)
+    middle_m = half_m - bend_m + inside_link_m(tie_m, bar_m)
+    return tie_centreline_m(middle_m, bend_m, hook_end_m(tie_m), HOOK_DEG)

@@ -1,0 +1,288 @@
+"""Details of generated cages that an engineer checks: what holds each bar, and what a bar holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import cache
+
+import numpy as np
+import pytest
+from jaxtyping import Bool, Float64
+from numpy import ndarray
+from scipy.spatial import ConvexHull
+
+from dataset_builder.scene.cages.clearance import Clearances
+from dataset_builder.scene.cages.design import Design, DesignBar, InfeasibleError
+from dataset_builder.scene.cages.families import FAMILIES
+from dataset_builder.scene.cages.generate import generate_cage
+from dataset_builder.scene.cages.rules import radius_m
+from dataset_builder.scene.shapes.bending import resample_polyline_m
+
+Line = Float64[ndarray, "n 3"]
+TOUCH_M = 0.006
+"""Largest clear distance of bars that are tied to each other in a design; links are 3 mm wider than their bars."""
+
+SHAPES = [(family, shape) for family, kind in FAMILIES.items() for shape in kind.shapes]
+IN_LINKS = [pair for pair in SHAPES if pair[0] in ("column", "beam", "pile-cage", "joint")]
+DESIGNS, MAX_DRAWS = 3, 60
+
+
+@cache
+def designs(family: str, shape: str) -> tuple[Design, ...]:
+    """Return designs of a shape whose bars do not touch."""
+    rng, found = np.random.default_rng(sum((family + shape).encode())), []
+    for _ in range(MAX_DRAWS):
+        try:
+            design = FAMILIES[family].draw(rng, shape)
+        except InfeasibleError:
+            continue
+        bars = Clearances([bar.line_m for bar in design.bars], [radius_m(bar.diameter_m) for bar in design.bars])
+        if bars.least_of_all_m() > 0:
+            found.append(design)
+        if len(found) == DESIGNS:
+            return tuple(found)
+    raise AssertionError(f"{family} {shape}: {len(found)} designs in {MAX_DRAWS}")
+
+
+def of(design: Design, *roles: str) -> list[DesignBar]:
+    return [bar for bar in design.bars if bar.role in roles]
+
+
+def distances_m(points_m: Line, start_m: Line, end_m: Line) -> Float64[ndarray, " n"]:
+    """Return the distances of points from the nearest of the segments."""
+    along = end_m - start_m
+    share = np.einsum("nks,ks->nk", points_m[:, None] - start_m, along) / (along**2).sum(axis=1)
+    nearest = start_m + np.clip(share, 0, 1)[..., None] * along
+    return np.asarray(np.linalg.norm(points_m[:, None] - nearest, axis=2).min(axis=1, initial=np.inf))
+
+
+def touched(bar: DesignBar, others: list[DesignBar], within_m: float = TOUCH_M) -> Bool[ndarray, " n"]:
+    """Return, for points every 5 mm along a bar, whether another bar is within this clear distance."""
+    points_m = resample_polyline_m(bar.line_m, 0.005)
+    is_touched = np.zeros(len(points_m), bool)
+    for other in others:
+        reach_m = radius_m(bar.diameter_m) + radius_m(other.diameter_m) + within_m
+        low, high = other.line_m.min(axis=0) - reach_m, other.line_m.max(axis=0) + reach_m
+        near = np.flatnonzero(((points_m >= low) & (points_m <= high)).all(axis=1))
+        if other is bar or not len(near):
+            continue
+        low, high = points_m[near].min(axis=0) - reach_m, points_m[near].max(axis=0) + reach_m
+        start, end = other.line_m[:-1], other.line_m[1:]
+        is_near = ((np.minimum(start, end) <= high) & (np.maximum(start, end) >= low)).all(axis=1)
+        is_touched[near] |= distances_m(points_m[near], start[is_near], end[is_near]) < reach_m
+    return is_touched
+
+
+def outline(link: DesignBar, axes: list[int]) -> ConvexHull:
+    """Return the outline of the axis of a link in the plane of these axes."""
+    return ConvexHull(link.line_m[:, axes])
+
+
+def inside_m(hull: ConvexHull, points: Float64[ndarray, "n 2"]) -> Float64[ndarray, " n"]:
+    """Return how far inside of an outline points are, negative outside."""
+    return np.asarray(-(points @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1))
+
+
+def is_across(link: DesignBar, axis: int) -> bool:
+    """Return True for a link in a plane across an axis."""
+    return bool(np.ptp(link.line_m, axis=0).argmin() == axis)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("family", "shape"), SHAPES)
+def test_every_bar_is_held_along_its_length(family: str, shape: str) -> None:
+    for design in designs(family, shape)[:2]:
+        for bar in design.bars:
+            is_touched = touched(bar, list(design.bars))
+            at = np.flatnonzero(is_touched)
+            what = f"{bar.role} of {design.parameters}"
+            assert len(at), f"floating {what}"
+            assert np.ptp(at) * 0.005 > 0.01, f"held at one place: {what}"
+            length_m = float(np.linalg.norm(np.diff(bar.line_m, axis=0), axis=1).sum())
+            step_m = length_m / (len(is_touched) - 1)
+            most_m = 2.0 if bar.role == "spiral" else 0.75  # A turn of a spiral may pass no bar beside cranks.
+            assert np.diff(at).max(initial=0) * step_m < most_m, f"held too seldom: {what}"
+            free_m = max(at[0], len(is_touched) - 1 - at[-1]) * step_m
+            anchored_m = 0.6 if family == "joint" and bar.role in ("top", "bottom") else 0.0
+            assert free_m < 0.15 + 22 * bar.diameter_m + anchored_m, f"{free_m:.2f} m of a {what} are free"
+
+
+@pytest.mark.parametrize(("family", "shape"), IN_LINKS)
+def test_links_enclose_the_bars_and_their_hooks_point_inwards(family: str, shape: str) -> None:
+    for design in designs(family, shape):
+        checked = 0
+        for link in of(design, "link"):
+            axis = int(np.ptp(link.line_m, axis=0).argmin())
+            axes, level_m = [n for n in range(3) if n != axis], link.line_m[:, axis].mean()
+            hull = outline(link, axes)
+            if shape not in ("round-ties", "rings"):  # The ends of rings lap.
+                assert inside_m(hull, link.line_m[[0, -1]][:, axes]).min() > 2 * link.diameter_m
+            roles = {0: ("top", "bottom", "side"), 2: ("main", "starter")} if family != "pile-cage" else None
+            for bar in of(design, *(roles[axis] if roles else ("main",))):
+                along = bar.line_m[:, axis]
+                if along.min() < level_m < along.max():
+                    segment = np.flatnonzero((along[:-1] - level_m) * (along[1:] - level_m) <= 0)[0]
+                    share = (level_m - along[segment]) / (along[segment + 1] - along[segment])
+                    place = bar.line_m[segment] + share * (bar.line_m[segment + 1] - bar.line_m[segment])
+                    clear_m = inside_m(hull, place[None, axes])[0]
+                    assert clear_m > radius_m(bar.diameter_m) + radius_m(link.diameter_m)
+                    checked += 1
+        assert checked > 20 or shape == "spiral"
+
+
+@pytest.mark.parametrize("shape", FAMILIES["beam"].shapes)
+def test_hooks_of_beam_bars_stay_within_the_outline_of_the_links(shape: str) -> None:
+    for design in designs("beam", shape):
+        hull = outline(of(design, "link")[0], [1, 2])
+        for bar in of(design, "top", "bottom", "side", "spacer"):
+            assert inside_m(hull, bar.line_m[:, 1:]).min() > radius_m(bar.diameter_m)
+
+
+@pytest.mark.parametrize("shape", ["square", "rectangular"])
+def test_column_bars_are_near_a_bend_and_ties_hold_bars_at_both_ends(shape: str) -> None:
+    for design in designs("column", shape):
+        bars = [bar for bar in of(design, "main") if np.ptp(bar.line_m[:, 2]) > 1.0]
+        ties = of(design, "tie")
+        places = np.array([bar.line_m[-1, :2] for bar in bars])
+        reach_m = np.abs(places).sum(axis=1)
+        is_held = np.isclose(reach_m, reach_m.max(), atol=1e-6)
+        is_held |= np.array([touched(bar, ties).any() for bar in bars])
+        apart_m = np.linalg.norm(places[:, None] - places[None, is_held], axis=2).min(axis=1)
+        assert apart_m.max() < 0.150 + 0.010  # The distance between bars, not from the axes of legs.
+        hull = outline(of(design, "link")[0], [0, 1])
+        for tie in ties:
+            assert inside_m(hull, tie.line_m[[0, -1], :2]).min() > 2 * tie.diameter_m
+            at = np.flatnonzero(touched(tie, of(design, "main", "starter")))
+            free_m = np.array([at[0], len(touched(tie, [])) - 1 - at[-1]]) * 0.005
+            assert free_m.max() < 0.05 + 8 * tie.diameter_m
+
+
+def test_chairs_stand_on_the_lower_mat_carry_the_upper_one_and_do_not_fall_over() -> None:
+    for number in range(3):
+        cage = generate_cage("train", number, 11, "slab")
+        built = [DesignBar(bar.role, bar.diameter_m, bar.line_m) for bar in cage.bars]
+        mats = {role: [bar for bar in built if bar.role == role] for role in ("lower", "upper", "chair")}
+        assert len(mats["chair"]) >= 3
+        for chair in mats["chair"]:
+            points_m = resample_polyline_m(chair.line_m, 0.005)
+            heights_m = points_m[:, 2]
+            stands = points_m[touched(chair, mats["lower"], 0.002) & (heights_m < heights_m.min() + 0.002)]
+            carries = points_m[touched(chair, mats["upper"], 0.002) & (heights_m > heights_m.max() - 0.002)]
+            assert len(stands)
+            assert len(carries)
+            assert np.ptp(stands[:, 1]) > 0.08, "both feet are in the plane of the chair"
+            for foot in mats["lower"]:
+                assert np.ptp(foot.line_m, axis=0).argmax() != 2
+
+
+@pytest.mark.parametrize(
+    ("family", "shape"), [("column", shape) for shape in FAMILIES["column"].shapes] + [("wall", "laps")]
+)
+def test_laps_have_their_length_and_touch(family: str, shape: str) -> None:
+    lapped = [design for design in designs(family, shape) if of(design, "starter")]
+    for design in lapped:
+        uppers = of(design, "main", "upright")
+        for starter in of(design, "starter"):
+            is_touched = touched(starter, uppers, 0.001)
+            assert is_touched.sum() * 0.005 > 40 * starter.diameter_m - 0.01
+            assert starter.line_m[:, 2].min() == 0.0
+        assert len(uppers) == len(of(design, "starter"))
+        hull = ConvexHull(np.concatenate([bar.line_m[-1:, :2] for bar in of(design, "starter")]))
+        for upper in uppers:  # The upper ends are in the places of the starters again.
+            assert inside_m(hull, upper.line_m[-1:, :2])[0] < 1e-6
+    assert lapped or family == "column"
+
+
+def test_feet_of_starters_lie_on_bars_of_the_mat() -> None:
+    for shape in FAMILIES["footing"].shapes:
+        for design in designs("footing", shape):
+            mat = of(design, "lower", "upper")
+            for starter in of(design, "starter"):
+                points_m = resample_polyline_m(starter.line_m, 0.005)
+                is_touched = touched(starter, mat, 0.001)
+                assert (is_touched & (points_m[:, 2] < points_m[:, 2].min() + 0.001)).any()
+                outward = starter.line_m[0, :2] - starter.line_m[-1, :2]
+                assert outward @ starter.line_m[-1, :2] > 0
+
+
+@pytest.mark.parametrize("shape", FAMILIES["joint"].shapes)
+def test_links_of_a_column_go_on_past_its_beam(shape: str) -> None:
+    for design in designs("joint", shape):
+        parameters = design.parameters
+        links = [bar for bar in of(design, "link") if is_across(bar, 2)]
+        levels_m = np.sort([bar.line_m[:, 2].mean() for bar in links])
+        low, depth_m = float(parameters["level_m"]), float(parameters["beam_side_y_m"])
+        assert ((levels_m > low) & (levels_m < low + depth_m)).any()
+        assert np.diff(levels_m).max() < float(parameters["spacing_m"]) + 0.15
+        column = outline(links[0], [0, 1])
+        for bar in of(design, "top", "bottom"):
+            ends = bar.line_m[np.abs(bar.line_m[:, 0]) < float(parameters["side_x_m"]) / 2, :2]
+            assert inside_m(column, ends).min(initial=1.0) > -0.05 if shape == "passing" else True
+            if shape == "corner":
+                assert inside_m(column, bar.line_m[[bar.line_m[:, 0].argmin()], :2])[0] > 2 * bar.diameter_m
+
+
+@pytest.mark.parametrize(("family", "shape"), SHAPES)
+def test_steel_stays_within_the_cover(family: str, shape: str) -> None:
+    if family in ("joint", "pile-cage") or shape in ("round-ties", "spiral"):
+        width = {"joint": "side_y_m", "pile-cage": "diameter_m", "column": "diameter_m"}[family]
+        axes = {width: 1}
+    else:
+        axes = {
+            "column": {"side_x_m": 0, "side_y_m": 1},
+            "beam": {"side_x_m": 1, "side_y_m": 2},
+            "wall": {"thickness_m": 1},
+            "slab": {"thickness_m": 2},
+            "footing": {"side_x_m": 0, "side_y_m": 1},
+        }[family]
+    for design in designs(family, shape):
+        low = np.min([(bar.line_m - bar.diameter_m / 2).min(axis=0) for bar in design.bars], axis=0)
+        high = np.max([(bar.line_m + bar.diameter_m / 2).max(axis=0) for bar in design.bars], axis=0)
+        for name, axis in axes.items():
+            room_m = float(design.parameters[name]) - 2 * float(design.parameters["cover_m"])
+            assert high[axis] - low[axis] <= room_m + 0.002, (name, design.parameters)
+
+
+def drawn(family: str, shape: str, count: int) -> Iterator[Design]:
+    """Yield the designs of ``count`` draws, also those whose bars touch."""
+    rng = np.random.default_rng(5)
+    for _ in range(count):
+        with suppress(InfeasibleError):
+            yield FAMILIES[family].draw(rng, shape)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", FAMILIES["column"].shapes)
+def test_areas_of_steel_are_within_the_limits_of_columns(shape: str) -> None:
+    shares = []
+    for design in drawn("column", shape, 60):
+        parameters = design.parameters
+        steel_m2 = sum(np.pi / 4 * bar.diameter_m**2 for bar in of(design, "main"))
+        if shape in ("square", "rectangular"):
+            concrete_m2 = float(parameters["side_x_m"]) * float(parameters["side_y_m"])
+        else:
+            concrete_m2 = np.pi / 4 * float(parameters["diameter_m"]) ** 2
+        shares.append(steel_m2 / concrete_m2)
+    assert len(shares) > 20
+    assert 0.002 <= min(shares) < 0.006
+    assert 0.025 < max(shares) <= 0.04
+
+
+def test_bars_of_a_second_layer_lie_on_spacers() -> None:
+    checked = 0
+    for design in drawn("beam", "straight", 60):
+        spacers = of(design, "spacer")
+        if design.parameters["layers"] != 2.0 or checked > 3:
+            assert checked > 3 or not spacers
+            continue
+        checked += 1
+        assert len(spacers) >= 2
+        for spacer in spacers:
+            touching = [bar for bar in of(design, "bottom") if touched(bar, [spacer], 0.005).any()]
+            above = [bar for bar in touching if bar.line_m[0, 2] > spacer.line_m[0, 2]]
+            assert len(above) == float(design.parameters["bars_x"])
+            assert len(touching) > len(above)
+        starts_m = np.sort([spacer.line_m[0, 0] for spacer in spacers])
+        assert np.diff(starts_m).max() < 1.5
+    assert checked
