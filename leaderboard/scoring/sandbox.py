@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from leaderboard.scoring.task import (
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError, Problem, RebarDepthError, SubmissionError
 from rebar_depth_bench.submission import open_submission
-from rebar_depth_bench.view_ids import TEST_SPLIT
+from rebar_depth_bench.view_ids import TEST_SPLIT, config_of, split_of
 
 NO_MEMORY = Problem("size", "", "the archive needs more memory than this service allows")
 
@@ -54,11 +54,18 @@ def main() -> int:
 
 def _check(task: SandboxTask, out: Path) -> Sequence[Problem]:
     """Return the problems of the archive; write its metadata if it has none."""
-    with open_submission(task.archive, open_folder(task.data).expected_views(TEST_SPLIT)) as submission:
-        problems = list(submission.problems())
+    with open_submission(task.archive, open_folder(task.data).expected_views()) as submission:
+        problems = list(_split_problems(submission.view_ids)) or list(submission.problems())
         if submission.meta is not None and not problems:
             (out / META_FILE).write_text(submission.meta.model_dump_json())
         return problems
+
+
+def _split_problems(view_ids: Iterable[str]) -> Iterator[Problem]:
+    """Yield a problem for each config whose views are of another split than the one that is ranked."""
+    for config, split in sorted({(config_of(view_id), split_of(view_id) or TEST_SPLIT) for view_id in view_ids}):
+        if split != TEST_SPLIT:
+            yield Problem("conflict", config, f"the archive covers the split {split}", f"the split {TEST_SPLIT}")
 
 
 def _score(task: SandboxTask, out: Path) -> Sequence[Problem]:

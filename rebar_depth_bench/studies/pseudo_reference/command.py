@@ -42,6 +42,7 @@ from rebar_depth_bench.studies.pseudo_reference.study import (
     score_frame_view,
 )
 from rebar_depth_bench.submission import ExpectedViews
+from rebar_depth_bench.view_ids import config_of, split_of
 
 PROTOCOL = "rebar-pseudo-reference-1"
 SUMMARY = "score methods on the full frame against two pseudo-references (the paper's Table II)"
@@ -64,6 +65,28 @@ class _StudyData:
     digest: str | None = None
     version: str | None = None
     camera: str | None = None
+
+    def of_split(self, sources: Sequence[DepthSource]) -> _StudyData:
+        """Return the data restricted to the split that the sources cover, if they are a config with splits.
+
+        Raises ``InputError`` if sources cover different splits.
+        """
+        if self.config is None or not self.config.has_splits:
+            return self
+        covered: dict[str, str] = {}
+        for source in sources:
+            for view_id in source.view_ids:
+                split = split_of(view_id)
+                if config_of(view_id) == self.config.name and split is not None:
+                    covered.setdefault(split, source.method)
+        if len(covered) > 1:
+            found = " and ".join(f"{method} the split {split}" for split, method in covered.items())
+            raise InputError(f"config {self.config.name}: {found}, expected one split in all depth maps")
+        if not covered:
+            return self
+        config = self.config.of_split(*covered)
+        views = dict.fromkeys(config.view_ids, config.grid)
+        return replace(self, name=f"config {config.name} ({config.scenes[0].split})", views=views, config=config)
 
     def frames(self, exact: bool) -> Iterator[FrameView]:
         """Yield the views to score.
@@ -161,6 +184,7 @@ def run_pseudo_reference_study(
             )
             for path in (*methods, *references)
         ]
+        study_data = study_data.of_split(depth_sources)
         sources = _label_sources(depth_sources, study_data.views)
         names = list(sources)
         by_method = {name: sources[name] for name in names[: len(methods)]}
@@ -183,7 +207,7 @@ def run_pseudo_reference_study(
         camera=study_data.camera,
         depth_range=depth_range,
         references=depth_references,
-        rows=_method_rows(outcomes),
+        rows=_method_rows(outcomes, study_data),
         agreements=_agreement_rows(outcomes),
     )
 
@@ -262,11 +286,12 @@ def _check_references_have_depth(references: Sequence[DepthReference], depth_ran
         )
 
 
-def _method_rows(outcomes: Sequence[FrameOutcome]) -> list[MethodRow]:
+def _method_rows(outcomes: Sequence[FrameOutcome], data: _StudyData) -> list[MethodRow]:
+    split = data.config.scenes[0].split if data.config is not None and data.config.has_splits else None
     rows = []
     for method, reference in outcomes[0].scores:
         frames = [outcome.scores[method, reference] for outcome in outcomes]
-        table = tabulate([frame.score for frame in frames if frame.score is not None])
+        table = tabulate([frame.score for frame in frames if frame.score is not None], split=split)
         rows.append(MethodRow(method, reference, table, mean([frame.frame_share for frame in frames]) or 0.0))
     return rows
 

@@ -167,7 +167,8 @@ def _notes(result: PseudoReferenceResult) -> list[str]:
     notes = [
         "z: the reference, p: the prediction. Pixels of the whole frame are scored if both are finite, > 0 and "
         f"within {result.depth_range.describe()}. Means over views; s: median over views of median(z)/median(p).",
-        f"Ratio: AbsRel here over AbsRel against {first}. Intervals: block bootstrap over views.",
+        f"Ratio: AbsRel here over AbsRel against {first}. Intervals: block bootstrap over views, over "
+        "scenes in configs with splits.",
         "A prediction that is missing or out of range lowers the coverage but does not change the errors. A "
         "method that covers less than 95 % of a reference's pixels, or none in a view, is shown but not ranked.",
     ]
