@@ -1,0 +1,52 @@
+"""Archives of configs with splits: only the split test is accepted and scored, and its result has groups."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rebar_depth_bench as rdb
+from leaderboard.scoring.run_sandbox import check_archive, score_archive
+from leaderboard.settings import Settings
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.submission import SubmissionMeta
+from tests.synthetic_dataset import write_split_dataset
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    write_split_dataset(tmp_path / "dataset", {"a": "train", "b": "test", "c": "test"}, 2, families={"b": "wall"})
+    return tmp_path / "dataset"
+
+
+def write_archive(root: Path, archive: Path, split: str) -> Path:
+    with rdb.SubmissionWriter(archive, "exact") as writer:
+        for row in rdb.load(root, "cages", split=split, columns=["view_id", "left_depth"]):
+            writer.add(row["view_id"], row["left_depth"] * np.float32(1.25))
+    return archive
+
+
+@pytest.mark.slow
+def test_only_the_split_test_is_accepted(root: Path, tmp_path: Path) -> None:
+    settings = Settings(data=str(root), state_dir=tmp_path / "state")  # type: ignore[call-arg]
+    refused = check_archive(write_archive(root, tmp_path / "train.zip", "train"), settings, tmp_path)
+    assert isinstance(refused, tuple)
+    [problem] = refused
+    assert (problem.code, problem.where) == ("conflict", "cages")
+    assert "split train" in str(problem)
+    accepted = check_archive(write_archive(root, tmp_path / "test.zip", "test"), settings, tmp_path)
+    assert isinstance(accepted, SubmissionMeta)
+
+
+@pytest.mark.slow
+def test_scored_archive_has_the_groups_of_the_command_line(root: Path, tmp_path: Path) -> None:
+    archive = write_archive(root, tmp_path / "test.zip", "test")
+    settings = Settings(data=str(root), state_dir=tmp_path / "state")  # type: ignore[call-arg]
+    outcome = score_archive(archive, open_folder(root).digest, settings, tmp_path, lambda: True)
+    assert outcome is not None
+    expected = rdb.score(archive, root).to_json()
+    assert outcome.result == expected
+    assert list(json.loads(expected)["tables"]["cages"]["groups"]["family"]) == ["wall"]
