@@ -36,14 +36,6 @@ _LOG = structlog.get_logger("service")
 
 
 @dataclass(frozen=True)
-class DatasetCard:
-    """Name and licence of the dataset as its card states them."""
-
-    name: str
-    licence: str
-
-
-@dataclass(frozen=True)
 class Service:
     """Dependencies of the request handlers. ``spool`` is the folder for incomplete uploads."""
 
@@ -55,7 +47,8 @@ class Service:
     metrics: ServiceMetrics
     versions: VersionReader
     rankings: CurrentRankings
-    card: DatasetCard
+    dataset_name: str
+    dataset_licence: str
     manifest_state: tuple[int, int] | None
     workers: list[threading.Thread] = field(default_factory=list)
     """Local workers; filled when they start."""
@@ -75,6 +68,7 @@ def open_service(settings: Settings) -> Iterator[Service]:
     submissions of another dataset, unless the setting ``rescore`` is on.
     """
     folder, manifest = open_folder(settings.data), manifest_state(settings.data)
+    name, licence = _read_card(settings.data)
     make_folder(settings.spool, "the folder of uploads")
     delete_abandoned_uploads(settings.spool)
     with ExitStack() as stack:
@@ -97,20 +91,21 @@ def open_service(settings: Settings) -> Iterator[Service]:
             metrics=ServiceMetrics(database),
             versions=versions,
             rankings=CurrentRankings(database, versions),
-            card=read_card(settings.data),
+            dataset_name=name,
+            dataset_licence=licence,
             manifest_state=manifest,
         )
 
 
-def read_card(data: str) -> DatasetCard:
-    """Return what the card of a dataset says; without a card, its name is that of the folder or repository."""
+def _read_card(data: str) -> tuple[str, str]:
+    """Return name and licence of a dataset; without a card, the name is that of the folder or repository."""
     path = Path(data)
     try:
-        values = metadata_load(path / "README.md") or {}
+        card = metadata_load(path / "README.md") or {}
     except (OSError, ValueError):
-        values = {}
-    name = values.get("pretty_name") or (path.resolve().name if path.is_dir() else data)
-    return DatasetCard(str(name), str(values.get("license", "not stated")))
+        card = {}
+    name = card.get("pretty_name") or (path.resolve().name if path.is_dir() else data)
+    return str(name), str(card.get("license", "not stated"))
 
 
 def manifest_state(data: str) -> tuple[int, int] | None:

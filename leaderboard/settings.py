@@ -77,8 +77,7 @@ class Settings(BaseSettings):
     archive_days: float = Field(
         0.0,
         ge=0,
-        description="age in days after which archives of ended submissions are deleted, so that these cannot be "
-        "scored again; 0: never",
+        description="age in days after which archives of ended submissions are deleted; 0: never",
     )
     archive_ranks: int = Field(
         10, ge=0, description="archives of submissions up to this rank in any config are never deleted"
@@ -93,7 +92,7 @@ class Settings(BaseSettings):
         False, description="return only rank error and coverage per config, rounded to three decimals"
     )
     rescore: bool = Field(False, description="score submissions for another dataset again, against this one")
-    workers: int = Field(1, ge=0, le=64, description="number of scoring processes that `serve` starts")
+    workers: int = Field(1, ge=0, le=64, description="number of submissions that `serve` scores at a time")
     check_time: float = Field(1800.0, gt=0, description="time limit for checking an uploaded archive")
     score_time: float = Field(3600.0, gt=0, description="time limit for scoring an archive")
     score_memory: ByteSize = Field(
@@ -199,11 +198,15 @@ def _read_file(file: Path) -> dict[str, Any]:
     Unknown names are refused here, because ``BaseSettings`` has parameters that are no settings (``_env_file``).
     """
     content, problems = parse_toml(read_file(file, TOML_BYTES, "a TOML file with settings", InputError))
-    values = _with_new_names(content, "setting ")
-    unknown = [format_location("", name) for name in values if name not in Settings.model_fields]
-    if problems := [*problems, *(Problem("unknown", name, "there is no such setting") for name in unknown)]:
+    for name in content:
+        new_name, place = RENAMED_SETTINGS.get(name, name), format_location("", name)
+        if new_name not in Settings.model_fields:
+            problems.append(Problem("unknown", place, "there is no such setting"))
+        elif new_name != name and new_name in content:
+            problems.append(Problem("duplicate", place, f"{new_name} is given twice", "one of its names"))
+    if problems:
         raise InputError.from_problems(file, problems)
-    return values
+    return _with_new_names(content, "setting ")
 
 
 def _from_old_variables() -> dict[str, Any]:

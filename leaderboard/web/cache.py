@@ -67,7 +67,9 @@ class CacheMiddleware:
         self._current_at_s = self._outdated_since_s = 0.0
 
     async def _read_version(self) -> int:
-        """Return the current version; requests take turns, so that they do not take all threads."""
+        """Return the current version; requests that have to read it take turns, not to take all threads."""
+        if (version := self._versions.unchanged()) is not None:
+            return version
         async with self._reading:
             version = self._versions.unchanged()
             return await to_thread.run_sync(self._versions.read) if version is None else version

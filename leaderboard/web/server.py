@@ -6,7 +6,7 @@ import signal
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import structlog
 import uvicorn
@@ -78,20 +78,16 @@ def metrics_server(service: Service) -> Iterator[None]:
 
     Raises ``InputError`` if the port is in use.
     """
-    port = service.settings.metrics_port
-    if not port:
+    with ExitStack() as stack:
+        if port := service.settings.metrics_port:
+            try:
+                server, thread = start_http_server(port, "127.0.0.1", service.metrics.registry)
+            except OSError as error:
+                reason = f"cannot listen on this port for metrics: {error.strerror}"
+                raise InputError(f"127.0.0.1:{port}: {reason}") from None
+            for end in (thread.join, server.server_close, server.shutdown):
+                stack.callback(end)
         yield
-        return
-    try:
-        server, thread = start_http_server(port, "127.0.0.1", service.metrics.registry)
-    except OSError as error:
-        raise InputError(f"127.0.0.1:{port}: cannot listen on this port for metrics: {error.strerror}") from None
-    try:
-        yield
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
 
 
 def listening_socket(settings: Settings) -> socket.socket:

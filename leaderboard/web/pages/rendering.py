@@ -90,7 +90,7 @@ def _common_context(request: Request, service: Service) -> dict[str, Any]:
         ],
         "hidden_truth": settings.hidden_truth,
         "contact": printable(settings.contact),
-        "card": service.card,
+        "service": service,
         "view_counts": {name: len(config.view_ids) for name, config in service.folder.config_by_name.items()},
     }
 
