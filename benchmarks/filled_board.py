@@ -19,10 +19,10 @@ from sqlalchemy import func, select
 
 from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import Database
-from leaderboard.db.jobs import Outcome
 from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.db.submissions import QUEUED, SCORED, SCORING, Quota, Upload
 from leaderboard.db.tokens import create_token, find_token
+from leaderboard.scoring.sandbox import Outcome
 from rebar_depth_bench.submission import SubmissionMeta
 from tests.synthetic_dataset import scale_errors
 

@@ -1,8 +1,17 @@
-"""Entry point of ``python -m leaderboard``, equivalent to ``rebar-leaderboard``."""
+"""Entry point of ``rebar-leaderboard`` and ``python -m leaderboard``.
+
+The processes that read archives import this module again, but need no command.
+"""
 
 import sys
 
-if __name__ == "__main__":  # The processes that check archives import this module again, but need no command.
-    from leaderboard.cli import main
 
+def main() -> int:
+    """Run the command line."""
+    from leaderboard.cli import main as run
+
+    return run()
+
+
+if __name__ == "__main__":
     sys.exit(main())

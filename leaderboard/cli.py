@@ -4,47 +4,45 @@ from __future__ import annotations
 
 import argparse
 import stat
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from leaderboard.db import submissions
-from leaderboard.db.engine import Database
-from leaderboard.db.tokens import create_token, replace_token, revoke_token
 from leaderboard.log_setup import set_up_logs
-from leaderboard.operations import run_operation
 from leaderboard.settings import RENAMED_SETTINGS, Settings, read_settings
-from leaderboard.storage.archive_store import ArchiveStore
-from leaderboard.storage.backup import back_up
 from rebar_depth_bench.atomic_io import write_error
 from rebar_depth_bench.console import replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.terminal import use_plain_characters
 from rebar_depth_bench.version import software_version
 
-COMMAND_SETTINGS: dict[str, tuple[str, ...]] = {
-    "serve": tuple(Settings.model_fields),
+_STORED = ("state_dir", "db")
+_WITH_ARCHIVES = (*_STORED, "archives")
+_SCORING = ("score_time", "score_memory", "lease_seconds", "error_maps", "hidden_truth")
+COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "serve": ("run the web server and its local scoring workers", tuple(Settings.model_fields)),
     "score": (
-        "data",
-        "state_dir",
-        "db",
-        "archives",
-        "score_time",
-        "score_memory",
-        "lease_seconds",
-        "error_maps",
-        "hidden_truth",
+        "run a scoring worker for a server that uses the same database and archive storage",
+        ("data", *_WITH_ARCHIVES, *_SCORING),
     ),
-    "token": ("state_dir", "db"),
-    "tokens": ("state_dir", "db"),
-    "submissions": ("state_dir", "db"),
-    "remove": ("state_dir", "db", "archives"),
-    "prune": ("data", "state_dir", "db", "archives", "archive_days", "archive_ranks"),
-    "check": ("data", "state_dir", "db", "archives"),
-    "backup": ("state_dir", "db", "archives"),
+    "token": ("create a token for a submitter and print it", _STORED),
+    "tokens": ("list the tokens with their submissions and bytes as CSV", _STORED),
+    "submissions": ("list the submissions of all tokens as CSV", _STORED),
+    "prune": (
+        "delete archives of ended submissions by age and rank, as the settings say",
+        ("data", *_WITH_ARCHIVES, "archive_days", "archive_ranks"),
+    ),
+    "check": (
+        "check dataset, database, archives, disk and queue, and print what is wrong",
+        ("data", *_WITH_ARCHIVES),
+    ),
+    "remove": ("delete a submission of any owner, with its archive and results", _WITH_ARCHIVES),
+    "backup": ("copy the database and the archives to a folder while the service is running", _WITH_ARCHIVES),
 }
-"""Settings that each command accepts as options; all can also be set in a TOML file or the environment."""
+"""Help texts of the commands, and the settings that each accepts as options.
+
+All settings can also be set in a TOML file or the environment.
+"""
 
 RENAMED_OPTIONS = {f"--{old}": f"--{new.replace('_', '-')}" for old, new in RENAMED_SETTINGS.items()}
 
@@ -57,47 +55,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> None:
-    setting_names = COMMAND_SETTINGS[options.command]
-    overrides: dict[str, Any] = {
-        name: value for name in setting_names if (value := getattr(options, name, None)) is not None
-    }
-    if "data" not in setting_names:
-        overrides["data"] = ""
-    settings = read_settings(options.settings, overrides)
+    _, names = COMMANDS[options.command]
+    values = {name: getattr(options, name, None) for name in names}
+    overrides: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    settings = read_settings(options.settings, overrides if "data" in names else {**overrides, "data": ""})
     set_up_logs()
     _make_state_dir(settings.state_dir)
     if options.command == "serve":
         from leaderboard.web.server import serve
 
         serve(settings)
-    elif options.command == "score":
-        from leaderboard.scoring.__main__ import run_worker
-
-        run_worker(settings, migrate=True)
-    elif options.command == "token":
-        database = Database(settings.database_url)
-        database.migrate()
-        if options.revoke:
-            revoke_token(database, options.name)
-            return
-        make_token = replace_token if options.replace else create_token
-        print(make_token(database, options.name))
-        print("The token is not shown again; only its hash is stored.", file=sys.stderr)
-    elif options.command == "remove":
-        _remove(settings, options.id)
-    elif options.command == "backup":
-        print(back_up(settings, options.target))
     else:
-        run_operation(options.command, settings, dry_run=getattr(options, "dry_run", False))
+        from leaderboard.operations import run_operation
 
-
-def _remove(settings: Settings, submission_id: str) -> None:
-    database = Database(settings.database_url)
-    database.migrate()
-    if submissions.find(database, submission_id) is None:
-        raise InputError(f"there is no submission {submission_id!r}")
-    submissions.remove(database, submission_id)
-    ArchiveStore(settings.archive_dir).delete(submission_id)
+        run_operation(options.command, settings, options)
 
 
 def _make_state_dir(folder: Path) -> None:
@@ -126,10 +97,10 @@ def argument_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=software_version())
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, help_text in _COMMAND_HELP.items():
+    for name, (help_text, settings) in COMMANDS.items():
         command = commands.add_parser(name, help=help_text, description=help_text)
         command.add_argument("--settings", type=Path, metavar="FILE", help="TOML file with settings")
-        for setting in COMMAND_SETTINGS[name]:
+        for setting in settings:
             _add_setting(command, setting)
         if name == "token":
             command.add_argument("name", metavar="NAME", help="name of the submitter, shown on the leaderboard")
@@ -143,19 +114,6 @@ def argument_parser() -> argparse.ArgumentParser:
         if name == "backup":
             command.add_argument("target", type=Path, metavar="FOLDER", help="folder to write the backup to")
     return parser
-
-
-_COMMAND_HELP = {
-    "serve": "run the web server and its local scoring workers",
-    "score": "run a scoring worker for a server that uses the same database and archive storage",
-    "token": "create a token for a submitter and print it",
-    "tokens": "list the tokens with their submissions and bytes as CSV",
-    "submissions": "list the submissions of all tokens as CSV",
-    "prune": "delete archives of ended submissions by age and rank, as the settings say",
-    "check": "check dataset, database, archives, disk and queue, and print what is wrong",
-    "remove": "delete a submission of any owner, with its archive and results",
-    "backup": "copy the database and the archives to a folder while the service is running",
-}
 
 
 def _add_setting(command: argparse.ArgumentParser, name: str) -> None:

@@ -44,7 +44,7 @@ class _QueueCollector(Collector):
         oldest_query = select(func.min(SubmissionModel.created_at)).where(SubmissionModel.status == QUEUED)
         try:
             with self._database.read() as session:
-                counts = dict(row._tuple() for row in session.execute(query))
+                counts = {status: int(count) for status, count in session.execute(query)}
                 oldest = session.scalar(oldest_query)
         except DATABASE_UNAVAILABLE:
             return

@@ -1,7 +1,9 @@
-"""Service context shared by the routes: settings, dataset, database, archive storage, upload limits, metrics."""
+"""Service context shared by the routes: settings, dataset, database, archives, limits, metrics; and its checks."""
 
 from __future__ import annotations
 
+import shutil
+import threading
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
@@ -12,34 +14,26 @@ from pathlib import Path
 import structlog
 from anyio import CapacityLimiter, Lock
 from huggingface_hub.repocard import metadata_load
-from sqlalchemy import select
+from sqlalchemy import func, select
 
 from leaderboard.db import jobs
 from leaderboard.db.engine import Database
 from leaderboard.db.models import SubmissionModel
-from leaderboard.db.submissions import DELETED
+from leaderboard.db.submissions import QUEUED, SCORING
 from leaderboard.db.versions import CurrentRankings, VersionReader
 from leaderboard.metrics import ServiceMetrics
-from leaderboard.scoring.supervisor import WorkerSupervisor
 from leaderboard.settings import Settings
-from leaderboard.storage.archive_store import ArchiveStore
-from leaderboard.storage.work_dirs import work_dir
+from leaderboard.storage.archive_store import ArchiveStore, delete_abandoned_uploads, make_folder
+from leaderboard.storage.retention import remove_orphan_archives
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, open_folder
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.view_ids import TEST_SPLIT, config_of
 
-ORPHAN_AGE_S = 3600.0
-"""Age in seconds after which an archive without a submission is regarded as an interrupted upload."""
 SIMULTANEOUS_CHECKS = 2
+MIN_FREE_BYTES = 1 << 30
+STALLED_S = 600.0
+"""Time without a lease after which a queued submission shows that no worker takes it."""
 _LOG = structlog.get_logger("service")
-
-
-@dataclass(frozen=True)
-class DatasetCard:
-    """Name and licence of the dataset as its card states them."""
-
-    name: str
-    licence: str
 
 
 @dataclass(frozen=True)
@@ -55,12 +49,14 @@ class Service:
     archives: ArchiveStore
     spool: Path
     metrics: ServiceMetrics
-    supervisor: WorkerSupervisor
     versions: VersionReader
     rankings: CurrentRankings
-    card: DatasetCard
+    dataset_name: str
+    dataset_licence: str
     manifest_state: tuple[int, int] | None
     view_counts: Mapping[str, int]
+    workers: list[threading.Thread] = field(default_factory=list)
+    """Local workers; filled when they start."""
     upload_locks: defaultdict[int, Lock] = field(default_factory=lambda: defaultdict(Lock))
     """Locks by id of a token, held while an archive is received and checked; used on the event loop only."""
     scenes: dict[str, bytes | None] = field(default_factory=dict)
@@ -70,16 +66,17 @@ class Service:
 
 @contextmanager
 def open_service(settings: Settings) -> Iterator[Service]:
-    """Open the service: migrate the database and remove orphaned archives.
+    """Open the service: migrate the database, and remove abandoned uploads and archives.
 
     Submissions whose result is of another protocol are scored again if their archive is kept. Raises
     ``InputError`` if the dataset, the database or the archive storage is unusable, and if the leaderboard has
     submissions of another dataset, unless the setting ``rescore`` is on.
     """
     folder, manifest = open_folder(settings.data), manifest_state(settings.data)
-    card = read_card(settings.data)
+    name, licence = _read_card(settings.data)
+    make_folder(settings.spool, "the folder of uploads")
+    delete_abandoned_uploads(settings.spool)
     with ExitStack() as stack:
-        spool = stack.enter_context(work_dir(settings.spool))
         database = stack.enter_context(
             closing(Database(settings.database_url, hidden_truth=settings.hidden_truth))
         )
@@ -95,26 +92,26 @@ def open_service(settings: Settings) -> Iterator[Service]:
             folder=folder,
             database=database,
             archives=archives,
-            spool=spool,
+            spool=settings.spool,
             metrics=ServiceMetrics(database),
-            supervisor=WorkerSupervisor(settings, settings.workers),
             versions=versions,
             rankings=CurrentRankings(database, versions),
-            card=card,
+            dataset_name=name,
+            dataset_licence=licence,
             manifest_state=manifest,
             view_counts=Counter(map(config_of, folder.expected_views(TEST_SPLIT))),
         )
 
 
-def read_card(data: str) -> DatasetCard:
-    """Return what the card of a dataset says; without a card, its name is that of the folder or repository."""
+def _read_card(data: str) -> tuple[str, str]:
+    """Return name and licence of a dataset; without a card, the name is that of the folder or repository."""
     path = Path(data)
     try:
-        values = metadata_load(path / "README.md") or {}
+        card = metadata_load(path / "README.md") or {}
     except (OSError, ValueError):
-        values = {}
-    name = values.get("pretty_name") or (path.resolve().name if path.is_dir() else data)
-    return DatasetCard(str(name), str(values.get("license", "not stated")))
+        card = {}
+    name = card.get("pretty_name") or (path.resolve().name if path.is_dir() else data)
+    return str(name), str(card.get("license", "not stated"))
 
 
 def manifest_state(data: str) -> tuple[int, int] | None:
@@ -140,19 +137,39 @@ def _check_dataset_unchanged(folder: DatasetFolder, database: Database, rescore:
     jobs.requeue_stale_submissions(database, folder.digest)
 
 
-def remove_orphan_archives(database: Database, archives: ArchiveStore) -> None:
-    """Delete archives without a submission, except recent ones, whose row may not be inserted yet.
+def service_problems(service: Service) -> list[str]:
+    """Return what is wrong with a running service. Raises the errors of an unavailable database."""
+    problems = [*_dataset_problems(service), *disk_problem(service.spool)]
+    expected, running = service.settings.workers, sum(worker.is_alive() for worker in service.workers)
+    if running < expected:
+        problems.append(f"{running} of {expected} local workers are running")
+    return problems + queue_problems(service.database)
 
-    Nothing is deleted if the database has no submissions, since it is probably not the one of these archives.
-    """
-    now = time.time()
+
+def _dataset_problems(service: Service) -> list[str]:
+    """Return whether the dataset folder is gone or its manifest was replaced; a Hub dataset is not checked."""
+    found = manifest_state(service.settings.data)
+    if found == service.manifest_state:
+        return []
+    return [
+        "the manifest of the dataset " + ("cannot be read" if found is None else "has changed since the start")
+    ]
+
+
+def disk_problem(folder: Path) -> list[str]:
+    """Return whether the disk of a folder is nearly full."""
+    free = shutil.disk_usage(folder).free
+    return [] if free >= MIN_FREE_BYTES else [f"the disk of the state folder has {free >> 20} MiB left"]
+
+
+def queue_problems(database: Database) -> list[str]:
+    """Return whether the oldest queued submission waits although no submission is being scored."""
+    oldest = select(func.min(SubmissionModel.created_at)).where(SubmissionModel.status == QUEUED)
+    active = select(func.count()).where(
+        SubmissionModel.status == SCORING, SubmissionModel.lease_until > time.time()
+    )
     with database.read() as session:
-        rows = session.execute(select(SubmissionModel.id, SubmissionModel.status)).all()
-    orphans = archives.ids() - {submission_id for submission_id, status in rows if status != DELETED}
-    if orphans and not rows:
-        _LOG.warning("orphan cleanup skipped", reason="the database has no submissions", archives=len(orphans))
-        return
-    for submission_id in orphans:
-        if archives.age_s(submission_id, now) > ORPHAN_AGE_S:
-            archives.delete(submission_id)
-            _LOG.info("orphaned archive deleted", archive=submission_id[:6])
+        queued_since, scoring = session.scalar(oldest), session.scalar(active)
+    if queued_since is None or scoring or time.time() - queued_since < STALLED_S:
+        return []
+    return [f"no worker scores, and a submission has waited for {time.time() - queued_since:.0f} s"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlsplit
@@ -34,13 +35,12 @@ RENAMED_SETTINGS = {
     "writes": "write_rate_limit",
 }
 """Old names of settings that are still accepted, and their new names."""
-ENVIRONMENT_PREFIX = "REBAR_LEADERBOARD_"
 
 
 class Settings(BaseSettings):
     """All settings with their defaults. Sizes are in bytes (``8GiB`` is accepted too), times in seconds."""
 
-    model_config = SettingsConfigDict(env_prefix=ENVIRONMENT_PREFIX, extra="forbid", frozen=True)
+    model_config = SettingsConfigDict(env_prefix="REBAR_LEADERBOARD_", extra="forbid", frozen=True)
 
     data: str = Field(description="dataset folder or Hub repository id")
     state_dir: Path = Field(
@@ -59,6 +59,8 @@ class Settings(BaseSettings):
     )
     title: str = Field("Rebar depth leaderboard", description="title shown on the pages")
     contact: str = Field("", description="how to reach the operator for a token, shown on the pages")
+    dataset_url: str = Field("", description="address from which submitters get the dataset, for links")
+    paper_url: str = Field("", description="address of the paper, for links and the citation")
     default_visibility: Literal["owner", "always"] = Field(
         "always",
         description="always: every scored submission is public; owner: only after its owner publishes it",
@@ -75,8 +77,7 @@ class Settings(BaseSettings):
     archive_days: float = Field(
         0.0,
         ge=0,
-        description="age in days after which archives of ended submissions are deleted, so that these cannot be "
-        "scored again; 0: never",
+        description="age in days after which archives of ended submissions are deleted; 0: never",
     )
     archive_ranks: int = Field(
         10, ge=0, description="archives of submissions up to this rank in any config are never deleted"
@@ -91,7 +92,7 @@ class Settings(BaseSettings):
         False, description="return only rank error and coverage per config, rounded to three decimals"
     )
     rescore: bool = Field(False, description="score submissions for another dataset again, against this one")
-    workers: int = Field(1, ge=0, le=64, description="number of scoring processes that `serve` starts")
+    workers: int = Field(1, ge=0, le=64, description="number of submissions that `serve` scores at a time")
     check_time: float = Field(1800.0, gt=0, description="time limit for checking an uploaded archive")
     score_time: float = Field(3600.0, gt=0, description="time limit for scoring an archive")
     score_memory: ByteSize = Field(
@@ -128,6 +129,13 @@ class Settings(BaseSettings):
         if "://" in archives:
             raise ValueError("expected a folder; remote storage can be mounted as one")
         return archives
+
+    @field_validator("dataset_url", "paper_url")
+    @classmethod
+    def _check_link(cls, url: str) -> str:
+        if url and not is_http_url(url):
+            raise ValueError("expected an address such as https://example.org/dataset")
+        return url
 
     @field_validator("public_url")
     @classmethod
@@ -168,7 +176,7 @@ class Settings(BaseSettings):
 
     @property
     def spool(self) -> Path:
-        """Folder for temporary files: uploads that are not accepted yet and archives fetched for scoring."""
+        """Folder for uploads that are not accepted yet."""
         return self.state_dir.absolute() / "spool"
 
 
@@ -179,42 +187,45 @@ def read_settings(file: Path | None, overrides: dict[str, Any]) -> Settings:
     """
     file_values = {} if file is None else _read_file(file)
     try:
-        return Settings(**{**_renamed_from_environment(), **file_values, **overrides})
+        return Settings(**{**_from_old_variables(), **file_values, **overrides})
     except ValidationError as error:
         raise InputError("settings: " + "; ".join(_format_error(details) for details in error.errors())) from None
 
 
 def _read_file(file: Path) -> dict[str, Any]:
-    """Return the values of a TOML file with renamed settings under their new names, with a warning for each.
+    """Return the values of a TOML file.
 
     Unknown names are refused here, because ``BaseSettings`` has parameters that are no settings (``_env_file``).
     """
     content, problems = parse_toml(read_file(file, TOML_BYTES, "a TOML file with settings", InputError))
-    values: dict[str, Any] = {}
-    for name, value in content.items():
-        new_name = RENAMED_SETTINGS.get(name, name)
-        place = format_location("", name)
+    for name in content:
+        new_name, place = RENAMED_SETTINGS.get(name, name), format_location("", name)
         if new_name not in Settings.model_fields:
             problems.append(Problem("unknown", place, "there is no such setting"))
-        elif new_name in values:
+        elif new_name != name and new_name in content:
             problems.append(Problem("duplicate", place, f"{new_name} is given twice", "one of its names"))
-        elif new_name != name:
-            warn_deprecated(f"setting {name}", new_name)
-        values[new_name] = value
     if problems:
         raise InputError.from_problems(file, problems)
-    return values
+    return _with_new_names(content, "setting ")
 
 
-def _renamed_from_environment() -> dict[str, str]:
-    """Return settings that the environment holds under old names only, with a warning for each."""
-    values = {}
-    for old, new in RENAMED_SETTINGS.items():
-        variables = [f"{ENVIRONMENT_PREFIX}{name.upper()}" for name in (old, new)]
-        if variables[0] in os.environ and variables[1] not in os.environ:
-            warn_deprecated(*variables)
-            values[new] = os.environ[variables[0]]
-    return values
+def _from_old_variables() -> dict[str, Any]:
+    """Return settings that the environment holds under old names only."""
+    prefix = "REBAR_LEADERBOARD_"
+    old = {
+        name: os.environ[f"{prefix}{name.upper()}"]
+        for name, new in RENAMED_SETTINGS.items()
+        if f"{prefix}{name.upper()}" in os.environ and f"{prefix}{new.upper()}" not in os.environ
+    }
+    return _with_new_names(old, "variable for ")
+
+
+def _with_new_names(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """Return settings with their present names, with a warning for each old name."""
+    for name in values:
+        if name in RENAMED_SETTINGS:
+            warn_deprecated(f"{prefix}{name}", RENAMED_SETTINGS[name])
+    return {RENAMED_SETTINGS.get(name, name): value for name, value in values.items()}
 
 
 _SECRET_SETTINGS = ("db",)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event
+from sqlalchemy import Connection, Engine, create_engine, event, inspect
 from sqlalchemy.exc import ArgumentError, DatabaseError, InterfaceError, NoSuchModuleError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.orm import Session
 
-from leaderboard.redact import without_password
+from leaderboard.db.models import Base
 from rebar_depth_bench.errors import InputError
 
 MIGRATIONS = Path(__file__).parent / "migrations"
@@ -63,7 +64,7 @@ class Database:
         return self._engine.dialect.name != "sqlite"
 
     def migrate(self) -> None:
-        """Upgrade the schema to the latest revision; services that start simultaneously take turns.
+        """Create the schema or upgrade it; services that start simultaneously take turns.
 
         Raises ``InputError`` if the database is unavailable.
         """
@@ -77,7 +78,11 @@ class Database:
                 if self.has_row_locks:
                     connection.exec_driver_sql("SELECT pg_advisory_xact_lock(7241053)")
                 config.attributes["connection"] = connection
-                command.upgrade(config, "head")
+                if inspect(connection).has_table("alembic_version"):
+                    command.upgrade(config, "head")
+                else:
+                    Base.metadata.create_all(connection, checkfirst=False)
+                    command.stamp(config, "head")
         except (*DATABASE_UNAVAILABLE, DatabaseError) as error:
             url = self._engine.url.render_as_string(hide_password=True)
             reason = " ".join(str(getattr(error, "orig", error)).split())
@@ -86,6 +91,11 @@ class Database:
     def close(self) -> None:
         """Close all connections."""
         self._engine.dispose()
+
+
+def without_password(url: str) -> str:
+    """Return a database URL for messages, with the user name and password before its host replaced by ``...``."""
+    return re.sub(r"://.*@", "://...@", url)
 
 
 def sqlite_path(url: str) -> Path | None:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from sqlalchemy import ColumnElement, and_, func, or_, select, update
@@ -19,6 +18,7 @@ from sqlalchemy.orm import Session
 
 from leaderboard.db.engine import Database
 from leaderboard.db.models import (
+    Base,
     LeaderboardRowModel,
     PictureImageModel,
     PictureModel,
@@ -28,31 +28,13 @@ from leaderboard.db.models import (
 )
 from leaderboard.db.submissions import FAILED, QUEUED, SCORED, SCORING, delete_results
 from leaderboard.db.view_errors import view_errors
+from leaderboard.scoring.sandbox import Outcome
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 MAX_ATTEMPTS = 5
 """Number of leases after which a submission fails if no worker finished it.
 
 The limit is high enough for a service that is killed occasionally."""
-
-
-@dataclass(frozen=True)
-class ViewPicture:
-    """Pictures of a view: WebP images by kind, and a JSON object with their size and the texts of colour bars."""
-
-    view_id: str
-    facts_json: str
-    images: Mapping[str, bytes]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Outcome of scoring: the result JSON, notes on possible mistakes, pictures; or the reason of the failure."""
-
-    result: bytes | None = None
-    notes: Sequence[str] = ()
-    pictures: Sequence[ViewPicture] = ()
-    reason: str | None = None
 
 
 def claim(database: Database, scorer: str, lease_s: float) -> str | None:
@@ -113,21 +95,7 @@ def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome
             return False
         if result is not None:
             delete_results(session, submission_id)
-            notes = json.dumps(list(outcome.notes))
-            session.add(
-                ResultModel(
-                    submission_id=submission_id, json=outcome.result, protocol=result["protocol"], notes=notes
-                )
-            )
-            session.add_all(_leaderboard_rows(submission_id, result))
-        for picture in outcome.pictures:
-            session.add(
-                PictureModel(submission_id=submission_id, view_id=picture.view_id, facts=picture.facts_json)
-            )
-            session.add_all(
-                PictureImageModel(submission_id=submission_id, view_id=picture.view_id, kind=kind, webp=webp)
-                for kind, webp in picture.images.items()
-            )
+            session.add_all(_stored(submission_id, outcome, result))
         increment_content_version(session)
     return True
 
@@ -169,9 +137,12 @@ def _is_stale(dataset_digest: str) -> ColumnElement[bool]:
     return and_(is_active, SubmissionModel.dataset_digest != dataset_digest)
 
 
-def _leaderboard_rows(submission_id: str, result: Mapping[str, Any]) -> list[LeaderboardRowModel]:
-    return [
-        LeaderboardRowModel(
+def _stored(submission_id: str, outcome: Outcome, result: Mapping[str, Any]) -> Iterator[Base]:
+    """Yield the rows of what scoring has found out."""
+    notes = json.dumps(list(outcome.notes))
+    yield ResultModel(submission_id=submission_id, json=outcome.result, protocol=result["protocol"], notes=notes)
+    for config, table in result["tables"].items():
+        yield LeaderboardRowModel(
             submission_id=submission_id,
             config=config,
             ranked=table["ranked"],
@@ -179,8 +150,11 @@ def _leaderboard_rows(submission_id: str, result: Mapping[str, Any]) -> list[Lea
             json=json.dumps({name: value for name, value in table.items() if name != "groups"}),
             view_errors=view_errors(result, config),
         )
-        for config, table in result["tables"].items()
-    ]
+    for picture in outcome.pictures:
+        place = {"submission_id": submission_id, "view_id": picture.view_id}
+        yield PictureModel(**place, facts=picture.facts_json)
+        for kind, webp in picture.images.items():
+            yield PictureImageModel(**place, kind=kind, webp=webp)
 
 
 def _has_lease(submission_id: str, scorer: str) -> ColumnElement[bool]:

@@ -2,7 +2,21 @@
 
 from __future__ import annotations
 
-from sqlalchemy import BigInteger, Boolean, Float, ForeignKey, Index, Integer, LargeBinary, String, Text, update
+from typing import ClassVar
+
+from sqlalchemy import (
+    BigInteger,
+    Connection,
+    Float,
+    ForeignKey,
+    Index,
+    LargeBinary,
+    String,
+    Table,
+    Text,
+    event,
+    update,
+)
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 
 from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL
@@ -11,17 +25,19 @@ from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL
 class Base(DeclarativeBase):
     """Declarative base class of the models."""
 
+    type_annotation_map: ClassVar = {float: Float()}  # Not Double, which differs from the tables that exist.
+
 
 class TokenModel(Base):
     """A submitter and the SHA-256 of their token, which has 256 random bits; the token is not stored."""
 
     __tablename__ = "tokens"
 
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    id: Mapped[int] = mapped_column(primary_key=True)
     name: Mapped[str] = mapped_column(String(100), unique=True)
     sha256: Mapped[str] = mapped_column(String(64), unique=True)
-    created_at: Mapped[float] = mapped_column(Float)
-    revoked_at: Mapped[float | None] = mapped_column(Float)
+    created_at: Mapped[float]
+    revoked_at: Mapped[float | None]
 
 
 class SubmissionModel(Base):
@@ -43,22 +59,22 @@ class SubmissionModel(Base):
     method: Mapped[str] = mapped_column(String(200))
     description: Mapped[str | None] = mapped_column(Text)
     url: Mapped[str | None] = mapped_column(Text)
-    uses_intrinsics: Mapped[bool | None] = mapped_column(Boolean)
+    uses_intrinsics: Mapped[bool | None]
     inputs: Mapped[str | None] = mapped_column(String(20))
-    uses_ground_truth: Mapped[bool | None] = mapped_column(Boolean)
+    uses_ground_truth: Mapped[bool | None]
     archive_sha256: Mapped[str] = mapped_column(String(64))
     archive_bytes: Mapped[int] = mapped_column(BigInteger)
     status: Mapped[str] = mapped_column(String(10))
     reason: Mapped[str | None] = mapped_column(Text)
-    public: Mapped[bool] = mapped_column(Boolean)
-    created_at: Mapped[float] = mapped_column(Float)
-    finished_at: Mapped[float | None] = mapped_column(Float)
-    attempts: Mapped[int] = mapped_column(Integer)
+    public: Mapped[bool]
+    created_at: Mapped[float]
+    finished_at: Mapped[float | None]
+    attempts: Mapped[int]
     scorer: Mapped[str | None] = mapped_column(String(64))
-    lease_until: Mapped[float | None] = mapped_column(Float)
+    lease_until: Mapped[float | None]
     dataset_digest: Mapped[str] = mapped_column(String(100))
     details: Mapped[str] = mapped_column(Text, server_default="{}")
-    archive_deleted_at: Mapped[float | None] = mapped_column(Float)
+    archive_deleted_at: Mapped[float | None]
 
 
 class ResultModel(Base):
@@ -85,8 +101,8 @@ class LeaderboardRowModel(Base):
 
     submission_id: Mapped[str] = mapped_column(ForeignKey("submissions.id"), primary_key=True)
     config: Mapped[str] = mapped_column(String(100), primary_key=True)
-    ranked: Mapped[bool] = mapped_column(Boolean)
-    rank_error: Mapped[float | None] = mapped_column(Float)
+    ranked: Mapped[bool]
+    rank_error: Mapped[float | None]
     json: Mapped[str] = mapped_column(Text)
     view_errors: Mapped[bytes | None] = mapped_column(LargeBinary)
 
@@ -117,8 +133,13 @@ class ContentVersionModel(Base):
 
     __tablename__ = "content_version"
 
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    id: Mapped[int] = mapped_column(primary_key=True)
     value: Mapped[int] = mapped_column(BigInteger)
+
+
+@event.listens_for(Base.metadata.tables["content_version"], "after_create")
+def _insert_version(table: Table, connection: Connection, **_: object) -> None:
+    connection.execute(table.insert().values(id=1, value=1))
 
 
 def increment_content_version(session: Session) -> None:

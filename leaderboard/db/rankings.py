@@ -9,10 +9,9 @@ returned.
 from __future__ import annotations
 
 import json
-from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Any
 
 from sqlalchemy import false, func, select
@@ -30,6 +29,9 @@ from leaderboard.db.submissions import QUEUED, SCORED
 from leaderboard.db.view_errors import rank_ranges
 from rebar_depth_bench.scoring.disclosure import DisclosedTable, disclosed_number
 from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL, PROTOCOL
+from rebar_depth_bench.submission.metadata import INPUTS
+
+_CACHED_TABLES = 4096
 
 
 @dataclass(frozen=True)
@@ -41,10 +43,7 @@ class LeaderboardEntry:
     known. ``table_json`` is the JSON text of the config's table in the result, or of its disclosed part.
     """
 
-    rank: int | None
-    class_rank: int | None
-    rank_range: tuple[int, int] | None
-    submission_id: str
+    id: str
     config: str
     method: str
     submitter: str
@@ -54,15 +53,28 @@ class LeaderboardEntry:
     uses_ground_truth: bool | None
     created_at: float
     public: bool
-    details_json: str
+    may_rank: bool
+    rank_error: float | None
+    view_errors: bytes | None
     table_json: str
-    rank_error: float | None = field(default=None, kw_only=True)
+    rank: int | None = None
+    class_rank: int | None = None
+    rank_range: tuple[int, int] | None = None
+
+    @property
+    def table(self) -> dict[str, Any]:
+        """The table's JSON object, which must not be changed."""
+        return _parsed(self.table_json)
+
+
+@lru_cache(maxsize=_CACHED_TABLES)
+def _parsed(table_json: str) -> dict[str, Any]:
+    """Return a table's JSON object; cached, because most rows stay the same when the content changes."""
+    table: dict[str, Any] = json.loads(table_json)
+    return table
 
 
 _COLUMNS = (
-    LeaderboardRowModel.ranked,
-    LeaderboardRowModel.rank_error,
-    LeaderboardRowModel.view_errors,
     SubmissionModel.id,
     LeaderboardRowModel.config,
     SubmissionModel.method,
@@ -73,10 +85,12 @@ _COLUMNS = (
     SubmissionModel.uses_ground_truth,
     SubmissionModel.created_at,
     SubmissionModel.public,
-    SubmissionModel.details,
+    LeaderboardRowModel.ranked,
+    LeaderboardRowModel.rank_error,
+    LeaderboardRowModel.view_errors,
     LeaderboardRowModel.json,
 )
-"""Columns of a row: whether it is ranked, its rank error, its view errors, then the fields of the entry."""
+"""Columns of the fields of an entry, without ranks."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +102,7 @@ class Ranking:
     @cached_property
     def by_id(self) -> dict[str, LeaderboardEntry]:
         """Rows by submission id."""
-        return {entry.submission_id: entry for entry in self.entries}
+        return {entry.id: entry for entry in self.entries}
 
     def of_class(self, inputs: str | None) -> list[LeaderboardEntry]:
         """Return the rows that declare ``inputs``, all rows for None; their ranks are kept."""
@@ -115,51 +129,39 @@ def read_ranking(database: Database, config: str, viewer: TokenModel | None = No
         .order_by(SubmissionModel.created_at)
     )
     with database.read() as session:
-        rows = [tuple(row) for row in session.execute(query)]
+        entries = [LeaderboardEntry(*tuple(row)) for row in session.execute(query)]
     if database.hidden_truth:
-        rows = [_disclosed(row) for row in rows]
+        entries = [_disclosed(entry) for entry in entries]
     # Sorted here, because databases round differently; the sort is stable.
-    rows.sort(key=lambda row: (not row[0], row[1] is None, row[1]))
-    return Ranking(tuple(_ranked(rows)))
+    entries.sort(key=lambda entry: (not entry.may_rank, entry.rank_error is None, entry.rank_error))
+    return Ranking(tuple(_with_ranks(entries)))
 
 
-def _ranked(rows: Sequence[tuple[Any, ...]]) -> list[LeaderboardEntry]:
-    overall, by_inputs = _RankCounter(), defaultdict[str, _RankCounter](_RankCounter)
-    entries = [LeaderboardEntry(None, None, None, *row[3:], rank_error=row[1]) for row in rows]
-    ranked = [index for index, row in enumerate(rows) if row[0] and entries[index].public]
-    ranges = rank_ranges([rows[index][2] for index in ranked])
-    for index, rank_range in zip(ranked, ranges, strict=True):
-        entry, error = entries[index], rows[index][1]
-        entries[index] = replace(
-            entry,
-            rank=overall.next(error),
-            class_rank=by_inputs[entry.inputs].next(error) if entry.inputs else None,
-            rank_range=rank_range,
-        )
-    return entries
+def _disclosed(entry: LeaderboardEntry) -> LeaderboardEntry:
+    """Return the entry with the rank error and the table as they are disclosed."""
+    shown = None if entry.rank_error is None else disclosed_number(entry.rank_error)
+    table_json = DisclosedTable.model_validate_json(entry.table_json).model_dump_json()
+    return replace(entry, rank_error=shown, view_errors=None, table_json=table_json)
 
 
-def _disclosed(row: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return the values of ``_COLUMNS`` with the rank error and the table as they are disclosed."""
-    ranked, rank_error, _, *others, table_json = row
-    shown = None if rank_error is None else disclosed_number(rank_error)
-    return ranked, shown, None, *others, DisclosedTable.model_validate_json(table_json).model_dump_json()
+def _with_ranks(entries: Sequence[LeaderboardEntry]) -> Iterator[LeaderboardEntry]:
+    """Yield sorted entries with their ranks."""
+    ranked = [entry for entry in entries if entry.may_rank and entry.public]
+    ranks = _ranks(ranked)
+    ranges = rank_ranges([entry.view_errors for entry in ranked])
+    classes = [_ranks([entry for entry in ranked if entry.inputs == name]) for name in INPUTS]
+    class_ranks = {entry_id: rank for ranks in classes for entry_id, rank in ranks.items()}
+    range_of = {entry.id: rank_range for entry, rank_range in zip(ranked, ranges, strict=True)}
+    for entry in entries:
+        key = entry.id
+        yield replace(entry, rank=ranks.get(key), class_rank=class_ranks.get(key), rank_range=range_of.get(key))
 
 
-@dataclass
-class _RankCounter:
-    """Counter of rows by ascending error, in which equal errors share a rank."""
-
-    rows: int = 0
-    rank: int = 0
-    error: float | None = None
-
-    def next(self, error: float) -> int:
-        """Return the rank of the next row."""
-        self.rows += 1
-        if error != self.error:
-            self.rank, self.error = self.rows, error
-        return self.rank
+def _ranks(entries: Sequence[LeaderboardEntry]) -> dict[str, int]:
+    """Return the ranks of entries in ascending order by submission id; equal errors share a rank."""
+    first: dict[float | None, int] = {}
+    places = enumerate(entries, start=1)
+    return {entry.id: first.setdefault(entry.rank_error, place) for place, entry in places}
 
 
 def picture_facts(database: Database, submission_id: str) -> dict[str, tuple[dict[str, Any], list[str]]]:
@@ -186,23 +188,18 @@ def picture_webp(database: Database, submission_id: str, view_id: str, kind: str
         return None if record is None else record.webp
 
 
-@dataclass(frozen=True)
-class QueuePosition:
-    """Position of a submission in the queue, where 1 is next, and the number of waiting submissions."""
+def queue_position(database: Database, submission: SubmissionModel) -> tuple[int, int] | None:
+    """Return the position of a submission in the queue, where 1 is next, and the number of waiting submissions.
 
-    number: int
-    waiting: int
-
-
-def queue_position(database: Database, submission: SubmissionModel) -> QueuePosition | None:
-    """Return the queue position of a submission, or None if it is not queued."""
+    Return None if the submission is not queued.
+    """
     if submission.status != QUEUED:
         return None
     older = func.count().filter(SubmissionModel.created_at < submission.created_at)
     query = select(older, func.count()).where(SubmissionModel.status == QUEUED)
     with database.read() as session:
         before, waiting = session.execute(query).one()
-    return QueuePosition(before + 1, max(waiting, before + 1))
+    return before + 1, max(waiting, before + 1)
 
 
 def submitter_name(database: Database, submission: SubmissionModel) -> str:

@@ -33,14 +33,6 @@ class QuotaExceededError(Exception):
     """Raised when a token has used its daily quota; the message names it."""
 
 
-class DuplicateError(Exception):
-    """Raised when a token has sent the same archive before; ``record`` is the submission of that archive."""
-
-    def __init__(self, record: SubmissionModel) -> None:
-        self.record = record
-        super().__init__(record.id)
-
-
 @dataclass(frozen=True)
 class Quota:
     """Number of submissions and bytes of archives that are accepted of a token per day (UTC)."""
@@ -77,25 +69,20 @@ def accept(
 ) -> SubmissionModel:
     """Insert a queued submission, whose archive is stored already, and return its row. Durable on return.
 
-    Raises ``DuplicateError`` if the token has a submission of the same archive, and ``QuotaExceededError`` if it
-    has used its daily quota.
+    If the token has a submission of the same archive, nothing is inserted, and the row of that one is returned.
+    Raises ``QuotaExceededError`` if the token has used its daily quota.
     """
     with database.write() as session:
         # The token's row is locked, so that concurrent uploads are neither duplicates nor exceed the quota.
         session.execute(select(TokenModel).where(TokenModel.id == token.id).with_for_update())
         if duplicate := find_duplicate(session, token, upload.sha256):
-            session.expunge(duplicate)  # The rollback would expire it.
-            raise DuplicateError(duplicate)
+            return duplicate
         check_quota(session, token, quota, upload.size)
+        declared = ("method", "description", "url", "uses_intrinsics", "inputs", "uses_ground_truth")
         record = SubmissionModel(
             id=submission_id,
             token_id=token.id,
-            method=upload.meta.method,
-            description=upload.meta.description,
-            url=upload.meta.url,
-            uses_intrinsics=upload.meta.uses_intrinsics,
-            inputs=upload.meta.inputs,
-            uses_ground_truth=upload.meta.uses_ground_truth,
+            **{name: getattr(upload.meta, name) for name in declared},
             archive_sha256=upload.sha256,
             archive_bytes=upload.size,
             status=QUEUED,
@@ -174,11 +161,6 @@ def result_notes(database: Database, submission_id: str) -> list[str]:
         record = session.get(ResultModel, submission_id)
     notes: list[str] = [] if record is None else json.loads(record.notes)
     return notes
-
-
-def publish(database: Database, submission_id: str, public: bool) -> None:
-    """Set whether the rows of a submission are shown on the leaderboard."""
-    change(database, submission_id, {"public": public})
 
 
 def change(database: Database, submission_id: str, values: Mapping[str, Any]) -> None:

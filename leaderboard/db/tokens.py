@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import secrets
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import Any
 
-from sqlalchemy import and_, func, select
+from sqlalchemy import and_, func, select, update
 from sqlalchemy.exc import IntegrityError
 
 from leaderboard.db.engine import Database
@@ -41,43 +42,36 @@ def create_token(database: Database, name: str) -> str:
 def replace_token(database: Database, name: str) -> str:
     """Create and return a token for ``name`` that replaces the old one. Raises ``InputError`` if there is none."""
     token = PREFIX + secrets.token_urlsafe(32)
-    with database.write() as session:
-        record = session.scalar(select(TokenModel).where(TokenModel.name == name))
-        if record is None:
-            raise InputError(f"there is no token for {name!r}, expected the name of an existing token")
-        record.sha256, record.revoked_at = digest(token), None
+    _change(database, name, {"sha256": digest(token), "revoked_at": None})
     return token
 
 
 def revoke_token(database: Database, name: str) -> None:
     """Revoke the token of ``name``, whose submissions stay. Raises ``InputError`` if there is none."""
+    _change(database, name, {"revoked_at": time.time()})
+
+
+def _change(database: Database, name: str, values: Mapping[str, Any]) -> None:
     with database.write() as session:
-        record = session.scalar(select(TokenModel).where(TokenModel.name == name))
-        if record is None:
-            raise InputError(f"there is no token for {name!r}, expected the name of an existing token")
-        record.revoked_at = time.time()
+        changed = session.scalar(
+            update(TokenModel).where(TokenModel.name == name).values(**values).returning(TokenModel.id)
+        )
+    if changed is None:
+        raise InputError(f"there is no token for {name!r}, expected the name of an existing token")
 
 
-@dataclass(frozen=True)
-class TokenUse:
-    """A token's name, creation and revocation (Unix timestamps), number of submissions and their bytes."""
+def list_tokens(database: Database) -> list[tuple[str, float, float | None, int, int]]:
+    """Return name, times of creation and revocation, number of submissions and their bytes of all tokens.
 
-    name: str
-    created_at: float
-    revoked_at: float | None
-    submissions: int
-    size: int
-
-
-def list_tokens(database: Database) -> list[TokenUse]:
-    """Return all tokens, oldest first; submissions that were deleted are not counted."""
+    The oldest token comes first. Submissions that were deleted are not counted.
+    """
     query = (
         select(
             TokenModel.name,
             TokenModel.created_at,
             TokenModel.revoked_at,
-            func.count(SubmissionModel.id),
-            func.coalesce(func.sum(SubmissionModel.archive_bytes), 0),
+            func.count(SubmissionModel.id).label("submissions"),
+            func.coalesce(func.sum(SubmissionModel.archive_bytes), 0).label("size"),
         )
         .outerjoin(
             SubmissionModel, and_(SubmissionModel.token_id == TokenModel.id, SubmissionModel.status != DELETED)
@@ -86,7 +80,7 @@ def list_tokens(database: Database) -> list[TokenUse]:
         .order_by(TokenModel.created_at)
     )
     with database.read() as session:
-        return [TokenUse(*row) for row in session.execute(query)]
+        return [(*row,) for row in session.execute(query)]
 
 
 def find_token(database: Database, token: str) -> TokenModel | None:

@@ -1,7 +1,4 @@
-"""Sandboxed process that checks or scores one archive, so that a malicious archive cannot affect the service.
-
-``python -m leaderboard.scoring.sandbox`` reads a ``SandboxTask`` as JSON from standard input and writes its
-outcome to the task's output folder, in the files that ``task`` names.
+"""Checking and scoring of one archive, as they run in a process of their own (``isolation.call_isolated``).
 
 Pictures of views are rendered as in the command line's report. A submitter can reconstruct the ground truth from
 them, so they are only for leaderboards with public ground truth.
@@ -10,55 +7,72 @@ them, so they are only for leaderboards with public ground truth.
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
-from leaderboard.scoring.process_limits import limit_process
-from leaderboard.scoring.task import (
-    META_FILE,
-    NOTES_FILE,
-    PICTURES_DIR,
-    PROBLEMS_FILE,
-    RESULT_FILE,
-    UNAVAILABLE_FILE,
-    SandboxTask,
-)
+from leaderboard.scoring.isolation import UnavailableError
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError, Problem, RebarDepthError, SubmissionError
-from rebar_depth_bench.submission import open_submission
+from rebar_depth_bench.scoring.view_score import ViewScore, sort_key_worst_first
+from rebar_depth_bench.submission import SubmissionMeta, open_submission
 from rebar_depth_bench.view_ids import TEST_SPLIT, config_of, split_of
 
-NO_MEMORY = Problem("size", "", "the archive needs more memory than this service allows")
+if TYPE_CHECKING:
+    from rebar_depth_bench.scoring.evaluation import Evaluation
+    from rebar_depth_bench.scoring.result import Result
+
+P = ParamSpec("P")
+T = TypeVar("T")
+Problems = tuple[Problem, ...]
 
 
-def main() -> int:
-    """Run the task on standard input; return exit status 0, also if the archive has problems."""
-    task = SandboxTask(**json.load(sys.stdin))
-    limit_process(task.memory, task.parent)
-    out = Path(task.out)
-    try:
-        problems = _check(task, out) if task.action == "check" else _score(task, out)
-    except SubmissionError as error:
-        problems = error.problems
-    except MemoryError:
-        problems = [NO_MEMORY]
-    except (RebarDepthError, OSError) as error:  # Dataset, cache or disk, not the archive.
-        (out / UNAVAILABLE_FILE).write_text(str(error))
-        return 0
-    if problems:
-        (out / PROBLEMS_FILE).write_text(json.dumps([asdict(problem) for problem in problems]))
-    return 0
+@dataclass(frozen=True)
+class ViewPicture:
+    """Pictures of a view: WebP images by kind, and a JSON object with their size and the texts of colour bars."""
+
+    view_id: str
+    facts_json: str
+    images: Mapping[str, bytes]
 
 
-def _check(task: SandboxTask, out: Path) -> Sequence[Problem]:
-    """Return the problems of the archive; write its metadata if it has none."""
-    with open_submission(task.archive, open_folder(task.data).expected_views()) as submission:
-        problems = list(_split_problems(submission.view_ids)) or list(submission.problems())
-        if submission.meta is not None and not problems:
-            (out / META_FILE).write_text(submission.meta.model_dump_json())
-        return problems
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of scoring: the result JSON, notes on possible mistakes, pictures; or the reason of the failure."""
+
+    result: bytes | None = None
+    notes: Sequence[str] = ()
+    pictures: Sequence[ViewPicture] = ()
+    reason: str | None = None
+
+
+def _with_problems(task: Callable[P, T]) -> Callable[P, T | Problems]:
+    """Return ``task`` with the problems of an archive as a value, and ``UnavailableError`` for other errors."""
+
+    @wraps(task)
+    def call(*arguments: P.args, **options: P.kwargs) -> T | Problems:
+        try:
+            return task(*arguments, **options)
+        except SubmissionError as error:
+            return tuple(error.problems)
+        except MemoryError:
+            return (Problem("size", "", "the archive needs more memory than this service allows"),)
+        except (RebarDepthError, OSError) as error:  # Dataset, cache or disk, not the archive.
+            raise UnavailableError(str(error)) from None
+
+    return call
+
+
+@_with_problems
+def check(archive: Path, data: str) -> SubmissionMeta | Problems:
+    """Return the content of ``submission.json`` if the archive is valid, otherwise all problems."""
+    with open_submission(archive, open_folder(data).expected_views()) as submission:
+        if problems := tuple(_split_problems(submission.view_ids)) or tuple(submission.problems()):
+            return problems
+        assert submission.meta is not None
+        return submission.meta
 
 
 def _split_problems(view_ids: Iterable[str]) -> Iterator[Problem]:
@@ -68,28 +82,51 @@ def _split_problems(view_ids: Iterable[str]) -> Iterator[Problem]:
             yield Problem("conflict", config, f"the archive covers the split {split}", f"the split {TEST_SPLIT}")
 
 
-def _score(task: SandboxTask, out: Path) -> Sequence[Problem]:
-    """Write the result, notes and pictures. Raises ``SubmissionError`` with the problems of the archive."""
+@_with_problems
+def score(archive: Path, data: str, dataset_digest: str, error_maps: int, hidden_truth: bool) -> Outcome:
+    """Return result, notes, and pictures of the ``error_maps`` worst views and the median view of each config.
+
+    With ``hidden_truth``, archives with a view of low coverage have a problem.
+    """
     # Half a second to import, which a check does not need.
-    from leaderboard.scoring.pictures import write_pictures
     from rebar_depth_bench.diagnosis.diagnose import diagnose
     from rebar_depth_bench.scoring.disclosure import check_view_coverage
     from rebar_depth_bench.scoring.evaluation import open_evaluation
     from rebar_depth_bench.scoring.score import score_evaluation
 
-    digest = open_folder(task.data).digest
-    if digest != task.dataset_digest:  # Checked first: on another dataset, the archive could seem invalid.
-        raise DatasetError(f"{task.data}: the digest is {digest}, expected {task.dataset_digest}")
-    with open_evaluation(task.archive, task.data) as evaluation:
+    digest = open_folder(data).digest
+    if digest != dataset_digest:  # Checked first: on another dataset, the archive could seem invalid.
+        raise DatasetError(f"{data}: the digest is {digest}, expected {dataset_digest}")
+    with open_evaluation(archive, data) as evaluation:
         result = score_evaluation(evaluation)
-        if task.hidden_truth:
+        if hidden_truth:
             check_view_coverage(result.views)
-        (out / NOTES_FILE).write_text(json.dumps([mistake.text for mistake in diagnose(evaluation)]))
-        if task.error_maps:
-            write_pictures(evaluation, result, task.error_maps, out / PICTURES_DIR)
-    (out / RESULT_FILE).write_bytes(result.to_json())
-    return []
+        notes = [mistake.text for mistake in diagnose(evaluation)]
+        pictures = list(_pictures(evaluation, result, error_maps)) if error_maps else []
+    return Outcome(result.to_json(), notes, pictures)
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def views_to_picture(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
+    """Return the ``count`` worst of the views by rank error, and the median view, worst first."""
+    worst_first = sorted(views, key=sort_key_worst_first, reverse=True)
+    median = worst_first[len(worst_first) // 2 : len(worst_first) // 2 + 1]
+    return [*worst_first[:count], *(view for view in median if view not in worst_first[:count])]
+
+
+def _pictures(evaluation: Evaluation, result: Result, count: int) -> Iterator[ViewPicture]:
+    from rebar_depth_bench.reporting.html.page import iter_view_panels, views_by_config
+    from rebar_depth_bench.reporting.html.view_browser import shown_view
+
+    chosen = {name: views_to_picture(views, count) for name, views in views_by_config(result).items()}
+    for panels in iter_view_panels(chosen, evaluation):
+        shown = shown_view(panels)
+        size = {"width": shown.images.width, "height": shown.images.height}
+        facts = {**size, "near": shown.near, "far": shown.far, "limit": shown.native_limit}
+        images = {
+            "colour": shown.images.colour,
+            "truth": shown.images.truth,
+            "prediction": shown.images.prediction,
+            "error": shown.images.native_error,
+        }
+        stored = {kind: webp for kind, webp in images.items() if webp is not None}
+        yield ViewPicture(panels.view_id, json.dumps(facts), stored)

@@ -1,12 +1,17 @@
-"""Archive storage: one file ``<submission id>.zip`` per submission in a folder, which machines may share."""
+"""Archive storage, one file ``<submission id>.zip`` per submission, and the files of unfinished uploads."""
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
-from rebar_depth_bench.atomic_io import fsync_path
+from rebar_depth_bench.atomic_io import exclusive_lock, fsync_path
 from rebar_depth_bench.errors import InputError
 
 
@@ -18,12 +23,9 @@ class ArchiveStore:
     """Storage of submission archives by submission id. Methods raise ``OSError`` if the folder is unusable."""
 
     def __init__(self, folder: Path) -> None:
-        """Create the folder. Raises ``InputError`` if that is not possible."""
+        """Create the folder, which machines may share. Raises ``InputError`` if that is not possible."""
         self._folder = folder
-        try:
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{folder}: cannot access the archive storage: {error.strerror}") from None
+        make_folder(folder, "the archive storage")
 
     def put(self, submission_id: str, source: Path) -> None:
         """Move a file into the storage; durable on return. It is renamed on the same disk and copied otherwise."""
@@ -61,3 +63,35 @@ class ArchiveStore:
 
     def _file(self, submission_id: str) -> Path:
         return self._folder / f"{submission_id}.zip"
+
+
+def make_folder(folder: Path, name: str) -> None:
+    """Create a folder with mode 0700 unless it exists. Raises ``InputError`` if that is not possible."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot access {name}: {error.strerror}") from None
+
+
+@contextmanager
+def upload_file(spool: Path) -> Iterator[IO[bytes]]:
+    """Yield a new file in ``spool`` for an upload, and delete it at the end unless it was moved.
+
+    This process holds a lock on it, which the kernel releases however the process ends.
+    """
+    with exclusive_lock(spool, wait=True):  # Otherwise it could be deleted before it is locked.
+        file = tempfile.NamedTemporaryFile(dir=spool, suffix=".upload", delete=False)  # noqa: SIM115
+        fcntl.flock(file, fcntl.LOCK_EX)
+    with file:
+        try:
+            yield file
+        finally:
+            Path(file.name).unlink(missing_ok=True)
+
+
+def delete_abandoned_uploads(spool: Path) -> None:
+    """Delete the files of uploads to processes that were killed, which no process holds a lock on."""
+    with exclusive_lock(spool, wait=True):
+        for path in spool.glob("*.upload"):
+            with suppress(BlockingIOError), exclusive_lock(path):
+                path.unlink()

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import tempfile
 from collections.abc import AsyncIterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import structlog
-from anyio import fail_after, to_thread
+from anyio import fail_after, move_on_after, to_thread
 
 from leaderboard.db import submissions
 from leaderboard.db.models import SubmissionModel, TokenModel
-from leaderboard.db.submissions import DuplicateError, Quota, QuotaExceededError, Upload
+from leaderboard.db.submissions import Quota, QuotaExceededError, Upload
 from leaderboard.names import name_problem, normalised
-from leaderboard.scoring.run_sandbox import UnavailableError, Verdict, check_archive
+from leaderboard.scoring.isolation import ProcessEndedError, TimeLimitError, UnavailableError, call_isolated
+from leaderboard.scoring.sandbox import Problems, check
 from leaderboard.service import Service
 from leaderboard.settings import Settings
-from leaderboard.uploads.errors import UploadRejectedError, too_large
+from leaderboard.storage.archive_store import upload_file
+from leaderboard.uploads.multipart import UploadRejectedError, too_large
 from rebar_depth_bench.errors import Problem, RebarDepthError
 from rebar_depth_bench.reporting.formatting import counted
+from rebar_depth_bench.submission import SubmissionMeta
 
 UNAVAILABLE_MESSAGE = "the service cannot check or store archives at the moment; try again later"
 """Detail of the 503 response if the dataset is unreadable or the disk full."""
@@ -30,129 +31,115 @@ WRITE_CHUNK_BYTES = 1 << 20
 _LOG = structlog.get_logger("uploads")
 
 
-@dataclass(frozen=True)
-class AcceptedUpload:
-    """Submission of an upload; it is not new if the token has sent the same archive before."""
+async def accept_upload(
+    service: Service, token: TokenModel, archive: AsyncIterator[bytes]
+) -> tuple[SubmissionModel, bool]:
+    """Accept an archive; return its submission, and whether that is new; both are on disk on return.
 
-    record: SubmissionModel
-    is_new: bool
-
-
-@dataclass(frozen=True)
-class _ReceivedArchive:
-    """A received archive: its file, its SHA-256 in hexadecimal and its size in bytes."""
-
-    path: Path
-    sha256: str
-    size: int
-
-
-async def accept_upload(service: Service, token: TokenModel, archive: AsyncIterator[bytes]) -> AcceptedUpload:
-    """Accept an archive; archive and database row are on disk on return.
-
-    Uploads with one token are received one after the other, so that they do not fill the disk. The quota is
-    checked before the archive is read, and only accepted archives count. Raises ``UploadRejectedError``.
+    It is not new if the token has sent the same archive before. Uploads with one token are received one after the
+    other, so that they do not fill the disk. The quota is checked before the archive is read, and only accepted
+    archives count. Raises ``UploadRejectedError``.
     """
-    settings = service.settings
     async with service.upload_locks[token.id]:
-        await to_thread.run_sync(_check_quota, service, token)
         try:
-            with fail_after(settings.upload_seconds):
-                received = await _receive(
-                    _with_idle_timeout(archive, settings), service.spool, settings.max_upload
+            await to_thread.run_sync(_check_quota, service, token)
+            with upload_file(service.spool) as file:
+                sha256, size = await _receive(archive, file, service.settings)
+                received = Path(file.name), sha256, size
+                return await to_thread.run_sync(
+                    _check_and_store, service, token, *received, limiter=service.check_limiter
                 )
-            try:
-                return await _check_and_store(service, token, received)
-            finally:
-                await to_thread.run_sync(received.path.unlink, True)
-        except TimeoutError:
-            message = f"the upload was ended, because it took longer than {settings.upload_seconds:g} seconds"
-            raise UploadRejectedError(408, message) from None
-        except DuplicateError as error:
-            _LOG.info("upload of a known archive", token=token.name, submission=error.record.id[:6])
-            return AcceptedUpload(error.record, is_new=False)
         except QuotaExceededError as error:
-            raise _quota_exceeded(error) from None
+            message = f"the quota of {error} is used up; rejected archives do not count"
+            raise UploadRejectedError(429, message) from None
         except (OSError, RebarDepthError, UnavailableError) as error:
             _LOG.error("upload failed: service unavailable", error=str(error))
             raise UploadRejectedError(503, UNAVAILABLE_MESSAGE) from None
 
 
-async def _with_idle_timeout(body: AsyncIterator[bytes], settings: Settings) -> AsyncIterator[bytes]:
-    """Yield the parts of ``body``. Raises ``UploadRejectedError`` (408) if none arrives for too long."""
-    seconds = settings.upload_idle_seconds
-    while True:
-        try:
-            with fail_after(seconds):
-                part = await anext(body, None)
-        except TimeoutError:
-            message = f"the upload was ended, because nothing was received for {seconds:g} seconds"
-            raise UploadRejectedError(408, message) from None
-        if part is None:
-            return
-        yield part
+async def _receive(archive: AsyncIterator[bytes], file: IO[bytes], settings: Settings) -> tuple[str, int]:
+    """Write an archive to ``file``; return its SHA-256 in hexadecimal and its size in bytes.
 
-
-async def _receive(archive: AsyncIterator[bytes], spool: Path, max_bytes: int) -> _ReceivedArchive:
-    """Write an archive to a new file in ``spool``.
-
-    Raises ``UploadRejectedError`` (413), and leaves no file, if it has more than ``max_bytes`` bytes.
+    Raises ``UploadRejectedError``: 413 if it is too large, 408 if it takes too long.
     """
-    descriptor, name = tempfile.mkstemp(dir=spool, suffix=".upload")
-    path, sha256, size, waiting = Path(name), hashlib.sha256(), 0, bytearray()
+    sha256, size, waiting = hashlib.sha256(), 0, bytearray()
+
+    def flush() -> None:
+        sha256.update(waiting)
+        file.write(waiting)
+        file.flush()
+        waiting.clear()
+
+    limit = f"it took longer than {settings.upload_seconds:g} seconds"
     try:
-        with os.fdopen(descriptor, "wb") as file:
-
-            def flush() -> None:
-                sha256.update(waiting)
-                file.write(waiting)
-                waiting.clear()
-
-            async for part in archive:
+        with fail_after(settings.upload_seconds):
+            while True:
+                with move_on_after(settings.upload_idle_seconds) as idle:
+                    part = await anext(archive, None)
+                if idle.cancelled_caught:
+                    limit = f"nothing was received for {settings.upload_idle_seconds:g} seconds"
+                    raise TimeoutError
+                if part is None:
+                    break
                 waiting += part
                 size += len(part)
-                if size > max_bytes:
-                    raise too_large(max_bytes)
+                if size > settings.max_upload:
+                    raise too_large(settings.max_upload)
                 if len(waiting) >= WRITE_CHUNK_BYTES:
                     await to_thread.run_sync(flush)
             await to_thread.run_sync(flush)
-        return _ReceivedArchive(path, sha256.hexdigest(), size)
-    except BaseException:
-        path.unlink(missing_ok=True)
-        raise
+    except TimeoutError:
+        raise UploadRejectedError(408, f"the upload was ended, because {limit}") from None
+    return sha256.hexdigest(), size
 
 
-async def _check_and_store(service: Service, token: TokenModel, received: _ReceivedArchive) -> AcceptedUpload:
-    settings = service.settings
-    await to_thread.run_sync(_raise_if_duplicate, service, token, received.sha256)
-    verdict = _with_name_problems(
-        await to_thread.run_sync(
-            check_archive, received.path, settings, service.spool, limiter=service.check_limiter
-        )
-    )
-    if isinstance(verdict, tuple):
+def _check_and_store(
+    service: Service, token: TokenModel, path: Path, sha256: str, size: int
+) -> tuple[SubmissionModel, bool]:
+    settings, database = service.settings, service.database
+    with database.read() as session:
+        duplicate = submissions.find_duplicate(session, token, sha256)
+    if duplicate is not None:
+        return duplicate, False
+    verdict = _checked_name(_check_archive(path, settings))
+    if not isinstance(verdict, SubmissionMeta):
         _LOG.info("upload rejected", token=token.name, problems=len(verdict))
         raise UploadRejectedError(422, f"the archive is invalid: {counted(len(verdict), 'problem')}", verdict)
     submission_id = submissions.new_id()
-    upload = Upload(verdict, received.sha256, received.size, service.folder.digest)
+    upload = Upload(verdict, sha256, size, service.folder.digest)
     public = settings.default_visibility == "always"
+    service.archives.put(submission_id, path)
+    try:
+        record = submissions.accept(database, submission_id, token, upload, _quota_of(settings), public)
+    except QuotaExceededError:  # After other errors the row may exist and needs its archive.
+        service.archives.delete(submission_id)
+        raise
+    if record.id != submission_id:  # Sent twice at the same time.
+        service.archives.delete(submission_id)
+        return record, False
+    _LOG.info("upload accepted", token=token.name, submission=submission_id[:6], bytes=size)
+    return record, True
 
-    def store() -> SubmissionModel:
-        service.archives.put(submission_id, received.path)
+
+def _check_archive(path: Path, settings: Settings) -> SubmissionMeta | Problems:
+    """Return the content of ``submission.json``, or the problems of the archive. Raises ``UnavailableError``."""
+    for _ in range(2):  # A process that was killed from outside says nothing about the archive.
         try:
-            return submissions.accept(service.database, submission_id, token, upload, quota_of(settings), public)
-        except (QuotaExceededError, DuplicateError):  # After other errors the row may exist and needs its archive.
-            service.archives.delete(submission_id)
-            raise
+            return call_isolated(
+                *(check, path, settings.data), memory=settings.score_memory, time_limit_s=settings.check_time
+            )
+        except TimeLimitError:
+            return (Problem("size", "", f"the check took longer than {settings.check_time:g} s"),)
+        except ProcessEndedError as error:
+            _LOG.error("checking process ended", status=error.status)
+            if not error.was_killed:
+                break
+    return (Problem("damaged", "", "the archive cannot be read: the process that reads it crashed"),)
 
-    record = await to_thread.run_sync(store)
-    _LOG.info("upload accepted", token=token.name, submission=submission_id[:6], bytes=received.size)
-    return AcceptedUpload(record, is_new=True)
 
-
-def _with_name_problems(verdict: Verdict) -> Verdict:
-    """Return the verdict with the method's name normalised, or with the problem of this name."""
-    if isinstance(verdict, tuple):
+def _checked_name(verdict: SubmissionMeta | Problems) -> SubmissionMeta | Problems:
+    """Return the verdict with the method's name normalised, or the problem of this name."""
+    if not isinstance(verdict, SubmissionMeta):
         return verdict
     method = normalised(verdict.method)
     if problem := name_problem(method):
@@ -160,24 +147,10 @@ def _with_name_problems(verdict: Verdict) -> Verdict:
     return verdict.model_copy(update={"method": method})
 
 
-def _raise_if_duplicate(service: Service, token: TokenModel, sha256: str) -> None:
-    with service.database.read() as session:
-        if duplicate := submissions.find_duplicate(session, token, sha256):
-            raise DuplicateError(duplicate)
-
-
-def quota_of(settings: Settings) -> Quota:
-    """Return the daily quota of every token."""
-    return Quota(settings.quota, settings.quota_bytes)
-
-
 def _check_quota(service: Service, token: TokenModel) -> None:
-    try:
-        with service.database.read() as session:
-            submissions.check_quota(session, token, quota_of(service.settings), 0)
-    except QuotaExceededError as error:
-        raise _quota_exceeded(error) from None
+    with service.database.read() as session:
+        submissions.check_quota(session, token, _quota_of(service.settings), 0)
 
 
-def _quota_exceeded(error: QuotaExceededError) -> UploadRejectedError:
-    return UploadRejectedError(429, f"the quota of {error} is used up; rejected archives do not count")
+def _quota_of(settings: Settings) -> Quota:
+    return Quota(settings.quota, settings.quota_bytes)

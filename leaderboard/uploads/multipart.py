@@ -1,18 +1,35 @@
-"""Fields of a multipart form, read as a stream: the token and the archive of an upload."""
+"""Multipart form of an upload, read as a stream: its token and its archive; and the rejection of an upload."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 
 from multipart import MultipartError, MultipartSegment, PushMultipartParser, parse_options_header
 
-from leaderboard.uploads.errors import UploadRejectedError
+from rebar_depth_bench.errors import Problem
 
 ARCHIVE_FIELD, TOKEN_FIELD = "archive", "token"
 MAX_FIELD_BYTES = 1 << 10
 """Maximum size in bytes of a text field."""
 MAX_OVERHEAD_BYTES = 64 << 10
 """Maximum size in bytes of everything in the body except the content of the archive."""
+
+
+class UploadRejectedError(Exception):
+    """Raised when an upload is rejected.
+
+    Holds the HTTP status, the detail message and, for status 422 only, all problems.
+    """
+
+    def __init__(self, status: int, detail: str, problems: Sequence[Problem] = ()) -> None:
+        self.status, self.detail = status, detail
+        self.problems = (problems or (Problem("syntax", "", detail),)) if status == 422 else ()
+        super().__init__(detail)
+
+
+def too_large(max_bytes: int) -> UploadRejectedError:
+    """Return the rejection of an archive of more than ``max_bytes`` bytes."""
+    return UploadRejectedError(413, f"the archive is larger than {max_bytes} bytes, the limit of this service")
 
 
 class UploadForm:

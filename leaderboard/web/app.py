@@ -15,12 +15,13 @@ from starlette.requests import ClientDisconnect
 
 from leaderboard.db.engine import DATABASE_UNAVAILABLE
 from leaderboard.service import Service
-from leaderboard.uploads.errors import UploadRejectedError
-from leaderboard.web.api import health, leaderboard, submissions, token
+from leaderboard.uploads.multipart import UploadRejectedError
+from leaderboard.web.api import leaderboard, status, submissions
 from leaderboard.web.api.schemas import DATABASE_UNAVAILABLE_MESSAGE
 from leaderboard.web.cache import CacheMiddleware
 from leaderboard.web.middleware import EarlyResponseMiddleware, RequestMiddleware
-from leaderboard.web.pages import account, routes, static, submit
+from leaderboard.web.pages import account, static, submission, submit
+from leaderboard.web.pages import leaderboard as board
 from leaderboard.web.pages.rendering import error_response, make_templates
 from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.version import software_version
@@ -54,7 +55,7 @@ def make_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     app.state.templates = make_templates()
-    for router in (submissions, leaderboard, token, health, routes, submit, account, static):
+    for router in (submissions, leaderboard, status, board, submission, submit, account, static):
         app.include_router(router.router)
     identity = f"{software_version()} {service.folder.digest} {settings.model_dump_json()}"
     app.add_middleware(CacheMiddleware, versions=service.versions, identity=identity)

@@ -10,12 +10,10 @@ previous response, which was current at most ``MAX_OUTDATED_S`` ago, so that a c
 
 from __future__ import annotations
 
-import asyncio
 import gzip
 import hashlib
 import time
 from collections import defaultdict
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,13 +58,21 @@ class CacheMiddleware:
         self, app: ASGIApp, *, versions: VersionReader, identity: str, max_bytes: int = MAX_CACHE_BYTES
     ) -> None:
         self._app, self._max_bytes = app, max_bytes
-        self._read_version = SharedVersion(versions)
+        self._versions, self._reading = versions, Lock()
         self._identity = hashlib.sha256(identity.encode()).hexdigest()[:16]
         self._rendering = defaultdict[_Key, Lock](Lock)
         self._responses: dict[_Key, _CachedResponse] = {}
         self._outdated: dict[_Key, _CachedResponse] = {}
         self._version, self._size = -1, 0
         self._current_at_s = self._outdated_since_s = 0.0
+
+    async def _read_version(self) -> int:
+        """Return the current version; requests that have to read it take turns, not to take all threads."""
+        if (version := self._versions.unchanged()) is not None:
+            return version
+        async with self._reading:
+            version = self._versions.unchanged()
+            return await to_thread.run_sync(self._versions.read) if version is None else version
 
     def _set_version(self, version: int) -> None:
         if version != self._version:
@@ -90,7 +96,7 @@ class CacheMiddleware:
             await self._app(scope, receive, send)
             return
         try:
-            version = await self._read_version.get()
+            version = await self._read_version()
         except DATABASE_UNAVAILABLE:  # The application reports it.
             await self._app(scope, receive, send)
             return
@@ -151,31 +157,3 @@ async def _send_response(response: _CachedResponse, request_headers: Headers, se
         headers = [*headers, (b"content-length", str(len(content)).encode())]
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": content})
-
-
-class SharedVersion:
-    """Content version whose read from the database is shared by concurrent requests.
-
-    Calls during a running read wait for the next one: a returned version was therefore read after the call, and
-    hundreds of concurrent calls cost one query.
-    """
-
-    def __init__(self, versions: VersionReader) -> None:
-        self._versions = versions
-        self._running: asyncio.Task[int] | None = None
-        self._next: asyncio.Task[int] | None = None
-
-    async def get(self) -> int:
-        """Return the version, or raise the exception of the database."""
-        if (version := self._versions.unchanged()) is not None:
-            return version
-        if self._next is None:
-            self._next = asyncio.create_task(self._read_after(self._running))
-        return await asyncio.shield(self._next)  # A cancelled request must not cancel the others.
-
-    async def _read_after(self, running: asyncio.Task[int] | None) -> int:
-        if running is not None and not running.done():
-            await asyncio.wait([running])
-        self._running, self._next = self._next, None  # Later calls wait for the next read.
-        read: Callable[[], int] = self._versions.read
-        return await to_thread.run_sync(read)

@@ -23,22 +23,19 @@ class ConnectionCounts:
     max_total: int
     max_per_address: int
     by_address: Counter[str] = field(default_factory=Counter)
-    total: int = 0
 
     def open(self, address: str) -> bool:
         """Count a new connection unless that exceeds a limit; return whether it was counted."""
-        if self.total >= self.max_total or 0 < self.max_per_address <= self.by_address[address]:
+        of_address = self.by_address[address]
+        if self.by_address.total() >= self.max_total or 0 < self.max_per_address <= of_address:
             return False
         self.by_address[address] += 1
-        self.total += 1
         return True
 
     def close(self, address: str) -> None:
         """Count the end of a connection."""
-        self.total -= 1
         self.by_address[address] -= 1
-        if not self.by_address[address]:
-            del self.by_address[address]
+        self.by_address += Counter()  # Drops addresses without a connection.
 
 
 def new_connection_counts(settings: Settings) -> ConnectionCounts:

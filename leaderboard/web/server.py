@@ -5,26 +5,24 @@ from __future__ import annotations
 import signal
 import socket
 import sys
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import structlog
 import uvicorn
 from prometheus_client import start_http_server
 
-from leaderboard.db.engine import DATABASE_UNAVAILABLE
-from leaderboard.redact import without_password
+from leaderboard.db.engine import without_password
+from leaderboard.scoring.worker import running_workers
 from leaderboard.service import Service, open_service
 from leaderboard.settings import Settings
-from leaderboard.storage.retention import delete_archives, expired_archives
+from leaderboard.storage.retention import archive_retention
 from leaderboard.web.app import make_app
 from leaderboard.web.connections import limited_protocol, new_connection_counts
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.version import software_version
 
 SHUTDOWN_GRACE_S = 10
-RETENTION_INTERVAL_S = 3600.0
 _SWITCH_INTERVAL_S = 0.0005
 """Interval of switches between threads; with Python's 5 ms, a response waits for several of them."""
 _LOG = structlog.get_logger("server")
@@ -63,7 +61,13 @@ def serve(settings: Settings) -> None:
         details = {"version": software_version(), "dataset": service.folder.digest, "scorers": settings.workers}
         details["hidden_truth"] = settings.hidden_truth
         _LOG.info("serving", database=without_password(settings.database_url), **details)
-        with service.supervisor, metrics_server(service), archive_retention(service):
+        stores = (service.database, service.archives, service.folder.configs, settings)
+        with (
+            metrics_server(service),
+            archive_retention(*stores),
+            running_workers(service.database, settings) as workers,
+        ):
+            service.workers.extend(workers)
             server.run(sockets=[listener])
         _LOG.info("stopped")
 
@@ -74,49 +78,16 @@ def metrics_server(service: Service) -> Iterator[None]:
 
     Raises ``InputError`` if the port is in use.
     """
-    port = service.settings.metrics_port
-    if not port:
-        yield
-        return
-    try:
-        server, thread = start_http_server(port, "127.0.0.1", service.metrics.registry)
-    except OSError as error:
-        raise InputError(f"127.0.0.1:{port}: cannot listen on this port for metrics: {error.strerror}") from None
-    try:
-        yield
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
-
-
-@contextmanager
-def archive_retention(service: Service) -> Iterator[None]:
-    """Delete expired archives now and every hour in a thread, if the settings say after how many days."""
-    settings, stop = service.settings, threading.Event()
-
-    def delete_expired() -> None:
-        while True:
+    with ExitStack() as stack:
+        if port := service.settings.metrics_port:
             try:
-                expired = expired_archives(
-                    service.database, service.folder.configs, settings.archive_days, settings.archive_ranks
-                )
-                delete_archives(service.database, service.archives, expired)
-                _LOG.info("expired archives deleted", archives=len(expired))
-            except (*DATABASE_UNAVAILABLE, OSError) as error:
-                _LOG.warning("expired archives not deleted", error=type(error).__name__)
-            if stop.wait(RETENTION_INTERVAL_S):
-                return
-
-    thread = threading.Thread(target=delete_expired, name="retention", daemon=True)
-    if settings.archive_days:
-        thread.start()
-    try:
+                server, thread = start_http_server(port, "127.0.0.1", service.metrics.registry)
+            except OSError as error:
+                reason = f"cannot listen on this port for metrics: {error.strerror}"
+                raise InputError(f"127.0.0.1:{port}: {reason}") from None
+            for end in (thread.join, server.server_close, server.shutdown):
+                stack.callback(end)
         yield
-    finally:
-        stop.set()
-        if thread.is_alive():
-            thread.join()
 
 
 def listening_socket(settings: Settings) -> socket.socket:

@@ -29,9 +29,8 @@ from leaderboard.settings import read_settings
 START_S = 120.0
 _COPIES = itertools.count(1000)
 ENDED = ("scored", "failed")
-SCORER = b"leaderboard.scoring\0"
-SCORING = b"leaderboard.scoring.sandbox"
-"""Parts of the command lines of a scorer and of the process in which it scores one archive."""
+SCORING = b"multiprocessing.spawn"
+"""Part of the command line of the process that reads one archive."""
 
 
 @dataclass

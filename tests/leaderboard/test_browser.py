@@ -143,7 +143,7 @@ def test_owner_edits_publishes_and_deletes_on_the_page(
         expect(page.get_by_text("on the leaderboard", exact=False).first).to_be_visible()
         page.get_by_text("Edit details").click()
         page.get_by_label("Licence").fill("MIT")
-        page.get_by_label("Code url").fill("ftp://wrong")
+        page.get_by_label("Code URL").fill("ftp://wrong")
         page.get_by_role("button", name="Save").click()
         expect(page.get_by_role("status")).to_contain_text("Not changed: code_url")
         page.get_by_text("Edit details").click()

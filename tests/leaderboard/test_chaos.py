@@ -22,7 +22,7 @@ import pytest
 from leaderboard.db.jobs import MAX_ATTEMPTS
 from tests.leaderboard.conftest import WriteArchive
 from tests.leaderboard.postgres import Postgres, RunPostgres
-from tests.leaderboard.serving import SCORER, SCORING, RunServer, Server, distinct_archive, make_token
+from tests.leaderboard.serving import SCORING, RunServer, Server, distinct_archive, make_token
 from tests.processes import descendants, is_running, processes_below, wait_until
 from tests.requirements import Repetitions
 
@@ -117,10 +117,10 @@ class Service:
         self.start()
 
     def kill_scorer(self, rng: np.random.Generator) -> None:
-        """Kill a random scorer or scoring process."""
+        """Kill a random process that checks or scores an archive."""
         assert self.server is not None
         pid = self.server.process.pid
-        scoring = [*processes_below(pid, SCORER), *processes_below(pid, SCORING)]
+        scoring = processes_below(pid, SCORING)
         if scoring:
             with suppress(ProcessLookupError):
                 os.kill(scoring[rng.integers(len(scoring))], signal.SIGKILL)

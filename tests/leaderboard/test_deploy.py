@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from leaderboard.cli import COMMAND_SETTINGS, argument_parser
+from leaderboard.cli import COMMANDS, argument_parser
 from leaderboard.settings import Settings
 
 ROOT = Path(__file__).parents[2]
@@ -59,7 +59,7 @@ def shell_lines(program: str) -> list[list[str]]:
 
 def test_readme_commands_parse() -> None:
     commands = [argument_parser().parse_args(words).command for words in shell_lines("rebar-leaderboard")]
-    assert set(commands) == set(COMMAND_SETTINGS)
+    assert set(commands) == set(COMMANDS)
 
 
 def test_readme_settings_table_matches_code() -> None:

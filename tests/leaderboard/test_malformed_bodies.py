@@ -51,7 +51,7 @@ class UploadServer:
 
     def spool_files(self) -> list[Path]:
         """Return the spool files of unfinished uploads."""
-        return list((self.server.state / "spool").glob("*/*"))
+        return list((self.server.state / "spool").iterdir())
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from alembic import command
 from alembic.autogenerate import compare_metadata
-from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import Column, Engine, MetaData, String, create_engine, insert, inspect
@@ -24,9 +22,11 @@ from leaderboard.db.engine import MIGRATIONS, Database
 from leaderboard.db.models import Base, LeaderboardRowModel
 from leaderboard.db.rankings import picture_facts, picture_webp, read_ranking
 from leaderboard.db.tokens import create_token, digest, find_token
+from leaderboard.db.versions import VersionReader
 from leaderboard.db.view_errors import unpack_view_errors
 from leaderboard.settings import Settings
 from tests.bench.reporting.results import result, scored_view
+from tests.leaderboard.old_schema import create_old_schema
 
 _MIGRATE = """
 import sys
@@ -131,11 +131,8 @@ def test_concurrent_migrations_succeed(url: str, engine: Engine) -> None:
 
 def test_database_of_revision_2_keeps_error_maps_and_gets_view_errors(url: str, engine: Engine) -> None:
     document = result(*(scored_view(f"lattice/{index:04d}") for index in range(3))).to_dict()
-    config = Config()
-    config.set_main_option("script_location", str(MIGRATIONS))
     with engine.begin() as connection:
-        config.attributes["connection"] = connection
-        command.upgrade(config, "0002")
+        create_old_schema(connection, "0002")
         tables = MetaData()
         tables.reflect(connection)
         rows: dict[str, dict[str, Any]] = {
@@ -159,7 +156,7 @@ def test_database_of_revision_2_keeps_error_maps_and_gets_view_errors(url: str, 
         assert picture_webp(database, "one", "lattice/0000", "error") == b"webp"
         assert picture_facts(database, "one") == {"lattice/0000": ({}, ["error"])}
         [entry] = read_ranking(database, "lattice").entries
-        assert (entry.submission_id, entry.submitter, entry.rank, entry.details_json) == ("one", "alice", 1, "{}")
+        assert (entry.id, entry.submitter, entry.rank) == ("one", "alice", 1)
         assert find_token(database, "a token") is not None
         with database.read() as session:
             packed = session.get_one(LeaderboardRowModel, ("one", "lattice")).view_errors
@@ -178,6 +175,15 @@ SUBMISSION = {
     "attempts": 1,
     "dataset_digest": "sha256:0",
 }
+
+
+def test_database_of_revision_1_migrates(url: str, engine: Engine) -> None:
+    with engine.begin() as connection:
+        create_old_schema(connection, "0001")
+    migrate(url)
+    assert differences(engine, Base.metadata) == []
+    with closing(Database(url)) as database, closing(VersionReader(database)) as versions:
+        assert versions.read() == 1
 
 
 def test_migrations_are_linear() -> None:

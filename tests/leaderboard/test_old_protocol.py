@@ -11,14 +11,12 @@ from typing import Any
 
 import httpx2
 import pytest
-from alembic import command
-from alembic.config import Config
 from sqlalchemy import MetaData, create_engine, insert, update
 
-from leaderboard.db.engine import MIGRATIONS
 from leaderboard.settings import Settings
 from rebar_depth_bench import score
 from rebar_depth_bench.data.manifest import open_folder
+from tests.leaderboard.old_schema import create_old_schema
 from tests.leaderboard.serving import RunServer
 from tests.synthetic_dataset import write_archive, write_dataset
 
@@ -41,11 +39,8 @@ def old_result(archive: Path, root: Path) -> dict[str, Any]:
 def write_old_database(url: str, digest: str, results: dict[str, dict[str, Any]]) -> None:
     """Write a database of the first schema with one scored submission per result."""
     engine = create_engine(url)
-    config = Config()
-    config.set_main_option("script_location", str(MIGRATIONS))
     with engine.begin() as connection:
-        config.attributes["connection"] = connection
-        command.upgrade(config, "0001")
+        create_old_schema(connection, "0001")
         tables = MetaData()
         tables.reflect(connection)
         token = {"id": 1, "name": "alice", "sha256": "0" * 64, "created_at": 0.0}

@@ -6,6 +6,7 @@ import asyncio
 import json
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qsl
 
 import pytest
@@ -16,17 +17,10 @@ from hypothesis import strategies as st
 from leaderboard.db.engine import Database
 from leaderboard.db.models import LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
 from leaderboard.db.rankings import LeaderboardEntry, queue_position, read_ranking
-from leaderboard.uploads.errors import UploadRejectedError
-from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadForm
-from leaderboard.web.pages.leaderboard import (
-    COLUMNS,
-    RANK,
-    Selection,
-    make_config_ranking,
-    parse_selection,
-    sort_indices,
-)
-from leaderboard.web.pages.rendering import clean_text, error_response, format_size, format_time, link
+from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadForm, UploadRejectedError
+from leaderboard.web.pages.leaderboard import make_config_ranking
+from leaderboard.web.pages.rendering import clean_text, error_response, format_size, link_html, time_html
+from leaderboard.web.pages.selection import COLUMNS, RANK, Selection, parse_selection
 from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.reporting.html.rows import table_row
 from rebar_depth_bench.scoring.result_io import read_result
@@ -81,7 +75,7 @@ def make_submission(
 
 
 def test_leaderboard_entries_are_public_and_in_order(database: Database) -> None:
-    shown = [(row.rank, row.submission_id) for row in read_ranking(database, "lattice").entries]
+    shown = [(row.rank, row.id) for row in read_ranking(database, "lattice").entries]
     assert shown == [(1, "s2"), (2, "s0"), (3, "s4"), (4, "s3"), (None, "s6"), (None, "s5")]
 
 
@@ -91,7 +85,7 @@ def test_queue_position_counts_earlier_submissions(database: Database) -> None:
         session.add_all(waiting)
         session.add(make_submission("q-", 150.0, status="scoring"))
     positions = [queue_position(database, record) for record in waiting]
-    assert [(position.number, position.waiting) for position in positions if position] == [(1, 3), (2, 3), (3, 3)]
+    assert [position for position in positions if position] == [(1, 3), (2, 3), (3, 3)]
     assert queue_position(database, make_submission("s0", 1.0)) is None
 
 
@@ -102,22 +96,22 @@ def test_equal_errors_share_a_rank_overall_and_in_their_class(database: Database
             row.rank_error, row.ranked = error, True
             record = session.get_one(SubmissionModel, name)
             record.inputs, record.public = inputs, True
-    entries = {entry.submission_id: entry for entry in read_ranking(database, "lattice").entries}
+    entries = {entry.id: entry for entry in read_ranking(database, "lattice").entries}
     assert (entries["s0"].rank, entries["s2"].rank) == (1, 1)
     assert entries["s3"].rank is not None
     assert entries["s3"].rank >= 3
     assert (entries["s0"].class_rank, entries["s2"].class_rank, entries["s3"].class_rank) == (1, 1, 2)
     assert {entry.class_rank for entry in entries.values() if entry.inputs is None} == {None}
     shown = make_config_ranking(read_ranking(database, "lattice"), "lattice", Selection(inputs="rgb"), False)
-    assert [line.submission_id for line in shown.lines] == ["s0", "s3"]
-    assert [line.rank for line in shown.lines] == [1, entries["s3"].rank]
+    assert [line.entry.id for line in shown.lines] == ["s0", "s3"]
+    assert [line.entry.rank for line in shown.lines] == [1, entries["s3"].rank]
 
 
 def test_pages_divide_the_rows(database: Database) -> None:
     ranking = read_ranking(database, "lattice")
     full = make_config_ranking(ranking, "lattice", Selection(), False)
     pages = [make_config_ranking(ranking, "lattice", Selection(page=page), False, 4) for page in (1, 2, 3)]
-    assert [[line.submission_id for line in page.lines] for page in pages] == [
+    assert [[line.entry.id for line in page.lines] for page in pages] == [
         ["s2", "s0", "s4", "s3"],
         ["s6", "s5"],
         ["s6", "s5"],
@@ -154,17 +148,17 @@ def test_missing_values_are_sorted_last_in_both_orders(errors: list[float | None
         for error in errors
     ]
     tables = [result(view).to_dict()["tables"]["lattice"] for view in views]
-    rows = [(entry_of(f"m{k}"), table) for k, table in enumerate(tables)]
+    entries = [entry_of(f"m{k}", table) for k, table in enumerate(tables)]
     for selection in (Selection(name), Selection(name, inverted=True)):
-        values = [COLUMNS[name].value(rows[index][1]) for index in sort_indices(rows, selection)]
+        values = [COLUMNS[name].value(entry.table) for entry in selection.sorted(entries)]
         present = [value for value in values if value is not None]
         assert values == present + [None] * (len(values) - len(present))
         assert present == sorted(present, reverse=selection.is_descending)
 
 
-def entry_of(name: str) -> LeaderboardEntry:
+def entry_of(name: str, table: dict[str, Any]) -> LeaderboardEntry:
     return LeaderboardEntry(
-        None, None, None, name, "lattice", name, "alice", None, None, None, None, 0.0, True, "{}", "{}"
+        *(name, "lattice", name, "alice", None, None, None, None, 0.0, True, True, None, None, json.dumps(table))
     )
 
 
@@ -271,17 +265,15 @@ def test_non_multipart_body_is_rejected() -> None:
 
 @pytest.mark.parametrize("url", [None, "", "javascript:alert(1)", "data:text/html,x", "//x.org", "ftp://x.org"])
 def test_only_http_urls_are_linked(url: str | None) -> None:
-    assert link(url) is None
+    assert link_html(url) == ""
 
 
 def test_clean_text_keeps_newlines_and_removes_controls() -> None:
     assert clean_text("a\nb\u202ec\x00") == "a\nb\ufffdc\ufffd"
     assert len(clean_text("x" * 10_000)) == 4000
     assert clean_text(None) == ""
-    parsed_link = link("https://example.org/a?b=1")
-    assert parsed_link is not None
-    assert parsed_link.host == "example.org"
-    assert format_time(0.0).text == "1970-01-01 00:00 UTC"
+    assert ">example.org</a>" in link_html("https://example.org/a?b=1")
+    assert time_html(0.0) == '<time datetime="1970-01-01T00:00:00Z">1970-01-01 00:00 UTC</time>'
     assert [format_size(n) for n in (999, 1024, 8 << 30, 22_120_682)] == [
         "999 bytes",
         "1 KiB",

@@ -16,6 +16,7 @@ from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result_io import read_result
 from tests.bench.reporting.pages import Page
 from tests.leaderboard.conftest import HOSTILE, SharedServer, WriteArchive
+from tests.leaderboard.serving import RunServer
 
 CONFIGS = ("lattice", "lattice-orbit")
 BROWSER = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
@@ -227,6 +228,16 @@ def test_pages_name_dataset_licence_and_scenes(board: SharedServer) -> None:
     for source in scenes:
         assert get(board.url + source).content[8:12] == b"WEBP"
     assert get(f"{board.url}/scenes/nope.webp").status_code == 404
+
+
+def test_links_of_dataset_and_paper_are_shown(tiny_root: Path, tmp_path: Path, running_server: RunServer) -> None:
+    links = {"dataset_url": "https://example.org/data", "paper_url": "https://example.org/paper"}
+    with running_server(tiny_root, tmp_path / "state", workers=0, **links) as server:
+        for path in ("/", "/how-to-submit"):
+            _, parsed = page(server.url + path)
+            addresses = {link["href"] for link in parsed.attributes_of("a")}
+            assert addresses >= set(links.values())
+        assert "url = {https://example.org/paper}" in parsed.text
 
 
 def test_details_of_a_method_are_shown(board: SharedServer, write_archive: WriteArchive) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from pydantic import ByteSize
 
-from leaderboard.cli import COMMAND_SETTINGS, RENAMED_OPTIONS, argument_parser
+from leaderboard.cli import COMMANDS, RENAMED_OPTIONS, argument_parser
 from leaderboard.settings import RENAMED_SETTINGS, Settings, read_settings
 from leaderboard.storage.archive_store import ArchiveStore
 from rebar_depth_bench.console import replace_renamed_options
@@ -213,7 +213,7 @@ def test_old_setting_names_work_with_a_warning(
     assert f"warning: setting {old} is deprecated, use {new}\n" in capsys.readouterr().err
     monkeypatch.setenv(PREFIX + old.upper(), value)
     assert getattr(read_settings(None, {"data": "x"}), new) == expected
-    assert f"{PREFIX}{old.upper()} is deprecated, use {PREFIX}{new.upper()}" in capsys.readouterr().err
+    assert f"warning: variable for {old} is deprecated, use {new}\n" in capsys.readouterr().err
     arguments = replace_renamed_options(["serve", f"--{old}", value], RENAMED_OPTIONS)
     assert getattr(argument_parser().parse_args(arguments), new) == value
     assert f"--{old} is deprecated" in capsys.readouterr().err
@@ -235,7 +235,7 @@ def example_value(name: str) -> str:
         "state_dir": "/elsewhere",
         "rescore": "true",
         "hidden_truth": "true",
-        "public_url": "https://example.org/board",
+        **dict.fromkeys(("public_url", "dataset_url", "paper_url"), "https://example.org/board"),
     }
     kind = Settings.model_fields[name].annotation
     return special.get(name, "17" if kind in (int, float, ByteSize) else "something")
@@ -265,18 +265,18 @@ def test_switches_need_no_value(option: str) -> None:
     assert getattr(read_settings(None, {"data": parsed.data, name: getattr(parsed, name)}), name) is True
 
 
-@pytest.mark.parametrize("command", COMMAND_SETTINGS)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_help_shows_every_setting_with_its_default(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
         argument_parser().parse_args([command, "--help"])
     assert end.value.code == 0
     shown = " ".join(capsys.readouterr().out.split())
-    for name in COMMAND_SETTINGS[command]:
+    for name in COMMANDS[command][1]:
         default = Settings.model_fields[name].default
         assert f"--{name.replace('_', '-')} " in shown
         if default not in ("", None) and not Settings.model_fields[name].is_required():
             assert f"(default: {default})" in shown, name
-    assert command != "serve" or set(COMMAND_SETTINGS["serve"]) == set(Settings.model_fields)
+    assert command != "serve" or set(COMMANDS["serve"][1]) == set(Settings.model_fields)
 
 
 @pytest.mark.parametrize("rate", ["600/minute", "10/second", "1 per 2 hours", "5/day"])

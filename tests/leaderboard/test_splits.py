@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import rebar_depth_bench as rdb
-from leaderboard.scoring.run_sandbox import check_archive, score_archive
-from leaderboard.settings import Settings
+from leaderboard.scoring.sandbox import Outcome, check, score
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.submission import SubmissionMeta
 from tests.synthetic_dataset import write_split_dataset
@@ -31,22 +30,20 @@ def write_archive(root: Path, archive: Path, split: str) -> Path:
 
 @pytest.mark.slow
 def test_only_the_split_test_is_accepted(root: Path, tmp_path: Path) -> None:
-    settings = Settings(data=str(root), state_dir=tmp_path / "state")  # type: ignore[call-arg]
-    refused = check_archive(write_archive(root, tmp_path / "train.zip", "train"), settings, tmp_path)
+    refused = check(write_archive(root, tmp_path / "train.zip", "train"), str(root))
     assert isinstance(refused, tuple)
     [problem] = refused
     assert (problem.code, problem.where) == ("conflict", "cages")
     assert "split train" in str(problem)
-    accepted = check_archive(write_archive(root, tmp_path / "test.zip", "test"), settings, tmp_path)
+    accepted = check(write_archive(root, tmp_path / "test.zip", "test"), str(root))
     assert isinstance(accepted, SubmissionMeta)
 
 
 @pytest.mark.slow
 def test_scored_archive_has_the_groups_of_the_command_line(root: Path, tmp_path: Path) -> None:
     archive = write_archive(root, tmp_path / "test.zip", "test")
-    settings = Settings(data=str(root), state_dir=tmp_path / "state")  # type: ignore[call-arg]
-    outcome = score_archive(archive, open_folder(root).digest, settings, tmp_path, lambda: True)
-    assert outcome is not None
+    outcome = score(archive, str(root), open_folder(root).digest, 0, False)
+    assert isinstance(outcome, Outcome)
     expected = rdb.score(archive, root).to_json()
     assert outcome.result == expected
     assert list(json.loads(expected)["tables"]["cages"]["groups"]["family"]) == ["wall"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
@@ -12,15 +11,7 @@ from leaderboard.db.models import TokenModel
 from leaderboard.db.rankings import LeaderboardEntry, read_ranking
 from leaderboard.service import Service
 from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, ServiceDep
-from leaderboard.web.api.schemas import (
-    COMMON_RESPONSES,
-    MALFORMED_RESPONSE,
-    UNKNOWN_TOKEN_RESPONSE,
-    ErrorResponse,
-    Leaderboard,
-    Responses,
-    row_schema,
-)
+from leaderboard.web.api.schemas import Leaderboard, LeaderboardRow, Responses, errors
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from rebar_depth_bench.reporting.tables import csv_text
 from rebar_depth_bench.scoring.disclosure import DisclosedTable
@@ -38,27 +29,21 @@ def entries_to_csv(rows: Sequence[LeaderboardEntry], hidden_truth: bool = False)
     header = ["rank", "class_rank", "id", "method", "submitter", "inputs", "uses_ground_truth", "config"]
     cells = (
         [
-            *(row.rank, row.class_rank, row.submission_id, row.method, row.submitter),
+            *(row.rank, row.class_rank, row.id, row.method, row.submitter),
             *(row.inputs, row.uses_ground_truth, row.config),
-            *(json.loads(row.table_json).values() if hidden_truth else table_values(json.loads(row.table_json))),
+            *(row.table.values() if hidden_truth else table_values(row.table)),
         ]
         for row in rows
     )
     return csv_text([[*header, *columns], *cells])
 
 
-router = APIRouter(prefix="/api/v1", tags=["leaderboard"], responses=COMMON_RESPONSES)
+router = APIRouter(prefix="/api/v1", tags=["leaderboard"], responses=errors(429, 503))
 
 CSV = "text/csv; charset=utf-8"
 ConfigName = Annotated[str, Query(max_length=100, description="name of the config", examples=["lattice"])]
-_ERROR_RESPONSES: Responses = {
-    **UNKNOWN_TOKEN_RESPONSE,
-    404: {"model": ErrorResponse, "description": "the dataset has no such config"},
-    **MALFORMED_RESPONSE,
-}
+_ERROR_RESPONSES = errors(401, 404, 422)
 _CSV_RESPONSE: Responses = {200: {"content": {"text/csv": {"schema": {"type": "string"}}}}}
-
-
 InputsQuery = Annotated[
     Literal["rgb", "rgb+K", "stereo", "multi-view", "lidar"] | None,
     Query(description="only the rows that declare this input class"),
@@ -70,7 +55,7 @@ def leaderboard(
     config: ConfigName, service: ServiceDep, token: OptionalToken, inputs: InputsQuery = None
 ) -> Response:
     """Return the public rows of a config and, with a token, those of its owner."""
-    rows = [row_schema(row) for row in _rows(service, config, inputs, token)]
+    rows = [LeaderboardRow.model_validate(row) for row in _rows(service, config, inputs, token)]
     dataset = {"digest": service.folder.digest, "version": service.folder.version}
     content = Leaderboard(config=config, protocol=PROTOCOL, dataset=dataset, rows=rows)
     return _response(content.model_dump_json(), "application/json", token)

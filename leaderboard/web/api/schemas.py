@@ -6,17 +6,18 @@ The docstrings of the models are part of the OpenAPI document.
 from __future__ import annotations
 
 import json
-from datetime import UTC, datetime
+from dataclasses import asdict
+from datetime import datetime
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from leaderboard.db.models import SubmissionModel
-from leaderboard.db.rankings import LeaderboardEntry
-from rebar_depth_bench.errors import ProblemCode
+from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.submission.metadata import MethodDetails
 
 _ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
+_PROBLEM = Problem("invalid", "lattice/0042.npy", "the dtype is <i4", "float16, float32 or float64")
 
 
 class ErrorResponse(BaseModel):
@@ -25,15 +26,6 @@ class ErrorResponse(BaseModel):
     model_config = ConfigDict(json_schema_extra={"example": {"detail": "no such submission"}})
 
     detail: str
-
-
-class ProblemDetail(BaseModel):
-    """One problem of a request or of an archive."""
-
-    code: ProblemCode = Field(description="kind of the problem, stable across versions")
-    where: str = Field(description="entry, key or parameter; empty if the problem concerns the whole input")
-    found: str
-    expected: str = Field(description="empty if it is obvious")
 
 
 class RejectedResponse(BaseModel):
@@ -46,22 +38,15 @@ class RejectedResponse(BaseModel):
         json_schema_extra={
             "example": {
                 "detail": "the archive is invalid: 1 problem",
-                "problems": ["lattice/0042.npy: the dtype is <i4, expected float16, float32 or float64"],
-                "problem_details": [
-                    {
-                        "code": "invalid",
-                        "where": "lattice/0042.npy",
-                        "found": "the dtype is <i4",
-                        "expected": "float16, float32 or float64",
-                    }
-                ],
+                "problems": [str(_PROBLEM)],
+                "problem_details": [asdict(_PROBLEM)],
             }
         }
     )
 
     detail: str
     problems: list[str] = Field(description="the problems as text")
-    problem_details: list[ProblemDetail] = Field(description="the listed problems, in the same order")
+    problem_details: list[Problem] = Field(description="the listed problems, in the same order")
 
 
 class Submission(BaseModel):
@@ -147,6 +132,8 @@ class SubmissionChange(MethodDetails):
 class LeaderboardRow(BaseModel):
     """Leaderboard row; ``table`` is the table of the config in the result JSON of the submission."""
 
+    model_config = ConfigDict(from_attributes=True)
+
     rank: int | None = Field(description="rank by rank error, shared by equal errors; null if not ranked")
     rank_range: tuple[int, int] | None = Field(
         description="first and last rank that the paired 95 % differences of the rank error allow"
@@ -175,63 +162,40 @@ class Leaderboard(BaseModel):
 
 def submission_schema(record: SubmissionModel, url: str, result: dict[str, Any] | None = None) -> Submission:
     """Return the API response for a submission; ``url`` is the address of its page, ``result`` its result JSON."""
-    return Submission(
-        id=record.id,
-        status=record.status,  # type: ignore[arg-type]
-        url=url,
-        method=record.method,
-        description=record.description,
-        method_url=record.url,
-        **json.loads(record.details),
-        inputs=record.inputs,
-        uses_ground_truth=record.uses_ground_truth,
-        public=record.public,
-        created_at=_utc_datetime(record.created_at),
-        finished_at=None if record.finished_at is None else _utc_datetime(record.finished_at),
-        reason=record.reason,
-        archive_sha256=record.archive_sha256,
-        archive_bytes=record.archive_bytes,
-        archive_kept=record.archive_deleted_at is None,
-        result=result,
+    return Submission.model_validate(
+        {
+            **{column.key: getattr(record, column.key) for column in SubmissionModel.__table__.columns},
+            **json.loads(record.details),
+            "url": url,
+            "method_url": record.url,
+            "archive_kept": record.archive_deleted_at is None,
+            "result": result,
+        }
     )
-
-
-def row_schema(row: LeaderboardEntry) -> LeaderboardRow:
-    """Return the API response for a leaderboard row."""
-    return LeaderboardRow(
-        rank=row.rank,
-        rank_range=row.rank_range,
-        class_rank=row.class_rank,
-        id=row.submission_id,
-        method=row.method,
-        submitter=row.submitter,
-        url=row.url,
-        uses_intrinsics=row.uses_intrinsics,
-        inputs=row.inputs,
-        uses_ground_truth=row.uses_ground_truth,
-        created_at=_utc_datetime(row.created_at),
-        public=row.public,
-        table=json.loads(row.table_json),
-    )
-
-
-def _utc_datetime(seconds: float) -> datetime:
-    return datetime.fromtimestamp(seconds, UTC)
 
 
 Responses = dict[int | str, dict[str, Any]]
 """OpenAPI ``responses`` by status, as FastAPI expects them."""
-
 DATABASE_UNAVAILABLE_MESSAGE = "the database is unavailable; try again later"
-DATABASE_UNAVAILABLE_RESPONSE: Responses = {
-    503: {"model": ErrorResponse, "description": DATABASE_UNAVAILABLE_MESSAGE}
+_ERRORS = {
+    400: "the body is not valid UTF-8",
+    401: "the token is missing or unknown",
+    403: "you are not the owner of this submission",
+    404: "there is no such submission or config",
+    408: "the client sent nothing for too long",
+    413: "the archive is too large",
+    422: "the request is malformed, or the archive is invalid; it does not count against the quota",
+    429: "too many requests, or the daily quota is used up",
+    503: DATABASE_UNAVAILABLE_MESSAGE,
 }
-COMMON_RESPONSES: Responses = {
-    429: {"model": ErrorResponse, "description": "too many requests"},
-    **DATABASE_UNAVAILABLE_RESPONSE,
-}
-MALFORMED_RESPONSE: Responses = {422: {"model": RejectedResponse, "description": "the request is malformed"}}
-UNKNOWN_TOKEN_RESPONSE: Responses = {401: {"model": ErrorResponse, "description": "the token is unknown"}}
-MISSING_TOKEN_RESPONSE: Responses = {
-    401: {"model": ErrorResponse, "description": "the token is missing or unknown"}
-}
+
+
+def errors(*statuses: int) -> Responses:
+    """Return the OpenAPI responses of errors."""
+    return {
+        status: {
+            "model": RejectedResponse if status == 422 else ErrorResponse,
+            "description": _ERRORS[status],
+        }
+        for status in statuses
+    }

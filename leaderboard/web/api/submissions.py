@@ -14,27 +14,21 @@ from fastapi import APIRouter, HTTPException, Path, Request, Response
 from leaderboard.db import submissions
 from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.service import Service
-from leaderboard.uploads.accept import AcceptedUpload, accept_upload
-from leaderboard.uploads.errors import too_large
-from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES, UploadForm
-from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, RequiredToken, ServiceDep
+from leaderboard.uploads.accept import accept_upload
+from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES, UploadForm, too_large
+from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, RequiredToken, ServiceDep, service_of
 from leaderboard.web.api.schemas import (
-    COMMON_RESPONSES,
-    MALFORMED_RESPONSE,
-    MISSING_TOKEN_RESPONSE,
-    UNKNOWN_TOKEN_RESPONSE,
-    ErrorResponse,
-    RejectedResponse,
     Responses,
     Submission,
     SubmissionChange,
     SubmissionList,
+    errors,
     submission_schema,
 )
 
 MAX_PATCH_BYTES = 32 << 10
 _LOG = structlog.get_logger("submissions")
-router = APIRouter(prefix="/api/v1/submissions", tags=["submissions"], responses=COMMON_RESPONSES)
+router = APIRouter(prefix="/api/v1/submissions", tags=["submissions"], responses=errors(429, 503))
 
 SubmissionId = Annotated[str, Path(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9_-]+$")]
 _BINARY = {"type": "string", "format": "binary"}
@@ -48,22 +42,6 @@ _UPLOAD_REQUEST_BODY = {
         },
     }
 }
-_ERROR_RESPONSES: Responses = {
-    **MISSING_TOKEN_RESPONSE,
-    408: {"model": ErrorResponse, "description": "the client sent nothing for too long"},
-    413: {"model": ErrorResponse, "description": "the archive is too large"},
-    422: {"model": RejectedResponse, "description": "the archive is invalid; it does not count against the quota"},
-    429: {"model": ErrorResponse, "description": "too many requests, or the daily quota is used up"},
-}
-_NOT_FOUND_RESPONSES: Responses = {
-    404: {"model": ErrorResponse, "description": "no such submission"},
-    **MALFORMED_RESPONSE,
-}
-_OWNER_ERROR_RESPONSES: Responses = {
-    **MISSING_TOKEN_RESPONSE,
-    403: {"model": ErrorResponse, "description": "you are not the owner of this submission"},
-    **_NOT_FOUND_RESPONSES,
-}
 _ACCEPTED_RESPONSE: Responses = {
     200: {"description": "the token has sent this archive before; its submission is returned"},
     202: {
@@ -71,13 +49,12 @@ _ACCEPTED_RESPONSE: Responses = {
         "headers": {"Location": {"description": "URL path of the submission", "schema": {"type": "string"}}},
     },
 }
-_UNREADABLE_RESPONSE: Responses = {400: {"model": ErrorResponse, "description": "the body is not valid UTF-8"}}
 
 
 @router.put(
     "",
     status_code=202,
-    responses={**_ACCEPTED_RESPONSE, **_ERROR_RESPONSES},
+    responses={**_ACCEPTED_RESPONSE, **errors(401, 408, 413, 422)},
     openapi_extra={
         "requestBody": {"required": True, "content": {"application/zip": {"schema": _BINARY}}},
     },
@@ -87,32 +64,33 @@ async def upload(request: Request, response: Response, service: ServiceDep, toke
 
     If the token has sent the same archive before, status 200 and that submission are returned.
     """
-    check_length(request, service.settings.max_upload)
+    check_length(request)
     return _accepted(request, response, await accept_upload(service, token, request.stream()))
 
 
 @router.post(
-    "", status_code=202, responses={**_ACCEPTED_RESPONSE, **_ERROR_RESPONSES}, openapi_extra=_UPLOAD_REQUEST_BODY
+    "",
+    status_code=202,
+    responses={**_ACCEPTED_RESPONSE, **errors(401, 408, 413, 422)},
+    openapi_extra=_UPLOAD_REQUEST_BODY,
 )
 async def upload_form(
     request: Request, response: Response, service: ServiceDep, token: RequiredToken
 ) -> Submission:
     """Upload an archive as the field `archive` of a form, with the checks and responses of `PUT`."""
-    check_length(request, service.settings.max_upload + MAX_OVERHEAD_BYTES)
+    check_length(request)
     form = UploadForm(request.stream(), request.headers.get("content-type", ""))
     return _accepted(request, response, await accept_upload(service, token, form.archive()))
 
 
-@router.get("", responses=MISSING_TOKEN_RESPONSE)
+@router.get("", responses=errors(401))
 def list_own(request: Request, service: ServiceDep, token: RequiredToken) -> SubmissionList:
     """Return the submissions of the token, newest first, without their results."""
     records = submissions.of_token(service.database, token)
     return SubmissionList(submissions=[submission_schema(record, page_url(request, record)) for record in records])
 
 
-@router.get(
-    "/{submission_id}", responses={**UNKNOWN_TOKEN_RESPONSE, **_NOT_FOUND_RESPONSES}, openapi_extra=WITHOUT_TOKEN
-)
+@router.get("/{submission_id}", responses=errors(401, 404, 422), openapi_extra=WITHOUT_TOKEN)
 def look_up(submission_id: SubmissionId, request: Request, service: ServiceDep, _: OptionalToken) -> Submission:
     """Return a submission. Its id cannot be guessed and gives read access without a token."""
     record = get_submission(service, submission_id)
@@ -122,7 +100,7 @@ def look_up(submission_id: SubmissionId, request: Request, service: ServiceDep, 
 
 @router.get(
     "/{submission_id}/result.json",
-    responses={**_NOT_FOUND_RESPONSES, 200: {"content": {"application/json": {"schema": {"type": "object"}}}}},
+    responses={**errors(404, 422), 200: {"content": {"application/json": {"schema": {"type": "object"}}}}},
     response_class=Response,
 )
 def result(submission_id: SubmissionId, service: ServiceDep) -> Response:
@@ -138,7 +116,9 @@ def result(submission_id: SubmissionId, service: ServiceDep) -> Response:
 
 
 @router.patch(
-    "/{submission_id}", responses={**_UNREADABLE_RESPONSE, **_OWNER_ERROR_RESPONSES}, max_body_size=MAX_PATCH_BYTES
+    "/{submission_id}",
+    responses=errors(400, 401, 403, 404, 422),
+    max_body_size=MAX_PATCH_BYTES,
 )
 def edit(
     submission_id: SubmissionId,
@@ -153,7 +133,7 @@ def edit(
     return submission_schema(get_submission(service, submission_id), page_url(request, record))
 
 
-@router.delete("/{submission_id}", status_code=204, responses=_OWNER_ERROR_RESPONSES)
+@router.delete("/{submission_id}", status_code=204, responses=errors(401, 403, 404, 422))
 def delete(submission_id: SubmissionId, service: ServiceDep, token: RequiredToken) -> None:
     """Delete a submission with its archive and results; only the owner may do this. The quota is not restored."""
     delete_submission(service, get_own_submission(service, submission_id, token))
@@ -181,19 +161,19 @@ def delete_submission(service: Service, record: SubmissionModel) -> None:
         _LOG.warning("archive not deleted", submission=record.id[:6], error=str(error))
 
 
-def check_length(request: Request, max_bytes: int) -> None:
-    """Raise ``UploadRejectedError`` (413) if the body is declared to be larger than ``max_bytes``.
+def check_length(request: Request) -> None:
+    """Raise ``UploadRejectedError`` (413) if the body is declared to be larger than that of any upload.
 
     A client that waits for 100 Continue then sends nothing of it.
     """
-    length = request.headers.get("content-length", "")
-    if length.isdecimal() and int(length) > max_bytes:
-        raise too_large(request.app.state.service.settings.max_upload)
+    length, max_upload = request.headers.get("content-length", ""), service_of(request).settings.max_upload
+    if length.isdecimal() and int(length) > max_upload + MAX_OVERHEAD_BYTES:
+        raise too_large(max_upload)
 
 
-def _accepted(request: Request, response: Response, accepted: AcceptedUpload) -> Submission:
-    record = accepted.record
-    response.status_code = 202 if accepted.is_new else 200
+def _accepted(request: Request, response: Response, accepted: tuple[SubmissionModel, bool]) -> Submission:
+    record, is_new = accepted
+    response.status_code = 202 if is_new else 200
     response.headers["Location"] = request.url_for("look_up", submission_id=record.id).path
     return submission_schema(record, page_url(request, record))
 
@@ -216,7 +196,7 @@ def get_own_submission(service: Service, submission_id: str, token: TokenModel) 
 
 def page_url(request: Request, record: SubmissionModel) -> str:
     """Return the URL of a submission's page, below the public URL if the settings have one."""
-    url = request.app.state.service.settings.public_url
+    url = service_of(request).settings.public_url
     if url:
         return f"{url}/submissions/{record.id}"
     return str(request.url_for("submission_page", submission_id=record.id))

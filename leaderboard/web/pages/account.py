@@ -6,6 +6,7 @@ forms need no further protection against forged requests.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 from urllib.parse import parse_qsl
@@ -16,20 +17,19 @@ from fastapi.responses import HTMLResponse
 from pydantic import ValidationError
 
 from leaderboard.db import submissions
-from leaderboard.db.models import SubmissionModel, TokenModel
+from leaderboard.db.models import TokenModel
 from leaderboard.db.tokens import find_token
 from leaderboard.service import Service
 from leaderboard.web.api.auth import ServiceDep
-from leaderboard.web.api.schemas import SubmissionChange, submission_schema
+from leaderboard.web.api.schemas import SubmissionChange
 from leaderboard.web.api.submissions import (
     MAX_PATCH_BYTES,
     delete_submission,
     edit_submission,
     get_own_submission,
-    page_url,
 )
 from leaderboard.web.cache import NO_STORE
-from leaderboard.web.pages.rendering import format_size, format_time, render
+from leaderboard.web.pages.rendering import render
 from rebar_depth_bench.errors import printable
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -40,7 +40,7 @@ EDITABLE = ("description", "url", "code_url", "licence", "training_data", "param
 @router.get("/account", name="account_page")
 async def account_page(request: Request) -> HTMLResponse:
     """Return the form that asks for the token."""
-    return render(request, "account.html.j2", token="", name="", message="", own=[], editable=EDITABLE)
+    return render(request, "account.html.j2", token="", message="")
 
 
 @router.post("/account", max_body_size=MAX_PATCH_BYTES)
@@ -50,17 +50,15 @@ async def account(request: Request, service: ServiceDep) -> HTMLResponse:
     text = fields.get("token", "").strip()
     token = await to_thread.run_sync(find_token, service.database, text)
     if token is None:
+        challenge = {"WWW-Authenticate": "Bearer"}
+        message = "The token is unknown."
         return render(
-            request,
-            "account.html.j2",
+            *(request, "account.html.j2"),
             status_code=401,
             cache=NO_STORE,
-            headers={"WWW-Authenticate": "Bearer"},
+            headers=challenge,
             token="",
-            name="",
-            message="The token is unknown.",
-            own=[],
-            editable=EDITABLE,
+            message=message,
         )
     status, message = await to_thread.run_sync(_change, service, token, fields)
     records = await to_thread.run_sync(submissions.of_token, service.database, token)
@@ -70,9 +68,12 @@ async def account(request: Request, service: ServiceDep) -> HTMLResponse:
         status_code=status,
         cache=NO_STORE,
         token=text,
-        name=printable(token.name),
+        name=token.name,
         message=message,
-        own=[_line(service, request, record) for record in records],
+        own=[
+            (record, {"description": record.description, "url": record.url, **json.loads(record.details)})
+            for record in records
+        ],
         editable=EDITABLE,
     )
 
@@ -87,8 +88,7 @@ def _change(service: Service, token: TokenModel, fields: Mapping[str, str]) -> t
         if action == "delete":
             delete_submission(service, record)
             return 200, f"{printable(record.method)} is deleted."
-        change = _change_of(action, fields)
-        edit_submission(service, record, change)
+        edit_submission(service, record, _change_of(action, fields))
     except HTTPException as error:
         return error.status_code, f"Not changed: {error.detail}."
     except ValidationError as error:
@@ -105,24 +105,3 @@ def _change_of(action: str, fields: Mapping[str, str]) -> SubmissionChange:
         raise HTTPException(422, "there is no such action")
     values: dict[str, Any] = {name: fields[name].strip() or None for name in EDITABLE if name in fields}
     return SubmissionChange.model_validate(values)
-
-
-def _line(service: Service, request: Request, record: SubmissionModel) -> dict[str, Any]:
-    submission = submission_schema(record, page_url(request, record))
-    return {
-        "id": record.id,
-        "method": printable(record.method),
-        "status": record.status,
-        "public": record.public,
-        "can_withdraw": service.settings.default_visibility != "always",
-        "created": format_time(record.created_at),
-        "size": format_size(record.archive_bytes),
-        "values": {
-            "description": submission.description or "",
-            "url": submission.method_url or "",
-            "code_url": submission.code_url or "",
-            "licence": submission.licence or "",
-            "training_data": submission.training_data or "",
-            "parameters": "" if submission.parameters is None else submission.parameters,
-        },
-    }

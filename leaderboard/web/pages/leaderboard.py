@@ -1,28 +1,36 @@
-"""Ranking of a config as shown in its table and plot: submitted rows, and the paper's rows, which are unranked.
+"""Page of the leaderboard: tables and plots of configs, and the overview of ranks across them.
 
-Rows are filtered, sorted and divided into pages on the server, so that an address shows the same rows to everyone.
-The columns define what ``?sort=NAME`` sorts by.
+A table has submitted rows, and the paper's rows, which are unranked.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from operator import itemgetter
-from typing import Any
-from urllib.parse import urlencode
+from typing import Annotated
 
+from fastapi import APIRouter, HTTPException, Query, Request
+from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
 from leaderboard.db.rankings import LeaderboardEntry, Ranking
-from leaderboard.names import confused_scripts
-from leaderboard.web.pages.disclosed import disclosed_row
-from leaderboard.web.pages.rendering import MAX_INTERVALS_PLOTTED, DisplayTime, Link, format_time, link
+from leaderboard.db.versions import CurrentRankings
+from leaderboard.web.api.auth import ServiceDep
+from leaderboard.web.pages.rendering import MAX_INTERVALS_PLOTTED, render
+from leaderboard.web.pages.selection import (
+    NATIVE,
+    PAGE_ROWS,
+    RANK,
+    SCALED,
+    WITHIN,
+    Selection,
+    parse_selection,
+)
 from rebar_depth_bench.errors import printable
+from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
-from rebar_depth_bench.reporting.formatting import interval_note, reference_rows
 from rebar_depth_bench.reporting.html.published import (
     PaperRow,
     finite_interval,
@@ -30,155 +38,69 @@ from rebar_depth_bench.reporting.html.published import (
     published_row,
     scatter_points,
 )
-from rebar_depth_bench.reporting.html.rows import ScoreRow, table_row
+from rebar_depth_bench.reporting.html.rows import Cell, ScoreRow, table_row
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published
+from rebar_depth_bench.scoring.disclosure import DECIMALS as DISCLOSED_DECIMALS
 from rebar_depth_bench.scoring.disclosure import DisclosedTable
-from rebar_depth_bench.scoring.metrics import METRICS
+from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Table
 from rebar_depth_bench.scoring.result_io import read_table
-from rebar_depth_bench.submission.metadata import INPUTS
 
-PAGE_ROWS = 50
-"""Number of submitted rows on a page of a config."""
-RANK = "rank"
-_MAX_QUERY_CHARACTERS = 100
-TableJson = Mapping[str, Any]
+router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
-
-@dataclass(frozen=True)
-class Column:
-    """A sortable column: its name in URLs, the path of its value in a table's JSON, whether more is better."""
-
-    name: str
-    path: tuple[str, ...]
-    largest_first: bool
-
-    def value(self, table: TableJson) -> float | None:
-        """Return the value, or None if it is undefined or hidden."""
-        found: Any = table
-        for key in self.path:
-            found = found.get(key) if isinstance(found, dict) else None
-        return found if isinstance(found, int | float) else None
-
-
-NATIVE = tuple(
-    Column(name.removesuffix("_cm"), ("native", name), info.higher_is_better) for name, info in METRICS.items()
-)
-SCALED = tuple(
-    Column(f"scaled_{column.name}", ("scaled", column.path[1]), column.largest_first) for column in NATIVE
-)
-WITHIN = tuple(Column(f"within_{t}mm", ("within_mm", str(t)), True) for t in WITHIN_MM)
-RANK_ERROR, SCALE = Column("rank_error", ("rank_error",), False), Column("scale", ("scale_median",), False)
-COVERAGE = Column("coverage", ("coverage",), True)
-COLUMNS = {column.name: column for column in (RANK_ERROR, *NATIVE, *SCALED, SCALE, *WITHIN, COVERAGE)}
-METHOD = "method"
-
-
-@dataclass(frozen=True)
-class Selection:
-    """Rows of a page: their order (a name of ``COLUMNS``, ``rank`` or ``method``), filters, and the page's number.
-
-    Best first, or worst first if ``inverted``. ``text`` is searched in the names of methods and submitters.
-    """
-
-    order: str = RANK
-    inverted: bool = False
-    inputs: str | None = None
-    text: str = ""
-    page: int = 1
-
-    @property
-    def is_descending(self) -> bool:
-        """Whether values decrease from top to bottom."""
-        return (self.order in COLUMNS and COLUMNS[self.order].largest_first) != self.inverted
-
-    def heading(self, name: str) -> str | None:
-        """Return the ``aria-sort`` value of a column's heading, or None if the rows are not sorted by it."""
-        if name != self.order:
-            return None
-        return "descending" if self.is_descending else "ascending"
-
-    def sorted_by(self, name: str) -> Selection:
-        """Return the selection of a column's link: best first, or inverted if the rows are sorted by it."""
-        inverted = name == self.order and not self.inverted
-        return replace(self, order=name, inverted=inverted, page=1)
-
-    def of_class(self, inputs: str | None) -> Selection:
-        """Return the selection of the rows that declare ``inputs``."""
-        return replace(self, inputs=inputs, page=1)
-
-    def at_page(self, page: int) -> Selection:
-        """Return the selection of another page."""
-        return replace(self, page=page)
-
-    def query(self, **others: str | None) -> str:
-        """Return the URL query of the selection, after the parameters ``others``."""
-        sort = f"{'-' * self.inverted}{self.order}"
-        values = {
-            **others,
-            "inputs": self.inputs,
-            "q": self.text,
-            "sort": "" if sort == RANK else sort,
-            "page": "" if self.page == 1 else str(self.page),
-        }
-        return urlencode({name: value for name, value in values.items() if value})
-
-    def matches(self, entry: LeaderboardEntry) -> bool:
-        """Return whether a row passes the filters."""
-        text = self.text.casefold()
-        return (self.inputs is None or entry.inputs == self.inputs) and (
-            text in entry.method.casefold() or text in entry.submitter.casefold()
-        )
-
-
-def parse_selection(sort: str | None, inputs: str | None, text: str | None, page: int | None) -> Selection:
-    """Return the selection of URL parameters; invalid values are replaced by their defaults."""
-    name = (sort or RANK).removeprefix("-")
-    if name not in (RANK, METHOD, *COLUMNS):
-        sort, name = None, RANK
-    return Selection(
-        order=name,
-        inverted=bool(sort) and sort != name,
-        inputs=inputs if inputs in INPUTS else None,
-        text=(text or "").strip()[:_MAX_QUERY_CHARACTERS],
-        page=max(1, page or 1),
-    )
-
-
-def sort_indices(rows: Sequence[tuple[LeaderboardEntry, TableJson]], selection: Selection) -> list[int]:
-    """Return the indices that sort the rows; missing values come last in both directions."""
-
-    def key(entry: LeaderboardEntry, table: TableJson) -> float | str | None:
-        if selection.order == METHOD:
-            return entry.method.casefold()
-        return entry.rank if selection.order == RANK else COLUMNS[selection.order].value(table)
-
-    keys = [key(entry, table) for entry, table in rows]
-    present = [(value, index) for index, value in enumerate(keys) if value is not None]
-    missing = [index for index, value in enumerate(keys) if value is None]
-    present.sort(key=itemgetter(0), reverse=selection.is_descending)
-    return [index for _, index in present] + missing
-
-
+NameQuery = Annotated[str | None, Query(max_length=100)]
+_PageQuery = Annotated[int | None, Query(ge=1, le=1_000_000)]
+_FIRST_ROWS, _FIRST_PLOTTED = 10, 300
+"""Rows and plotted points per config on the page of several configs, which links to the full rankings."""
 _CACHED_ROWS = 4096
+MISSING_ERROR = 1.0
+"""Rank error that counts where a submission lacks a config: that of no prediction at all."""
+_DECIMALS, _SIGNIFICANT_DIGITS = 4, 12
+
+
+@router.get("/", name="board_page")
+def leaderboard_page(
+    request: Request,
+    service: ServiceDep,
+    config: NameQuery = None,
+    sort: NameQuery = None,
+    inputs: NameQuery = None,
+    q: NameQuery = None,
+    page: _PageQuery = None,
+) -> HTMLResponse:
+    """Return the page with an overview and the first rows of all configs, or with the rows of ``config``.
+
+    The other parameters are those of ``parse_selection``.
+    """
+    all_configs, rankings = service.folder.configs, service.rankings
+    if config is not None and config not in all_configs:
+        raise HTTPException(404, f"the dataset has no config {config!r}, expected one of {', '.join(all_configs)}")
+    configs = all_configs if config is None else (config,)
+    selection = parse_selection(sort, inputs, q, page)
+    several, hidden_truth = len(configs) > 1, service.settings.hidden_truth
+    shown = selection.but() if several else selection
+    limits = (_FIRST_ROWS, _FIRST_PLOTTED) if several else (PAGE_ROWS, None)
+    return render(
+        request,
+        "board.html.j2",
+        configs=all_configs,
+        chosen=config,
+        selection=selection,
+        overview=make_overview(rankings, configs, selection, hidden_truth) if several else None,
+        rankings=[make_config_ranking(rankings.of(name), name, shown, hidden_truth, *limits) for name in configs],
+        columns={"native": NATIVE, "scaled": SCALED, "within": WITHIN},
+        paper_part=load_published().parts["synthetic"],
+    )
 
 
 @dataclass(frozen=True)
 class RankingLine:
-    """A submitted row as displayed; ``scripts`` are those that its name mixes and that resemble each other."""
+    """A submitted row, its formatted numbers, and its table unless the ground truth is hidden."""
 
-    rank: int | None
-    rank_range: tuple[int, int] | None
-    class_rank: int | None
-    submission_id: str
-    submitter: str
-    inputs: str | None
-    uses_ground_truth: bool | None
-    link: Link | None
-    when: DisplayTime
-    scripts: list[str]
+    entry: LeaderboardEntry
     row: ScoreRow
+    table: Table | None
 
 
 @dataclass(frozen=True)
@@ -187,8 +109,7 @@ class ConfigRanking:
 
     ``row_count`` is the number of rows that pass the filters, ``lines`` the rows of the page, ``references`` the
     rows of reference errors (name, native and scaled cells), ``published`` the rows of the paper and ``distance``
-    their camera distance. ``plotted`` is the number of points of submissions. ``interval_note`` explains the
-    confidence intervals.
+    their camera distance. ``plotted`` is the number of points of submissions.
     """
 
     config: str
@@ -201,7 +122,6 @@ class ConfigRanking:
     distance: str
     chart: Markup | None
     plotted: int
-    interval_note: str
 
     @property
     def interval(self) -> bool:
@@ -209,27 +129,14 @@ class ConfigRanking:
         return any(line.row.has_interval() for line in self.lines)
 
     @property
+    def interval_note(self) -> str:
+        """Explanation of the confidence intervals."""
+        return formatting.interval_note(line.table for line in self.lines if line.table)
+
+    @property
     def dash(self) -> bool:
         """Whether any number is shown as undefined."""
         return any(line.row.has_dash() for line in self.lines)
-
-    @property
-    def rank_ranges(self) -> bool:
-        """Whether any rank is shown with its range."""
-        return any(line.rank_range for line in self.lines)
-
-    @property
-    def dagger(self) -> bool:
-        """Whether any published row took its scale from the ground truth."""
-        return any(row.dagger for row in self.published)
-
-
-@dataclass(frozen=True)
-class _FormattedRow:
-    """A row, and its table unless the ground truth is hidden."""
-
-    table: Table | None
-    row: ScoreRow
 
 
 def make_config_ranking(
@@ -244,102 +151,141 @@ def make_config_ranking(
 
     The chart has a point for every selected row; there is none if that makes more than ``max_plotted`` points.
     """
-    rows = [(entry, _parse_table(entry.table_json)) for entry in ranking.entries if selection.matches(entry)]
-    pages = max(1, -(-len(rows) // page_rows))
-    selection = selection.at_page(min(selection.page, pages))
-    start = (selection.page - 1) * page_rows
-    shown = [rows[index][0] for index in sort_indices(rows, selection)[start : start + page_rows]]
-    formatted = [_format_row(entry.method, entry.table_json, hidden_truth) for entry in shown]
-    published, distance = _published(formatted)
+    rows = [entry for entry in ranking.entries if selection.matches(entry)]
+    shown, selection, pages = selection.page_of(selection.sorted(rows), page_rows)
+    lines = [RankingLine(entry, *_formatted(entry.method, entry.table_json, hidden_truth)) for entry in shown]
+    tables = [line.table for line in lines if line.table]
+    published, distance = _published(tables)
     points = _plot_points(rows)
     chart = None
     if points and (max_plotted is None or len(points) <= max_plotted):
         title = f"{printable(config)}: native and scaled AbsRel"
         chart = scatter_chart(title, [*points, *scatter_points(published, {})])
+    references = (formatting.reference_rows(table.reference) for table in tables)
     return ConfigRanking(
         config=printable(config),
         selection=selection,
         row_count=len(rows),
         pages=pages,
-        references=_references(formatted),
-        lines=[_ranking_line(entry, numbers.row) for entry, numbers in zip(shown, formatted, strict=True)],
+        references=next(filter(None, references), []),  # Tables of the previous protocol have none.
+        lines=lines,
         published=published,
         distance=distance,
         chart=chart,
         plotted=len(points),
-        interval_note=interval_note(row.table for row in formatted if row.table),
     )
 
 
-def _references(formatted: Sequence[_FormattedRow]) -> list[tuple[str, list[str], list[str]]]:
-    """Return the reference rows, which every table of the current protocol contains."""
-    tables = (row.table for row in formatted if row.table)
-    return next((rows for table in tables if (rows := reference_rows(table.reference))), [])
-
-
 @lru_cache(maxsize=_CACHED_ROWS)
-def _parse_table(table_json: str) -> TableJson:
-    """Return a table's JSON object; cached, because most rows stay the same when the content changes."""
-    table: TableJson = json.loads(table_json)
-    return table
-
-
-@lru_cache(maxsize=_CACHED_ROWS)
-def _format_row(method: str, table_json: str, hidden_truth: bool) -> _FormattedRow:
+def _formatted(method: str, table_json: str, hidden_truth: bool) -> tuple[ScoreRow, Table | None]:
     """Return the formatted numbers of a row; cached, because they depend on the arguments only."""
     if hidden_truth:
-        return _FormattedRow(None, disclosed_row(method, DisclosedTable.model_validate_json(table_json)))
+        return disclosed_row(method, DisclosedTable.model_validate_json(table_json)), None
     table = read_table(json.loads(table_json))
-    return _FormattedRow(table, table_row(method, replace(table, split=None)))
+    return table_row(method, replace(table, split=None)), table
 
 
-def _ranking_line(entry: LeaderboardEntry, row: ScoreRow) -> RankingLine:
-    return RankingLine(
-        rank=entry.rank,
-        rank_range=entry.rank_range,
-        class_rank=entry.class_rank,
-        submission_id=entry.submission_id,
-        submitter=printable(entry.submitter),
-        inputs=entry.inputs,
-        uses_ground_truth=entry.uses_ground_truth,
-        link=link(entry.url),
-        when=format_time(entry.created_at),
-        scripts=confused_scripts(entry.method),
-        row=row,
+def disclosed_row(name: str, table: DisclosedTable) -> ScoreRow:
+    """Return the row of a config or submission; the cells of numbers that are not disclosed are empty."""
+    empty = Cell("", None)
+    metrics = [empty] * len(METRIC_NAMES)
+    return ScoreRow(
+        name=printable(name),
+        views=empty,
+        coverage=Cell(formatting.coverage_percent(table.coverage), table.coverage),
+        rank_error=Cell(formatting.number(table.rank_error, DISCLOSED_DECIMALS), table.rank_error),
+        ranked=table.ranked and table.rank_error is not None,
+        notes=[],
+        findings=[],
+        native=metrics,
+        scaled=metrics,
+        scale=empty,
+        within=[empty] * len(WITHIN_MM),
     )
 
 
-def _plot_points(rows: Sequence[tuple[LeaderboardEntry, TableJson]]) -> list[ScatterPoint]:
+def _plot_points(rows: Sequence[LeaderboardEntry]) -> list[ScatterPoint]:
     """Return the points of all rows with both errors; each is labelled by its rank, "–" if it is not ranked."""
-    columns = (NATIVE[0], SCALED[0])
     points = []
-    for entry, table in rows:
-        native, scaled = (column.value(table) for column in columns)
+    for entry in rows:
+        native, scaled = (column.value(entry.table) for column in (NATIVE[0], SCALED[0]))
         if native is None or scaled is None:
             continue
         intervals = [
-            _interval(table, ".".join(column.path)) if len(rows) <= MAX_INTERVALS_PLOTTED else None
-            for column in columns
+            finite_interval(column.interval(entry.table)) if len(rows) <= MAX_INTERVALS_PLOTTED else None
+            for column in (NATIVE[0], SCALED[0])
         ]
         mark = "–" if entry.rank is None else str(entry.rank)
         points.append(ScatterPoint(mark, entry.method, native, scaled, False, *intervals))
     return points
 
 
-def _interval(table: TableJson, name: str) -> tuple[float, float] | None:
-    ends = table.get("ci95", {})
-    for key in name.split("."):
-        ends = ends.get(key) if isinstance(ends, dict) else None
-    if not isinstance(ends, list) or len(ends) != 2 or not all(isinstance(end, int | float) for end in ends):
-        return None
-    return finite_interval((ends[0], ends[1]))
-
-
-def _published(formatted: Sequence[_FormattedRow]) -> tuple[list[PaperRow], str]:
+def _published(tables: Sequence[Table]) -> tuple[list[PaperRow], str]:
     """Return the paper's rows of the scene that the config shows, and their camera distance."""
-    match = next((match for row in formatted if row.table and (match := row.table.published)), None)
+    match = next((table.published for table in tables if table.published), None)
     scene = load_published().scenes.get(match.scene) if match else None
     if match is None or scene is None:
         return [], ""
     rows = [published_row(published_mark(k), row) for k, row in enumerate(scene.rows)]
     return rows, scene.distance if match.same_optics else f"{scene.distance} {OTHER_OPTICS_NOTE}"
+
+
+@dataclass(frozen=True)
+class OverviewLine:
+    """A submission, its mean rank error over all configs, and its entries by config; ``rank`` None: not ranked."""
+
+    mean: float
+    entries: dict[str, LeaderboardEntry]
+    rank: int | None = None
+
+    @property
+    def first(self) -> LeaderboardEntry:
+        """An entry of the submission."""
+        return next(iter(self.entries.values()))
+
+    @property
+    def is_ranked(self) -> bool:
+        """Whether the submission is ranked in any config."""
+        return any(entry.rank is not None for entry in self.entries.values())
+
+
+@dataclass(frozen=True)
+class Overview:
+    """Rows of a page of the overview, the number of rows that pass the filters, and the decimals of errors."""
+
+    selection: Selection
+    row_count: int
+    pages: int
+    lines: Sequence[OverviewLine]
+    decimals: int
+
+
+def make_overview(
+    rankings: CurrentRankings, configs: Sequence[str], selection: Selection, hidden_truth: bool
+) -> Overview:
+    """Return the overview, ordered by the mean rank error over ``configs``.
+
+    A config that a submission lacks counts ``MISSING_ERROR``; results of different submissions are not combined.
+    """
+    by_id: dict[str, dict[str, LeaderboardEntry]] = {}
+    for config in configs:
+        for entry in rankings.of(config).entries:
+            by_id.setdefault(entry.id, {})[config] = entry
+    all_lines = [OverviewLine(_mean_error(entries, configs), entries) for entries in by_id.values()]
+    ranked = [line for line in all_lines if line.is_ranked]
+    ranked.sort(key=lambda line: (line.mean, line.first.created_at))
+    first: dict[float, int] = {}
+    lines = [replace(line, rank=first.setdefault(line.mean, place)) for place, line in enumerate(ranked, 1)]
+    lines += [line for line in all_lines if not line.is_ranked]
+    if selection.order == RANK and selection.inverted:
+        lines.reverse()
+    lines = [line for line in lines if selection.matches(line.first)]
+    shown, selection, pages = selection.page_of(lines)
+    decimals = DISCLOSED_DECIMALS if hidden_truth else _DECIMALS
+    return Overview(selection, len(lines), pages, shown, decimals)
+
+
+def _mean_error(entries: dict[str, LeaderboardEntry], configs: Sequence[str]) -> float:
+    errors = [entries[config].rank_error if config in entries else None for config in configs]
+    mean = sum(MISSING_ERROR if error is None else error for error in errors) / len(configs)
+    return float(f"{mean:.{_SIGNIFICANT_DIGITS}g}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 from urllib.parse import urlsplit
@@ -11,7 +11,9 @@ from urllib.parse import urlsplit
 from fastapi import Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from jinja2 import Environment, PackageLoader
+from markupsafe import Markup
 
+from leaderboard.names import confused_scripts
 from leaderboard.service import Service
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.pages.static import static_path
@@ -27,7 +29,31 @@ from rebar_depth_bench.version import software_version
 
 def make_templates() -> Environment:
     """Return the Jinja environment of the pages, which also contains the templates of the report."""
-    return environment(PackageLoader("leaderboard.web.pages", "templates"))
+    templates = environment(PackageLoader("leaderboard.web.pages", "templates"))
+    templates.filters.update(
+        clean=clean_text,
+        link=link_html,
+        number=formatting.number,
+        printable=printable,
+        scripts=confused_scripts,
+        size=format_size,
+        time=time_html,
+    )
+    templates.globals.update(
+        protocol=PROTOCOL,
+        metric_heads=formatting.METRIC_HEADS,
+        tolerances=WITHIN_MM,
+        dash_note=formatting.DASH_NOTE,
+        reference_note=formatting.REFERENCE_NOTE,
+        input_classes=INPUTS,
+        plural=formatting.plural,
+        is_degenerate=lambda interval: len(set(interval.split(" – "))) == 1,
+        picture_titles=PICTURE_TITLES,
+        max_intervals=MAX_INTERVALS_PLOTTED,
+        paper_title=load_published().title,
+        coverage_rule=COVERAGE_RULE,
+    )
+    return templates
 
 
 def render(
@@ -46,49 +72,25 @@ def render(
     return HTMLResponse(content, status_code, {"Cache-Control": cache, **(headers or {})})
 
 
-def root_path(request: Request) -> str:
-    """Return the URL path below which the service is mounted, without a trailing slash.
-
-    It is the only value, apart from the address, that pages take from the request.
-    """
-    return str(request.scope.get("root_path", "").rstrip("/"))
-
-
-def service_address(request: Request) -> str:
-    """Return the public URL of the settings, or the base URL as seen by the client, without a trailing slash."""
-    service: Service = request.app.state.service
-    return service.settings.public_url or str(request.base_url).rstrip("/")
-
-
 def _common_context(request: Request, service: Service) -> dict[str, Any]:
-    root = root_path(request)
+    """Return the context of all pages; of the request, it depends on the path below which the service is only."""
+    root = str(request.scope.get("root_path", "").rstrip("/"))
+    settings = service.settings
     return {
         "root": root,
         "static": lambda name: root + static_path(name),
-        "site": printable(service.settings.title),
-        "protocol": PROTOCOL,
+        "site": printable(settings.title),
+        "settings": settings,
         "stamps": [
             ("Protocol", PROTOCOL),
             ("Dataset version", printable(service.folder.version)),
             ("Dataset digest", printable(service.folder.digest)),
             ("Software", f"rebar-depth-bench {software_version()}"),
         ],
-        "metric_heads": formatting.METRIC_HEADS,
-        "tolerances": WITHIN_MM,
-        "dash_note": formatting.DASH_NOTE,
-        "reference_note": formatting.REFERENCE_NOTE,
-        "input_classes": INPUTS,
-        "plural": formatting.plural,
-        "is_degenerate": lambda interval: len(set(interval.split(" – "))) == 1,
-        "hidden_truth": service.settings.hidden_truth,
-        "contact": printable(service.settings.contact),
-        "dataset_name": printable(service.card.name),
-        "dataset_licence": printable(service.card.licence),
+        "hidden_truth": settings.hidden_truth,
+        "contact": printable(settings.contact),
+        "service": service,
         "view_counts": service.view_counts,
-        "picture_titles": PICTURE_TITLES,
-        "max_intervals": MAX_INTERVALS_PLOTTED,
-        "paper_title": load_published().title,
-        "coverage_rule": COVERAGE_RULE,
     }
 
 
@@ -100,26 +102,19 @@ MAX_TEXT_CHARS = 4000
 _STEPS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
 
 
-@dataclass(frozen=True)
-class DisplayTime:
-    """A time as display text and in ISO 8601."""
-
-    text: str
-    iso: str
-
-
-@dataclass(frozen=True)
-class Link:
-    """A method's URL and the host name that is displayed for it."""
-
-    address: str
-    host: str
-
-
-def format_time(seconds: float) -> DisplayTime:
-    """Return a Unix timestamp in seconds as a time in UTC."""
+def time_html(seconds: float, date_only: bool = False) -> Markup:
+    """Return a Unix timestamp in seconds as a ``time`` element in UTC."""
     when = datetime.fromtimestamp(seconds, UTC)
-    return DisplayTime(when.strftime("%Y-%m-%d %H:%M UTC"), when.strftime("%Y-%m-%dT%H:%M:%SZ"))
+    text = when.strftime("%Y-%m-%d" if date_only else "%Y-%m-%d %H:%M UTC")
+    return Markup('<time datetime="{}">{}</time>').format(when.strftime("%Y-%m-%dT%H:%M:%SZ"), text)
+
+
+def link_html(url: str | None) -> Markup:
+    """Return a link that shows the host of a submitter's URL; nothing if it is no valid http or https URL."""
+    if not url or not is_http_url(url):
+        return Markup()
+    link = Markup('<a href="{}" rel="nofollow noopener noreferrer">{}</a>')
+    return link.format(url, printable(urlsplit(url).hostname or "", 60))
 
 
 def clean_text(text: str | None) -> str:
@@ -127,13 +122,6 @@ def clean_text(text: str | None) -> str:
     truncated = (text or "")[: MAX_TEXT_CHARS + 1]
     clean = "\n".join(printable(line, MAX_TEXT_CHARS + 1) for line in truncated.splitlines())
     return clean if len(clean) <= MAX_TEXT_CHARS else clean[: MAX_TEXT_CHARS - 1] + "…"
-
-
-def link(url: str | None) -> Link | None:
-    """Return the link for a method's URL, or None if it is not a valid http or https URL."""
-    if not url or not is_http_url(url):
-        return None
-    return Link(url, printable(urlsplit(url).hostname or "", 60))
 
 
 def format_size(count: int) -> str:

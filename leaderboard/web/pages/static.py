@@ -1,65 +1,43 @@
-"""Static files: style sheets and scripts of this package and of the report, served without a build step.
+"""Style sheets, scripts and the icon, of this package and of the report, and a picture of each config.
 
-URLs contain a digest of the content, so that browsers can cache a file permanently and fetch a new version when
-it changes.
+URLs of files contain a digest, so that browsers can keep a file and fetch a new version when it changes.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+import io
 from importlib.resources import files
 
 from fastapi import APIRouter, HTTPException, Request, Response
+from PIL import Image
+
+from leaderboard.web.api.auth import ServiceDep
+from rebar_depth_bench.data.dataset import iterate_undecoded
+from rebar_depth_bench.data.decoding import RowDecoder
+from rebar_depth_bench.data.manifest import DatasetFolder
 
 router = APIRouter(include_in_schema=False)
 
+_REPORT, _OWN = files("rebar_depth_bench.reporting.html"), files("leaderboard.web.pages").joinpath("static")
 _STYLE, _SCRIPT = "text/css; charset=utf-8", "text/javascript; charset=utf-8"
-_SOURCES = {
-    "report.css": ("rebar_depth_bench.reporting.html", "report.css", _STYLE),
-    "sortable.js": ("rebar_depth_bench.reporting.html", "sortable.js", _SCRIPT),
-    "page.css": ("leaderboard.web.pages", "static/page.css", _STYLE),
-    "page.js": ("leaderboard.web.pages", "static/page.js", _SCRIPT),
+STATIC = {
+    "report.css": (_REPORT.joinpath("report.css").read_bytes(), _STYLE),
+    "sortable.js": (_REPORT.joinpath("sortable.js").read_bytes(), _SCRIPT),
+    "page.css": (_OWN.joinpath("page.css").read_bytes(), _STYLE),
+    "page.js": (_OWN.joinpath("page.js").read_bytes(), _SCRIPT),
+    "icon.svg": (_OWN.joinpath("icon.svg").read_bytes(), "image/svg+xml"),
 }
+"""Content and media type of the files."""
+_DIGESTS = {name: hashlib.sha256(content).hexdigest()[:16] for name, (content, _) in STATIC.items()}
 _MAX_AGE_S, _IMMUTABLE_MAX_AGE_S = 300, 31536000
 """Cache lifetimes without and with the current digest in the URL."""
-
-
-@dataclass(frozen=True)
-class StaticFile:
-    """Content, media type and digest (first 16 hexadecimal digits of its SHA-256) of a static file."""
-
-    content: bytes
-    media_type: str
-    digest: str
-
-
-_ICON = (
-    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32">'
-    '<rect width="32" height="32" rx="6" fill="#14171b"/>'
-    '<path d="M9 5v22M16 5v22M23 5v22" stroke="#74a9ff" stroke-width="3"/>'
-    '<path d="M5 11h22M5 21h22" stroke="#fb923c" stroke-width="3"/></svg>'
-)
-
-
-def _read(package: str, name: str, media_type: str) -> StaticFile:
-    return _file(files(package).joinpath(name).read_bytes(), media_type)
-
-
-def _file(content: bytes, media_type: str) -> StaticFile:
-    return StaticFile(content, media_type, hashlib.sha256(content).hexdigest()[:16])
-
-
-STATIC: Mapping[str, StaticFile] = {
-    **{name: _read(*source) for name, source in _SOURCES.items()},
-    "icon.svg": _file(_ICON.encode(), "image/svg+xml"),
-}
+_SCENE_WIDTH, _SCENE_AGE_S = 480, 3600
 
 
 def static_path(name: str) -> str:
     """Return the URL path of a file below the root path, with its digest."""
-    return f"/static/{name}?v={STATIC[name].digest}"
+    return f"/static/{name}?v={_DIGESTS[name]}"
 
 
 @router.get("/static/{name}", name="static")
@@ -67,13 +45,38 @@ def static(name: str, request: Request, v: str = "") -> Response:
     """Return a file, or 304 if the client's copy is current."""
     if name not in STATIC:
         raise HTTPException(404, "no such file")
-    file = STATIC[name]
-    cache_control = (
-        f"public, max-age={_IMMUTABLE_MAX_AGE_S}, immutable"
-        if v == file.digest
-        else f"public, max-age={_MAX_AGE_S}"
-    )
-    headers = {"ETag": f'"{file.digest}"', "Cache-Control": cache_control}
-    if file.digest in request.headers.get("if-none-match", ""):
+    (content, media_type), digest = STATIC[name], _DIGESTS[name]
+    lifetime = f"max-age={_IMMUTABLE_MAX_AGE_S}, immutable" if v == digest else f"max-age={_MAX_AGE_S}"
+    headers = {"ETag": f'"{digest}"', "Cache-Control": f"public, {lifetime}"}
+    if digest in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=headers)
-    return Response(file.content, media_type=file.media_type, headers=headers)
+    return Response(content, media_type=media_type, headers=headers)
+
+
+@router.get("/scenes/{config}.webp")
+def scene(config: str, service: ServiceDep) -> Response:
+    """Return a picture of a config. Raises status 404 if the config is unknown or has no colour."""
+    if config in service.folder.configs and config not in service.scenes:
+        service.scenes[config] = _scene_webp(service.folder, config)
+    webp = service.scenes.get(config)
+    if webp is None:
+        raise HTTPException(404, "there is no such config, or it has no colour")
+    headers = {"Cache-Control": f"public, max-age={_SCENE_AGE_S}"}
+    return Response(webp, media_type="image/webp", headers=headers)
+
+
+def _scene_webp(folder: DatasetFolder, config: str) -> bytes | None:
+    """Return the left image of the first view, reduced, as WebP, or None if the config has no colour.
+
+    Raises ``DatasetError`` if the shard cannot be read.
+    """
+    shown = folder.config(config)
+    row = next(iter(iterate_undecoded(shown, ("view_id", "left_rgb"))), None)
+    rgb = None if row is None else RowDecoder.of(shown).row(row)["left_rgb"]
+    if rgb is None:
+        return None
+    image = Image.fromarray(rgb)
+    image.thumbnail((_SCENE_WIDTH, _SCENE_WIDTH))
+    out = io.BytesIO()
+    image.save(out, "WEBP", quality=80)
+    return out.getvalue()

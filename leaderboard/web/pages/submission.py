@@ -1,25 +1,33 @@
-"""Template context of a submission's page: status, tables, views sorted worst first, and error maps."""
+"""Pages of submissions: status, tables, views sorted worst first, pictures of views, and comparisons of two."""
 
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
 
-from fastapi import HTTPException
+from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
+from fastapi.responses import HTMLResponse
 
 from leaderboard.db.models import SubmissionModel
-from leaderboard.db.rankings import LeaderboardEntry, picture_facts, queue_position, submitter_name
+from leaderboard.db.rankings import (
+    LeaderboardEntry,
+    picture_facts,
+    picture_webp,
+    queue_position,
+    submitter_name,
+)
 from leaderboard.db.submissions import QUEUED, SCORED, SCORING, result_json, result_notes
-from leaderboard.names import confused_scripts
 from leaderboard.service import Service
-from leaderboard.web.pages.disclosed import disclosed_context
-from leaderboard.web.pages.rendering import PICTURE_TITLES, clean_text, format_size, format_time, link
+from leaderboard.web.api.auth import ServiceDep
+from leaderboard.web.api.submissions import SubmissionId, get_submission
+from leaderboard.web.cache import NO_STORE, REVALIDATE
+from leaderboard.web.pages.leaderboard import NameQuery, disclosed_row
+from leaderboard.web.pages.rendering import PICTURE_TITLES, clean_text, render
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.reporting.charts import score_charts
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
+from rebar_depth_bench.reporting.comparison_tables import COMPARISON_NOTE, comparison_cells, views_note
 from rebar_depth_bench.reporting.formatting import ground_truth_text, inputs_text
 from rebar_depth_bench.reporting.html.page import (
     WORST_SHOWN,
@@ -28,106 +36,138 @@ from rebar_depth_bench.reporting.html.page import (
     results_context,
     views_by_config,
 )
-from rebar_depth_bench.reporting.html.rows import ScoreRow, view_row
-from rebar_depth_bench.reporting.html.view_images import PANEL_WIDTH, colour_bar_uri
+from rebar_depth_bench.reporting.html.rows import view_row
+from rebar_depth_bench.reporting.html.view_images import colour_bar_uri
+from rebar_depth_bench.scoring.comparison import compare
+from rebar_depth_bench.scoring.disclosure import read_disclosed
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.result_io import read_result
 from rebar_depth_bench.scoring.view_score import ViewScore, sort_key_worst_first
 from rebar_depth_bench.submission import Declaration
 from rebar_depth_bench.view_ids import config_of
 
-
-@dataclass(frozen=True)
-class PicturedView:
-    """A view with pictures: its numbers, their size in pixels, kinds and the texts of their colour bars.
-
-    ``near``, ``far`` and ``limit`` are empty in submissions that an earlier version scored.
-    """
-
-    row: ScoreRow
-    view_id: str
-    width: int
-    height: int
-    kinds: list[str]
-    near: str
-    far: str
-    limit: str
-
+router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
 MAX_OTHERS = 50
 """Number of submissions offered for a comparison."""
 _UNREADABLE = "The stored result was written by another version of this software, which must show it."
+_IdQuery = Annotated[str, Query(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9_-]+$")]
+PathPart = Annotated[str, Path(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
 
-def submission_context(service: Service, record: SubmissionModel, full_config: str | None) -> dict[str, Any]:
-    """Return the template context of a submission's page.
+@router.get("/submissions/{submission_id}", name="submission_page")
+def submission_page(
+    submission_id: SubmissionId, request: Request, service: ServiceDep, views: NameQuery = None
+) -> HTMLResponse:
+    """Return the page of a submission, which anyone who knows its URL may read.
 
-    Of the config ``full_config`` all views are listed, of the others the worst.
+    All views of the config ``views`` are listed, and the worst views of the others.
     """
-    database = service.database
-    declared = Declaration(record.inputs, record.uses_ground_truth)
-    return {
-        "id": record.id,
-        "status": record.status,
-        "waits": record.status in (QUEUED, SCORING),
-        "place": queue_position(database, record),
-        "public": record.public,
-        "method": printable(record.method),
-        "description": clean_text(record.description),
-        "link": link(record.url),
-        "declared": [
-            ("Inputs", inputs_text(declared)),
-            ("Ground truth", ground_truth_text(declared)),
-            *_details(record),
+    record = get_submission(service, submission_id)
+    cache = _cache_control(record.public and record.status == SCORED)
+    scored = _result_context(service, record, views) if record.status == SCORED else {"scored": False}
+    return render(
+        request,
+        "submission.html.j2",
+        cache=cache,
+        record=record,
+        waits=record.status in (QUEUED, SCORING),
+        place=queue_position(service.database, record),
+        submitter=submitter_name(service.database, record),
+        details=_details(record),
+        **{"reason": record.reason, **scored},
+    )
+
+
+@router.get("/submissions/{submission_id}/pictures/{kind}/{config}/{number}.webp", response_class=Response)
+def picture(
+    submission_id: SubmissionId,
+    kind: Literal["colour", "truth", "prediction", "error"],
+    config: PathPart,
+    number: PathPart,
+    service: ServiceDep,
+) -> Response:
+    """Return a picture of a view. Raises status 404 if it is not stored."""
+    record = get_submission(service, submission_id)
+    webp = picture_webp(service.database, submission_id, f"{config}/{number}", kind)
+    if webp is None:
+        raise HTTPException(404, "there is no such picture of this view")
+    return Response(webp, media_type="image/webp", headers={"Cache-Control": _cache_control(record.public)})
+
+
+@router.get("/compare")
+def compare_page(request: Request, service: ServiceDep, a: _IdQuery, b: _IdQuery) -> HTMLResponse:
+    """Return the comparison of two scored submissions, which anyone who knows their ids may read.
+
+    Every metric has the paired difference and its 95 % interval. Raises status 404 if one has no result or the
+    ground truth is hidden, and 422 if they cannot be compared.
+    """
+    records = [get_submission(service, submission_id) for submission_id in (a, b)]
+    if service.settings.hidden_truth:
+        raise HTTPException(404, "the ground truth is hidden; submissions are not compared view by view")
+    contents = [result_json(service.database, record.id) for record in records]
+    if None in contents:
+        raise HTTPException(404, "the submission is not scored")
+    try:
+        first, other = (read_result(content or b"", "the submission") for content in contents)
+        comparison = compare(first, other)
+    except InputError as error:
+        raise HTTPException(422, str(error)) from None
+    return render(
+        request,
+        "comparison.html.j2",
+        cache=_cache_control(all(record.public for record in records)),
+        pair=records,
+        compared=[
+            (printable(config), views_note(differences), [comparison_cells(one) for one in differences])
+            for config, differences in comparison.configs.items()
         ],
-        "code_link": link(json.loads(record.details).get("code_url")),
-        "scripts": confused_scripts(record.method),
-        "archive_deleted": record.archive_deleted_at is not None,
-        "submitter": printable(submitter_name(database, record)),
-        "created": format_time(record.created_at),
-        "finished": None if record.finished_at is None else format_time(record.finished_at),
-        "sha256": record.archive_sha256,
-        "size": format_size(record.archive_bytes),
-        "reason": clean_text(record.reason),
-        **(_result_context(service, record, full_config) if record.status == SCORED else {"scored": False}),
-    }
+        note=COMPARISON_NOTE,
+    )
 
 
-def _details(record: SubmissionModel) -> list[tuple[str, str]]:
-    """Return heading and text of what the submitter says about the method."""
-    details = json.loads(record.details)
+def _cache_control(public: bool) -> str:
+    return REVALIDATE if public else NO_STORE
+
+
+def _details(record: SubmissionModel) -> dict[str, Any]:
+    """Return what the submitter says about the method: texts by heading, and the URL of the code."""
+    declared, details = Declaration(record.inputs, record.uses_ground_truth), json.loads(record.details)
     parameters, seconds = details.get("parameters"), details.get("seconds_per_view")
     texts = {
+        "Inputs": inputs_text(declared),
+        "Ground truth": ground_truth_text(declared),
         "Training data": clean_text(details.get("training_data")),
         "Parameters": f"{parameters:,}" if isinstance(parameters, int) else printable(str(parameters or "")),
         "Runtime per view": "" if seconds is None else f"{seconds:.3g} s",
         "Licence": printable(details.get("licence") or ""),
     }
-    return [(name, text) for name, text in texts.items() if text]
+    return {"texts": {name: text for name, text in texts.items() if text}, "code_url": details.get("code_url")}
 
 
 def _result_context(service: Service, record: SubmissionModel, full_config: str | None) -> dict[str, Any]:
     data = result_json(service.database, record.id)
     if data is None:  # Deleted since its row was read.
         raise HTTPException(404, "no such submission")
-    ranks = _entries(service, record)
+    context = {"scored": True, "ranks": _entries(service, record)}
     try:
         if service.settings.hidden_truth:
-            return {"ranks": ranks, **disclosed_context(data, record.id)}
+            disclosed = read_disclosed(data, record.id)
+            rows = [disclosed_row(name, table) for name, table in disclosed.tables.items()]
+            return {**context, "result_protocol": disclosed.protocol, "configs": rows}
         result = read_result(data, record.id)
     except InputError:
         return {"scored": False, "reason": _UNREADABLE, "configs": [], "ranks": {}}
     views = views_by_config(result)
     configs = [_config_views(name, views[name], name == full_config) for name in result.tables]
     return {
-        "scored": True,
+        **context,
         "result_protocol": result.protocol,
-        "ranks": ranks,
         "configs": configs,
         "dash_in_views": any(row.has_dash() for config in configs for row in config.worst),
         "pictured": _pictured_views(service, record.id, result),
-        "notes": [clean_text(note) for note in result_notes(service.database, record.id)],
-        "others": _others(service, record, ranks),
+        "notes": result_notes(service.database, record.id),
+        "others": _others(service, record),
         "depth_bar": colour_bar_uri(DEPTH_COLOURS[::-1]),
         "error_bar": colour_bar_uri(ERROR_COLOURS),
         **results_context(result, views),
@@ -155,37 +195,29 @@ def _entries(service: Service, record: SubmissionModel) -> dict[str, Leaderboard
     return {config: entry for config, entry in entries.items() if entry is not None and entry.rank is not None}
 
 
-def _others(
-    service: Service, record: SubmissionModel, ranks: Mapping[str, LeaderboardEntry]
-) -> list[tuple[str, str]]:
-    """Return id and name of the best other submissions of the first config, for a comparison."""
-    config = next(iter(ranks), None)
+def _others(service: Service, record: SubmissionModel) -> list[LeaderboardEntry]:
+    """Return the best other submissions of the first config in which this one is ranked, for a comparison."""
+    config = next(iter(_entries(service, record)), None)
     entries = service.rankings.of(config).entries if config else ()
-    others = [(entry.submission_id, printable(entry.method, 60)) for entry in entries]
-    return [other for other in others if other[0] != record.id][:MAX_OTHERS]
+    return [entry for entry in entries if entry.id != record.id][:MAX_OTHERS]
 
 
-def _pictured_views(service: Service, submission_id: str, result: Result) -> list[PicturedView]:
-    """Return the views with pictures, grouped by config and sorted worst first."""
+def _pictured_views(service: Service, submission_id: str, result: Result) -> list[dict[str, Any]]:
+    """Return the views with pictures, grouped by config and sorted worst first.
+
+    Pictures that an earlier version stored have no facts: size, and texts of their colour bars.
+    """
     pictures = picture_facts(service.database, submission_id)
     views = [view for view in result.views if view.view_id in pictures]
     order = {config: index for index, config in enumerate(result.tables)}
     views.sort(key=lambda view: (order[config_of(view.view_id)], -sort_key_worst_first(view)))
-    return [_pictured_view(service, view, *pictures[view.view_id]) for view in views]
-
-
-def _pictured_view(
-    service: Service, view: ViewScore, facts: Mapping[str, Any], kinds: Sequence[str]
-) -> PicturedView:
-    height, width = service.folder.config(config_of(view.view_id)).grid
-    step = max(1, round(width / PANEL_WIDTH))
-    return PicturedView(
-        row=view_row(view),
-        view_id=view.view_id,
-        width=facts.get("width", math.ceil(width / step)),
-        height=facts.get("height", math.ceil(height / step)),
-        kinds=[kind for kind in PICTURE_TITLES if kind in kinds],
-        near=facts.get("near", ""),
-        far=facts.get("far", ""),
-        limit=facts.get("limit", ""),
-    )
+    return [
+        {
+            "row": view_row(view),
+            "view_id": view.view_id,
+            "facts": facts,
+            "kinds": [kind for kind in PICTURE_TITLES if kind in kinds],
+        }
+        for view in views
+        for facts, kinds in [pictures[view.view_id]]
+    ]

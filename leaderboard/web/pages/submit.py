@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import Sequence
 from urllib.parse import urlsplit
 
 from anyio import to_thread
@@ -13,15 +13,20 @@ from leaderboard.db.models import SubmissionModel
 from leaderboard.db.tokens import find_token
 from leaderboard.service import Service
 from leaderboard.uploads.accept import accept_upload
-from leaderboard.uploads.errors import UploadRejectedError
-from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES, UploadForm
-from leaderboard.web.api.auth import ServiceDep
+from leaderboard.uploads.multipart import UploadForm, UploadRejectedError
+from leaderboard.web.api.auth import ServiceDep, service_of
 from leaderboard.web.api.submissions import check_length, page_url
 from leaderboard.web.cache import NO_STORE, REVALIDATE
-from leaderboard.web.pages.rendering import clean_text, format_size, problem_lines, render, service_address
+from leaderboard.web.pages.rendering import clean_text, problem_lines, render
 from rebar_depth_bench.view_ids import TEST_SPLIT
 
 router = APIRouter(include_in_schema=False)
+
+
+@router.get("/how-to-submit", name="how_to_submit", response_class=HTMLResponse)
+async def how_to_submit(request: Request) -> HTMLResponse:
+    """Return the page with submission instructions and the upload form."""
+    return _how_to_page(request)
 
 
 @router.post("/submit", response_class=HTMLResponse)
@@ -32,50 +37,45 @@ async def submit(request: Request, service: ServiceDep) -> Response:
     form, which alone authenticates the request.
     """
     try:
-        check_length(request, service.settings.max_upload + MAX_OVERHEAD_BYTES)
-        record = await _accept_form_upload(service, request.stream(), request)
+        check_length(request)
+        record = await _accept_form_upload(service, request)
     except UploadRejectedError as error:
-        return how_to_page(request, error.status, error.detail, problem_lines(error.problems))
+        return _how_to_page(request, error.status, error.detail, problem_lines(error.problems))
     # Path only: behind a proxy, Content-Security-Policy form-action rejects a scheme other than the browser's.
     return RedirectResponse(urlsplit(page_url(request, record)).path, 303)
 
 
-def how_to_page(
+def _how_to_page(
     request: Request, status: int = 200, message: str = "", problems: Sequence[str] = ()
 ) -> HTMLResponse:
     """Return the page; after a rejected upload with the error message, its problems and its HTTP status."""
-    service: Service = request.app.state.service
-    settings = service.settings
-    headers = {"WWW-Authenticate": "Bearer"} if status == 401 else {}
+    service = service_of(request)
+    configs = service.folder.configs
     return render(
         request,
         "how_to.html.j2",
         status_code=status,
         cache=NO_STORE if message else REVALIDATE,
-        headers=headers,
+        headers={"WWW-Authenticate": "Bearer"} if status == 401 else None,
         refusal=clean_text(message),
         problems=[clean_text(problem) for problem in problems if problem != message],
-        address=service_address(request),
-        quota=settings.quota,
-        quota_size=format_size(settings.quota_bytes),
-        most=format_size(settings.max_upload),
-        most_bytes=settings.max_upload,
-        always_public=settings.default_visibility == "always",
-        dataset_configs=service.folder.configs,
+        address=service.settings.public_url or str(request.base_url).rstrip("/"),
+        dataset_configs=configs,
         first_view=next(iter(service.folder.expected_views(TEST_SPLIT)), ""),
     )
 
 
-async def _accept_form_upload(service: Service, body: AsyncIterator[bytes], request: Request) -> SubmissionModel:
+async def _accept_form_upload(service: Service, request: Request) -> SubmissionModel:
     """Accept the archive of the form; the token is checked before any of the archive is stored.
 
     Raises ``UploadRejectedError``.
     """
-    form = UploadForm(body, request.headers.get("content-type", ""))
+    form = UploadForm(request.stream(), request.headers.get("content-type", ""))
     text = (await form.token()).strip()
     if not text:
         raise UploadRejectedError(401, "no token, expected the token that you received from the operator")
     token = await to_thread.run_sync(find_token, service.database, text)
     if token is None:
         raise UploadRejectedError(401, "the token is unknown")
-    return (await accept_upload(service, token, form.archive())).record
+    record, _ = await accept_upload(service, token, form.archive())
+    return record

@@ -6,10 +6,7 @@ Rows that exist are those of protocol rebar-1: they have no rank error and are n
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0002"
-down_revision = "0001"
-branch_labels = None
-depends_on = None
+revision, down_revision = "0002", "0001"
 
 
 def upgrade() -> None:

@@ -1,0 +1,119 @@
+"""Function calls in a process of their own, with limits of time and memory, to read untrusted archives.
+
+What crashes, hangs or needs too much memory there concerns a single archive. The process runs with the rights of
+the service: it is no barrier against code that an archive would manage to run.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import os
+import resource
+import signal
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar
+
+POLL_INTERVAL_S = 1.0
+NICENESS = 10
+MIN_MEMORY_BYTES = 1 << 30
+"""Minimum memory limit: interpreter, libraries and thread stacks alone take several hundred megabytes."""
+_PR_SET_PDEATHSIG = 1
+_SPAWN = multiprocessing.get_context("spawn")
+
+T = TypeVar("T")
+
+
+class UnavailableError(Exception):
+    """Raised by a function, and in the calling process, if its work is impossible for now."""
+
+
+class ProcessEndedError(Exception):
+    """Raised when the process has ended without a value.
+
+    ``status`` is its exit status, ``was_killed`` tells whether something outside has ended it.
+    """
+
+    def __init__(self, status: int | None) -> None:
+        self.status, self.was_killed = status, status in (-signal.SIGKILL, -signal.SIGTERM)
+        super().__init__(f"the process exited with status {status}")
+
+
+class TimeLimitError(Exception):
+    """Raised when the process has reached its time limit."""
+
+
+class StoppedError(Exception):
+    """Raised when ``should_continue`` returned False."""
+
+
+def call_isolated(
+    function: Callable[..., T],
+    *arguments: object,
+    memory: int,
+    time_limit_s: float,
+    step_s: float = POLL_INTERVAL_S,
+    should_continue: Callable[[], bool] = lambda: True,
+) -> T:
+    """Return the value of ``function(*arguments)``, which runs in a new process.
+
+    ``memory`` is its limit in bytes; ``should_continue`` is called about every ``step_s`` seconds. Raises
+    ``TimeLimitError``, ``StoppedError``, ``ProcessEndedError``, and ``UnavailableError`` also if no process can be
+    started.
+    """
+    receiver, sender = _SPAWN.Pipe(duplex=False)
+    process = _SPAWN.Process(target=_run, args=(sender, memory, os.getpid(), function, arguments))
+    deadline = time.monotonic() + time_limit_s
+    with receiver:
+        with sender:  # Closed here, so that the end of the other process is noticed.
+            try:
+                process.start()
+            except OSError as error:  # Out of memory or processes.
+                raise UnavailableError(str(error)) from None
+        try:
+            while not receiver.poll(min(step_s, max(0.0, deadline - time.monotonic()))):
+                if time.monotonic() >= deadline:
+                    raise TimeLimitError
+                if not should_continue():
+                    raise StoppedError
+            value: T | UnavailableError = receiver.recv()
+        except EOFError:
+            process.join()
+            raise ProcessEndedError(process.exitcode) from None
+        finally:
+            process.kill()
+            process.join()
+            process.close()
+    if isinstance(value, UnavailableError):
+        raise value
+    return value
+
+
+def _run(
+    sender: Connection, memory: int, parent: int, function: Callable[..., object], arguments: tuple[Any, ...]
+) -> None:
+    """Send the value of the function from a process whose output is discarded, because it could fill the log."""
+    with open(os.devnull, "w") as null:  # noqa: PTH123
+        for stream in (1, 2):
+            os.dup2(null.fileno(), stream)
+    limit_process(memory, parent)
+    try:
+        sender.send(function(*arguments))
+    except UnavailableError as error:
+        sender.send(error)
+
+
+def limit_process(memory: int, parent: int) -> None:
+    """Limit the memory of this process to ``memory`` bytes and have it killed when process ``parent`` dies.
+
+    Its priority is lowered, so that it does not slow down the server, and core dumps are disabled.
+    """
+    os.nice(NICENESS)
+    limit = max(memory, MIN_MEMORY_BYTES)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))  # Not RLIMIT_AS, because archives are memory-mapped.
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # The parent died before the signal was set.
+        os.kill(os.getpid(), signal.SIGKILL)
