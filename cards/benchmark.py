@@ -14,6 +14,7 @@ from cards.reference import FULL_SETS, SUBSET, number, percent, reference_contex
 from cards.steel import STEEL_RESULTS, depth_text, range_text
 from cards.templates import render
 from rebar_depth_bench.bar_crossings.definition import crossing_parameters
+from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW
 from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
 from rebar_depth_bench.extended.inspection.tolerances import PROFILES
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
@@ -86,6 +87,7 @@ def benchmark_card() -> str:
         fits_note=FITS_NOTE,
         reach_note=REACH_NOTE,
         contacts=_CONTACTS,
+        max_rows=f"{MAX_ROWS_PER_VIEW:,}",
         families=[_family_rows(family) for family in MEASURE_FAMILIES.values()],
         profiles=PROFILES,
     )

@@ -44,6 +44,7 @@ class Limit:
 JSON_BYTES = Limit("json_bytes", 64 * _MIB, "a JSON file or answer: manifest, result, export record")
 TOML_BYTES = Limit("toml_bytes", _MIB, "a scene, calibration or model description, and any other small text file")
 TABLE_BYTES = Limit("table_bytes", _GIB, "the decoded size of `bars.parquet` and of `crossings.parquet`")
+DETECTIONS_BYTES = Limit("detections_bytes", 256 * _MIB, "a file of detected crossings, also decoded")
 CELL_BYTES = Limit("cell_bytes", 256 * _MIB, "an encoded image or depth map of a dataset row")
 IMAGE_PIXELS = Limit("image_pixels", 100_000_000, "an image of a capture or of KITTI, before it is decoded")
 MESH_BYTES = Limit("mesh_bytes", _GIB, "a PLY, STL, OBJ or glTF file")
@@ -61,6 +62,7 @@ LIMITS = (
     JSON_BYTES,
     TOML_BYTES,
     TABLE_BYTES,
+    DETECTIONS_BYTES,
     CELL_BYTES,
     IMAGE_PIXELS,
     MESH_BYTES,

@@ -17,7 +17,16 @@ OUTPUT_OPTIONS = (
 """Names (argparse dest) of the options that are output paths."""
 STANDARD_OUTPUT_OPTIONS = ("--json", "--csv")
 """Options whose file may be ``-``, standard output."""
-INPUT_FILE_OPTIONS = ("archive", "archives", "first", "others", "method", "token_file", "scene_files")
+INPUT_FILE_OPTIONS = (
+    "archive",
+    "detections",
+    "archives",
+    "first",
+    "others",
+    "method",
+    "token_file",
+    "scene_files",
+)
 """Names of the options that are files to read; a method may be ``FILE.py:NAME`` or ``FILE.toml``."""
 INPUT_FOLDER_OPTIONS = ("data", "predictions", "kitti", "methods", "reference")
 """Names of the options that are folders to read, or files or Hub repositories in their place."""

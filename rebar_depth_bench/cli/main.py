@@ -15,6 +15,7 @@ from rebar_depth_bench.cli import (
     predict,
     push_results,
     score,
+    score_crossings,
     submissions,
     submit,
     table,
@@ -29,6 +30,7 @@ from rebar_depth_bench.version import software_version
 
 COMMANDS: Mapping[str, Command] = {
     "score": score,
+    "score-crossings": score_crossings,
     "compare": compare,
     "table": table,
     "check": check,

@@ -10,6 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
 from dataset_builder.cli import argument_parser as builder_parser
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.quality import colour_spec
@@ -24,13 +28,19 @@ from rebar_depth_bench.methods.controls import noisy_depth_m
 from rebar_depth_bench.submission import check_archive
 from tests.fuzz.entry_point import EntryPoint, bench, run_options
 from tests.fuzz.workspace import CACHE, CASE, Workspace
+from tests.mat_dataset import write_mat_dataset
 from tests.synthetic_dataset import write_split_dataset
 
 TINY = Path(__file__).parents[1] / "data" / "tiny"
 CONFIG = "lattice-orbit"
 ROOT = f"{CASE}/root"
 SHARDS = f"{ROOT}/{CONFIG}/*.parquet"
-METADATA = (f"{ROOT}/manifest.json", f"{ROOT}/README.md", f"{ROOT}/bars.parquet")
+METADATA = (
+    f"{ROOT}/manifest.json",
+    f"{ROOT}/README.md",
+    f"{ROOT}/bars.parquet",
+    f"{ROOT}/crossings.parquet",
+)
 OPTIONAL_OUTPUTS = (
     *("--html", "r.html", "--csv", "r.csv", "--extended-csv", "e.csv", "--html-views", "1"),
     *("--eval-results", "h.yaml", "--hub-id", "org/rebar"),
@@ -120,6 +130,34 @@ def _export(workspace: Workspace) -> None:
     run_options(builder_parser(), "export", data, "--out", workspace.out / "export", "--config", CONFIG)
 
 
+def _write_mat_and_detections(workspace: Workspace) -> None:
+    """Write a dataset with judged crossings, and files of detections in a view of it."""
+    root = workspace.root / ROOT
+    root.mkdir(parents=True)
+    write_mat_dataset(root)
+    rows = [
+        {
+            "view_id": "mat/0000",
+            "x": 0.01 * i,
+            "y": 0.0,
+            "z": 0.4,
+            "nx": 0.0,
+            "ny": 0.0,
+            "nz": 1.0,
+            "confidence": i,
+        }
+        for i in range(-3, 4)
+    ]
+    pd.DataFrame(rows).to_csv(workspace.case / "d.csv", index=False)
+    table = pa.Table.from_pylist(rows).replace_schema_metadata({"method": "detector", "inputs": "rgb"})
+    pq.write_table(table, workspace.case / "d.parquet")
+
+
+def _score_crossings(workspace: Workspace, name: str) -> None:
+    outputs = ("--json", workspace.out / "c.json", "--html", workspace.out / "c.html")
+    bench("score-crossings", workspace.case / name, "--data", workspace.root / ROOT, *outputs)
+
+
 def _verify(workspace: Workspace) -> None:
     bench("verify", workspace.root / ROOT)
 
@@ -146,6 +184,7 @@ _DATASET_FILES = (
     "manifest.json",
     "README.md",
     "bars.parquet",
+    "crossings.parquet",
     "eval.yaml",
     "pictures/*.webp",
     "meshes/*.ply",
@@ -198,6 +237,20 @@ DATASET_ENTRIES = (
         (f"{ROOT}/manifest.json", SHARDS),
         check=check_predictions,
         kept_outputs=(".p.zip.views/*", ".p.zip.views"),
+    ),
+    EntryPoint(
+        "score-crossings: CSV",
+        4,
+        _write_mat_and_detections,
+        partial(_score_crossings, name="d.csv"),
+        (f"{CASE}/d.csv",),
+    ),
+    EntryPoint(
+        "score-crossings: Parquet",
+        4,
+        _write_mat_and_detections,
+        partial(_score_crossings, name="d.parquet"),
+        (f"{CASE}/d.parquet", f"{ROOT}/crossings.parquet"),
     ),
     EntryPoint("load: streaming", 8, write_dataset, _stream, (*METADATA[:2], SHARDS)),
     EntryPoint("load", 3, write_dataset, _load, (*METADATA[:2], SHARDS)),

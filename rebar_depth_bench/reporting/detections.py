@@ -1,0 +1,150 @@
+"""Page and terminal tables of a detector of crossings: numbers with intervals, and precision over recall."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
+from rebar_depth_bench.detections.matching import MATCH_M
+from rebar_depth_bench.detections.result import AVERAGE_PRECISION_MM, DetectionResult, DetectionTable
+from rebar_depth_bench.errors import printable
+from rebar_depth_bench.reporting import formatting
+from rebar_depth_bench.reporting.charts.lines import HEIGHT, LEFT, RIGHT, TOP, ChartText, LinearAxis, Series, chart
+from rebar_depth_bench.reporting.html.study_page import Columns, PageFigure, PageTable, StudyPage, page_table
+from rebar_depth_bench.version import software_version
+
+Row = tuple[str, DetectionTable]
+"""Name and table of a config, or of all together."""
+
+_PERCENT: dict[str, str] = {
+    "precision": "Precision ↑",
+    "recall": "Recall ↑",
+    "f1": "F1 ↑",
+    "node_recall": "Recall of nodes ↑",
+}
+_ERRORS: dict[str, tuple[str, str]] = {
+    "position_mm": ("Position ↓", "mm, median"),
+    "position_p95_mm": ("Position ↓", "mm, p95"),
+    "normal_deg": ("Normal ↓", "degrees, median"),
+    "normal_p95_deg": ("Normal ↓", "degrees, p95"),
+}
+
+
+def detection_page(result: DetectionResult) -> StudyPage:
+    """Return the page of a result; its tables are also those of the terminal."""
+    rows: list[Row] = list(result.tables.items())
+    if len(rows) > 1:
+        rows.append(("all", result.pooled))
+    threshold = result.least_confidence
+    matched = "all detections" if threshold is None else f"detections with a confidence of {threshold:g} or more"
+    method = printable(result.meta.method)
+    return StudyPage(
+        study="crossings",
+        title=f"{method}: detected crossings of bars",
+        lead=f"Crossings that the left image shows well enough are to be found. Matched within "
+        f"{1000 * MATCH_M:g} mm: {matched}.",
+        stamps=_stamps(result),
+        figures=[_curve_figure(name, table) for name, table in rows],
+        tables=(_share_table(rows), _average_table(rows), _error_table(rows), _count_table(rows)),
+        notes=_notes(result),
+    )
+
+
+def _stamps(result: DetectionResult) -> list[tuple[str, str]]:
+    declared = result.meta.declaration
+    return [
+        ("Protocol", CROSSINGS_PROTOCOL),
+        ("Inputs", formatting.inputs_text(declared)),
+        ("Ground truth", formatting.ground_truth_text(declared)),
+        ("Dataset", f"{printable(result.dataset_version)} ({printable(result.dataset_digest)})"),
+        ("Crossings", f"{printable(result.source.file)} {printable(result.source.sha256)}"),
+        ("File", printable(result.sha256)),
+        ("Software", f"rebar-depth-bench {printable(software_version())}"),
+    ]
+
+
+def _percent_cells(name: str) -> tuple[Callable[[Row], str], Callable[[Row], str]]:
+    def value(row: Row) -> str:
+        number = row[1].numbers[name]
+        return formatting.number(None if number is None else 100 * number, 1)
+
+    return value, lambda row: formatting.interval_cell(row[1].intervals[name], 1, 100.0)
+
+
+def _share_table(rows: list[Row]) -> PageTable:
+    columns: list[tuple[str, str, Callable[[Row], str]]] = [("Config", "", lambda row: printable(row[0]))]
+    for name, title in _PERCENT.items():
+        value, ends = _percent_cells(name)
+        columns += [(title, "%", value), (title, "95 % interval", ends)]
+    return page_table("Precision and recall, pooled over views.", columns, rows)
+
+
+def _average_table(rows: list[Row]) -> PageTable:
+    columns: list[tuple[str, str, Callable[[Row], str]]] = [("Config", "", lambda row: printable(row[0]))]
+    for limit in AVERAGE_PRECISION_MM:
+        value, ends = _percent_cells(f"average_precision_{limit}mm")
+        columns += [(f"AP at {limit} mm ↑", "%", value), (f"AP at {limit} mm ↑", "95 % interval", ends)]
+    caption = "Average precision over all confidences: greedy matching, the most confident first."
+    return page_table(caption, columns, rows)
+
+
+def _error_cells(name: str) -> tuple[Callable[[Row], str], Callable[[Row], str]]:
+    return (
+        lambda row: formatting.number(row[1].numbers[name], 2),
+        lambda row: formatting.interval_text(row[1].intervals[name], 2),
+    )
+
+
+def _error_table(rows: list[Row]) -> PageTable:
+    columns: list[tuple[str, str, Callable[[Row], str]]] = [("Config", "", lambda row: printable(row[0]))]
+    for name, (title, unit) in _ERRORS.items():
+        value, ends = _error_cells(name)
+        columns += [(title, unit, value), (title, "95 % interval", ends)]
+    return page_table("Errors of matched detections: tie point, and normal where one is given.", columns, rows)
+
+
+def _count(name: str) -> Callable[[Row], str]:
+    return lambda row: str(row[1].counts[name])
+
+
+def _count_table(rows: list[Row]) -> PageTable:
+    columns: Columns[Row] = (
+        ("Config", "", lambda row: printable(row[0])),
+        ("Views", "", lambda row: str(row[1].views)),
+        ("Crossings", "judged", _count("crossings")),
+        ("Nodes", "judged", _count("nodes")),
+        ("Detections", "", _count("detections")),
+        ("Matched", "", _count("matched")),
+        ("False", "", _count("false")),
+        ("Ignored", "", _count("ignored")),
+    )
+    return page_table("Numbers over all views.", columns, rows)
+
+
+def _curve_figure(name: str, table: DetectionTable) -> PageFigure:
+    series = [
+        Series(f"{limit} mm", colour, line=[(0.0, curve[0][1]), *curve] if curve else [])
+        for colour, (limit, curve) in enumerate(table.curves.items())
+    ]
+    average = "; ".join(
+        f"average precision at {limit} mm: {_percent_cells(f'average_precision_{limit}mm')[0]((name, table))} %"
+        for limit in AVERAGE_PRECISION_MM
+    )
+    labels = ChartText(f"Precision over recall, {name}", average, "recall", "precision")
+    svg = chart(series, LinearAxis(0, 1, LEFT, RIGHT), LinearAxis(0, 1, HEIGHT, TOP), labels)
+    caption = f"By the distance within which a detection is correct; {average}."
+    return PageFigure(svg, f"{printable(name)}: precision over recall.", caption)
+
+
+def _notes(result: DetectionResult) -> list[str]:
+    notes = [
+        "A crossing is judged by the ground truth of the left eye alone: its tie point's pixel shows one of the "
+        "bars, and each bar has 30 single-bar interior pixels or more within 6 diameters, on both sides.",
+        f"Ignored: detections whose nearest crossing is not judged and within {1000 * MATCH_M:g} mm, one for each "
+        "such crossing, and those that project onto a bar whose axis is not known.",
+        "Intervals: bootstrap over blocks of neighbouring views, or over scenes. "
+        f"{formatting.DASH}: undefined or unknown.",
+    ]
+    if not result.has_confidence:
+        notes.append("The file has no confidences, so that average precision has one point of the curve only.")
+    return notes
