@@ -46,8 +46,9 @@ class RankedDetections:
         """Return the interval of the average precision over resampled views."""
         ordered, ends = self._order()
         correct, view = self.correct[ordered].astype(np.float64), self.view[ordered]
-        draws = np.full(len(resampling.counts), np.nan)
-        for draw, counts in enumerate(resampling.counts):
+        view_counts = resampling.view_counts
+        draws = np.full(len(view_counts), np.nan)
+        for draw, counts in enumerate(view_counts):
             total = float(counts @ self.positives)
             if total:
                 weight = counts[view]

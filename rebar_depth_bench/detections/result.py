@@ -216,7 +216,7 @@ def _intervals(
     """Return the 95 % intervals over resampled views."""
     intervals: dict[str, Interval | None] = {}
     for name, (top, all_) in _SHARES.items():
-        sums = resampling.counts @ np.array([[top(view), all_(view)] for view in views], dtype=np.float64)
+        sums = resampling.view_counts @ np.array([[top(view), all_(view)] for view in views], dtype=np.float64)
         with np.errstate(invalid="ignore", divide="ignore"):
             intervals[name] = interval(sums[:, 0] / sums[:, 1])
     for limit, of_one in ranked.items():

@@ -24,7 +24,6 @@ from rebar_depth_bench.detections.result import (
 )
 from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.extended.crossings.judged import shown_bars
-from rebar_depth_bench.extended.crossings.reach import config_resampling
 from rebar_depth_bench.extended.ground_truth import SceneBars, has_bar_ids, load_steel_truth
 from rebar_depth_bench.extended.result import CrossingsSource
 from rebar_depth_bench.extended.steel_truth import SteelTruth
@@ -32,6 +31,7 @@ from rebar_depth_bench.geometry.cameras import transform
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS
+from rebar_depth_bench.scoring.view_score import resample_views
 from rebar_depth_bench.view_ids import TEST_SPLIT, config_of, split_of
 
 
@@ -71,8 +71,9 @@ def score_crossings(
 
         task = f"crossings of {config.name}"
         found = map_with_progress(compare, range(len(steel)), workers, progress, task, len(steel))
-        scenes = [config.scene_by_view[view_id] for view_id in steel.view_ids]
-        resampling = config_resampling(steel.view_ids, scenes) if len(found) >= MIN_VIEWS else None
+        resampling = (
+            resample_views(steel.view_ids, by_scene=config.has_splits) if len(found) >= MIN_VIEWS else None
+        )
         views[config.name] = found
         tables[config.name] = tabulate_detections(found, resampling)
     assert source is not None

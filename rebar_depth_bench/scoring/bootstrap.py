@@ -53,6 +53,12 @@ class Resampling:
     counts: Float64[ndarray, "draws units"]
     unit: Int64[ndarray, " n"] | None = None
 
+    @property
+    def view_counts(self) -> Float64[ndarray, "draws n"]:
+        """Number of times that each view occurs in each resample; there are no resamples of few units."""
+        counts = self.counts if self.counts.shape[1] >= MIN_VIEWS else self.counts[:0]
+        return counts if self.unit is None else counts[:, self.unit]
+
     def means(self, values: Float64[ndarray, "n k"]) -> Float64[ndarray, "draws k"]:
         """Return the mean of each column in each resample; NaN in ``values`` marks a view without a value.
 

@@ -178,3 +178,15 @@ def test_scenes_give_the_interval_of_clustered_means() -> None:
     half_width = 1.96 * of_scene.std() / math.sqrt(60)
     assert by_scene == pytest.approx((values.mean() - half_width, values.mean() + half_width), abs=0.03)
     assert by_block[1] - by_block[0] < 0.5 * (by_scene[1] - by_scene[0])
+
+
+def test_view_counts_repeat_those_of_the_scenes_of_the_views() -> None:
+    scenes = ["c", "a", "a", "b", "c", "d", "e"]
+    resampling = resample_scenes(scenes)
+    counts = resampling.view_counts
+    assert counts.shape == (len(resampling.counts), len(scenes))
+    np.testing.assert_array_equal(counts[:, 0], counts[:, 4])
+    np.testing.assert_array_equal(counts[:, 1], counts[:, 2])
+    assert (counts[:, [0, 1, 3, 5, 6]].sum(axis=1) == 5).all()
+    assert len(resample_scenes(["a", "b", "a"]).view_counts) == 0
+    np.testing.assert_array_equal(resample(range(8)).view_counts, resample(range(8)).counts)
