@@ -109,10 +109,11 @@ def test_bars_that_are_in_no_design_are_not_judged() -> None:
 
 
 def test_arm_of_a_bent_bar_is_compared_with_the_same_arm() -> None:
-    """The other arms of the nominal axis, one of them nearer, are not taken."""
+    """An arm of the nominal axis that ends on the bar as built, nearer but across it, is not taken."""
     built = displaced(mat()[1], (6, 0, 8))
     (x, y, z), end = built.nominal_axis_m
-    nominal = ((x + 0.006, y, z + 0.008), (x, y, z), end, (end[0] + 0.01, end[1], end[2] + 0.008), (0.1, y, z))
+    across = ((0.1, 0.0, z + 0.008), (x + 0.006, 0.0, z + 0.008))
+    nominal = ((x, y, z), end, *across)
     bars = [replace(built, nominal_axis_m=nominal)]
     truth, cage = view(bars)
     samples = as_built_samples(truth.depth_m.astype(float), truth, cage, bar_axes(tuple(bars)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,8 @@ from hypothesis import strategies as st
 from scipy.ndimage import binary_erosion
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.bars import BARS_FILE
+from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
+from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.scoring.bootstrap import resample_scenes
 from rebar_depth_bench.scoring.comparison import compare
@@ -31,6 +33,8 @@ from rebar_depth_bench.scoring.groups import (
 )
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.result_io import read_result, read_table
+from tests.damage import change_manifest
+from tests.ground_truth import truth_of
 from tests.synthetic_dataset import write_archive, write_dataset, write_split_dataset
 
 # The depth of a bar is 0.3 m + 0.01 m times ten times the number of its scene, and more downwards.
@@ -217,6 +221,22 @@ def test_split_without_sound_bars_is_refused(tmp_path: Path, damage: str) -> Non
         bars.write_bytes(bars.read_bytes() + b"x")
     with pytest.raises(DatasetError, match=r"bars\.parquet"):
         rdb.score(archive, copy)
+
+
+def test_cached_widths_follow_the_bars(tmp_path: Path) -> None:
+    """Another table of bars of the same views gives other widths, although their ground truth is in the cache."""
+    copy = write_cages(tmp_path / "copy", ["a1", "b1"])
+    before = truth_of(copy, "cages", "test").traits
+    scenes = read_bars(copy / BARS_FILE)
+    doubled = {
+        name: tuple(replace(bar, diameter_m=2 * bar.diameter_m) for bar in bars) for name, bars in scenes.items()
+    }
+    write_bars(copy / BARS_FILE, doubled)
+    change_manifest(
+        copy, lambda manifest, _: manifest["files"].update({BARS_FILE: file_sha256(copy / BARS_FILE)}), "cages"
+    )
+    after = truth_of(copy, "cages", "test").traits
+    assert [view.bar_width_px for view in after] == [2 * (view.bar_width_px or 0) for view in before]
 
 
 def test_groups_are_not_disclosed(scored: Result) -> None:
