@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from dataset_builder.config.specs import GeneratedCageSpec
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, ribs_per_row
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.cages.as_built import BuiltBar
 from dataset_builder.scene.cages.generate import VERSION, GeneratedCage, generate_cage
-from dataset_builder.scene.model import Assembly, axis_of
+from dataset_builder.scene.model import Assembly, Mesh, axis_of
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import InputError
 
@@ -39,7 +41,12 @@ def cage_assembly(cage: GeneratedCage) -> Assembly:
     """Return the bars of a generated cage, numbered from 1 in the order of the generator, and their meshes."""
     bars = cage_bars(cage)
     is_ribbed = sum(map(ribs_per_row, bars)) <= MAX_RIBS
-    return Assembly.from_meshes((bar.bar, bar_mesh(replace(bar, ribs=is_ribbed))) for bar in bars)
+    return Assembly.from_meshes((bar.bar, _rounded(bar_mesh(replace(bar, ribs=is_ribbed)))) for bar in bars)
+
+
+def _rounded(mesh: Mesh) -> Mesh:
+    """Return a mesh with vertices rounded to the nanometre, which are the same on every processor."""
+    return Mesh(np.round(mesh.vertices_m, 9) + 0.0, mesh.faces)
 
 
 def cage_bars(cage: GeneratedCage) -> tuple[CageBar, ...]:

@@ -75,7 +75,7 @@ def test_same_numbers_give_the_same_cage(cages: Mapping[str, list[GeneratedCage]
 def test_bars_are_clear_of_each_other_and_tied(cages: Mapping[str, list[GeneratedCage]], family: str) -> None:
     for cage in cages[family]:
         clear_m = clearances_m(cage)
-        assert clear_m.min() >= MIN_CLEAR_M - 1e-12
+        assert clear_m.min() >= MIN_CLEAR_M
         loose = [cage.bars[index].role for index in np.flatnonzero(clear_m.min(axis=1) > TIED_WITHIN_M)]
         assert not loose, f"{cage.record['parameters']}: {loose}"
 
