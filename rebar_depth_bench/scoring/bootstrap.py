@@ -12,6 +12,7 @@ this kind.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -33,7 +34,6 @@ MIN_VIEWS = 5
 
 _MIN_BLOCKS = 4
 _SEED = 0
-_CHUNK_ELEMENTS = 4_000_000
 
 Interval = tuple[float, float]
 
@@ -100,13 +100,12 @@ class Resampling:
         if len(np.unique(view)) < MIN_VIEWS or not np.isfinite(samples).all():
             return np.full(len(self.counts), np.nan)
         order = np.argsort(samples, kind="stable")
-        ordered, ordered_view = samples[order], view[order]
-        chunk_draws = max(1, _CHUNK_ELEMENTS // len(samples))
-        chunks = [
-            _weighted_percentile(ordered, self.counts[start : start + chunk_draws, ordered_view], percent)
-            for start in range(0, len(self.counts), chunk_draws)
-        ]
-        return np.concatenate(chunks)
+        ordered, ranks = samples[order], _Ranks.of(self.counts, view[order])
+        threshold = ranks.totals * percent / 100
+        values = ordered[ranks.below(threshold, inclusive=False)]
+        if percent == 50:
+            values = (values + ordered[ranks.below(threshold, inclusive=True)]) / 2
+        return np.where(ranks.totals > 0, values, np.nan)
 
 
 def interval(estimates: Float64[ndarray, " draws"]) -> Interval | None:
@@ -161,13 +160,43 @@ def block_length(indices: Sequence[int]) -> int:
     return max(1, min(round(BLOCK_VIEWS / stride), n // _MIN_BLOCKS))
 
 
-def _weighted_percentile(
-    ordered: Float64[ndarray, " m"], weights: Float64[ndarray, "draws m"], percent: float
-) -> Float64[ndarray, " draws"]:
-    cumulative = np.cumsum(weights, axis=1)
-    threshold = cumulative[:, -1] * percent / 100
-    lower = ordered[np.minimum((cumulative < threshold[:, None]).sum(axis=1), len(ordered) - 1)]
-    if percent != 50:
-        return np.where(cumulative[:, -1] > 0, lower, np.nan)
-    upper = ordered[np.minimum((cumulative <= threshold[:, None]).sum(axis=1), len(ordered) - 1)]
-    return np.where(cumulative[:, -1] > 0, (lower + upper) / 2, np.nan)
+@dataclass(frozen=True, eq=False)
+class _Ranks:
+    """Cumulative weights of ordered samples in each resample, by blocks of about the square root of their number.
+
+    The blocks make a percentile hundreds of times faster than adding up all samples. Weights are whole numbers, so
+    that no sum is rounded and the order of additions has no effect. ``view`` has the view of each place of the
+    blocks; places behind the last sample have a view of weight 0.
+    """
+
+    counts: Float64[ndarray, "draws v"]
+    view: Int64[ndarray, "blocks size"]
+    ends: Float64[ndarray, "draws blocks"]
+    samples: int
+
+    @classmethod
+    def of(cls, counts: Float64[ndarray, "draws n"], view: Int64[ndarray, " m"]) -> _Ranks:
+        """Return the weights of ordered samples, given the view of each."""
+        size = max(1, math.isqrt(len(view)))
+        blocks, views = -(-len(view) // size), counts.shape[1]
+        places = np.full(blocks * size, views)
+        places[: len(view)] = view
+        block = np.arange(len(view)) // size
+        samples_by_view = np.bincount(view * blocks + block, minlength=views * blocks).reshape(views, blocks)
+        ends = np.cumsum(counts @ samples_by_view.astype(np.float64), axis=1)
+        return cls(np.pad(counts, ((0, 0), (0, 1))), places.reshape(blocks, size), ends, len(view))
+
+    @property
+    def totals(self) -> Float64[ndarray, " draws"]:
+        """Weight of all samples in each resample."""
+        return self.ends[:, -1]
+
+    def below(self, threshold: Float64[ndarray, " draws"], *, inclusive: bool) -> Int64[ndarray, " draws"]:
+        """Return the first place with a cumulative weight of ``threshold`` or more; of more, if ``inclusive``."""
+        compare = np.less_equal if inclusive else np.less
+        draw = np.arange(len(self.counts))
+        block = np.minimum(compare(self.ends, threshold[:, None]).sum(axis=1), len(self.view) - 1)
+        before = np.where(block > 0, self.ends[draw, block - 1], 0.0)
+        weights = self.counts[draw[:, None], self.view[block]]
+        inside = compare(before[:, None] + np.cumsum(weights, axis=1), threshold[:, None]).sum(axis=1)
+        return np.asarray(np.minimum(block * self.view.shape[1] + inside, self.samples - 1))
