@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from cards.crossings import crossing_baselines
 from cards.reference import FULL_SETS, SUBSET, number, percent, reference_context
 from cards.steel import STEEL_RESULTS, depth_text, range_text
 from cards.templates import render
@@ -87,6 +88,8 @@ def benchmark_card() -> str:
         fits_note=FITS_NOTE,
         reach_note=REACH_NOTE,
         contacts=_CONTACTS,
+        baselines=crossing_baselines(),
+        random_points=60,
         max_rows=f"{MAX_ROWS_PER_VIEW:,}",
         families=[_family_rows(family) for family in MEASURE_FAMILIES.values()],
         profiles=PROFILES,

@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
 
-_MAX_CURVE_POINTS = 200
+_MAX_CURVE_POINTS = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class RankedDetections:
         return recall / max(int(self.positives.sum()), 1), precision
 
     def drawn_points(self) -> list[tuple[float, float]]:
-        """Return at most 200 points (recall, precision) of the curve."""
+        """Return at most 50 points (recall, precision) of the curve."""
         recall, precision = self.curve()
         chosen = np.unique(np.linspace(0, len(recall) - 1, min(len(recall), _MAX_CURVE_POINTS)).astype(np.int64))
         return [(float(recall[i]), float(precision[i])) for i in chosen]

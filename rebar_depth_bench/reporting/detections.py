@@ -44,7 +44,7 @@ def detection_page(result: DetectionResult) -> StudyPage:
         lead=f"Crossings that the left image shows well enough are to be found. Matched within "
         f"{1000 * MATCH_M:g} mm: {matched}.",
         stamps=_stamps(result),
-        figures=[_curve_figure(name, table) for name, table in rows],
+        figures=[_curve_figure(name, table) for name, table in rows if table.counts["crossings"]],
         tables=(_share_table(rows), _average_table(rows), _error_table(rows), _count_table(rows)),
         notes=_notes(result),
     )
@@ -68,7 +68,11 @@ def _percent_cells(name: str) -> tuple[Callable[[Row], str], Callable[[Row], str
         number = row[1].numbers[name]
         return formatting.number(None if number is None else 100 * number, 1)
 
-    return value, lambda row: formatting.interval_cell(row[1].intervals[name], 1, 100.0)
+    def ends(row: Row) -> str:
+        interval = row[1].intervals[name]
+        return formatting.interval_text(None if interval is None else (100 * interval[0], 100 * interval[1]), 1)
+
+    return value, ends
 
 
 def _share_table(rows: list[Row]) -> PageTable:

@@ -77,7 +77,7 @@ def select_spaced(values: Iterable[float], axis: Axis, min_distance_px: float) -
 
 def tick_label(value: float) -> str:
     """Return the label of a tick, short and without trailing zeros."""
-    return f"{value:.6g}" if 1e-4 <= abs(value) < 1e6 else f"{value:.0e}"
+    return f"{value:.6g}" if value == 0 or 1e-4 <= abs(value) < 1e6 else f"{value:.0e}"
 
 
 def _even_ticks(low: float, high: float) -> list[float]:
