@@ -4,6 +4,7 @@ python -m benchmarks.leaderboard_overhead [--rows N] [--seconds S] [--repeats N]
 
 Both servers run in processes of their own with uvicorn's h11 protocol, and are measured by turns with 1 and 50
 clients. The bare app returns the bodies that the leaderboard has rendered, from memory, without middleware.
+The share by processor time does not depend on what else the machine does.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ import tempfile
 import urllib.request
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import rebar_depth_bench as rdb
-from benchmarks.filled_board import add_scored_submissions, running_server
+from benchmarks.filled_board import ServerProcess, add_scored_submissions, running_server
 from benchmarks.http_load import LoadPlan, run_load
 from benchmarks.timing import machine_description, print_markdown
 from leaderboard.db.engine import Database
@@ -79,46 +81,56 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for number, path in enumerate(targets.values()):
                 with urllib.request.urlopen(f"http://{served.host}:{served.port}{path}") as response:
                     (bodies / f"{number:02d}").write_bytes(response.read())
-            with bare_app(bodies) as bare_port:
+            with bare_app(bodies) as bare:
                 rows = []
                 for number, (route, path) in enumerate(targets.items()):
                     size = (bodies / f"{number:02d}").stat().st_size
                     for clients in CLIENTS:
-                        ours, bare = _rates([(served.port, path), (bare_port, f"/{number}")], clients, options)
-                        rows.append(
-                            (
-                                f"`{route}`",
-                                f"{size / 1000:.0f}",
-                                clients,
-                                f"{ours:.0f}",
-                                f"{bare:.0f}",
-                                f"{ours / bare:.0%}",
-                            )
-                        )
-    print_markdown(["route", "kB", "clients", "leaderboard/s", "bare/s", "share"], rows)
+                        ours, others = _measure([(served, path), (bare, f"/{number}")], clients, options)
+                        rates = (f"{ours.per_s:.0f}", f"{others.per_s:.0f}", f"{ours.per_s / others.per_s:.0%}")
+                        times = (f"{1000 * ours.cpu_s:.2f}", f"{1000 * others.cpu_s:.2f}")
+                        share = f"{others.cpu_s / ours.cpu_s:.0%}"
+                        rows.append((f"`{route}`", f"{size / 1000:.0f}", clients, *rates, *times, share))
+    heads = ["route", "kB", "clients", "leaderboard/s", "bare/s", "share"]
+    print_markdown([*heads, "leaderboard ms", "bare ms", "share by processor time"], rows)
     return 0
 
 
-def _rates(servers: Sequence[tuple[int, str]], clients: int, options: argparse.Namespace) -> list[float]:
-    """Return the median rates of the (port, path) pairs, measured by turns."""
+@dataclass(frozen=True)
+class Load:
+    """Requests per second, and processor time of the server for a request in seconds."""
+
+    per_s: float
+    cpu_s: float
+
+
+def _measure(
+    servers: Sequence[tuple[ServerProcess, str]], clients: int, options: argparse.Namespace
+) -> list[Load]:
+    """Return the median loads of the servers and paths, measured by turns."""
     rates: list[list[float]] = [[] for _ in servers]
+    times: list[list[float]] = [[] for _ in servers]
     for turn in range(options.repeats):
-        for index, (port, path) in enumerate(servers):
-            plan = LoadPlan("127.0.0.1", port, [(path, path)], clients, options.seconds)
+        for index, (server, path) in enumerate(servers):
+            plan, before = (
+                LoadPlan("127.0.0.1", server.port, [(path, path)], clients, options.seconds),
+                server.cpu_s(),
+            )
             result = run_load(plan, SEED + turn)
             assert not result.errors, result.errors[:3]
             rates[index].append(len(result.all_read_s) / result.wall_s)
-    return [statistics.median(one) for one in rates]
+            times[index].append((server.cpu_s() - before) / len(result.all_read_s))
+    return [Load(*map(statistics.median, pair)) for pair in zip(rates, times, strict=True)]
 
 
 @contextmanager
-def bare_app(bodies: Path) -> Iterator[int]:
-    """Run the bare app until the block ends; yield its port."""
+def bare_app(bodies: Path) -> Iterator[ServerProcess]:
+    """Run the bare app until the block ends."""
     port = free_port()
     process = subprocess.Popen([sys.executable, "-c", _BARE_APP, str(port), str(bodies)])
     try:
         wait_until(lambda: _answers(port), "the bare app answers")
-        yield port
+        yield ServerProcess("127.0.0.1", port, process.pid)
     finally:
         process.kill()
         process.wait()
