@@ -139,10 +139,10 @@ def _stacks() -> tuple[Part, ...]:
 
 
 def _core() -> tuple[Part, ...]:
-    """Return the concrete core of stairs and lift north of the deck, which is already one storey higher."""
-    foot, high, y = GROUND_M - STOREY_M - 0.3, 3.4, HALF_M + 0.7
+    """Return the concrete core of stairs and lift, one storey higher; in the east it shades no light variant."""
+    foot, high, x = GROUND_M - STOREY_M - 0.3, 3.4, HALF_M + 0.7
     return (
-        surface("core", box((-3.4, y, foot), (2.6, y + 5.0, high)), "cast wall"),
-        surface("core-opening", box((-0.9, y - 0.004, 0.0), (0.15, y - 0.002, 2.15)), "dark laminate"),
-        surface("core-joint", box((-3.38, y - 0.012, 2.62), (2.58, y - 0.002, 2.65)), "dark laminate"),
+        surface("core", box((x, -3.4, foot), (x + 5.0, 2.6, high)), "cast wall"),
+        surface("core-opening", box((x - 0.004, -0.9, 0.0), (x - 0.002, 0.15, 2.15)), "dark laminate"),
+        surface("core-joint", box((x - 0.012, -3.38, 2.62), (x - 0.002, 2.58, 2.65)), "dark laminate"),
     )

@@ -123,7 +123,7 @@ def _crane() -> tuple[Part, ...]:
 def _racks() -> tuple[Part, ...]:
     """Return a row of racks along the south wall, with crates and cartons on three levels."""
     random = np.random.default_rng(29)
-    back_m, front_m = -NORTH_M + 0.5, -NORTH_M + 1.45
+    back_m, front_m = -NORTH_M + 0.56, -NORTH_M + 1.45
     bays = [-13.4 + 2.8 * k for k in range(8)]
     levels = (0.12, 1.65, 3.15)
     posts = [
@@ -170,9 +170,9 @@ def _equipment() -> tuple[Part, ...]:
         for k in range(3)
         for row in range(5)
     ]
-    pallets = [box((x, y, g), (x + 1.2, y + 0.8, 0.144)) for x, y in ((-6.2, 10.75), (-4.6, 10.75), (12.2, -10.2))]
+    pallets = [box((x, y, g), (x + 1.2, y + 0.8, 0.144)) for x, y in ((-6.2, 10.6), (-4.6, 10.6), (12.2, -10.2))]
     cartons = [
-        box((x + 0.05, y + 0.05, 0.146), (x + 1.15, y + 0.75, 1.1)) for x, y in ((-6.2, 10.75), (12.2, -10.2))
+        box((x + 0.05, y + 0.05, 0.146), (x + 1.15, y + 0.75, 1.1)) for x, y in ((-6.2, 10.6), (12.2, -10.2))
     ]
     return (
         surface("cabin", box((11.6, 7.4, g), (14.8, 11.4, 2.75)), "cabinet"),
@@ -183,7 +183,7 @@ def _equipment() -> tuple[Part, ...]:
         surface("timber", merge_meshes(timber), "timber"),
         surface("pallets", merge_meshes(pallets), "timber"),
         surface("cartons", merge_meshes(cartons), "cardboard"),
-        surface("bin", box((-4.5, 10.8, 0.146), (-3.5, 11.5, 0.9)), "blue plastic"),
+        surface("bin", box((-4.5, 10.65, 0.146), (-3.5, 11.35, 0.9)), "blue plastic"),
         surface("lockers", box((-13.4, -8.6, g), (-12.9, -6.0, 1.9)), "cabinet"),
         surface("toolbox", box((-13.3, 6.4, g), (-12.7, 7.6, 1.0)), "red paint"),
     )

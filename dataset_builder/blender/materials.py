@@ -222,7 +222,7 @@ _MATERIAL_BUILDERS: dict[str, Callable[[MaterialBuilder], bpy.types.Material]] =
     LAMP: _lamp,
     "strong floor": partial(_anchored, (0.125, 0.15, 0.143), (0.09, 0.108, 0.103), (1.0, 1.0, 0.0)),
     "reaction wall": partial(_anchored, (0.43, 0.43, 0.42), (0.36, 0.36, 0.35), (0.0, 1.0, 1.0)),
-    "cast wall": partial(_anchored, (0.44, 0.43, 0.41), (0.36, 0.355, 0.34), (1.0, 0.0, 1.0)),
+    "cast wall": partial(_anchored, (0.44, 0.43, 0.41), (0.36, 0.355, 0.34), (0.0, 1.0, 1.0)),
     "cladding": partial(_mottled, (0.42, 0.43, 0.425), (0.39, 0.40, 0.395), 1.5, 0.25, (0.36, 0.37, 0.37)),
     "window": partial(_matt, (0.52, 0.64, 0.72)),
     "gate": partial(_matt, (0.16, 0.27, 0.38)),

@@ -19,6 +19,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 from scipy.spatial import ConvexHull
 
+from dataset_builder.blender.deck import deck
+from dataset_builder.blender.hall import hall
 from dataset_builder.blender.laboratory import laboratory
 from dataset_builder.blender.outdoors import CLEAR_M, SLAB_HALF_M, outdoors
 from dataset_builder.config.catalog import LATTICE_DOME, LATTICE_RING, PIER_DOME, PILE_DOME
@@ -265,7 +267,7 @@ def test_props_fit_cages_of_any_size(side_m: float, flatness: float, slenderness
             assert distance_to_box_m(part.mesh.vertices_m, box_m).min() > 0
 
 
-@pytest.mark.parametrize("place", [laboratory, outdoors])
+@pytest.mark.parametrize("place", [laboratory, outdoors, hall, deck])
 def test_environments_are_closed_non_steel_surfaces(place: Any) -> None:
     for part in place():
         body = trimesh.Trimesh(part.mesh.vertices_m, part.mesh.faces, process=False)

@@ -251,3 +251,5 @@ def test_space_for_cameras() -> None:
         [[0, 0, 0.1], [0, 0, 0.09], [0, 1.0, 0.1], [0, 1.01, 0.1], [0, -1.01, 0.4], [2, 0, 0.4], [1.5, 1.5, 5]]
     )
     assert space.contains(points_m).tolist() == [True, False, True, False, True, True, False]
+    below_roof = replace(space, ceiling_m=5.0)
+    assert below_roof.contains(np.array([[0, 0, 5.0], [0, 0, 5.01]])).tolist() == [True, False]
