@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.cages.clearance import Clearances
-from dataset_builder.scene.cages.design import Design, DesignBar, InfeasibleError
+from dataset_builder.scene.cages.design import Design, DesignBar, InfeasibleError, Z
 from dataset_builder.scene.cages.rules import contact_m, radius_m
 
 SPACING_TOLERANCE_M = 0.020
@@ -25,7 +25,10 @@ PLACE_TOLERANCE_M = 0.008
 """Largest displacement in any other direction, within the tolerance of the cover."""
 
 TILT_TOLERANCE_DEG = 2.5
-"""Largest tilt of a bar or link about its middle; that of long bars is limited by ``PLACE_TOLERANCE_M``."""
+"""Largest tilt of a bar or link about its middle, or about its foot if it stands."""
+
+END_TOLERANCE_M = 0.012
+"""Largest displacement of the end of a bar by its tilt, which limits that of long bars."""
 
 BOW_TOLERANCE = 1 / 250
 """Largest bow of a straight bar, in lengths."""
@@ -170,7 +173,9 @@ def _drawn_deviation(bar: DesignBar, rng: np.random.Generator, *, stands: bool) 
         along = np.array(bar.spaced_along)
         spacing_m = along * rng.uniform(-1, 1) * SPACING_TOLERANCE_M
         shift_m = shift_m - along * (shift_m @ along)
-    most_rad = min(np.deg2rad(TILT_TOLERANCE_DEG), 2 * PLACE_TOLERANCE_M / size_m * 1.5)
+    is_standing = stands and float(line_m[:, 2].min()) < 1e-9 and bar.spaced_along != Z
+    reach_m = size_m if is_standing else size_m / 2
+    most_rad = min(np.deg2rad(TILT_TOLERANCE_DEG), END_TOLERANCE_M / reach_m)
     tilt_rad = _within_ball(rng) * most_rad
     bow_m, side = np.zeros(3), rng.normal(size=3)
     if bar.held_along is not None:
@@ -179,7 +184,6 @@ def _drawn_deviation(bar: DesignBar, rng: np.random.Generator, *, stands: bool) 
     if len(line_m) == 2 and length_m > _BOWED_FROM * bar.diameter_m:
         side = np.cross(line_m[1] - line_m[0], side)
         bow_m = side / np.linalg.norm(side) * rng.uniform(-BOW_TOLERANCE, BOW_TOLERANCE) * length_m
-    is_standing = stands and float(line_m[:, 2].min()) < 1e-9 and bar.spaced_along != (0.0, 0.0, 1.0)
     return _Deviation(line_m, spacing_m, shift_m, tilt_rad, bow_m, is_standing)
 
 

@@ -119,10 +119,11 @@ def _rotated(direction: Direction | None, rotation: Float64[ndarray, "3 3"]) -> 
     return (x, y, z)
 
 
-def check_steel(steel_m2: float, concrete_m2: float, shares: tuple[float, float]) -> None:
-    """Raise ``InfeasibleError`` unless the area of steel per area of concrete is within ``shares``."""
+def steel_share(steel_m2: float, concrete_m2: float, shares: tuple[float, float]) -> float:
+    """Return the area of steel per area of concrete; raise ``InfeasibleError`` if it is not within ``shares``."""
     if not shares[0] <= steel_m2 / concrete_m2 <= shares[1]:
         raise InfeasibleError(f"too {'little' if steel_m2 < shares[0] * concrete_m2 else 'much'} steel")
+    return round(steel_m2 / concrete_m2, 6)
 
 
 LYING = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dataset_builder.scene.cages.design import DesignBar, InfeasibleError, Line, X, Y, Z, check_steel, straight
+from dataset_builder.scene.cages.design import DesignBar, InfeasibleError, Line, X, Y, Z, steel_share, straight
 from dataset_builder.scene.cages.rules import (
     COLUMN_STEEL,
     MOST_UNHELD_M,
@@ -80,9 +80,9 @@ class Section:
             if 2 * half_m / (count - 1) - self.bar_m < least_clear_m(self.bar_m):
                 raise InfeasibleError("bars along a side are too close to each other")
 
-    def check_column(self, bars: int) -> None:
-        """Raise ``InfeasibleError`` unless ``bars`` main bars are neither too little nor too much for a column."""
-        check_steel(area_m2(self.bar_m, bars), self.side_x_m * self.side_y_m, COLUMN_STEEL)
+    def column_steel_share(self, bars: int) -> float:
+        """Return the area of ``bars`` main bars per area of concrete. Raises as ``steel_share`` for a column."""
+        return steel_share(area_m2(self.bar_m, bars), self.side_x_m * self.side_y_m, COLUMN_STEEL)
 
     def along_m(self) -> tuple[list[float], list[float]]:
         """Return the positions along x and along y of the bars between the corners."""

@@ -18,6 +18,7 @@ from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.cages import generate as generate_module
 from dataset_builder.scene.cages.as_built import (
     BOW_TOLERANCE,
+    END_TOLERANCE_M,
     MIN_CLEAR_M,
     PLACE_TOLERANCE_M,
     SPACING_TOLERANCE_M,
@@ -104,7 +105,7 @@ def test_deviations_are_within_the_tolerances(cages: Mapping[str, list[Generated
                 continue
             length_m = float(np.linalg.norm(np.diff(bar.nominal_m, axis=0), axis=1).sum())
             off_m = float(np.linalg.norm(bar.line_m[[0, -1]] - bar.nominal_m[[0, -1]], axis=1).max())
-            assert off_m <= SPACING_TOLERANCE_M + 4 * PLACE_TOLERANCE_M
+            assert off_m <= SPACING_TOLERANCE_M + PLACE_TOLERANCE_M + END_TOLERANCE_M
             if len(bar.nominal_m) == 2:
                 chord = bar.line_m[-1] - bar.line_m[0]
                 from_chord = np.cross(bar.line_m - bar.line_m[0], chord / np.linalg.norm(chord))

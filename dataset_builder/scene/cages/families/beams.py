@@ -17,10 +17,10 @@ from dataset_builder.scene.cages.design import (
     Y,
     Z,
     bent,
-    check_steel,
     drawn_of,
     drawn_step,
     spaced,
+    steel_share,
     straight,
     turned,
 )
@@ -101,7 +101,8 @@ def beam_bars(
     spacing_m = drawn_step(rng, 0.08, min(beam_link_spacing_m(depth_m), 0.30), 0.01)
     other_m = drawn_of(rng, [d for d in DIAMETERS_M if max(0.010, bar_m / 2) <= d <= bar_m])
     others = int(rng.integers(2, section.bars_x + 1))
-    check_steel(area_m2(bar_m, section.bars_x * (1 + layout.two_layers)), 0.9 * width_m * depth_m, BEAM_STEEL)
+    steel_m2 = area_m2(bar_m, section.bars_x * (1 + layout.two_layers))
+    share = steel_share(steel_m2, 0.9 * width_m * depth_m, BEAM_STEEL)
     links = stirrups(section, spaced(first_link_m, length_m - 0.05, spacing_m), corners=2)
     role, other_role, side = (TOP, BOTTOM, 1.0) if layout.hogging else (BOTTOM, TOP, -1.0)
     outer = _layer_m(section, bar_m, section.bars_x, side)
@@ -129,6 +130,7 @@ def beam_bars(
         "other_bar_m": other_m,
         "other_bars_x": float(others),
         "spacing_m": spacing_m,
+        "steel_share": share,
         "layers": 1.0 + layout.two_layers,
     }
     return [*bars, *links], drawn

@@ -12,9 +12,9 @@ from dataset_builder.scene.cages.design import (
     Design,
     DesignBar,
     InfeasibleError,
-    check_steel,
     drawn_of,
     drawn_step,
+    steel_share,
     turned,
 )
 from dataset_builder.scene.cages.linear import Lap, lapped, link_levels_m, rise_m
@@ -56,7 +56,7 @@ def column(rng: np.random.Generator, shape: str) -> Design:
     diameter_m = drawn_step(rng, 0.30, 0.80, 0.05)
     section = RoundSection(diameter_m, cover_m, link_m, bar_m, int(rng.integers(6, 15)))
     section.check(MOST_CLEAR_M)
-    check_steel(area_m2(bar_m, section.bars), section.concrete_m2, COLUMN_STEEL)
+    share = steel_share(area_m2(bar_m, section.bars), section.concrete_m2, COLUMN_STEEL)
     most_m = min(column_link_spacing_m(bar_m, diameter_m), 0.15 if shape == "spiral" else 0.4)
     spacing_m = drawn_step(rng, 0.06, most_m, 0.01)
     bars: list[DesignBar] = section.main_bars(length_m)
@@ -66,6 +66,7 @@ def column(rng: np.random.Generator, shape: str) -> Design:
         bars = lapped(bars, [(-x, -y) for x, y in section.outward().tolist()], lap)
     bars += [section.spiral(length_m, spacing_m)] if shape == "spiral" else section.rings(levels)
     drawn = {**common, "diameter_m": diameter_m, "bars": float(section.bars), "spacing_m": spacing_m}
+    drawn["steel_share"] = share
     drawn |= {"extra": "none"} if lap is None else {"extra": "laps", "lap_start_m": lap.start_m}
     return Design("column", tuple(bars), drawn, STANDING_M)
 
@@ -98,7 +99,7 @@ def _rectangular(rng: np.random.Generator, shape: str, common: dict[str, float |
         raise InfeasibleError("a rectangular section is square")
     extra = str(rng.choice(_EXTRAS))
     section = drawn_section(rng, bar_m, link_m, cover_m, side_x_m, side_y_m)
-    section.check_column(section.count + (4 if extra == "bundles" else 0))
+    share = section.column_steel_share(section.count + (4 if extra == "bundles" else 0))
     spacing_m = drawn_step(rng, 0.08, column_link_spacing_m(bar_m, min(side_x_m, side_y_m)), 0.01)
     lap = _drawn_lap(rng, bar_m, extra == "laps")
     levels = link_levels_m(length_m, spacing_m, max(side_x_m, side_y_m), max(0.08, 0.6 * spacing_m), lap)
@@ -119,6 +120,7 @@ def _rectangular(rng: np.random.Generator, shape: str, common: dict[str, float |
         "spacing_m": spacing_m,
         "extra": extra,
         "ties": float(with_ties),
+        "steel_share": share,
     }
     drawn |= {} if lap is None else {"lap_start_m": lap.start_m}
     return Design("column", tuple(bars), drawn, STANDING_M)
@@ -133,7 +135,7 @@ def pile_cage(rng: np.random.Generator, shape: str) -> Design:
     section = RoundSection(diameter_m, cover_m, link_m, bar_m, int(rng.integers(6, 19)))
     section.check(MOST_CLEAR_PILE_M)
     least_share = least_pile_steel_m2(section.concrete_m2) / section.concrete_m2
-    check_steel(area_m2(bar_m, section.bars), section.concrete_m2, (least_share, COLUMN_STEEL[1]))
+    share = steel_share(area_m2(bar_m, section.bars), section.concrete_m2, (least_share, COLUMN_STEEL[1]))
     length_m = drawn_step(rng, 2.0, 4.5, 0.1)
     pitch_m = drawn_step(rng, 0.10, 0.25, 0.01)
     bars = section.main_bars(length_m)
@@ -157,6 +159,7 @@ def pile_cage(rng: np.random.Generator, shape: str) -> Design:
         "length_m": length_m,
         "spacing_m": pitch_m,
         "stiffener_m": stiffener_m,
+        "steel_share": share,
         "lies": float(lies),
     }
     return Design("pile-cage", tuple(bars), drawn, LYING_M if lies else STANDING_M)

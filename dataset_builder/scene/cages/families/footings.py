@@ -12,10 +12,10 @@ from dataset_builder.scene.cages.design import (
     Y,
     Z,
     bent,
-    check_steel,
     drawn_of,
     drawn_step,
     spaced,
+    steel_share,
     straight,
 )
 from dataset_builder.scene.cages.families.columns import drawn_section
@@ -47,7 +47,7 @@ def footing(rng: np.random.Generator, shape: str) -> Design:
     column_m = drawn_step(rng, 0.30, 0.50, 0.05)
     low = cover_m + bar_m / 2
     second = low + contact_m(bar_m, bar_m)
-    check_steel(area_m2(bar_m) / spacing_m, depth_m - second, SLAB_STEEL)
+    share = steel_share(area_m2(bar_m) / spacing_m, depth_m - second, SLAB_STEEL)
     bob_m = second + bend_radius_m(bar_m) + square_end_m(bar_m)
     up_m = bob_m if shape == "bobs" else depth_m - cover_m
     if bob_m > depth_m - cover_m:
@@ -67,7 +67,7 @@ def footing(rng: np.random.Generator, shape: str) -> Design:
     if shape == "full-height":
         bars += _edge_bars(bar_m, half_x, half_y, up_m, second + bend_radius_m(bar_m))
     section = drawn_section(rng, starter_m, link_m, _COLUMN_COVER_M, column_m, column_m)
-    section.check_column(section.count)
+    starters_share = section.column_steel_share(section.count)
     foot_m = bend_radius_m(starter_m) + max(square_end_m(starter_m), spacing_m + 0.03)
     if section.half_m(starter_m)[1][0] + foot_m > min(half_x, half_y) - 0.03:
         raise InfeasibleError("a footing is too small for the feet of its starters")
@@ -90,6 +90,8 @@ def footing(rng: np.random.Generator, shape: str) -> Design:
         "starters_y": float(section.bars_y),
         "link_m": link_m,
         "spacing_m": spacing_m,
+        "steel_share": share,
+        "starters_steel_share": starters_share,
         "column_m": column_m,
     }
     return Design("footing", tuple(bars), drawn, cover_m)

@@ -47,7 +47,7 @@ def joint(rng: np.random.Generator, shape: str) -> Design:
     cover_m = drawn_step(rng, 0.03, 0.05, 0.005)
     side_m = drawn_step(rng, 0.40, 0.60, 0.05)
     column = drawn_section(rng, bar_m, link_m, cover_m, side_m, side_m)
-    column.check_column(column.count)
+    share = column.column_steel_share(column.count)
     height_m, level_m = drawn_step(rng, 1.8, 2.6, 0.1), drawn_step(rng, 0.8, 1.2, 0.05)
     spacing_m = drawn_step(rng, 0.08, column_link_spacing_m(bar_m, side_m), 0.01)
     depth_m = drawn_step(rng, 0.35, SIDES_FROM_M - 0.05, 0.05)
@@ -73,6 +73,7 @@ def joint(rng: np.random.Generator, shape: str) -> Design:
         "length_m": height_m,
         "level_m": level_m,
         "spacing_m": spacing_m,
+        "steel_share": share,
         "ties": float(with_ties),
         "ties_left_out": float(len(held) - len(kept)),
     }

@@ -14,10 +14,10 @@ from dataset_builder.scene.cages.design import (
     Y,
     Z,
     bent,
-    check_steel,
     drawn_of,
     drawn_step,
     spaced,
+    steel_share,
     straight,
 )
 from dataset_builder.scene.cages.rules import DIAMETERS_M, SLAB_STEEL, area_m2, contact_m, slab_spacing_m
@@ -44,7 +44,7 @@ def slab(rng: np.random.Generator, shape: str) -> Design:
     step_m = contact_m(bar_m, bar_m)
     low = [cover_m + bar_m / 2, cover_m + bar_m / 2 + step_m]
     high = [thickness_m - cover_m - bar_m / 2 - step_m, thickness_m - cover_m - bar_m / 2]
-    check_steel(area_m2(bar_m) / spacing_m, high[0], SLAB_STEEL)
+    share = steel_share(area_m2(bar_m) / spacing_m, high[0], SLAB_STEEL)
     across_x = spaced(_EDGE_M - side_x_m / 2, side_x_m / 2 - _EDGE_M, spacing_m)
     across_y = spaced(_EDGE_M - side_y_m / 2, side_y_m / 2 - _EDGE_M, spacing_m)
     bars = [
@@ -64,6 +64,7 @@ def slab(rng: np.random.Generator, shape: str) -> Design:
         "bar_m": bar_m,
         "link_m": chair_m,
         "spacing_m": spacing_m,
+        "steel_share": share,
     }
     return Design("slab", tuple(bars), drawn, cover_m)
 

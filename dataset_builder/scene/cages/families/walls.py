@@ -15,10 +15,10 @@ from dataset_builder.scene.cages.design import (
     Y,
     Z,
     bent,
-    check_steel,
     drawn_of,
     drawn_step,
     spaced,
+    steel_share,
     straight,
 )
 from dataset_builder.scene.cages.linear import Lap, lapped
@@ -56,10 +56,9 @@ def wall(rng: np.random.Generator, shape: str) -> Design:
     level_m = drawn_of(rng, [d for d in DIAMETERS_M if 0.008 <= d <= min(0.016, upright_m)])
     spacing_m = drawn_step(rng, 0.10, min(0.30, wall_spacing_m(thickness_m)), 0.025)
     level_spacing_m = drawn_step(rng, 0.10, 0.30, 0.025)
-    upright_share = 2 * area_m2(upright_m) / (spacing_m * thickness_m)
-    check_steel(upright_share, 1.0, WALL_STEEL)
-    level_share = 2 * area_m2(level_m) / (level_spacing_m * thickness_m)
-    check_steel(level_share, 1.0, (max(0.25 * upright_share, 0.001), WALL_STEEL[1]))  # EN 1992-1-1, 9.6.3.
+    upright_share = steel_share(2 * area_m2(upright_m), spacing_m * thickness_m, WALL_STEEL)
+    least_share = max(0.25 * upright_share, 0.001)  # EN 1992-1-1, 9.6.3.
+    steel_share(2 * area_m2(level_m), level_spacing_m * thickness_m, (least_share, WALL_STEEL[1]))
     tie_m = drawn_of(rng, [0.006, 0.008])
     level_y = thickness_m / 2 - cover_m - level_m / 2
     upright_y = level_y - contact_m(level_m, upright_m)
@@ -86,6 +85,7 @@ def wall(rng: np.random.Generator, shape: str) -> Design:
         "level_bar_m": level_m,
         "link_m": tie_m,
         "spacing_m": spacing_m,
+        "steel_share": upright_share,
         "level_spacing_m": level_spacing_m,
     }
     if shape == "laps":
