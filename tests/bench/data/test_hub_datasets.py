@@ -65,7 +65,7 @@ def test_revision_selects_the_commit_of_all_files(reading_hub: HubServer, tmp_pa
     commit = reading_hub.repositories["datasets/org/data"].branches[revision[1:] or "main"]
     lines = finished.stdout.splitlines()
     assert lines[:3] == [f"{commit} 2", "2", "2"]
-    assert "no problem found in 10 files" in lines[3]
+    assert "no problem found in 11 files" in lines[3]
     [entry] = parse_eval_result_entries(yaml.safe_load((tmp_path / "results.yaml").read_text()))
     assert (entry.dataset_id, entry.task_id, entry.dataset_revision) == ("org/data", "lattice-orbit", commit)
     requests = [request.path for request in reading_hub.requests]
