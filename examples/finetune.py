@@ -62,7 +62,8 @@ MEAN, STD = 0.5, 0.25
 """Normalisation of colour, in units of white."""
 CHANNELS = (8, 16, 32, 64, 96, 128)
 """Channels at full, half, quarter, ... resolution: 620,000 parameters."""
-FRAME_WEIGHT = 0.2
+FRAME_WEIGHT = 1.0
+"""Weight of all surfaces; with less, the ground and the horizon, which show the distance, are learned slowly."""
 LEARNING_RATE, WEIGHT_DECAY, WARM_UP = 2e-3, 1e-2, 0.05
 """Peak of the learning rate, which rises over the share ``WARM_UP`` of the training and falls as a cosine."""
 GAINS = (0.6, 1.5)
@@ -79,7 +80,7 @@ COLUMNS = [
 
 def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), nn.GroupNorm(8, outputs), nn.ReLU()
+        nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU()
     )
 
 
@@ -143,7 +144,8 @@ class Training:
     def start(cls, plan: dict[str, Any]) -> Training:
         """Return a training with random weights of the seed."""
         torch.manual_seed(plan["seed"])
-        net = DepthNet()
+        # Channels last are a third faster on a CPU.
+        net: DepthNet = DepthNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         optimiser = torch.optim.AdamW(net.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
         return cls(plan, net, optimiser)
 
@@ -260,8 +262,8 @@ def export(net: DepthNet, out: Path, width: int, height: int) -> Path:
     """Write ``finetuned.onnx`` for images of any size, and ``finetuned.toml``, whose path is returned."""
     sides = {2: "height", 3: "width"}
     with warnings.catch_warnings(), atomic_replace(out / "finetuned.onnx") as temporary:
-        # This exporter is deprecated, but the new one needs onnxscript; and the trace leaves out checks of sizes.
-        warnings.simplefilter("ignore")
+        # This exporter is deprecated, but the new one needs onnxscript.
+        warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             _Exported(net).eval(),
             (torch.zeros(1, 3, height, width),),
@@ -344,10 +346,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="train a small depth network on the config cages and score it")
     parser.add_argument("root", metavar="ROOT", help="dataset folder with the split train of cages")
     parser.add_argument("--out", type=Path, default=Path("finetuned"), metavar="FOLDER", help="default: finetuned")
-    parser.add_argument("--epochs", type=int, default=30, help="number of passes over the views (default: 30)")
+    parser.add_argument("--epochs", type=int, default=24, help="number of passes over the views (default: 24)")
     parser.add_argument("--minutes", type=float, help="end the training after this time (default: no limit)")
     parser.add_argument("--crop", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="size of random crops")
-    parser.add_argument("--batch", type=int, default=4, help="stereo pairs in a batch (default: 4)")
+    parser.add_argument("--batch", type=int, default=2, help="stereo pairs in a batch (default: 2)")
     parser.add_argument("--workers", type=int, default=1, help="processes that load views (default: 1)")
     parser.add_argument("--seed", type=int, default=0, help="seed of weights, order, crops and flips (default: 0)")
     options = parser.parse_args(arguments)

@@ -78,15 +78,17 @@ def build_as(design: Design, rng: np.random.Generator) -> BuiltCage:
     """Return the cage as it is built. Raises ``InfeasibleError`` if bars of the design touch each other."""
     bars, left_out = _some_left_out(design.bars, rng)
     clearances = Clearances([bar.line_m for bar in bars], [radius_m(bar.diameter_m) for bar in bars])
-    if clearances.least_of_all_m() < _NEEDED_M:
+    if not clearances.are_all(_NEEDED_M):
         raise InfeasibleError("bars of the design touch each other")
     lines, reduced, refused = [bar.line_m for bar in bars], 0, 0
     for index in rng.permutation(len(bars)).tolist():
         bar = bars[index]
         deviation = _drawn_deviation(bar, rng, stands=design.stands)
+        radius = radius_m(bar.diameter_m)
+        near = clearances.neighbours(bar.line_m, radius, index, deviation.most_m)
         for share, spacing_share in _SHARES:
             line_m = deviation.applied(share, spacing_share)
-            if clearances.least_m(line_m, radius_m(bar.diameter_m), index) >= _NEEDED_M:
+            if near.least_m(line_m, radius) >= _NEEDED_M:
                 lines[index] = line_m
                 clearances.replace(index, line_m)
                 reduced += (share, spacing_share) != _SHARES[0]
@@ -146,6 +148,12 @@ class _Deviation:
     tilt_rad: Float64[ndarray, " 3"]
     bow_m: Float64[ndarray, " 3"]
     stands: bool
+
+    @property
+    def most_m(self) -> float:
+        """Largest displacement of a point of the axis."""
+        turn_m = float(np.linalg.norm(self.tilt_rad) * np.linalg.norm(np.ptp(self.line_m, axis=0)))
+        return turn_m + sum(float(np.linalg.norm(part)) for part in (self.spacing_m, self.shift_m, self.bow_m))
 
     def applied(self, share: float, spacing_share: float) -> Float64[ndarray, "k 3"]:
         """Return the axis with these shares of the deviation."""

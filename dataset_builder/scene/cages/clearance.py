@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -38,33 +39,52 @@ class Clearances:
         self._low_m = np.vstack([self._low_m, line_m.min(axis=0)])
         self._high_m = np.vstack([self._high_m, line_m.max(axis=0)])
 
-    def least_m(self, line_m: Float64[ndarray, "n 3"], radius_m: float, without: int | None = None) -> float:
-        """Return the least clearance between a bar along ``line_m`` and the others, ``without`` one of them."""
-        reach_m = NEAR_M + radius_m + self._radii_m[:, None]
-        is_near = (
-            (self._low_m <= line_m.max(axis=0) + reach_m) & (self._high_m >= line_m.min(axis=0) - reach_m)
-        ).all(axis=1)
+    def neighbours(
+        self, line_m: Float64[ndarray, "n 3"], radius_m: float, without: int | None = None, margin_m: float = 0.0
+    ) -> Neighbours:
+        """Return the bars near a bar along ``line_m``, or along lines within ``margin_m``, ``without`` one."""
+        reach_m = NEAR_M + radius_m + margin_m
+        low, high = line_m.min(axis=0) - reach_m, line_m.max(axis=0) + reach_m
+        radii_m = self._radii_m[:, None]
+        is_near = ((self._low_m - radii_m <= high) & (self._high_m + radii_m >= low)).all(axis=1)
         if without is not None:
             is_near[without] = False
-        near = np.flatnonzero(is_near)
-        if not len(near):
-            return np.inf
+        near = np.flatnonzero(is_near).tolist()
+        if not near:
+            return Neighbours(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         start_m = np.concatenate([self._lines_m[index][:-1] for index in near])
         end_m = np.concatenate([self._lines_m[index][1:] for index in near])
-        owner = np.repeat(near, [len(self._lines_m[index]) - 1 for index in near])
-        i, j = _near_segments(line_m[:-1], line_m[1:], start_m, end_m, NEAR_M + radius_m + self._radii_m[owner])
+        radii_m = np.repeat(self._radii_m[near], [len(self._lines_m[index]) - 1 for index in near])
+        lower_m, upper_m = np.minimum(start_m, end_m), np.maximum(start_m, end_m)
+        is_near = ((lower_m - radii_m[:, None] <= high) & (upper_m + radii_m[:, None] >= low)).all(axis=1)
+        return Neighbours(start_m[is_near], end_m[is_near], radii_m[is_near])
+
+    def least_m(self, line_m: Float64[ndarray, "n 3"], radius_m: float, without: int | None = None) -> float:
+        """Return the least clearance between a bar along ``line_m`` and the others, ``without`` one of them."""
+        return self.neighbours(line_m, radius_m, without).least_m(line_m, radius_m)
+
+    def are_all(self, least_m: float) -> bool:
+        """Return True if the clearance of any two bars is at least ``least_m``."""
+        return all(
+            self.least_m(line_m, float(self._radii_m[i]), i) >= least_m for i, line_m in enumerate(self._lines_m)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """Segments of the axes of bars, and their radii, to which bars in one place are compared."""
+
+    start_m: Float64[ndarray, "k 3"]
+    end_m: Float64[ndarray, "k 3"]
+    radii_m: Float64[ndarray, " k"]
+
+    def least_m(self, line_m: Float64[ndarray, "n 3"], radius_m: float) -> float:
+        """Return the least clearance of a bar; infinity if all are farther than ``NEAR_M``."""
+        i, j = _near_segments(line_m[:-1], line_m[1:], self.start_m, self.end_m, NEAR_M + radius_m + self.radii_m)
         if not len(i):
             return np.inf
-        on_a, on_b = closest_points_m(line_m[:-1][i], line_m[1:][i], start_m[j], end_m[j])
-        clear_m = np.linalg.norm(on_a - on_b, axis=1) - radius_m - self._radii_m[owner[j]]
-        return float(clear_m.min())
-
-    def least_of_all_m(self) -> float:
-        """Return the least clearance of any two bars."""
-        return min(
-            (self.least_m(line_m, float(self._radii_m[i]), i) for i, line_m in enumerate(self._lines_m)),
-            default=np.inf,
-        )
+        on_a, on_b = closest_points_m(line_m[:-1][i], line_m[1:][i], self.start_m[j], self.end_m[j])
+        return float((np.linalg.norm(on_a - on_b, axis=1) - self.radii_m[j]).min()) - radius_m
 
 
 def _near_segments(

@@ -184,14 +184,15 @@ def ties(section: Section, levels_m: Sequence[float], link_rise_m: float) -> lis
     along_x, along_y = section.along_m()
     step_m = contact_m(section.link_m, section.link_m)
     above_m = link_rise_m + step_m
+    line_x_m, line_y_m = (held_tie_m(face_m, section.link_m, section.bar_m) for face_m in (face_x, face_y))
     made = []
     for n, z_m in enumerate(levels_m):
         side = np.array([1.0, (-1.0) ** n, 1.0])
         for x in along_x:
-            line_m = (held_tie_m(face_y, section.link_m, section.bar_m) * side)[:, [1, 0, 2]]
+            line_m = (line_y_m * side)[:, [1, 0, 2]]
             made.append(DesignBar(TIE, section.link_m, line_m + np.array([x, 0.0, z_m + above_m]), Z, False))
         for y in along_y:
-            line_m = held_tie_m(face_x, section.link_m, section.bar_m) * side
+            line_m = line_x_m * side
             height_m = z_m + above_m + (step_m if along_x else 0.0)
             made.append(DesignBar(TIE, section.link_m, line_m + np.array([0.0, y, height_m]), Z, False))
     return made

@@ -38,7 +38,7 @@ def designs(family: str, shape: str) -> tuple[Design, ...]:
         except InfeasibleError:
             continue
         bars = Clearances([bar.line_m for bar in design.bars], [radius_m(bar.diameter_m) for bar in design.bars])
-        if bars.least_of_all_m() > 0:
+        if bars.are_all(1e-4):
             found.append(design)
         if len(found) == DESIGNS:
             return tuple(found)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from jaxtyping import Float64
 from numpy import ndarray
@@ -196,3 +196,17 @@ def test_clearance_is_that_of_all_segments(lines: list[Line], index: int) -> Non
         assert found == pytest.approx(expected, abs=1e-9)
     else:
         assert found >= NEAR_M - 1e-9
+
+
+@example([straight((0, 0, 0), (1, 0, 0)), straight((0, 0.09, 0), (1, 0.09, 0))], np.array([0, 0.06, 0]))
+@given(
+    st.lists(LINES, min_size=2, max_size=5),
+    st.tuples(*[st.integers(-30, 30).map(lambda mm: mm / 1000)] * 3).map(np.array),
+)
+@settings(max_examples=100)
+def test_neighbours_are_enough_for_lines_within_the_margin(
+    lines: list[Line], shift_m: Float64[ndarray, " 3"]
+) -> None:
+    clearances = Clearances(lines, [0.004] * len(lines))
+    near = clearances.neighbours(lines[0], 0.004, 0, float(np.linalg.norm(shift_m)))
+    assert near.least_m(lines[0] + shift_m, 0.004) == clearances.least_m(lines[0] + shift_m, 0.004, 0)

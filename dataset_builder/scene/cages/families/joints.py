@@ -31,7 +31,13 @@ from dataset_builder.scene.cages.families.beams import (
 from dataset_builder.scene.cages.families.columns import drawn_section
 from dataset_builder.scene.cages.linear import rise_m
 from dataset_builder.scene.cages.rectangular import LINK, Section, links_height_m, main_bars, stirrups, ties
-from dataset_builder.scene.cages.rules import column_link_spacing_m, contact_m, link_diameters_m, radius_m
+from dataset_builder.scene.cages.rules import (
+    CONTACT_GAP_M,
+    column_link_spacing_m,
+    contact_m,
+    link_diameters_m,
+    radius_m,
+)
 
 _PASSING_M = 0.002
 """Clear distance of links of a column from the bars of the beam that they pass."""
@@ -55,11 +61,13 @@ def joint(rng: np.random.Generator, shape: str) -> Design:
         raise InfeasibleError("a column ends too close to its beam")
     beam, drawn = _beam(rng, column, shape, depth_m, level_m)
     standing = main_bars(column, height_m)
+    steel = Clearances([bar.line_m for bar in beam], [radius_m(bar.diameter_m) for bar in beam])
+    if any(steel.least_m(bar.line_m, radius_m(bar.diameter_m)) < CONTACT_GAP_M for bar in standing):
+        raise InfeasibleError("bars of a beam meet those of its column")
     with_ties = column.needs_ties() or (bool(rng.random() < 0.4) and column.count > 4)
     rise = rise_m(stirrups(column, [0.0]))
     levels = _levels_past(beam, links_height_m(column, rise, with_ties=with_ties), height_m, spacing_m)
     held = ties(column, levels, rise) if with_ties else []
-    steel = Clearances([bar.line_m for bar in beam], [radius_m(bar.diameter_m) for bar in beam])
     kept = [bar for bar in held if steel.least_m(bar.line_m, radius_m(bar.diameter_m)) > _PASSING_M]
     drawn |= {
         "shape": shape,
