@@ -21,6 +21,9 @@ from rebar_depth_bench.view_ids import SPLITS
 VERSION = 1
 """Version of the generator: it changes when the same seed gives another cage."""
 
+MAX_BARS = 200
+"""Largest number of bars of a design, which bounds the time to generate and to render a cage."""
+
 MAX_ATTEMPTS = 200
 """Number of designs that are drawn before a cage is given up."""
 
@@ -63,6 +66,8 @@ def generate_cage(split: str, number: int, seed: int = 0, family: str | None = N
     for _ in range(MAX_ATTEMPTS):
         try:
             design = FAMILIES[chosen].draw(rng, shape)
+            if len(design.bars) > MAX_BARS:
+                raise InfeasibleError("too many bars")
             built = build_as(design, rng)
         except InfeasibleError as error:
             refused[str(error)] += 1

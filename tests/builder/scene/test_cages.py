@@ -27,7 +27,7 @@ from dataset_builder.scene.cages.as_built import (
 from dataset_builder.scene.cages.clearance import NEAR_M, Clearances
 from dataset_builder.scene.cages.design import Design, DesignBar, InfeasibleError, straight
 from dataset_builder.scene.cages.families import FAMILIES, Family
-from dataset_builder.scene.cages.generate import GeneratedCage, drawn_family, generate_cage
+from dataset_builder.scene.cages.generate import MAX_BARS, GeneratedCage, drawn_family, generate_cage
 from dataset_builder.scene.cages.rules import DIAMETERS_M, radius_m
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.view_ids import SPLITS
@@ -123,7 +123,7 @@ def test_diameters_and_records_are_those_of_the_rules(
     for cage in cages[family]:
         assert {bar.diameter_m for bar in cage.bars} <= set(DIAMETERS_M)
         assert cage.family == cage.record["family"] == family
-        assert 10 <= len(cage.bars) <= 400
+        assert 7 <= len(cage.bars) + len(cage.record["left_out"]) - cage.record["doubled"] <= MAX_BARS
         assert json.loads(json.dumps(cage.record)) == cage.record
         for missing in cage.record["left_out"]:
             assert len(missing["nominal_axis"]) >= 2
@@ -160,6 +160,13 @@ def test_cage_that_cannot_be_made_is_refused_with_reasons(monkeypatch: pytest.Mo
     monkeypatch.setattr(generate_module, "FAMILIES", {"wall": Family(impossible, ("plain",))})
     with pytest.raises(InputError, match=r"no bar fits plain \(200\)"):
         generate_cage("train", 0)
+
+
+def test_designs_of_too_many_bars_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(generate_module, "MAX_BARS", 40)
+    cages = [generate_cage("train", number, 0, "slab") for number in range(3)]
+    assert any(cage.record["designs_refused"].get("too many bars") for cage in cages)
+    assert max(len(cage.bars) - cage.record["doubled"] for cage in cages) <= 40
 
 
 def test_design_whose_bars_touch_is_refused() -> None:
