@@ -77,7 +77,10 @@ def _lines(a: Bar, b: Bar) -> list[tuple[ndarray, ndarray]]:
 def _gap_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
     """Return the check that no two bars touch, ribs included."""
     lines, radii = [np.array(bar.axis_m) for bar in bars], [radius_m(bar.diameter_m) for bar in bars]
-    least_m = Clearances(lines, radii).least_of_all_m()
+    clearances = Clearances(lines, radii)
+    least_m = min(
+        clearances.least_m(line, radius, i) for i, (line, radius) in enumerate(zip(lines, radii, strict=True))
+    )
     problems = () if least_m > 0 else (f"two bars penetrate each other by {-least_m * 1000:.2f} mm",)
     return Check(f"{scene.label}: gaps of bars", f"{least_m * 1000:.2f} mm or more", "above 0 mm", problems)
 
