@@ -37,7 +37,8 @@ Sha256 = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
 Digest = Annotated[str, StringConstraints(pattern=f"^{DIGEST_PATTERN}$"), Expected("sha256: and 64 hex digits")]
 _Side = Annotated[int, whole_number(1, 16384)]
 _Length = Annotated[float, number(0, 10)]
-_Distance = Annotated[float, number(0)]
+_Error = Annotated[float, Expected("a number from 0 to 1e+09", lambda error: 0 <= error <= 1e9)]
+"""Error of a reference; it is 0 where a view has one scored pixel."""
 
 
 class ViewRecord(StrictModel):
@@ -139,8 +140,8 @@ class Rig(ManifestTable):
 class ReferenceRecord(ManifestTable):
     """AbsRel and RMSE (cm) of a reference, means over the views; None where undefined."""
 
-    abs_rel: _Distance | None
-    rmse_cm: _Distance | None
+    abs_rel: _Error | None
+    rmse_cm: _Error | None
 
 
 class References(ManifestTable):

@@ -14,9 +14,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from pydantic import ValidationError
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.columns import features
+from rebar_depth_bench.data.config_tables import References
 from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.trajectory import Survey, Trajectory
@@ -356,3 +358,10 @@ def test_load_with_missing_shard_raises_dataset_error(tiny_root: Path, tmp_path:
 def test_columns_given_as_text_are_rejected(tiny_root: Path) -> None:
     with pytest.raises(rdb.DatasetError, match="columns is 'left_rgb', expected a list"):
         rdb.load(tiny_root, "lattice", columns="left_rgb")
+
+
+def test_reference_errors_may_be_zero_but_not_negative() -> None:
+    zero = {"abs_rel": 0.0, "rmse_cm": 0.0}
+    assert References.model_validate({"constant": zero, "one_pixel": zero}).constant.abs_rel == 0.0
+    with pytest.raises(ValidationError):
+        References.model_validate({"constant": {**zero, "rmse_cm": -1.0}, "one_pixel": zero})
