@@ -64,7 +64,7 @@ CHANNELS = (8, 16, 32, 64, 96, 128)
 """Channels at full, half, quarter, ... resolution: 620,000 parameters."""
 FRAME_WEIGHT = 1.0
 """Weight of all surfaces; with less, the ground and the horizon, which show the distance, are learned slowly."""
-LEARNING_RATE, WEIGHT_DECAY, WARM_UP = 2e-3, 1e-2, 0.05
+LEARNING_RATE, WEIGHT_DECAY, WARM_UP = 1e-3, 1e-2, 0.05
 """Peak of the learning rate, which rises over the share ``WARM_UP`` of the training and falls as a cosine."""
 GAINS = (0.6, 1.5)
 """Range of the random factors of brightness in training."""
@@ -346,10 +346,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="train a small depth network on the config cages and score it")
     parser.add_argument("root", metavar="ROOT", help="dataset folder with the split train of cages")
     parser.add_argument("--out", type=Path, default=Path("finetuned"), metavar="FOLDER", help="default: finetuned")
-    parser.add_argument("--epochs", type=int, default=24, help="number of passes over the views (default: 24)")
+    parser.add_argument("--epochs", type=int, default=30, help="number of passes over the views (default: 30)")
     parser.add_argument("--minutes", type=float, help="end the training after this time (default: no limit)")
     parser.add_argument("--crop", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="size of random crops")
-    parser.add_argument("--batch", type=int, default=2, help="stereo pairs in a batch (default: 2)")
+    parser.add_argument("--batch", type=int, default=4, help="stereo pairs in a batch (default: 4)")
     parser.add_argument("--workers", type=int, default=1, help="processes that load views (default: 1)")
     parser.add_argument("--seed", type=int, default=0, help="seed of weights, order, crops and flips (default: 0)")
     options = parser.parse_args(arguments)
