@@ -80,6 +80,11 @@ def add_build_arguments(parser: argparse.ArgumentParser) -> None:
         default=0,
         help=f"random seed of surfaces and noise, and of all of {CAGES} (default: %(default)s)",
     )
+    _add_cages_arguments(parser)
+
+
+def _add_cages_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options for the scenes of the config ``cages``."""
     cages = parser.add_argument_group(f"scenes of the config {CAGES}")
     cages.add_argument(
         "--split",
