@@ -22,6 +22,8 @@ _REACH_M = 0.35
 """Largest distance of a block from its place."""
 _LAYER_M = 0.012
 """Height above the lowest steel up to which bars are supported."""
+_MAX_SLOPE = 0.1
+"""Largest rise per length of a supported part of a bar: a block below a bend would carry nothing."""
 _SAMPLE_M = 0.02
 _CLEAR_M = 4e-4
 """Distance of the points along bars at which a block is tried, and the least distance of a block from steel."""
@@ -60,16 +62,18 @@ def _places_m(context: PlacementContext) -> Float64[ndarray, "n 2"]:
 
 
 def _points_below_bars(context: PlacementContext) -> Float64[ndarray, "n 3"]:
-    """Return points below bars of the lowest layer, at the height of the top of a block there."""
+    """Return points below level bars of the lowest layer, at the height of the top of a block there."""
     capsules = context.capsules
     bottoms_m = np.minimum(capsules.a_m[:, 2], capsules.b_m[:, 2]) - capsules.radius_m
     lowest = capsules.select(bottoms_m < context.low_m[2] + _LAYER_M)
     points = [np.zeros((0, 3))]
     for a, b, radius_m in zip(lowest.a_m, lowest.b_m, lowest.radius_m, strict=True):
-        count = max(2, int(np.linalg.norm(b - a) / _SAMPLE_M))
-        along = a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
         # A bar that slopes is lower at one side of a block than above its middle.
         slope = abs(b[2] - a[2]) / max(float(np.hypot(*(b - a)[:2])), 1e-9)
+        if slope > _MAX_SLOPE:
+            continue
+        count = max(2, int(np.linalg.norm(b - a) / _SAMPLE_M))
+        along = a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
         points.append(along - [0.0, 0.0, radius_m + slope * BLOCK_HALF_M + 2 * _CLEAR_M])
     joined = np.concatenate(points)
     return np.asarray(joined[joined[:, 2] > 0.5 * context.low_m[2]])

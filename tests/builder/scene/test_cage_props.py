@@ -77,8 +77,6 @@ def test_props_are_closed_non_steel_and_above_ground(family: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("family", LYING)
 def test_blocks_carry_cages_above_the_ground(family: str) -> None:
-    if family == "footing":
-        pytest.xfail("its cages have changed since this was written: to be examined")
     (support,) = props(family)
     blocks = body(support).split()
     corners_m = box_m(family)[:, :2]
@@ -124,14 +122,14 @@ def test_sheets_stand_at_the_cover(family: str, seed: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("family", FORMWORK_FAMILIES)
 def test_formwork_closes_some_sides_and_leaves_others_open(family: str) -> None:
-    if family == "beam":
-        pytest.xfail("its cages have changed since this was written: to be examined")
     low, high = box_m(family)
     middle_m, reach_m = (low + high) / 2, float(np.ptp([low, high], axis=0)[:2].max())
     height_m = 0.5 * min(high[2], 0.3)
     sheets = trimesh.util.concatenate([body(part) for part in named(props(family, "formwork"), "sheet")])
     towards = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], dtype=float)
-    is_closed = sheets.ray.intersects_any(np.tile([*middle_m[:2], height_m], (4, 1)), towards * reach_m)
+    # Not from the middle itself, where two sheets of a long panel meet.
+    origin_m = [*(middle_m[:2] + 0.05 * (high - low)[:2]), height_m]
+    is_closed = sheets.ray.intersects_any(np.tile(origin_m, (4, 1)), towards * reach_m)
     assert is_closed.sum() == (3 if family == "slab" else 2)
 
 
