@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
+from itertools import groupby
 from pathlib import Path
 
 from dataset_builder.config.specs import ColourSpec, ConfigSpec, SceneConfigSpec
@@ -26,13 +27,18 @@ from rebar_depth_bench.progress import Progress, silent
 
 @dataclass(frozen=True)
 class ConfigEstimate:
-    """Estimate of one config: views per remaining work unit, disk space and trial (None: nothing to render)."""
+    """Estimate of a config, or of one or more of its scenes.
+
+    ``unit_views`` has the number of views of each remaining work unit. ``space`` and ``trial`` are None if nothing
+    is to be built or rendered.
+    """
 
     spec: ConfigSpec
     views: int
     unit_views: tuple[int, ...] = ()
     space: ConfigSpace | None = None
     trial: Trial | None = None
+    scenes: int = 1
 
     @property
     def missing(self) -> int:
@@ -79,6 +85,20 @@ def _estimate_config(plan: ConfigPlan, out: Path, threads: int, trials: dict[obj
     return ConfigEstimate(spec, len(plan.indices), unit_views, config_space(plan, out), trials.get(key))
 
 
+def of_scenes(estimates: Sequence[ConfigEstimate]) -> ConfigEstimate:
+    """Return the estimate of a config whose scenes have the given ones: their units are rendered side by side."""
+    spaces = [estimate.space for estimate in estimates if estimate.space]
+    sizes = [sum(column) for column in zip(*map(astuple, spaces), strict=True)]
+    return ConfigEstimate(
+        spec=estimates[0].spec,
+        views=sum(estimate.views for estimate in estimates),
+        unit_views=tuple(views for estimate in estimates for views in estimate.unit_views),
+        space=ConfigSpace(*sizes) if spaces else None,
+        trial=next((estimate.trial for estimate in estimates if estimate.trial), None),
+        scenes=len(estimates),
+    )
+
+
 def makespan(durations: Sequence[float], processes: int) -> float:
     """Return the time until all tasks are done if each process takes the next task when it is free."""
     busy_until = [0.0] * max(1, min(processes, len(durations)))
@@ -89,17 +109,19 @@ def makespan(durations: Sequence[float], processes: int) -> float:
 
 def estimate_lines(estimates: Sequence[ConfigEstimate], out: Path, processes: int) -> Iterator[str]:
     """Yield the lines that describe the estimates of a build with this number of concurrent processes."""
-    for estimate in estimates:
-        yield from _config_lines(estimate, processes)
-    missing, views = (sum(getattr(item, name) for item in estimates) for name in ("missing", "views"))
+    configs = [of_scenes(list(scenes)) for _, scenes in groupby(estimates, lambda estimate: estimate.spec.name)]
+    for config in configs:
+        yield from _config_lines(config, processes)
+    missing, views = (sum(getattr(item, name) for item in configs) for name in ("missing", "views"))
     needed = needed_bytes(item.space for item in estimates if item.space)
-    yield f"total: {missing} of {views} views to render, {_duration_text(estimates, processes)}"
+    yield f"total: {missing} of {views} views to render, {_duration_text(configs, processes)}"
     yield f"disk space: {bytes_text(needed)} needed, {bytes_text(free_bytes(out))} free for {out}"
 
 
 def _config_lines(estimate: ConfigEstimate, processes: int) -> Iterator[str]:
     rig, space, trial = estimate.spec.rig, estimate.space, estimate.trial
-    yield f"{estimate.spec.name}: {estimate.views} views of two pictures, {rig.width} x {rig.height}"
+    scenes = f" in {estimate.scenes} scenes," if estimate.scenes > 1 else ""
+    yield f"{estimate.spec.name}: {estimate.views} views{scenes} of two pictures, {rig.width} x {rig.height}"
     if space is None:
         yield "  up to date: nothing to render"
         return

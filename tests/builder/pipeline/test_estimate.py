@@ -12,7 +12,8 @@ import pytest
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.quality import QUALITIES
 from dataset_builder.config.specs import ColourSpec, RigSpec
-from dataset_builder.pipeline.estimate import ConfigEstimate, makespan
+from dataset_builder.pipeline.disk_space import ConfigSpace
+from dataset_builder.pipeline.estimate import ConfigEstimate, makespan, of_scenes
 from dataset_builder.pipeline.trial import Trial, split_times, trial_rig
 from tests.building import TINY, TWO_BARS, RunBuild, contents
 
@@ -31,6 +32,17 @@ def test_trial_scales_with_pixels_and_processes() -> None:
     assert estimate.seconds(2) == pytest.approx(19 + 11)
     assert estimate.seconds(100) == pytest.approx(19)
     assert estimate.cpu_seconds == pytest.approx(2 * 49)
+
+
+def test_scenes_of_a_config_are_one_estimate() -> None:
+    trial = Trial(process_s=3.0, view_s_per_pixel=1e-4, busy_threads=2.0, pixels=10_000, memory_bytes=10**9)
+    [spec] = BuildRequest(configs=("pile",), width=200, height=100).config_specs()
+    rendered = [ConfigEstimate(spec, 4, (4,), ConfigSpace(0, 100 * scene, 7, 1), trial) for scene in (1, 2)]
+    config = of_scenes([ConfigEstimate(spec, 4), *rendered])
+    assert (config.scenes, config.views, config.missing) == (3, 12, 8)
+    assert config.space == ConfigSpace(0, 300, 14, 2)
+    assert config.seconds(1) == 2 * config.seconds(2) == pytest.approx(2 * (3 + 4 * 2))
+    assert of_scenes([ConfigEstimate(spec, 4)] * 2).space is None
 
 
 def test_makespan_gives_the_next_task_to_the_process_that_is_free_first() -> None:
