@@ -28,6 +28,7 @@ from numpy import ndarray
 
 import rebar_depth_bench as rdb
 from benchmarks.timing import print_markdown
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.detections.score import score_crossings
 from rebar_depth_bench.extended.evaluate import score_extended
@@ -76,16 +77,21 @@ def main(root: str, out: str, *archives: str) -> None:
     rows = [row for config in configs for row in _random(root, config)]
     files.append(("random points on steel", configs, _write(target / "random.csv", rows)))
     detectors = {method: _scores(method, of_file, path, root) for method, of_file, path in files}
-    sizes = {(len(config.views), *config.grid[::-1]) for config in folder.config_by_name.values()}
     document = {
         "command": "python -m benchmarks.crossings ROOT OUT ARCHIVE...",
-        "renders": [f"{views} views of {width} x {height}" for views, width, height in sorted(sizes)],
+        "renders": [_renders_text(folder.config(config)) for config in configs],
         "depth": depth,
         "detectors": detectors,
     }
     (target / "crossings.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
     head = ["config", "detector", *SHARES, "AP 5", "AP 10", "AP 20", "median mm", "p95 mm"]
     print_markdown(head, [row for method, tables in detectors.items() for row in _table_rows(method, tables)])
+
+
+def _renders_text(config: DatasetConfig) -> str:
+    height, width = config.grid
+    scenes = f" in {len(config.scenes)} scenes," if len(config.scenes) > 1 else ""
+    return f"{config.name}: {len(config.views)} views{scenes} of {width} x {height}"
 
 
 def _measures(archive: str, root: str) -> dict[str, Any]:

@@ -3,8 +3,9 @@
 ``python -m benchmarks.reference OUT SET`` renders the views of a set into OUT/dataset, writes the predictions of
 each method to OUT/NAME.zip, scores them and writes ``cards/reference/SET.json``, the source of the tables in the
 benchmark card. ``subset`` has all methods on a subset of every scene; ``lattice``, ``pile`` and ``pier`` have the
-fast methods on all views of one scene. A set takes hours. After an interruption, the same command computes only
-the archives that are missing or older than the dataset. OUT must not be used for two sets.
+fast methods on all views of one scene, ``cages`` has them on 40 generated scenes. A set takes hours. After an
+interruption, the same command computes only the archives that are missing or older than the dataset. OUT must not
+be used for two sets.
 """
 
 from __future__ import annotations
@@ -28,17 +29,40 @@ from rebar_depth_bench.scoring.single_bar import mean_single_bar
 from rebar_depth_bench.studies.distance.command import run_distance_study
 from rebar_depth_bench.studies.distance.study import DistancePoint
 from rebar_depth_bench.submission.metadata import METADATA_NAME
-from rebar_depth_bench.view_ids import config_of
+from rebar_depth_bench.view_ids import TEST_SPLIT, config_of
 
 
 @dataclass(frozen=True)
 class Renders:
-    """Rendered views of each config: their number, evenly spread, image size in pixels, and colour option."""
+    """Rendered views of each config: their number, evenly spread, image size in pixels, and colour option.
+
+    ``scenes`` is the number of scenes of the split ``test`` in a config with splits; they share the views equally.
+    """
 
     views: int
     colour: str
     width: int = 640
     height: int = 360
+    scenes: int | None = None
+
+    def to_dict(self) -> dict[str, int | str]:
+        """Return the fields that are set, as a JSON object."""
+        return {key: value for key, value in asdict(self).items() if value is not None}
+
+    def options(self) -> list[str]:
+        """Return the options of ``rebar-build``."""
+        views = ["--views", self.views]
+        if self.scenes is not None:
+            views = [
+                "--split",
+                TEST_SPLIT,
+                "--scenes",
+                self.scenes,
+                "--views-per-scene",
+                self.views // self.scenes,
+            ]
+        size = ("--width", self.width, "--height", self.height)
+        return [*map(str, (*views, *size)), *self.colour.split()]
 
 
 @dataclass(frozen=True)
@@ -87,9 +111,12 @@ def _all_views(scene: str) -> ReferenceSet:
     return ReferenceSet(Renders(504, "--quality preview"), runs)
 
 
+CAGE_METHODS = ("sgbm", "sgbm-filled", "lidar-mobile", "constant", "noisy-truth", "truth")
+
 SETS: Mapping[str, ReferenceSet] = {
     "subset": ReferenceSet(Renders(72, "--samples 4"), RUNS),
     **{scene: _all_views(scene) for scene in ALL_SCENES},
+    "cages": ReferenceSet(Renders(160, "--quality preview", scenes=40), dict.fromkeys(CAGE_METHODS, ("cages",))),
 }
 """Sets of results by name."""
 
@@ -97,19 +124,9 @@ SETS: Mapping[str, ReferenceSet] = {
 def main(out: Path, set_name: str) -> int:
     """Compute missing archives of a set and write its results; return the exit status."""
     reference = SETS[set_name]
-    renders, root = reference.renders, out / "dataset"
-    size = ("--width", renders.width, "--height", renders.height)
-    build = (
-        "--out",
-        root,
-        "--config",
-        *reference.configs,
-        "--views",
-        renders.views,
-        *size,
-        *renders.colour.split(),
-    )
-    if status := rebar_build(list(map(str, build))):
+    root = out / "dataset"
+    build = ("--out", str(root), "--config", *reference.configs, *reference.renders.options())
+    if status := rebar_build(list(build)):
         return status
     for method, configs in reference.runs.items():
         archive = out / f"{method}.zip"
@@ -118,7 +135,7 @@ def main(out: Path, set_name: str) -> int:
             return status
     results = {method: _result(out / f"{method}.zip", root) for method in reference.runs}
     command = f"python -m benchmarks.reference OUT {set_name}"
-    document = {"command": command, "renders": asdict(renders), "results": results}
+    document = {"command": command, "renders": reference.renders.to_dict(), "results": results}
     write_text(results_file(set_name), json.dumps(document, indent=1, allow_nan=False) + "\n")
     return 0
 

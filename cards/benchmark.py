@@ -10,8 +10,17 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cards.crossings import crossing_baselines
-from cards.reference import FULL_SETS, SUBSET, number, percent, reference_context
+from cards.crossings import FILES, crossing_baselines
+from cards.reference import (
+    CAGES,
+    FULL_SETS,
+    GROUPS_METHOD,
+    SUBSET,
+    group_tables,
+    number,
+    percent,
+    reference_context,
+)
 from cards.steel import STEEL_RESULTS, depth_text, range_text
 from cards.templates import render
 from rebar_depth_bench.bar_crossings.definition import crossing_parameters
@@ -78,6 +87,9 @@ def benchmark_card() -> str:
         methods=[_method_row(method) for method in own_methods().values()],
         subset=reference_context(SUBSET),
         full=[reference_context(name) for name in FULL_SETS],
+        cages=reference_context(CAGES),
+        cage_groups=group_tables(CAGES, "cages"),
+        groups_method=GROUPS_METHOD,
         **steel_context(),
         draws=RESAMPLES,
         ring_views=BLOCK_VIEWS,
@@ -88,7 +100,7 @@ def benchmark_card() -> str:
         fits_note=FITS_NOTE,
         reach_note=REACH_NOTE,
         contacts=_CONTACTS,
-        baselines=crossing_baselines(),
+        baselines=[crossing_baselines(file) for file in FILES],
         random_points=60,
         max_rows=f"{MAX_ROWS_PER_VIEW:,}",
         families=[_family_rows(family) for family in MEASURE_FAMILIES.values()],

@@ -1,4 +1,4 @@
-"""Baselines at crossings: rows of the card's tables, from the file that ``benchmarks.crossings`` writes."""
+"""Baselines at crossings: rows of the card's tables, from the files that ``benchmarks.crossings`` writes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from typing import Any
 
 from cards.reference import number, percent
 
-RESULTS = Path(__file__).parent / "reference" / "crossings.json"
+FILES = ("crossings.json", "crossings-cages.json")
+"""Files of results: of the scenes, and of generated scenes."""
 
 
-def crossing_baselines() -> dict[str, Any]:
-    """Return the template variables of the baselines: command, renders, and rows of the tables."""
-    document = json.loads(RESULTS.read_text())
+def crossing_baselines(file: str) -> dict[str, Any]:
+    """Return the template variables of the baselines in a file: command, renders, and rows of the tables."""
+    document = json.loads((Path(__file__).parent / "reference" / file).read_text())
     depth = document["depth"]
     return {
+        "file": f"reference/{file}",
         "command": document["command"],
         "renders": document["renders"],
         "methods": [f"`{method}`" for method in depth],

@@ -15,6 +15,12 @@ SUBSET = "subset"
 FULL_SETS = ("lattice", "pile", "pier")
 """Published sets of results of the fast methods on all views of a scene, each named after its config."""
 
+CAGES = "cages"
+"""Set of results of the fast methods on generated scenes."""
+
+GROUPS_METHOD = "sgbm"
+"""Method whose results the card shows for each group of views."""
+
 
 def results_file(set_name: str) -> Path:
     """Return the JSON file of a set of results."""
@@ -42,6 +48,21 @@ def reference_context(set_name: str) -> dict[str, Any]:
         },
         "single_bar": [_single_bar_row(config, *row) for config, rows in by_config.items() for row in rows],
     }
+
+
+def group_tables(set_name: str, config: str) -> dict[str, list[dict[str, str]]]:
+    """Return the formatted rows of groups of views, of the method ``GROUPS_METHOD``, by key of the grouping."""
+    document = json.loads(results_file(set_name).read_text())
+    groups = document["results"][GROUPS_METHOD]["tables"][config]["groups"]
+    return {
+        grouping: [_group_row(group, table) for group, table in tables.items()]
+        for grouping, tables in groups.items()
+    }
+
+
+def _group_row(group: str, table: Mapping[str, Any]) -> dict[str, str]:
+    reference = {name: number(errors["abs_rel"], 4) for name, errors in table["reference"].items()}
+    return {"group": group, "views": str(table["views"]), **_table_cells(table), **reference}
 
 
 def _method_rows(config: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) -> list[dict[str, str]]:
@@ -73,12 +94,20 @@ def _mark(method: str) -> str:
 
 def _method_row_of(method: str, result: Mapping[str, Any], config: str) -> dict[str, str]:
     table = result["tables"][config]
+    return {
+        "method": method,
+        "mark": _mark(method),
+        **_table_cells(table),
+        "seconds": _seconds(result, config, table["views"]),
+    }
+
+
+def _table_cells(table: Mapping[str, Any]) -> dict[str, str]:
+    """Return the formatted numbers of the table of a config or of a group of its views."""
     native, scaled = table["native"] or {}, table["scaled"] or {}
     bounds = (table.get("ci95") or {}).get("native", {}).get("abs_rel")
     interval = "" if bounds is None else f" ({number(bounds[0], 3)}-{number(bounds[1], 3)})"
     return {
-        "method": method,
-        "mark": _mark(method),
         "rank_error": number(table["rank_error"], 4),
         "coverage": percent(table["coverage"]),
         "abs_rel": number(native.get("abs_rel"), 4) + interval,
@@ -86,7 +115,6 @@ def _method_row_of(method: str, result: Mapping[str, Any], config: str) -> dict[
         "scaled": number(scaled.get("abs_rel"), 4),
         "scale": number(table["scale_median"], 3),
         "within": percent(table["within_mm"]["5"]),
-        "seconds": _seconds(result, config, table["views"]),
     }
 
 

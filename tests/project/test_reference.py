@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from typing import Any
 
 import pytest
 
 from benchmarks.reference import RUNS, SETS
-from cards.reference import FULL_SETS, SUBSET, reference_context, results_file
+from cards.reference import CAGES, FULL_SETS, SUBSET, reference_context, results_file
 from rebar_depth_bench.methods import own_methods
 
-PUBLISHED = (SUBSET, *FULL_SETS)
+PUBLISHED = (SUBSET, *FULL_SETS, CAGES)
 STORED: dict[str, dict[str, Any]] = {name: json.loads(results_file(name).read_text()) for name in PUBLISHED}
 
 
@@ -25,7 +24,7 @@ def test_every_cpu_method_has_a_stored_run() -> None:
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_set_has_its_methods_configs_and_views(name: str) -> None:
     renders, runs, results = SETS[name].renders, SETS[name].runs, STORED[name]["results"]
-    assert STORED[name]["renders"] == asdict(renders)
+    assert STORED[name]["renders"] == renders.to_dict()
     assert set(results) == set(runs)
     for method, result in results.items():
         assert tuple(result["tables"]) == runs[method]
