@@ -74,9 +74,7 @@ def test_readme_settings_table_matches_code() -> None:
 def test_extras_in_readme_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     installed = {
-        extra
-        for extras_list in re.findall(r"rebar-depth-bench\[([\w,]+)\]", README)
-        for extra in extras_list.split(",")
+        extra for extras_list in re.findall(r"'\.\[([\w,]+)\]'", README) for extra in extras_list.split(",")
     }
     assert {"server", "postgresql"} <= installed <= set(extras)
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
+import tomllib
 from argparse import ArgumentParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from cards.reference import FULL_SETS, reference_context
 from dataset_builder.cli import argument_parser as build_parser
 from dataset_builder.config.catalog import CONFIGS, SWEEPS
 from dataset_builder.importing.layout import read_layout
@@ -21,6 +24,7 @@ from rebar_depth_bench.limits import LIMITS, Limit
 from rebar_depth_bench.methods import find_method, own_methods
 from tests.bench.methods.predictors import load_predictor
 
+DOCS = sorted(Path("docs").rglob("*.md"))
 PAGES = [
     Path("README.md"),
     Path("CONTRIBUTING.md"),
@@ -28,8 +32,7 @@ PAGES = [
     Path("SECURITY.md"),
     Path("cards/BENCHMARK.md"),
     Path("deploy/README.md"),
-    Path("docs/captures.md"),
-    Path("docs/import.md"),
+    *DOCS,
 ]
 PARSERS: dict[str, ArgumentParser] = {
     "rebar-build": build_parser(),
@@ -43,9 +46,15 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def commands() -> list[str]:
+    """Return the commands of all pages: lines of blocks, and inline ones that have arguments."""
     lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
-    inline = re.findall(r"`(rebar-(?:build|bench|leaderboard) [^`\n]*)`", Path("README.md").read_text())
-    return [line for line in [*lines, *inline] if line.startswith(tuple(PARSERS))]
+    inline = [
+        " ".join(command.split())
+        for page in (Path("README.md"), *DOCS)
+        for command in re.findall(r"`(rebar-(?:build|bench|leaderboard) [^`]*)`", page.read_text())
+    ]
+    with_arguments = [command for command in inline if len(command.split()) > 2]
+    return [line for line in [*lines, *with_arguments] if line.startswith(tuple(PARSERS))]
 
 
 @pytest.mark.parametrize("command", commands())
@@ -54,26 +63,42 @@ def test_documented_commands_parse(command: str) -> None:
     assert PARSERS[program].parse_args(arguments)
 
 
-def test_documented_python_runs(tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first, second, *_ = blocks(Path("README.md"), "python")
+@pytest.mark.parametrize("page", [Path("README.md"), Path("docs/score.md")], ids=str)
+def test_documented_python_runs(
+    tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, page: Path
+) -> None:
+    text = "".join(blocks(page, "python"))
+    shown = text.replace('"demo-output/dataset"', repr(str(tiny_root))).replace("(480, 640)", "(48, 64)")
+    assert repr(str(tiny_root)) in shown
     monkeypatch.chdir(tmp_path)
-    shown = first.replace('"demo-output/dataset"', repr(str(tiny_root)))
-    assert shown != first
     names: dict[str, object] = {"my_model": lambda rgb, K: np.full(rgb.shape[:2], K[0, 0] / 200)}
-    exec(shown + second.replace("(480, 640)", "(48, 64)"), names)
+    exec(shown, names)
     assert (tmp_path / "submission.zip").is_file()
-    batch = next(iter(names["loader"]))  # type: ignore[call-overload]
-    assert {"rgb", "depth", "mask", "K", "poses", "view_id", "right_rgb", "baseline_m"} <= set(batch)
+    if "loader" in names:
+        batch = next(iter(names["loader"]))  # type: ignore[call-overload]
+        assert {"rgb", "depth", "mask", "K", "poses", "view_id", "right_rgb", "baseline_m"} <= set(batch)
 
 
-def test_method_template_in_readme_works(tmp_path: Path) -> None:
-    [template] = blocks(Path("README.md"), "py")
+def test_method_template_works(tmp_path: Path) -> None:
+    [template] = blocks(Path("docs/methods.md"), "py")
     path = tmp_path / "my_model.py"
     path.write_text(f"load_my_model = lambda: lambda rgb, K: rgb[..., 0] * K[0, 0]\n{template}")
     method = find_method(f"{path}:METHOD")
     row = {"left_rgb": np.full((2, 3, 3), 2.0), "left_K": 5 * np.eye(3)}
     assert load_predictor(method)(row).tolist() == [[10.0] * 3] * 2
     assert set(method.info.columns) == set(row)
+
+
+def test_results_in_readme_are_those_of_the_card() -> None:
+    rows = re.findall(r"^\| [\w -]+, [\d.]+-[\d.]+ m \| (.*) \|$", Path("README.md").read_text(), re.MULTILINE)
+    expected = []
+    for config in FULL_SETS:
+        context = reference_context(config)
+        row = next(row for row in context["rows"][config] if row["method"] == "sgbm")
+        errors = context["errors"][config]
+        cells = (*(row[key] for key in ("coverage", "abs_rel", "scaled", "within")), errors["constant"][0])
+        expected.append(" | ".join((*cells, errors["one_pixel"][0])))
+    assert rows == expected
 
 
 def test_leaderboard_settings_table_matches_code() -> None:
@@ -83,20 +108,39 @@ def test_leaderboard_settings_table_matches_code() -> None:
         assert f"| `{name}` | {default} | {field.description} |" in page
 
 
-def test_readme_tables_list_configs_variants_and_methods() -> None:
-    readme = Path("README.md").read_text()
-    assert set(re.findall(r"^\| `([\w-]+)` \|", readme, flags=re.MULTILINE)) == {
-        *CONFIGS,
-        *SWEEPS,
-        *own_methods(),
-        *VARIANTS,
+def test_tables_list_configs_variants_and_methods() -> None:
+    build, methods = (Path(f"docs/{name}.md").read_text() for name in ("build", "methods"))
+    assert table_names(build) == {*CONFIGS, *SWEEPS, *VARIANTS}
+    assert table_names(methods) == set(own_methods())
+    assert all(f"| `{variant.name}` | {variant.description} |" in build for variant in VARIANTS.values())
+
+
+def table_names(text: str) -> set[str]:
+    return set(re.findall(r"^\| `([\w-]+)` \|", text, flags=re.MULTILINE))
+
+
+def test_extras_are_documented() -> None:
+    extras = tomllib.loads(Path("pyproject.toml").read_text())["project"]["optional-dependencies"]
+    rows = re.findall(r"^\| (`[\w`, ]+`) \|", Path("docs/quickstart.md").read_text(), flags=re.MULTILINE)
+    assert {name for row in rows for name in re.findall(r"\w+", row)} == {*extras} - {"dev", "docs"}
+    used = {
+        name
+        for page in PAGES
+        for names in re.findall(r"'\.\[([\w,]+)\]'", page.read_text())
+        for name in names.split(",")
     }
-    assert all(f"| `{variant.name}` | {variant.description} |" in readme for variant in VARIANTS.values())
+    assert used <= set(extras)
+
+
+@pytest.mark.parametrize("language", ["json", "toml"])
+def test_documented_files_can_be_parsed(language: str) -> None:
+    parse = {"json": json.loads, "toml": tomllib.loads}[language]
+    assert [parse(block) for page in DOCS for block in blocks(page, language)]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=str)
 def test_local_links_exist(page: Path) -> None:
-    links = re.findall(r"\]\(([^)#]+)\)", page.read_text())
+    links = re.findall(r"\]\(([^)#\s]+)", page.read_text())
     assert all((page.parent / link).exists() for link in links if "://" not in link)
 
 
