@@ -60,11 +60,14 @@ myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]
 nb_execution_mode = "force"
 nb_execution_show_tb = True
+# Progress of reading, which depends on the machine.
+nb_output_stderr = "remove"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 
 html_theme = "furo"
 html_title = f"rebar-depth-bench {release}"
 html_extra_path = ["index.html"]
+html_show_copyright = False
 html_show_sourcelink = False
 html_copy_source = False
