@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo quick test nightly format env-dev env-space system-packages cards docs sample-data clean
+.PHONY: help demo quick test nightly versions docs dist format env-dev env-space system-packages cards sample-data clean
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -24,6 +24,14 @@ test: system-packages env-dev ## Everything that CI runs: quick, and real render
 nightly: system-packages env-dev env-space ## Everything, with the long stress tests and 10,000 damaged inputs
 	scripts/check.sh $(BIN) nightly
 	$(BIN)/python -m tests.fuzz --cases 10000 --log fuzz.jsonl
+
+versions: ## The fast tests of the core on other versions of Python: all that are found, or VERSIONS="3.12 3.13"
+	scripts/versions.sh $(VERSIONS)
+
+dist: env-dev ## Build and check the source distribution and the wheel in dist/
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/python -m twine check --strict dist/*
 
 format: env-dev ## Format the code and apply the linter's safe fixes
 	$(BIN)/ruff format .
@@ -48,4 +56,4 @@ system-packages: ## Check the system packages that rendering and testing need; a
 	@scripts/system_packages.sh blender browser uploads
 
 clean: ## Remove the environments and the demo's output
-	rm -rf $(VENV) $(VENV)-space demo-output
+	rm -rf $(VENV) $(VENV)-space $(VENV)-3.* build dist *.egg-info demo-output

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
 # Makes or reuses a virtual environment with one of the project's extras, or with what the app in examples/space needs.
+# The extra "test" works on any supported version of Python.
 # usage: scripts/environment.sh PYTHON VENV EXTRA|space
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -13,7 +14,7 @@ fail() {
 command -v "$python" >/dev/null 2>&1 ||
     fail "$python is not on the PATH; install Python 3.11 (Debian: apt-get install python3.11 python3.11-venv), which Blender 4.5 needs exactly, or name it: make PYTHON=/path/to/python3.11"
 version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
-[ "$version" = 3.11 ] || fail "$python is Python $version; Blender 4.5 needs exactly 3.11"
+[ "$version" = 3.11 ] || [ "$extra" = test ] || fail "$python is Python $version; Blender 4.5 needs exactly 3.11"
 "$python" -c 'import ensurepip, venv' 2>/dev/null ||
     fail "$python lacks venv; install it (Debian: apt-get install python3.11-venv)"
 

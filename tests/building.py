@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from dataset_builder.pipeline.plan import BUILD_FOLDER
 from tests.processes import processes_below
 
 TINY = ("--width", "160", "--height", "90", "--quality", "preview")
@@ -39,6 +38,9 @@ def render_processes_of(pid: int) -> list[int]:
 
 
 def staged_rows(root: Path) -> int:
+    # Tests of the core run without the packages of the extra ``build``, which this import needs.
+    from dataset_builder.pipeline.plan import BUILD_FOLDER
+
     return len(list(root.glob(f"{BUILD_FOLDER}/*/rows/????.parquet")))
 
 

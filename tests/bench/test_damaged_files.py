@@ -11,8 +11,12 @@ from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
+
+pytest.importorskip("cv2")
+pytest.importorskip("pydantic_settings")
+
+import numpy as np
 from PIL import Image
 
 from leaderboard.settings import read_settings

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
+
+pytest.importorskip("cv2")
+
+import numpy as np
 from PIL import Image
 
 from rebar_depth_bench.captures.folder import open_capture

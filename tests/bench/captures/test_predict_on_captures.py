@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+pytest.importorskip("cv2")
+
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.submission import SubmissionReader
 from tests.bench.captures import calibration_files as files

@@ -7,8 +7,11 @@ from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+
+pytest.importorskip("cv2")
+
+import numpy as np
 
 from rebar_depth_bench.captures.camera_files import read_cameras
 from rebar_depth_bench.errors import CalibrationError

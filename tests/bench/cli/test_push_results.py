@@ -6,6 +6,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
+
+pytest.importorskip("starlette")
+pytest.importorskip("uvicorn")
+
 import yaml
 from huggingface_hub import constants, parse_eval_result_entries
 from starlette.responses import JSONResponse

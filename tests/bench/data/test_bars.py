@@ -28,7 +28,8 @@ def write_rows(path: Path, *rows: dict[str, Any]) -> Path:
 def test_read_bars_returns_what_write_bars_wrote(tmp_path: Path) -> None:
     scenes = {"pier": (STRAIGHT, BENT, WITHOUT_AXIS), "pile": (STRAIGHT,)}
     write_bars(tmp_path / "bars.parquet", scenes)
-    assert read_bars(tmp_path / "bars.parquet") == scenes
+    # Texts, because the diameter of a bar without an axis is NaN, which differs from itself.
+    assert repr(read_bars(tmp_path / "bars.parquet")) == repr(scenes)
 
 
 def test_bar_without_axis_is_null_in_the_table(tmp_path: Path) -> None:

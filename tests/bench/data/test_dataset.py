@@ -13,7 +13,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-import torch
 from pydantic import ValidationError
 
 import rebar_depth_bench as rdb
@@ -80,6 +79,7 @@ def test_streaming_gives_the_same_rows(tiny_root: Path) -> None:
 @pytest.mark.parametrize("streaming", [False, True])
 @pytest.mark.parametrize("num_workers", [0, 2])
 def test_torch_batch_shapes_and_dtypes(tiny_root: Path, streaming: bool, num_workers: int) -> None:
+    torch = pytest.importorskip("torch")
     ds = rdb.load(tiny_root, "lattice", streaming=streaming)
     loaded_ids: list[str] = []
     for batch in rdb.torch_loader(ds, batch_size=4, num_workers=num_workers):
@@ -96,6 +96,7 @@ def test_torch_batch_shapes_and_dtypes(tiny_root: Path, streaming: bool, num_wor
 
 
 def test_torch_batch_equals_row_values(tiny_root: Path) -> None:
+    pytest.importorskip("torch")
     row = rdb.load(tiny_root, "lattice")[0]
     batch = next(iter(rdb.torch_loader(rdb.load(tiny_root, "lattice"), stereo=True)))
     assert np.array_equal(batch["rgb"][0].permute(1, 2, 0).numpy(), row["left_rgb"])

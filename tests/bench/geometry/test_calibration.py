@@ -7,9 +7,12 @@ from dataclasses import replace
 from math import pi
 from pathlib import Path
 
+import pytest
+
+pytest.importorskip("cv2")
+
 import cv2
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 

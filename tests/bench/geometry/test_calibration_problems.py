@@ -91,7 +91,7 @@ def test_file_that_is_no_calibration_is_rejected(tmp_path: Path, content: bytes,
     [
         ("none.conf", "missing", "cannot be read: No such file"),
         ("folder.conf", "unreadable", "cannot be read: it is a folder"),
-        ("nul\0.conf", "unreadable", "cannot be read: embedded null"),
+        ("nul\0.conf", "unreadable", "embedded null"),
         ("a.yaml", "invalid", "the file suffix is '.yaml', expected .conf or .toml"),
     ],
 )

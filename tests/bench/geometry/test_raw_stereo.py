@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
+pytest.importorskip("cv2")
+
 import cv2
 import numpy as np
-import pytest
 from jaxtyping import Float64
 from numpy import ndarray
 

@@ -7,9 +7,12 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
+pytest.importorskip("torch")
+
 import huggingface_hub
 import numpy as np
-import pytest
 from huggingface_hub import constants
 
 from rebar_depth_bench.cli.main import main

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+pytest.importorskip("torch")
+pytest.importorskip("transformers")
+
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.huggingface.model import hf_method

@@ -10,9 +10,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytest.importorskip("cv2")
+pytest.importorskip("torch")
+
 import cv2
 import numpy as np
-import pytest
 
 H, W, FX, FY = 90, 160, 87.5, 80.0
 SMALL = """

@@ -9,10 +9,14 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
+pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
 import numpy as np
 import onnx
 import onnxruntime
-import pytest
 from onnx import ModelProto, TensorProto, helper, numpy_helper
 
 from rebar_depth_bench.errors import MethodError

@@ -9,8 +9,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+
+pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
+import numpy as np
 from onnx import TensorProto, helper
 
 from rebar_depth_bench.cli.main import main

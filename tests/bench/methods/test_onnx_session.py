@@ -7,8 +7,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+
+pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
+import numpy as np
 from onnx import TensorProto, helper
 
 from rebar_depth_bench.errors import MethodError

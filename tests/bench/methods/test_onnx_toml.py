@@ -7,6 +7,10 @@ from textwrap import dedent
 from typing import Annotated
 
 import pytest
+
+pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 

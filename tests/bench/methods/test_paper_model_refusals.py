@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+pytest.importorskip("cv2")
+pytest.importorskip("torch")
+
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.registry import FROM_FOLDER

@@ -13,9 +13,13 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
+pytest.importorskip("cv2")
+pytest.importorskip("torch")
+
 import cv2
 import numpy as np
-import pytest
 
 from rebar_depth_bench import score
 from rebar_depth_bench.cli.main import main

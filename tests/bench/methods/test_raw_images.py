@@ -6,8 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+
+pytest.importorskip("cv2")
+pytest.importorskip("torch")
+
+import numpy as np
 from PIL import Image
 
 from rebar_depth_bench.captures.folder import open_capture

@@ -36,6 +36,7 @@ def test_consistent_plane_is_confirmed_where_both_see_it(disparity: int, seed: i
 @pytest.mark.parametrize("where", ["bar", "none"])
 def test_pixels_seen_by_one_eye_have_no_depth(where: str) -> None:
     """A textured bar stands in front of a textured wall; beside its edge the wall is hidden from the right eye."""
+    pytest.importorskip("cv2")
     rng = np.random.default_rng(1)
     wall, bar = (rng.integers(0, 255, (60, 240, 3), np.uint8) for _ in range(2))
     left, right = wall[:, :200].copy(), wall[:, 8:208].copy()  # The wall has 8 px of disparity.

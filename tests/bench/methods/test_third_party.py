@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+pytest.importorskip("torch")
+
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import MethodInfo
 from rebar_depth_bench.methods.monocular.third_party import (

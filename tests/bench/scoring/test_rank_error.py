@@ -75,7 +75,7 @@ def test_no_removal_lowers_it(seed: int, share: float, invalid: float) -> None:
 @given(st.integers(0, 2**32 - 1), st.floats(5e-324, 1e308))
 def test_filling_holes_never_raises_it(seed: int, fill: float) -> None:
     p_m, z_m = noisy_view(seed)
-    filled = np.where(is_valid_prediction(p_m), p_m, fill)
+    filled = np.where(is_valid_prediction(p_m), p_m.astype(np.float64), fill)
     value = ranked_value(scored(filled, z_m))
     assert 0 <= value <= ranked_value(scored(p_m, z_m))
 

@@ -11,11 +11,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+pytest.importorskip("cv2")
+pytest.importorskip("rerun")
+
 import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import pytest
 import rerun.dataframe
 from scipy.ndimage import binary_erosion
 

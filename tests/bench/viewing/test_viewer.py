@@ -6,6 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
+
+pytest.importorskip("rerun_cli")
+
 import rerun_cli
 
 from rebar_depth_bench.errors import InputError, RebarDepthError

@@ -8,9 +8,13 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+pytest.importorskip("cv2")
+pytest.importorskip("pycolmap")
+
 import numpy as np
 import pycolmap
-import pytest
 
 from rebar_depth_bench import load, score
 from rebar_depth_bench.data.manifest import open_folder
