@@ -22,6 +22,7 @@ from leaderboard.settings import Settings
 from rebar_depth_bench.cli.main import argument_parser as bench_parser
 from rebar_depth_bench.limits import LIMITS, Limit
 from rebar_depth_bench.methods import find_method, own_methods
+from scripts.diagrams import diagrams
 from tests.bench.methods.predictors import load_predictor
 
 DOCS = sorted(Path("docs").rglob("*.md"))
@@ -169,3 +170,7 @@ def test_documented_layout_files_are_valid(tmp_path: Path) -> None:
         path = tmp_path / "layout.toml"
         path.write_text(block)
         assert read_layout(path).truth_sigma_m > 0
+
+
+def test_diagrams_are_up_to_date() -> None:
+    assert {name: Path("docs/pictures", name).read_text() for name in diagrams()} == diagrams()
