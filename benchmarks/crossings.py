@@ -11,6 +11,11 @@ for all archives:
 3. at each group of such points, a near depth is the front of the front bar; its width in the image gives its
    diameter, and the tie point lies one diameter behind that front;
 4. the confidence is the share of steel pixels around the point.
+
+The card's results are of ``rebar-build --out ROOT --config lattice pile --views 72 --width 640 --height 360
+--samples 4`` with ``truth``, ``sgbm``, ``sgbm-filled`` and ``sweep-aruco`` (``crossings.json``), and of the dataset
+and archives of ``python -m benchmarks.reference OUT cages`` with ``truth``, ``sgbm``, ``sgbm-filled`` and
+``lidar-mobile`` (``crossings-cages.json``).
 """
 
 from __future__ import annotations
