@@ -28,8 +28,8 @@ nightly: system-packages env-dev env-space ## Everything, with the long stress t
 versions: ## The fast tests of the core on other versions of Python: all that are found, or VERSIONS="3.12 3.13"
 	scripts/versions.sh $(VERSIONS)
 
-docs: env-dev ## Build the documentation site in docs/_build/html; a warning is an error
-	$(BIN)/python -m sphinx --fail-on-warning --keep-going docs docs/_build/html
+docs: system-packages env-dev ## Build the documentation in build/docs; a warning is an error
+	$(BIN)/python -m sphinx -W --keep-going -q -c docs . build/docs
 
 dist: env-dev ## Build and check the source distribution and the wheel in dist/
 	rm -rf dist
