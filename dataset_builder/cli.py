@@ -20,7 +20,7 @@ from dataset_builder.config.specs import CPU
 from dataset_builder.export import command as export_command
 from dataset_builder.importing import command as import_command
 from dataset_builder.push import command as push_command
-from rebar_depth_bench.console import ProgressBars, Rate, replace_renamed_options, run_command
+from rebar_depth_bench.console import ProgressBars, Rate, replace_renamed_options, require_extra, run_command
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
 from rebar_depth_bench.outputs import write_output
@@ -52,16 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _check_extra() -> None:
-    """Raise ``InputError`` if the build extra is not installed.
-
-    Modules that need the extra are imported only after this check.
-    """
-    missing = [name for name in _EXTRA_MODULES if find_spec(name) is None]
-    if missing:
-        raise InputError(
-            f"not installed: {', '.join(missing)}; expected the build extra: "
-            "pip install 'rebar-depth-bench[build]'"
-        )
+    """Raise ``InputError`` if the build extra is not installed."""
+    require_extra("build", _EXTRA_MODULES)
 
 
 def _build(options: argparse.Namespace) -> None:

@@ -5,9 +5,25 @@ The processes that read archives import this module again, but need no command.
 
 import sys
 
+_EXTRA_MODULES = (
+    "alembic",
+    "fastapi",
+    "limits",
+    "multipart",
+    "prometheus_client",
+    "pydantic_settings",
+    "sqlalchemy",
+    "structlog",
+    "uvicorn",
+)
+
 
 def main() -> int:
-    """Run the command line."""
+    """Run the command line; return its exit status."""
+    from rebar_depth_bench.console import require_extra, run_command
+
+    if status := run_command(lambda: require_extra("server", _EXTRA_MODULES)):
+        return status
     from leaderboard.cli import main as run
 
     return run()

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Protocol
 
 from rich.console import Console
@@ -147,6 +148,19 @@ def add_commands(
         command.add_arguments(subparser)
         subparser.set_defaults(run=command.run)
     return subparsers
+
+
+def require_extra(extra: str, modules: Sequence[str]) -> None:
+    """Raise ``InputError`` if a module of an extra of this distribution is not installed.
+
+    Modules that need the extra are imported only after this check.
+    """
+    missing = [name for name in modules if find_spec(name) is None]
+    if missing:
+        raise InputError(
+            f"not installed: {', '.join(missing)}; expected the {extra} extra: "
+            f"pip install 'rebar-depth-bench[{extra}]'"
+        )
 
 
 def run_command(command: Callable[[], None], interrupted: str = "interrupted") -> int:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ctypes.util
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -53,6 +55,34 @@ def require(use: str) -> None:
     missing = [package for probe, package in programs.items() if not is_present(probe)]
     if missing:
         reason = f"missing system packages; on Debian: apt-get install {' '.join(missing)}"
+        if os.environ.get("CI") == "true":
+            pytest.fail(reason)
+        pytest.skip(reason)
+
+
+def pip_environment() -> dict[str, str]:
+    """Return the environment of a pip with the settings and the cache of the user, not those of the tests."""
+    removed = ("PYTHONPATH", "VIRTUAL_ENV", "XDG_CACHE_HOME")
+    return {name: value for name, value in os.environ.items() if name not in removed}
+
+
+def require_index(folder: Path) -> None:
+    """Skip the test unless pip can download a package into ``folder``; fail instead where ``CI`` is true."""
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "download",
+        "--quiet",
+        "--no-deps",
+        "--dest",
+        str(folder),
+        "setuptools>=77",
+    ]
+    finished = subprocess.run(command, capture_output=True, text=True, env=pip_environment(), check=False)
+    if finished.returncode:
+        last_line = (finished.stderr.strip() or "pip ended with an error").splitlines()[-1]
+        reason = f"no package index can be reached: {last_line}"
         if os.environ.get("CI") == "true":
             pytest.fail(reason)
         pytest.skip(reason)

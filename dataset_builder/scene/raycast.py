@@ -14,8 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float64, Int32, UInt16
 from numpy import ndarray
 
@@ -45,6 +43,10 @@ class RayCaster:
     """Ray caster for the mesh of one scene."""
 
     def __init__(self, mesh: WorldMesh) -> None:
+        # Commands that cast no rays, such as export, run without the extra ``build``.
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
         a, b, c = np.moveaxis(mesh.vertices_m[mesh.faces], 1, 0)
         self._normal = np.cross(b - a, c - a)
         self._plane = np.einsum("ij,ij->i", self._normal, a)

@@ -18,7 +18,6 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float64, UInt8, UInt16
 from numpy import ndarray
@@ -137,6 +136,9 @@ def demosaic(raw_dn: UInt16[ndarray, "h w"], spec: SensorSpec) -> Float64[ndarra
 
     A mirrored border keeps the filter's pattern and replaces OpenCV's copies of the second rows and columns.
     """
+    # Plans of builds and imports, which read the specs, run without the extra ``build``.
+    import cv2
+
     border, unused_bits = 2, 16 - spec.adc_bits
     mirrored = np.pad(raw_dn << unused_bits, border, mode="reflect")
     rgb = cv2.demosaicing(mirrored, getattr(cv2, spec.demosaicing))[border:-border, border:-border]
