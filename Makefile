@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo quick test nightly check format env env-dev env-space system-packages cards sample-data clean
+.PHONY: help demo quick test nightly check format env env-dev env-space system-packages cards docs sample-data clean
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -31,6 +31,9 @@ format: env-dev ## Format the code and apply the linter's safe fixes
 
 cards: env-dev ## Write the benchmark card from the code
 	$(BIN)/python -m cards > cards/BENCHMARK.md
+
+docs: env-dev ## Build the documentation as a site in build/docs, and fail on any warning
+	$(BIN)/python -m sphinx -W --keep-going -n -q -b html docs build/docs
 
 sample-data: system-packages env-dev ## Render the dataset in tests/data again, after a change of the format
 	$(BIN)/python -m tests.data.render

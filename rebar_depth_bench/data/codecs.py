@@ -1,6 +1,6 @@
 """Lossless codecs of the dataset's images and depth maps.
 
-The formats were chosen by measurements on rendered views (``benchmarks/codecs.py``; table in ARCHITECTURE.md).
+The formats were chosen by measurements on rendered views (``benchmarks/codecs.py``; table in docs/measurements.md).
 """
 
 from __future__ import annotations
