@@ -40,8 +40,8 @@ format: env-dev ## Format the code and apply the linter's safe fixes
 cards: env-dev ## Write the benchmark card from the code
 	$(BIN)/python -m cards > cards/BENCHMARK.md
 
-docs: system-packages env-dev ## Build the documentation in build/docs; a warning is an error
-	$(BIN)/python -m sphinx -W --keep-going -q -c docs . build/docs
+docs: system-packages env-dev ## Build the documentation as a site in build/docs; a warning is an error
+	$(BIN)/python -m sphinx -W --keep-going -n -q docs build/docs
 
 sample-data: system-packages env-dev ## Render the dataset in tests/data again, after a change of the format
 	$(BIN)/python -m tests.data.render

@@ -1,73 +1,99 @@
-"""Settings of Sphinx, for ``make docs``.
-
-The source folder is the repository, so that links between its pages work here and on code hosting sites alike.
-"""
+"""Configuration of Sphinx: MyST pages, notebooks and the API reference, without network access."""
 
 from __future__ import annotations
 
 import os
+import re
 import sys
-from importlib import metadata
+from importlib.metadata import version as installed_version
 from pathlib import Path
+from typing import Any
 
-REPOSITORY = Path(__file__).parents[1]
-sys.path.insert(0, str(REPOSITORY))
-# The notebooks read a small dataset, and find the commands of this environment.
-os.environ.setdefault("REBAR_NOTEBOOK_DATA", str(REPOSITORY / "tests" / "data" / "tiny"))
-os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+ROOT = Path(__file__).parents[1]
+INCLUDED = {
+    "ARCHITECTURE.md": "architecture.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
+    "cards/BENCHMARK.md": "benchmark-card.md",
+}
+"""Files of the repository that are pages of the site, and the pages that include them."""
+
+# The reference describes the code of this checkout, also where another one is installed.
+sys.path.insert(0, str(ROOT))
 
 project = "rebar-depth-bench"
 author = "The rebar-depth-bench authors"
-release = metadata.version("rebar-depth-bench")
-root_doc = "docs/index"
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-include_patterns = [
-    "docs/**.md",
-    "docs/**.ipynb",
-    "cards/BENCHMARK.md",
-    "deploy/README.md",
-    "examples/space/README.md",
-    "*.md",
-]
-exclude_patterns = [
-    "README.md",
-    ".venv*",
-    "build",
-    "demo-output",
-    "tests",
-    "**/.ipynb_checkpoints",
-    "**/*.egg-info",
-]
+copyright = author
+version = release = installed_version("rebar-depth-bench")
 
-# Every reference must exist; these classes belong to packages whose pages are not read without a network.
-nitpicky = True
-nitpick_ignore_regex = [
-    ("py:.*", r"(numpy|np|torch|datasets|pandas|jaxtyping|pydantic|collections|pathlib|typing)\..*"),
-    (
-        "py:.*",
-        r"(os\.PathLike|ndarray|Path|DataFrame|Dataset|IterableDataset|DataLoader|Tensor|optional|ExtendedResult|Declaration)",
-    ),
-    ("py:.*", r"rebar_depth_bench\..*"),
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
 ]
+exclude_patterns = ["_static", "pictures"]
+root_doc = "index"
 
-autodoc_member_order = "bysource"
-autodoc_typehints = "signature"
-autodoc_default_options = {"members": True, "show-inheritance": True}
-add_module_names = False
-napoleon_google_docstring = False
-
-myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]
+myst_heading_anchors = 4
+
+# The notebooks read the small dataset of the tests, and find the commands of this environment.
+os.environ.setdefault("REBAR_NOTEBOOK_DATA", str(ROOT / "tests" / "data" / "tiny"))
+os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 nb_execution_mode = "force"
 nb_execution_show_tb = True
-# Progress of reading, which depends on the machine.
-nb_output_stderr = "remove"
+nb_output_stderr = "remove"  # Progress of reading, which depends on the machine.
 nb_execution_raise_on_error = True
-nb_execution_timeout = 300
+nb_execution_timeout = 600
+# Without widgets, pages need no script of another server.
+nb_ipywidgets_js: dict[str, dict[str, str]] = {}
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+autoclass_content = "class"
+python_use_unqualified_type_names = True
+# Types of other packages, whose inventories would have to be downloaded.
+nitpick_ignore_regex = [
+    ("py:.*", rf"({package})(\..*)?")
+    for package in ("collections", "datasets", "jaxtyping", "numpy", "os", "pandas", "pathlib", "torch", "typing")
+]
+# Names that the annotations have only for type checkers.
+nitpick_ignore = [("py:class", name) for name in ("DataFrame", "Dataset", "IterableDataset")]
 
 html_theme = "furo"
 html_title = f"rebar-depth-bench {release}"
-html_extra_path = ["index.html"]
-html_show_copyright = False
-html_show_sourcelink = False
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
 html_copy_source = False
+html_show_sourcelink = False
+templates_path: list[str] = []
+
+
+def setup(app: Any) -> None:
+    """Register the function that adapts included files."""
+    app.connect("include-read", _adapt_links)
+
+
+def _adapt_links(app: Any, path: Path, _including: str, content: list[str]) -> None:
+    """Change the local links of an included file, which are relative to its folder, to links of the page."""
+    folder = (Path(app.srcdir) / path).resolve().parent
+
+    def adapted(link: re.Match[str]) -> str:
+        text, target, anchor = link.groups(default="")
+        if not target or "://" in target:
+            return link[0]
+        file = (folder / target).resolve()
+        if file.is_dir():  # There is no page of a folder.
+            return text
+        page = INCLUDED.get(file.relative_to(ROOT).as_posix())
+        return f"[{text}]({page or os.path.relpath(file, app.srcdir)}{anchor})"
+
+    content[0] = re.sub(r"(?<!!)\[([^]]*)\]\(([^)#\s]*)(#[^)\s]*)?\)", adapted, content[0])
+    content[0] = re.sub(
+        r"!\[([^]]*)\]\(([^):\s]+)\)",
+        lambda image: f"![{image[1]}]({os.path.relpath(folder / image[2], app.srcdir)})",
+        content[0],
+    )

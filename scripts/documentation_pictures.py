@@ -1,42 +1,68 @@
-"""Pictures of the documentation, from the output of the demo.
+"""Pictures of the documentation, made from a dataset folder: views, reports and pages of a leaderboard.
 
-``make demo``, then ``python -m scripts.documentation_pictures demo-output docs`` writes ``lattice.webp`` (colour,
-depth and bar ids of a view) and screenshots of a report and of a leaderboard to ``docs/pictures``. It needs the
-environment for developing and the system's Chromium.
+rebar-build --out ROOT --config lattice pile --views 12 --width 640 --height 360 --quality preview
+python -m scripts.documentation_pictures ROOT docs/pictures
+
+The dataset needs the configs lattice and pile in colour. The methods that take less than a second a view are run
+and scored; the pages are those that users see, in the system's Chromium.
 """
 
 from __future__ import annotations
 
 import io
+import os
+import shutil
+import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from playwright.sync_api import Locator, sync_playwright
+from playwright.sync_api import Page, sync_playwright
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, colour_indices
-from tests.leaderboard.serving import make_token, running_server
-from tests.requirements import chromium_path
 
+METHODS = ("sgbm-filled", "sgbm", "board-plane", "constant", "truth")
+REPORT_METHOD, BOARD_METHOD = "sgbm-filled", "sgbm"
+"""Methods whose report, and whose page of the leaderboard, are shown."""
 PANEL = (640, 360)
-WINDOW = {"width": 1100, "height": 900}
-METHODS = ("sgbm", "sgbm-filled", "constant")
+MAX_BYTES = 150_000
+START_S = 60.0
+PROJECT = Path(__file__).parents[1]
 
 
-def main(demo: str, docs: str) -> None:
-    """Write the pictures of the demo's output in the folder ``demo`` to the folder ``docs``."""
-    view_strip(Path(demo, "dataset")).save(Path(docs, "lattice.webp"), "WEBP", quality=82)
-    pictures = Path(docs, "pictures")
-    pictures.mkdir(exist_ok=True)
-    screenshots(Path(demo).resolve(), pictures)
+def main(root: str, target: str) -> None:
+    """Write the pictures of the dataset folder ``root`` to the folder ``target`` as WebP files."""
+    data, out = Path(root).resolve(), Path(target).resolve()
+    save(view_strip(data), out / "lattice.webp")
+    shutil.copyfile(data / "pictures" / "lattice.webp", out / "contact-sheet.webp")
+    with tempfile.TemporaryDirectory() as name, chromium() as page:
+        work = Path(name)
+        save(cage_picture(work), out / "inspect.webp")
+        archives = [predicted(method, data, work) for method in METHODS]
+        report = work / "report.html"
+        run(
+            "rebar_depth_bench",
+            "score",
+            str(work / f"{REPORT_METHOD}.zip"),
+            "--data",
+            str(data),
+            "--html",
+            str(report),
+        )
+        report_pictures(page, report, out)
+        with leaderboard(data, work / "board", archives) as (url, pages):
+            board_pictures(page, url, pages[METHODS.index(BOARD_METHOD)], out)
 
 
-def view_strip(root: Path) -> Image.Image:
-    """Return colour, depth and bar ids of the first lattice view, side by side."""
-    row = rdb.load(str(root), "lattice", columns=["left_rgb", "left_depth", "left_bars"])[0]
+def view_strip(data: Path, view: int = 0) -> Image.Image:
+    """Return colour, depth and bar ids of one view of the lattice, side by side."""
+    row = rdb.load(data, "lattice", columns=["left_rgb", "left_depth", "left_bars"])[view]
     steel = row["left_bars"] > 0
     near_m, far_m = row["left_depth"][steel].min(), row["left_depth"][steel].max()
     depth = DEPTH_COLOURS[colour_indices(-row["left_depth"], -far_m, -near_m)]
@@ -51,32 +77,116 @@ def view_strip(root: Path) -> Image.Image:
     return strip
 
 
-def screenshots(demo: Path, pictures: Path) -> None:
-    """Write screenshots of the report of SGBM, and of a leaderboard with the archives of the demo."""
-    with tempfile.TemporaryDirectory() as scratch, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium_path(), args=["--no-sandbox"])
-        page = browser.new_page(viewport=WINDOW, color_scheme="light")  # type: ignore[arg-type]
-        page.goto((demo / "sgbm.html").as_uri())
-        _save(page.locator("section[aria-labelledby=results]"), pictures / "report.webp")
-        _save(page.locator("article:visible").first, pictures / "report-view.webp")
-        state = Path(scratch) / "state"
-        token = make_token(state, "Example Institute")
-        with running_server(demo / "dataset", state, error_maps=2) as server:
-            ids = [server.submit_accepted(demo / f"{method}.zip", token) for method in METHODS]
-            for submission_id in ids:
-                server.wait_until_ended(submission_id)
-            page.goto(f"{server.url}/?config=lattice")
-            _save(page.locator("body"), pictures / "leaderboard.webp")
-            page.goto(f"{server.url}/submissions/{ids[0]}")
-            _save(page.locator("body"), pictures / "submission.webp", 1400)
+def cage_picture(work: Path) -> Image.Image:
+    """Return the picture that ``rebar-build inspect`` draws of the example cage."""
+    picture = work / "beam.png"
+    scene = PROJECT / "examples" / "beam.toml"
+    run("dataset_builder", "inspect", str(scene), "--picture", str(picture))
+    with Image.open(picture) as image:
+        return image.convert("RGB")
+
+
+def report_pictures(page: Page, report: Path, out: Path) -> None:
+    """Photograph the head of a report and its browser of views."""
+    page.goto(report.as_uri())
+    results_top, _ = extent(page, "section[aria-labelledby=results]")
+    save(photograph(page, 0, results_top + 520), out / "report.webp")
+    top, _ = extent(page, "section.browser .controls")
+    _, bottom = extent(page, "section.browser article:visible")
+    save(photograph(page, top - 2, bottom + 12), out / "report-view.webp")
+
+
+def board_pictures(page: Page, url: str, submission: str, out: Path) -> None:
+    """Photograph the ranking of a config, and the page of a submission."""
+    page.set_viewport_size({"width": 1440, "height": 900})
+    page.goto(f"{url}/?config=lattice")
+    save(photograph(page, 0, 1000), out / "leaderboard.webp")
+    page.set_viewport_size({"width": 1280, "height": 900})
+    page.goto(submission)
+    save(photograph(page, 0, 900), out / "submission.webp")
+
+
+def predicted(method: str, data: Path, work: Path) -> Path:
+    """Return the archive of a method's predictions."""
+    archive = work / f"{method}.zip"
+    run("rebar_depth_bench", "predict", method, "--data", str(data), "--out", str(archive))
+    return archive
+
+
+@contextmanager
+def leaderboard(data: Path, state: Path, archives: Sequence[Path]) -> Iterator[tuple[str, list[str]]]:
+    """Run a leaderboard with scored submissions; yield its URL and those of the pages of the submissions."""
+    token = run("leaderboard", "token", "documentation", "--state-dir", str(state)).strip()
+    command = [sys.executable, "-m", "leaderboard", "serve", "--data", str(data), "--state-dir", str(state)]
+    server = subprocess.Popen([*command, "--port", "0"], stderr=subprocess.PIPE, text=True)
+    try:
+        url = _announced_url(server)
+        environment = {**os.environ, "REBAR_LEADERBOARD_TOKEN": token}
+        for archive in reversed(archives):
+            run("rebar_depth_bench", "submit", str(archive), "--url", url, env=environment)
+        listed = run("rebar_depth_bench", "submissions", "list", "--url", url, env=environment)
+        # The list has the newest first, which is the first of the archives.
+        yield url, [f"{url}/submissions/{line.split()[0]}" for line in listed.splitlines()]
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def _announced_url(server: subprocess.Popen[str]) -> str:
+    """Return the URL that a server prints when it has started, and leave the rest of its log unread."""
+    assert server.stderr is not None
+    end = time.monotonic() + START_S
+    while time.monotonic() < end:
+        for word in server.stderr.readline().split():
+            if word.startswith("http://"):
+                return word.rstrip("/")
+    raise TimeoutError(f"the leaderboard has not started within {START_S:g} s")
+
+
+@contextmanager
+def chromium(width: int = 1280) -> Iterator[Page]:
+    """Open a page of the system's Chromium, in light colours."""
+    with sync_playwright() as playwright:
+        program = shutil.which("chromium") or shutil.which("google-chrome")
+        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield browser.new_page(viewport={"width": width, "height": 900}, color_scheme="light")
         browser.close()
 
 
-def _save(part: Locator, file: Path, max_height: int = 1000) -> None:
-    """Save a screenshot of a part of a page, cut below ``max_height`` pixels."""
-    part.scroll_into_view_if_needed()
-    image = Image.open(io.BytesIO(part.screenshot()))
-    image.crop((0, 0, image.width, min(image.height, max_height))).save(file, "WEBP", quality=80)
+def extent(page: Page, selector: str) -> tuple[float, float]:
+    """Return the top and the bottom of the first such element of a page that is not scrolled, in pixels."""
+    box = page.locator(selector).first.bounding_box()
+    assert box is not None
+    return box["y"], box["y"] + box["height"]
+
+
+def photograph(page: Page, top: float, bottom: float) -> Image.Image:
+    """Return the part of a page between two heights, in pixels."""
+    width = (page.viewport_size or {"width": 1280})["width"]
+    clip = {"x": 0, "y": top, "width": width, "height": bottom - top}
+    return opened(page.screenshot(full_page=True, clip=clip))  # type: ignore[arg-type]
+
+
+def opened(png: bytes) -> Image.Image:
+    """Return the image of a PNG file."""
+    return Image.open(io.BytesIO(png)).convert("RGB")
+
+
+def save(image: Image.Image, path: Path) -> None:
+    """Write a WebP file of at most ``MAX_BYTES``, with the highest quality for which it is small enough."""
+    for quality in (90, 82, 74, 66, 58, 50):
+        stream = io.BytesIO()
+        image.save(stream, "WEBP", quality=quality, method=6)
+        if stream.tell() <= MAX_BYTES:
+            break
+    path.write_bytes(stream.getvalue())
+    print(f"{path.name}: {image.width} x {image.height}, {stream.tell() // 1000} kB")
+
+
+def run(module: str, *arguments: str, env: dict[str, str] | None = None) -> str:
+    """Run a command of the project; return its standard output."""
+    command = [sys.executable, "-m", module, *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True, env=env).stdout
 
 
 if __name__ == "__main__":

@@ -18,10 +18,10 @@ from leaderboard.settings import Settings
 ROOT = Path(__file__).parents[2]
 DATA_VOLUME = "${DATASET:?set the dataset folder}:/data:ro"
 COMPOSE, CONTAINERFILE = ROOT / "deploy/compose.yaml", ROOT / "deploy/Containerfile"
-README = (ROOT / "deploy/README.md").read_text()
+PAGE = (ROOT / "docs/leaderboard-operator.md").read_text()
 PREFIX = "REBAR_LEADERBOARD_"
 NON_SETTINGS = {"name", "token"}
-"""Names in the README that are not server settings: a placeholder and a variable of the client."""
+"""Names in the page that are not server settings: a placeholder and a variable of the client."""
 
 
 @pytest.fixture(scope="module")
@@ -51,8 +51,8 @@ def test_deployed_settings_exist() -> None:
 
 
 def shell_lines(program: str) -> list[list[str]]:
-    """Return the argument lists of the commands of ``program`` in the README."""
-    blocks = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+    """Return the argument lists of the commands of ``program`` in the page."""
+    blocks = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
     lines = [shlex.split(line, comments=True) for block in blocks for line in block.splitlines()]
     return [words[1:] for words in lines if words and words[0] == program]
 
@@ -63,7 +63,7 @@ def test_readme_commands_parse() -> None:
 
 
 def test_readme_settings_table_matches_code() -> None:
-    table_rows = re.findall(r"^\| `(\w+)` \| (?:`(.*)`)? ?\| (.+) \|$", README, re.MULTILINE)
+    table_rows = re.findall(r"^\| `(\w+)` \| (?:`(.*)`)? ?\| (.+) \|$", PAGE, re.MULTILINE)
     fields = Settings.model_fields.items()
     expected = [
         (name, "" if field.is_required() else str(field.default), field.description) for name, field in fields
@@ -74,7 +74,7 @@ def test_readme_settings_table_matches_code() -> None:
 def test_extras_in_readme_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     installed = {
-        extra for extras_list in re.findall(r"'\.\[([\w,]+)\]'", README) for extra in extras_list.split(",")
+        extra for extras_list in re.findall(r"'\.\[([\w,]+)\]'", PAGE) for extra in extras_list.split(",")
     }
     assert {"server", "postgresql"} <= installed <= set(extras)
 
