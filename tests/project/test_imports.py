@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import re
 import subprocess
 import sys
+from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 
@@ -86,3 +90,15 @@ def test_unknown_name_raises_attribute_error() -> None:
 
     with pytest.raises(AttributeError, match="has no attribute 'lod'"):
         rebar_depth_bench.lod  # noqa: B018
+
+
+def test_packages_without_which_tests_are_skipped_are_installed() -> None:
+    """Where ``CI`` is true, no file of tests is skipped because its extra was not installed."""
+    files = Path(__file__).parents[1].rglob("test_*.py")
+    calls = [re.findall(r"^\s*(?:\w+ = )?pytest\.importorskip\(\"(\w+)", path.read_text(), re.M) for path in files]
+    names = {name for found in calls for name in found}
+    assert {"cv2", "onnx", "torch"} <= names
+    missing = sorted(name for name in names if find_spec(name) is None)
+    if missing and os.environ.get("CI") != "true":
+        pytest.skip(f"not installed, and tests that need them are skipped: {', '.join(missing)}")
+    assert not missing
