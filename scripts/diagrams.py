@@ -71,7 +71,9 @@ def packages_svg(layers: Sequence[str]) -> str:
     width, top, row = 860, 276, 26
     height = top + 46 + row * len(layers) + 16
     boxes = [
-        Box(40, 24, 370, 76, "dataset_builder", ["specs, geometry, Blender processes,", "shards, audit"], "builder"),
+        Box(
+            40, 24, 370, 76, "dataset_builder", ["specs, geometry, Blender processes,", "shards, audit"], "builder"
+        ),
         Box(150, 150, 260, 62, "cards", ["dataset card, benchmark card"], "file"),
         Box(490, 24, 330, 76, "leaderboard", ["uploads, queue, workers, API, pages"], "board"),
     ]

@@ -3,7 +3,7 @@
 rebar-build --out ROOT --config lattice pile --views 12 --width 640 --height 360 --quality preview
 python -m scripts.documentation_pictures ROOT docs/pictures
 
-The dataset needs the configs lattice and pile in colour. The methods that take less than a second a view are run and
+The dataset needs the configs lattice and pile in colour. Methods that take less than a second a view are run and
 scored; the pages are those that users see, in the system's Chromium.
 """
 
@@ -46,7 +46,15 @@ def main(root: str, target: str) -> None:
         save(cage_picture(work), out / "inspect.webp")
         archives = [predicted(method, data, work) for method in METHODS]
         report = work / "report.html"
-        run("rebar_depth_bench", "score", str(work / f"{REPORT_METHOD}.zip"), "--data", str(data), "--html", str(report))
+        run(
+            "rebar_depth_bench",
+            "score",
+            str(work / f"{REPORT_METHOD}.zip"),
+            "--data",
+            str(data),
+            "--html",
+            str(report),
+        )
         report_pictures(page, report, out)
         with leaderboard(data, work / "board", archives) as (url, pages):
             board_pictures(page, url, pages[METHODS.index(BOARD_METHOD)], out)

@@ -122,8 +122,8 @@ def crossings(root: str | Path) -> DataFrame:
     """Return the crossings of every scene of a dataset folder or Hub repository as a frame, one row per crossing.
 
     Columns as in ``crossings.parquet``; points and ``normal`` are float64 arrays of 3, world frame, metres. For
-    folders without the file, crossings are computed from the bars. Raises ``DatasetError`` as ``open_folder`` and
-    ``folder_crossings``.
+    folders without the file, crossings are computed from the bars. Raises ``DatasetError`` if the folder is
+    invalid, or its table of crossings or bars is damaged or not that of the manifest.
     """
     import pandas as pd  # Half a second to import, which reading crossings for scoring does not need.
 

@@ -117,7 +117,7 @@ def bars(root: str | Path) -> DataFrame:
 
     Columns: ``scene``, ``bar_id``, ``role``, ``diameter_m``, ``length_m`` (of the centreline) and ``axis_m``, a
     float64 array of shape (n, 3), world frame. A bar without an axis has NaN, NaN and no points. Raises
-    ``DatasetError`` as ``open_folder`` and ``read_bars``.
+    ``DatasetError`` if the folder is invalid, or its table of bars is damaged or not that of the manifest.
     """
     import pandas as pd  # Half a second to import, which reading bars for scoring does not need.
 

@@ -1,6 +1,7 @@
 """Lossless codecs of the dataset's images and depth maps.
 
-The formats were chosen by measurements on rendered views (``benchmarks/codecs.py``; table in docs/measurements.md).
+The formats were chosen by measurements on rendered views (``benchmarks/codecs.py``; docs/measurements.md has the
+table).
 """
 
 from __future__ import annotations

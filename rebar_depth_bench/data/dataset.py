@@ -74,7 +74,7 @@ def load(
     streaming: bool = False,
     columns: Sequence[str] | None = None,
 ) -> Dataset | IterableDataset:
-    """Load one split of a config of a dataset folder or Hub repository.
+    """Load one split of a config of a dataset folder or Hub repository, by default ``test``.
 
     Rows are dicts of decoded columns: colour uint8 H x W x 3, depth float32 H x W (planar, metres, 0 where no
     surface), masks bool H x W, bar ids uint16 H x W, K float64 3 x 3 in pixels, distortion float64 5, poses

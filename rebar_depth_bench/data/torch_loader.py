@@ -55,10 +55,11 @@ def torch_loader(
     decoded; pass ``columns`` to ``load`` to select them.
 
     For training, ``shuffle`` changes the order in every epoch. A streamed dataset is shuffled by shard, and then
-    in a buffer of ``SHUFFLE_BUFFER`` views. ``crop`` (height, width) takes a random part of each view, and
-    ``flip`` mirrors half of the views: see ``augmentation`` for K, poses and stereo pairs. The order of shuffled
-    views depends on ``seed`` and the epoch, and for a streamed dataset on the number of workers; crops and flips
-    depend on ``seed``, the epoch and the view id.
+    in a buffer of 32 views (``SHUFFLE_BUFFER``). ``crop`` (height, width) takes a random part of each view, and
+    ``flip`` mirrors half of the views. Depth, masks, K and poses stay consistent: a flipped stereo pair has its
+    eyes exchanged, and the pose of a flipped view contains the reflection. The order of shuffled views depends on
+    ``seed`` and the epoch, and for a streamed dataset on the number of workers; crops and flips depend on
+    ``seed``, the epoch and the view id.
 
     Importing this module without torch raises ``MethodError``. Raises ``InputError`` for an invalid crop or seed.
     """

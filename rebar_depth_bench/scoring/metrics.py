@@ -27,8 +27,8 @@ class DepthMetrics:
     """Depth errors of one view, or their means over views.
 
     ``abs_rel`` is ``mean(|p - z| / z)``, ``rmse_cm`` is ``100 sqrt(mean((p - z)^2))``, ``mae_cm`` is
-    ``100 mean(|p - z|)``, and ``delta1`` is the share of pixels with ``max(p/z, z/p) < 1.25``, for predicted depth p
-    and true depth z in metres.
+    ``100 mean(|p - z|)``, and ``delta1`` is the share of pixels with ``max(p/z, z/p) < 1.25``, for predicted depth
+    p and true depth z in metres.
     """
 
     abs_rel: float

@@ -1,4 +1,4 @@
-"""Consistency of ``deploy/`` with the code: settings, commands, extras and images."""
+"""Consistency of ``deploy/`` and the operator's page with the code: settings, commands, extras and images."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from leaderboard.settings import Settings
 ROOT = Path(__file__).parents[2]
 DATA_VOLUME = "${DATASET:?set the dataset folder}:/data:ro"
 COMPOSE, CONTAINERFILE = ROOT / "deploy/compose.yaml", ROOT / "deploy/Containerfile"
-README = (ROOT / "deploy/README.md").read_text()
+OPERATOR = ROOT / "docs/leaderboard-operator.md"
+PAGE = OPERATOR.read_text()
 PREFIX = "REBAR_LEADERBOARD_"
 NON_SETTINGS = {"name", "token"}
-"""Names in the README that are not server settings: a placeholder and a variable of the client."""
+"""Names on the page that are not server settings: a placeholder and a variable of the client."""
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,7 @@ def image_environment() -> dict[str, str]:
 
 
 def test_deployed_settings_exist() -> None:
-    for file in sorted((ROOT / "deploy").iterdir()):
+    for file in [*sorted((ROOT / "deploy").iterdir()), OPERATOR]:
         names = {name.lower() for name in re.findall(rf"{PREFIX}(\w+)", file.read_text())}
         assert names or file.suffix == ".conf", f"{file.name}: nothing is set"
         allowed = NON_SETTINGS if file.suffix == ".md" else set()
@@ -51,19 +52,19 @@ def test_deployed_settings_exist() -> None:
 
 
 def shell_lines(program: str) -> list[list[str]]:
-    """Return the argument lists of the commands of ``program`` in the README."""
-    blocks = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+    """Return the argument lists of the commands of ``program`` on the page."""
+    blocks = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
     lines = [shlex.split(line, comments=True) for block in blocks for line in block.splitlines()]
     return [words[1:] for words in lines if words and words[0] == program]
 
 
-def test_readme_commands_parse() -> None:
+def test_page_commands_parse() -> None:
     commands = [argument_parser().parse_args(words).command for words in shell_lines("rebar-leaderboard")]
     assert set(commands) == set(COMMANDS)
 
 
-def test_readme_settings_table_matches_code() -> None:
-    table_rows = re.findall(r"^\| `(\w+)` \| (?:`(.*)`)? ?\| (.+) \|$", README, re.MULTILINE)
+def test_page_settings_table_matches_code() -> None:
+    table_rows = re.findall(r"^\| `(\w+)` \| (?:`(.*)`)? ?\| (.+) \|$", PAGE, re.MULTILINE)
     fields = Settings.model_fields.items()
     expected = [
         (name, "" if field.is_required() else str(field.default), field.description) for name, field in fields
@@ -71,11 +72,11 @@ def test_readme_settings_table_matches_code() -> None:
     assert table_rows == expected
 
 
-def test_extras_in_readme_exist() -> None:
+def test_extras_on_page_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     installed = {
         extra
-        for extras_list in re.findall(r"rebar-depth-bench\[([\w,]+)\]", README)
+        for extras_list in re.findall(r"pip install \'\.\[([\w,]+)\]", PAGE)
         for extra in extras_list.split(",")
     }
     assert {"server", "postgresql"} <= installed <= set(extras)

@@ -1,4 +1,4 @@
-"""System packages: the same list in the README, make, CI and messages of skipped tests."""
+"""System packages: the same list in the documentation, make, CI and messages of skipped tests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from tests import requirements
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "system_packages.sh"
-README = Path(__file__).parents[2] / "README.md"
+PAGE = Path(__file__).parents[2] / "docs" / "quick-start.md"
 USES = ("blender", "browser", "uploads")
 
 
@@ -36,8 +36,8 @@ def all_libraries() -> str:
     return "".join(f"\\t{probe} (libc6) => /lib/{probe}\\n" for probe in probes if ".so." in probe)
 
 
-def test_readme_lists_all_system_packages() -> None:
-    commands = re.findall(r"^apt-get install (.+)$", README.read_text(), flags=re.MULTILINE)
+def test_page_lists_all_system_packages() -> None:
+    commands = re.findall(r"^apt-get install (.+)$", PAGE.read_text(), flags=re.MULTILINE)
     listed = [package for use in USES for package in requirements.probes(use).values()]
     assert sorted(" ".join(commands).split()) == sorted(listed)
 
