@@ -1,4 +1,4 @@
-"""Consistency of ``deploy/`` and the operator's page with the code: settings, commands, extras and images."""
+"""Consistency of ``deploy/`` and the leaderboard's pages with the code: settings, commands, requests, images."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ from typing import Any
 
 import pytest
 import yaml
+from fastapi.routing import APIRoute
 
 from leaderboard.cli import COMMANDS, argument_parser
 from leaderboard.settings import Settings
+from leaderboard.web.api import leaderboard, status, submissions
 
 ROOT = Path(__file__).parents[2]
 DATA_VOLUME = "${DATASET:?set the dataset folder}:/data:ro"
 COMPOSE, CONTAINERFILE = ROOT / "deploy/compose.yaml", ROOT / "deploy/Containerfile"
+API_ROUTERS = (leaderboard.router, status.router, submissions.router)
+SUBMITTERS = ROOT / "docs/leaderboard-submitter.md"
 OPERATOR = ROOT / "docs/leaderboard-operator.md"
 PAGE = OPERATOR.read_text()
 PREFIX = "REBAR_LEADERBOARD_"
@@ -154,3 +158,16 @@ def test_commands_in_comments_refer_to_existing_files() -> None:
     assert all((ROOT / file).is_file() for file in files)
     (scaled,) = re.findall(r"--scale (\w+)=", " ".join(commands))
     assert scaled in yaml.safe_load(COMPOSE.read_text())["services"]
+
+
+def test_submitters_page_lists_every_request() -> None:
+    routes = [route for router in API_ROUTERS for route in router.routes if isinstance(route, APIRoute)]
+    served = {
+        f"{method} {re.sub(r'{[^}]+}', 'ID', route.path)}"
+        for route in routes
+        if route.include_in_schema
+        for method in route.methods
+    }
+    listed = re.findall(r"^\| `([A-Z]+ [^`?]+)", SUBMITTERS.read_text(), re.MULTILINE)
+    assert {*listed, "GET /api/v1/leaderboard.csv"} == served
+    assert "`leaderboard.csv`" in SUBMITTERS.read_text()
