@@ -22,6 +22,18 @@ INCLUDED = {
 # The reference describes the code of this checkout, also where another one is installed.
 sys.path.insert(0, str(ROOT))
 
+import rebar_depth_bench  # noqa: E402
+
+LINKED = {
+    "Declaration": "rebar_depth_bench.submission.Declaration",
+    **{
+        name: f"rebar_depth_bench.methods.{name}"
+        for name in ("Method", "MethodInfo", "MultiViewMethod", "Prepared")
+    },
+    **{name: f"rebar_depth_bench.{name}" for name in rebar_depth_bench.__all__ if name not in ("bars", "score")},
+}
+"""Full names of the objects that docstrings name; ``bars`` and ``score`` are also words of their own."""
+
 project = "rebar-depth-bench"
 author = "The rebar-depth-bench authors"
 copyright = author
@@ -51,8 +63,9 @@ nb_execution_timeout = 600
 nb_ipywidgets_js: dict[str, dict[str, str]] = {}
 
 autodoc_member_order = "bysource"
-autodoc_typehints = "description"
-autodoc_typehints_description_target = "documented"
+autodoc_typehints = "signature"
+autodoc_preserve_defaults = True
+maximum_signature_line_length = 88
 autoclass_content = "class"
 python_use_unqualified_type_names = True
 # Types of other packages, whose inventories would have to be downloaded.
@@ -61,7 +74,12 @@ nitpick_ignore_regex = [
     for package in ("collections", "datasets", "jaxtyping", "numpy", "os", "pandas", "pathlib", "torch", "typing")
 ]
 # Names that the annotations have only for type checkers.
-nitpick_ignore = [("py:class", name) for name in ("DataFrame", "Dataset", "IterableDataset")]
+nitpick_ignore = [("py:class", name) for name in ("DataFrame", "Dataset", "IterableDataset", "Path", "ndarray")]
+# A result lists its extended measures with ``to_pandas("extended")``.
+nitpick_ignore += [
+    ("py:class", "rebar_depth_bench.extended.result.ExtendedResult"),
+    ("py:class", "ExtendedResult"),
+]
 
 html_theme = "furo"
 html_title = f"rebar-depth-bench {release}"
@@ -73,11 +91,22 @@ templates_path: list[str] = []
 
 
 def setup(app: Any) -> None:
-    """Register the function that adapts included files."""
+    """Register the functions that adapt included files and docstrings."""
     app.connect("include-read", _adapt_links)
+    app.connect("autodoc-process-docstring", _link_names)
 
 
-def _adapt_links(app: Any, path: Path, _including: str, content: list[str]) -> None:
+def _link_names(_app: Any, _kind: str, _name: str, _value: Any, _options: Any, lines: list[str]) -> None:
+    """Make links of the names of the public interface, which docstrings mark as literals."""
+    for n, line in enumerate(lines):
+        lines[n] = re.sub(
+            r"``(\w+)``",
+            lambda word: f":py:obj:`{word[1]} <{LINKED[word[1]]}>`" if word[1] in LINKED else word[0],
+            line,
+        )
+
+
+def _adapt_links(app: Any, path: Path, _page: str, content: list[str]) -> None:
     """Change the local links of an included file, which are relative to its folder, to links of the page."""
     folder = (Path(app.srcdir) / path).resolve().parent
 

@@ -6,7 +6,7 @@
     rebar-build --out ROOT --config lattice pile --views 24 $SIZE
     python examples/finetune.py ROOT --out finetuned --minutes 10
 
-It needs ``pip install 'rebar-depth-bench[torch,onnx,methods]' onnx`` and torch 2.5 or later. ``finetuned/`` then
+It needs ``pip install '.[torch,onnx,methods]' onnx`` and torch 2.5 or later. ``finetuned/`` then
 holds the weights of the last epoch (``checkpoint.pt``), the network as ``finetuned.onnx`` with ``finetuned.toml``,
 which ``rebar-bench predict finetuned/finetuned.toml --data ROOT`` takes, and one archive for each method and
 config of the table that is printed.

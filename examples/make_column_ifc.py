@@ -1,6 +1,6 @@
 """Generator of ``column.ifc``: a small IFC4 model of a column cage for ``rebar-build --scene``.
 
-python examples/make_column_ifc.py [FILE]      (needs pip install 'rebar-depth-bench[ifc]')
+python examples/make_column_ifc.py [FILE]      (needs pip install '.[ifc]')
 
 The cage has eight upright bars and five stirrups. Each upright bar has its own swept disc along a polyline. The
 stirrups share one swept disc along a curve of lines and arcs through mapped items; every second stirrup is rotated

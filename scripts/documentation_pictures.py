@@ -1,9 +1,9 @@
 """Pictures of the documentation, made from a dataset folder: views, reports and pages of a leaderboard.
 
-rebar-build --out ROOT --config lattice pile --views 12 --width 640 --height 360 --quality preview
+rebar-build --out ROOT --config lattice pile pier --views 12 --width 640 --height 360 --quality preview
 python -m scripts.documentation_pictures ROOT docs/pictures
 
-The dataset needs the configs lattice and pile in colour. The methods that take less than a second a view are run
+The dataset needs the configs lattice, pile and pier in colour. Methods that take less than a second a view are run
 and scored; the pages are those that users see, in the system's Chromium.
 """
 
@@ -30,6 +30,8 @@ from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, colour_indices
 METHODS = ("sgbm-filled", "sgbm", "board-plane", "constant", "truth")
 REPORT_METHOD, BOARD_METHOD = "sgbm-filled", "sgbm"
 """Methods whose report, and whose page of the leaderboard, are shown."""
+SHOWN = ("lattice", "pile")
+"""Configs whose results are shown; the pier has no board, which ``board-plane`` needs."""
 PANEL = (640, 360)
 MAX_BYTES = 150_000
 START_S = 60.0
@@ -40,7 +42,8 @@ def main(root: str, target: str) -> None:
     """Write the pictures of the dataset folder ``root`` to the folder ``target`` as WebP files."""
     data, out = Path(root).resolve(), Path(target).resolve()
     save(view_strip(data), out / "lattice.webp")
-    shutil.copyfile(data / "pictures" / "lattice.webp", out / "contact-sheet.webp")
+    for name, target_name in (("scenes", "scenes"), ("lattice", "contact-sheet")):
+        shutil.copyfile(data / "pictures" / f"{name}.webp", out / f"{target_name}.webp")
     with tempfile.TemporaryDirectory() as name, chromium() as page:
         work = Path(name)
         save(cage_picture(work), out / "inspect.webp")
@@ -109,7 +112,7 @@ def board_pictures(page: Page, url: str, submission: str, out: Path) -> None:
 def predicted(method: str, data: Path, work: Path) -> Path:
     """Return the archive of a method's predictions."""
     archive = work / f"{method}.zip"
-    run("rebar_depth_bench", "predict", method, "--data", str(data), "--out", str(archive))
+    run("rebar_depth_bench", "predict", method, "--data", str(data), "--out", str(archive), "--config", *SHOWN)
     return archive
 
 

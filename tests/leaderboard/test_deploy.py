@@ -1,4 +1,4 @@
-"""Consistency of ``deploy/`` with the code: settings, commands, extras and images."""
+"""Consistency of ``deploy/`` and the leaderboard's pages with the code: settings, commands, requests, images."""
 
 from __future__ import annotations
 
@@ -11,17 +11,22 @@ from typing import Any
 
 import pytest
 import yaml
+from fastapi.routing import APIRoute
 
 from leaderboard.cli import COMMANDS, argument_parser
 from leaderboard.settings import Settings
+from leaderboard.web.api import leaderboard, status, submissions
 
 ROOT = Path(__file__).parents[2]
 DATA_VOLUME = "${DATASET:?set the dataset folder}:/data:ro"
 COMPOSE, CONTAINERFILE = ROOT / "deploy/compose.yaml", ROOT / "deploy/Containerfile"
-PAGE = (ROOT / "docs/leaderboard-operator.md").read_text()
+API_ROUTERS = (leaderboard.router, status.router, submissions.router)
+SUBMITTERS = ROOT / "docs/leaderboard-submitter.md"
+OPERATOR = ROOT / "docs/leaderboard-operator.md"
+PAGE = OPERATOR.read_text()
 PREFIX = "REBAR_LEADERBOARD_"
 NON_SETTINGS = {"name", "token"}
-"""Names in the page that are not server settings: a placeholder and a variable of the client."""
+"""Names on the page that are not server settings: a placeholder and a variable of the client."""
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +48,7 @@ def image_environment() -> dict[str, str]:
 
 
 def test_deployed_settings_exist() -> None:
-    for file in sorted((ROOT / "deploy").iterdir()):
+    for file in [*sorted((ROOT / "deploy").iterdir()), OPERATOR]:
         names = {name.lower() for name in re.findall(rf"{PREFIX}(\w+)", file.read_text())}
         assert names or file.suffix == ".conf", f"{file.name}: nothing is set"
         allowed = NON_SETTINGS if file.suffix == ".md" else set()
@@ -51,18 +56,18 @@ def test_deployed_settings_exist() -> None:
 
 
 def shell_lines(program: str) -> list[list[str]]:
-    """Return the argument lists of the commands of ``program`` in the page."""
+    """Return the argument lists of the commands of ``program`` on the page."""
     blocks = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
     lines = [shlex.split(line, comments=True) for block in blocks for line in block.splitlines()]
     return [words[1:] for words in lines if words and words[0] == program]
 
 
-def test_readme_commands_parse() -> None:
+def test_page_commands_parse() -> None:
     commands = [argument_parser().parse_args(words).command for words in shell_lines("rebar-leaderboard")]
     assert set(commands) == set(COMMANDS)
 
 
-def test_readme_settings_table_matches_code() -> None:
+def test_page_settings_table_matches_code() -> None:
     table_rows = re.findall(r"^\| `(\w+)` \| (?:`(.*)`)? ?\| (.+) \|$", PAGE, re.MULTILINE)
     fields = Settings.model_fields.items()
     expected = [
@@ -71,10 +76,12 @@ def test_readme_settings_table_matches_code() -> None:
     assert table_rows == expected
 
 
-def test_extras_in_readme_exist() -> None:
+def test_extras_on_page_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     installed = {
-        extra for extras_list in re.findall(r"'\.\[([\w,]+)\]'", PAGE) for extra in extras_list.split(",")
+        extra
+        for extras_list in re.findall(r"pip install \'\.\[([\w,]+)\]", PAGE)
+        for extra in extras_list.split(",")
     }
     assert {"server", "postgresql"} <= installed <= set(extras)
 
@@ -151,3 +158,16 @@ def test_commands_in_comments_refer_to_existing_files() -> None:
     assert all((ROOT / file).is_file() for file in files)
     (scaled,) = re.findall(r"--scale (\w+)=", " ".join(commands))
     assert scaled in yaml.safe_load(COMPOSE.read_text())["services"]
+
+
+def test_submitters_page_lists_every_request() -> None:
+    routes = [route for router in API_ROUTERS for route in router.routes if isinstance(route, APIRoute)]
+    served = {
+        f"{method} {re.sub(r'{[^}]+}', 'ID', route.path)}"
+        for route in routes
+        if route.include_in_schema
+        for method in route.methods or ()
+    }
+    listed = re.findall(r"^\| `([A-Z]+ [^`?]+)", SUBMITTERS.read_text(), re.MULTILINE)
+    assert {*listed, "GET /api/v1/leaderboard.csv"} == served
+    assert "`leaderboard.csv`" in SUBMITTERS.read_text()

@@ -1,4 +1,4 @@
-"""Documentation: commands parse, Python examples run, and tables and links are correct."""
+"""Documentation: commands parse, Python examples run, and tables, links and pictures are correct."""
 
 from __future__ import annotations
 
@@ -6,56 +6,60 @@ import json
 import re
 import shlex
 import tomllib
-from argparse import ArgumentParser
+from argparse import ArgumentParser, _SubParsersAction
+from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
+import grimp
 import numpy as np
 import pytest
 
 from cards.reference import FULL_SETS, reference_context
 from dataset_builder.cli import argument_parser as build_parser
 from dataset_builder.config.catalog import CONFIGS, SWEEPS
+from dataset_builder.config.scene_schema import read_scene_toml
 from dataset_builder.importing.layout import read_layout
 from dataset_builder.scene.variants import VARIANTS
 from leaderboard.cli import argument_parser as board_parser
-from leaderboard.settings import Settings
+from rebar_depth_bench.bar_crossings.table import CROSSINGS_SCHEMA
 from rebar_depth_bench.cli.main import argument_parser as bench_parser
+from rebar_depth_bench.data.bars import BARS_SCHEMA
+from rebar_depth_bench.data.columns import COLUMN_DESCRIPTIONS, COLUMNS, column_kind
 from rebar_depth_bench.limits import LIMITS, Limit
 from rebar_depth_bench.methods import find_method, own_methods
-from scripts.diagrams import diagrams
+from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS
+from rebar_depth_bench.submission import SubmissionMeta
+from scripts.diagrams import PACKAGE_EDGES, diagrams
 from tests.bench.methods.predictors import load_predictor
+from tests.project.pages import (
+    PAGES,
+    ROOT,
+    anchors,
+    blocks,
+    first_column,
+    inline_code,
+    local_links,
+    name_of,
+    shell_lines,
+)
 
-DOCS = sorted(Path("docs").rglob("*.md"))
-PAGES = [
-    Path("README.md"),
-    Path("CONTRIBUTING.md"),
-    Path("ARCHITECTURE.md"),
-    Path("SECURITY.md"),
-    Path("cards/BENCHMARK.md"),
-    Path("deploy/README.md"),
-    *DOCS,
-]
+DOCS = ROOT / "docs"
+CURRENT_PAGES = [page for page in PAGES if page.name != "CHANGELOG.md"]
+"""Pages about this version; the changelog also names what earlier versions had."""
+PACKAGES = ("dataset_builder", "rebar_depth_bench", "leaderboard", "cards")
 PARSERS: dict[str, ArgumentParser] = {
     "rebar-build": build_parser(),
     "rebar-bench": bench_parser(),
     "rebar-leaderboard": board_parser(),
 }
-
-
-def blocks(page: Path, language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", page.read_text(), flags=re.DOTALL)
+MAX_PICTURE_BYTES = 150_000
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def commands() -> list[str]:
-    """Return the commands of all pages: lines of blocks, and inline ones that have arguments."""
-    lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
-    inline = [
-        " ".join(command.split())
-        for page in (Path("README.md"), *DOCS)
-        for command in re.findall(r"`(rebar-(?:build|bench|leaderboard) [^`]*)`", page.read_text())
-    ]
-    with_arguments = [command for command in inline if len(command.split()) > 3]
-    return [line for line in [*lines, *with_arguments] if line.startswith(tuple(PARSERS))]
+    lines = [line for page in PAGES for line in shell_lines(page)]
+    return sorted({line for line in lines if line.startswith(tuple(PARSERS))})
 
 
 @pytest.mark.parametrize("command", commands())
@@ -64,24 +68,76 @@ def test_documented_commands_parse(command: str) -> None:
     assert PARSERS[program].parse_args(arguments)
 
 
-@pytest.mark.parametrize("page", [Path("README.md"), Path("docs/score.md")], ids=str)
+def subparsers(parser: ArgumentParser) -> dict[str, ArgumentParser]:
+    actions = [action for action in parser._actions if isinstance(action, _SubParsersAction)]
+    return {name: sub for action in actions for name, sub in action.choices.items()}
+
+
+def unknown_words(parser: ArgumentParser, words: list[str]) -> Iterator[str]:
+    """Yield the subcommand or the options of a mentioned command that its parser does not know."""
+    while (choices := subparsers(parser)) and words and re.fullmatch(r"[a-z][a-z-]+", words[0]):
+        name, *words = words
+        if name not in choices and parser is not PARSERS["rebar-build"]:
+            yield name
+            return
+        parser = choices.get(name, parser)
+    # A program may be mentioned with the options of its commands.
+    known = {option for one in (parser, *subparsers(parser).values()) for option in one._option_string_actions}
+    yield from (word for word in words if word.startswith("-") and word != "-" and word not in known)
+
+
+@pytest.mark.parametrize("page", CURRENT_PAGES, ids=name_of)
+def test_mentioned_commands_and_options_exist(page: Path) -> None:
+    mentioned = [code.split() for code in inline_code(page) if code.split()[:1] and code.split()[0] in PARSERS]
+    assert [(words, list(unknown_words(PARSERS[words[0]], words[1:]))) for words in mentioned] == [
+        (words, []) for words in mentioned
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_documented_modules_and_scripts_exist(page: Path) -> None:
+    code = "\n".join([*shell_lines(page), *inline_code(page)])
+    modules = re.findall(r"python -m ([\w.]+)", code)
+    scripts = re.findall(r"python ((?:examples|scripts)/[\w./]+)", code)
+    assert all(find_spec(module) for module in modules)
+    assert all((ROOT / script).is_file() for script in scripts)
+
+
+@pytest.mark.parametrize("page", CURRENT_PAGES, ids=name_of)
+def test_extras_are_installed_from_the_repository(page: Path) -> None:
+    text = page.read_text()
+    assert "pip install rebar-depth-bench" not in text
+    extras = re.findall(r"\.\[([\w,]+)\]'", text)
+    assert {name for group in extras for name in group.split(",")} <= set(PROJECT["optional-dependencies"])
+
+
+def test_quick_start_lists_every_extra() -> None:
+    assert set(PROJECT["optional-dependencies"]) == set(first_column(DOCS / "quick-start.md"))
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name_of)
 def test_documented_python_runs(
-    tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, page: Path
+    page: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = "".join(blocks(page, "python"))
-    shown = text.replace('"demo-output/dataset"', repr(str(tiny_root))).replace("(480, 640)", "(48, 64)")
-    assert repr(str(tiny_root)) in shown
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {"my_model": lambda rgb, K: np.full(rgb.shape[:2], K[0, 0] / 200)}
-    exec(shown, names)
-    assert (tmp_path / "submission.zip").is_file()
+    for block in blocks(page, "python"):
+        shown = block.replace('"demo-output/dataset"', repr(str(tiny_root)))
+        exec(shown.replace("(480, 640)", "(48, 64)"), names)
+    writes = any("submission.zip" in block for block in blocks(page, "python"))
+    assert (tmp_path / "submission.zip").is_file() == writes
     if "loader" in names:
         batch = next(iter(names["loader"]))  # type: ignore[call-overload]
         assert {"rgb", "depth", "mask", "K", "poses", "view_id", "right_rgb", "baseline_m"} <= set(batch)
 
 
+def test_readme_and_score_page_run_python() -> None:
+    assert blocks(ROOT / "README.md", "python")
+    assert len(blocks(DOCS / "score.md", "python")) > 1
+
+
 def test_method_template_works(tmp_path: Path) -> None:
-    [template] = blocks(Path("docs/methods.md"), "py")
+    [template] = blocks(DOCS / "methods.md", "py")
     path = tmp_path / "my_model.py"
     path.write_text(f"load_my_model = lambda: lambda rgb, K: rgb[..., 0] * K[0, 0]\n{template}")
     method = find_method(f"{path}:METHOD")
@@ -90,69 +146,43 @@ def test_method_template_works(tmp_path: Path) -> None:
     assert set(method.info.columns) == set(row)
 
 
-def test_results_in_readme_are_those_of_the_card() -> None:
-    rows = re.findall(r"^\| [\w -]+, [\d.]+-[\d.]+ m \| (.*) \|$", Path("README.md").read_text(), re.MULTILINE)
-    expected = []
-    for config in FULL_SETS:
-        context = reference_context(config)
-        row = next(row for row in context["rows"][config] if row["method"] == "sgbm")
-        errors = context["errors"][config]
-        cells = (*(row[key] for key in ("coverage", "abs_rel", "scaled", "within")), errors["constant"][0])
-        expected.append(" | ".join((*cells, errors["one_pixel"][0])))
-    assert rows == expected
-
-
-def test_leaderboard_settings_table_matches_code() -> None:
-    page = Path("docs/leaderboard-operator.md").read_text()
-    for name, field in Settings.model_fields.items():
-        default = "" if field.is_required() or field.default == "" else f"`{field.default}`"
-        assert f"| `{name}` | {default} | {field.description} |" in page
-
-
 def test_tables_list_configs_variants_and_methods() -> None:
-    build, methods = (Path(f"docs/{name}.md").read_text() for name in ("build", "methods"))
-    assert table_names(build) == {*CONFIGS, *SWEEPS, *VARIANTS}
-    assert table_names(methods.partition("## Your own model")[0]) == set(own_methods())
-    assert all(f"| `{variant.name}` | {variant.description} |" in build for variant in VARIANTS.values())
+    build = DOCS / "build.md"
+    assert set(first_column(build)) == {*CONFIGS, *SWEEPS, *VARIANTS}
+    assert all(
+        f"| `{variant.name}` | {variant.description} |" in build.read_text() for variant in VARIANTS.values()
+    )
+    assert set(first_column(DOCS / "methods.md")) == {*own_methods(), *OUTPUT_MEANINGS}
+    meanings = (DOCS / "methods.md").read_text()
+    assert all(f"| `{name}` | {meaning.description} |" in meanings for name, meaning in OUTPUT_MEANINGS.items())
 
 
-def table_names(text: str) -> set[str]:
-    return set(re.findall(r"^\| `([\w-]+)` \|", text, flags=re.MULTILINE))
+def test_formats_list_columns_and_keys() -> None:
+    page = DOCS / "formats.md"
+    listed = first_column(page)
+    assert {*COLUMNS, *BARS_SCHEMA.names, *CROSSINGS_SCHEMA.names} <= set(listed)
+    assert set(SubmissionMeta.model_fields) - {"uses_intrinsics"} <= set(listed)
+    descriptions = {COLUMN_DESCRIPTIONS[column_kind(name)] for name in COLUMNS}
+    assert all(f"| {description} |" in page.read_text() for description in descriptions)
 
 
-def test_extras_are_documented() -> None:
-    extras = tomllib.loads(Path("pyproject.toml").read_text())["project"]["optional-dependencies"]
-    rows = re.findall(r"^\| (`[\w`, ]+`) \|", Path("docs/quick-start.md").read_text(), flags=re.MULTILINE)
-    assert {name for row in rows for name in re.findall(r"\w+", row)} == {*extras} - {"test"}
-    used = {
-        name
-        for page in PAGES
-        for names in re.findall(r"'\.\[([\w,]+)\]'", page.read_text())
-        for name in names.split(",")
-    }
-    assert used <= set(extras)
-
-
-@pytest.mark.parametrize("language", ["json", "toml"])
-def test_documented_files_can_be_parsed(language: str) -> None:
-    parse = {"json": json.loads, "toml": tomllib.loads}[language]
-    assert [parse(block) for page in DOCS for block in blocks(page, language)]
-
-
-@pytest.mark.parametrize("page", PAGES, ids=str)
-def test_local_links_exist(page: Path) -> None:
-    links = re.findall(r"\]\(([^)#\s]+)", page.read_text())
-    assert all((page.parent / link).exists() for link in links if "://" not in link)
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_local_links_and_anchors_exist(page: Path) -> None:
+    for path, anchor in local_links(page):
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), path
+        assert not anchor or anchor in anchors(target), f"{path}#{anchor}"
 
 
 def test_documented_make_targets_exist() -> None:
-    targets = set(re.findall(r"^([a-z-]+):.*##", Path("Makefile").read_text(), flags=re.MULTILINE))
-    shown = {name for page in PAGES for name in re.findall(r"\bmake ([a-z-]+)\b(?:`|\s+#)", page.read_text())}
-    assert {"demo", "test"} <= shown <= targets
+    targets = set(re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
+    code = [line for page in PAGES for line in [*shell_lines(page), *inline_code(page)]]
+    shown = {match[1] for line in code if (match := re.match(r"make ([a-z-]+)\b", line))}
+    assert {"demo", "docs", "test"} <= shown <= targets
 
 
 def test_security_lists_every_limit() -> None:
-    page = Path("SECURITY.md").read_text()
+    page = (ROOT / "SECURITY.md").read_text()
     rows = re.findall(r"^\| `(REBAR_MAX_\w+)` \| (.*?) \| (.*?) \|$", page, re.MULTILINE)
     assert rows == [(limit.variable, default_text(limit), limit.description) for limit in LIMITS]
 
@@ -166,11 +196,61 @@ def default_text(limit: Limit) -> str:
 
 
 def test_documented_layout_files_are_valid(tmp_path: Path) -> None:
-    for block in blocks(Path("docs/import.md"), "toml"):
+    layouts = blocks(DOCS / "import.md", "toml")
+    assert layouts
+    for block in layouts:
         path = tmp_path / "layout.toml"
         path.write_text(block)
         assert read_layout(path).truth_sigma_m > 0
 
 
-def test_diagrams_are_up_to_date() -> None:
-    assert {name: Path("docs/pictures", name).read_text() for name in diagrams()} == diagrams()
+def test_documented_scene_files_are_valid() -> None:
+    scenes = blocks(DOCS / "cages.md", "toml")
+    assert scenes
+    assert all(read_scene_toml(block.encode(), "page") for block in scenes)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_documented_toml_and_json_parse(page: Path) -> None:
+    assert all(tomllib.loads(block) for block in blocks(page, "toml"))
+    assert all(json.loads(block) for block in blocks(page, "json"))
+
+
+def test_architecture_table_and_diagram_have_the_real_imports() -> None:
+    graph = grimp.build_graph(*PACKAGES, exclude_type_checking_imports=True)
+    imports = {
+        (importer, imported)
+        for importer in PACKAGES
+        for imported in PACKAGES
+        if importer != imported
+        and graph.direct_import_exists(importer=importer, imported=imported, as_packages=True)
+    }
+    rows = re.findall(r"^\| `(\w+)` \| (.*?) \|", (ROOT / "ARCHITECTURE.md").read_text(), flags=re.MULTILINE)
+    assert [name for name, _ in rows] == ["rebar_depth_bench", "dataset_builder", "leaderboard", "cards"]
+    assert {(name, imported) for name, cell in rows for imported in re.findall(r"`(\w+)`", cell)} == imports
+    assert set(PACKAGE_EDGES) == imports
+
+
+def test_diagrams_are_current() -> None:
+    stored = {name: (DOCS / "pictures" / name).read_text() for name in diagrams()}
+    assert stored == diagrams(), "write them: python -m scripts.diagrams docs/pictures"
+
+
+def test_results_in_readme_are_those_of_the_card() -> None:
+    rows = re.findall(r"^\| [\w -]+, [\d.]+-[\d.]+ m \| (.*) \|$", (ROOT / "README.md").read_text(), re.MULTILINE)
+    expected = []
+    for config in FULL_SETS:
+        context = reference_context(config)
+        row = next(row for row in context["rows"][config] if row["method"] == "sgbm")
+        errors = context["errors"][config]
+        cells = (*(row[key] for key in ("coverage", "abs_rel", "scaled", "within")), errors["constant"][0])
+        expected.append(" | ".join((*cells, errors["one_pixel"][0])))
+    assert rows == expected
+
+
+def test_pictures_are_used_and_small() -> None:
+    text = "\n".join(page.read_text() for page in PAGES)
+    for picture in (DOCS / "pictures").iterdir():
+        assert f"pictures/{picture.name}" in text
+        assert picture.suffix in (".webp", ".svg")
+        assert picture.stat().st_size < MAX_PICTURE_BYTES, picture.name

@@ -36,7 +36,7 @@ def all_libraries() -> str:
     return "".join(f"\\t{probe} (libc6) => /lib/{probe}\\n" for probe in probes if ".so." in probe)
 
 
-def test_readme_lists_all_system_packages() -> None:
+def test_page_lists_all_system_packages() -> None:
     commands = re.findall(r"^apt-get install (.+)$", PAGE.read_text(), flags=re.MULTILINE)
     listed = [package for use in USES for package in requirements.probes(use).values()]
     assert sorted(" ".join(commands).split()) == sorted(listed)

@@ -18,7 +18,7 @@
     std = [58.395, 57.12, 57.375]     # optional (default: 1)
 
     [output]
-    meaning = "canonical-depth"     # see OUTPUT_MEANINGS
+    meaning = "canonical-depth"     # or depth, inverse-depth, canonical-inverse-depth
     focal_canonical_px = 1000       # only for canonical meanings
     scale = 1.0                     # optional: factor applied to the value first (0.001: millimetres)
     min_m = 0.1                     # optional, as is max_m: depth outside becomes NaN (no prediction)

@@ -137,12 +137,12 @@ def _sgbm_method(name: str, summary: str, *, check_consistency: bool) -> Method:
 
 SGBM = _sgbm_method(
     "sgbm",
-    "OpenCV semi-global matching and weighted-least-squares filter on the stereo pair; no answer where the "
+    "OpenCV semi-global matching and weighted-least-squares filter on the stereo pair; no prediction where the "
     "two views disagree",
     check_consistency=True,
 )
 SGBM_FILLED = _sgbm_method(
     "sgbm-filled",
-    "the same, with an answer everywhere: where the views disagree the filter fills in",
+    "semi-global matching as sgbm; where the views disagree, the filter fills in",
     check_consistency=False,
 )

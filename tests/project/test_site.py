@@ -1,4 +1,4 @@
-"""Documentation as a site: it has no warnings, loads nothing from other servers, and lists the interface."""
+"""Documentation as a site: a build without warnings, no content of other servers, and the public interface."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import rebar_depth_bench
+from tests.project.pages import ROOT
 
-ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.slow
 METHOD_TYPES = ("Method", "MethodInfo", "MultiViewMethod", "Prepared", "Views", "find_method")
 
