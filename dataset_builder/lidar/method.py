@@ -61,7 +61,7 @@ def lidar_method(name: str, spec: ScannerSpec, what: str) -> MultiViewMethod:
 
     summary = (
         f"simulated laser scanner, {what}, {-1000 * spec.position_left_m[1]:.0f} mm above the left camera, pose"
-        " known exactly; reads the scene's mesh: a simulation, no measurement of pictures; no answer at"
+        " known exactly; reads the scene's mesh: a simulation, not a measurement on images; no prediction at"
         f" ranges below {spec.min_range_m:g} m"
     )
     # The digest distinguishes scanners of the same name with different parameters.

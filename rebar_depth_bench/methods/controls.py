@@ -134,7 +134,9 @@ def _prepare_board_plane(views: Views, work: Path, progress: Progress) -> Prepar
 BOARD_PLANE = MultiViewMethod(
     MethodInfo(
         name="board-plane",
-        summary="control: the plane of the ArUco board, by its markers in the left picture; none seen, no answer",
+        summary=(
+            "control: the plane of the ArUco board, from its markers in the left image; no prediction without markers"
+        ),
         columns=("left_rgb", "left_K", "left_distortion"),
         uses_intrinsics=True,
         source="this project, OpenCV's ArUco detector",

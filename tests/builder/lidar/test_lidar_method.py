@@ -45,7 +45,7 @@ def test_both_methods_are_registered_as_entry_points() -> None:
 @pytest.mark.parametrize(("method", "nearest"), [(LIDAR_SURVEY, "0.6 m"), (LIDAR_MOBILE, "0.8 m")])
 def test_summary_states_simulation_and_minimum_range(method: MultiViewMethod, nearest: str) -> None:
     summary = method.info.summary
-    assert "reads the scene's mesh: a simulation, no measurement of pictures" in summary
+    assert "reads the scene's mesh: a simulation, not a measurement on images" in summary
     assert "60 mm above the left camera, pose known exactly" in summary
     assert f"no answer at ranges below {nearest}" in summary
     assert method.info.uses_intrinsics
