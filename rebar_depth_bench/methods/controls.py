@@ -135,7 +135,7 @@ BOARD_PLANE = MultiViewMethod(
     MethodInfo(
         name="board-plane",
         summary=(
-            "control: the plane of the ArUco board, from its markers in the left image; no prediction without markers"
+            "control: the plane of the ArUco board, from its markers in the left image; no prediction without them"
         ),
         columns=("left_rgb", "left_K", "left_distortion"),
         uses_intrinsics=True,
