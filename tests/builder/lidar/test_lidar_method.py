@@ -47,7 +47,7 @@ def test_summary_states_simulation_and_minimum_range(method: MultiViewMethod, ne
     summary = method.info.summary
     assert "reads the scene's mesh: a simulation, not a measurement on images" in summary
     assert "60 mm above the left camera, pose known exactly" in summary
-    assert f"no answer at ranges below {nearest}" in summary
+    assert f"no prediction at ranges below {nearest}" in summary
     assert method.info.uses_intrinsics
 
 
