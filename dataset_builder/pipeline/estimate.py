@@ -86,7 +86,7 @@ def _estimate_config(plan: ConfigPlan, out: Path, threads: int, trials: dict[obj
 
 
 def of_scenes(estimates: Sequence[ConfigEstimate]) -> ConfigEstimate:
-    """Return the estimate of a config whose scenes have the given ones: their units are rendered side by side."""
+    """Return the estimate of a config from those of its scenes, whose units are rendered side by side."""
     spaces = [estimate.space for estimate in estimates if estimate.space]
     sizes = [sum(column) for column in zip(*map(astuple, spaces), strict=True)]
     return ConfigEstimate(
