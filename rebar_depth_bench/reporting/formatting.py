@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from decimal import ROUND_DOWN, Decimal
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS
+from rebar_depth_bench.scoring.bootstrap import MIN_BLOCKS
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.metrics import METRICS, DepthMetrics
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, OLD_PROTOCOL, WITHIN_MM
@@ -48,7 +48,7 @@ GROUP_METRICS = ("abs_rel", "rmse_cm")
 GROUP_NOTE = (
     "The group of a view follows from its ground truth. Beside the errors of a group are the reference errors of "
     f"its views: {ONE_PIXEL_TITLE} for native, {CONSTANT_TITLE} for scaled errors. A group with views of fewer "
-    f"than {MIN_VIEWS} scenes has no intervals."
+    f"than {MIN_BLOCKS} scenes has no intervals."
 )
 
 

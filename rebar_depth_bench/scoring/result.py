@@ -10,7 +10,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any, Literal
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.scoring.bootstrap import Interval
+from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval
 from rebar_depth_bench.scoring.frames import groups_frame, tables_frame, views_frame
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics, mean, mean_metrics
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
@@ -80,6 +80,7 @@ class Result:
     """
 
     method: str
+    ``intervals`` states how the intervals were computed; None in a file of an earlier version, which does not.
     submission_sha256: str
     dataset_digest: str
     dataset_version: str
@@ -92,6 +93,7 @@ class Result:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a JSON-compatible object; extended measures, if computed, are its last entry."""
+    intervals: Mapping[str, Any] | None = field(default_factory=lambda: dict(INTERVALS))
         extended = {} if self.extended is None else {"extended": self.extended.to_dict()}
         return {
             "protocol": self.protocol,
@@ -105,6 +107,7 @@ class Result:
             "tables": {name: _table_dict(table) for name, table in self.tables.items()},
             "views": [_view_dict(view) for view in self.views],
             **extended,
+            **({} if self.intervals is None else {"intervals": dict(self.intervals)}),
         }
 
     def to_pandas(self, rows: Literal["tables", "groups", "views", "extended"] = "tables") -> DataFrame:

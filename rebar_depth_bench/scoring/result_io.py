@@ -49,6 +49,7 @@ def read_result(data: bytes, where: str) -> Result:
         software_version=content.software.version,
         tables={config: table.content() for config, table in content.tables.items()},
         views=[view.content() for view in content.views],
+        intervals=content.intervals,
     )
 
 
@@ -324,6 +325,7 @@ class _ResultJson(StoredModel):
     software: SoftwareJson
     tables: Annotated[dict[Name, _ConfigTableJson], BeforeValidator(_check_tables)]
     views: Annotated[list[_ViewJson], FailFast()]
+    intervals: Annotated[dict[Name, Name | _Count | _Share], LIMITED] | None = None
 
     @model_validator(mode="after")
     def _check_views(self) -> Self:

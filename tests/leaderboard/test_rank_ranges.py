@@ -22,7 +22,7 @@ def random_results(count: int, spread: float, seed: int) -> list[Result]:
     results = []
     for number in range(count):
         errors = np.clip(difficulty + spread * number + rng.normal(0, 0.05, VIEWS), 0.01, 0.9)
-        views = [scored_view(f"lattice/{index:04d}", float(error)) for index, error in enumerate(errors)]
+        views = [scored_view(f"lattice/{12 * index:04d}", float(error)) for index, error in enumerate(errors)]
         results.append(result(*views, method=f"m{number}"))
     return results
 

@@ -27,7 +27,7 @@ from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredic
 @pytest.fixture
 def two_configs() -> Result:
     return result(
-        *(scored_view(f"lattice/{index:04d}") for index in range(12)),
+        *(scored_view(f"lattice/{12 * index:04d}") for index in range(12)),
         scored_view("pier/0000"),
         unpredicted_view("pier/0001"),
     )
