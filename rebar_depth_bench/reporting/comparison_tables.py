@@ -201,7 +201,7 @@ def _paper_table(rows: Sequence[tuple[Result, Table]], match: PublishedMatch | N
             plain_text(formatting.rank_error_cell(table.rank_error)),
             *map(plain_text, formatting.paper_cells(table)),
         )
-    for title, cells in formatting.paper_reference_rows(rows[0][1].reference):
+    for title, cells in formatting.paper_reference_rows([(result.method, table) for result, table in rows]):
         grid.add_row(plain_text(f"reference: {title}"), "", *map(plain_text, cells), style="dim")
     if match is not None:
         grid.add_section()

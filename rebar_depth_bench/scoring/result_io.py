@@ -153,6 +153,7 @@ class _ReferenceJson(StoredModel):
 
     constant: _ErrorsJson = _ErrorsJson()
     one_pixel: _ErrorsJson = _ErrorsJson()
+    scaled_constant: _ErrorsJson = _ErrorsJson()
 
     def content(self) -> Reference:
         """Return the reference errors."""
@@ -221,6 +222,7 @@ class _TableJson(_AlignedJson):
             ranked=self.ranked and self.rank_error is not None,
             rank_error=self.rank_error,
             reference=self.reference.content(),
+            scaled_constant=(self.reference.scaled_constant.abs_rel, self.reference.scaled_constant.rmse_cm),
             published=None if self.published is None else PublishedMatch(**vars(self.published)),
             split=self.split,
             truth_sigma_m=self.truth_sigma_m,
@@ -323,9 +325,9 @@ class _ResultJson(StoredModel):
     dataset: DatasetJson
     submission: SubmissionJson
     software: SoftwareJson
+    intervals: Annotated[dict[Name, Name | _Count | _Share], LIMITED] | None = None
     tables: Annotated[dict[Name, _ConfigTableJson], BeforeValidator(_check_tables)]
     views: Annotated[list[_ViewJson], FailFast()]
-    intervals: Annotated[dict[Name, Name | _Count | _Share], LIMITED] | None = None
 
     @model_validator(mode="after")
     def _check_views(self) -> Self:

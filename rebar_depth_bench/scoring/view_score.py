@@ -26,7 +26,8 @@ _VIEW_INDEX = re.compile("[0-9]{4}")
 class ViewScore:
     """Metrics of one view; ``scale``, ``native`` and ``scaled`` are None without valid predictions.
 
-    ``rank_error`` is None in results of the previous protocol.
+    ``rank_error`` is None in results of the previous protocol. ``scaled_constant`` is as in ``Table``; it is
+    None in results that were read from a file.
     """
 
     view_id: str
@@ -37,6 +38,7 @@ class ViewScore:
     native: DepthMetrics | None
     scaled: DepthMetrics | None
     within_mm: Mapping[int, float]
+    scaled_constant: tuple[float, float] | None = None
 
 
 def _metric_getter(alignment: str, name: str) -> Callable[[ViewScore], float | None]:
