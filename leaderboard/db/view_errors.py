@@ -25,7 +25,7 @@ from rebar_depth_bench.scoring.bootstrap import (
 from rebar_depth_bench.scoring.view_score import protocol_indices
 from rebar_depth_bench.view_ids import config_of, scene_of
 
-_CLEAR, _UNCLEAR = 1.33, 0.77
+_CLEAR, _UNCLEAR = 1.6, 0.6
 """Differences in half widths from which a pair is decided, and below which it is undecided, without draws."""
 _CHUNK_PAIRS = 2_000
 _CACHED_ROWS = 2048
