@@ -14,14 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.bootstrap import (
-    MIN_BLOCKS,
-    Resampling,
-    end_percents,
-    half_width,
-    resample,
-    resample_scenes,
-)
+from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.view_score import protocol_indices
 from rebar_depth_bench.view_ids import config_of, scene_of
 
@@ -90,9 +83,9 @@ def _resampled_means(packed: bytes) -> Float64[ndarray, " draws"]:
 
 
 @lru_cache(maxsize=4)
-def _resampling(indices: bytes) -> Resampling:
+def _resampling(indices: bytes) -> bootstrap.Resampling:
     numbers: list[int] = np.frombuffer(indices, "<i4").tolist()
-    return resample_scenes(list(map(str, numbers))) if min(numbers) < 0 else resample(numbers)
+    return bootstrap.resample_scenes(list(map(str, numbers))) if min(numbers) < 0 else bootstrap.resample(numbers)
 
 
 def _is_better(means: Float64[ndarray, "n draws"], blocks: int) -> ndarray:
@@ -101,18 +94,17 @@ def _is_better(means: Float64[ndarray, "n draws"], blocks: int) -> ndarray:
     It is all False where there are too few blocks of views, or scenes, for an interval.
     """
     n = len(means)
-    if blocks < MIN_BLOCKS:
+    if blocks < bootstrap.MIN_BLOCKS:
         return np.zeros((n, n), bool)
     covariance = np.cov(means)
     variance = np.diag(covariance)
-    deviation = np.sqrt(np.maximum(variance[:, None] + variance - 2 * covariance, 0))
+    width = bootstrap.half_width(blocks) * np.sqrt(np.maximum(variance[:, None] + variance - 2 * covariance, 0))
     difference = means.mean(axis=1)[:, None] - means.mean(axis=1)
-    width = half_width(blocks) * deviation
     better: ndarray = difference < -_CLEAR * width
     unclear = ~better & (difference < -_UNCLEAR * width)
     first, other = np.nonzero(unclear)
     for start in range(0, len(first), _CHUNK_PAIRS):
         i, j = first[start : start + _CHUNK_PAIRS], other[start : start + _CHUNK_PAIRS]
-        upper = np.percentile(means[i] - means[j], end_percents(blocks)[1], axis=1)
+        upper = np.percentile(means[i] - means[j], bootstrap.end_percents(blocks)[1], axis=1)
         better[i, j] = upper < 0
     return better

@@ -49,7 +49,7 @@ def read_result(data: bytes, where: str) -> Result:
         software_version=content.software.version,
         tables={config: table.content() for config, table in content.tables.items()},
         views=[view.content() for view in content.views],
-        intervals=content.intervals,
+        intervals=None if content.intervals is None else vars(content.intervals),
     )
 
 
@@ -318,6 +318,14 @@ class SoftwareJson(StoredModel):
     version: Name
 
 
+class _MethodJson(StoredModel):
+    """How intervals were computed."""
+
+    method: Name
+    draws: _Count
+    level: _Share
+
+
 class _ResultJson(StoredModel):
     """Content of a result file."""
 
@@ -325,7 +333,7 @@ class _ResultJson(StoredModel):
     dataset: DatasetJson
     submission: SubmissionJson
     software: SoftwareJson
-    intervals: Annotated[dict[Name, Name | _Count | _Share], LIMITED] | None = None
+    intervals: _MethodJson | None = None
     tables: Annotated[dict[Name, _ConfigTableJson], BeforeValidator(_check_tables)]
     views: Annotated[list[_ViewJson], FailFast()]
 
