@@ -31,7 +31,7 @@ from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.predictions import ONCE
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, own_methods
 from rebar_depth_bench.reporting.crossing_texts import FITS_NOTE, REACH_NOTE
-from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_VIEWS, RESAMPLES
+from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, INTERVALS, MIN_BLOCKS, RESAMPLES
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import DELTA1_RATIO, MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.rounding import SIGNIFICANT_DIGITS
@@ -93,7 +93,8 @@ def benchmark_card() -> str:
         **steel_context(),
         draws=RESAMPLES,
         ring_views=BLOCK_VIEWS,
-        min_views=MIN_VIEWS,
+        min_blocks=MIN_BLOCKS,
+        interval_method=INTERVALS["method"],
         groupings=GROUPINGS,
         extended_protocol=EXTENDED_PROTOCOL,
         crossings=crossing_parameters(),

@@ -51,7 +51,13 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.runner import predict
-from rebar_depth_bench.reporting.formatting import coverage_percent, metric_cell, number, rank_error_cell
+from rebar_depth_bench.reporting.formatting import (
+    coverage_percent,
+    metric_cell,
+    number,
+    rank_error_cell,
+    scaled_constants,
+)
 
 CONFIG = "cages"
 TARGETS = ((CONFIG, "validation"), ("lattice", "test"), ("pile", "test"))
@@ -303,31 +309,26 @@ focal_canonical_px = {FOCAL_PX:g}
 def score_rows(root: str, method_names: Sequence[str], out: Path) -> Iterator[Sequence[str]]:
     """Yield the rows of the table: for each config of the folder, those of the methods and of the constant.
 
-    The constant is the reference row: it is the best constant for each view, from ground truth.
+    The constant has the true median depth of each view; that of incomplete predictions is on their pixels.
     """
     configs = open_folder(root).config_by_name
     for config, split in TARGETS:
         if config not in configs or split not in configs[config].splits:
             continue
         title = f"{config}, {split}" if configs[config].has_splits else config
+        scored = []
         for name in method_names:
             method = find_method(name)
             archive = out / f"{method.info.name.partition(' ')[0]}-{config}.zip"
             with ProgressBars() as bars:
                 predict(method, root, archive, configs=[config], split=split, progress=bars.update)
             table = rdb.score(archive, root).tables[config]
+            scored.append((method.info.name.partition(" ")[0], table))
             errors = (metric_cell(metrics, "abs_rel") for metrics in (table.native, table.scaled))
             cells = (rank_error_cell(table.rank_error), *errors, coverage_percent(table.coverage))
             yield (title, method.info.name.partition(" ")[0], str(table.views), *cells)
-        yield (
-            title,
-            "constant, scaled",
-            str(table.views),
-            "",
-            "",
-            number(table.reference.constant_abs_rel, 4),
-            "",
-        )
+        for name, (abs_rel, _) in scaled_constants(scored).items():
+            yield title, f"{name}, scaled", str(table.views), "", "", number(abs_rel, 4), ""
 
 
 def run(options: argparse.Namespace) -> None:

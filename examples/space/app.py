@@ -20,7 +20,6 @@ from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.scoring.disclosure import DisclosedTable
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.reference import Reference
 from rebar_depth_bench.scoring.result import Table
 from rebar_depth_bench.scoring.result_io import read_result, read_table
 
@@ -58,8 +57,8 @@ SCALED_HEADS = [*METRIC_HEADS, "scale<br>"]
 NOTES = (
     f"{formatting.RANK_ERROR_NOTE} A submission that uses ground truth is not ranked. Native: no alignment. "
     "≤ t mm: share of all scored pixels with an error of at most t. Scaled numbers need the ground truth and never"
-    " rank. References follow from the ground truth alone: exact depth shifted by one pixel for native numbers, a "
-    "constant for scaled ones."
+    " rank. References follow from the ground truth: exact depth shifted by one pixel for native numbers, a "
+    "constant on the predicted pixels for scaled ones."
 )
 
 
@@ -180,29 +179,31 @@ def show_ranking(config: str | None) -> str:
         for row in rows
     ]
     tables = [row.table for row in rows]
-    return show_tables(("method", "rank", "inputs"), texts, tables, {"": tables[0].reference})
+    return show_tables(
+        ("method", "rank", "inputs"), texts, tables, {"": [(row.method, row.table) for row in rows]}
+    )
 
 
 def show_tables(
     heads: Sequence[str],
     texts: Sequence[Sequence[str]],
     tables: Sequence[Table],
-    references: Mapping[str, Reference],
+    results: Mapping[str, Sequence[tuple[str, Table]]],
 ) -> str:
     """Return the HTML of a native and a scaled table; ``texts`` are the first cells of each row.
 
-    ``references`` are the reference errors that follow the rows, by what their names begin with.
+    The reference errors of ``results``, methods and tables of a config, follow, by what their names begin with.
     """
     native = [table_row(text, native_cells(table)) for text, table in zip(texts, tables, strict=True)]
     scaled = [table_row(text, scaled_cells(table)) for text, table in zip(texts, tables, strict=True)]
     empty = [""] * (len(heads) - 1)
-    for name, errors in references.items():
-        shifted = reference_cells(errors.one_pixel_abs_rel, errors.one_pixel_rmse_cm)
-        native.append(
-            table_row([f"{name}reference, one-pixel shift", *empty], ["", "", *shifted, *[""] * 6], "reference")
-        )
-        constant = reference_cells(errors.constant_abs_rel, errors.constant_rmse_cm)
-        scaled.append(table_row([f"{name}reference, constant", *empty], [*constant, *[""] * 3], "reference"))
+    for name, of_config in results.items():
+        for title, native_errors, scaled_errors in formatting.reference_rows(of_config):
+            texts = [f"{name}reference, {title}", *empty]
+            if any(native_errors):
+                native.append(table_row(texts, ["", "", *native_errors, *[""] * 4], "reference"))
+            if any(scaled_errors):
+                scaled.append(table_row(texts, [*scaled_errors, ""], "reference"))
     return (
         f'<div class="rdb"><h3>Native</h3>{html_table(heads, NATIVE_HEADS, native)}'
         f"<h3>Scaled by the true median of each view</h3>{html_table(heads, SCALED_HEADS, scaled)}"
@@ -223,11 +224,6 @@ def native_cells(table: Table) -> list[str]:
 def scaled_cells(table: Table) -> list[str]:
     """Return the cells of ``SCALED_HEADS``."""
     return [*formatting.metric_cells(table.scaled), formatting.scale_cell(table.scale_median)]
-
-
-def reference_cells(abs_rel: float | None, rmse_cm: float | None) -> list[str]:
-    """Return the cells of AbsRel and RMSE."""
-    return [formatting.number(abs_rel, 4), formatting.number(rmse_cm, 2)]
 
 
 def html_table(heads: Sequence[str], number_heads: Sequence[str], rows: Sequence[str]) -> str:
@@ -281,8 +277,8 @@ def score_upload(archive: str | None) -> tuple[str, str | None]:
         f"<h3>{escape(printable(result.method))}</h3><p>{escape(formatting.declaration_text(result.declared))}</p>"
     )
     texts = [(name, str(table.views)) for name, table in result.tables.items()]
-    references = {f"{name}: ": table.reference for name, table in result.tables.items()}
-    tables = show_tables(("config", "views"), texts, [*result.tables.values()], references)
+    results = {f"{name}: ": [(result.method, table)] for name, table in result.tables.items()}
+    tables = show_tables(("config", "views"), texts, [*result.tables.values()], results)
     return f'<div class="rdb">{head}</div>{tables}', str(file)
 
 

@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.bootstrap import CONFIDENCE_LEVEL, Resampling, resample, resample_scenes
+from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.view_score import protocol_indices
 from rebar_depth_bench.view_ids import config_of, scene_of
 
-_CLEAR_Z, _UNCLEAR_Z = 2.6, 1.5
-"""Differences in standard errors from which a pair is decided, and below which it is undecided, without draws."""
+_CLEAR, _UNCLEAR = 1.6, 0.6
+"""Differences in half widths from which a pair is decided, and below which it is undecided, without draws."""
 _CHUNK_PAIRS = 2_000
 _CACHED_ROWS = 2048
 
@@ -69,7 +69,7 @@ def rank_ranges(packed: Sequence[bytes | None]) -> list[tuple[int, int] | None]:
     ranges: list[tuple[int, int] | None] = [None] * len(packed)
     if len(rows) < 2:
         return ranges
-    better = _is_better(np.array([_resampled_means(one) for _, one in same_views]))
+    better = _is_better(np.array([_resampled_means(one) for _, one in same_views]), _resampling(views).blocks())
     for row, index in enumerate(rows):
         ranges[index] = (1 + int(better[:, row].sum()), len(rows) - int(better[row].sum()))
     return ranges
@@ -83,28 +83,28 @@ def _resampled_means(packed: bytes) -> Float64[ndarray, " draws"]:
 
 
 @lru_cache(maxsize=4)
-def _resampling(indices: bytes) -> Resampling:
+def _resampling(indices: bytes) -> bootstrap.Resampling:
     numbers: list[int] = np.frombuffer(indices, "<i4").tolist()
-    return resample_scenes(list(map(str, numbers))) if min(numbers) < 0 else resample(numbers)
+    return bootstrap.resample_scenes(list(map(str, numbers))) if min(numbers) < 0 else bootstrap.resample(numbers)
 
 
-def _is_better(means: Float64[ndarray, "n draws"]) -> ndarray:
+def _is_better(means: Float64[ndarray, "n draws"], blocks: int) -> ndarray:
     """Return an n x n matrix: whether submission i is better than j, from their means in each resample.
 
-    It is all False where there are too few views for an interval.
+    It is all False where there are too few blocks of views, or scenes, for an interval.
     """
     n = len(means)
-    if not np.isfinite(means).all():
+    if blocks < bootstrap.MIN_BLOCKS:
         return np.zeros((n, n), bool)
     covariance = np.cov(means)
     variance = np.diag(covariance)
-    deviation = np.sqrt(np.maximum(variance[:, None] + variance - 2 * covariance, 0))
+    width = bootstrap.half_width(blocks) * np.sqrt(np.maximum(variance[:, None] + variance - 2 * covariance, 0))
     difference = means.mean(axis=1)[:, None] - means.mean(axis=1)
-    better: ndarray = difference < -_CLEAR_Z * deviation
-    unclear = ~better & (difference < -_UNCLEAR_Z * deviation)
+    better: ndarray = difference < -_CLEAR * width
+    unclear = ~better & (difference < -_UNCLEAR * width)
     first, other = np.nonzero(unclear)
     for start in range(0, len(first), _CHUNK_PAIRS):
         i, j = first[start : start + _CHUNK_PAIRS], other[start : start + _CHUNK_PAIRS]
-        upper = np.percentile(means[i] - means[j], 50 * (1 + CONFIDENCE_LEVEL), axis=1)
+        upper = np.percentile(means[i] - means[j], bootstrap.end_percents(blocks)[1], axis=1)
         better[i, j] = upper < 0
     return better

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
+from rebar_depth_bench.scoring.bootstrap import MIN_BLOCKS, Interval, Resampling, interval
 
 _MAX_CURVE_POINTS = 50
 
@@ -46,7 +46,8 @@ class RankedDetections:
         """Return the interval of the average precision over resampled views."""
         ordered, ends = self._order()
         correct, view = self.correct[ordered].astype(np.float64), self.view[ordered]
-        view_counts = resampling.view_counts
+        blocks = resampling.blocks(np.flatnonzero(self.positives))
+        view_counts = resampling.view_counts if blocks >= MIN_BLOCKS else np.empty((0, 0))
         draws = np.full(len(view_counts), np.nan)
         for draw, counts in enumerate(view_counts):
             total = float(counts @ self.positives)
@@ -54,7 +55,7 @@ class RankedDetections:
                 weight = counts[view]
                 recall, precision = _curve(correct * weight, weight, ends)
                 draws[draw] = _area(recall / total, precision)
-        return interval(draws)
+        return interval(draws, blocks)
 
     def _order(self) -> tuple[Int64[ndarray, " n"], Int64[ndarray, " k"]]:
         """Return the detections by descending confidence, and the last one of each confidence."""

@@ -15,7 +15,7 @@ from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
 from rebar_depth_bench.detections.average_precision import RankedDetections
 from rebar_depth_bench.extended.measures import percentile
 from rebar_depth_bench.extended.result import CrossingsSource
-from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
+from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, Resampling, interval
 from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
 from rebar_depth_bench.submission.metadata import SubmissionMeta
 from rebar_depth_bench.version import software_version
@@ -128,6 +128,7 @@ class DetectionResult:
                 **self.meta.declaration.to_dict(),
             },
             "software": {"version": software_version()},
+            "intervals": dict(INTERVALS),
             "least_confidence": rounded(self.least_confidence),
             "has_confidence": self.has_confidence,
             "rows_outside_of_protocol": self.outside,
@@ -216,9 +217,11 @@ def _intervals(
     """Return the 95 % intervals over resampled views."""
     intervals: dict[str, Interval | None] = {}
     for name, (top, all_) in _SHARES.items():
-        sums = resampling.view_counts @ np.array([[top(view), all_(view)] for view in views], dtype=np.float64)
+        parts = np.array([[top(view), all_(view)] for view in views], dtype=np.float64)
+        sums = resampling.view_counts @ parts
         with np.errstate(invalid="ignore", divide="ignore"):
-            intervals[name] = interval(sums[:, 0] / sums[:, 1])
+            draws = sums[:, 0] / sums[:, 1]
+        intervals[name] = interval(draws, resampling.blocks(np.flatnonzero(parts[:, 1])))
     for limit, of_one in ranked.items():
         intervals[f"average_precision_{limit}mm"] = of_one.interval(resampling)
     for name, (attribute, percent) in _ERRORS.items():
@@ -226,5 +229,5 @@ def _intervals(
         samples = np.concatenate([np.empty(0), *values])
         view = np.repeat(np.arange(len(views)), [len(of_one) for of_one in values])
         draws = resampling.percentile(samples, view, percent) if len(samples) else np.empty(0)
-        intervals[name] = interval(draws)
+        intervals[name] = interval(draws, resampling.blocks(view))
     return intervals

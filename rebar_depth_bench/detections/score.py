@@ -30,7 +30,6 @@ from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS
 from rebar_depth_bench.scoring.view_score import resample_views
 from rebar_depth_bench.view_ids import TEST_SPLIT, config_of, split_of
 
@@ -71,9 +70,7 @@ def score_crossings(
 
         task = f"crossings of {config.name}"
         found = map_with_progress(compare, range(len(steel)), workers, progress, task, len(steel))
-        resampling = (
-            resample_views(steel.view_ids, by_scene=config.has_splits) if len(found) >= MIN_VIEWS else None
-        )
+        resampling = resample_views(steel.view_ids, by_scene=config.has_splits) if found else None
         views[config.name] = found
         tables[config.name] = tabulate_detections(found, resampling)
     assert source is not None

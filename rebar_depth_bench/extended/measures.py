@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-EXTENDED_PROTOCOL = "rebar-extended-3"
+EXTENDED_PROTOCOL = "rebar-extended-4"
 """Version of the definitions of all extended measures; any change of a definition changes it."""
 
 Samples = Mapping[str, Float64[ndarray, " n"]]

@@ -1,24 +1,25 @@
 """Point cloud accuracy and completeness of the steel, at 1, 2, 5, 10 and 20 mm.
 
 After Knapitsch et al., "Tanks and Temples", ACM TOG 2017 (precision, recall and F-score of a reconstruction) and
-Seitz et al., CVPR 2006 (accuracy, completeness), for the points of one view in the camera frame: the rays of the
-interior pixels at true and at predicted depth, ``x_cam = depth_m * (rays[:, 0], rays[:, 1], 1)``, with no
-alignment beyond what the caller applied to the depth. Both clouds use the same pixels, at most ``MAX_POINTS``, so
-that a perfect prediction scores 1:
+Seitz et al., CVPR 2006 (accuracy, completeness), for the points of one view in the camera frame: the rays of
+pixels at true and at predicted depth, ``x_cam = depth_m * (rays[:, 0], rays[:, 1], 1)``, with no alignment beyond
+what the caller applied to the depth. At most ``MAX_POINTS`` interior pixels are queried, evenly, and their nearest
+neighbours are sought among all pixels:
 
-    accuracy[t]     = share of the pixels whose predicted point is within t of a true point
-    completeness[t] = share of the pixels whose true point is within t of a predicted point
+    accuracy[t]     = share of queried pixels whose predicted point is within t of a true point of the steel
+    completeness[t] = share of queried pixels whose true point is within t of a predicted point of the interior
     F[t]            = 2 accuracy completeness / (accuracy + completeness), 0 where both are 0
 
 A missing prediction contributes no point to completeness and is a failure in accuracy, so removing predictions
-raises neither. A sparser cloud has more distant neighbours and thus lower shares at small t: ``MAX_POINTS`` is
-part of the definition. At long range pixels are farther apart than t (17 mm at 12 m and 700 px focal length); a
-point then matches the point of its own pixel or none.
+raises neither. The shares depend on the size of the image: in a larger one, points lie closer to each other, so
+that a wrong point is nearer to that of another pixel. At long range pixels are farther apart than t (17 mm at 12 m
+and 700 px focal length); a point then matches the point of its own pixel or none.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -33,32 +34,41 @@ TOLERANCES_MM = (1, 2, 5, 10, 20)
 """Distance tolerances t, ascending, in millimetres."""
 
 MAX_POINTS = 4000
-"""Maximum number of pixels per view; part of the definition of the measures."""
-
+"""Maximum number of queried pixels per view; part of the definition of the measures."""
 
 _SEARCH_RADIUS_M = 1.001 * TOLERANCES_MM[-1] / 1000  # the tree's bound is exclusive
 
 
 @dataclass(frozen=True, eq=False)
 class TrueCloud:
-    """True points of a view and their k-d tree.
+    """Asked pixels and true points of a view; they do not depend on a prediction.
 
-    ``points_m`` are in the camera frame, metres; ``position`` holds their positions in ``SteelTruth.index``;
-    ``rays`` are ``(x/z, y/z, 1)``.
+    ``position`` holds the positions of the interior pixels in ``SteelTruth.index``, and ``queried`` those of the
+    queried pixels among them. ``rays`` are ``(x/z, y/z, 1)`` of the interior pixels and ``z_m`` their true depth.
+    ``steel_m`` are the true points of all steel pixels, metres in the camera frame.
     """
 
-    position: Int64[ndarray, " m"]
-    rays: Float64[ndarray, "m 3"]
-    points_m: Float64[ndarray, "m 3"]
-    tree: Any
+    position: Int64[ndarray, " n"]
+    queried: Int64[ndarray, " m"]
+    rays: Float64[ndarray, "n 3"]
+    z_m: Float64[ndarray, " n"]
+    steel_m: Float64[ndarray, "k 3"]
+
+    @cached_property
+    def tree(self) -> Any:
+        """The k-d tree of ``steel_m``, built when it is needed."""
+        return _build_tree(self.steel_m)
 
 
 def true_cloud(truth: SteelTruth) -> TrueCloud:
-    """Return the subsampled true points of a view's interior; they do not depend on a prediction."""
-    position = subsample(np.flatnonzero(truth.interior), MAX_POINTS)
-    rays = np.concatenate([truth.rays[position], np.ones((len(position), 1))], axis=1)
-    points_m = rays * truth.depth_m[position, None].astype(np.float64)
-    return TrueCloud(position, rays, points_m, _build_tree(points_m))
+    """Return the queried pixels and true points of a view."""
+    position = np.flatnonzero(truth.interior)
+    rays = np.concatenate([truth.rays, np.ones((len(truth.rays), 1))], axis=1)
+    depth_m = truth.depth_m.astype(np.float64)
+    steel = truth.interior | (truth.bar_id > 0)
+    steel_m = rays[steel] * depth_m[steel, None]
+    queried = subsample(np.arange(len(position)), MAX_POINTS)
+    return TrueCloud(position, queried, rays[position], depth_m[position], steel_m)
 
 
 def cloud_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth, cloud: TrueCloud | None = None) -> Samples:
@@ -68,7 +78,7 @@ def cloud_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth, cloud: TrueClo
     1, none where the view has no interior pixel. ``cloud`` is ``true_cloud(truth)``, if already computed.
     """
     cloud = cloud or true_cloud(truth)
-    count = len(cloud.position)
+    count = len(cloud.queried)
     kinds = dict.fromkeys(("accuracy", "completeness", "f"), np.empty(0))
     if count:
         accuracy_m, completeness_m = _distances_m(p_m[cloud.position], cloud)
@@ -84,25 +94,27 @@ def cloud_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth, cloud: TrueClo
 
 
 def _distances_m(
-    p_m: Float64[ndarray, " m"], cloud: TrueCloud
+    p_m: Float64[ndarray, " n"], cloud: TrueCloud
 ) -> tuple[Float64[ndarray, " k"], Float64[ndarray, " m"]]:
-    """Return the distances of predicted points to the true cloud and of true points to the predicted one, metres.
+    """Return the distances in metres of queried predicted points to steel, and of true points to predicted ones.
 
-    ``p_m`` is the prediction at the cloud's pixels. Points out of reach of every tolerance have an infinite
+    ``p_m`` is the prediction at the interior pixels. Points out of reach of every tolerance have an infinite
     distance or are left out of the first array. Where the two points of a pixel are within the smallest tolerance
     of each other, their distance is used instead of the nearest neighbour's: either counts at every tolerance.
     """
-    z_m = cloud.points_m[:, 2]
+    steel_z_m, queried = cloud.steel_m[:, 2], cloud.queried
     in_range = is_valid_prediction(p_m)  # The distance of two points is at least their difference in planar depth.
-    in_range &= (p_m > z_m.min() - _SEARCH_RADIUS_M) & (p_m < z_m.max() + _SEARCH_RADIUS_M)
+    in_range &= (p_m > steel_z_m.min() - _SEARCH_RADIUS_M) & (p_m < steel_z_m.max() + _SEARCH_RADIUS_M)
     depth_m = np.where(in_range, p_m, np.inf)
-    own_m = np.abs(depth_m - z_m) * np.sqrt(np.einsum("ij,ij->i", cloud.rays, cloud.rays))
+    rays, queried_z_m, in_reach = cloud.rays[queried], cloud.z_m[queried], in_range[queried]
+    own_m = np.abs(depth_m[queried] - queried_z_m) * np.sqrt(np.einsum("ij,ij->i", rays, rays))
     unmatched = own_m > TOLERANCES_MM[0] / 1000
-    points_m = cloud.rays[in_range] * depth_m[in_range, None]
-    accuracy_m = _nearest_m(cloud.tree, points_m, own_m[in_range], unmatched[in_range])
     if not unmatched.any():
-        return accuracy_m, own_m
-    return accuracy_m, _nearest_m(_build_tree(points_m), cloud.points_m, own_m, unmatched)
+        return own_m, own_m
+    predicted_m = rays[in_reach] * depth_m[queried][in_reach, None]
+    accuracy_m = _nearest_m(cloud.tree, predicted_m, own_m[in_reach], unmatched[in_reach])
+    tree = _build_tree(cloud.rays[in_range] * depth_m[in_range, None])
+    return accuracy_m, _nearest_m(tree, rays * queried_z_m[:, None], own_m, unmatched)
 
 
 def _nearest_m(
@@ -122,7 +134,7 @@ def _build_tree(points_m: Float64[ndarray, "m 3"]) -> Any:
     """Return a k-d tree that is fast to build: it serves a single batch of queries."""
     from scipy.spatial import cKDTree  # Half a second to import, which reports and cards do not need.
 
-    return cKDTree(points_m, balanced_tree=False, compact_nodes=False)
+    return cKDTree(points_m, leafsize=64, balanced_tree=False, compact_nodes=False)
 
 
 def _shares_within(distance_m: Float64[ndarray, " m"], count: int) -> Float64[ndarray, " t"]:
@@ -135,13 +147,13 @@ _KINDS = (
         "accuracy",
         "Cloud accuracy",
         f"share of interior pixels (at most {MAX_POINTS} a view, evenly) whose predicted point is within {{t}} mm "
-        "of a true point; a missing one is not",
+        "of the true point of any steel pixel; a missing one is not; depends on the image size",
     ),
     (
         "completeness",
         "Cloud completeness",
         f"share of interior pixels (at most {MAX_POINTS} a view, evenly) whose true point is within {{t}} mm "
-        "of a predicted point",
+        "of the predicted point of any interior pixel; depends on the image size",
     ),
     (
         "f",

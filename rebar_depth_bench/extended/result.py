@@ -181,7 +181,8 @@ def estimate(
         return MeasureEstimate(None, None, 0)
     view = np.repeat(np.arange(len(by_view)), [len(view_samples) for view_samples in by_view])
     draws = _draws(measure, samples, view, resampling)
-    return MeasureEstimate(STATISTICS[measure.statistic](samples), interval(draws), len(samples))
+    ends = interval(draws, resampling.blocks(view))
+    return MeasureEstimate(STATISTICS[measure.statistic](samples), ends, len(samples))
 
 
 def _draws(

@@ -23,7 +23,7 @@ from rebar_depth_bench.reporting.published import (
     published_rows,
 )
 from rebar_depth_bench.reporting.tables import frame_csv, plain_text
-from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_VIEWS
+from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_BLOCKS
 from rebar_depth_bench.scoring.comparison import Comparison, Difference
 from rebar_depth_bench.scoring.frames import differences_frame
 from rebar_depth_bench.scoring.metrics import METRICS
@@ -53,7 +53,7 @@ NUMBER_TITLES: Mapping[str, tuple[str, int, float]] = _titles()
 COMPARISON_NOTE = (
     "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
     f"({BLOCK_VIEWS} steps of the protocol), of whole scenes in configs with splits; none with fewer than "
-    f"{MIN_VIEWS} views or, with splits, scenes. B is called better "
+    f"{MIN_BLOCKS} blocks or, with splits, scenes. B is called better "
     "or worse if the interval excludes zero, which happens by chance in about one of twenty comparisons. "
     "Errors of valid predictions are not compared if either submission has a coverage below 95 %, a view "
     "without prediction or an overflow; the rank error counts every scored pixel."
@@ -201,7 +201,7 @@ def _paper_table(rows: Sequence[tuple[Result, Table]], match: PublishedMatch | N
             plain_text(formatting.rank_error_cell(table.rank_error)),
             *map(plain_text, formatting.paper_cells(table)),
         )
-    for title, cells in formatting.paper_reference_rows(rows[0][1].reference):
+    for title, cells in formatting.paper_reference_rows([(result.method, table) for result, table in rows]):
         grid.add_row(plain_text(f"reference: {title}"), "", *map(plain_text, cells), style="dim")
     if match is not None:
         grid.add_section()

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from decimal import ROUND_DOWN, Decimal
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS
+from rebar_depth_bench.scoring.bootstrap import MIN_BLOCKS
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.metrics import METRICS, DepthMetrics
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, OLD_PROTOCOL, WITHIN_MM
-from rebar_depth_bench.scoring.reference import Reference
 from rebar_depth_bench.scoring.result import Table
 from rebar_depth_bench.submission.metadata import Declaration
 
@@ -29,8 +28,8 @@ RANK_ERROR_NOTE = "Rank error: mean over all scored pixels of |p - z| / max(p, z
 CONSTANT_TITLE = "constant"
 ONE_PIXEL_TITLE = "one pixel"
 REFERENCE_NOTE = (
-    f"References, from ground truth alone: {CONSTANT_TITLE}, a constant after scaling, for scaled errors; "
-    f"{ONE_PIXEL_TITLE}, exact depth shifted by one pixel, for native errors."
+    f"References, from ground truth: {CONSTANT_TITLE}, a constant after scaling on the predicted pixels, for "
+    f"scaled errors; {ONE_PIXEL_TITLE}, exact depth shifted by one pixel, for native errors."
 )
 
 INTERVAL_NOTE = (
@@ -48,7 +47,7 @@ GROUP_METRICS = ("abs_rel", "rmse_cm")
 GROUP_NOTE = (
     "The group of a view follows from its ground truth. Beside the errors of a group are the reference errors of "
     f"its views: {ONE_PIXEL_TITLE} for native, {CONSTANT_TITLE} for scaled errors. A group with views of fewer "
-    f"than {MIN_VIEWS} scenes has no intervals."
+    f"than {MIN_BLOCKS} scenes has no intervals."
 )
 
 
@@ -213,13 +212,14 @@ def incomparable_reasons(table: Table) -> list[str]:
     return reasons
 
 
-def group_reference_cells(reference: Reference) -> tuple[list[str], list[str]]:
+def group_reference_cells(table: Table) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the errors ``GROUP_METRICS`` of the references one pixel and constant as text."""
-    one_pixel = (reference.one_pixel_abs_rel, reference.one_pixel_rmse_cm)
-    constant = (reference.constant_abs_rel, reference.constant_rmse_cm)
-    decimals = [METRICS[name].decimals for name in GROUP_METRICS]
-    shifted, flat = (list(map(number, values, decimals)) for values in (one_pixel, constant))
-    return shifted, flat
+    one_pixel = _error_texts(table.reference.one_pixel_abs_rel, table.reference.one_pixel_rmse_cm)
+    return one_pixel, _error_texts(*table.scaled_constant)
+
+
+def _error_texts(*errors: float | None) -> tuple[str, ...]:
+    return tuple(number(error, METRICS[name].decimals) for name, error in zip(GROUP_METRICS, errors, strict=True))
 
 
 def grouping_title(grouping: str) -> str:
@@ -227,25 +227,48 @@ def grouping_title(grouping: str) -> str:
     return GROUPINGS[grouping].title if grouping in GROUPINGS else printable(grouping)
 
 
-def reference_rows(reference: Reference) -> list[tuple[str, list[str], list[str]]]:
-    """Return name, native and scaled cells (as ``metric_cells``, empty if they do not apply) of each reference."""
+def scaled_constants(results: Sequence[tuple[str, Table]]) -> dict[str, tuple[float, float | None]]:
+    """Return AbsRel and RMSE (cm) of the scaled constants of one config that differ as text, by their titles.
+
+    ``results`` are the method and table of each. The title of a constant has its methods, unless it is the
+    only one, or that of complete predictions.
+    """
+    found: dict[tuple[str, ...], tuple[float, float | None]] = {}
+    titles: dict[tuple[str, ...], str] = {}
+    for method, table in results:
+        abs_rel, rmse_cm = table.scaled_constant
+        if abs_rel is not None:
+            texts = _error_texts(abs_rel, rmse_cm)
+            complete = _error_texts(table.reference.constant_abs_rel, table.reference.constant_rmse_cm)
+            found.setdefault(texts, (abs_rel, rmse_cm))
+            listed = f"{titles.get(texts, CONSTANT_TITLE)}, {printable(method)}"
+            titles[texts] = CONSTANT_TITLE if texts == complete else listed
+    return {titles[texts] if len(found) > 1 else CONSTANT_TITLE: errors for texts, errors in found.items()}
+
+
+def reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str, list[str], list[str]]]:
+    """Return name, native and scaled cells (as ``metric_cells``, empty if they do not apply) of each reference.
+
+    ``results`` are as in ``scaled_constants``.
+    """
     empty = [""] * len(METRICS)
-    rows = []
-    if reference.constant_abs_rel is not None:
-        values = {"abs_rel": reference.constant_abs_rel, "rmse_cm": reference.constant_rmse_cm}
-        rows.append((CONSTANT_TITLE, empty, _reference_cells(values)))
-    if reference.one_pixel_abs_rel is not None:
+    rows = [
+        (title, empty, _reference_cells(dict(zip(GROUP_METRICS, errors, strict=True))))
+        for title, errors in scaled_constants(results).items()
+    ]
+    references = [table.reference for _, table in results if table.reference.one_pixel_abs_rel is not None]
+    for reference in references[:1]:
         values = {"abs_rel": reference.one_pixel_abs_rel, "rmse_cm": reference.one_pixel_rmse_cm}
         rows.append((ONE_PIXEL_TITLE, _reference_cells(values), empty))
     return rows
 
 
-def paper_reference_rows(reference: Reference) -> list[tuple[str, list[str]]]:
+def paper_reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str, list[str]]]:
     """Return name and cells of each reference in the columns of ``paper_cells``, empty where they do not apply."""
     abs_rel, rmse_cm = list(METRICS).index("abs_rel"), list(METRICS).index("rmse_cm")
     return [
         (name, [native[rmse_cm], native[abs_rel], scaled[abs_rel], ""])
-        for name, native, scaled in reference_rows(reference)
+        for name, native, scaled in reference_rows(results)
     ]
 
 
@@ -265,11 +288,11 @@ def reference_findings(table: Table) -> list[str]:
             f"one pixel ({number(reference.one_pixel_abs_rel, METRICS['abs_rel'].decimals)}): it is smaller than "
             "the differences between neighbouring pixels."
         )
-    if table.scaled and reference.constant_abs_rel and table.scaled.abs_rel > reference.constant_abs_rel:
+    constant, _ = table.scaled_constant
+    if table.scaled and constant and table.scaled.abs_rel > constant:
         findings.append(
             f"The scaled AbsRel {metric_cell(table.scaled, 'abs_rel')} is above that of a constant "
-            f"({number(reference.constant_abs_rel, METRICS['abs_rel'].decimals)}): a plane at one depth describes "
-            "the shape better."
+            f"({number(constant, METRICS['abs_rel'].decimals)}): a plane at one depth describes the shape better."
         )
     return findings
 

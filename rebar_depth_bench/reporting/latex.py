@@ -154,12 +154,12 @@ def _reference_rows(results: Sequence[Result], configs: Sequence[str]) -> list[l
     """Return the rows of reference errors of a block, each a name and the cells of each config."""
     rows_by_config = {}
     for config in configs:
-        references = [result.tables[config].reference for result in results if config in result.tables]
-        rows_by_config[config] = dict(formatting.paper_reference_rows(references[0]))
+        shown = [(result.method, result.tables[config]) for result in results if config in result.tables]
+        rows_by_config[config] = dict(formatting.paper_reference_rows(shown))
     names = dict.fromkeys(name for rows in rows_by_config.values() for name in rows)
     empty = [""] * (_COLUMNS - 1)
     return [
-        [name, *(cell for rows in rows_by_config.values() for cell in ("", *rows.get(name, empty)))]
+        [escape_latex(name), *(cell for rows in rows_by_config.values() for cell in ("", *rows.get(name, empty)))]
         for name in names
     ]
 

@@ -94,7 +94,7 @@ _GROUP_NATIVE = _ColumnGroup(
 _GROUP_ONE_PIXEL = _ColumnGroup(
     "",
     [f"1 pixel\n{head}" for head in _REFERENCE_HEADS],
-    lambda table: formatting.group_reference_cells(table.reference)[0],
+    lambda table: formatting.group_reference_cells(table)[0],
 )
 _GROUP_SCALED = _ColumnGroup(
     "",
@@ -105,7 +105,7 @@ _GROUP_CONSTANT = _ColumnGroup(
     "",
     [*(f"const.\n{head}" for head in _REFERENCE_HEADS), "scale\ns\n"],
     lambda table: [
-        *formatting.group_reference_cells(table.reference)[1],
+        *formatting.group_reference_cells(table)[1],
         formatting.scale_cell(table.scale_median),
     ],
 )
@@ -208,7 +208,7 @@ def _print_notes(result: Result, console: Console) -> None:
 
 def _config_rows(tables: Mapping[str, Table]) -> list[_Row | str]:
     return [
-        _Row(formatting.config_title(name, table.split), table, formatting.reference_rows(table.reference))
+        _Row(formatting.config_title(name, table.split), table, formatting.reference_rows([("", table)]))
         for name, table in tables.items()
     ]
 

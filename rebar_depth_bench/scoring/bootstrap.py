@@ -1,4 +1,4 @@
-"""Block bootstrap of table metrics: 95 % percentile intervals over resampled views or scenes.
+"""Block bootstrap of table metrics: 95 % intervals over resampled views or scenes.
 
 Neighbouring views show nearly the same steel, so their errors are correlated, and resampling single views would
 give intervals that are too narrow. Resampling blocks of consecutive views preserves the correlation: circular
@@ -9,13 +9,19 @@ cages, lights or cameras.
 In a config of several scenes, which are drawn independently of each other, whole scenes with all of their views
 are resampled: cluster bootstrap of Field and Welsh ("Bootstrapping clustered data", Journal of the Royal
 Statistical Society B 69, 2007). These intervals describe the variation with other scenes of the same generator.
+
+The ends of an interval are expanded percentiles (Hesterberg, "What teachers should know about the bootstrap", The
+American Statistician 69, 2015), because plain percentiles of few blocks are too narrow. ``benchmarks.intervals``
+simulates how often intervals contain the true mean.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -30,13 +36,12 @@ CONFIDENCE_LEVEL = 0.95
 BLOCK_VIEWS = 12
 """Block length in steps of the full camera protocol: one ring of azimuths of the dome."""
 
-MIN_VIEWS = 5
-"""Smallest number of views for which an interval is computed; fewer values do not determine their spread.
+MIN_BLOCKS = 8
+"""Smallest number of blocks of views, or of scenes, with values for which an interval is computed."""
 
-Where scenes are resampled, it is the smallest number of scenes.
-"""
+INTERVALS: Mapping[str, Any] = {"method": "expanded-percentile", "draws": RESAMPLES, "level": CONFIDENCE_LEVEL}
+"""Entry ``intervals`` of the JSON of results: how all of their intervals were computed."""
 
-_MIN_BLOCKS = 4
 _SEED = 0
 
 Interval = tuple[float, float]
@@ -47,30 +52,38 @@ class Resampling:
     """Bootstrap resamples of n views, in which units are drawn: single views, or scenes with all of their views.
 
     ``counts[i, j]`` is the number of times that unit j occurs in resample i; there are ``RESAMPLES`` resamples.
-    ``unit`` holds the unit of each view; None if each view is a unit of its own.
+    ``unit`` holds the unit of each view; None if each view is a unit of its own. ``length`` is the number of
+    consecutive views that are drawn together.
     """
 
     counts: Float64[ndarray, "draws units"]
     unit: Int64[ndarray, " n"] | None = None
+    length: int = 1
 
     @property
     def view_counts(self) -> Float64[ndarray, "draws n"]:
-        """Number of times that each view occurs in each resample; there are no resamples of few units."""
-        counts = self.counts if self.counts.shape[1] >= MIN_VIEWS else self.counts[:0]
-        return counts if self.unit is None else counts[:, self.unit]
+        """Number of times that each view occurs in each resample."""
+        return self.counts if self.unit is None else self.counts[:, self.unit]
+
+    def blocks(self, view: Int64[ndarray, " m"] | None = None) -> int:
+        """Return the number of blocks of ``length`` views, or of scenes, that have any of some views.
+
+        ``view`` holds positions of views, in any order and any number of times; all views by default.
+        """
+        if view is None:
+            view = np.arange(self.counts.shape[1] if self.unit is None else len(self.unit))
+        return len(np.unique(self._units(view) // self.length))
 
     def means(self, values: Float64[ndarray, "n k"]) -> Float64[ndarray, "draws k"]:
         """Return the mean of each column in each resample; NaN in ``values`` marks a view without a value.
 
-        The result is NaN where a resample has no value, in columns with values in fewer than ``MIN_VIEWS`` units,
-        and in columns with an infinite value.
+        The result is NaN where a resample has no value, and in columns with an infinite value.
         """
         present = self.sums((~np.isnan(values)).astype(np.float64))
         sums = self.counts @ self.sums(np.where(np.isfinite(values), values, 0.0))
         with np.errstate(invalid="ignore", divide="ignore"):
             means = sums / (self.counts @ present)
-        usable = ((present > 0).sum(axis=0) >= MIN_VIEWS) & ~np.isinf(values).any(axis=0)
-        return np.where(usable, means, np.nan)
+        return np.where(np.isinf(values).any(axis=0), np.nan, means)
 
     def sums(self, values: Float64[ndarray, "n k"]) -> Float64[ndarray, "units k"]:
         """Return the sums of each column over the views of each unit."""
@@ -85,13 +98,11 @@ class Resampling:
     ) -> Float64[ndarray, " draws"]:
         """Return the mean of samples pooled over views in each resample; ``view`` is each sample's view index.
 
-        The result is NaN where a resample has no sample, and everywhere if fewer than ``MIN_VIEWS`` units have
-        samples or a sample is not finite.
+        The result is NaN where a resample has no sample, and everywhere if a sample is not finite.
         """
-        unit = self._units(view)
-        if len(np.unique(unit)) < MIN_VIEWS or not np.isfinite(samples).all():
+        if not np.isfinite(samples).all():
             return np.full(len(self.counts), np.nan)
-        units = self.counts.shape[1]
+        unit, units = self._units(view), self.counts.shape[1]
         totals = np.stack([np.bincount(unit, weights, units) for weights in (samples, np.ones(len(samples)))], 1)
         sums = self.counts @ totals
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -115,14 +126,12 @@ class Resampling:
         median (``percent`` = 50), if exactly half of the samples are at or below it, the mean of this sample and
         the next one is returned.
 
-        The result is NaN where a resample has no sample, and everywhere if fewer than ``MIN_VIEWS`` units have
-        samples or a sample is not finite.
+        The result is NaN where a resample has no sample, and everywhere if a sample is not finite.
         """
-        unit = self._units(view)
-        if len(np.unique(unit)) < MIN_VIEWS or not np.isfinite(samples).all():
+        if not len(samples) or not np.isfinite(samples).all():
             return np.full(len(self.counts), np.nan)
         order = np.argsort(samples, kind="stable")
-        ordered, ranks = samples[order], _Ranks.of(self.counts, unit[order])
+        ordered, ranks = samples[order], _Ranks.of(self.counts, self._units(view)[order])
         threshold = ranks.totals * percent / 100
         values = ordered[ranks.below(threshold, inclusive=False)]
         if percent == 50:
@@ -133,12 +142,34 @@ class Resampling:
         return view if self.unit is None else self.unit[view]
 
 
-def interval(estimates: Float64[ndarray, " draws"]) -> Interval | None:
-    """Return the percentile interval of the finite estimates over resamples, or None if no estimate is finite."""
+def half_width(blocks: int) -> float:
+    """Return half the width of the interval of a normal mean of two or more blocks, in standard deviations.
+
+    The deviation is that of the means of resamples. The half width is sqrt(u / (u - 1)) t for u blocks: variance
+    in resamples is (u - 1) / u of that in samples, and t is Student's quantile for u - 1 degrees of freedom.
+    """
+    from scipy.special import stdtrit  # A tenth of a second to import.
+
+    return math.sqrt(blocks / (blocks - 1)) * float(stdtrit(blocks - 1, (1 + CONFIDENCE_LEVEL) / 2))
+
+
+def end_percents(blocks: int) -> tuple[float, float]:
+    """Return the percentiles of the estimates over resamples that are the ends of the interval."""
+    low = 100 * NormalDist().cdf(-half_width(blocks))
+    return low, 100 - low
+
+
+def interval(
+    estimates: Float64[ndarray, " draws"], blocks: int, method: Literal["linear", "inverted_cdf"] = "linear"
+) -> Interval | None:
+    """Return the interval of the finite estimates over resamples; None if there are none, or too few blocks.
+
+    ``blocks`` is the number of ``Resampling.blocks`` with a value, and ``method`` that of ``numpy.percentile``.
+    """
     finite = estimates[np.isfinite(estimates)]
-    if not len(finite):
+    if blocks < MIN_BLOCKS or not len(finite):
         return None
-    low, high = np.percentile(finite, [50 * (1 - CONFIDENCE_LEVEL), 50 * (1 + CONFIDENCE_LEVEL)])
+    low, high = np.percentile(finite, end_percents(blocks), method=method)
     return float(low), float(high)
 
 
@@ -153,7 +184,7 @@ def resample(indices: Sequence[int]) -> Resampling:
     blocks = -(-n // length)
     starts = (np.random.PCG64(_SEED).random_raw(RESAMPLES * blocks) % max(n, 1)).astype(np.int64)
     views = (starts.reshape(RESAMPLES, blocks, 1) + np.arange(length)).reshape(RESAMPLES, -1)[:, :n] % max(n, 1)
-    return Resampling(_counts(views, n))
+    return Resampling(_counts(views, n), length=length)
 
 
 def resample_scenes(scenes: Sequence[str]) -> Resampling:
@@ -169,8 +200,7 @@ def resample_scenes(scenes: Sequence[str]) -> Resampling:
 
 
 def block_length(indices: Sequence[int]) -> int:
-    """Return the number of views per block: those on ``BLOCK_VIEWS`` steps of the full camera protocol, at least
-    1.
+    """Return the number of views per block: those on ``BLOCK_VIEWS`` steps of the full camera protocol, or 1.
 
     The views of a sparse subset, which are farther apart than that, are resampled one by one.
     """
@@ -178,7 +208,7 @@ def block_length(indices: Sequence[int]) -> int:
     if n < 2:
         return 1
     stride = max(1.0, (indices[-1] - indices[0]) / (n - 1))
-    return max(1, min(round(BLOCK_VIEWS / stride), n // _MIN_BLOCKS))
+    return max(1, round(BLOCK_VIEWS / stride))
 
 
 def _counts(drawn: Int64[ndarray, "draws n"], units: int) -> Float64[ndarray, "draws units"]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.scoring.bootstrap import Interval, interval
+from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval
 from rebar_depth_bench.scoring.frames import ALIGNMENTS, differences_frame
 from rebar_depth_bench.scoring.metrics import METRICS
 from rebar_depth_bench.scoring.protocol import PROTOCOL
@@ -25,7 +25,9 @@ from rebar_depth_bench.scoring.view_score import (
     VIEW_METRICS,
     ViewScore,
     bootstrap_estimates,
+    metric_intervals,
     resample_views,
+    view_metric_values,
 )
 from rebar_depth_bench.view_ids import config_of
 
@@ -83,6 +85,7 @@ class Comparison:
         """Return the comparison as a JSON-compatible object."""
         return {
             **self.provenance.to_dict(),
+            "intervals": dict(INTERVALS),
             "configs": {
                 name: [_difference_dict(difference) for difference in rows] for name, rows in self.configs.items()
             },
@@ -163,11 +166,12 @@ def _differences_on_views(
 ) -> dict[str, Difference]:
     """Return the differences on the given views by metric name, with the same resamples for both submissions."""
     resampling = resample_views([view.view_id for view in first], by_scene=by_scene)
-    draws = bootstrap_estimates(other, resampling) - bootstrap_estimates(first, resampling)
+    first_values, other_values = view_metric_values(first), view_metric_values(other)
+    draws = bootstrap_estimates(other_values, resampling) - bootstrap_estimates(first_values, resampling)
+    intervals = metric_intervals(draws, first_values + other_values, resampling)
     differences = {}
-    for k, name in enumerate(VIEW_METRICS):
+    for name, bounds in intervals.items():
         first_value, other_value = (_table_value(name, views) for views in (first, other))
-        bounds = interval(draws[:, k])
         change = None if first_value is None or other_value is None else other_value - first_value
         differences[name] = Difference(
             name, len(first), first_value, other_value, change, bounds, _verdict(name, bounds)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.reference import NO_REFERENCE
 from rebar_depth_bench.scoring.rounding import rounded
 from rebar_depth_bench.view_ids import config_of
 
@@ -27,9 +26,8 @@ METRIC_COLUMNS: Mapping[str, str] = {
 }
 """Column names of the metrics with an interval, by their names in ``VIEW_METRICS``."""
 
-REFERENCE_COLUMNS = tuple(
-    f"{reference}_{name}" for reference in ("constant", "one_pixel") for name in ("abs_rel", "rmse_cm")
-)
+_REFERENCES, _REFERENCE_ERRORS = ("constant", "one_pixel", "scaled_constant"), ("abs_rel", "rmse_cm")
+REFERENCE_COLUMNS = tuple(f"{reference}_{name}" for reference in _REFERENCES for name in _REFERENCE_ERRORS)
 """Column names of the reference errors of a config."""
 
 TABLE_COLUMNS = (
@@ -56,9 +54,9 @@ _DIFFERENCE_COLUMNS = (
 def table_values(table: Mapping[str, Any]) -> list[Any]:
     """Return a config's numbers in the order of ``TABLE_COLUMNS``, from its table in the result's JSON.
 
-    Tables of the previous protocol have no rank error and no reference errors.
+    Tables of earlier versions have no rank error, or lack reference errors.
     """
-    reference = table.get("reference") or NO_REFERENCE.to_dict()
+    reference = table.get("reference") or {}
     return [
         *(table[key] for key in ("views", "views_scored", "coverage", "ranked")),
         table.get("rank_error"),
@@ -66,7 +64,7 @@ def table_values(table: Mapping[str, Any]) -> list[Any]:
         *table["scaled"].values(),
         table["scale_median"],
         *table["within_mm"].values(),
-        *(error for errors in reference.values() for error in errors.values()),
+        *(reference.get(name, {}).get(error) for name in _REFERENCES for error in _REFERENCE_ERRORS),
     ]
 
 

@@ -47,13 +47,14 @@ class ViewTruth:
     """Scored pixels of one view.
 
     ``index`` holds flat indices into the H x W image, ``depth_m`` their planar depth and ``median_m`` its median,
-    in metres.
+    in metres. ``constant`` has ``reference.constant_errors``, if they are known.
     """
 
     view_id: str
     index: UInt32[ndarray, " n"]
     depth_m: Float32[ndarray, " n"]
     median_m: float
+    constant: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +106,9 @@ class ConfigTruth:
     def view(self, position: int) -> ViewTruth:
         """Return the view at ``position`` in protocol order."""
         view = self.cache.view(position)
-        median_m, *_ = view.numbers
-        return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], median_m)
+        median_m, abs_rel, rmse_cm, *_ = view.numbers
+        constant = abs_rel, rmse_cm
+        return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], median_m, constant)
 
 
 def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progress = silent) -> ConfigTruth:

@@ -25,9 +25,9 @@ _UNDEFINED = -1.0
 class Reference:
     """Reference errors of a view, or their means over the views of a config; None where undefined.
 
-    The errors of ``constant``, a constant prediction after scaling, are compared with scaled errors. The errors of
-    ``one_pixel``, exact depth taken one pixel to the left, right, above and below (means of the four), are
-    compared with native errors.
+    The errors of ``constant``, a constant prediction after scaling, are compared with scaled errors of complete
+    predictions (with others, ``Table.scaled_constant``). The errors of ``one_pixel``, exact depth taken one pixel
+    to the left, right, above and below (means of the four), are compared with native errors.
     """
 
     constant_abs_rel: float | None = None
@@ -71,7 +71,13 @@ def view_reference(depth_m: Float32[ndarray, "h w"], pixels: UInt32[ndarray, " n
     z_m = depth_m[row, column]
     shifted = [_errors(framed_m[row + v, column + u], z_m) for v, u in ((1, 0), (1, 2), (0, 1), (2, 1))]
     one_pixel = [_defined_mean(values) for values in zip(*shifted, strict=True)]
-    return Reference(*_errors(np.full(len(z_m), median_m), z_m), *one_pixel)
+    return Reference(*constant_errors(z_m, median_m), *one_pixel)
+
+
+def constant_errors(z_m: Float32[ndarray, " n"], median_m: float) -> tuple[float, float]:
+    """Return AbsRel and RMSE (cm) of the depth ``median_m`` at pixels of the true depth ``z_m``."""
+    metrics = depth_metrics(np.full(len(z_m), median_m), z_m)
+    return metrics.abs_rel, metrics.rmse_cm
 
 
 def mean_reference(views: Iterable[Reference]) -> Reference:

@@ -10,7 +10,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any, Literal
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.scoring.bootstrap import Interval
+from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval
 from rebar_depth_bench.scoring.frames import groups_frame, tables_frame, views_frame
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics, mean, mean_metrics
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
@@ -37,9 +37,11 @@ class Table:
     """Metrics of one config: means over its views, and the median of their scale factors.
 
     ``rank_error`` is None in results of the previous protocol; ``reference`` are the config's reference errors,
-    and ``published`` is the scene of the paper's Table I that it shows, if any. ``split`` is None for a config of
-    one scene. ``truth_sigma_m`` is the standard deviation of the ground truth's depth, None where it is exact.
-    ``intervals`` has the 95 % block bootstrap interval of each of ``VIEW_METRICS``, None where it is undefined.
+    and ``published`` is the scene of the paper's Table I that it shows, if any. ``scaled_constant`` has AbsRel and
+    RMSE (cm) of a constant after scaling on the predicted pixels, to compare with ``scaled``. ``split`` is None
+    for a config of one scene. ``truth_sigma_m`` is the standard deviation of the ground truth's depth, None where
+    it is exact.
+    ``intervals`` has the 95 % bootstrap interval of each of ``VIEW_METRICS``, None where it is undefined.
     ``groups`` has the tables of groups of views by grouping (see ``groups.GROUPINGS``) and group, of a config with
     splits; they have no groups.
     """
@@ -54,6 +56,7 @@ class Table:
     scale_median: float | None
     within_mm: Mapping[int, float | None]
     reference: Reference = NO_REFERENCE
+    scaled_constant: tuple[float | None, float | None] = (None, None)
     published: PublishedMatch | None = None
     split: str | None = None
     truth_sigma_m: float | None = None
@@ -77,6 +80,7 @@ class Result:
     """Result of scoring one submission, with the digests and versions of its inputs.
 
     ``protocol`` is another than ``PROTOCOL`` only if the result was read from a file of the previous protocol.
+    ``intervals`` states how the intervals were computed; None in a file of an earlier version, which does not.
     """
 
     method: str
@@ -89,6 +93,7 @@ class Result:
     extended: ExtendedResult | None = None
     declared: Declaration = NOT_DECLARED
     protocol: str = PROTOCOL
+    intervals: Mapping[str, Any] | None = field(default_factory=lambda: dict(INTERVALS))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a JSON-compatible object; extended measures, if computed, are its last entry."""
@@ -102,6 +107,7 @@ class Result:
                 **self.declared.to_dict(),
             },
             "software": {"version": self.software_version},
+            **({} if self.intervals is None else {"intervals": dict(self.intervals)}),
             "tables": {name: _table_dict(table) for name, table in self.tables.items()},
             "views": [_view_dict(view) for view in self.views],
             **extended,
@@ -165,6 +171,7 @@ def tabulate(
     predicted = [view for view in views if view.native is not None]
     native = mean_metrics([view.native for view in predicted if view.native])
     scaled = mean_metrics([view.scaled for view in predicted if view.scaled])
+    constants = [view.scaled_constant for view in predicted if view.scaled_constant is not None]
     return Table(
         views=len(views),
         views_scored=len(predicted),
@@ -176,6 +183,7 @@ def tabulate(
         scale_median=median([view.scale for view in predicted if view.scale is not None]) if predicted else None,
         within_mm={t: mean([view.within_mm[t] for view in views]) for t in WITHIN_MM},
         reference=reference,
+        scaled_constant=(mean([abs_rel for abs_rel, _ in constants]), mean([rmse_cm for _, rmse_cm in constants])),
         published=published,
         split=split,
         truth_sigma_m=truth_sigma_m,
@@ -200,6 +208,7 @@ def _within_dict(within_mm: Mapping[int, float | None] | Mapping[int, float]) ->
 
 
 def _table_dict(table: Table) -> dict[str, Any]:
+    abs_rel, rmse_cm = map(rounded, table.scaled_constant)
     return {
         **({} if table.split is None else {"split": table.split}),
         **({} if table.truth_sigma_m is None else {"truth_sigma_m": table.truth_sigma_m}),
@@ -212,7 +221,7 @@ def _table_dict(table: Table) -> dict[str, Any]:
         "scaled": _metrics_dict(table.scaled),
         "scale_median": rounded(table.scale_median),
         "within_mm": _within_dict(table.within_mm),
-        "reference": table.reference.to_dict(),
+        "reference": {**table.reference.to_dict(), "scaled_constant": {"abs_rel": abs_rel, "rmse_cm": rmse_cm}},
         "published": None if table.published is None else table.published.to_dict(),
         "ci95": _intervals_dict(table.intervals),
         **({"groups": _groups_dict(table.groups)} if table.groups else {}),

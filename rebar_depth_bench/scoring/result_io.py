@@ -49,6 +49,7 @@ def read_result(data: bytes, where: str) -> Result:
         software_version=content.software.version,
         tables={config: table.content() for config, table in content.tables.items()},
         views=[view.content() for view in content.views],
+        intervals=None if content.intervals is None else vars(content.intervals),
     )
 
 
@@ -152,6 +153,7 @@ class _ReferenceJson(StoredModel):
 
     constant: _ErrorsJson = _ErrorsJson()
     one_pixel: _ErrorsJson = _ErrorsJson()
+    scaled_constant: _ErrorsJson = _ErrorsJson()
 
     def content(self) -> Reference:
         """Return the reference errors."""
@@ -220,6 +222,7 @@ class _TableJson(_AlignedJson):
             ranked=self.ranked and self.rank_error is not None,
             rank_error=self.rank_error,
             reference=self.reference.content(),
+            scaled_constant=(self.reference.scaled_constant.abs_rel, self.reference.scaled_constant.rmse_cm),
             published=None if self.published is None else PublishedMatch(**vars(self.published)),
             split=self.split,
             truth_sigma_m=self.truth_sigma_m,
@@ -315,6 +318,14 @@ class SoftwareJson(StoredModel):
     version: Name
 
 
+class _MethodJson(StoredModel):
+    """How intervals were computed."""
+
+    method: Name
+    draws: _Count
+    level: _Share
+
+
 class _ResultJson(StoredModel):
     """Content of a result file."""
 
@@ -322,6 +333,7 @@ class _ResultJson(StoredModel):
     dataset: DatasetJson
     submission: SubmissionJson
     software: SoftwareJson
+    intervals: _MethodJson | None = None
     tables: Annotated[dict[Name, _ConfigTableJson], BeforeValidator(_check_tables)]
     views: Annotated[list[_ViewJson], FailFast()]
 

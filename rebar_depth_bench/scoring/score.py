@@ -29,7 +29,7 @@ from rebar_depth_bench.scoring.metrics import (
 )
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.published_match import published_match
-from rebar_depth_bench.scoring.reference import mean_reference
+from rebar_depth_bench.scoring.reference import constant_errors, mean_reference
 from rebar_depth_bench.scoring.result import Result, Table, tabulate
 from rebar_depth_bench.scoring.view_score import ViewScore
 from rebar_depth_bench.submission import Declaration, EntryError, SubmissionReader
@@ -78,8 +78,9 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
     p_m, z_m, z_median_m = prediction_m.ravel().take(truth.index.astype(np.intp)), truth.depth_m, truth.median_m
     valid = is_valid_prediction(p_m)
     error = rank_error(p_m, z_m, valid)
+    constant = truth.constant
     if not valid.all():
-        p_m, z_m = p_m[valid], z_m[valid]
+        p_m, z_m, constant = p_m[valid], z_m[valid], None
         z_median_m = median(z_m) if len(z_m) else 0.0
     scored_px = len(truth.index)
     coverage = len(p_m) / scored_px
@@ -98,6 +99,7 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
         native=native,
         scaled=scaled,
         within_mm={tolerance_mm: count / scored_px for tolerance_mm, count in within.items()},
+        scaled_constant=constant or constant_errors(z_m, z_median_m),
     )
 
 

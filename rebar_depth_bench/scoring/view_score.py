@@ -26,7 +26,8 @@ _VIEW_INDEX = re.compile("[0-9]{4}")
 class ViewScore:
     """Metrics of one view; ``scale``, ``native`` and ``scaled`` are None without valid predictions.
 
-    ``rank_error`` is None in results of the previous protocol.
+    ``rank_error`` is None in results of the previous protocol. ``scaled_constant`` is as in ``Table``; it is
+    None in results that were read from a file.
     """
 
     view_id: str
@@ -37,6 +38,7 @@ class ViewScore:
     native: DepthMetrics | None
     scaled: DepthMetrics | None
     within_mm: Mapping[int, float]
+    scaled_constant: tuple[float, float] | None = None
 
 
 def _metric_getter(alignment: str, name: str) -> Callable[[ViewScore], float | None]:
@@ -63,13 +65,23 @@ VIEW_METRICS: Mapping[str, Callable[[ViewScore], float | None]] = {
 
 def view_intervals(views: Sequence[ViewScore], *, by_scene: bool) -> dict[str, Interval | None]:
     """Return the 95 % interval of every table metric of the given views; ``by_scene`` as in ``resample_views``."""
-    estimates = bootstrap_estimates(views, resample_views([view.view_id for view in views], by_scene=by_scene))
-    return {name: interval(estimates[:, k]) for k, name in enumerate(VIEW_METRICS)}
-
-
-def bootstrap_estimates(views: Sequence[ViewScore], resampling: Resampling) -> Float64[ndarray, "draws k"]:
-    """Return the table's ``VIEW_METRICS`` in each resample of the views; NaN where undefined."""
     values = view_metric_values(views)
+    resampling = resample_views([view.view_id for view in views], by_scene=by_scene)
+    return metric_intervals(bootstrap_estimates(values, resampling), values, resampling)
+
+
+def metric_intervals(
+    estimates: Float64[ndarray, "draws k"], values: Float64[ndarray, "n k"], resampling: Resampling
+) -> dict[str, Interval | None]:
+    """Return the interval of each of ``VIEW_METRICS`` from its estimates; ``values`` is NaN where it has none."""
+    return {
+        name: interval(estimates[:, k], resampling.blocks(np.flatnonzero(~np.isnan(values[:, k]))))
+        for k, name in enumerate(VIEW_METRICS)
+    }
+
+
+def bootstrap_estimates(values: Float64[ndarray, "n k"], resampling: Resampling) -> Float64[ndarray, "draws k"]:
+    """Return the table's ``VIEW_METRICS`` in each resample of ``view_metric_values``; NaN where undefined."""
     draws = resampling.means(values)
     scale = list(VIEW_METRICS).index(SCALE_MEDIAN)
     draws[:, scale] = resampling.medians(values[:, scale])

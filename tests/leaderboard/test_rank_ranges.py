@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from leaderboard.db import view_errors as view_errors_module
 from leaderboard.db.view_errors import rank_ranges, unpack_view_errors, view_errors
+from rebar_depth_bench.scoring.bootstrap import interval, resample
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import Result, tabulate
 from tests.bench.reporting.results import result, scored_view
@@ -22,7 +24,7 @@ def random_results(count: int, spread: float, seed: int) -> list[Result]:
     results = []
     for number in range(count):
         errors = np.clip(difficulty + spread * number + rng.normal(0, 0.05, VIEWS), 0.01, 0.9)
-        views = [scored_view(f"lattice/{index:04d}", float(error)) for index, error in enumerate(errors)]
+        views = [scored_view(f"lattice/{12 * index:04d}", float(error)) for index, error in enumerate(errors)]
         results.append(result(*views, method=f"m{number}"))
     return results
 
@@ -38,6 +40,19 @@ def test_ranges_agree_with_the_paired_comparison(spread: float) -> None:
             if number != index
         ]
         assert ranges[index] == (1 + verdicts.count("better"), len(results) - verdicts.count("worse"))
+
+
+def test_pairs_on_few_skewed_views_are_those_of_the_interval() -> None:
+    """Pairs that are decided without draws are those whose interval excludes zero, also for eight blocks."""
+    resampling = resample(range(0, 96, 12))
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        spread = np.where(np.arange(12) % 2, 0.1, 0.03)[:, None]
+        errors = rng.exponential(0.1, 8) + 0.03 * np.arange(12)[:, None] + spread * rng.exponential(size=(12, 8))
+        means = resampling.means(errors.T).T
+        better = view_errors_module._is_better(means, resampling.blocks())
+        intervals = [[interval(a - b, resampling.blocks()) for b in means] for a in means]
+        assert better.tolist() == [[bounds is not None and bounds[1] < 0 for bounds in row] for row in intervals]
 
 
 def test_range_contains_the_rank() -> None:

@@ -161,13 +161,12 @@ def make_config_ranking(
     if points and (max_plotted is None or len(points) <= max_plotted):
         title = f"{printable(config)}: native and scaled AbsRel"
         chart = scatter_chart(title, [*points, *scatter_points(published, {})])
-    references = (formatting.reference_rows(table.reference) for table in tables)
     return ConfigRanking(
         config=printable(config),
         selection=selection,
         row_count=len(rows),
         pages=pages,
-        references=next(filter(None, references), []),  # Tables of the previous protocol have none.
+        references=formatting.reference_rows([(line.entry.method, line.table) for line in lines if line.table]),
         lines=lines,
         published=published,
         distance=distance,

@@ -64,7 +64,8 @@ class Reach:
     """Reach for one limit: see the module docstring.
 
     ``distance_m`` is None for the verdicts ``not met`` and ``none tested``. ``interval`` holds edges of bins,
-    where 0 stands for ``not met``; it is None if no bin is tested. ``bins`` are those with judged crossings.
+    where 0 stands for ``not met``; it is None if no bin is tested, or one has few blocks of views. ``bins`` are
+    those with judged crossings.
     """
 
     limit_mm: int
@@ -125,31 +126,31 @@ def pooled(by_view: Sequence[Samples], name: str) -> tuple[Float64[ndarray, " m"
 def _reach(
     z_m: Float64[ndarray, " m"], passes: ndarray, view: ndarray, resampling: Resampling, limit_mm: int
 ) -> Reach:
-    bins, draws = [], []
+    bins, draws, blocks = [], [], []
     for low_m, high_m in pairwise(CROSSING_EDGES_M):
         inside = (z_m >= low_m) & (z_m < high_m)
         if not inside.any():
             continue
         values, views = passes[inside].astype(np.float64), view[inside]
-        share = resampling.pooled_means(values, views)
-        count = len(np.unique(views))
-        bins.append(ReachBin(low_m, high_m, len(values), count, float(values.mean()), interval(share)))
-        draws.append(share)
+        draws.append(resampling.pooled_means(values, views))
+        blocks.append(resampling.blocks(views))
+        count, ends = len(np.unique(views)), interval(draws[-1], blocks[-1])
+        bins.append(ReachBin(low_m, high_m, len(values), count, float(values.mean()), ends))
     run = _tested_run(bins)
     if not run:
         return Reach(limit_mm, "none tested", None, None, tuple(bins))
     edges_m = np.array([0.0, *(one.high_m for one in run)])
     met = np.array([one.share >= SHARE for one in run])
     reached = _leading(met[None])[0]
-    shares = np.stack(draws[bins.index(run[0]) : bins.index(run[-1]) + 1], axis=1)
+    tested = slice(bins.index(run[0]), bins.index(run[-1]) + 1)
+    shares = np.stack(draws[tested], axis=1)
     drawn_m = edges_m[_leading(shares >= SHARE)[np.isfinite(shares).all(axis=1)]]
     verdict: Verdict = "not met" if not reached else "at least" if reached == len(run) else "up to"
-    ends = np.percentile(drawn_m, [2.5, 97.5], method="inverted_cdf") if len(drawn_m) else None
     return Reach(
         limit_mm,
         verdict,
         float(edges_m[reached]) if reached else None,
-        None if ends is None else (float(ends[0]), float(ends[1])),
+        interval(drawn_m, min(blocks[tested]), "inverted_cdf"),
         tuple(bins),
     )
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.reporting.formatting import config_title, counted, rank_mark
+from rebar_depth_bench.reporting.formatting import config_title, counted, rank_mark, scaled_constants
 from rebar_depth_bench.reporting.published import (
     OTHER_OPTICS_MARK,
     OTHER_OPTICS_NOTE,
@@ -39,12 +39,13 @@ class FigurePoint:
 
 @dataclass(frozen=True)
 class Panel:
-    """Points of a config, those of the paper first, and its reference errors."""
+    """Points of a config, those of the paper first, its reference errors, and AbsRel of constants by title."""
 
     config: str
     title: str
     points: tuple[FigurePoint, ...]
     reference: Reference
+    constants: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,9 @@ def _panel(config: str, results: Sequence[Result], *, published: bool) -> Panel:
     title = f"{config_title(printable(config, 40), first.split)}, {counted(first.views, 'view')}"
     if any(OTHER_OPTICS_MARK in point.mark for point in shown):
         title += f", paper {OTHER_OPTICS_MARK}"
-    return Panel(printable(config), title, tuple(shown), first.reference)
+    constants = scaled_constants([(_name(result), table) for result, table in rows])
+    abs_rels = {title: abs_rel for title, (abs_rel, _) in constants.items()}
+    return Panel(printable(config), title, tuple(shown), first.reference, abs_rels)
 
 
 def _published_points(match: PublishedMatch) -> list[FigurePoint]:

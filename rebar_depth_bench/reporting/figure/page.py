@@ -91,11 +91,10 @@ def _entries(content: FigureContent) -> list[_Entry]:
     entries += [(f"paper: {name}", published_marker(index)) for index, name in enumerate(content.published)]
     half = _SAMPLE / 2 - 2
     flat, upright = ((-half, 0.0), (half, 0.0)), ((0.0, -4.5), (0.0, 4.5))
-    references = [panel.reference for panel in content.panels]
-    if any(reference.constant_abs_rel is not None for reference in references):
+    if any(panel.constants for panel in content.panels):
         sample = Path(flat, INK, 0.9, dash=CONSTANT_DASH)
         entries.append((f"reference: {CONSTANT_TITLE} (for scaled)", (sample,)))
-    if any(reference.one_pixel_abs_rel is not None for reference in references):
+    if any(panel.reference.one_pixel_abs_rel is not None for panel in content.panels):
         sample = Path(upright, INK, 0.9, dash=ONE_PIXEL_DASH)
         entries.append((f"reference: {ONE_PIXEL_TITLE} (for native)", (sample,)))
     entries.append(("native = scaled", (Path(flat, GREY, 0.7, dash=DIAGONAL_DASH),)))

@@ -54,7 +54,7 @@ def frame_of(panel: Panel, left: float, top: float, right: float, bottom: float)
 
     The x axis also covers the y axis, so that the diagonal crosses the panel.
     """
-    scaled = [point.scaled for point in panel.points] + _defined(panel.reference.constant_abs_rel)
+    scaled = [point.scaled for point in panel.points] + list(panel.constants.values())
     native = [point.native for point in panel.points] + _defined(panel.reference.one_pixel_abs_rel)
     y = decade_axis(_with_margin(scaled), bottom, top)
     x = decade_axis([*_with_margin(native), *((y.low, y.high) if scaled else ())], left, right)
@@ -64,7 +64,7 @@ def frame_of(panel: Panel, left: float, top: float, right: float, bottom: float)
 def is_beyond(panel: Panel) -> bool:
     """Return whether anything is drawn on the frame of a panel because the axes do not reach it."""
     errors = [error for point in panel.points for error in (point.native, point.scaled)]
-    errors += _defined(panel.reference.constant_abs_rel) + _defined(panel.reference.one_pixel_abs_rel)
+    errors += [*panel.constants.values(), *_defined(panel.reference.one_pixel_abs_rel)]
     return not all(LIMITS[0] <= error <= LIMITS[1] for error in errors)
 
 
@@ -135,9 +135,9 @@ def _reference_lines(panel: Panel, frame: Frame) -> list[Element]:
     low, high = max(frame.x.low, frame.y.low), min(frame.x.high, frame.y.high)
     if low < high:
         lines.append(Path((frame.at(low, low), frame.at(high, high)), GREY, 0.7, dash=DIAGONAL_DASH))
-    for value in _defined(panel.reference.constant_abs_rel):
+    for title, value in panel.constants.items():
         y = frame.y.at(value)
-        description = f"{panel.config}, constant: scaled {value:.4g}"
+        description = f"{panel.config}, {title}: scaled {value:.4g}"
         across = Path(((0.0, 0.0), (frame.right - frame.left, 0.0)), INK, 0.9, dash=CONSTANT_DASH)
         lines.append(Marker((frame.left, y), "reference constant", description, (across,)))
     for value in _defined(panel.reference.one_pixel_abs_rel):

@@ -62,11 +62,11 @@ def _group_table(grouping: str, groups: Mapping[str, Table]) -> GroupTable:
 
 def _group_row(group: str, table: Table) -> GroupRow:
     row, reference = table_row(group, replace(table, split=None)), table.reference
-    one_pixel, constant = formatting.group_reference_cells(reference)
+    one_pixel, constant = formatting.group_reference_cells(table)
     return GroupRow(
         row,
         native=[row.native[position] for position in _POSITIONS],
         one_pixel=number_cells(one_pixel, [reference.one_pixel_abs_rel, reference.one_pixel_rmse_cm]),
         scaled=[row.scaled[position] for position in _POSITIONS],
-        constant=number_cells(constant, [reference.constant_abs_rel, reference.constant_rmse_cm]),
+        constant=number_cells(constant, table.scaled_constant),
     )

@@ -109,7 +109,7 @@ def results_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) ->
         "references": [
             (f"{printable(config)}: {name}", native, scaled)
             for config, table in result.tables.items()
-            for name, native, scaled in formatting.reference_rows(table.reference)
+            for name, native, scaled in formatting.reference_rows([("", table)])
         ],
         "reference_note": formatting.REFERENCE_NOTE,
         "dash_in_results": any(row.has_dash() for row in rows),

@@ -11,7 +11,7 @@ from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.lines import HEIGHT, LEFT, RIGHT, TOP, ChartText, Series, chart, log_axis
 from rebar_depth_bench.reporting.crossing_texts import FITS_NOTE, REACH_NOTE
 from rebar_depth_bench.reporting.html.study_page import Columns, PageFigure, PageTable, StudyPage, page_table
-from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS
+from rebar_depth_bench.scoring.bootstrap import INTERVALS, MIN_BLOCKS
 from rebar_depth_bench.scoring.frames import make_frame
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.single_bar import SingleBarScore
@@ -34,6 +34,7 @@ def to_json(study: DistanceStudy) -> dict[str, Any]:
     return {
         "study": "distance",
         **study.provenance.to_dict(),
+        "intervals": dict(INTERVALS),
         "bins_per_decade": study.bins_per_decade,
         "slopes": [asdict(slope) for slope in study.slopes],
         "bins": [asdict(bin_) for bin_ in study.bins],
@@ -273,7 +274,7 @@ def _notes(study: DistanceStudy) -> list[str]:
         "Distance of a view: the median true depth of its scored pixels. z: truth, p: prediction.",
         "Intervals: bootstrap over blocks of neighbouring views; they hold for other views of the same scenes, "
         "not for other scenes. In configs with splits: bootstrap over scenes; they hold for others of the same "
-        f"generator. {formatting.DASH}: undefined, or no interval from fewer than {MIN_VIEWS} views or scenes.",
+        f"generator. {formatting.DASH}: undefined, or no interval from fewer than {MIN_BLOCKS} blocks or scenes.",
     ]
     if study.reaches:
         notes += [f"Crossings: {REACH_NOTE}", FITS_NOTE]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rebar_depth_bench.scoring.bootstrap import Interval, interval, resample
+from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, interval, resample
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 from rebar_depth_bench.scoring.provenance import Provenance
 from rebar_depth_bench.studies.kitti.ground_truth import EXPECTED_IMAGES, GroundTruthKind, LidarDepthConvention
@@ -89,6 +89,7 @@ class KittiResult:
         kitti = {**vars(self.protocol), "found": self.images_with_truth, "missing": list(self.missing)}
         return {
             **self.provenance.to_dict(),
+            "intervals": dict(INTERVALS),
             "method": self.method,
             "kitti": kitti,
             "table": table,
@@ -130,7 +131,8 @@ def _intervals(images: Sequence[ImageScore]) -> dict[str, Interval | None]:
     values = np.array(rows, dtype=np.float64).reshape(len(images), len(INTERVAL_NAMES))
     draws = resampling.means(values)
     draws[:, -1] = resampling.medians(values[:, -1])
-    return {name: interval(draws[:, column]) for column, name in enumerate(INTERVAL_NAMES)}
+    blocks = resampling.blocks(np.flatnonzero(~np.isnan(values[:, 0])))
+    return {name: interval(draws[:, column], blocks) for column, name in enumerate(INTERVAL_NAMES)}
 
 
 def _metric_value(image: ImageScore, name: str) -> float:

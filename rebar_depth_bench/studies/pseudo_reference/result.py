@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from itertools import combinations
 from typing import Any, Literal
 
+from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.provenance import Provenance
 from rebar_depth_bench.scoring.result import Table
@@ -108,6 +109,7 @@ class PseudoReferenceResult:
         """Return the JSON object of the study; its numbers are not yet rounded."""
         return {
             **self.provenance.to_dict(),
+            "intervals": dict(INTERVALS),
             "data": self.data,
             "camera": self.camera,
             "range_m": [self.depth_range.near_m, self.depth_range.far_m],

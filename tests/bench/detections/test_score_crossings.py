@@ -16,9 +16,11 @@ import pytest
 from rebar_depth_bench.bar_crossings.definition import scene_crossings
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW, read_detections
+from rebar_depth_bench.detections.result import ViewDetections, tabulate_detections
 from rebar_depth_bench.detections.score import score_crossings
 from rebar_depth_bench.errors import InputError, SubmissionError
 from rebar_depth_bench.geometry.cameras import transform
+from rebar_depth_bench.scoring.bootstrap import resample
 from tests.mat_dataset import CAGES, CONFIG, SCENES, VIEWS, mat_bars, poses, write_mat_dataset
 
 pytestmark = pytest.mark.slow
@@ -93,8 +95,31 @@ def test_counts_pool_over_views_by_hand(mat: Path, tmp_path: Path) -> None:
     views = {view["view_id"]: view for view in result["views"]}
     assert views[f"{CONFIG}/0001"]["detections"] == 0
     assert len(views) == result["views_scored"] == VIEWS
-    low, high = result["ci95"]["recall"]
-    assert low <= 1 / 8 <= high
+    assert result["intervals"]["method"] == "expanded-percentile"
+    assert set(result["ci95"].values()) == {None}, "six consecutive views are one block"
+
+
+def test_intervals_need_eight_blocks_with_values() -> None:
+    """Find all crossings in every second view of a sparse subset: errors of position are those of eight views."""
+    found = [
+        ViewDetections(
+            f"{CONFIG}/{12 * index:04d}",
+            *(4, 4, 4 * (index % 2), 4 * (index % 2), 4 * (index % 2), 0),
+            position_mm=np.full(4 * (index % 2), 1.0 + index),
+            normal_deg=np.empty(0),
+            confidence=np.ones(4 * (index % 2)),
+            counts=dict.fromkeys((5, 10, 20), np.ones(4 * (index % 2), bool)),
+            correct=dict.fromkeys((5, 10, 20), np.ones(4 * (index % 2), bool)),
+        )
+        for index in range(17)
+    ]
+    for views, has_errors in ((found, True), (found[:15], False)):
+        intervals = tabulate_detections(views, resample(range(0, 12 * len(views), 12))).intervals
+        low, high = intervals["recall"] or (0, 0)
+        assert 0.1 < low < 0.5 < high < 0.9
+        assert (intervals["position_mm"] is not None) == has_errors
+        assert intervals["average_precision_5mm"] is not None
+        assert intervals["normal_deg"] is None
 
 
 def test_confidence_selects_matches_but_not_average_precision(mat: Path, tmp_path: Path) -> None:

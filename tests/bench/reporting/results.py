@@ -34,6 +34,7 @@ def scored_view(view_id: str, abs_rel: float = 0.75, coverage: float = 1.0, scal
         native=DepthMetrics(abs_rel=abs_rel, rmse_cm=20.09, mae_cm=18.71, delta1=0.1234),
         scaled=DepthMetrics(abs_rel=0.0613, rmse_cm=1.52, mae_cm=1.17, delta1=0.9876),
         within_mm={3: 0.0123, 5: 0.0456, 10: 0.0789, 20: 0.1357},
+        scaled_constant=(0.0571, 2.21) if coverage == 1 else (0.0529, 2.05),
     )
 
 

@@ -33,7 +33,7 @@ from rebar_depth_bench.scoring.result import Result
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, panels, result, scored_view
 
-VIEWS = 6
+VIEWS = 8
 INDICES = [100 * index for index in range(VIEWS)]
 
 LEVELS = {
@@ -142,7 +142,7 @@ def remove_details(section: str) -> str:
 def test_inspection_table_is_open_with_native_and_scaled(rendered: str, lattice: ExtendedResult) -> None:
     opened, label = remove_details(extended_section_html(rendered)), "lattice: Inspection, bar by bar"
     cells = table_row_cells(opened, label, "bars found %\xa0↑")
-    assert [cell[:3] for cell in cells] == ["87.", "43.", "24"]
+    assert [cell[:3] for cell in cells] == ["87.", "43.", "32"]
     numbers = lattice.tables["lattice"].numbers
     spacing = table_row_cells(opened, label, "bar spacing: bias mm")
     for alignment, cell in zip((NATIVE, SCALED), spacing, strict=False):
@@ -156,7 +156,7 @@ def test_inspection_table_is_open_with_native_and_scaled(rendered: str, lattice:
 
 def test_missed_bars_are_shown_as_missed_not_as_length(rendered: str) -> None:
     layer = table_row_cells(rendered, "lattice: Inspection, bar by bar", "layer distance: p95 error mm\xa0↓")
-    assert layer == ["missed", "50.00 50.00 – 50.00", "24"]
+    assert layer == ["missed", "50.00 50.00 – 50.00", "32"]
     assert "missed: not found, counted as 100 mm." in Page(rendered).text
 
 

@@ -96,11 +96,14 @@ def test_points_and_references_are_where_the_tick_labels_say() -> None:
     for row, (description, place) in zip(rows, published.items(), strict=True):
         assert description.startswith(f"lattice, paper: {row.method}: native ")
         assert place == pytest.approx((x(float(row.abs_rel)), y(float(row.abs_rel_scaled))), abs=0.02)
-    [(_, constant)] = places(svg, "reference constant").values()
+    constants = places(svg, "reference constant")
+    assert list(constants) == ["lattice, constant: scaled 0.0571", "lattice, constant, far: scaled 0.0529"]
+    (_, constant), (_, of_far) = constants.values()
     [(one_pixel, _)] = places(svg, "reference one-pixel").values()
     assert REFERENCE.constant_abs_rel is not None
     assert REFERENCE.one_pixel_abs_rel is not None
     assert constant == pytest.approx(y(REFERENCE.constant_abs_rel), abs=0.02)
+    assert of_far == pytest.approx(y(0.0529), abs=0.02)
     assert one_pixel == pytest.approx(x(REFERENCE.one_pixel_abs_rel), abs=0.02)
     legend = list(places(svg, "legend"))
     assert legend[:2] == ["near", "far"]

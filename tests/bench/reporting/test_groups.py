@@ -18,7 +18,7 @@ from rebar_depth_bench.scoring.result import Result, tabulate
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, REFERENCE, result, scored_view, unpredicted_view
 
-SCENES = 6
+SCENES = 8
 NEAR = Reference(0.2222, 7.89, 0.0333, 4.56)
 
 
@@ -51,7 +51,7 @@ def test_terminal_has_a_row_for_each_group_with_its_reference_errors(width: int)
     assert len(rows) == (1 if width == 120 else 2), "in one table if it fits, else in two"
     cells = [cell for row in rows for cell in row[1:]]
     assert cells[0] == f"{SCENES}/{SCENES}"
-    assert {"0.1250", "0.0333", "4.56", "0.2222", "7.89"} <= set(cells)
+    assert {"0.1350", "0.0333", "4.56", "0.0571", "2.21"} <= set(cells)
     text = "\n".join(lines)
     assert text.index("cage family") < text.index("wall") < text.index("slab") < text.index("distance")
     assert formatting.GROUP_NOTE.split(".")[0] in text.replace("\n", " ")
@@ -67,7 +67,7 @@ def test_report_has_a_table_for_each_grouping() -> None:
     labels = [attributes.get("aria-label") for attributes in Page(page).attributes_of("table")]
     assert labels.count("cages (test): by cage family") == labels.count("cages (test): by distance") == 1
     row = page[page.index('data-value="1">wall</th>') :].partition("</tr>")[0]
-    for text in ("6/6", "0.1250", "0.0333", "4.56", "0.2222", "7.89"):
+    for text in ("8/8", "0.1350", "0.0333", "4.56", "0.0571", "2.21"):
         assert f">{text}" in row
     assert 'class="interval"' in row
     other = page[page.index('data-value="2">slab</th>') :].partition("</tr>")[0]
@@ -97,13 +97,14 @@ def test_csv_has_one_row_for_each_group() -> None:
     group = shown.to_dict()["tables"]["cages"]["groups"]["family"]["wall"]
     assert float(rows[0]["rank_error"]) == group["rank_error"]
     assert float(rows[0]["constant_abs_rel"]) == group["reference"]["constant"]["abs_rel"]
+    assert float(rows[0]["scaled_constant_abs_rel"]) == group["reference"]["scaled_constant"]["abs_rel"] == 0.0571
     assert rows[1]["native_abs_rel"] == ""
     [header] = groups_csv(result(scored_view("lattice/0000"))).splitlines()
     assert header.split(",")[:8] == list(rows[0])[:8]
 
 
 def test_notes_state_what_is_resampled() -> None:
-    one_scene = result(*(scored_view(f"lattice/{index:04d}") for index in range(5)))
+    one_scene = result(*(scored_view(f"lattice/{12 * index:04d}") for index in range(8)))
     split = split_result()
     both = replace(split, tables={**split.tables, **one_scene.tables}, views=[*split.views, *one_scene.views])
     assert formatting.interval_note(one_scene.tables.values()) == formatting.INTERVAL_NOTE

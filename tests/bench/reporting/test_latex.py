@@ -143,6 +143,8 @@ def test_single_results_and_incomparable_errors_are_not_bold() -> None:
     table = _check_latex(latex_table([*_two_results(), low], published=False))
     line = next(line for line in table.splitlines() if line.startswith("gaps"))
     assert line.startswith(r"gaps & 0.5005 & 20.09 & 0.0010 &")
+    assert r"\emph{constant} &  &  &  & 0.0571 &" in table
+    assert r"\emph{constant, gaps} &  &  &  & 0.0529 &  &  &  &  &  &  \\" in table
     lattice = [
         row.split(" & ")[1:6] for row in table.splitlines() if row.startswith(("gaps", "my model", r"a\_b"))
     ]
@@ -150,7 +152,8 @@ def test_single_results_and_incomparable_errors_are_not_bold() -> None:
 
 
 def test_many_configs_split_into_several_tabulars() -> None:
-    views = [scored_view(f"{name}/{i:04d}") for name in ("lattice", "pile", "pier", "beam") for i in range(8)]
+    names = ("lattice", "pile", "pier", "beam")
+    views = [scored_view(f"{name}/{12 * i:04d}") for name in names for i in range(8)]
     table = _check_latex(latex_table([result(*views)], published=True))
     assert table.count(r"\begin{tabular}") == 2
     assert table.count(r"\begin{table*}") == 1

@@ -32,6 +32,31 @@ def _with_intervals(shown: Result, **intervals: tuple[float, float] | None) -> R
     return dataclasses.replace(shown, tables=tables)
 
 
+def test_constants_of_results_on_other_pixels_are_named() -> None:
+    """The constants of two results without some pixels look alike and share a row."""
+    named = {"a": 1.0, "b": 0.9, "c\x1b": 0.8, "d": 1.0}
+    tables = {name: result(scored_view("lattice/0000", coverage=share)) for name, share in named.items()}
+    rows = [(name, one.tables["lattice"]) for name, one in tables.items()]
+    assert formatting.scaled_constants(rows) == {
+        "constant": (0.0571, 2.21),
+        "constant, b, c\N{REPLACEMENT CHARACTER}": (0.0529, 2.05),
+    }
+    assert formatting.scaled_constants(rows[1:3]) == {"constant": (0.0529, 2.05)}
+    titles = [title for title, _, _ in formatting.reference_rows(rows)]
+    assert titles == [*formatting.scaled_constants(rows), "one pixel"]
+    assert (
+        formatting.reference_rows([("x", dataclasses.replace(rows[0][1], scaled_constant=(None, None)))])[0][0]
+        == "one pixel"
+    )
+
+
+def test_scaled_error_is_compared_with_the_constant_on_the_same_pixels() -> None:
+    table = result(scored_view("lattice/0000", coverage=0.9)).tables["lattice"]
+    assert any("above that of a constant (0.0529)" in finding for finding in formatting.reference_findings(table))
+    between = dataclasses.replace(table, scaled_constant=(0.07, 2.6))
+    assert not any("constant" in finding for finding in formatting.reference_findings(between))
+
+
 def test_cells_sort_by_full_precision_and_skip_undefined() -> None:
     row = view_row(scored_view("lattice/0000", abs_rel=0.123456789))
     assert (row.native[0].text, row.native[0].value) == ("0.1235", 0.123456789)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -10,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rebar_depth_bench.scoring.bootstrap import (
-    MIN_VIEWS,
+    MIN_BLOCKS,
     RESAMPLES,
     Resampling,
     block_length,
+    half_width,
     interval,
     resample,
     resample_scenes,
@@ -21,7 +23,8 @@ from rebar_depth_bench.scoring.bootstrap import (
 
 
 def mean_interval(values: np.ndarray, indices: range) -> tuple[float, float] | None:
-    return interval(resample(indices).means(values[:, None])[:, 0])
+    resampling = resample(indices)
+    return interval(resampling.means(values[:, None])[:, 0], resampling.blocks(np.flatnonzero(~np.isnan(values))))
 
 
 def test_resamples_have_equal_size_and_draw_whole_blocks() -> None:
@@ -41,7 +44,7 @@ def test_resamples_have_equal_size_and_draw_whole_blocks() -> None:
         (range(100), 12),
         (range(6, 504, 12), 1),  # one view of each ring: no two views are neighbours
         (range(2, 504, 4), 3),
-        (range(20), 5),  # at least four blocks
+        (range(20), 12),
         (range(1), 1),
         (range(0), 1),
     ],
@@ -54,8 +57,35 @@ def test_independent_views_give_normal_interval() -> None:
     values = np.random.default_rng(3).normal(5.0, 2.0, 500)
     bounds = mean_interval(values, range(0, 6000, 12))
     assert bounds is not None
-    half_width = 1.96 * values.std() / math.sqrt(500)
-    assert bounds == pytest.approx((values.mean() - half_width, values.mean() + half_width), abs=0.02)
+    error = 1.96 * values.std() / math.sqrt(500)
+    assert bounds == pytest.approx((values.mean() - error, values.mean() + error), abs=0.02)
+
+
+@pytest.mark.parametrize(("blocks", "t"), [(8, 2.364624), (10, 2.262157), (24, 2.068658), (61, 2.000298)])
+def test_ends_are_those_of_students_interval(blocks: int, t: float) -> None:
+    """Resamples of normal means give the interval mean +- t s / sqrt(n); t is from printed tables."""
+    assert half_width(blocks) == pytest.approx(math.sqrt(blocks / (blocks - 1)) * t, rel=1e-6)
+    draws = np.array([NormalDist(3.0, 0.5).inv_cdf((k + 0.5) / 200_000) for k in range(200_000)])
+    error = t * 0.5 * math.sqrt(blocks / (blocks - 1))
+    assert interval(draws, blocks) == pytest.approx((3 - error, 3 + error), abs=1e-3)
+
+
+def test_blocks_and_scenes_with_values_are_counted() -> None:
+    assert [resample(range(n)).blocks() for n in (504, 100, 20)] == [42, 9, 2]
+    assert resample(range(0, 504, 21)).blocks() == 24
+    assert resample(range(504)).blocks(np.array([0, 11, 12, 503, 12])) == 3
+    scenes = resample_scenes(["a", "b", "a", "c"])
+    assert (scenes.blocks(), scenes.blocks(np.array([0, 2, 3]))) == (3, 2)
+
+
+@pytest.mark.slow
+def test_intervals_of_few_views_contain_the_mean() -> None:
+    """Plain percentiles of eight normal values contain their mean in 88 of 100 cases."""
+    values = np.random.default_rng(12).normal(size=(8, 2000))
+    draws = resample(range(0, 96, 12)).means(values)
+    intervals = [interval(draws[:, k], 8) for k in range(2000)]
+    contain = [bounds is not None and bounds[0] <= 0 <= bounds[1] for bounds in intervals]
+    assert 0.92 <= np.mean(contain) <= 0.96
 
 
 @pytest.mark.slow
@@ -93,24 +123,30 @@ def test_pooled_percentile_weights_samples_by_view_count() -> None:
 
 
 def test_few_infinite_or_nan_views_have_no_interval() -> None:
-    assert mean_interval(np.ones(MIN_VIEWS - 1), range(MIN_VIEWS - 1)) is None
-    assert mean_interval(np.r_[np.ones(9), np.inf], range(10)) is None
-    assert mean_interval(np.full(10, np.nan), range(10)) is None
-    assert interval(resample(range(3)).percentile(np.ones(3), np.arange(3), 50)) is None
+    few, enough = (range(0, 12 * count, 12) for count in (MIN_BLOCKS - 1, MIN_BLOCKS))
+    assert mean_interval(np.ones(MIN_BLOCKS - 1), few) is None
+    assert mean_interval(np.ones(MIN_BLOCKS), enough) == (1.0, 1.0)
+    assert mean_interval(np.r_[np.ones(9), np.inf], range(0, 120, 12)) is None
+    assert mean_interval(np.full(10, np.nan), range(0, 120, 12)) is None
+    assert mean_interval(np.ones(84), range(84)) is None  # seven blocks
+    assert np.isnan(resample([]).percentile(np.empty(0), np.empty(0, np.int64), 50)).all()
 
 
 def test_nan_views_are_excluded() -> None:
-    values = np.array([1.0, np.nan, 1.0, 1.0, np.nan, 1.0, 1.0])
-    assert mean_interval(values, range(7)) == (1.0, 1.0)
+    values = np.array([np.nan, *np.ones(8), np.nan])
+    assert mean_interval(values, range(0, 120, 12)) == (1.0, 1.0)
+    values[3] = np.nan
+    assert mean_interval(values, range(0, 120, 12)) is None  # seven values
 
 
 @settings(max_examples=30)
-@given(st.lists(st.floats(-1e6, 1e6), min_size=MIN_VIEWS, max_size=40), st.floats(0.1, 10), st.floats(-100, 100))
+@given(st.lists(st.floats(-1e6, 1e6), min_size=MIN_BLOCKS, max_size=40), st.floats(0.1, 10), st.floats(-100, 100))
 def test_interval_is_within_values_and_follows_their_unit(
     values: list[float], factor: float, shift: float
 ) -> None:
-    bounds = mean_interval(np.array(values), range(len(values)))
-    moved_bounds = mean_interval(factor * np.array(values) + shift, range(len(values)))
+    indices = range(0, 12 * len(values), 12)
+    bounds = mean_interval(np.array(values), indices)
+    moved_bounds = mean_interval(factor * np.array(values) + shift, indices)
     assert bounds is not None
     assert moved_bounds is not None
     slack = 1e-9 * (1 + max(map(abs, values)))
@@ -153,17 +189,13 @@ def test_statistics_of_drawn_scenes_equal_numpy() -> None:
 
 
 def test_few_scenes_have_no_interval_however_many_views() -> None:
-    few = resample_scenes([str(index % (MIN_VIEWS - 1)) for index in range(100)])
-    values = np.random.default_rng(2).normal(size=100)
-    view = np.arange(100)
-    assert interval(few.means(values[:, None])[:, 0]) is None
-    assert interval(few.medians(values)) is None
-    assert interval(few.pooled_means(values, view)) is None
-    enough = resample_scenes([str(index % MIN_VIEWS) for index in range(100)])
-    assert interval(enough.means(values[:, None])[:, 0]) is not None
-    in_four_scenes = np.where(view % MIN_VIEWS == 0, np.nan, values)
-    assert interval(enough.means(in_four_scenes[:, None])[:, 0]) is None
-    assert interval(resample_scenes([]).medians(np.empty(0))) is None
+    values, view = np.random.default_rng(2).normal(size=100), np.arange(100)
+    few, enough = (resample_scenes([str(n % count) for n in view]) for count in (MIN_BLOCKS - 1, MIN_BLOCKS))
+    for scenes, has_interval in ((few, False), (enough, True)):
+        means, medians = scenes.means(values[:, None])[:, 0], scenes.medians(values)
+        for estimates in (means, medians, scenes.pooled_means(values, view)):
+            assert (interval(estimates, scenes.blocks()) is not None) == has_interval
+    assert interval(resample_scenes([]).medians(np.empty(0)), 0) is None
 
 
 def test_scenes_give_the_interval_of_clustered_means() -> None:
@@ -171,12 +203,12 @@ def test_scenes_give_the_interval_of_clustered_means() -> None:
     rng = np.random.default_rng(9)
     of_scene = rng.normal(size=60)
     values = np.repeat(of_scene, 8) + 0.01 * rng.normal(size=480)
-    by_scene = interval(resample_scenes([str(n // 8) for n in range(480)]).means(values[:, None])[:, 0])
+    by_scene = interval(resample_scenes([str(n // 8) for n in range(480)]).means(values[:, None])[:, 0], 60)
     by_block = mean_interval(values, range(0, 480 * 12, 12))
     assert by_scene is not None
     assert by_block is not None
-    half_width = 1.96 * of_scene.std() / math.sqrt(60)
-    assert by_scene == pytest.approx((values.mean() - half_width, values.mean() + half_width), abs=0.03)
+    error = 2.001 * of_scene.std(ddof=1) / math.sqrt(60)
+    assert by_scene == pytest.approx((values.mean() - error, values.mean() + error), abs=0.03)
     assert by_block[1] - by_block[0] < 0.5 * (by_scene[1] - by_scene[0])
 
 
@@ -188,5 +220,4 @@ def test_view_counts_repeat_those_of_the_scenes_of_the_views() -> None:
     np.testing.assert_array_equal(counts[:, 0], counts[:, 4])
     np.testing.assert_array_equal(counts[:, 1], counts[:, 2])
     assert (counts[:, [0, 1, 3, 5, 6]].sum(axis=1) == 5).all()
-    assert len(resample_scenes(["a", "b", "a"]).view_counts) == 0
     np.testing.assert_array_equal(resample(range(8)).view_counts, resample(range(8)).counts)

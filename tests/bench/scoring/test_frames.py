@@ -17,7 +17,7 @@ from rebar_depth_bench.reporting.comparison_tables import comparison_csv
 from rebar_depth_bench.reporting.extended_tables import extended_csv
 from rebar_depth_bench.reporting.tables import frame_csv, result_csv
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.frames import make_frame
+from rebar_depth_bench.scoring.frames import TABLE_COLUMNS, make_frame, table_values
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.view_score import VIEW_METRICS
 from tests.bench.reporting.pages import Page
@@ -27,7 +27,7 @@ from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredic
 @pytest.fixture
 def two_configs() -> Result:
     return result(
-        *(scored_view(f"lattice/{index:04d}") for index in range(12)),
+        *(scored_view(f"lattice/{12 * index:04d}") for index in range(12)),
         scored_view("pier/0000"),
         unpredicted_view("pier/0001"),
     )
@@ -45,6 +45,14 @@ def test_tables_have_numbers_and_intervals_of_json(two_configs: Result) -> None:
     assert frame.loc["lattice", ["native_abs_rel_low", "native_abs_rel_high"]].tolist() == [low, high]
     assert math.isnan(frame.loc["pier", "native_abs_rel_low"]), "two views have no interval"
     assert sum(name.endswith("_low") for name in frame) == len(VIEW_METRICS)
+
+
+def test_numbers_of_tables_of_earlier_versions_stay_in_their_columns(two_configs: Result) -> None:
+    table = two_configs.to_dict()["tables"]["lattice"]
+    earlier = {**table, "reference": {"constant": table["reference"]["constant"]}}
+    numbers = dict(zip(TABLE_COLUMNS, table_values(earlier), strict=True))
+    assert (numbers["constant_abs_rel"], numbers["scaled_constant_abs_rel"]) == (0.0571, None)
+    assert dict(zip(TABLE_COLUMNS, table_values(table), strict=True))["scaled_constant_abs_rel"] == 0.0571
 
 
 def test_views_have_one_row_each(two_configs: Result) -> None:

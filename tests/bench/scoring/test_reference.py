@@ -49,11 +49,43 @@ def test_tables_have_the_reference_errors_of_the_dataset(
         is_scored[scored_pixels(tiny_masks[view_id], depth_m)] = True
         expected.append(independent_reference(depth_m, is_scored.reshape(depth_m.shape)))
     found = result.to_dict()["tables"]["lattice"]["reference"]
-    assert list(found) == ["constant", "one_pixel"]
-    numbers = [value for errors in found.values() for value in errors.values()]
+    assert list(found) == ["constant", "one_pixel", "scaled_constant"]
+    assert found["scaled_constant"] == found["constant"], "of complete predictions"
+    numbers = [value for errors in (found["constant"], found["one_pixel"]) for value in errors.values()]
     assert numbers == pytest.approx(np.mean(expected, axis=0).tolist(), rel=1e-11)
     again = score(archive_of(tiny_truth), tiny_root)  # From the cache.
     assert again.to_json() == result.to_json()
+
+
+def test_scaled_constant_is_on_the_predicted_pixels(
+    tiny_truth: dict[str, ndarray],
+    tiny_masks: dict[str, ndarray],
+    tiny_root: Path,
+    archive_of: Callable[..., Path],
+) -> None:
+    """Predict the nearer half of each view, and nothing in the first view."""
+    predictions: dict[str, ndarray] = {}
+    expected = []
+    for view_id, depth_m in tiny_truth.items():
+        pixels = scored_pixels(tiny_masks[view_id], depth_m)
+        near = depth_m <= np.median(depth_m.ravel()[pixels])
+        predictions[view_id] = np.where(near & bool(predictions), 1.7 * depth_m, np.nan)
+        z = depth_m.ravel()[pixels][near.ravel()[pixels]].astype(np.float64)
+        error = np.abs(np.median(z) - z)
+        expected.append((np.mean(error / z), 100 * np.sqrt(np.mean(error**2))))
+    table = score(archive_of(predictions), tiny_root).to_dict()["tables"]["lattice"]
+    found = table["reference"]["scaled_constant"]
+    assert list(found.values()) == pytest.approx(np.mean(expected[1:], axis=0).tolist(), rel=1e-11)
+    assert found["abs_rel"] < 0.8 * table["reference"]["constant"]["abs_rel"]
+
+
+def test_nothing_predicted_has_no_scaled_constant(
+    tiny_truth: dict[str, ndarray], tiny_root: Path, archive_of: Callable[..., Path]
+) -> None:
+    nothing = {view_id: np.zeros_like(depth_m) for view_id, depth_m in tiny_truth.items()}
+    reference = score(archive_of(nothing), tiny_root).to_dict()["tables"]["lattice"]["reference"]
+    assert reference["scaled_constant"] == {"abs_rel": None, "rmse_cm": None}
+    assert reference["constant"]["abs_rel"] > 0
 
 
 def test_neighbours_without_depth_are_skipped() -> None:

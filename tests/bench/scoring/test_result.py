@@ -87,7 +87,8 @@ def test_no_views_give_null_and_unranked_table() -> None:
 
 def test_json_keys_and_units_match_contract() -> None:
     content = json.loads(result_of(view(0, 0.25)).to_json())
-    assert list(content) == ["protocol", "dataset", "submission", "software", "tables", "views"]
+    assert list(content) == ["protocol", "dataset", "submission", "software", "intervals", "tables", "views"]
+    assert content["intervals"] == {"method": "expanded-percentile", "draws": 2000, "level": 0.95}
     assert content["protocol"] == "rebar-2"
     assert content["dataset"] == {"digest": "sha256:11", "version": "1"}
     assert content["submission"] == {

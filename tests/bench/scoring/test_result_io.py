@@ -50,6 +50,14 @@ def test_keys_of_later_versions_are_ignored() -> None:
     assert json.loads(read_result(json.dumps(document).encode(), "x").to_json())["tables"]["lattice"] == expected
 
 
+def test_result_that_does_not_state_its_intervals_is_read_without_a_statement() -> None:
+    document = json.loads(SOUND)
+    del document["intervals"]
+    read = read_result(json.dumps(document).encode(), "x")
+    assert read.intervals is None
+    assert json.loads(read.to_json()) == document
+
+
 @pytest.mark.parametrize(
     ("content", "location"),
     [
