@@ -20,6 +20,33 @@ from rebar_depth_bench.limits import CELL_BYTES
 
 _TIFF_PREDICTOR, _FLOATING_POINT = 317, 3
 _TIFF_ROWS_PER_STRIP, _TIFF_TILE_WIDTH = 278, 322
+_COLOUR = (("WEBP", "PNG", "JPEG", "TIFF"), ("RGB", "RGBA", "P", "L"))
+_ACCEPTED: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "rgb": _COLOUR,
+    "preview": _COLOUR,
+    "depth": (("TIFF",), ("F",)),
+    "mask": (("PNG",), ("1", "L")),
+    "bars": (("PNG",), ("I;16", "I", "L")),
+}
+"""Formats and Pillow's modes of the images of each kind of column; a decoded picture has the first of the modes."""
+_DTYPES: Mapping[str, type[np.generic]] = {"mask": np.bool_, "bars": np.uint16}
+
+
+class Picture(Image.Image):
+    """Decoded image without a file, whose NumPy array is writable.
+
+    It has no ``format``, so that ``datasets`` stores a changed picture as PNG or TIFF, without loss.
+    """
+
+    def __init__(self, image: Image.Image) -> None:
+        super().__init__()
+        vars(self).update({name: vars(image)[name] for name in vars(self)})
+
+    @property
+    def __array_interface__(self) -> dict[str, Any]:
+        """Description of a copy of the pixels, for NumPy."""
+        interface: dict[str, Any] = super().__array_interface__
+        return interface | {"data": bytearray(interface["data"])}
 
 
 def encode_depth(depth_m: Float32[ndarray, "h w"]) -> bytes:
@@ -53,29 +80,41 @@ def encode_palette(indices: UInt8[ndarray, "h w"], palette: bytes) -> bytes:
 
 def decode_depth(content: bytes, grid: tuple[int, int]) -> Float32[ndarray, "h w"]:
     """Decode planar depth of ``grid`` (height, width): float32, metres, 0.0 where there is no surface."""
-    with _open_image(content, grid, ("TIFF",), ("F",)) as image:
-        depth_m = np.asarray(image, dtype=np.float32)
-    if not (depth_m.min() >= 0 and depth_m.max() < np.inf):
-        raise ValueError("it holds negative or non-finite values, expected depth from 0")
-    return depth_m
+    return np.asarray(open_picture("depth", content, grid))
 
 
 def decode_rgb(content: bytes, grid: tuple[int, int]) -> UInt8[ndarray, "h w 3"]:
     """Decode an 8-bit colour image of ``grid`` (height, width)."""
-    with _open_image(content, grid, ("WEBP", "PNG", "JPEG", "TIFF"), ("RGB", "RGBA", "P", "L")) as image:
-        return np.asarray(image.convert("RGB") if image.mode != "RGB" else image)
+    return np.asarray(open_picture("rgb", content, grid))
 
 
 def decode_mask(content: bytes, grid: tuple[int, int]) -> Bool[ndarray, "h w"]:
     """Decode a 1-bit mask of ``grid`` (height, width)."""
-    with _open_image(content, grid, ("PNG",), ("1", "L")) as image:
-        return np.asarray(image, dtype=bool)
+    return np.asarray(open_picture("mask", content, grid))
 
 
 def decode_bars(content: bytes, grid: tuple[int, int]) -> UInt16[ndarray, "h w"]:
     """Decode 16-bit bar ids of ``grid`` (height, width)."""
-    with _open_image(content, grid, ("PNG",), ("I;16", "I", "L")) as image:
-        return np.asarray(image, dtype=np.uint16)
+    return np.asarray(open_picture("bars", content, grid))
+
+
+def open_picture(kind: str, content: bytes, grid: tuple[int, int]) -> Picture:
+    """Decode the image of a column of ``kind`` and ``grid`` (height, width), in the mode of that kind.
+
+    Raises ``ValueError`` or an error of Pillow, which has no base class, for other content.
+    """
+    formats, modes = _ACCEPTED[kind]
+    with _open_image(content, grid, formats, modes) as file:
+        file.load()
+        image: Image.Image = file
+        if file.mode != modes[0]:
+            is_colour = modes[0] == "RGB"
+            image = file.convert("RGB") if is_colour else Image.fromarray(np.asarray(file, _DTYPES[kind]))
+    if kind == "depth":
+        depth_m = np.asarray(image)
+        if not (depth_m.min() >= 0 and depth_m.max() < np.inf):
+            raise ValueError("it holds negative or non-finite values, expected depth from 0")
+    return Picture(image)
 
 
 def _open_image(
