@@ -1,20 +1,22 @@
 """Loading of configs through ``datasets``: rows of NumPy arrays, or what its other formats make of the columns.
 
 A loaded dataset has the format ``numpy`` of ``datasets``. Its columns decode to pictures of Pillow and to lists, of
-which every format makes its arrays or tensors. Importing this module takes a second, since it imports ``datasets``.
+which every format makes its arrays or tensors. A streamed dataset has rows of arrays. Importing this module takes a second, since it imports ``datasets``.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, ClassVar, Literal, overload
 
 import numpy as np
-from datasets import Dataset, Features, Image, IterableDataset, List, NamedSplit, ReadInstruction, Value
+import pyarrow as pa
+from datasets import Dataset, Features, Image, IterableDataset, List, NamedSplit, ReadInstruction
 
 from rebar_depth_bench.data.codecs import Picture
 from rebar_depth_bench.data.columns import COLUMNS, column_kind, features, validated_columns
@@ -26,6 +28,14 @@ from rebar_depth_bench.data.shards import check_shards, damaged_error, iterate_s
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
 from rebar_depth_bench.view_ids import TEST_SPLIT
 
+IMAGE_DTYPES: Mapping[str, type[np.generic]] = {
+    "rgb": np.uint8,
+    "depth": np.float32,
+    "mask": np.bool_,
+    "bars": np.uint16,
+    "preview": np.uint8,
+}
+"""Types of the arrays of images by kind of column."""
 PICTURE_MODES = {"depth": "F", "preview": "RGB"}
 """Modes of ``datasets.Image`` by kind of column; the images of the other kinds are stored in their modes."""
 _CACHE_VERSION = 1
@@ -83,45 +93,40 @@ def load(
     others are not decoded. With ``streaming`` the result is an ``IterableDataset``, and nothing is copied to the
     cache of ``datasets``.
 
-    The result has the format ``numpy``. Image columns are ``datasets.Image``: ``with_format("torch")`` makes
-    tensors of them, ``with_format(None)`` and ``with_transform`` give pictures of Pillow and matrices as lists.
+    A ``Dataset`` has the format ``numpy``, and its image columns are ``datasets.Image``: ``with_format("torch")``
+    makes tensors of them, ``with_format(None)`` and ``with_transform`` give pictures of Pillow and matrices as lists.
 
     Raises ``DatasetError`` for a folder, config, split or column that does not exist, for a damaged shard, and for
     a cell that contradicts the manifest; the rows raise it for a damaged image. A streamed dataset raises it while
     it is read.
     """
-    located = open_folder(root).config(config).of_split(split.partition("[")[0])
-    part, selected = _part(located, split), validated_columns(columns)
+    whole = split.partition("[")[0] if split.endswith("]") else split
+    located = open_folder(root).config(config).of_split(whole)
+    part = None if split == whole else _part(located, split)
+    selected = validated_columns(columns)
     check_shards(located)
-    decoder = RowDecoder.of(located)
-    loaded: Dataset | IterableDataset
     if streaming:
-        loaded = IterableDataset.from_generator(
+        streamed = IterableDataset.from_generator(
             _encoded_rows,
-            features=_decoding_features(decoder, selected),
+            features=_decoding_features(located, selected, to_arrays=True),
             gen_kwargs={"config": located, "columns": selected, "shards": list(located.shards)},
-            split=NamedSplit(located.scenes[0].split),
+            split=NamedSplit(whole),
         )
-    else:
-        loaded = _cached(located).select_columns(list(selected))
-    loaded.info.features = _decoding_features(decoder, selected)
-    loaded = loaded.with_format("numpy")
-    if part is None:
-        return loaded
-    return loaded.skip(part.start).take(len(part)) if streaming else loaded.select(part)
+        return streamed if part is None else streamed.skip(part.start).take(len(part))
+    loaded = _cached(located, whole).select_columns(list(selected))
+    loaded.info.features = _decoding_features(located, selected)
+    formatted = loaded.with_format("numpy")
+    return formatted if part is None else formatted.select(part)
 
 
-def _part(config: DatasetConfig, split: str) -> range | None:
-    """Return the positions of a part of the split of ``config``, None for all of it."""
-    name = config.scenes[0].split
-    if split == name:
-        return None
+def _part(config: DatasetConfig, split: str) -> range:
+    """Return the positions of a part of the split of ``config``. Raises ``DatasetError`` if it is none."""
     try:
-        [part] = ReadInstruction.from_spec(split).to_absolute({name: len(config.views)})
+        [part] = ReadInstruction.from_spec(split).to_absolute({config.scenes[0].split: len(config.views)})
         return range(part.from_, part.to)
     except Exception as error:  # ``datasets`` asserts some properties of a part.
-        found = f"{config.root}: split {escape_text(split)} is no part of {name}: {error}"
-        raise DatasetError(f"{found}; expected one as {name}[:10] or {name}[50%:]") from None
+        found = f"{config.root}: {escape_text(split)} is no part of a split: {error}"
+        raise DatasetError(f"{found}; expected one as test[:10] or test[50%:]") from None
 
 
 def _encoded_rows(config: DatasetConfig, columns: Sequence[str], shards: Sequence[str]) -> Iterator[dict[str, Any]]:
@@ -131,20 +136,19 @@ def _encoded_rows(config: DatasetConfig, columns: Sequence[str], shards: Sequenc
         yield {name: encoded[name] for name in columns}
 
 
-def _cached(config: DatasetConfig) -> Dataset:
+def _cached(config: DatasetConfig, split: str) -> Dataset:
     """Return the rows of a config from the cache of ``datasets``, into which they are copied at the first call.
 
     The cache is mapped into memory. Its key covers the manifest's entry of the config, and place, size and time of
     the shards. ``datasets`` never reads the dataset's README.md, whose ``data_files`` could be any files.
     """
-    split = config.scenes[0].split
     files = [config.file(shard).absolute() for shard in config.shards]
     stamps = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     key = json.dumps([_CACHE_VERSION, config.root, split, stamps, config.manifest_entry], sort_keys=True)
     try:
         return Dataset.from_generator(
             _encoded_rows,
-            features=_decoding_features(RowDecoder.of(config), COLUMNS),
+            features=_decoding_features(config, COLUMNS),
             gen_kwargs={"config": config, "columns": COLUMNS, "shards": list(config.shards)},
             split=NamedSplit(split),
             fingerprint=hashlib.sha256(key.encode()).hexdigest()[:32],
@@ -157,17 +161,18 @@ def _cached(config: DatasetConfig) -> Dataset:
         raise damaged_error(config, error) from error
 
 
-def _decoding_features(decoder: RowDecoder, columns: Sequence[str]) -> Features:
-    """Return features that are stored as ``features`` with depth as an image, and decode with ``decoder``."""
-    small, by_name = replace(decoder, scene_by_view={}), features()
+def _decoding_features(config: DatasetConfig, columns: Sequence[str], *, to_arrays: bool = False) -> Features:
+    """Return features that are stored as ``features`` with depth as an image.
+
+    They decode to arrays, or to pictures and lists, of which the format ``numpy`` makes the same arrays.
+    """
+    decoder, by_name = replace(RowDecoder.of(config), scene_by_view={}), features()
     for name in columns:
-        if (kind := column_kind(name)) in PICTURE_KINDS:
-            by_name[name] = _Images(small, name)
-        elif kind in CAMERA_KINDS:
-            stored = by_name[name]
-            by_name[name] = _Matrices(stored.feature, stored.length)
-        elif kind == "baseline_m":
-            by_name[name] = _Numbers(by_name[name].dtype)
+        if column_kind(name) in PICTURE_KINDS:
+            by_name[name] = _Images(decoder, name, to_arrays)
+        elif column_kind(name) in CAMERA_KINDS:
+            by_name[name] = _Matrices(by_name[name].feature, by_name[name].length)
+            by_name[name].to_arrays = to_arrays
     return Features({name: by_name[name] for name in columns})
 
 
@@ -191,32 +196,43 @@ class _Images(_Stored, Image):  # type: ignore[misc]
     their content, and others, as from ``map``, as ``datasets.Image`` does.
     """
 
-    def __init__(self, decoder: RowDecoder, column: str) -> None:
+    def __init__(self, decoder: RowDecoder, column: str, to_arrays: bool) -> None:
         super().__init__(mode=PICTURE_MODES.get(column_kind(column)))
         self._decoder = decoder
         self._column = column
+        self._to_arrays = to_arrays
 
     def encode_example(self, value: Any) -> Any:
         """Return the stored cell of a picture, an array or a cell of ``RowDecoder.encoded``."""
         return value if self._is_of_shard(value) else super().encode_example(value)
 
     def decode_example(self, value: Any, token_per_repo_id: Any = None) -> Any:
-        """Return the picture in a cell. Raises ``DatasetError`` for a damaged image of the config's shards."""
+        """Return the image in a cell. Raises ``DatasetError`` for a damaged image of the config's shards."""
         if self._is_of_shard(value):
-            return self._decoder.picture(self._column, value["bytes"], value["path"])
-        picture = super().decode_example(value, token_per_repo_id)
-        return picture if isinstance(picture, Picture) else Picture(picture)
+            picture = self._decoder.picture(self._column, value["bytes"], value["path"])
+        else:
+            picture = Picture(super().decode_example(value, token_per_repo_id))
+        return np.asarray(picture) if self._to_arrays else picture
+
+    def cast_storage(self, storage: Any) -> Any:
+        """Return the stored cells of an Arrow array, as ``map`` makes it of the arrays of images."""
+        if pa.types.is_list(storage.type):
+            kind = column_kind(self._column)
+            cells = [self.encode_example(_image_array(cell.values, kind)) if cell.is_valid else None for cell in storage]
+            storage = pa.array(cells, type=self.pa_type)
+        return super().cast_storage(storage)
 
     def _is_of_shard(self, value: Any) -> bool:
         return isinstance(value, dict) and (value["path"] or "").startswith(self._decoder.place)
 
 
-class _Numbers(_Stored, Value):  # type: ignore[misc]
-    """Column of numbers, stored as ``datasets.Value``; the format ``numpy`` keeps its scalars."""
-
-    def decode_example(self, value: float, token_per_repo_id: Any = None) -> np.float64:
-        """Return the number in a cell."""
-        return np.float64(value)
+def _image_array(values: pa.Array, kind: str) -> np.ndarray[Any, Any]:
+    """Convert nested lists of an image's pixels to an array."""
+    shape = [len(values)]
+    while pa.types.is_list(values.type):
+        values = values.flatten()
+        shape.append(len(values) // math.prod(shape))
+    return values.to_numpy(zero_copy_only=False).reshape(shape).astype(IMAGE_DTYPES[kind])
 
 
 @dataclass(eq=False)
@@ -228,6 +244,7 @@ class _Matrices(_Stored):
 
     feature: Any
     length: int
+    to_arrays: ClassVar[bool] = False
     _type: str = field(default="List", init=False)
 
     def __call__(self) -> Any:
@@ -237,9 +254,9 @@ class _Matrices(_Stored):
         """Return the stored cell of a matrix."""
         return np.asarray(value).tolist()
 
-    def decode_example(self, value: Any, token_per_repo_id: Any = None) -> list[Any] | None:
-        """Return the matrix in a cell as lists of NumPy's scalars, None for an absent one."""
+    def decode_example(self, value: Any, token_per_repo_id: Any = None) -> Any:
+        """Return the matrix in a cell as an array or as lists of NumPy's scalars, None for an absent one."""
         matrix = np.array([*value], dtype=np.float64)
-        if is_absent(matrix.tolist()):
-            return None
+        if self.to_arrays or is_absent(matrix.tolist()):
+            return None if is_absent(matrix.tolist()) else matrix
         return [list(row) if matrix.ndim > 1 else row for row in matrix]

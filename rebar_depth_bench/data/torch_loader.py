@@ -12,7 +12,7 @@ from datasets import Dataset, Image, IterableDataset, Value
 from rebar_depth_bench.data.augmentation import Augmentation
 from rebar_depth_bench.data.columns import column_kind
 from rebar_depth_bench.data.eye_view import is_absent
-from rebar_depth_bench.data.loading import PICTURE_MODES
+from rebar_depth_bench.data.loading import IMAGE_DTYPES, PICTURE_MODES
 from rebar_depth_bench.errors import DatasetError, MethodError
 
 try:
@@ -31,12 +31,7 @@ _LEFT = {
     "K": "left_K",
     "poses": "left_cam_from_world",
 }
-_DTYPES: Mapping[str, type[np.generic]] = {
-    "rgb": np.uint8,
-    "depth": np.float32,
-    "mask": np.bool_,
-    **dict.fromkeys(("K", "cam_from_world", "baseline_m"), np.float64),
-}
+_DTYPES = {**IMAGE_DTYPES, **dict.fromkeys(("K", "cam_from_world", "baseline_m"), np.float64)}
 """Types of arrays by kind of column."""
 SHUFFLE_BUFFER = 32
 """Views of a streamed dataset among which the next one is drawn."""
