@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -20,16 +21,27 @@ from rebar_depth_bench.limits import CELL_BYTES
 
 _TIFF_PREDICTOR, _FLOATING_POINT = 317, 3
 _TIFF_ROWS_PER_STRIP, _TIFF_TILE_WIDTH = 278, 322
-_COLOUR = (("WEBP", "PNG", "JPEG", "TIFF"), ("RGB", "RGBA", "P", "L"))
-_ACCEPTED: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+
+
+@dataclass(frozen=True)
+class PictureKind:
+    """Images of a kind of column: accepted formats and modes of Pillow; mode and type to which they decode."""
+
+    formats: tuple[str, ...]
+    modes: tuple[str, ...]
+    mode: str
+    dtype: type[np.generic]
+
+
+_COLOUR = PictureKind(("WEBP", "PNG", "JPEG", "TIFF"), ("RGB", "RGBA", "P", "L"), "RGB", np.uint8)
+PICTURE_KINDS: Mapping[str, PictureKind] = {
     "rgb": _COLOUR,
     "preview": _COLOUR,
-    "depth": (("TIFF",), ("F",)),
-    "mask": (("PNG",), ("1", "L")),
-    "bars": (("PNG",), ("I;16", "I", "L")),
+    "depth": PictureKind(("TIFF",), ("F",), "F", np.float32),
+    "mask": PictureKind(("PNG",), ("1", "L"), "1", np.bool_),
+    "bars": PictureKind(("PNG",), ("I;16", "I", "L"), "I;16", np.uint16),
 }
-"""Formats and Pillow's modes of the images of each kind of column; a decoded picture has the first of the modes."""
-_DTYPES: Mapping[str, type[np.generic]] = {"mask": np.bool_, "bars": np.uint16}
+"""Images by the kind of their column (see ``columns.column_kind``)."""
 
 
 class Picture(Image.Image):
@@ -78,24 +90,13 @@ def encode_palette(indices: UInt8[ndarray, "h w"], palette: bytes) -> bytes:
     return _encode_image(image, "PNG")
 
 
-def decode_depth(content: bytes, grid: tuple[int, int]) -> Float32[ndarray, "h w"]:
-    """Decode planar depth of ``grid`` (height, width): float32, metres, 0.0 where there is no surface."""
-    return np.asarray(open_picture("depth", content, grid))
+def decode(kind: str, content: bytes, grid: tuple[int, int]) -> ndarray[Any, Any]:
+    """Decode the image of a column of ``kind`` and ``grid`` (height, width) to a writable array.
 
-
-def decode_rgb(content: bytes, grid: tuple[int, int]) -> UInt8[ndarray, "h w 3"]:
-    """Decode an 8-bit colour image of ``grid`` (height, width)."""
-    return np.asarray(open_picture("rgb", content, grid))
-
-
-def decode_mask(content: bytes, grid: tuple[int, int]) -> Bool[ndarray, "h w"]:
-    """Decode a 1-bit mask of ``grid`` (height, width)."""
-    return np.asarray(open_picture("mask", content, grid))
-
-
-def decode_bars(content: bytes, grid: tuple[int, int]) -> UInt16[ndarray, "h w"]:
-    """Decode 16-bit bar ids of ``grid`` (height, width)."""
-    return np.asarray(open_picture("bars", content, grid))
+    It is uint8 H x W x 3 for colour and previews, float32 H x W for depth (metres, 0.0 where there is no surface),
+    bool H x W for masks and uint16 H x W for bar ids. Raises as ``open_picture``.
+    """
+    return np.asarray(open_picture(kind, content, grid))
 
 
 def open_picture(kind: str, content: bytes, grid: tuple[int, int]) -> Picture:
@@ -103,13 +104,13 @@ def open_picture(kind: str, content: bytes, grid: tuple[int, int]) -> Picture:
 
     Raises ``ValueError`` or an error of Pillow, which has no base class, for other content.
     """
-    formats, modes = _ACCEPTED[kind]
-    with _open_image(content, grid, formats, modes) as file:
+    expected = PICTURE_KINDS[kind]
+    with _open_image(content, grid, expected.formats, expected.modes) as file:
         file.load()
         image: Image.Image = file
-        if file.mode != modes[0]:
-            is_colour = modes[0] == "RGB"
-            image = file.convert("RGB") if is_colour else Image.fromarray(np.asarray(file, _DTYPES[kind]))
+        if file.mode != expected.mode:
+            is_colour = expected.mode == "RGB"
+            image = file.convert("RGB") if is_colour else Image.fromarray(np.asarray(file, expected.dtype))
     if kind == "depth":
         depth_m = np.asarray(image)
         if not (depth_m.min() >= 0 and depth_m.max() < np.inf):

@@ -8,17 +8,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Self
 
-import numpy as np
-
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.columns import column_kind
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS, camera_array, is_absent
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.validation import short_repr
-
-PICTURE_KINDS = ("rgb", "depth", "mask", "bars", "preview")
-"""Kinds of columns whose cells are encoded images."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +59,7 @@ class RowDecoder:
 
     def _encoded(self, column: str, cell: Any, view: str) -> Any:
         kind = column_kind(column)
-        if kind not in PICTURE_KINDS or column in self.absent_columns:
+        if kind not in codecs.PICTURE_KINDS or column in self.absent_columns:
             self._decode(column, cell, view)
             return cell
         with self._naming(view, column):
@@ -90,8 +85,8 @@ class RowDecoder:
             ) from error
 
     def _decode_kind(self, kind: str, cell: Any, view: str) -> Any:
-        if kind in PICTURE_KINDS:
-            return np.asarray(codecs.open_picture(kind, _content(kind, cell), self.grid))
+        if kind in codecs.PICTURE_KINDS:
+            return codecs.decode(kind, _content(kind, cell), self.grid)
         if kind in CAMERA_KINDS:
             return camera_array(kind, cell)
         if kind == "view_id" and cell not in self.scene_by_view:

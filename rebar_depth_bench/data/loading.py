@@ -1,7 +1,8 @@
-"""Loading of configs through ``datasets``: rows of NumPy arrays, or what its other formats make of the columns.
+"""Loading of configs through ``datasets``: rows of NumPy arrays, or what other formats make of the columns.
 
-A loaded dataset has the format ``numpy`` of ``datasets``. Its columns decode to pictures of Pillow and to lists, of
-which every format makes its arrays or tensors. A streamed dataset has rows of arrays. Importing this module takes a second, since it imports ``datasets``.
+A loaded dataset has the format ``numpy`` of ``datasets``: its columns decode to pictures of Pillow and to lists, of
+which every format makes its arrays or tensors. Those of a streamed dataset, which loses the types of its columns in
+``map``, decode to arrays. Importing this module takes a second, since it imports ``datasets``.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, overload
@@ -18,25 +19,17 @@ import numpy as np
 import pyarrow as pa
 from datasets import Dataset, Features, Image, IterableDataset, List, NamedSplit, ReadInstruction
 
-from rebar_depth_bench.data.codecs import Picture
+from rebar_depth_bench.data.codecs import PICTURE_KINDS, Picture
 from rebar_depth_bench.data.columns import COLUMNS, column_kind, features, validated_columns
 from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.decoding import PICTURE_KINDS, RowDecoder
+from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS, is_absent
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.shards import check_shards, damaged_error, iterate_shards
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
 from rebar_depth_bench.view_ids import TEST_SPLIT
 
-IMAGE_DTYPES: Mapping[str, type[np.generic]] = {
-    "rgb": np.uint8,
-    "depth": np.float32,
-    "mask": np.bool_,
-    "bars": np.uint16,
-    "preview": np.uint8,
-}
-"""Types of the arrays of images by kind of column."""
-PICTURE_MODES = {"depth": "F", "preview": "RGB"}
+STORED_MODES = {"depth": "F", "preview": "RGB"}
 """Modes of ``datasets.Image`` by kind of column; the images of the other kinds are stored in their modes."""
 _CACHE_VERSION = 1
 _ROWS_IN_MEMORY = 8
@@ -93,8 +86,8 @@ def load(
     others are not decoded. With ``streaming`` the result is an ``IterableDataset``, and nothing is copied to the
     cache of ``datasets``.
 
-    A ``Dataset`` has the format ``numpy``, and its image columns are ``datasets.Image``: ``with_format("torch")``
-    makes tensors of them, ``with_format(None)`` and ``with_transform`` give pictures of Pillow and matrices as lists.
+    Image columns are ``datasets.Image``. A ``Dataset`` has the format ``numpy``: ``with_format("torch")`` makes
+    tensors, ``with_format(None)`` and ``with_transform`` give pictures of Pillow, and matrices as lists.
 
     Raises ``DatasetError`` for a folder, config, split or column that does not exist, for a damaged shard, and for
     a cell that contradicts the manifest; the rows raise it for a damaged image. A streamed dataset raises it while
@@ -129,7 +122,9 @@ def _part(config: DatasetConfig, split: str) -> range:
         raise DatasetError(f"{found}; expected one as test[:10] or test[50%:]") from None
 
 
-def _encoded_rows(config: DatasetConfig, columns: Sequence[str], shards: Sequence[str]) -> Iterator[dict[str, Any]]:
+def _encoded_rows(
+    config: DatasetConfig, columns: Sequence[str], shards: Sequence[str]
+) -> Iterator[dict[str, Any]]:
     decoder = RowDecoder.of(config)
     for row in iterate_shards(config, ("view_id", *columns), shards):
         encoded = decoder.encoded(row)
@@ -155,10 +150,9 @@ def _cached(config: DatasetConfig, split: str) -> Dataset:
             config_name=config.name,
             writer_batch_size=_ROWS_IN_MEMORY,
         )
-    except Exception as error:  # ``datasets`` raises many types, which depend on the damage.
-        if isinstance(error.__cause__, InputError):
-            raise error.__cause__ from None
-        raise damaged_error(config, error) from error
+    except Exception as error:  # ``datasets`` wraps what reading a shard raises.
+        cause = error.__cause__ if isinstance(error.__cause__, Exception) else error
+        raise cause if isinstance(cause, InputError) else damaged_error(config, cause) from error
 
 
 def _decoding_features(config: DatasetConfig, columns: Sequence[str], *, to_arrays: bool = False) -> Features:
@@ -197,7 +191,7 @@ class _Images(_Stored, Image):  # type: ignore[misc]
     """
 
     def __init__(self, decoder: RowDecoder, column: str, to_arrays: bool) -> None:
-        super().__init__(mode=PICTURE_MODES.get(column_kind(column)))
+        super().__init__(mode=STORED_MODES.get(column_kind(column)))
         self._decoder = decoder
         self._column = column
         self._to_arrays = to_arrays
@@ -218,7 +212,9 @@ class _Images(_Stored, Image):  # type: ignore[misc]
         """Return the stored cells of an Arrow array, as ``map`` makes it of the arrays of images."""
         if pa.types.is_list(storage.type):
             kind = column_kind(self._column)
-            cells = [self.encode_example(_image_array(cell.values, kind)) if cell.is_valid else None for cell in storage]
+            cells = [
+                self.encode_example(_image_array(cell.values, kind)) if cell.is_valid else None for cell in storage
+            ]
             storage = pa.array(cells, type=self.pa_type)
         return super().cast_storage(storage)
 
@@ -232,7 +228,7 @@ def _image_array(values: pa.Array, kind: str) -> np.ndarray[Any, Any]:
     while pa.types.is_list(values.type):
         values = values.flatten()
         shape.append(len(values) // math.prod(shape))
-    return values.to_numpy(zero_copy_only=False).reshape(shape).astype(IMAGE_DTYPES[kind])
+    return np.asarray(values.to_numpy(zero_copy_only=False).reshape(shape), dtype=PICTURE_KINDS[kind].dtype)
 
 
 @dataclass(eq=False)
@@ -254,9 +250,9 @@ class _Matrices(_Stored):
         """Return the stored cell of a matrix."""
         return np.asarray(value).tolist()
 
-    def decode_example(self, value: Any, token_per_repo_id: Any = None) -> Any:
+    def decode_example(self, value: Any, **_: Any) -> Any:
         """Return the matrix in a cell as an array or as lists of NumPy's scalars, None for an absent one."""
         matrix = np.array([*value], dtype=np.float64)
-        if self.to_arrays or is_absent(matrix.tolist()):
-            return None if is_absent(matrix.tolist()) else matrix
-        return [list(row) if matrix.ndim > 1 else row for row in matrix]
+        if is_absent(matrix.tolist()):
+            return None
+        return matrix if self.to_arrays else [list(row) if matrix.ndim > 1 else row for row in matrix]

@@ -10,9 +10,10 @@ import PIL.Image
 from datasets import Dataset, Image, IterableDataset, Value
 
 from rebar_depth_bench.data.augmentation import Augmentation
+from rebar_depth_bench.data.codecs import PICTURE_KINDS
 from rebar_depth_bench.data.columns import column_kind
 from rebar_depth_bench.data.eye_view import is_absent
-from rebar_depth_bench.data.loading import IMAGE_DTYPES, PICTURE_MODES
+from rebar_depth_bench.data.loading import STORED_MODES
 from rebar_depth_bench.errors import DatasetError, MethodError
 
 try:
@@ -31,8 +32,7 @@ _LEFT = {
     "K": "left_K",
     "poses": "left_cam_from_world",
 }
-_DTYPES = {**IMAGE_DTYPES, **dict.fromkeys(("K", "cam_from_world", "baseline_m"), np.float64)}
-"""Types of arrays by kind of column."""
+_NUMBER_KINDS = ("K", "cam_from_world", "baseline_m")
 SHUFFLE_BUFFER = 32
 """Views of a streamed dataset among which the next one is drawn."""
 _RIGHT = {f"right_{key}": column.replace("left", "right") for key, column in _LEFT.items()}
@@ -90,7 +90,7 @@ def _pictured(ds: Dataset | IterableDataset, columns: Sequence[str]) -> Dataset 
     rows = ds.select_columns(list(columns))
     for name in columns:
         if rows.features is not None and rows.features[name] == Value("binary"):
-            rows = rows.cast_column(name, Image(mode=PICTURE_MODES[column_kind(name)]))
+            rows = rows.cast_column(name, Image(mode=STORED_MODES[column_kind(name)]))
     has_transform = isinstance(rows, Dataset) and rows.format["type"] == "custom"
     return rows if has_transform else rows.with_format(None)
 
@@ -142,10 +142,14 @@ class _Collate:
 
 def _array(kind: str, cell: Any) -> Any:
     """Convert a cell with an image, a matrix or a number to an array, None for an absent one, and keep others."""
-    if kind not in _DTYPES or is_absent(cell):
-        return cell if kind not in _DTYPES else None
+    if is_absent(cell):
+        return None
+    if kind in _NUMBER_KINDS:
+        return np.asarray(cell, dtype=np.float64)
+    if kind not in PICTURE_KINDS:
+        return cell
     is_colour = kind == "rgb" and isinstance(cell, PIL.Image.Image)
-    return np.asarray(cell.convert("RGB") if is_colour else cell, dtype=_DTYPES[kind])
+    return np.asarray(cell.convert("RGB") if is_colour else cell, dtype=PICTURE_KINDS[kind].dtype)
 
 
 def _tensor(key: str, stacked: np.ndarray[Any, Any]) -> torch.Tensor:
