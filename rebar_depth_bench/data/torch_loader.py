@@ -12,8 +12,8 @@ from datasets import Dataset, Image, IterableDataset, Value
 from rebar_depth_bench.data.augmentation import Augmentation
 from rebar_depth_bench.data.codecs import PICTURE_KINDS
 from rebar_depth_bench.data.columns import column_kind
+from rebar_depth_bench.data.decoding_features import STORED_MODES
 from rebar_depth_bench.data.eye_view import is_absent
-from rebar_depth_bench.data.loading import STORED_MODES
 from rebar_depth_bench.errors import DatasetError, MethodError
 
 try:
