@@ -38,8 +38,8 @@ def decoding_features(config: DatasetConfig, columns: Sequence[str], *, to_array
         elif column_kind(name) in CAMERA_KINDS:
             by_name[name] = _Matrices(by_name[name].feature, by_name[name].length)
             by_name[name].to_arrays = to_arrays
-        elif name == "baseline_m":
-            by_name[name] = _Numbers(by_name[name].dtype)
+        else:
+            by_name[name] = _Scalars(by_name[name].dtype)
     return Features({name: by_name[name] for name in columns})
 
 
@@ -104,11 +104,13 @@ def _image_array(values: pa.Array, kind: str) -> np.ndarray[Any, Any]:
     return np.asarray(values.to_numpy(zero_copy_only=False).reshape(shape), dtype=PICTURE_KINDS[kind].dtype)
 
 
-class _Numbers(_Stored, Value):  # type: ignore[misc]
-    """Column of numbers, stored as ``datasets.Value``."""
+class _Scalars(_Stored, Value):  # type: ignore[misc]
+    """Column of texts or numbers, stored as ``datasets.Value``."""
 
-    def decode_example(self, value: float, **_: Any) -> np.float64 | None:
-        """Return the number in a cell, None for an absent one, which the format ``numpy`` reads as NaN."""
+    def decode_example(self, value: Any, **_: Any) -> Any:
+        """Return the text or number in a cell, None for an absent number, which ``datasets`` may read as NaN."""
+        if self.dtype == "string":
+            return str(value)
         return None if np.isnan(value) else np.float64(value)
 
 

@@ -132,7 +132,7 @@ def test_flip_of_a_pair_that_lacks_an_eye_is_refused(tiny_root: Path) -> None:
 
 @pytest.mark.parametrize("streaming", [False, True])
 def test_plain_and_saved_datasets_give_the_same_batches(tiny_root: Path, tmp_path: Path, streaming: bool) -> None:
-    options = {"stereo": True, "crop": CROP, "flip": True, "seed": 3}
+    options: dict[str, Any] = {"stereo": True, "crop": CROP, "flip": True, "seed": 3}
     expected = batches(tiny_root, **options)
     sources = [datasets.load_dataset(str(tiny_root), "lattice", split="test", streaming=streaming)]
     if not streaming:

@@ -162,7 +162,7 @@ def test_arrays_of_rows_are_exact_and_writable(
     tiny_root: Path, truth: dict[str, dict[str, Any]], streaming: bool
 ) -> None:
     for row in rdb.load(tiny_root, CONFIG, streaming=streaming, columns=COLUMNS):
-        assert isinstance(row["view_id"], str)
+        assert type(row["view_id"]) is str
         assert isinstance(row["baseline_m"], float)
         for name, expected in truth[row["view_id"]].items():
             assert np.array_equal(row[name], expected), name
