@@ -16,11 +16,10 @@ from itertools import product
 from os import times
 from typing import Any
 
-import datasets
-
 import rebar_depth_bench as rdb
 from benchmarks.timing import machine_description, median_seconds, print_markdown
-from rebar_depth_bench.data.columns import features
+from rebar_depth_bench.data.columns import COLUMNS
+from rebar_depth_bench.data.dataset import iterate_undecoded
 from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.view_ids import TEST_SPLIT
@@ -39,9 +38,9 @@ def main(root: str, config: str = "lattice", split: str = TEST_SPLIT) -> None:
 
 
 def print_overhead(root: str, config: str, split: str) -> None:
-    undecoded = features(decode_images=False)
-    raw: list[dict[str, Any]] = list(datasets.load_dataset(root, config, split=split).cast(undecoded))
-    decoder = RowDecoder.of(open_folder(root).config(config).of_split(split))
+    located = open_folder(root).config(config).of_split(split)
+    raw = list(iterate_undecoded(located, COLUMNS))
+    decoder = RowDecoder.of(located)
     loaded = rdb.load(root, config, split=split)
     loader = rdb.torch_loader(loaded, batch_size=1)
     raw_left = [{name: row[name] for name in LEFT} for row in raw]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rebar_depth_bench.bar_crossings.table import crossings
     from rebar_depth_bench.data.bars import bars
-    from rebar_depth_bench.data.dataset import load
+    from rebar_depth_bench.data.loading import load
     from rebar_depth_bench.data.torch_loader import torch_loader
     from rebar_depth_bench.errors import (
         CalibrationError,
@@ -46,7 +46,7 @@ __all__ = [
 _MODULE_BY_NAME = {
     "bars": "data.bars",
     "crossings": "bar_crossings.table",
-    "load": "data.dataset",
+    "load": "data.loading",
     "score": "scoring.score",
     "torch_loader": "data.torch_loader",
     "SubmissionWriter": "submission",

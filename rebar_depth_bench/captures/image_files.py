@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.captures.image_header import read_image_shape
-from rebar_depth_bench.data.codecs import decode_rgb
+from rebar_depth_bench.data.codecs import decode
 from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.limits import CELL_BYTES
 from rebar_depth_bench.reading import read_file
@@ -29,7 +29,7 @@ def read_image(path: Path, grid: tuple[int, int]) -> UInt8[ndarray, "h w 3"]:
     """
     content = read_file(path, CELL_BYTES, "an image", InputError)
     try:
-        return decode_rgb(content, grid)
+        return decode("rgb", content, grid)
     except Exception as error:  # Pillow raises many types, which depend on the damage.
         reason = escape_text(str(error) or type(error).__name__)
         raise InputError(f"{path}: cannot be decoded: {reason}, expected an 8-bit PNG or JPEG image") from error

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -20,6 +21,44 @@ from rebar_depth_bench.limits import CELL_BYTES
 
 _TIFF_PREDICTOR, _FLOATING_POINT = 317, 3
 _TIFF_ROWS_PER_STRIP, _TIFF_TILE_WIDTH = 278, 322
+
+
+@dataclass(frozen=True)
+class PictureKind:
+    """Images of a kind of column: accepted formats and modes of Pillow; mode and type to which they decode."""
+
+    formats: tuple[str, ...]
+    modes: tuple[str, ...]
+    mode: str
+    dtype: type[np.generic]
+
+
+_COLOUR = PictureKind(("WEBP", "PNG", "JPEG", "TIFF"), ("RGB", "RGBA", "P", "L"), "RGB", np.uint8)
+PICTURE_KINDS: Mapping[str, PictureKind] = {
+    "rgb": _COLOUR,
+    "preview": _COLOUR,
+    "depth": PictureKind(("TIFF",), ("F",), "F", np.float32),
+    "mask": PictureKind(("PNG",), ("1", "L"), "1", np.bool_),
+    "bars": PictureKind(("PNG",), ("I;16", "I", "L"), "I;16", np.uint16),
+}
+"""Images by the kind of their column (see ``columns.column_kind``)."""
+
+
+class Picture(Image.Image):
+    """Decoded image without a file, whose NumPy array is writable.
+
+    It has no ``format``, so that ``datasets`` stores a changed picture as PNG or TIFF, without loss.
+    """
+
+    def __init__(self, image: Image.Image) -> None:
+        super().__init__()
+        vars(self).update({name: vars(image)[name] for name in vars(self)})
+
+    @property
+    def __array_interface__(self) -> dict[str, Any]:
+        """Description of a copy of the pixels, for NumPy."""
+        interface: dict[str, Any] = super().__array_interface__
+        return interface | {"data": bytearray(interface["data"])}
 
 
 def encode_depth(depth_m: Float32[ndarray, "h w"]) -> bytes:
@@ -51,31 +90,32 @@ def encode_palette(indices: UInt8[ndarray, "h w"], palette: bytes) -> bytes:
     return _encode_image(image, "PNG")
 
 
-def decode_depth(content: bytes, grid: tuple[int, int]) -> Float32[ndarray, "h w"]:
-    """Decode planar depth of ``grid`` (height, width): float32, metres, 0.0 where there is no surface."""
-    with _open_image(content, grid, ("TIFF",), ("F",)) as image:
-        depth_m = np.asarray(image, dtype=np.float32)
-    if not (depth_m.min() >= 0 and depth_m.max() < np.inf):
-        raise ValueError("it holds negative or non-finite values, expected depth from 0")
-    return depth_m
+def decode(kind: str, content: bytes, grid: tuple[int, int]) -> ndarray[Any, Any]:
+    """Decode the image of a column of ``kind`` and ``grid`` (height, width) to a writable array.
+
+    It is uint8 H x W x 3 for colour and previews, float32 H x W for depth (metres, 0.0 where there is no surface),
+    bool H x W for masks and uint16 H x W for bar ids. Raises as ``open_picture``.
+    """
+    return np.asarray(open_picture(kind, content, grid))
 
 
-def decode_rgb(content: bytes, grid: tuple[int, int]) -> UInt8[ndarray, "h w 3"]:
-    """Decode an 8-bit colour image of ``grid`` (height, width)."""
-    with _open_image(content, grid, ("WEBP", "PNG", "JPEG", "TIFF"), ("RGB", "RGBA", "P", "L")) as image:
-        return np.asarray(image.convert("RGB") if image.mode != "RGB" else image)
+def open_picture(kind: str, content: bytes, grid: tuple[int, int]) -> Picture:
+    """Decode the image of a column of ``kind`` and ``grid`` (height, width), in the mode of that kind.
 
-
-def decode_mask(content: bytes, grid: tuple[int, int]) -> Bool[ndarray, "h w"]:
-    """Decode a 1-bit mask of ``grid`` (height, width)."""
-    with _open_image(content, grid, ("PNG",), ("1", "L")) as image:
-        return np.asarray(image, dtype=bool)
-
-
-def decode_bars(content: bytes, grid: tuple[int, int]) -> UInt16[ndarray, "h w"]:
-    """Decode 16-bit bar ids of ``grid`` (height, width)."""
-    with _open_image(content, grid, ("PNG",), ("I;16", "I", "L")) as image:
-        return np.asarray(image, dtype=np.uint16)
+    Raises ``ValueError`` or an error of Pillow, which has no base class, for other content.
+    """
+    expected = PICTURE_KINDS[kind]
+    with _open_image(content, grid, expected.formats, expected.modes) as file:
+        file.load()
+        image: Image.Image = file
+        if file.mode != expected.mode:
+            is_colour = expected.mode == "RGB"
+            image = file.convert("RGB") if is_colour else Image.fromarray(np.asarray(file, expected.dtype))
+    if kind == "depth":
+        depth_m = np.asarray(image)
+        if not (depth_m.min() >= 0 and depth_m.max() < np.inf):
+            raise ValueError("it holds negative or non-finite values, expected depth from 0")
+    return Picture(image)
 
 
 def _open_image(

@@ -29,14 +29,11 @@ OPTIONAL_COLUMNS = (
 """Columns that may be null in every row of a config that was imported; K, distortion and pose are NaN then."""
 
 
-def features(*, decode_images: bool = True) -> Features:
-    """Return the ``datasets`` features of a row, in column order.
-
-    With ``decode_images=False`` image columns are left as encoded bytes.
-    """
+def features() -> Features:
+    """Return the ``datasets`` features of the shards' rows, in column order."""
     from datasets import Features, Image, List, Value  # Takes a second to import, which scoring does not need.
 
-    image, number = Image(decode=decode_images), Value("float64")
+    image, number = Image(), Value("float64")
     by_kind = {
         **dict.fromkeys(("view_id", "scene"), Value("string")),
         **dict.fromkeys(("rgb", "mask", "bars", "preview"), image),

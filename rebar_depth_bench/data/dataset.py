@@ -1,132 +1,21 @@
-"""Dataset rows: loading through ``datasets``, and iteration without it.
+"""Dataset rows: iteration over decoded rows without ``datasets``, which takes a second to import.
 
-``load`` returns a config as a ``datasets`` object whose rows decode to NumPy arrays; ``ConfigViews`` gives access
-to all views of a config for methods that need more than one view at a time. ``datasets`` takes a second to import,
-which commands that read only cached ground truth do not need, so functions import it on use.
+``ConfigViews`` gives access to all views of a config for methods that need more than one view at a time.
 """
 
 from __future__ import annotations
 
-import glob
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import Any
 
-from rebar_depth_bench.data.columns import COLUMNS, features, validated_columns
+from rebar_depth_bench.data.columns import validated_columns
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.decoding import RowDecoder
-from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.shards import (
-    SCENE_COLUMN,
-    all_rows,
-    check_shards,
-    damaged_error,
-    iterate_shards,
-    lacks_scene_column,
-)
+from rebar_depth_bench.data.shards import all_rows
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.view_ids import TEST_SPLIT
-
-if TYPE_CHECKING:
-    from datasets import Dataset, IterableDataset
-
-
-@overload
-def load(
-    root: str | Path,
-    config: str,
-    *,
-    split: str = TEST_SPLIT,
-    streaming: Literal[False] = False,
-    columns: Sequence[str] | None = None,
-) -> Dataset: ...
-
-
-@overload
-def load(
-    root: str | Path,
-    config: str,
-    *,
-    split: str = TEST_SPLIT,
-    streaming: Literal[True],
-    columns: Sequence[str] | None = None,
-) -> IterableDataset: ...
-
-
-@overload
-def load(
-    root: str | Path,
-    config: str,
-    *,
-    split: str = TEST_SPLIT,
-    streaming: bool,
-    columns: Sequence[str] | None = None,
-) -> Dataset | IterableDataset: ...
-
-
-def load(
-    root: str | Path,
-    config: str,
-    *,
-    split: str = TEST_SPLIT,
-    streaming: bool = False,
-    columns: Sequence[str] | None = None,
-) -> Dataset | IterableDataset:
-    """Load one split of a config of a dataset folder or Hub repository, by default ``test``.
-
-    Rows are dicts of decoded columns: colour uint8 H x W x 3, depth float32 H x W (planar, metres, 0 where no
-    surface), masks bool H x W, bar ids uint16 H x W, K float64 3 x 3 in pixels, distortion float64 5, poses
-    float64 4 x 4; None for colour of a config that was built without, and for what a config was imported without.
-    ``columns`` selects columns; the others are not decoded. With ``streaming`` the result is an
-    ``IterableDataset``, and nothing is copied to the cache of ``datasets``.
-
-    Raises ``DatasetError`` for a folder, config, split or column that does not exist, and for a damaged shard; the
-    rows raise it for a damaged cell.
-    """
-    located = open_folder(root).config(config).of_split(split)
-    decoder, undecoded = RowDecoder.of(located), load_undecoded(located, streaming=streaming, columns=columns)
-    return undecoded.map(decoder.row) if streaming else undecoded.with_transform(decoder.batch)
-
-
-def load_undecoded(
-    config: DatasetConfig, *, streaming: bool, columns: Sequence[str] | None
-) -> Dataset | IterableDataset:
-    """Load scenes of one split with image and depth cells left as bytes, to be decoded by ``RowDecoder``.
-
-    ``datasets`` receives the shards of the manifest: it never reads the dataset's README.md, whose ``data_files``
-    could be any files. Raises ``DatasetError`` as ``load`` does.
-    """
-    import datasets
-
-    selected, split = validated_columns(columns), config.scenes[0].split
-    undecoded = features(decode_images=False)
-    check_shards(config)
-    if streaming:
-        return datasets.IterableDataset.from_generator(
-            iterate_shards,
-            features=datasets.Features({name: undecoded[name] for name in selected}),
-            gen_kwargs={"config": config, "columns": selected, "shards": list(config.shards)},
-            split=datasets.NamedSplit(split),
-        )
-    paths = [glob.escape(str(config.file(shard).absolute())) for shard in config.shards]
-    is_old = lacks_scene_column(config)
-    present = [name for name in COLUMNS if not is_old or name != SCENE_COLUMN]
-    try:
-        loaded = datasets.load_dataset(
-            "parquet",
-            config.name,
-            data_files={split: paths},
-            columns=present,
-            features=datasets.Features({name: undecoded[name] for name in present}),
-            split=split,
-        )
-        if is_old:
-            loaded = loaded.add_column(SCENE_COLUMN, [config.scene.name] * len(loaded))
-    except Exception as error:  # ``datasets`` raises many types, which depend on the damage.
-        raise damaged_error(config, error) from error
-    return loaded.select_columns(list(selected))
 
 
 def iterate_rows(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str, Any]]:

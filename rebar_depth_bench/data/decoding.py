@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -13,13 +14,6 @@ from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS, camera_array, is_absent
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.validation import short_repr
-
-_IMAGE_DECODERS: Mapping[str, Callable[[bytes, tuple[int, int]], Any]] = {
-    "rgb": codecs.decode_rgb,
-    "mask": codecs.decode_mask,
-    "bars": codecs.decode_bars,
-    "preview": codecs.decode_rgb,
-}
 
 
 @dataclass(frozen=True)
@@ -46,18 +40,43 @@ class RowDecoder:
         view = str(row.get("view_id", f"a view of {self.config}"))
         return {name: self._decode(name, cell, view) for name, cell in row.items()}
 
-    def batch(self, batch: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
-        """Decode a dict of columns, the format that ``datasets`` passes to a transform, as ``row`` does."""
-        rows = [self.row(dict(zip(batch, cells, strict=True))) for cells in zip(*batch.values(), strict=True)]
-        return {name: [row[name] for row in rows] for name in batch}
+    def encoded(self, row: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a row for ``datasets``, whose images stay encoded and have the path that ``picture`` expects.
+
+        All other cells are checked. Raises ``DatasetError`` as ``row``.
+        """
+        return {name: self._encoded(name, cell, str(row["view_id"])) for name, cell in row.items()}
+
+    def picture(self, column: str, content: bytes, path: str) -> codecs.Picture:
+        """Decode the image in a cell of ``encoded``. Raises ``DatasetError`` as ``row``."""
+        with self._naming(path.removeprefix(self.place), column):
+            return codecs.open_picture(column_kind(column), content, self.grid)
+
+    @property
+    def place(self) -> str:
+        """Start of the paths of images, before the id of the view."""
+        return f"{self.root}/"
+
+    def _encoded(self, column: str, cell: Any, view: str) -> Any:
+        kind = column_kind(column)
+        if kind not in codecs.PICTURE_KINDS or column in self.absent_columns:
+            self._decode(column, cell, view)
+            return cell
+        with self._naming(view, column):
+            return {"bytes": _content(kind, cell), "path": self.place + view}
 
     def _decode(self, column: str, cell: Any, view: str) -> Any:
-        try:
+        with self._naming(view, column):
             if column in self.absent_columns:
                 if not is_absent(cell):
                     raise ValueError("it has a value, expected null as in the manifest")
                 return None
             return self._decode_kind(column_kind(column), cell, view)
+
+    @contextmanager
+    def _naming(self, view: str, column: str) -> Iterator[None]:
+        try:
+            yield
         except Exception as error:  # Pillow raises many types, which depend on the damage.
             reason = escape_text(str(error) or type(error).__name__)
             raise DatasetError(
@@ -66,10 +85,8 @@ class RowDecoder:
             ) from error
 
     def _decode_kind(self, kind: str, cell: Any, view: str) -> Any:
-        if kind in _IMAGE_DECODERS:
-            return _IMAGE_DECODERS[kind](cell["bytes"], self.grid)
-        if kind == "depth":
-            return codecs.decode_depth(cell, self.grid)
+        if kind in codecs.PICTURE_KINDS:
+            return codecs.decode(kind, _content(kind, cell), self.grid)
         if kind in CAMERA_KINDS:
             return camera_array(kind, cell)
         if kind == "view_id" and cell not in self.scene_by_view:
@@ -79,3 +96,11 @@ class RowDecoder:
         if kind == "baseline_m" and not (isinstance(cell, float) and math.isfinite(cell)):
             raise ValueError(f"got {cell}, expected a length in metres")
         return cell
+
+
+def _content(kind: str, cell: Any) -> bytes:
+    """Return the encoded image in a cell of a shard. Raises an error of any type for another cell."""
+    content = cell if kind == "depth" else cell["bytes"]
+    if not isinstance(content, bytes):
+        raise ValueError("the cell holds no bytes")
+    return content

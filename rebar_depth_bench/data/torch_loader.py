@@ -6,10 +6,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from datasets import Dataset, IterableDataset
+import PIL.Image
+from datasets import Dataset, Image, IterableDataset, Value
 
 from rebar_depth_bench.data.augmentation import Augmentation
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.data.codecs import PICTURE_KINDS
+from rebar_depth_bench.data.columns import column_kind
+from rebar_depth_bench.data.decoding_features import STORED_MODES
+from rebar_depth_bench.data.eye_view import is_absent
+from rebar_depth_bench.errors import DatasetError, MethodError
 
 try:
     import torch
@@ -27,6 +32,7 @@ _LEFT = {
     "K": "left_K",
     "poses": "left_cam_from_world",
 }
+_NUMBER_KINDS = ("K", "cam_from_world", "baseline_m")
 SHUFFLE_BUFFER = 32
 """Views of a streamed dataset among which the next one is drawn."""
 _RIGHT = {f"right_{key}": column.replace("left", "right") for key, column in _LEFT.items()}
@@ -43,7 +49,7 @@ def torch_loader(
     flip: bool = False,
     seed: int = 0,
 ) -> DataLoader[Batch]:
-    """Return a ``DataLoader`` over a dataset returned by ``load``, streaming or not.
+    """Return a ``DataLoader`` over a dataset returned by ``load``, streaming or not, or by ``load_dataset``.
 
     A batch is a dict: ``rgb`` uint8 B x 3 x H x W, ``depth`` float32 B x 1 x H x W (planar, metres, 0 where there
     is no surface), ``mask`` bool B x 1 x H x W, ``K`` float64 B x 3 x 3 (pixels), ``poses`` float64 B x 4 x 4
@@ -51,8 +57,8 @@ def torch_loader(
     the same keys of the right view, prefixed ``right_``, and ``baseline_m`` float64 B. Batches of a config without
     colour lack ``rgb`` and ``right_rgb``, and those of an imported config all that it lacks.
 
-    Columns that a batch does not need are not decoded, except in a streamed dataset, whose columns are already
-    decoded; pass ``columns`` to ``load`` to select them.
+    Columns that a batch does not need are not decoded. The format of ``ds`` makes no difference, but a transform
+    is applied. A dataset that only ``datasets`` has read is not compared with the manifest.
 
     For training, ``shuffle`` changes the order in every epoch. A streamed dataset is shuffled by shard, and then
     in a buffer of 32 views (``SHUFFLE_BUFFER``). ``crop`` (height, width) takes a random part of each view, and
@@ -61,15 +67,32 @@ def torch_loader(
     ``seed`` and the epoch, and for a streamed dataset on the number of workers; crops and flips depend on
     ``seed``, the epoch and the view id.
 
-    Importing this module without torch raises ``MethodError``. Raises ``InputError`` for an invalid crop or seed.
+    Importing this module without torch raises ``MethodError``. Raises ``InputError`` for an invalid crop or seed,
+    and ``DatasetError`` if ``ds`` lacks columns.
     """
     keys = {**_LEFT, **_RIGHT, "baseline_m": "baseline_m"} if stereo else _LEFT
-    rows = ds.select_columns(["view_id", *keys.values()])
+    rows = _pictured(ds, ["view_id", *keys.values()])
     collate = _Collate(keys, Augmentation(crop, flip, seed))
     if not isinstance(rows, IterableDataset):
         return _EpochLoader(rows, batch_size, shuffle, collate, num_workers)
     shuffled = rows.shuffle(seed, buffer_size=SHUFFLE_BUFFER) if shuffle else rows
     return _EpochLoader(_StreamedRows(shuffled), batch_size, False, collate, num_workers)
+
+
+def _pictured(ds: Dataset | IterableDataset, columns: Sequence[str]) -> Dataset | IterableDataset:
+    """Return ``columns`` with images decoded to pictures, or as the transform of ``ds`` decodes them."""
+    if not isinstance(ds, (Dataset, IterableDataset)):
+        raise DatasetError(f"got a {type(ds).__name__}, expected one split, as rdb.load(ROOT, CONFIG) returns it")
+    missing = [name for name in columns if ds.column_names is not None and name not in ds.column_names]
+    if missing:
+        found = f"the dataset lacks the columns {', '.join(missing)}"
+        raise DatasetError(f"{found}, expected those that rdb.load(ROOT, CONFIG) returns")
+    rows = ds.select_columns(list(columns))
+    for name in columns:
+        if rows.features is not None and rows.features[name] == Value("binary"):
+            rows = rows.cast_column(name, Image(mode=STORED_MODES[column_kind(name)]))
+    has_transform = isinstance(rows, Dataset) and rows.format["type"] == "custom"
+    return rows if has_transform else rows.with_format(None)
 
 
 class _EpochLoader(DataLoader[Any]):
@@ -98,7 +121,7 @@ class _EpochLoader(DataLoader[Any]):
 
 
 class _Collate:
-    """Collate function that changes decoded rows and stacks them into tensors; it is pickled for workers."""
+    """Collate function that decodes and changes rows and stacks them to tensors; it is pickled for workers."""
 
     def __init__(self, keys: Mapping[str, str], augmentation: Augmentation) -> None:
         self._keys = keys
@@ -106,14 +129,27 @@ class _Collate:
         self.epoch = -1
 
     def __call__(self, rows: Sequence[Mapping[str, Any]]) -> Batch:
+        rows = [{name: _array(column_kind(name), cell) for name, cell in row.items()} for row in rows]
         rows = [self.augmentation(row, self.epoch) for row in rows]
         batch: Batch = {
-            key: _tensor(key, np.stack([np.asarray(row[column]) for row in rows]))
+            key: _tensor(key, np.stack([row[column] for row in rows]))
             for key, column in self._keys.items()
             if rows[0][column] is not None
         }
         batch["view_id"] = [row["view_id"] for row in rows]
         return batch
+
+
+def _array(kind: str, cell: Any) -> Any:
+    """Convert a cell with an image, a matrix or a number to an array, None for an absent one, and keep others."""
+    if is_absent(cell):
+        return None
+    if kind in _NUMBER_KINDS:
+        return np.asarray(cell, dtype=np.float64)
+    if kind not in PICTURE_KINDS:
+        return cell
+    is_colour = kind == "rgb" and isinstance(cell, PIL.Image.Image)
+    return np.asarray(cell.convert("RGB") if is_colour else cell, dtype=PICTURE_KINDS[kind].dtype)
 
 
 def _tensor(key: str, stacked: np.ndarray[Any, Any]) -> torch.Tensor:

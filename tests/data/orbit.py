@@ -25,7 +25,7 @@ from dataset_builder.scene.assemblies import aim_point_m, make_assembly
 from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
-from rebar_depth_bench.data.codecs import decode_rgb
+from rebar_depth_bench.data.codecs import decode
 from rebar_depth_bench.data.digests import file_sha256
 
 IMAGES = Path(__file__).parent / "orbit"
@@ -53,7 +53,7 @@ class StoredImages:
             for name, camera in rig_cameras(config.rig, left_poses[index]).items():
                 shape = (camera.height, camera.width, 3)
                 rgb = (
-                    decode_rgb(_image(index).read_bytes(), shape[:2])
+                    decode("rgb", _image(index).read_bytes(), shape[:2])
                     if name == "left"
                     else np.zeros(shape, np.uint8)
                 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +116,20 @@ def test_load_errors_name_expected_values(tiny_root: Path, tmp_path: Path) -> No
         rdb.load(tmp_path, "lattice")
     with pytest.raises(rdb.DatasetError, match="no such folder"):
         rdb.load(tmp_path / "missing", "lattice")
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+@pytest.mark.parametrize(("part", "positions"), [("[:2]", range(2)), ("[50%:]", range(4, 9)), ("[-1:]", [8])])
+def test_part_of_a_split(tiny_root: Path, part: str, positions: Sequence[int], streaming: bool) -> None:
+    view_ids = open_folder(tiny_root).config("lattice").view_ids
+    loaded = rdb.load(tiny_root, "lattice", split=f"test{part}", streaming=streaming, columns=["view_id"])
+    assert [row["view_id"] for row in loaded] == [view_ids[position] for position in positions]
+
+
+@pytest.mark.parametrize("split", ["test[", "test[a]", "test[:2]+test[3:]", "tests[:2]", "test+test", "[:2]"])
+def test_text_that_is_no_part_of_a_split_is_refused(tiny_root: Path, split: str) -> None:
+    with pytest.raises(rdb.DatasetError, match=r"has no split .*, expected test|expected one as test\[:10\]"):
+        rdb.load(tiny_root, "lattice", split=split)
 
 
 def test_unavailable_hub_repository_raises_dataset_error() -> None:

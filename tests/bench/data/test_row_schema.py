@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import datasets
+
 from rebar_depth_bench.data.columns import COLUMNS, ROW_SCHEMA, features
-from rebar_depth_bench.data.dataset import iterate_undecoded, load_undecoded
+from rebar_depth_bench.data.dataset import iterate_undecoded
 from rebar_depth_bench.data.manifest import open_folder
 
 
@@ -15,5 +17,5 @@ def test_row_schema_is_that_of_the_features() -> None:
 
 def test_local_rows_equal_those_of_datasets(tiny_root: Path) -> None:
     config = open_folder(tiny_root).config("lattice")
-    streamed = load_undecoded(config, streaming=True, columns=COLUMNS)
-    assert list(iterate_undecoded(config, COLUMNS)) == list(streamed)
+    loaded = datasets.load_dataset(str(tiny_root), "lattice", split="test")
+    assert list(iterate_undecoded(config, COLUMNS)) == loaded.data.to_pylist()

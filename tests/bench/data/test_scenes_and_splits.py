@@ -267,13 +267,13 @@ def test_rows_under_another_scene_are_refused(tmp_path: Path) -> None:
     table = pq.read_table(shard)
     position = table.schema.get_field_index("scene")
     pq.write_table(table.set_column(position, "scene", pa.array(["e"])), shard)
-    for rows in (
-        rdb.load(tmp_path / "new", "cages"),
-        rdb.load(tmp_path / "new", "cages", streaming=True),
-        truth_problems(open_folder(tmp_path / "new").config("cages")),
+    for read in (
+        lambda: rdb.load(tmp_path / "new", "cages"),
+        lambda: rdb.load(tmp_path / "new", "cages", streaming=True),
+        lambda: truth_problems(open_folder(tmp_path / "new").config("cages")),
     ):
         with pytest.raises(DatasetError, match="scene is damaged: got 'e', expected d"):
-            list(rows)
+            list(read())
 
 
 Entry = dict[str, Any]

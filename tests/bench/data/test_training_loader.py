@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import datasets
 import numpy as np
 import pytest
 from jaxtyping import Float64
@@ -127,3 +128,32 @@ def test_flip_of_a_pair_that_lacks_an_eye_is_refused(tiny_root: Path) -> None:
     row["right_depth"] = None
     with pytest.raises(InputError, match="one eye only"):
         flip_row(row)
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+def test_plain_and_saved_datasets_give_the_same_batches(tiny_root: Path, tmp_path: Path, streaming: bool) -> None:
+    options: dict[str, Any] = {"stereo": True, "crop": CROP, "flip": True, "seed": 3}
+    expected = batches(tiny_root, **options)
+    sources = [datasets.load_dataset(str(tiny_root), "lattice", split="test", streaming=streaming)]
+    if not streaming:
+        rdb.load(tiny_root, "lattice").save_to_disk(tmp_path)
+        sources += [datasets.load_from_disk(tmp_path), rdb.load(tiny_root, "lattice").with_format("torch")]
+    for source in sources:
+        for batch, same in zip(rdb.torch_loader(source, **options), expected, strict=True):
+            assert list(batch) == list(same)
+            for key, value in batch.items():
+                assert value == same[key] if key == "view_id" else torch.equal(value, same[key]), key
+
+
+def test_transform_is_applied_to_batches(tiny_root: Path) -> None:
+    ds = rdb.load(tiny_root, "lattice").with_transform(
+        lambda rows: rows | {"left_mask": [np.ones_like(image) for image in rows["left_mask"]]}
+    )
+    assert all(batch["mask"].all() for batch in rdb.torch_loader(ds))
+
+
+def test_other_than_one_split_with_all_columns_is_refused(tiny_root: Path) -> None:
+    with pytest.raises(rdb.DatasetError, match=r"DatasetDict, expected one split, as rdb\.load"):
+        rdb.torch_loader(datasets.load_dataset(str(tiny_root), "lattice"))
+    with pytest.raises(rdb.DatasetError, match=r"lacks the columns left_rgb, .*expected those that rdb\.load"):
+        rdb.torch_loader(rdb.load(tiny_root, "lattice", columns=["view_id"]))

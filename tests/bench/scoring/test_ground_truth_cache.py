@@ -19,7 +19,7 @@ from rebar_depth_bench import DatasetError, score
 from rebar_depth_bench.bar_crossings.table import write_crossings
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import read_bars, write_bars
-from rebar_depth_bench.data.codecs import decode_depth, encode_depth
+from rebar_depth_bench.data.codecs import decode, encode_depth
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.data.eye_view import EyeTruth
@@ -229,7 +229,7 @@ def change_depth(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None
         table = pq.read_table(path)
         rows = table.to_pylist()
         for row in rows:
-            depth_m = change(decode_depth(row["left_depth"], GRID))
+            depth_m = change(decode("depth", row["left_depth"], GRID))
             row["left_depth"] = encode_depth(depth_m)
             left = views[row["view_id"]]
             digests[row["view_id"]] = EyeTruth(left.camera, None, depth_m, left.mask, left.bars).digest()

@@ -1,0 +1,156 @@
+"""Loading of configs through ``datasets``: rows of NumPy arrays, or what other formats make of the columns.
+
+``datasets`` takes a second to import, so ``load`` imports it on use.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, overload
+
+from rebar_depth_bench.data.columns import COLUMNS, validated_columns
+from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.decoding import RowDecoder
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.shards import check_shards, damaged_error, iterate_shards
+from rebar_depth_bench.errors import DatasetError, InputError, escape_text
+from rebar_depth_bench.view_ids import TEST_SPLIT
+
+if TYPE_CHECKING:
+    from datasets import Dataset, IterableDataset
+
+_CACHE_VERSION = 1
+_ROWS_IN_MEMORY = 8
+"""Rows that are kept in memory until they are written to the cache of ``datasets``."""
+
+
+@overload
+def load(
+    root: str | Path,
+    config: str,
+    *,
+    split: str = TEST_SPLIT,
+    streaming: Literal[False] = False,
+    columns: Sequence[str] | None = None,
+) -> Dataset: ...
+
+
+@overload
+def load(
+    root: str | Path,
+    config: str,
+    *,
+    split: str = TEST_SPLIT,
+    streaming: Literal[True],
+    columns: Sequence[str] | None = None,
+) -> IterableDataset: ...
+
+
+@overload
+def load(
+    root: str | Path,
+    config: str,
+    *,
+    split: str = TEST_SPLIT,
+    streaming: bool,
+    columns: Sequence[str] | None = None,
+) -> Dataset | IterableDataset: ...
+
+
+def load(
+    root: str | Path,
+    config: str,
+    *,
+    split: str = TEST_SPLIT,
+    streaming: bool = False,
+    columns: Sequence[str] | None = None,
+) -> Dataset | IterableDataset:
+    """Load one split of a config of a dataset folder or Hub repository, by default ``test``.
+
+    Rows are dicts of decoded columns: colour uint8 H x W x 3, depth float32 H x W (planar, metres, 0 where no
+    surface), masks bool H x W, bar ids uint16 H x W, K float64 3 x 3 in pixels, distortion float64 5, poses
+    float64 4 x 4; None for colour of a config that was built without, and for what a config was imported without.
+    ``split`` may be a part of a split, as ``"test[:10]"`` or ``"test[50%:]"``. ``columns`` selects columns; the
+    others are not decoded. With ``streaming`` the result is an ``IterableDataset``, and nothing is copied to the
+    cache of ``datasets``.
+
+    Image columns are ``datasets.Image``. A ``Dataset`` has the format ``numpy``: ``with_format("torch")`` makes
+    tensors, ``with_format(None)`` and ``with_transform`` give pictures of Pillow, and matrices as lists.
+
+    Raises ``DatasetError`` for a folder, config, split or column that does not exist, for a damaged shard, and for
+    a cell that contradicts the manifest; the rows raise it for a damaged image. A streamed dataset raises it while
+    it is read.
+    """
+    from datasets import IterableDataset, NamedSplit
+
+    from rebar_depth_bench.data.decoding_features import decoding_features
+
+    whole = split.partition("[")[0] if split.endswith("]") else split
+    located = open_folder(root).config(config).of_split(whole)
+    part = None if split == whole else _part(located, split)
+    selected = validated_columns(columns)
+    check_shards(located)
+    if streaming:
+        streamed = IterableDataset.from_generator(
+            _encoded_rows,
+            features=decoding_features(located, selected, to_arrays=True),
+            gen_kwargs={"config": located, "columns": selected, "shards": list(located.shards)},
+            split=NamedSplit(whole),
+        )
+        return streamed if part is None else streamed.skip(part.start).take(len(part))
+    loaded = _cached(located, whole).select_columns(list(selected))
+    loaded.info.features = decoding_features(located, selected)
+    formatted = loaded.with_format("numpy")
+    return formatted if part is None else formatted.select(part)
+
+
+def _part(config: DatasetConfig, split: str) -> range:
+    """Return the positions of a part of the split of ``config``. Raises ``DatasetError`` if it is none."""
+    from datasets import ReadInstruction
+
+    try:
+        [part] = ReadInstruction.from_spec(split).to_absolute({config.scenes[0].split: len(config.views)})
+        return range(part.from_, part.to)
+    except Exception as error:  # ``datasets`` asserts some properties of a part.
+        found = f"{config.root}: {escape_text(split)} is no part of a split: {error}"
+        raise DatasetError(f"{found}; expected one as test[:10] or test[50%:]") from None
+
+
+def _encoded_rows(
+    config: DatasetConfig, columns: Sequence[str], shards: Sequence[str]
+) -> Iterator[dict[str, Any]]:
+    decoder = RowDecoder.of(config)
+    for row in iterate_shards(config, ("view_id", *columns), shards):
+        encoded = decoder.encoded(row)
+        yield {name: encoded[name] for name in columns}
+
+
+def _cached(config: DatasetConfig, split: str) -> Dataset:
+    """Return the rows of a config from the cache of ``datasets``, into which they are copied at the first call.
+
+    The cache is mapped into memory. Its key covers the manifest's entry of the config, and place, size and time of
+    the shards. ``datasets`` never reads the dataset's README.md, whose ``data_files`` could be any files.
+    """
+    from datasets import Dataset, NamedSplit
+
+    from rebar_depth_bench.data.decoding_features import decoding_features
+
+    files = [config.file(shard).absolute() for shard in config.shards]
+    stamps = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    key = json.dumps([_CACHE_VERSION, config.root, split, stamps, config.manifest_entry], sort_keys=True)
+    try:
+        return Dataset.from_generator(
+            _encoded_rows,
+            features=decoding_features(config, COLUMNS),
+            gen_kwargs={"config": config, "columns": COLUMNS, "shards": list(config.shards)},
+            split=NamedSplit(split),
+            fingerprint=hashlib.sha256(key.encode()).hexdigest()[:32],
+            config_name=config.name,
+            writer_batch_size=_ROWS_IN_MEMORY,
+        )
+    except Exception as error:  # ``datasets`` wraps what reading a shard raises.
+        cause = error.__cause__ if isinstance(error.__cause__, Exception) else error
+        raise cause if isinstance(cause, InputError) else damaged_error(config, cause) from error
