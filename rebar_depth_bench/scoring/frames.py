@@ -27,9 +27,8 @@ METRIC_COLUMNS: Mapping[str, str] = {
 }
 """Column names of the metrics with an interval, by their names in ``VIEW_METRICS``."""
 
-REFERENCE_COLUMNS = tuple(
-    f"{reference}_{name}" for reference in ("constant", "one_pixel") for name in ("abs_rel", "rmse_cm")
-)
+_REFERENCES, _REFERENCE_ERRORS = ("constant", "one_pixel"), ("abs_rel", "rmse_cm")
+REFERENCE_COLUMNS = tuple(f"{reference}_{name}" for reference in _REFERENCES for name in _REFERENCE_ERRORS)
 """Column names of the reference errors of a config."""
 
 TABLE_COLUMNS = (
@@ -62,11 +61,10 @@ def table_values(table: Mapping[str, Any]) -> list[Any]:
     return [
         *(table[key] for key in ("views", "views_scored", "coverage", "ranked")),
         table.get("rank_error"),
-        *table["native"].values(),
-        *table["scaled"].values(),
+        *(table[alignment][name] for alignment in ALIGNMENTS for name in METRIC_NAMES),
         table["scale_median"],
-        *table["within_mm"].values(),
-        *(error for errors in reference.values() for error in errors.values()),
+        *(table["within_mm"][str(tolerance)] for tolerance in WITHIN_MM),
+        *(reference[name][error] for name in _REFERENCES for error in _REFERENCE_ERRORS),
     ]
 
 
@@ -137,7 +135,7 @@ def views_frame(document: Mapping[str, Any]) -> DataFrame:
             "config": config_of(view["view_id"]),
             **{key: view[key] for key in ("view_id", "scored_px", "coverage", "rank_error", "scale")},
             **{f"{alignment}_{name}": view[alignment][name] for alignment in ALIGNMENTS for name in METRIC_NAMES},
-            **{f"within_{tolerance}mm": share for tolerance, share in view["within_mm"].items()},
+            **{f"within_{tolerance}mm": view["within_mm"][str(tolerance)] for tolerance in WITHIN_MM},
         }
         for view in document["views"]
     ]
