@@ -77,7 +77,7 @@ def mistakes(rows: Sequence[Mapping[str, ndarray]]) -> dict[str, Callable[[Seque
         "shift": partial(shift, shift=(2, -3), order=0),
         "log": _logarithm,
         "log10": lambda p: _logarithm(p) / np.log(10),
-        "normalised": lambda p: p / p.max(),
+        "normalised": lambda p: p / np.nanmax(p),
         "negative": np.negative,
         "infinite": lambda p: np.full_like(p, np.inf),
         "nan": lambda p: np.full_like(p, np.nan),

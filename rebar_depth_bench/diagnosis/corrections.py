@@ -120,7 +120,7 @@ def _normalised_errors(view: DiagnosedView) -> Errors:
 
 def logarithm_corrections() -> list[Correction]:
     """Return the corrections of logarithms of depth, of which those of depth below a metre are no valid depth."""
-    measure = f"{_SCALED}, 100 % at pixels without a valid value,"
+    measure = f"{_SCALED}, 100 % at values of 0 and less,"
     return [
         Correction(name, seems, measure, partial(_logarithm_errors, log_base=log_base), CLEARLY_BETTER)
         for name, (seems, log_base) in LOGARITHMS.items()
@@ -128,7 +128,11 @@ def logarithm_corrections() -> list[Correction]:
 
 
 def _logarithm_errors(view: DiagnosedView, log_base: float) -> Errors:
-    p, z_m = view.left.values(view.prediction), view.left.depth_m
+    p = view.left.values(view.prediction)
+    finite = np.isfinite(p)  # Holes of a method do not count.
+    if not finite.any():
+        return Errors(math.nan, math.nan)
+    p, z_m = p[finite], view.left.depth_m[finite]
     coverage = valid_share(p)
     before = 1 - coverage * (1 - mean_error(p, z_m)) if coverage else 1.0
     with np.errstate(over="ignore", under="ignore"):
