@@ -55,7 +55,8 @@ def mistakes_named(root: Path, rows: Sequence[Mapping[str, ndarray]], images: Se
                     writer.add(str(row["view_id"]), image)
             with open_evaluation(archive, root) as evaluation:
                 named = [mistake.name for mistake in diagnose(evaluation)]
-        cells[name] = "yes" if named == [name] else ", ".join(named) or "-"
+        # Logarithms of depth below a metre are negative.
+        cells[name] = "yes" if named in ([name], ["negative", name]) else ", ".join(named) or "-"
     return cells
 
 
@@ -74,6 +75,12 @@ def mistakes(rows: Sequence[Mapping[str, ndarray]]) -> dict[str, Callable[[Seque
         "upside-down": np.flipud,
         "rotated": lambda p: p[::-1, ::-1],
         "shift": partial(shift, shift=(2, -3), order=0),
+        "log": _logarithm,
+        "log10": lambda p: _logarithm(p) / np.log(10),
+        "normalised": lambda p: p / np.nanmax(p),
+        "negative": np.negative,
+        "infinite": lambda p: np.full_like(p, np.inf),
+        "nan": lambda p: np.full_like(p, np.nan),
     }
     orders = {
         "reversed": range(count)[::-1],
@@ -109,6 +116,10 @@ def _map_images(make: Callable[[Image], Image], images: Sequence[Image]) -> list
 
 def _reorder(images: Sequence[Image], order: Sequence[int]) -> list[Image]:
     return [images[n] for n in order]
+
+
+def _logarithm(depth_m: Image) -> Image:
+    return np.log(depth_m, out=np.full_like(depth_m, np.nan), where=depth_m > 0)
 
 
 def _disparity(depth_m: Image) -> Image:

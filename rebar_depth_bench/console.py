@@ -19,6 +19,7 @@ from rich.progress import TimeRemainingColumn as Remaining
 
 from rebar_depth_bench.atomic_io import WRITE_ERRORS
 from rebar_depth_bench.errors import InputError, RebarDepthError, printable, terminal_text
+from rebar_depth_bench.reading import parse_number
 
 EXIT_DONE, EXIT_OTHER, EXIT_INPUT = 0, 1, 2
 """Exit codes: success, any other error, invalid input."""
@@ -226,10 +227,15 @@ def add_seconds(container: argparse._ActionsContainer, option: str, default: flo
 
 
 def _positive_seconds(text: str) -> float:
-    seconds = float(text)
-    if not 0 < seconds <= MAX_SECONDS:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0, up to {MAX_SECONDS:g}")
-    return seconds
+    return positive_number(text, f"a number above 0, up to {MAX_SECONDS:g}", MAX_SECONDS)
+
+
+def positive_number(text: str, expected: str, high: float = sys.float_info.max) -> float:
+    """Return the number of an option, above 0 and up to ``high``; raise the error that names what is expected."""
+    value = parse_number(text)
+    if not 0 < value <= high:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {expected}")
+    return value
 
 
 def print_notice(text: str) -> None:

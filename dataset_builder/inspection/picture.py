@@ -200,7 +200,7 @@ def _draw_scale_bar(draw: ImageDraw.ImageDraw, px_per_m: float) -> None:
     """Draw a bar of 1, 2 or 5 times a power of ten metres, up to a quarter of the panel."""
     longest_m = _PANEL_PX[0] / 4 / px_per_m
     power = 10.0 ** np.floor(np.log10(longest_m))
-    length_m = max(step * power for step in (1, 2, 5) if step * power <= longest_m)
+    length_m = max((step * power for step in (1, 2, 5) if step * power <= longest_m), default=power)
     x, y = _MARGIN_PX, _PANEL_PX[1] - 30
     end = x + length_m * px_per_m
     draw.line((x, y, end, y), _INK, 3)

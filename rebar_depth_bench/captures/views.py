@@ -23,6 +23,7 @@ from rebar_depth_bench.geometry.stereo_calibration import (
     lens_K,
     right_from_left,
 )
+from rebar_depth_bench.submission import CaptureViews
 
 _LEFT_COLUMNS = ("left_rgb", "left_K", "left_distortion", "left_cam_from_world")
 _RIGHT_COLUMNS = ("right_rgb", "right_K", "right_distortion", "right_cam_from_world", "baseline_m")
@@ -94,9 +95,9 @@ class ImageViews:
         poses = ("left_cam_from_world",) if self.has_poses or is_stereo else ()
         return (*_LEFT_COLUMNS[:-1], *poses, *(_RIGHT_COLUMNS if is_stereo else ()))
 
-    def expected_views(self) -> dict[str, tuple[int, int]]:
+    def expected_views(self) -> CaptureViews:
         """Return every view id with its (height, width)."""
-        return dict.fromkeys(self.view_ids, self.grid)
+        return CaptureViews(dict.fromkeys(self.view_ids, self.grid))
 
     def describe_camera(self) -> str:
         """Return a description of K, the baseline and the pixel grid of depth maps."""

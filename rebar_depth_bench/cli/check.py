@@ -9,8 +9,8 @@ from rebar_depth_bench.console import ProgressBars, add_archive, add_data, print
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.errors import SubmissionError
-from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.submission import check_archive
+from rebar_depth_bench.scoring.evaluation import Evaluation
+from rebar_depth_bench.submission import check_archive, open_submission
 
 SUMMARY = "list all problems of a submission archive"
 
@@ -31,6 +31,6 @@ def run(options: argparse.Namespace) -> None:
     if problems:
         raise SubmissionError.from_problems(options.archive, problems)
     print(f"{options.archive}: no problem found")
-    with open_evaluation(options.archive, options.data) as evaluation:
-        for mistake in diagnose(evaluation):
+    with open_submission(options.archive, folder.expected_views()) as submission:
+        for mistake in diagnose(Evaluation(folder, submission)):
             print_notice(f"possible mistake: {mistake.text}")

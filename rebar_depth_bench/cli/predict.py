@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from rebar_depth_bench.captures.opening import open_images
 from rebar_depth_bench.captures.views import ImageViews
 from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
-from rebar_depth_bench.console import ProgressBars, add_seconds, print_notice
+from rebar_depth_bench.console import ProgressBars, add_seconds, positive_number, print_notice
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import InputError
@@ -74,10 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _positive_metres(text: str) -> float:
-    metres = float(text)
-    if not 0 < metres < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a distance above 0 m")
-    return metres
+    return positive_number(text, "a distance above 0 m")
 
 
 def format_note(value: object) -> str:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
-from rebar_depth_bench.console import print_notice
+from rebar_depth_bench.console import positive_number, print_notice
 from rebar_depth_bench.data.bars import with_axis
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import InputError, SubmissionError, printable
@@ -71,10 +70,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _positive_millimetres(text: str) -> float:
-    millimetres = float(text)
-    if not 0 < millimetres < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a length above 0 mm")
-    return millimetres
+    return positive_number(text, "a length above 0 mm")
 
 
 def _print_view_notes(view: ShownView) -> None:

@@ -115,18 +115,22 @@ def read_bars(path: Path) -> dict[str, tuple[Bar, ...]]:
 def bars(root: str | Path) -> DataFrame:
     """Return the bars of every scene of a dataset folder or Hub repository as a frame, one row per bar.
 
-    Columns: ``scene``, ``bar_id``, ``role``, ``diameter_m``, ``length_m`` (of the centreline) and ``axis_m``, a
-    float64 array of shape (n, 3), world frame. A bar without an axis has NaN, NaN and no points. Raises
+    Columns as in ``bars.parquet``, and ``length_m`` of the centreline; ``axis`` and ``nominal_axis`` are float64
+    arrays of shape (n, 3), world frame, metres. A bar without an axis has NaN, NaN and no points. Raises
     ``DatasetError`` if the folder is invalid, or its table of bars is damaged or not that of the manifest.
     """
     import pandas as pd  # Half a second to import, which reading bars for scoring does not need.
 
     rows = [
-        (scene, bar.bar_id, bar.role, bar.diameter_m, bar.length_m, np.array(bar.axis_m).reshape(-1, 3))
+        (
+            *(scene, bar.bar_id, bar.role, bar.diameter_m),
+            *(np.array(line).reshape(-1, 3) for line in (bar.axis_m, bar.nominal_axis_m)),
+            bar.length_m,
+        )
         for scene, scene_bars in read_bars(open_folder(root).verified_file(BARS_FILE)).items()
         for bar in scene_bars
     ]
-    return pd.DataFrame(rows, columns=["scene", "bar_id", "role", "diameter_m", "length_m", "axis_m"])
+    return pd.DataFrame(rows, columns=[*BARS_SCHEMA.names, "length_m"])
 
 
 def write_bars(path: Path, scenes: Mapping[str, tuple[Bar, ...]]) -> None:

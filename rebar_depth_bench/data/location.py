@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO, cast
 
@@ -82,6 +84,8 @@ def _hub_root(root: str) -> tuple[str, str | None]:
 def local_path(root: str, name: str, commit: str = "") -> Path:
     """Return the local path of a regular file below ``root``; ``commit`` replaces the revision of a Hub root.
 
+    Without ``commit``, a Hub root may be a mistyped folder: the Hub is asked once, and not if its owner is a
+    folder here.
     Raises ``DatasetError`` if ``root`` is neither a folder nor a Hub root, or as ``Located.file`` does.
     """
     folder = Path(root)
@@ -101,12 +105,23 @@ def local_path(root: str, name: str, commit: str = "") -> Path:
 
 def _download(root: str, name: str, commit: str) -> Path:
     # Imported on use: it takes a fifth of a second, which local folders do not need.
-    from huggingface_hub import hf_hub_download
+    from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
 
     repository, revision = _hub_root(root)
+    folder = Path(repository).parent
+    if not commit and folder.is_dir():
+        raise DatasetError(
+            f"{root}: no such folder, expected a dataset folder; it is not read as the id of a Hub repository, "
+            f"since the folder {folder} exists here"
+        )
+    download = partial(hf_hub_download, repository, name, repo_type="dataset", revision=commit or revision)
     try:
-        return Path(hf_hub_download(repository, name, repo_type="dataset", revision=commit or revision))
+        if not commit:  # Without an answer, the download would try five times more.
+            get_hf_file_metadata(hf_hub_url(repository, name, repo_type="dataset", revision=revision))
+        return Path(download())
     except Exception as error:  # The errors of the HTTP client have no base class in the Hub's package.
+        with suppress(Exception):
+            return Path(download(local_files_only=True))
         raise _download_error(root, name, error) from None
 
 

@@ -90,27 +90,31 @@ def _read_csv(path: Path, problems: list[Problem]) -> RawDetections | None:
         found = f"byte {error.start} is not UTF-8"
         problems.append(Problem("syntax", "", found, "a Parquet file, or a CSV file in UTF-8"))
         return None
-    metadata, first = _csv_metadata(text)
-    reader = csv.reader(io.StringIO(text), strict=True)
+    lines = io.StringIO(text)
+    metadata, first = _csv_metadata(lines)
+    reader = csv.reader(lines, strict=True)
     try:
-        rows = ((reader.line_num, row) for row in reader)
-        rows = ((line, row) for line, row in rows if line > first and row)
+        rows = ((first + reader.line_num, row) for row in reader if row)
         _, head = next(rows, (0, []))
         names = [name.strip() for name in head]
         faults = column_problems(names)
         problems += faults
         return None if faults else _csv_rows(rows, names, metadata, problems)
     except csv.Error as error:
-        problems.append(Problem("syntax", f"line {reader.line_num}", f"it is not CSV: {escape_text(str(error))}"))
+        where = f"line {first + reader.line_num}"
+        problems.append(Problem("syntax", where, f"it is not CSV: {escape_text(str(error))}"))
         return None
 
 
-def _csv_metadata(text: str) -> tuple[dict[str, str], int]:
-    """Return the values of the lines ``# key: value`` at the start of a CSV, and the number of these lines."""
+def _csv_metadata(lines: io.StringIO) -> tuple[dict[str, str], int]:
+    """Read the lines ``# key: value`` at the start of a CSV; return their values and their number."""
     metadata: dict[str, str] = {}
     count = 0
-    for line in io.StringIO(text):
+    while True:
+        start = lines.tell()
+        line = lines.readline()
         if not line.startswith("#"):
+            lines.seek(start)
             break
         count += 1
         key, _, value = line[1:].partition(":")

@@ -24,6 +24,7 @@ from rebar_depth_bench.diagnosis.errors import (
     valid_share,
 )
 from rebar_depth_bench.diagnosis.views import DiagnosedView
+from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 Image = Float[ndarray, "h w"]
 ReadPrediction = Callable[[int], Image]
@@ -36,6 +37,15 @@ UNITS: Mapping[str, float] = {
     "feet": 1 / 0.3048,
 }
 """Units in a metre."""
+LOGARITHMS: Mapping[str, tuple[str, float]] = {
+    "log": ("natural logarithms of depth in metres", 1.0),
+    "log10": ("logarithms of depth in metres to base 10", math.log(10)),
+}
+"""Logarithms of depth, and the natural logarithm of their base."""
+LOGARITHM_TOLERANCE = 0.3
+"""Largest natural logarithm of a view's scale after a logarithm is undone; that of sound depth is above 0.8."""
+NORMALISED_TOLERANCE = 0.005
+"""Largest deviation from 1 of the largest value of a picture that was divided by its largest value."""
 UNIT_TOLERANCE = 0.06
 """Largest deviation of a view's scale from that of a unit, as a share of the unit's logarithm.
 
@@ -78,8 +88,8 @@ class Correction:
 
 
 def unit_corrections() -> list[Correction]:
-    """Return the corrections of depth in other units than metres."""
-    return [
+    """Return the corrections of depth in other units than metres: those of ``UNITS``, or the largest value."""
+    units = [
         Correction(
             unit,
             f"in {unit}",
@@ -89,6 +99,8 @@ def unit_corrections() -> list[Correction]:
         )
         for unit, units_in_metre in UNITS.items()
     ]
+    seems = "depth divided by the largest value of each picture"
+    return [*units, Correction("normalised", seems, "mean error", _normalised_errors, CLEARLY_BETTER)]
 
 
 def _unit_errors(view: DiagnosedView, units_in_metre: float) -> Errors:
@@ -97,6 +109,38 @@ def _unit_errors(view: DiagnosedView, units_in_metre: float) -> Errors:
     # One depth for every pixel can be near any unit by chance.
     is_unit = scale > 0 and abs(math.log(scale)) <= UNIT_TOLERANCE * math.log(units_in_metre) and np.ptp(p) != 0
     return Errors(before, mean_error(p, z_m, 1 / units_in_metre) if is_unit else math.nan)
+
+
+def _normalised_errors(view: DiagnosedView) -> Errors:
+    p, z_m = view.left.values(view.prediction), view.left.depth_m
+    valid = view.prediction[is_valid_prediction(view.prediction)]
+    is_normalised = valid.size and abs(valid.max() - 1) <= NORMALISED_TOLERANCE and np.ptp(p) != 0
+    return Errors(mean_error(p, z_m, 1.0), mean_error(p, z_m) if is_normalised else math.nan)
+
+
+def logarithm_corrections() -> list[Correction]:
+    """Return the corrections of logarithms of depth, of which those of depth below a metre are no valid depth."""
+    measure = f"{_SCALED}, 100 % at values of 0 and less,"
+    return [
+        Correction(name, seems, measure, partial(_logarithm_errors, log_base=log_base), CLEARLY_BETTER)
+        for name, (seems, log_base) in LOGARITHMS.items()
+    ]
+
+
+def _logarithm_errors(view: DiagnosedView, log_base: float) -> Errors:
+    p = view.left.values(view.prediction)
+    finite = np.isfinite(p)  # Holes of a method do not count.
+    if not finite.any():
+        return Errors(math.nan, math.nan)
+    p, z_m = p[finite], view.left.depth_m[finite]
+    coverage = valid_share(p)
+    before = 1 - coverage * (1 - mean_error(p, z_m)) if coverage else 1.0
+    with np.errstate(over="ignore", under="ignore"):
+        depth_m = np.exp(p * log_base)
+    scale = median_ratio(depth_m, z_m)
+    is_logarithm = scale > 0 and abs(math.log(scale)) <= LOGARITHM_TOLERANCE and np.ptp(p) != 0
+    is_comparable = is_logarithm and valid_share(depth_m) >= LEAST_VALID_SHARE
+    return Errors(before, mean_error(depth_m, z_m) if is_comparable else math.nan)
 
 
 def shape_corrections(views: Sequence[DiagnosedView], read: ReadPrediction, count: int) -> list[Correction]:

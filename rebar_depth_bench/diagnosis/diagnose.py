@@ -9,13 +9,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.diagnosis.corrections import Correction, Errors, shape_corrections, unit_corrections
+from rebar_depth_bench.diagnosis.corrections import (
+    Correction,
+    Errors,
+    logarithm_corrections,
+    shape_corrections,
+    unit_corrections,
+)
+from rebar_depth_bench.diagnosis.errors import valid_share
 from rebar_depth_bench.diagnosis.views import DiagnosedView, positions_to_read, read_views
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.submission import SubmissionReader
 
 MIN_VIEWS = 3
 """Number of views below which nothing is said."""
+LEAST_COVERAGE = 0.05
+"""Share of the scored pixels with a valid prediction below which the kinds of invalid values are named."""
 MOST_VIEWS = 0.75
 """Share of the views that a correction must make clearly better."""
 LEAST_ERROR = 0.002
@@ -28,7 +37,8 @@ SMALLEST_RATIO = 1e-6
 class PossibleMistake:
     """Mistake that most of the views of a config show.
 
-    ``name`` is that of the correction, ``text`` describes the mistake with its figures, in one sentence.
+    ``name`` is that of the correction, or of the most frequent kind of invalid values; ``text`` describes the
+    mistake with its figures, in one sentence.
     """
 
     config: str
@@ -37,7 +47,9 @@ class PossibleMistake:
 
 
 def diagnose(evaluation: Evaluation) -> list[PossibleMistake]:
-    """Return the possible mistakes in a submission, at most one of units and one other for each config.
+    """Return the possible mistakes in a submission, at most two for each config.
+
+    They are one of units and one other, or with few valid values what the others are, and a logarithm.
 
     Up to ``views.MAX_VIEWS`` views of each config in a local folder are read. Raises ``EntryError`` and
     ``DatasetError`` for entries and shards that scoring refuses.
@@ -53,19 +65,37 @@ def _diagnose_config(config: DatasetConfig, submission: SubmissionReader) -> lis
     views = list(read_views(config, positions_to_read(config), read))
     if len(views) < MIN_VIEWS:
         return []
-    if is_same_map(views):
+    invalid = invalid_values(config.name, views)
+    if invalid is None and is_same_map(views):
         text = (
             f"the predictions of {config.name} seem to be one picture: {len(views)} of {len(views)} are identical"
         )
         return [PossibleMistake(config.name, "same-map", text)]
-    found = [
-        best_mistake(config.name, views, corrections)
-        for corrections in (
-            unit_corrections(),
-            shape_corrections(views, read, len(config.views)),
-        )
-    ]
+    if invalid is not None:
+        found = [invalid, best_mistake(config.name, views, logarithm_corrections())]
+    else:
+        others = [*shape_corrections(views, read, len(config.views)), *logarithm_corrections()]
+        found = [best_mistake(config.name, views, corrections) for corrections in (unit_corrections(), others)]
     return [mistake for mistake in found if mistake]
+
+
+def invalid_values(config: str, views: Sequence[DiagnosedView]) -> PossibleMistake | None:
+    """Return the mistake of predictions that are hardly anywhere finite and above 0; None if they are."""
+    p = np.concatenate([view.left.values(view.prediction) for view in views])
+    if valid_share(p) >= LEAST_COVERAGE:
+        return None
+    shares = {
+        "negative": float(np.mean(np.isfinite(p) & (p < 0))),
+        "infinite": float(np.isinf(p).mean()),
+        "NaN": float(np.isnan(p).mean()),
+        "zero": float((p == 0).mean()),
+    }
+    text = (
+        f"the predictions of {config} are hardly anywhere valid depth: of the scored pixels looked at in "
+        f"{len(views)} views, {', '.join(f'{_percent(share)} are {name}' for name, share in shares.items())} and "
+        f"{_percent(valid_share(p))} are finite and above 0"
+    )
+    return PossibleMistake(config, max(shares, key=lambda name: shares[name]).lower(), text)
 
 
 def is_same_map(views: Sequence[DiagnosedView]) -> bool:

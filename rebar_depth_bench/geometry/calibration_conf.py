@@ -33,7 +33,8 @@ STEREOLABS_GRIDS: Mapping[str, tuple[int, int]] = {
 }
 """Image sizes (width, height) of Stereolabs cameras, pixels, by section suffix."""
 
-Sections = Mapping[str, Mapping[str, str]]
+Sections = Mapping[str, Mapping[str, tuple[int, str]]]
+"""Line and text of each key of each section."""
 _COMMENT = re.compile(r"(?:^|\s)[;#]")
 _SEPARATOR = re.compile("[=:]")
 
@@ -76,7 +77,7 @@ def _read_sections(content: bytes, problems: list[Problem]) -> Sections:
     except UnicodeDecodeError as error:
         problems.append(Problem("syntax", "", f"byte {error.start} is not UTF-8", "an INI file"))
         return {}
-    sections: dict[str, dict[str, str]] = {}
+    sections: dict[str, dict[str, tuple[int, str]]] = {}
     section = ""
     for line_number, line in enumerate(lines, start=1):
         if len(problems) == MAX_PROBLEMS_SHOWN:
@@ -93,7 +94,7 @@ def _read_sections(content: bytes, problems: list[Problem]) -> Sections:
             if key.lower() in sections[section]:
                 place = format_location("", section, key)
                 problems.append(Problem("duplicate", place, f"line {line_number}: the key occurs twice"))
-            sections[section][key.lower()] = value[0]
+            sections[section][key.lower()] = line_number, value[0]
         elif text:
             expected = "[SECTION] or key = value" if section else "a [SECTION]"
             problems.append(Problem("syntax", "", f"line {line_number} is {short_repr(text)}", expected))
@@ -137,8 +138,10 @@ def _conf_number(
         if default is None and section in sections:
             problems.append(Problem("missing", f"{section}.{keys[-1]}", "missing", expected.text))
         return math.nan if default is None else default
-    raw = values[key.lower()]
+    line_number, raw = values[key.lower()]
     value = parse_number(raw)
     if not expected.accept(value):
-        problems.append(Problem("invalid", f"{section}.{key}", f"got {short_repr(raw)}", expected.text))
+        problems.append(
+            Problem("invalid", f"{section}.{key}", f"line {line_number}: got {short_repr(raw)}", expected.text)
+        )
     return value

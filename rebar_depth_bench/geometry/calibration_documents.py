@@ -85,7 +85,7 @@ def _parse_json(text: str) -> Any:
 
 def _parse_xml(text: str) -> Any:
     """Return the values of OpenCV's XML. Raises ``ValueError`` for invalid XML and for document types."""
-    if "<!" in re.sub("<!--.*?-->", "", text, flags=re.DOTALL):
+    if "<!" in re.sub(r"<!--.*?(?:-->|\Z)", "", text, flags=re.DOTALL):
         raise ValueError("a document type or CDATA, expected OpenCV's XML")
     try:
         root = ElementTree.fromstring(text.lstrip("\ufeff").encode())  # noqa: S314 (no entities without a type)

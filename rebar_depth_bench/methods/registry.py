@@ -16,6 +16,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -157,24 +158,39 @@ def _with_file_digest(path: Path, method: AnyMethod) -> AnyMethod:
 
 
 def _import_file(path: Path) -> ModuleType:
-    """Import a Python file as a module. Raises ``MethodError`` if it is missing or cannot be imported."""
+    """Import a Python file as a module; its folder stays the first of ``sys.path``, as for a script.
+
+    Files beside it can thus also be imported when the method is loaded. No ``__pycache__`` appears beside them.
+
+    Raises ``MethodError`` if the file is missing or cannot be imported.
+    """
     if not path.is_file():
         raise MethodError(f"{path}: no such file, expected a Python file that defines a method")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
+    name, folder, before = _module_name(path), str(path.resolve().parent), list(sys.path)
+    spec = importlib.util.spec_from_file_location(name, path.resolve())
     if spec is None or spec.loader is None:
         raise MethodError(f"{path}: is not a Python file")
     module = importlib.util.module_from_spec(spec)
-    sys.path.insert(0, str(path.resolve().parent))  # Allows imports of files beside it, as for a script.
-    writes_bytecode = sys.dont_write_bytecode
-    sys.dont_write_bytecode = True  # No __pycache__ appears beside the user's files.
+    sys.modules[name] = module  # Dataclasses and pickle look it up.
+    sys.path[:] = [folder, *(other for other in before if other != folder)]
+    sys.dont_write_bytecode = True
     try:
         spec.loader.exec_module(module)
     except Exception as error:
+        del sys.modules[name]
+        sys.path[:] = before
         raise MethodError(f"{path}: cannot be imported: {_error_text(error)}") from error
-    finally:
-        sys.path.pop(0)
-        sys.dont_write_bytecode = writes_bytecode
     return module
+
+
+def _module_name(path: Path) -> str:
+    """Return the stem of a file, or a longer name if another module has that name."""
+    name, file = path.stem, path.resolve()
+    spec = PathFinder.find_spec(name)
+    files = {spec.origin} if spec else set()
+    if name in sys.modules:
+        files.add(getattr(sys.modules[name], "__file__", None))
+    return name if files <= {str(file)} else f"{name} in {file.parent}"
 
 
 def _require_method(name: str, value: object) -> AnyMethod:

@@ -60,10 +60,9 @@ def table_values(table: Mapping[str, Any]) -> list[Any]:
     return [
         *(table[key] for key in ("views", "views_scored", "coverage", "ranked")),
         table.get("rank_error"),
-        *table["native"].values(),
-        *table["scaled"].values(),
+        *(table[alignment][name] for alignment in ALIGNMENTS for name in METRIC_NAMES),
         table["scale_median"],
-        *table["within_mm"].values(),
+        *(table["within_mm"][str(tolerance)] for tolerance in WITHIN_MM),
         *(reference.get(name, {}).get(error) for name in _REFERENCES for error in _REFERENCE_ERRORS),
     ]
 
@@ -135,7 +134,7 @@ def views_frame(document: Mapping[str, Any]) -> DataFrame:
             "config": config_of(view["view_id"]),
             **{key: view[key] for key in ("view_id", "scored_px", "coverage", "rank_error", "scale")},
             **{f"{alignment}_{name}": view[alignment][name] for alignment in ALIGNMENTS for name in METRIC_NAMES},
-            **{f"within_{tolerance}mm": share for tolerance, share in view["within_mm"].items()},
+            **{f"within_{tolerance}mm": view["within_mm"][str(tolerance)] for tolerance in WITHIN_MM},
         }
         for view in document["views"]
     ]

@@ -19,7 +19,7 @@ from rebar_depth_bench.view_ids import scene_of
 SCALE_MEDIAN = "scale_median"
 """Key of the median over views of the scale factor in ``VIEW_METRICS``."""
 
-_VIEW_INDEX = re.compile("[0-9]{4}")
+_VIEW_INDEX = re.compile("[0-9]{4,9}")
 
 
 @dataclass(frozen=True)
@@ -105,14 +105,16 @@ def resample_views(view_ids: Sequence[str], *, by_scene: bool) -> Resampling:
 
 
 def protocol_indices(view_ids: Sequence[str]) -> list[int]:
-    """Return each view's index in its full camera protocol: the four digits at the end of its view_id.
+    """Return each view's index in its full camera protocol: the four or more digits at the end of its view_id.
 
-    If the ids do not all end with four digits, or are not in ascending order, return the positions in the
+    If the ids do not all end with such an index, or are not in its ascending order, return the positions in the
     sequence.
     """
     suffixes = [view_id.rpartition("/")[2] for view_id in view_ids]
-    if all(_VIEW_INDEX.fullmatch(suffix) for suffix in suffixes) and suffixes == sorted(suffixes):
-        return [int(suffix) for suffix in suffixes]
+    if all(map(_VIEW_INDEX.fullmatch, suffixes)):
+        indices = list(map(int, suffixes))
+        if indices == sorted(indices):
+            return indices
     return list(range(len(suffixes)))
 
 

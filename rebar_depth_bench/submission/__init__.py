@@ -1,13 +1,14 @@
 """Submission archives: writing, validation and reading of predictions."""
 
 from rebar_depth_bench.errors import EntryError
-from rebar_depth_bench.submission.entries import ExpectedViews
+from rebar_depth_bench.submission.entries import CaptureViews, ExpectedViews
 from rebar_depth_bench.submission.metadata import INPUTS, Declaration, SubmissionMeta
 from rebar_depth_bench.submission.reader import SubmissionReader, check_archive, open_submission
 from rebar_depth_bench.submission.writer import SubmissionWriter
 
 __all__ = [
     "INPUTS",
+    "CaptureViews",
     "Declaration",
     "EntryError",
     "ExpectedViews",

@@ -16,6 +16,12 @@ from rebar_depth_bench.submission.metadata import MAX_METADATA_BYTES, METADATA_N
 from rebar_depth_bench.view_ids import config_of, split_of
 
 ExpectedViews = Mapping[str, tuple[int, int]]
+
+
+class CaptureViews(dict[str, tuple[int, int]]):
+    """Expected views of a capture, whose ids are names of pictures and never name a split."""
+
+
 """Mapping of every view_id of a dataset folder to its (H, W) in pixels."""
 
 _ANY_SUFFIX = f"one of {', '.join(FORMATS)}"
@@ -142,7 +148,8 @@ def _duplicate_problems(candidates: Mapping[str, Sequence[int]], names: Sequence
 def _missing_problems(candidates: Mapping[str, Sequence[int]], expected: ExpectedViews) -> Iterator[Problem]:
     if METADATA_NAME not in candidates:
         yield Problem("missing", METADATA_NAME, "missing", '{"method": "name"}')
-    parts = {(config_of(view_id), split_of(view_id)) for view_id in candidates if view_id != METADATA_NAME}
+    split_named_by = (lambda _: None) if isinstance(expected, CaptureViews) else split_of
+    parts = {(config_of(view_id), split_named_by(view_id)) for view_id in candidates if view_id != METADATA_NAME}
     if not parts:
         yield Problem("missing", "", "no view was found", f"<view_id> with {_ANY_SUFFIX} of at least one config")
     for config, splits in _splits_by_config(parts).items():
@@ -150,7 +157,7 @@ def _missing_problems(candidates: Mapping[str, Sequence[int]], expected: Expecte
             found = f"the archive has views of the splits {' and '.join(sorted(splits))}"
             yield Problem("conflict", config, found, "views of one split")
     for view in sorted(expected):
-        config, split = config_of(view), split_of(view)
+        config, split = config_of(view), split_named_by(view)
         if (config, split) in parts and view not in candidates:
             because = f"because other views of {config if split is None else f'{config}, {split},'} are included"
             yield Problem("missing", view, "missing", f"{_ANY_SUFFIX}, {because}")

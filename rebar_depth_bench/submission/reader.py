@@ -36,7 +36,7 @@ class SubmissionReader:
 
     def __init__(self, path: str | os.PathLike[str], expected: ExpectedViews) -> None:
         self.path = Path(path)
-        self._expected = dict(expected)
+        self._expected = expected
         self._source: FileSource | None = None
         self._inspection = self._open()
 

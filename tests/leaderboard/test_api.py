@@ -270,7 +270,7 @@ def test_error_maps_are_off_by_default(private_server: Server, small_archive: Pa
     views = call(private_server, "GET", f"{API}/{submission_id}/result.json").json()["views"]
     assert views
     for view in views:
-        path = f"/submissions/{submission_id}/error-maps/{view['view_id']}.webp"
+        path = f"/submissions/{submission_id}/pictures/error/{view['view_id']}.webp"
         assert call(private_server, "GET", path).status_code == 404
 
 

@@ -7,6 +7,7 @@ The line is a list of the tables that select objects (``scene.selection.TABLES``
 
 from __future__ import annotations
 
+import ctypes
 import os
 import resource
 import signal
@@ -14,16 +15,16 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from dataset_builder.scene.ifc_reader.ahead import end_with_parent
-
 SECONDS_PER_SHAPE = 60
 """Time limit for tessellating one object; SIGALRM ends the process after it."""
+
+_PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
     """Set the limits, read the content and write the answer; native output is redirected to standard error."""
     memory_bytes, cpu_seconds, parent_pid = map(int, sys.argv[1:])
-    end_with_parent(parent_pid)
+    _end_with_parent(parent_pid)
     _set_limits(memory_bytes, cpu_seconds)
     from dataset_builder.scene.ifc_reader.answer import write_answer
     from dataset_builder.scene.selection import TABLES
@@ -31,7 +32,15 @@ def main() -> None:
     with os.fdopen(os.dup(1), "wb") as stream:
         os.dup2(2, 1)
         select = TABLES.validate_json(sys.stdin.buffer.readline())
-        write_answer(sys.stdin.buffer.read(), stream, select, _limited_time, two_processes=True)
+        write_answer(sys.stdin.buffer.read(), stream, select, _limited_time)
+
+
+def _end_with_parent(parent_pid: int) -> None:
+    """Let the kernel end this process when its parent ends, where the system can do so (Linux)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent_pid:
+            os._exit(1)
 
 
 @contextmanager

@@ -31,12 +31,10 @@ def write_answer(
     stream: BinaryIO,
     select: Sequence[Selection] = (),
     kernel_limit: Callable[[], AbstractContextManager[object]] = nullcontext,
-    *,
-    two_processes: bool = False,
 ) -> None:
     """Write the selected shapes of an IFC file's ``content`` to ``stream``, or a failure; nothing is raised.
 
-    The geometry kernel is used within ``kernel_limit()``. With ``two_processes``, large models are read by two.
+    The geometry kernel is used within ``kernel_limit()``.
     """
 
     def kernel_step(label: str, reason: str) -> AbstractContextManager[object]:
@@ -52,8 +50,7 @@ def write_answer(
         return
     try:
         records = 0
-        items = read_bars(content, select, kernel_step, two_processes=two_processes)
-        for records, item in enumerate(items, start=1):  # noqa: B007
+        for records, item in enumerate(read_bars(content, select, kernel_step), start=1):  # noqa: B007
             _write(stream, *_record(item))
         _write(stream, {"kind": "end", "records": records})
     except MemoryError:

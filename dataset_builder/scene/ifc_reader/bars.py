@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Float64, Int32
 from numpy import ndarray
 
-from dataset_builder.scene.ifc_reader.ahead import read_in_order
 from dataset_builder.scene.ifc_reader.bodies import BodyItem, body_items, type_objects
 from dataset_builder.scene.ifc_reader.declared import Declared, declared_sizes, role
 from dataset_builder.scene.ifc_reader.model import Model, angle_unit_rad, item_mesh, length_unit_m, open_model
@@ -88,14 +87,11 @@ def read_bars(
     content: bytes,
     select: Sequence[Selection] = (),
     kernel_step: KernelStep = lambda *_: nullcontext(),
-    *,
-    two_processes: bool = False,
 ) -> Iterator[Project | Shape | LeftOut]:
     """Yield the project of an IFC file's ``content``, the objects that are left out, and the shapes in its order.
 
     ``select`` chooses objects (``choose_objects``). ``kernel_step`` is called with an object's name and the reason
     why it has no axis, and entered while the geometry kernel tessellates a solid of it, which may hang or crash.
-    With ``two_processes``, the objects of a large model are read in two processes (``ahead``).
 
     Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, nothing to read or too
     much of it, if a bar depends on an instance that was not read as written, or if it has no usable geometry;
@@ -106,14 +102,13 @@ def read_bars(
     chosen, left_out = choose_objects(model, relations, select)
     for relation in model.by_type("IfcRelDefinesByType"):
         model.check.attributes(relation, "RelatedObjects", "RelatingType")
-    reader, ahead = _Reader(model, relations, kernel_step), _Reader(model, relations, _no_kernel)
+    reader = _Reader(model, relations, kernel_step)
     yield Project(reader.unit_m)
     yield from left_out
     outside = 0
     size = _Size()
-    read_ahead = ahead.shapes if two_processes else None
-    all_shapes = read_in_order(reader.shapes, [item.entity for item in chosen], read_ahead)
-    for item, shapes in zip(chosen, all_shapes, strict=True):
+    for item in chosen:
+        shapes = reader.shapes(item.entity)
         for shape in shapes:
             size.add(shape.source.label, len(_points_m(shape)))
         points = np.concatenate([_points_m(shape) for shape in shapes]) / reader.unit_m
@@ -129,11 +124,6 @@ def read_bars(
 
 def _points_m(shape: Shape) -> Float64[ndarray, "n 3"]:
     return shape.axis_m if isinstance(shape, SweptBar) else shape.vertices_m
-
-
-def _no_kernel(label: str, reason: str) -> AbstractContextManager[object]:
-    """Refuse the geometry kernel, whose failures only the first process can report."""
-    raise ShapeError(f"{label}: {reason}")
 
 
 class _Size:

@@ -50,10 +50,10 @@ def find_checkpoint(name_or_path: str) -> Checkpoint:
     if name_or_path and folder.is_dir():
         config = _read_settings(folder / CONFIG)
         return Checkpoint(folder.resolve().name, folder, None, _weights_digest(folder), config)
-    if not _REPOSITORY.fullmatch(name_or_path):
+    if not _REPOSITORY.fullmatch(name_or_path) or Path(name_or_path).parent.is_dir():
         raise MethodError(
             f"{name_or_path}: is neither a folder nor the name of a model on the Hub, expected a folder with "
-            f"{CONFIG} or ORG/NAME"
+            f"{CONFIG}, or ORG/NAME where there is no folder ORG"
         )
     folder = snapshot(name_or_path, CONFIG, _local_copy_hint(name_or_path))
     return Checkpoint(name_or_path, folder, name_or_path, f"commit {folder.name}", _read_settings(folder / CONFIG))

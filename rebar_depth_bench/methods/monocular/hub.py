@@ -28,7 +28,7 @@ def snapshot(repository: str, file: str, local_hint: str) -> Path:
 
     Raises ``MethodError`` if the download fails.
     """
-    from huggingface_hub import hf_hub_download
+    from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
     from huggingface_hub.errors import LocalEntryNotFoundError
 
     try:
@@ -36,6 +36,7 @@ def snapshot(repository: str, file: str, local_hint: str) -> Path:
     except LocalEntryNotFoundError:
         pass
     with hub_download(repository, file, local_hint):
+        get_hf_file_metadata(hf_hub_url(repository, file))  # Without an answer, the download would try six times.
         return Path(hf_hub_download(repository, file)).parent
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -14,7 +15,9 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench import score
+from rebar_depth_bench.cli import check
 from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN
 from tests.commands import run_in_process
 
@@ -121,6 +124,17 @@ def test_check_accepts_valid_archive(constant: Path, tiny_root: Path) -> None:
     assert "no problem found" in finished.stdout
 
 
+def test_check_reads_the_manifest_once(
+    constant: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = shutil.copytree(tiny_root, tmp_path / "dataset")
+    # Another manifest would not have the expected digest.
+    monkeypatch.setattr(check, "print_verified", lambda _: (root / "manifest.json").unlink())
+    digest = open_folder(root).digest
+    finished = run_in_process(main, "check", constant, "--data", root, "--expect-digest", digest)
+    assert (finished.returncode, finished.stderr.count("error: ")) == (0, 0), finished.stderr
+
+
 @pytest.mark.parametrize("command", ["score", "check"])
 def test_invalid_archive_exits_2_and_lists_problems(command: str, tiny_root: Path, tmp_path: Path) -> None:
     archive = tmp_path / "bad.zip"
@@ -148,6 +162,9 @@ def test_invalid_archive_exits_2_and_lists_problems(command: str, tiny_root: Pat
         ),
         (("predict", "sgbm", "--data", "ROOT", "--out", "x.zip", "--config", "pier"), 2, "no config 'pier'"),
         (("score",), 2, "usage:"),
+        (("predict", "x", "--nearest-distance", "near"), 2, "'near' is not a distance above 0 m"),
+        (("predict", "x", "--view-timeout", "soon"), 2, "'soon' is not a number above 0, up to"),
+        (("view", "x", "lattice/0028", "--signed-error", "1 mm"), 2, "'1 mm' is not a length above 0 mm"),
         ((), 2, "usage:"),
         (("methods",), 0, ""),
     ],

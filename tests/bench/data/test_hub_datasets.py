@@ -15,9 +15,12 @@ pytest.importorskip("uvicorn")
 
 import yaml
 from huggingface_hub import parse_eval_result_entries
+from starlette.responses import Response
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.methods.huggingface.checkpoints import find_checkpoint
 from tests.hub_server import HubServer, folder_files, running_hub
 
 REVISIONS = ("main", "v1.0", "refs/pr/1")
@@ -83,6 +86,38 @@ def test_revision_selects_the_commit_of_all_files(reading_hub: HubServer, tmp_pa
 def test_unknown_revision_is_refused(reading_hub: HubServer, tmp_path: Path) -> None:
     finished = run_script("org/data@v2", tmp_path / "home", reading_hub.url)
     assert "DatasetError: org/data@v2: not a local folder, and its manifest.json cannot" in finished.stderr
+
+
+def use_hub(monkeypatch: pytest.MonkeyPatch, hub: HubServer) -> None:
+    """Let addresses of files be those of the server; the package makes their template when it is imported."""
+    template = f"{hub.url}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
+    monkeypatch.setattr("huggingface_hub.constants.HUGGINGFACE_CO_URL_TEMPLATE", template)
+
+
+@pytest.mark.slow
+def test_hub_without_answer_is_asked_once(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    use_hub(monkeypatch, hub)
+    hub.faults["HEAD *"] = lambda _: Response(status_code=503)
+    with pytest.raises(rdb.DatasetError, match=r"^org/data: not a local folder, .* from the Hub: .*503"):
+        open_folder("org/data")
+    with pytest.raises(MethodError, match=r"cannot be downloaded from .*503"):
+        find_checkpoint("org/model")
+    asked = [request.path for request in hub.requests if "/resolve/" in request.path]
+    assert asked == ["/datasets/org/data/resolve/main/manifest.json", "/org/model/resolve/main/config.json"]
+
+
+def test_missing_folder_in_a_folder_is_not_asked_at_the_hub(
+    hub: HubServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_hub(monkeypatch, hub)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "org").mkdir()
+    for root in ("org/data", "org/data@refs/pr/1"):
+        with pytest.raises(rdb.DatasetError, match=f"^{root}: no such folder, .* Hub .* folder org exists here"):
+            open_folder(root)
+    with pytest.raises(MethodError, match=r"^org/model: .*, or ORG/NAME where there is no folder ORG"):
+        find_checkpoint("org/model")
+    assert not [request for request in hub.requests if "/resolve/" in request.path]
 
 
 @pytest.mark.parametrize(

@@ -193,6 +193,8 @@ def problems(path: Path) -> list[tuple[str, str]]:
         ("view_id,x,y,z\ncages/train-third-0000,1,2,3\ncages/test-first-0000,1,2,3\n", [("conflict", "cages")]),
         ("# inputs: radar\nview_id,x,y,z\nmat/0000,1,2,3\n", [("invalid", "metadata.inputs")]),
         ('view_id,x,y,z\n"mat/0000,1,2,3\n', [("syntax", "line 2")]),
+        ('# method: foo,"bar\nview_id,x,y,z\nmat/0000,1,2,far\n', [("invalid", "line 3: z")]),
+        ('# note: "\nview_id,x,y,z\n"mat/0000,1,2,3\n', [("syntax", "line 3")]),
     ],
 )
 def test_every_problem_of_a_csv_is_named(tmp_path: Path, text: str, expected: Sequence[tuple[str, str]]) -> None:

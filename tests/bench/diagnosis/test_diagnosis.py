@@ -54,6 +54,7 @@ MADE = (
     "shift",
     "right-eye",
     "same-map",
+    *("log", "log10", "normalised", "negative", "infinite", "nan"),
     *UNITS,
     *ORDERS,
 )
@@ -104,7 +105,7 @@ def test_wrong_scale_is_no_mistake(scale: float, tiny_root: Path, tmp_path: Path
     assert _named(tiny_root, tmp_path, rows, [scale * row["left_depth"] for row in rows]) == []
 
 
-@pytest.mark.parametrize("image", ["noise", "constant", "plane", "nothing", "huge"])
+@pytest.mark.parametrize("image", ["noise", "constant", "plane", "huge"])
 def test_prediction_without_structure_is_no_mistake(
     image: str, tiny_root: Path, tmp_path: Path, rows: Rows
 ) -> None:
@@ -115,7 +116,6 @@ def test_prediction_without_structure_is_no_mistake(
         "noise": lambda: random.uniform(0.1, 5.0, shape),
         "constant": lambda: np.full(shape, 1000.0),
         "plane": lambda: np.broadcast_to(0.5 + 0.01 * v + random.uniform(0, 1e-6), shape).copy(),
-        "nothing": lambda: np.full(shape, random.choice([0.0, math.nan, -1.0, math.inf])),
         "huge": lambda: np.full(shape, 1e38) * random.uniform(0.5, 1, shape),
     }
     assert _named(tiny_root, tmp_path, rows, [make[image]() for _ in rows]) == []
@@ -158,6 +158,32 @@ def test_commands_print_notes_and_leave_the_result_alone(tiny_root: Path, tmp_pa
         assert "mistake" not in finished.stdout
     assert "Possible mistake: " in page.read_text()
     assert result.read_bytes() == score(archive, tiny_root).to_json()
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda z: np.full_like(z, math.nan), "0.0 % are infinite, 100.0 % are NaN, 0.0 % are zero and 0.0 % are"),
+        (lambda z: np.full_like(z, -math.inf), "0.0 % are negative, 100.0 % are infinite, 0.0 % are NaN, "),
+        (np.negative, "100.0 % are negative, 0.0 % are infinite, 0.0 % are NaN, 0.0 % are zero"),
+        (np.zeros_like, "0.0 % are NaN, 100.0 % are zero and 0.0 % are finite and above 0"),
+        (
+            lambda z: np.log(z + (z == 0)),
+            "natural logarithms of depth in metres: the mean error after scaling, 10",
+        ),
+        (lambda z: z / z.max(), "depth divided by the largest value of each picture: the mean error is "),
+    ],
+    ids=["NaN", "infinite", "negative", "zero", "logarithm", "normalised"],
+)
+def test_check_names_values_that_are_no_depth(
+    make: Callable[[np.ndarray], np.ndarray], words: str, tiny_root: Path, tmp_path: Path, rows: Rows
+) -> None:
+    archive = tmp_path / "made.zip"
+    _write(archive, rows, [make(row["left_depth"]) for row in rows])
+    checked = run_in_process(main, "check", archive, "--data", tiny_root)
+    assert checked.returncode == 0
+    assert words in checked.stderr
+    assert "one picture" not in checked.stderr
 
 
 def test_report_of_a_sound_submission_has_no_section_of_mistakes(

@@ -288,6 +288,44 @@ def test_resumed_run_keeps_work_and_finished_configs(tiny_root: Path, tmp_path: 
     assert [path.name for path in tmp_path.iterdir()] == ["whole.zip"]
 
 
+def test_user_file_is_a_module_that_imports_files_beside_it(
+    tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    for name, value in (("when_loaded", "0.5"), ("when_run", "1.0")):
+        (tmp_path / f"own_{name}.py").write_text(f"VALUE = {value}\n")
+    path = tmp_path / "own_module.py"
+    path.write_text("""
+from __future__ import annotations
+import pickle
+from dataclasses import dataclass, field
+from typing import ClassVar
+import numpy as np
+from rebar_depth_bench.methods import Method, MethodInfo
+
+@dataclass
+class Settings:
+    unused: ClassVar[int] = 0
+    values: list[float] = field(default_factory=list)
+
+def load():
+    import own_when_loaded
+    def run(row):
+        import own_when_run
+        settings = pickle.loads(pickle.dumps(Settings([own_when_loaded.VALUE, own_when_run.VALUE])))
+        return np.full(row["left_rgb"].shape[:2], sum(settings.values), np.float32)
+    return run
+
+METHOD = Method(MethodInfo("own", "a test", ("left_rgb",), False, "here", "MIT"), load)
+""")
+    predict(find_method(f"{path}:METHOD"), tiny_root, tmp_path / "own.zip", configs=["lattice-orbit"])
+    assert not (tmp_path / "__pycache__").exists()
+    path = path.rename(tmp_path / "json.py")  # The name of another module, which stays what it is.
+    assert find_method(f"{path}:METHOD").info.name == "own"
+    assert sys.modules["json"] is json
+
+
 def test_failing_check_stops_run_before_prediction(tiny_root: Path, tmp_path: Path) -> None:
     log: list[str] = []
     with pytest.raises(MethodError, match="lattice-orbit: does not fit"):

@@ -20,6 +20,8 @@ from rebar_depth_bench.scoring.bootstrap import (
     resample,
     resample_scenes,
 )
+from rebar_depth_bench.scoring.view_score import protocol_indices, resample_views
+from rebar_depth_bench.view_ids import view_id
 
 
 def mean_interval(values: np.ndarray, indices: range) -> tuple[float, float] | None:
@@ -51,6 +53,14 @@ def test_resamples_have_equal_size_and_draw_whole_blocks() -> None:
 )
 def test_block_length_is_one_ring_of_full_protocol(indices: range, length: int) -> None:
     assert block_length(indices) == length
+
+
+@pytest.mark.parametrize("first", [0, 9_990, 99_990])
+def test_blocks_do_not_depend_on_the_digits_of_view_ids(first: int) -> None:
+    view_ids = [view_id("dome", index) for index in range(first, first + 60, 3)]
+    assert protocol_indices(view_ids) == list(range(first, first + 60, 3))
+    expected = resample(range(0, 60, 3))
+    np.testing.assert_array_equal(resample_views(view_ids, by_scene=False).counts, expected.counts)
 
 
 def test_independent_views_give_normal_interval() -> None:

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.bars import read_bars
+from rebar_depth_bench.data.bars import read_bars, write_bars
+from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.comparison_tables import comparison_csv
 from rebar_depth_bench.reporting.extended_tables import extended_csv
 from rebar_depth_bench.reporting.tables import frame_csv, result_csv
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.frames import TABLE_COLUMNS, make_frame, table_values
+from rebar_depth_bench.scoring.frames import TABLE_COLUMNS, make_frame, table_values, tables_frame, views_frame
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.view_score import VIEW_METRICS
 from tests.bench.reporting.pages import Page
@@ -94,16 +98,36 @@ def test_csv_without_rows_has_the_header(two_configs: Result) -> None:
     )
 
 
-def test_bars_of_a_dataset_folder(tiny_root: Path) -> None:
-    frame = rdb.bars(tiny_root)
-    bars = read_bars(tiny_root / "bars.parquet")["lattice"]
+def test_bars_of_a_dataset_folder(tiny_root: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(tiny_root, tmp_path / "dataset")
+    path, manifest = root / "bars.parquet", root / "manifest.json"
+    before, bars = file_sha256(path), list(read_bars(path)["lattice"])
+    bars[0] = dataclasses.replace(bars[0], nominal_axis_m=((0.0, 0.0, 0.5), (1.0, 0.0, 0.5)))
+    write_bars(path, {"lattice": tuple(bars)})
+    manifest.write_text(manifest.read_text().replace(before, file_sha256(path)))
+    frame = rdb.bars(root)
     assert (len(frame), set(frame["scene"])) == (len(bars), {"lattice"})
     assert frame["bar_id"].tolist() == [bar.bar_id for bar in bars]
+    assert set(frame) == {*pq.read_schema(path).names, "length_m"}
     first = frame.iloc[0]
-    assert np.array_equal(first["axis_m"], np.array(bars[0].axis_m))
-    assert first["length_m"] == pytest.approx(
-        float(np.linalg.norm(np.diff(first["axis_m"], axis=0), axis=1).sum())
-    )
+    assert np.array_equal(first["axis"], np.array(bars[0].axis_m))
+    assert np.array_equal(first["nominal_axis"], np.array(bars[0].nominal_axis_m))
+    assert {axis.shape for axis in frame["nominal_axis"][1:]} == {(0, 3)}
+    assert first["length_m"] == pytest.approx(float(np.linalg.norm(np.diff(first["axis"], axis=0), axis=1).sum()))
+
+
+def test_columns_do_not_depend_on_the_order_of_a_document(two_configs: Result) -> None:
+    document = two_configs.to_dict()
+    tables = tables_frame([_reversed(document)]).iloc[::-1]
+    assert tables.to_csv(index=False) == tables_frame([document]).to_csv(index=False)
+    assert views_frame(_reversed(document)).to_csv() == views_frame(document).to_csv()
+
+
+def _reversed(value: Any) -> Any:
+    """Return a document with the keys of all objects in reverse order."""
+    if isinstance(value, dict):
+        return {key: _reversed(item) for key, item in reversed(value.items())}
+    return [_reversed(item) for item in value] if isinstance(value, list) else value
 
 
 def test_repr_fits_a_screen() -> None:

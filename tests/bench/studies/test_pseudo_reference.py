@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rebar_depth_bench import SubmissionWriter
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.studies.pseudo_reference import command as study_module
 from rebar_depth_bench.studies.pseudo_reference.command import run_pseudo_reference_study
@@ -187,6 +188,22 @@ def test_equal_names_are_made_unique(lab: Path) -> None:
 
 def test_result_is_independent_of_worker_count(lab: Path) -> None:
     assert run_lab(lab, "mono", "other", workers=1) == run_lab(lab, "mono", "other", workers=3)
+
+
+def test_names_of_pictures_are_no_splits(tmp_path: Path) -> None:
+    capture = write_capture(tmp_path / "site", views=6)
+    stems = [f"{split}-left-{view:04d}" for split in ("test", "train") for view in range(3)]
+    for eye in ("left", "right"):
+        for view, stem in enumerate(stems):
+            (capture / eye / f"{view:06d}.png").rename(capture / eye / f"{stem}.png")
+    for name in ("reference", "method"):
+        with SubmissionWriter(tmp_path / f"{name}.zip", method=name) as writer:
+            for view, stem in enumerate(stems):
+                writer.add(f"site/{stem}", exact_depth(view))
+    result = run_pseudo_reference_study(
+        [str(tmp_path / "method.zip")], [str(tmp_path / "reference.zip")], str(capture)
+    )
+    assert [row.method for row in result.rows] == ["method"]
 
 
 def test_dataset_folder_adds_exact_references(

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
+from PIL import Image, ImageDraw
 from rich.console import Console
 
 from dataset_builder.cli import main
-from dataset_builder.inspection.picture import inspection_picture
+from dataset_builder.inspection.picture import _draw_scale_bar, inspection_picture
 from dataset_builder.inspection.report import inspection_json, print_inspection
 from dataset_builder.inspection.summary import bar_box_m, inspect_cage
 from dataset_builder.pipeline.notes import MAX_NOTES, print_notes
@@ -168,6 +168,15 @@ def test_picture_shows_bars_of_every_size(scale: float) -> None:
     for panel in panels:
         assert (panel[60:580].max(axis=2).astype(int) - panel[60:580].min(axis=2) > 40).any()
     json.loads(inspection_json(inspect_cage(cage, "a")))
+
+
+@pytest.mark.parametrize("power", range(-3, 4))
+def test_picture_has_a_scale_bar_at_rounding_edges(power: int) -> None:
+    px_per_m = 240 / np.nextafter(10.0**power, 0.0)  # The logarithm of the longest bar is rounded up.
+    for pixels in np.nextafter(px_per_m, [0.0, np.inf, px_per_m]).tolist():
+        image = Image.new("RGB", (960, 640))
+        _draw_scale_bar(ImageDraw.Draw(image), pixels)
+        assert image.getbbox() is not None
 
 
 def test_notes_are_cut_and_lengths_come_last(capsys: pytest.CaptureFixture[str]) -> None:

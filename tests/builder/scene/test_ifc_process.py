@@ -21,9 +21,11 @@ from dataset_builder.config.scene_file import scene_config
 from dataset_builder.scene.assemblies.ifc import process
 from dataset_builder.scene.assemblies.ifc.answer import MAX_ARRAY_BYTES, Answer, AnswerError
 from dataset_builder.scene.assemblies.ifc.process import ifc_cage
+from dataset_builder.scene.ifc_reader.__main__ import SECONDS_PER_SHAPE, _limited_time
 from dataset_builder.scene.model import MAX_BARS
 from rebar_depth_bench.errors import InputError, MeshError
 from rebar_depth_bench.limits import IFC_MEMORY_BYTES, IFC_SECONDS
+from tests.builder.scene.ifc_step_text import MILLIMETRES, Step
 from tests.builder.scene.ifc_writer import Ifc, extruded_circle
 from tests.processes import is_running, wait_until
 
@@ -102,6 +104,26 @@ def test_limits_of_time_and_memory_end_the_process(monkeypatch: pytest.MonkeyPat
         MeshError, match=r"^a.ifc: .*needs more than 262144000 .*REBAR_MAX_IFC_MEMORY_BYTES raises"
     ):
         ifc_cage(content, "a.ifc")
+
+
+@pytest.mark.slow
+def test_large_model_is_read_by_one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    bars, step = 600, Step(MILLIMETRES, "IFC4")
+    solid = step.disc(step.polyline((0, 0, 0), (0, 0, 1000)), 5.0, "$", "$")
+    for bar in range(bars):
+        step.bar([solid], 0.010, 1.0, at=(100 * bar, 0, 0))
+    program = (
+        "import os, runpy, sys; sys.addaudithook(lambda event, _: os._exit(3) if event == 'os.fork' else None); "
+        "runpy.run_module('dataset_builder.scene.ifc_reader', run_name='__main__')"
+    )
+    monkeypatch.setattr(process, "COMMAND", (sys.executable, "-c", program))
+    assert len(ifc_cage(step.text().encode(), "a.ifc").bars) == bars  # A fork would have limits of its own.
+
+
+def test_time_limit_ends_with_the_use_of_the_kernel() -> None:
+    with _limited_time():
+        assert 0 < signal.getitimer(signal.ITIMER_REAL)[0] <= SECONDS_PER_SHAPE
+    assert signal.getitimer(signal.ITIMER_REAL)[0] == 0
 
 
 @pytest.mark.slow
