@@ -13,39 +13,43 @@ from datetime import UTC, datetime
 
 import structlog
 from sqlalchemy import select
+from sqlalchemy.exc import DatabaseError
 
 from leaderboard.db import jobs, submissions
-from leaderboard.db.engine import Database, without_password
+from leaderboard.db.engine import Database, sqlite_path, without_password
 from leaderboard.db.models import SubmissionModel, TokenModel
-from leaderboard.db.submissions import DELETED
+from leaderboard.db.submissions import DELETED, archive_rows
 from leaderboard.db.tokens import create_token, list_tokens, replace_token, revoke_token
 from leaderboard.scoring.worker import process_queue
 from leaderboard.service import disk_problem, queue_problems
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import ArchiveStore
 from leaderboard.storage.backup import back_up
-from leaderboard.storage.retention import delete_archives, expired_archives
+from leaderboard.storage.retention import expired_archives, orphaned_archives, prune_archives
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.verification import file_problems
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import InputError, StorageError, problem_summary
 from rebar_depth_bench.reporting.formatting import counted
 from rebar_depth_bench.reporting.tables import csv_text
 from rebar_depth_bench.version import software_version
 
 _LOG = structlog.get_logger("worker")
+_POSTGRESQL_NOTE = (
+    "Only the archives are copied. The rows are in PostgreSQL: save them with pg_dump before each backup, so that "
+    "every row that is saved has its archive."
+)
 Cell = str | float | None
 
 
 def run_operation(command: str, settings: Settings, options: argparse.Namespace) -> None:
-    """Run a command on the database of the settings, and print its output. Raises ``InputError``."""
-    if command == "backup":
-        print(back_up(settings, options.target))
+    """Run a command on the database of the settings, and print its output.
+
+    Raises ``InputError``, and ``StorageError`` for stored data that are missing or damaged.
+    """
+    if command in ("backup", "check"):
+        (_back_up if command == "backup" else _check)(settings, options)
         return
     with closing(Database(settings.database_url)) as database:
-        if command == "score" and database.file is not None and not database.file.is_file():
-            raise InputError(
-                f"{settings.database_url}: the database does not exist, expected the database of a server"
-            )
         database.migrate()
         _OPERATIONS[command](database, settings, options)
 
@@ -103,33 +107,83 @@ def _remove(database: Database, settings: Settings, options: argparse.Namespace)
 
 
 def _prune(database: Database, settings: Settings, options: argparse.Namespace) -> None:
+    archives = ArchiveStore(settings.archive_dir)
+    if options.orphans:
+        for submission_id in orphaned_archives(database, archives):
+            if not options.dry_run:
+                archives.delete(submission_id)
+            print(submission_id)
+        return
     if not settings.archive_days:
         raise InputError("archive_days is 0, which keeps every archive; expected --archive-days DAYS")
-    expired = expired_archives(database, open_folder(settings.data).configs, settings)
+    expired = expired_archives(database, open_folder(settings.data), settings)
     if not options.dry_run:
-        delete_archives(database, ArchiveStore(settings.archive_dir), expired)
+        prune_archives(database, archives, expired)
     for record in expired:
         print(record.id)
 
 
-def _check(database: Database, settings: Settings, _: argparse.Namespace) -> None:
-    """Print that all is well. Raises ``InputError`` with everything that is wrong."""
-    folder = open_folder(settings.data)
-    problems = [str(problem) for problem in file_problems(folder)]
-    if stale := jobs.count_stale_submissions(database, folder.digest):
-        problems.append(f"{counted(stale, 'submission')} of another dataset than {folder.digest}")
-    archives = ArchiveStore(settings.archive_dir).ids()
-    query = select(SubmissionModel.id).where(
-        SubmissionModel.status != DELETED, SubmissionModel.archive_deleted_at.is_(None)
-    )
-    with database.read() as session:
-        missing = [submission_id for submission_id in session.scalars(query) if submission_id not in archives]
-    problems += [f"the archive of submission {submission_id} is missing" for submission_id in missing]
-    problems += [*disk_problem(settings.state_dir), *queue_problems(database)]
+def _back_up(settings: Settings, options: argparse.Namespace) -> None:
+    missing = back_up(settings, options.target, options.prune)
+    print(options.target)
+    if sqlite_path(settings.database_url) is None:
+        print(_POSTGRESQL_NOTE, file=sys.stderr)
+    if missing:
+        problems = [f"the archive of submission {submission_id} is missing" for submission_id in missing]
+        raise StorageError(f"{options.target}: has all the rest, but {problem_summary(problems)}")
+
+
+def _check(settings: Settings, options: argparse.Namespace) -> None:
+    """Print that all is well. Raises ``StorageError`` with everything that is wrong, ``InputError`` for a dataset.
+
+    Nothing is written or created.
+    """
+    archives = ArchiveStore(settings.archive_dir, create=False)
+    folders = {"archives": settings.archive_dir, "state folder": settings.state_dir}
+    disks = {name: folder for name, folder in folders.items() if folder.is_dir()}
+    with closing(Database(settings.database_url, read_only=True)) as database:
+        database.check_schema()
+        problems = database.problems()
+        for name, folder in disks.items():
+            problems += disk_problem(folder, name)
+        try:
+            problems += _archive_problems(database, archives, options.hash_archives)
+            problems += queue_problems(database)
+            of_dataset = _dataset_problems(database, settings, archives)
+        except DatabaseError:
+            if not problems:
+                raise
+            of_dataset = []
     if problems:
-        raise InputError("\n".join([f"{counted(len(problems), 'problem')}:", *(f"  - {one}" for one in problems)]))
-    free = shutil.disk_usage(settings.state_dir).free
-    print(f"dataset, database, {counted(len(archives), 'archive')} and queue are in order; {free >> 30} GiB free")
+        raise StorageError(problem_summary([*problems, *of_dataset]))
+    if of_dataset:
+        raise InputError(problem_summary(of_dataset))
+    free = min((shutil.disk_usage(folder).free >> 30 for folder in disks.values()), default=0)
+    print(f"dataset, database, {counted(len(archives.ids()), 'archive')} and queue are in order; {free} GiB free")
+
+
+def _archive_problems(database: Database, archives: ArchiveStore, hashed: bool) -> list[str]:
+    rows = archive_rows(database)
+    found = {
+        submission_id: archives.problem(submission_id, row, hashed) for submission_id, row in rows.items() if row
+    }
+    rows = archive_rows(database)  # Again, because an archive may be deleted meanwhile.
+    problems = [problem for submission_id, problem in found.items() if problem and rows[submission_id]]
+    unneeded = sorted(submission_id for submission_id in archives.ids() if rows.get(submission_id, "") is None)
+    problems += [f"the archive {name}.zip is still there, although its row says deleted" for name in unneeded]
+    orphans = orphaned_archives(database, archives)
+    return problems + [f"the archive {name}.zip has no submission; prune --orphans deletes it" for name in orphans]
+
+
+def _dataset_problems(database: Database, settings: Settings, archives: ArchiveStore) -> list[str]:
+    try:
+        folder = open_folder(settings.data)
+        problems = [str(problem) for problem in file_problems(folder)]
+    except InputError as error:
+        return [str(error)]
+    if stale := jobs.count_other_datasets(database, folder.digest, archives.ids()):
+        problems.append(f"{counted(stale, 'submission')} of another dataset than {folder.digest}")
+    return problems
 
 
 def _print_csv(head: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
@@ -147,5 +201,4 @@ _OPERATIONS: dict[str, Callable[[Database, Settings, argparse.Namespace], None]]
     "submissions": _submissions,
     "remove": _remove,
     "prune": _prune,
-    "check": _check,
 }

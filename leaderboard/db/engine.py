@@ -1,20 +1,22 @@
-"""Database engine for SQLite and PostgreSQL: read sessions, write sessions and schema migration."""
+"""Database engine for SQLite and PostgreSQL: read sessions, write sessions, schema migration and checks."""
 
 from __future__ import annotations
 
+import json
 import re
+import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event, inspect
+from sqlalchemy import Connection, Engine, create_engine, event, inspect, select, text
 from sqlalchemy.exc import ArgumentError, DatabaseError, InterfaceError, NoSuchModuleError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.orm import Session
 
-from leaderboard.db.models import Base
-from rebar_depth_bench.errors import InputError
+from leaderboard.db.models import Base, ResultModel
+from rebar_depth_bench.errors import InputError, StorageError
 
 MIGRATIONS = Path(__file__).parent / "migrations"
 SQLITE_BUSY_TIMEOUT_S = 30
@@ -33,13 +35,15 @@ class Database:
 
     With ``hidden_truth``, the functions of this package return only the disclosed part of the stored scores
     (``rebar_depth_bench.scoring.disclosure``). What is stored does not depend on it.
+
+    With ``read_only``, an SQLite database must exist, and nothing is written or created to read it.
     """
 
-    def __init__(self, url: str, *, hidden_truth: bool = False) -> None:
+    def __init__(self, url: str, *, hidden_truth: bool = False, read_only: bool = False) -> None:
         """Create the engine. Raises ``InputError`` if ``url`` is not a valid database URL."""
         self.hidden_truth = hidden_truth
         try:
-            self._engine = _engine(url)
+            self._engine = _engine(url, read_only)
         except (ArgumentError, NoSuchModuleError, ImportError, OSError) as error:
             raise InputError(f"{without_password(url)}: invalid database URL: {error}") from None
         self.file = sqlite_path(url)
@@ -66,10 +70,11 @@ class Database:
     def migrate(self) -> None:
         """Create the schema or upgrade it; services that start simultaneously take turns.
 
-        Raises ``InputError`` if the database is unavailable.
+        Raises ``InputError`` if the database is unavailable or has the schema of a later version.
         """
         from alembic import command  # Half a second to import, which processes that only score do not need.
         from alembic.config import Config
+        from alembic.util import CommandError
 
         config = Config()
         config.set_main_option("script_location", str(MIGRATIONS))
@@ -87,6 +92,45 @@ class Database:
             url = self._engine.url.render_as_string(hide_password=True)
             reason = " ".join(str(getattr(error, "orig", error)).split())
             raise InputError(f"{url}: the database is unavailable: {reason}") from None
+        except CommandError:  # It has no migration to the revision that it found.
+            self.check_schema()
+            raise
+
+    def check_schema(self) -> None:
+        """Raise ``InputError`` unless the database has the schema of this version."""
+        from alembic.migration import MigrationContext
+        from alembic.script import ScriptDirectory
+
+        with self._engine.connect() as connection:
+            found = MigrationContext.configure(connection).get_current_revision()
+        scripts = ScriptDirectory(str(MIGRATIONS))
+        expected = scripts.get_current_head()
+        place = self._engine.url.render_as_string(hide_password=True)
+        if found is None:
+            raise InputError(f"{place}: holds no leaderboard, expected the database of one")
+        if found != expected:
+            known = found in {script.revision for script in scripts.walk_revisions()}
+            hint = "serve upgrades it" if known else "expected the version of this software that wrote it"
+            raise InputError(f"{place}: the database has the schema {found}, not {expected}; {hint}")
+
+    def problems(self) -> list[str]:
+        """Return what is damaged: pages and references of an SQLite database, and results that are no JSON."""
+        found: list[str] = []
+        with self.read() as session:
+            if not self.has_row_locks:
+                pages = session.scalars(text("PRAGMA integrity_check(5)")).all()
+                found += [f"the database is damaged: {page}" for page in pages if page != "ok"]
+                if found:  # Nothing else that is read can be relied on.
+                    return found
+                for table, row, parent, _ in session.execute(text("PRAGMA foreign_key_check")):
+                    found.append(f"row {row} of {table} refers to a missing row of {parent}")
+            results = select(ResultModel.submission_id, ResultModel.json)
+            for submission_id, content in session.execute(results, execution_options={"yield_per": 20}):
+                try:
+                    json.loads(content)
+                except ValueError:
+                    found.append(f"the result of submission {submission_id} is no JSON")
+        return found
 
     def close(self) -> None:
         """Close all connections."""
@@ -104,7 +148,24 @@ def sqlite_path(url: str) -> Path | None:
     return Path(url.removeprefix(prefix)) if url.startswith(prefix) else None
 
 
-def _engine(url: str) -> Engine:
+@contextmanager
+def database_errors(url: str) -> Iterator[None]:
+    """Raise the errors of the database in the block as ``StorageError`` that names it."""
+    try:
+        yield
+    except (*DATABASE_UNAVAILABLE, DatabaseError) as error:
+        reason = " ".join(str(getattr(error, "orig", error)).split())
+        raise StorageError(f"{without_password(url)}: the database cannot be used: {reason}") from None
+
+
+def read_only_uri(file: Path) -> str:
+    """Return the URI by which SQLite reads a database without creating files beside it."""
+    # Without a write-ahead log nobody has the database open.
+    is_open = Path(f"{file}-wal").exists()
+    return f"{file.resolve().as_uri()}?{'mode=ro' if is_open else 'immutable=1'}"
+
+
+def _engine(url: str, read_only: bool) -> Engine:
     path = sqlite_path(url)
     if path is None:
         return create_engine(
@@ -115,6 +176,12 @@ def _engine(url: str) -> Engine:
             pool_size=10,
             max_overflow=10,
         )
+    if read_only:
+        engine = create_engine(
+            url, creator=lambda: sqlite3.connect(read_only_uri(path), uri=True, isolation_level=None)
+        )
+        event.listen(engine, "begin", _begin_transaction)
+        return engine
     path.parent.mkdir(parents=True, exist_ok=True)
     engine = create_engine(
         url, hide_parameters=True, connect_args={"timeout": SQLITE_BUSY_TIMEOUT_S}, pool_size=20, max_overflow=20

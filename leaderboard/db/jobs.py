@@ -12,7 +12,7 @@ import time
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, func, or_, select, update
+from sqlalchemy import ColumnElement, and_, or_, select, update
 from sqlalchemy.engine import CursorResult
 from sqlalchemy.orm import Session
 
@@ -29,6 +29,7 @@ from leaderboard.db.models import (
 from leaderboard.db.submissions import FAILED, QUEUED, SCORED, SCORING, delete_results
 from leaderboard.db.view_errors import view_errors
 from leaderboard.scoring.sandbox import Outcome
+from leaderboard.settings import MAX_LEASE_S
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 MAX_ATTEMPTS = 5
@@ -46,8 +47,7 @@ def claim(database: Database, scorer: str, lease_s: float) -> str | None:
     while True:
         with database.write() as session:
             now = time.time()
-            is_free = or_(SubmissionModel.lease_until.is_(None), SubmissionModel.lease_until < now)
-            waiting = and_(SubmissionModel.status.in_((QUEUED, SCORING)), is_free)
+            waiting = and_(SubmissionModel.status.in_((QUEUED, SCORING)), is_free(now))
             order = (SubmissionModel.attempts, SubmissionModel.created_at)
             oldest = select(SubmissionModel).where(waiting).order_by(*order).limit(1)
             if database.has_row_locks:
@@ -61,6 +61,16 @@ def claim(database: Database, scorer: str, lease_s: float) -> str | None:
                 return record.id
             record.status, record.finished_at = FAILED, now
             record.reason = f"scoring was started {record.attempts} times but never finished"
+
+
+def is_free(now: float) -> ColumnElement[bool]:
+    """Return the condition that no lease holds a submission at Unix time ``now``.
+
+    A lease that ends later than any lease can was made before the clock was set back, and holds nothing. Twice the
+    longest one leaves room for the clocks of other machines.
+    """
+    lease_until = SubmissionModel.lease_until
+    return or_(lease_until.is_(None), lease_until < now, lease_until > now + 2 * MAX_LEASE_S)
 
 
 def renew(database: Database, submission_id: str, scorer: str, lease_s: float) -> bool:
@@ -82,7 +92,10 @@ def release(database: Database, submission_id: str, scorer: str, wait_s: float =
 
 
 def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome) -> bool:
-    """Store the outcome in one transaction if ``scorer`` still holds the lease; return whether it did."""
+    """Store the outcome in one transaction if ``scorer`` still holds the lease; return whether it did.
+
+    If the archive is missing, a result that was to be computed again stays, with its dataset.
+    """
     result = None if outcome.result is None else json.loads(outcome.result)
     values = {
         "status": FAILED if result is None else SCORED,
@@ -91,6 +104,9 @@ def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome
         "lease_until": None,
     }
     with database.write() as session:
+        if outcome.archive_missing and (kept := session.get(ResultModel, submission_id)):
+            digest = json.loads(kept.json)["dataset"]["digest"]
+            values |= {"status": SCORED, "reason": None, "dataset_digest": digest}
         if not _update_one(session, _has_lease(submission_id, scorer), values):
             return False
         if result is not None:
@@ -100,41 +116,58 @@ def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome
     return True
 
 
-def count_stale_submissions(database: Database, dataset_digest: str) -> int:
-    """Return the number of submissions that belong to another dataset than the one with ``dataset_digest``."""
-    with database.read() as session:
-        return session.scalar(select(func.count()).where(_is_stale(dataset_digest))) or 0
+def count_other_datasets(database: Database, dataset_digest: str, archive_ids: Collection[str]) -> int:
+    """Return the number of submissions of other datasets that can be scored against this one.
 
-
-def requeue_stale_submissions(database: Database, dataset_digest: str) -> None:
-    """Requeue the submissions of other datasets for scoring against this one; old results stay until replaced."""
-    with database.write() as session:
-        values = {"status": QUEUED, "attempts": 0, "finished_at": None, "dataset_digest": dataset_digest}
-        session.execute(update(SubmissionModel).where(_is_stale(dataset_digest)).values(**values))
-        increment_content_version(session)
-
-
-def requeue_other_protocols(database: Database, archive_ids: Collection[str]) -> int:
-    """Requeue the scored submissions whose result is of another protocol; return their number.
-
-    ``archive_ids`` are those of the submissions whose archive is kept; the results of others stay.
+    ``archive_ids`` are those of the archives that exist. A result whose archive is gone stays as it is.
     """
-    query = (
-        select(SubmissionModel)
+    with database.read() as session:
+        records = session.scalars(select(SubmissionModel).where(_is_of_other_dataset(dataset_digest)))
+        return sum(_can_be_scored(record, archive_ids) for record in records)
+
+
+def requeue_stale(database: Database, dataset_digest: str, archive_ids: Collection[str]) -> int:
+    """Requeue the submissions of other datasets, and the results of other definitions; return their number.
+
+    They are scored against the dataset with ``dataset_digest``; old results stay until they are replaced, and for
+    ever if their archive is not among ``archive_ids``.
+    """
+    other_dataset = select(SubmissionModel).where(_is_of_other_dataset(dataset_digest))
+    scored = (
+        select(SubmissionModel, ResultModel.json)
         .join(ResultModel, ResultModel.submission_id == SubmissionModel.id)
-        .where(SubmissionModel.status == SCORED, ResultModel.protocol != PROTOCOL)
+        .where(SubmissionModel.status == SCORED, SubmissionModel.dataset_digest == dataset_digest)
     )
     with database.write() as session:
-        requeued = [record for record in session.scalars(query) if record.id in archive_ids]
+        stale = list(session.scalars(other_dataset.with_for_update()))
+        rows = session.execute(scored.with_for_update(of=SubmissionModel), execution_options={"yield_per": 20})
+        stale += [record for record, content in rows if _has_other_definitions(content)]
+        requeued = [record for record in stale if _can_be_scored(record, archive_ids)]
         for record in requeued:
             record.status, record.attempts, record.finished_at = QUEUED, 0, None
-        increment_content_version(session)
+            record.dataset_digest = dataset_digest
+        if requeued:
+            increment_content_version(session)
         return len(requeued)
 
 
-def _is_stale(dataset_digest: str) -> ColumnElement[bool]:
+def _is_of_other_dataset(dataset_digest: str) -> ColumnElement[bool]:
     is_active = SubmissionModel.status.in_((QUEUED, SCORING, SCORED))
     return and_(is_active, SubmissionModel.dataset_digest != dataset_digest)
+
+
+def _has_other_definitions(content: bytes) -> bool:
+    """Return whether a result JSON was computed with other definitions than those of this version, or is damaged."""
+    try:
+        result = json.loads(content)
+    except ValueError:
+        return True
+    return result["protocol"] != PROTOCOL
+
+
+def _can_be_scored(record: SubmissionModel, archive_ids: Collection[str]) -> bool:
+    """Return whether a submission has its archive, or no result that would be lost without it."""
+    return record.status != SCORED or (record.archive_deleted_at is None and record.id in archive_ids)
 
 
 def _stored(submission_id: str, outcome: Outcome, result: Mapping[str, Any]) -> Iterator[Base]:

@@ -51,10 +51,10 @@ class VersionReader:
 
 
 class CurrentRankings:
-    """Rankings of the public rows, each read from the database once per content version; thread-safe."""
+    """Rankings of the public rows of a dataset, each read from the database once per content version; thread-safe."""
 
-    def __init__(self, database: Database, versions: VersionReader) -> None:
-        self._database, self._versions = database, versions
+    def __init__(self, database: Database, versions: VersionReader, dataset_digest: str) -> None:
+        self._database, self._versions, self._dataset_digest = database, versions, dataset_digest
         self._lock = threading.Lock()
         self._version, self._by_config = -1, dict[str, Ranking]()
 
@@ -66,5 +66,5 @@ class CurrentRankings:
             if version != self._version:
                 self._version, self._by_config = version, {}
             if config not in self._by_config:
-                self._by_config[config] = read_ranking(self._database, config)
+                self._by_config[config] = read_ranking(self._database, config, self._dataset_digest)
             return self._by_config[config]

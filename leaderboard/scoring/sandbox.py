@@ -40,12 +40,16 @@ class ViewPicture:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of scoring: the result JSON, notes on possible mistakes, pictures; or the reason of the failure."""
+    """Outcome of scoring: the result JSON, notes on possible mistakes, pictures; or the reason of the failure.
+
+    ``archive_missing`` tells that it has failed because there is no archive.
+    """
 
     result: bytes | None = None
     notes: Sequence[str] = ()
     pictures: Sequence[ViewPicture] = ()
     reason: str | None = None
+    archive_missing: bool = False
 
 
 def _with_problems(task: Callable[P, T]) -> Callable[P, T | Problems]:

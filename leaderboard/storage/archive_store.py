@@ -1,18 +1,24 @@
-"""Archive storage, one file ``<submission id>.zip`` per submission, and the files of unfinished uploads."""
+"""Archive storage, one file ``<submission id>.zip`` per submission; unfinished uploads; the lock of a state folder."""
 
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import os
-import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from rebar_depth_bench.atomic_io import exclusive_lock, fsync_path
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.atomic_io import atomic_replace, exclusive_lock, fsync_path
+from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.errors import InputError, StorageError
+
+
+FILE_MODE = 0o600
+_CHUNK_BYTES = 1 << 20
 
 
 class ArchiveNotFoundError(Exception):
@@ -22,10 +28,11 @@ class ArchiveNotFoundError(Exception):
 class ArchiveStore:
     """Storage of submission archives by submission id. Methods raise ``OSError`` if the folder is unusable."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, create: bool = True) -> None:
         """Create the folder, which machines may share. Raises ``InputError`` if that is not possible."""
         self._folder = folder
-        make_folder(folder, "the archive storage")
+        if create:
+            make_folder(folder, "the archive storage")
 
     def put(self, submission_id: str, source: Path) -> None:
         """Move a file into the storage; durable on return. It is renamed on the same disk and copied otherwise."""
@@ -34,11 +41,34 @@ class ArchiveStore:
             os.utime(source)  # Its age counts from now.
             fsync_path(source)
             source.replace(target)
+            fsync_path(self._folder)
         else:
-            shutil.copyfile(source, target)
-            fsync_path(target)
+            with atomic_replace(target, FILE_MODE) as temporary:
+                _copy_file(source, temporary)
             source.unlink()
-        fsync_path(self._folder)
+
+    def copy_from(self, source: Path, submission_id: str, row: tuple[str, int]) -> None:
+        """Store a copy of an archive. Raises ``StorageError`` if its SHA-256 and size are not those of ``row``."""
+        with atomic_replace(self._file(submission_id), FILE_MODE) as temporary:
+            if _copy_file(source, temporary) != row:
+                raise StorageError(f"the archive of submission {submission_id} differs from its row")
+
+    def problem(self, submission_id: str, row: tuple[str, int], hashed: bool) -> str | None:
+        """Return how an archive differs from its ``row`` (SHA-256, size in bytes), or None.
+
+        Its content is read only if ``hashed``.
+        """
+        path, (sha256, size) = self._file(submission_id), row
+        try:
+            if (found := path.stat().st_size) != size:
+                return f"the archive of submission {submission_id} has {found} bytes, expected {size}"
+            if hashed and file_sha256(path) != sha256:
+                return f"the archive of submission {submission_id} has another SHA-256 than its row"
+        except FileNotFoundError:
+            return f"the archive of submission {submission_id} is missing"
+        except OSError as error:
+            return f"the archive of submission {submission_id} cannot be read: {error.strerror}"
+        return None
 
     def path(self, submission_id: str) -> Path:
         """Return the path of an archive. Raises ``ArchiveNotFoundError`` if the archive does not exist."""
@@ -54,12 +84,17 @@ class ArchiveStore:
         self._file(submission_id).unlink(missing_ok=True)
 
     def ids(self) -> set[str]:
-        """Return the ids of all stored archives."""
+        """Return the ids of all stored archives, none if the folder does not exist."""
+        if not self._folder.exists():
+            return set()
         return {path.stem for path in self._folder.iterdir() if path.suffix == ".zip"}
 
-    def age_s(self, submission_id: str, now: float) -> float:
-        """Return the age of an archive in seconds at Unix time ``now``."""
-        return now - self._file(submission_id).stat().st_mtime
+    def age_s(self, submission_id: str) -> float:
+        """Return the age of an archive in seconds; 0 if it was deleted since it was listed."""
+        try:
+            return time.time() - self._file(submission_id).stat().st_mtime
+        except FileNotFoundError:
+            return 0.0
 
     def _file(self, submission_id: str) -> Path:
         return self._folder / f"{submission_id}.zip"
@@ -71,6 +106,36 @@ def make_folder(folder: Path, name: str) -> None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot access {name}: {error.strerror}") from None
+
+
+def _copy_file(source: Path, target: Path) -> tuple[str, int]:
+    """Copy the content of a file, and return its SHA-256 in hexadecimal and its size in bytes."""
+    sha256, size = hashlib.sha256(), 0
+    with source.open("rb") as read, target.open("wb") as written:
+        while chunk := read.read(_CHUNK_BYTES):
+            sha256.update(chunk)
+            size += len(chunk)
+            written.write(chunk)
+    return sha256.hexdigest(), size
+
+
+@contextmanager
+def state_lock(folder: Path, *, alone: bool = False) -> Iterator[None]:
+    """Hold a lock on a state folder, shared or ``alone``, which the kernel releases however the process ends.
+
+    Every command that may write to a board holds a shared one, and a backup holds one alone on its target. Raises
+    ``InputError`` if another process holds a lock that excludes this one.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+        except BlockingIOError:
+            user = "a server, a worker or another command uses it" if alone else "a backup is being written to it"
+            raise InputError(f"{folder}: {user}; end that first") from None
+        yield
+    finally:
+        os.close(descriptor)
 
 
 @contextmanager

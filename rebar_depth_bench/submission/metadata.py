@@ -32,8 +32,12 @@ def is_http_url(url: str) -> bool:
     return valid and url.isprintable() and " " not in url and len(url) <= _MAX_URL_CHARACTERS
 
 
-# PostgreSQL cannot store NUL.
-_Description = Annotated[str, Expected("text without NUL", lambda value: "\0" not in value)]
+def _can_be_stored(text: str) -> bool:
+    """Return whether text has neither NUL, which PostgreSQL cannot store, nor surrogates, which UTF-8 has not."""
+    return not any(char == "\0" or "\ud800" <= char <= "\udfff" for char in text)
+
+
+_Description = Annotated[str, Expected("text without NUL and surrogates", _can_be_stored)]
 _HttpUrl = Annotated[
     str,
     Expected(

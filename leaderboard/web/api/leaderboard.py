@@ -80,7 +80,10 @@ def _rows(service: Service, config: str, inputs: str | None, token: TokenModel |
     if config not in service.folder.configs:
         known = ", ".join(service.folder.configs)
         raise HTTPException(404, f"the dataset has no config {config!r}, expected one of {known}")
-    ranking = service.rankings.of(config) if token is None else read_ranking(service.database, config, token)
+    if token is None:
+        ranking = service.rankings.of(config)
+    else:
+        ranking = read_ranking(service.database, config, service.folder.digest, token)
     return ranking.of_class(inputs)
 
 

@@ -94,6 +94,7 @@ class Submission(BaseModel):
     archive_sha256: str
     archive_bytes: int
     archive_kept: bool = Field(description="whether the archive is kept; without it nothing is scored again")
+    outdated: str | None = Field(None, description="why the result is of another dataset; null if it is not")
     result: dict[str, Any] | None = None
 
 
@@ -160,8 +161,14 @@ class Leaderboard(BaseModel):
     rows: list[LeaderboardRow]
 
 
-def submission_schema(record: SubmissionModel, url: str, result: dict[str, Any] | None = None) -> Submission:
-    """Return the API response for a submission; ``url`` is the address of its page, ``result`` its result JSON."""
+def submission_schema(
+    record: SubmissionModel, url: str, outdated: str | None = None, result: dict[str, Any] | None = None
+) -> Submission:
+    """Return the API response for a submission.
+
+    ``url`` is the address of its page, ``outdated`` says why its result is of another dataset, and ``result`` is
+    its result JSON.
+    """
     return Submission.model_validate(
         {
             **{column.key: getattr(record, column.key) for column in SubmissionModel.__table__.columns},
@@ -169,6 +176,7 @@ def submission_schema(record: SubmissionModel, url: str, result: dict[str, Any] 
             "url": url,
             "method_url": record.url,
             "archive_kept": record.archive_deleted_at is None,
+            "outdated": outdated,
             "result": result,
         }
     )

@@ -87,7 +87,7 @@ async def upload_form(
 def list_own(request: Request, service: ServiceDep, token: RequiredToken) -> SubmissionList:
     """Return the submissions of the token, newest first, without their results."""
     records = submissions.of_token(service.database, token)
-    return SubmissionList(submissions=[submission_schema(record, page_url(request, record)) for record in records])
+    return SubmissionList(submissions=[_schema(request, record) for record in records])
 
 
 @router.get("/{submission_id}", responses=errors(401, 404, 422), openapi_extra=WITHOUT_TOKEN)
@@ -95,7 +95,7 @@ def look_up(submission_id: SubmissionId, request: Request, service: ServiceDep, 
     """Return a submission. Its id cannot be guessed and gives read access without a token."""
     record = get_submission(service, submission_id)
     result = submissions.result_json(service.database, submission_id)
-    return submission_schema(record, page_url(request, record), None if result is None else json.loads(result))
+    return _schema(request, record, None if result is None else json.loads(result))
 
 
 @router.get(
@@ -130,7 +130,7 @@ def edit(
     """Publish a submission's rows, withdraw them, or change what is said about the method; only as the owner."""
     record = get_own_submission(service, submission_id, token)
     edit_submission(service, record, change)
-    return submission_schema(get_submission(service, submission_id), page_url(request, record))
+    return _schema(request, get_submission(service, submission_id))
 
 
 @router.delete("/{submission_id}", status_code=204, responses=errors(401, 403, 404, 422))
@@ -157,7 +157,7 @@ def delete_submission(service: Service, record: SubmissionModel) -> None:
     submissions.remove(service.database, record.id)
     try:
         service.archives.delete(record.id)
-    except OSError as error:  # Storage unavailable: the orphaned archive is removed at a later startup.
+    except OSError as error:  # Storage unavailable: the retention deletes it later, as the row says.
         _LOG.warning("archive not deleted", submission=record.id[:6], error=str(error))
 
 
@@ -175,7 +175,22 @@ def _accepted(request: Request, response: Response, accepted: tuple[SubmissionMo
     record, is_new = accepted
     response.status_code = 202 if is_new else 200
     response.headers["Location"] = request.url_for("look_up", submission_id=record.id).path
-    return submission_schema(record, page_url(request, record))
+    return _schema(request, record)
+
+
+def _schema(request: Request, record: SubmissionModel, result: dict[str, Any] | None = None) -> Submission:
+    outdated = outdated_note(service_of(request), record)
+    return submission_schema(record, page_url(request, record), outdated, result)
+
+
+def outdated_note(service: Service, record: SubmissionModel) -> str | None:
+    """Return why the result of a submission is not one of the present dataset, or None."""
+    if record.status != submissions.SCORED or record.dataset_digest == service.folder.digest:
+        return None
+    return (
+        f"the result belongs to another dataset, {record.dataset_digest}; its archive is not kept, so that it cannot "
+        "be scored against the present one and is not ranked"
+    )
 
 
 def get_submission(service: Service, submission_id: str) -> SubmissionModel:
