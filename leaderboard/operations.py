@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 
@@ -23,9 +22,15 @@ from leaderboard.db.tokens import create_token, list_tokens, replace_token, revo
 from leaderboard.scoring.worker import process_queue
 from leaderboard.service import disk_problem, queue_problems
 from leaderboard.settings import Settings
-from leaderboard.storage.archive_store import ArchiveStore
+from leaderboard.storage.archive_store import ArchiveStore, archive_problem
 from leaderboard.storage.backup import back_up
-from leaderboard.storage.retention import expired_archives, orphaned_archives, prune_archives
+from leaderboard.storage.retention import (
+    delete_archives,
+    expired_archives,
+    orphaned_archives,
+    prune_archives,
+    unneeded_archives,
+)
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.verification import file_problems
 from rebar_depth_bench.errors import InputError, StorageError, problem_summary
@@ -34,10 +39,6 @@ from rebar_depth_bench.reporting.tables import csv_text
 from rebar_depth_bench.version import software_version
 
 _LOG = structlog.get_logger("worker")
-_POSTGRESQL_NOTE = (
-    "Only the archives are copied. The rows are in PostgreSQL: save them with pg_dump before each backup, so that "
-    "every row that is saved has its archive."
-)
 Cell = str | float | None
 
 
@@ -100,90 +101,84 @@ def _submissions(database: Database, _: Settings, __: argparse.Namespace) -> Non
 
 
 def _remove(database: Database, settings: Settings, options: argparse.Namespace) -> None:
-    if submissions.find(database, options.id) is None:
+    if not options.id.isascii() or submissions.find(database, options.id) is None:
         raise InputError(f"there is no submission {options.id!r}")
     submissions.remove(database, options.id)
-    ArchiveStore(settings.archive_dir).delete(options.id)
+    delete_archives(ArchiveStore(settings.archive_dir), [options.id])
 
 
 def _prune(database: Database, settings: Settings, options: argparse.Namespace) -> None:
     archives = ArchiveStore(settings.archive_dir)
     if options.orphans:
-        for submission_id in orphaned_archives(database, archives):
-            if not options.dry_run:
-                archives.delete(submission_id)
-            print(submission_id)
-        return
-    if not settings.archive_days:
+        pruned = orphaned_archives(database, archives)
+        if not options.dry_run:
+            delete_archives(archives, pruned)
+    elif settings.archive_days:
+        expired = expired_archives(database, open_folder(settings.data), settings)
+        pruned = [record.id for record in expired]
+        if not options.dry_run:
+            prune_archives(database, archives, pruned)
+    else:
         raise InputError("archive_days is 0, which keeps every archive; expected --archive-days DAYS")
-    expired = expired_archives(database, open_folder(settings.data), settings)
-    if not options.dry_run:
-        prune_archives(database, archives, expired)
-    for record in expired:
-        print(record.id)
+    for submission_id in pruned:
+        print(submission_id)
 
 
 def _back_up(settings: Settings, options: argparse.Namespace) -> None:
-    missing = back_up(settings, options.target, options.prune)
-    print(options.target)
     if sqlite_path(settings.database_url) is None:
-        print(_POSTGRESQL_NOTE, file=sys.stderr)
-    if missing:
-        problems = [f"the archive of submission {submission_id} is missing" for submission_id in missing]
-        raise StorageError(f"{options.target}: has all the rest, but {problem_summary(problems)}")
+        note = "only archives are copied; save the rows with pg_dump before, so that each has its archive"
+        print(f"the database is PostgreSQL: {note}", file=sys.stderr)
+    back_up(settings, options.target, options.prune)
+    print(options.target)
 
 
 def _check(settings: Settings, options: argparse.Namespace) -> None:
-    """Print that all is well. Raises ``StorageError`` with everything that is wrong, ``InputError`` for a dataset.
+    """Print that all is well; nothing is written or created.
 
-    Nothing is written or created.
+    Raises ``StorageError`` with everything that is wrong, and ``InputError`` if only the dataset is.
     """
     archives = ArchiveStore(settings.archive_dir, create=False)
-    folders = {"archives": settings.archive_dir, "state folder": settings.state_dir}
-    disks = {name: folder for name, folder in folders.items() if folder.is_dir()}
     with closing(Database(settings.database_url, read_only=True)) as database:
         database.check_schema()
-        problems = database.problems()
-        for name, folder in disks.items():
-            problems += disk_problem(folder, name)
+        problems, of_dataset = database.problems(), list[str]()
         try:
-            problems += _archive_problems(database, archives, options.hash_archives)
-            problems += queue_problems(database)
+            problems += [*_archive_problems(database, archives, options.hash_archives), *queue_problems(database)]
             of_dataset = _dataset_problems(database, settings, archives)
         except DatabaseError:
             if not problems:
                 raise
-            of_dataset = []
+    for name, folder in (("the state folder", settings.state_dir), ("the archives", settings.archive_dir)):
+        problems += disk_problem(folder, name) if folder.is_dir() else []
     if problems:
         raise StorageError(problem_summary([*problems, *of_dataset]))
     if of_dataset:
         raise InputError(problem_summary(of_dataset))
-    free = min((shutil.disk_usage(folder).free >> 30 for folder in disks.values()), default=0)
-    print(f"dataset, database, {counted(len(archives.ids()), 'archive')} and queue are in order; {free} GiB free")
+    print(f"dataset, database, {counted(len(archives.ids()), 'archive')}, disk and queue are in order")
 
 
-def _archive_problems(database: Database, archives: ArchiveStore, hashed: bool) -> list[str]:
+def _archive_problems(database: Database, archives: ArchiveStore, hashed: bool) -> Iterator[str]:
     rows = archive_rows(database)
-    found = {
-        submission_id: archives.problem(submission_id, row, hashed) for submission_id, row in rows.items() if row
-    }
-    rows = archive_rows(database)  # Again, because an archive may be deleted meanwhile.
-    problems = [problem for submission_id, problem in found.items() if problem and rows[submission_id]]
-    unneeded = sorted(submission_id for submission_id in archives.ids() if rows.get(submission_id, "") is None)
-    problems += [f"the archive {name}.zip is still there, although its row says deleted" for name in unneeded]
-    orphans = orphaned_archives(database, archives)
-    return problems + [f"the archive {name}.zip has no submission; prune --orphans deletes it" for name in orphans]
+    found = {name: archive_problem(archives.file(name), row, hashed) for name, row in rows.items() if row}
+    rows = archive_rows(database)  # Again, because archives may have been deleted meanwhile.
+    for name, problem in found.items():
+        if problem and rows[name]:
+            yield f"the archive of submission {name} {problem}"
+    for name in unneeded_archives(rows, archives):
+        yield f"the archive {name}.zip exists, but its row says deleted; serve deletes it within an hour"
+    for name in orphaned_archives(database, archives):
+        yield f"the archive {name}.zip has no submission; prune --orphans deletes it"
 
 
 def _dataset_problems(database: Database, settings: Settings, archives: ArchiveStore) -> list[str]:
     try:
         folder = open_folder(settings.data)
-        problems = [str(problem) for problem in file_problems(folder)]
     except InputError as error:
         return [str(error)]
-    if stale := jobs.count_other_datasets(database, folder.digest, archives.ids()):
-        problems.append(f"{counted(stale, 'submission')} of another dataset than {folder.digest}")
-    return problems
+    with database.read() as session:
+        stale = jobs.stale_submissions(session, folder.digest, archives.ids())
+    others = sum(record.dataset_digest != folder.digest for record in stale)
+    text = f"{counted(others, 'submission')} of another dataset than {folder.digest}"
+    return [*map(str, file_problems(folder)), *([text] if others else [])]
 
 
 def _print_csv(head: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:

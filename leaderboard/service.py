@@ -6,7 +6,7 @@ import shutil
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,7 +25,6 @@ from leaderboard.metrics import ServiceMetrics
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import ArchiveStore, delete_abandoned_uploads, make_folder
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, open_folder
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.view_ids import TEST_SPLIT, config_of
 
 SIMULTANEOUS_CHECKS = 2
@@ -81,9 +80,7 @@ def open_service(settings: Settings) -> Iterator[Service]:
         )
         archives = ArchiveStore(settings.archive_dir)
         database.migrate()
-        archive_ids = archives.ids()
-        _check_dataset_unchanged(folder, database, archive_ids, settings.rescore)
-        if requeued := jobs.requeue_stale(database, folder.digest, archive_ids):
+        if requeued := jobs.requeue_stale(database, folder.digest, archives.ids(), settings.rescore):
             _LOG.info("results of another dataset or definition; submissions requeued", submissions=requeued)
         versions = stack.enter_context(closing(VersionReader(database)))
         yield Service(
@@ -122,18 +119,6 @@ def manifest_state(data: str) -> tuple[int, int] | None:
     return status.st_size, status.st_mtime_ns
 
 
-def _check_dataset_unchanged(
-    folder: DatasetFolder, database: Database, archive_ids: Collection[str], rescore: bool
-) -> None:
-    """Raise ``InputError`` if submissions of another dataset would be scored again, unless ``rescore`` is True."""
-    stale = jobs.count_other_datasets(database, folder.digest, archive_ids)
-    if stale and not rescore:
-        raise InputError(
-            f"{folder.root}: the dataset digest is {folder.digest}, but {stale} submissions of this leaderboard "
-            "belong to another dataset; use --rescore true to score them against this one"
-        )
-
-
 def service_problems(service: Service) -> list[str]:
     """Return what is wrong with a running service. Raises the errors of an unavailable database."""
     problems = [*_dataset_problems(service), *disk_problem(service.spool)]
@@ -153,10 +138,10 @@ def _dataset_problems(service: Service) -> list[str]:
     ]
 
 
-def disk_problem(folder: Path, name: str = "state folder") -> list[str]:
+def disk_problem(folder: Path, name: str = "the state folder") -> list[str]:
     """Return whether the disk of a folder is nearly full."""
     free = shutil.disk_usage(folder).free
-    return [] if free >= MIN_FREE_BYTES else [f"the disk of the {name} has {free >> 20} MiB left"]
+    return [] if free >= MIN_FREE_BYTES else [f"the disk of {name} has {free >> 20} MiB left"]
 
 
 def queue_problems(database: Database) -> list[str]:

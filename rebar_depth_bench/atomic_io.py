@@ -55,10 +55,10 @@ def write_error(target: object, error: OSError) -> OutputError | InputError:
 def atomic_replace(target: Path, mode: int | None = None) -> Iterator[Path]:
     """Yield a temporary path in the target's folder; on a clean exit, flush it and rename it to ``target``.
 
-    Missing parent folders are created. The permissions are ``mode``; without it, a replaced file passes on its own,
-    and a new one has those of the umask. On an exception the temporary file is removed and an existing ``target`` is left unchanged. Raises
-    ``InputError`` if ``target`` is a folder, a device or a pipe, or its name is impossible, and ``OutputError`` if
-    it or its folder cannot be written.
+    Missing parent folders are created. The permissions are ``mode``; without it, those of a replaced file, or
+    of the umask. On an exception the temporary file is removed and an existing ``target`` is left unchanged.
+    Raises ``InputError`` if ``target`` is a folder, a device or a pipe, or its name is impossible, and
+    ``OutputError`` if it or its folder cannot be written.
     """
     if target.is_dir():
         raise InputError(f"{target}: is a folder, expected the name of a file to write")

@@ -41,7 +41,7 @@ class Database:
 
     def __init__(self, url: str, *, hidden_truth: bool = False, read_only: bool = False) -> None:
         """Create the engine. Raises ``InputError`` if ``url`` is not a valid database URL."""
-        self.hidden_truth = hidden_truth
+        self.hidden_truth, self._url = hidden_truth, url
         try:
             self._engine = _engine(url, read_only)
         except (ArgumentError, NoSuchModuleError, ImportError, OSError) as error:
@@ -79,7 +79,7 @@ class Database:
         config = Config()
         config.set_main_option("script_location", str(MIGRATIONS))
         try:
-            with self._write_engine.begin() as connection:
+            with database_errors(self._url, InputError), self._write_engine.begin() as connection:
                 if self.has_row_locks:
                     connection.exec_driver_sql("SELECT pg_advisory_xact_lock(7241053)")
                 config.attributes["connection"] = connection
@@ -88,13 +88,8 @@ class Database:
                 else:
                     Base.metadata.create_all(connection, checkfirst=False)
                     command.stamp(config, "head")
-        except (*DATABASE_UNAVAILABLE, DatabaseError) as error:
-            url = self._engine.url.render_as_string(hide_password=True)
-            reason = " ".join(str(getattr(error, "orig", error)).split())
-            raise InputError(f"{url}: the database is unavailable: {reason}") from None
-        except CommandError:  # It has no migration to the revision that it found.
+        except CommandError:  # There is no migration from the revision that it has.
             self.check_schema()
-            raise
 
     def check_schema(self) -> None:
         """Raise ``InputError`` unless the database has the schema of this version."""
@@ -103,15 +98,12 @@ class Database:
 
         with self._engine.connect() as connection:
             found = MigrationContext.configure(connection).get_current_revision()
-        scripts = ScriptDirectory(str(MIGRATIONS))
-        expected = scripts.get_current_head()
-        place = self._engine.url.render_as_string(hide_password=True)
-        if found is None:
-            raise InputError(f"{place}: holds no leaderboard, expected the database of one")
+        expected = ScriptDirectory(str(MIGRATIONS)).get_current_head()
         if found != expected:
-            known = found in {script.revision for script in scripts.walk_revisions()}
-            hint = "serve upgrades it" if known else "expected the version of this software that wrote it"
-            raise InputError(f"{place}: the database has the schema {found}, not {expected}; {hint}")
+            schema = "holds no leaderboard" if found is None else f"has the schema {found} of another version"
+            raise InputError(
+                f"{without_password(self._url)}: {schema}, expected {expected}; serve upgrades an earlier one"
+            )
 
     def problems(self) -> list[str]:
         """Return what is damaged: pages and references of an SQLite database, and results that are no JSON."""
@@ -119,9 +111,8 @@ class Database:
         with self.read() as session:
             if not self.has_row_locks:
                 pages = session.scalars(text("PRAGMA integrity_check(5)")).all()
-                found += [f"the database is damaged: {page}" for page in pages if page != "ok"]
-                if found:  # Nothing else that is read can be relied on.
-                    return found
+                if pages != ["ok"]:
+                    return [f"the database is damaged: {page}" for page in pages]
                 for table, row, parent, _ in session.execute(text("PRAGMA foreign_key_check")):
                     found.append(f"row {row} of {table} refers to a missing row of {parent}")
             results = select(ResultModel.submission_id, ResultModel.json)
@@ -149,20 +140,13 @@ def sqlite_path(url: str) -> Path | None:
 
 
 @contextmanager
-def database_errors(url: str) -> Iterator[None]:
-    """Raise the errors of the database in the block as ``StorageError`` that names it."""
+def database_errors(url: str, kind: type[InputError | StorageError] = StorageError) -> Iterator[None]:
+    """Raise the errors of a database that is unavailable or damaged as errors of a ``kind`` that name it."""
     try:
         yield
     except (*DATABASE_UNAVAILABLE, DatabaseError) as error:
         reason = " ".join(str(getattr(error, "orig", error)).split())
-        raise StorageError(f"{without_password(url)}: the database cannot be used: {reason}") from None
-
-
-def read_only_uri(file: Path) -> str:
-    """Return the URI by which SQLite reads a database without creating files beside it."""
-    # Without a write-ahead log nobody has the database open.
-    is_open = Path(f"{file}-wal").exists()
-    return f"{file.resolve().as_uri()}?{'mode=ro' if is_open else 'immutable=1'}"
+        raise kind(f"{without_password(url)}: the database is unavailable: {reason}") from None
 
 
 def _engine(url: str, read_only: bool) -> Engine:
@@ -177,11 +161,10 @@ def _engine(url: str, read_only: bool) -> Engine:
             max_overflow=10,
         )
     if read_only:
-        engine = create_engine(
-            url, creator=lambda: sqlite3.connect(read_only_uri(path), uri=True, isolation_level=None)
-        )
-        event.listen(engine, "begin", _begin_transaction)
-        return engine
+        # Without a write-ahead log nobody has the database open, and SQLite would create one to read it.
+        mode = "mode=ro" if Path(f"{path}-wal").exists() else "immutable=1"
+        uri = f"{path.resolve().as_uri()}?{mode}"
+        return create_engine(url, creator=lambda: sqlite3.connect(uri, uri=True))
     path.parent.mkdir(parents=True, exist_ok=True)
     engine = create_engine(
         url, hide_parameters=True, connect_args={"timeout": SQLITE_BUSY_TIMEOUT_S}, pool_size=20, max_overflow=20

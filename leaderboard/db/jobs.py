@@ -30,6 +30,7 @@ from leaderboard.db.submissions import FAILED, QUEUED, SCORED, SCORING, delete_r
 from leaderboard.db.view_errors import view_errors
 from leaderboard.scoring.sandbox import Outcome
 from leaderboard.settings import MAX_LEASE_S
+from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 MAX_ATTEMPTS = 5
@@ -116,58 +117,57 @@ def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome
     return True
 
 
-def count_other_datasets(database: Database, dataset_digest: str, archive_ids: Collection[str]) -> int:
-    """Return the number of submissions of other datasets that can be scored against this one.
+def requeue_stale(database: Database, dataset_digest: str, archive_ids: Collection[str], rescore: bool) -> int:
+    """Requeue the stale submissions for scoring against a dataset; return their number.
 
-    ``archive_ids`` are those of the archives that exist. A result whose archive is gone stays as it is.
+    Old results stay until they are replaced. Raises ``InputError`` if there are submissions of other datasets,
+    unless ``rescore`` is True.
     """
-    with database.read() as session:
-        records = session.scalars(select(SubmissionModel).where(_is_of_other_dataset(dataset_digest)))
-        return sum(_can_be_scored(record, archive_ids) for record in records)
-
-
-def requeue_stale(database: Database, dataset_digest: str, archive_ids: Collection[str]) -> int:
-    """Requeue the submissions of other datasets, and the results of other definitions; return their number.
-
-    They are scored against the dataset with ``dataset_digest``; old results stay until they are replaced, and for
-    ever if their archive is not among ``archive_ids``.
-    """
-    other_dataset = select(SubmissionModel).where(_is_of_other_dataset(dataset_digest))
-    scored = (
-        select(SubmissionModel, ResultModel.json)
-        .join(ResultModel, ResultModel.submission_id == SubmissionModel.id)
-        .where(SubmissionModel.status == SCORED, SubmissionModel.dataset_digest == dataset_digest)
-    )
     with database.write() as session:
-        stale = list(session.scalars(other_dataset.with_for_update()))
-        rows = session.execute(scored.with_for_update(of=SubmissionModel), execution_options={"yield_per": 20})
-        stale += [record for record, content in rows if _has_other_definitions(content)]
-        requeued = [record for record in stale if _can_be_scored(record, archive_ids)]
-        for record in requeued:
+        stale = stale_submissions(session, dataset_digest, archive_ids)
+        others = sum(record.dataset_digest != dataset_digest for record in stale)
+        if others and not rescore:
+            raise InputError(
+                f"the dataset digest is {dataset_digest}, but {others} submissions of this leaderboard belong to "
+                "another dataset; use --rescore true to score them against this one"
+            )
+        for record in stale:
             record.status, record.attempts, record.finished_at = QUEUED, 0, None
             record.dataset_digest = dataset_digest
-        if requeued:
+        if stale:
             increment_content_version(session)
-        return len(requeued)
+        return len(stale)
 
 
-def _is_of_other_dataset(dataset_digest: str) -> ColumnElement[bool]:
-    is_active = SubmissionModel.status.in_((QUEUED, SCORING, SCORED))
-    return and_(is_active, SubmissionModel.dataset_digest != dataset_digest)
+def stale_submissions(
+    session: Session, dataset_digest: str, archive_ids: Collection[str]
+) -> list[SubmissionModel]:
+    """Return the submissions of other datasets, and those whose result is of other definitions.
+
+    Results stay as they are if their archive is pruned, or not among ``archive_ids``.
+    """
+    query = (
+        select(SubmissionModel, ResultModel.json)
+        .outerjoin(ResultModel, ResultModel.submission_id == SubmissionModel.id)
+        .where(SubmissionModel.status.in_((QUEUED, SCORING, SCORED)))
+        .with_for_update(of=SubmissionModel)
+    )
+    stale = []
+    for record, content in session.execute(query, execution_options={"yield_per": 20}):
+        scored, has_archive = record.status == SCORED, record.id in archive_ids and not record.archive_deleted_at
+        is_other = record.dataset_digest != dataset_digest or (scored and _has_other_definitions(content or b""))
+        if is_other and (has_archive or not scored):
+            stale.append(record)
+    return stale
 
 
 def _has_other_definitions(content: bytes) -> bool:
-    """Return whether a result JSON was computed with other definitions than those of this version, or is damaged."""
+    """Return whether a result JSON was computed with other definitions than those of this version."""
     try:
-        result = json.loads(content)
-    except ValueError:
+        result: dict[str, Any] = json.loads(content)
+    except ValueError:  # Damaged: it is computed again, too.
         return True
-    return result["protocol"] != PROTOCOL
-
-
-def _can_be_scored(record: SubmissionModel, archive_ids: Collection[str]) -> bool:
-    """Return whether a submission has its archive, or no result that would be lost without it."""
-    return record.status != SCORED or (record.archive_deleted_at is None and record.id in archive_ids)
+    return bool(result["protocol"] != PROTOCOL)
 
 
 def _stored(submission_id: str, outcome: Outcome, result: Mapping[str, Any]) -> Iterator[Base]:

@@ -114,7 +114,8 @@ def read_ranking(
 ) -> Ranking:
     """Return the public rows of a config and those of ``viewer``, of results that this version can read.
 
-    Results of other datasets than the one with ``dataset_digest``, whose archives are gone, are left out. Equal rank errors share a rank. A row that is not public has no rank and does not affect the ranks of others.
+    Results of another dataset than the one with ``dataset_digest`` are left out. Equal rank errors share a
+    rank. A row that is not public has no rank and does not affect the ranks of others.
     """
     own = false() if viewer is None else SubmissionModel.token_id == viewer.id
     query = (

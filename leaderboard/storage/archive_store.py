@@ -1,10 +1,10 @@
-"""Archive storage, one file ``<submission id>.zip`` per submission; unfinished uploads; the lock of a state folder."""
+"""Archive storage, one file ``<submission id>.zip`` per submission; files of uploads; lock of a state folder."""
 
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Iterator
@@ -14,11 +14,9 @@ from typing import IO
 
 from rebar_depth_bench.atomic_io import atomic_replace, exclusive_lock, fsync_path
 from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.errors import InputError, StorageError
-
+from rebar_depth_bench.errors import InputError
 
 FILE_MODE = 0o600
-_CHUNK_BYTES = 1 << 20
 
 
 class ArchiveNotFoundError(Exception):
@@ -36,7 +34,7 @@ class ArchiveStore:
 
     def put(self, submission_id: str, source: Path) -> None:
         """Move a file into the storage; durable on return. It is renamed on the same disk and copied otherwise."""
-        target = self._file(submission_id)
+        target = self.file(submission_id)
         if source.stat().st_dev == self._folder.stat().st_dev:
             os.utime(source)  # Its age counts from now.
             fsync_path(source)
@@ -44,35 +42,12 @@ class ArchiveStore:
             fsync_path(self._folder)
         else:
             with atomic_replace(target, FILE_MODE) as temporary:
-                _copy_file(source, temporary)
+                shutil.copyfile(source, temporary)
             source.unlink()
-
-    def copy_from(self, source: Path, submission_id: str, row: tuple[str, int]) -> None:
-        """Store a copy of an archive. Raises ``StorageError`` if its SHA-256 and size are not those of ``row``."""
-        with atomic_replace(self._file(submission_id), FILE_MODE) as temporary:
-            if _copy_file(source, temporary) != row:
-                raise StorageError(f"the archive of submission {submission_id} differs from its row")
-
-    def problem(self, submission_id: str, row: tuple[str, int], hashed: bool) -> str | None:
-        """Return how an archive differs from its ``row`` (SHA-256, size in bytes), or None.
-
-        Its content is read only if ``hashed``.
-        """
-        path, (sha256, size) = self._file(submission_id), row
-        try:
-            if (found := path.stat().st_size) != size:
-                return f"the archive of submission {submission_id} has {found} bytes, expected {size}"
-            if hashed and file_sha256(path) != sha256:
-                return f"the archive of submission {submission_id} has another SHA-256 than its row"
-        except FileNotFoundError:
-            return f"the archive of submission {submission_id} is missing"
-        except OSError as error:
-            return f"the archive of submission {submission_id} cannot be read: {error.strerror}"
-        return None
 
     def path(self, submission_id: str) -> Path:
         """Return the path of an archive. Raises ``ArchiveNotFoundError`` if the archive does not exist."""
-        path = self._file(submission_id)
+        path = self.file(submission_id)
         if path.is_file():
             return path
         if self._folder.is_dir():
@@ -81,7 +56,7 @@ class ArchiveStore:
 
     def delete(self, submission_id: str) -> None:
         """Delete an archive; a missing archive is not an error."""
-        self._file(submission_id).unlink(missing_ok=True)
+        self.file(submission_id).unlink(missing_ok=True)
 
     def ids(self) -> set[str]:
         """Return the ids of all stored archives, none if the folder does not exist."""
@@ -92,11 +67,12 @@ class ArchiveStore:
     def age_s(self, submission_id: str) -> float:
         """Return the age of an archive in seconds; 0 if it was deleted since it was listed."""
         try:
-            return time.time() - self._file(submission_id).stat().st_mtime
+            return time.time() - self.file(submission_id).stat().st_mtime
         except FileNotFoundError:
             return 0.0
 
-    def _file(self, submission_id: str) -> Path:
+    def file(self, submission_id: str) -> Path:
+        """Return the place of an archive, which may not exist."""
         return self._folder / f"{submission_id}.zip"
 
 
@@ -108,22 +84,21 @@ def make_folder(folder: Path, name: str) -> None:
         raise InputError(f"{folder}: cannot access {name}: {error.strerror}") from None
 
 
-def _copy_file(source: Path, target: Path) -> tuple[str, int]:
-    """Copy the content of a file, and return its SHA-256 in hexadecimal and its size in bytes."""
-    sha256, size = hashlib.sha256(), 0
-    with source.open("rb") as read, target.open("wb") as written:
-        while chunk := read.read(_CHUNK_BYTES):
-            sha256.update(chunk)
-            size += len(chunk)
-            written.write(chunk)
-    return sha256.hexdigest(), size
+def archive_problem(path: Path, row: tuple[str, int], hashed: bool) -> str | None:
+    """Return how a file differs from the archive of ``row`` (SHA-256, size in bytes), or None."""
+    try:
+        if (size := path.stat().st_size) != row[1]:
+            return f"has {size} bytes, expected {row[1]}"
+        return "has another SHA-256 than its row" if hashed and file_sha256(path) != row[0] else None
+    except OSError as error:
+        return "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
 
 
 @contextmanager
 def state_lock(folder: Path, *, alone: bool = False) -> Iterator[None]:
     """Hold a lock on a state folder, shared or ``alone``, which the kernel releases however the process ends.
 
-    Every command that may write to a board holds a shared one, and a backup holds one alone on its target. Raises
+    Every command but ``check`` holds a shared one, and a backup holds one alone on its target. Raises
     ``InputError`` if another process holds a lock that excludes this one.
     """
     descriptor = os.open(folder, os.O_RDONLY)

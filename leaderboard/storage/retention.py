@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 import structlog
@@ -23,7 +23,7 @@ from leaderboard.storage.archive_store import ArchiveStore
 from rebar_depth_bench.data.manifest import DatasetFolder
 
 ORPHAN_AGE_S = 3600.0
-"""Age in seconds after which an archive without a submission belongs to no upload whose row is yet to be inserted."""
+"""Age in seconds after which an archive without a row belongs to no upload that is about to insert one."""
 RETENTION_INTERVAL_S = 3600.0
 _LOG = structlog.get_logger("retention")
 
@@ -54,43 +54,42 @@ def expired_archives(database: Database, folder: DatasetFolder, settings: Settin
     return [record for record in old if record.id not in kept]
 
 
-def prune_archives(database: Database, archives: ArchiveStore, records: Sequence[SubmissionModel]) -> None:
-    """Delete the archives of submissions, which stay and cannot be scored again."""
-    for record in records:
-        is_ended = (SubmissionModel.id == record.id, SubmissionModel.status.in_((SCORED, FAILED)))
+def prune_archives(database: Database, archives: ArchiveStore, submission_ids: Iterable[str]) -> None:
+    """Delete the archives of submissions, which stay and cannot be scored again, and all that are not needed."""
+    for submission_id in submission_ids:
+        is_ended = (SubmissionModel.id == submission_id, SubmissionModel.status.in_((SCORED, FAILED)))
         with database.write() as session:
             session.execute(update(SubmissionModel).where(*is_ended).values(archive_deleted_at=time.time()))
             increment_content_version(session)
-    delete_unneeded(database, archives)
+    delete_archives(archives, unneeded_archives(archive_rows(database), archives))
 
 
-def delete_unneeded(database: Database, archives: ArchiveStore) -> None:
-    """Delete the archives whose row says deleted or pruned; one that cannot be deleted is logged."""
-    stored = archives.ids()
-    unneeded = [submission_id for submission_id, kept in archive_rows(database).items() if kept is None]
-    for submission_id in sorted(stored.intersection(unneeded)):
+def unneeded_archives(rows: Mapping[str, tuple[str, int] | None], archives: ArchiveStore) -> list[str]:
+    """Return the ids of the archives whose row says deleted or pruned."""
+    return sorted(submission_id for submission_id in archives.ids() if rows.get(submission_id, ("", 0)) is None)
+
+
+def delete_archives(archives: ArchiveStore, submission_ids: Iterable[str]) -> None:
+    """Delete archives; one that cannot be deleted is logged."""
+    for submission_id in submission_ids:
         try:
             archives.delete(submission_id)
-            _LOG.info("archive deleted", submission=submission_id[:6])
         except OSError as error:
-            _LOG.warning("archive not deleted", submission=submission_id[:6], error=str(error.strerror))
+            _LOG.warning("archive not deleted", submission=submission_id[:6], error=error.strerror)
 
 
 @contextmanager
 def archive_retention(
     database: Database, archives: ArchiveStore, folder: DatasetFolder, settings: Settings
 ) -> Iterator[None]:
-    """Delete expired archives, if the settings say after how many days, and unneeded ones, every hour in a thread.
-
-    It begins at once.
-    """
+    """Delete expired archives, if the settings have an age, and unneeded ones: now and every hour, in a thread."""
     stop = threading.Event()
 
     def apply() -> None:
         while not stop.is_set():
             try:
                 expired = expired_archives(database, folder, settings) if settings.archive_days else []
-                prune_archives(database, archives, expired)
+                prune_archives(database, archives, [record.id for record in expired])
             except (*DATABASE_UNAVAILABLE, DatabaseError, OSError) as error:
                 _LOG.warning("archives not deleted", error=type(error).__name__)
             stop.wait(RETENTION_INTERVAL_S)

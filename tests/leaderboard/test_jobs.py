@@ -148,7 +148,7 @@ def test_job_scored_twice_has_one_result(database: Database, alice: TokenModel) 
     assert submissions.result_notes(database, submission_id) == ["a note"]
     assert picture_facts(database, submission_id) == {"lattice/0000": ({"near": "1 m"}, ["error", "truth"])}
     assert picture_webp(database, submission_id, "lattice/0000", "truth") == b"true"
-    [row] = read_ranking(database, "lattice").entries
+    [row] = read_ranking(database, "lattice", "sha256:0").entries
     assert json.loads(row.table_json) == json.loads(second)["tables"]["lattice"]
 
 
@@ -162,7 +162,7 @@ def test_submission_deleted_while_scoring_stays_deleted(database: Database, alic
     )
     assert submissions.find(database, submission_id) is None
     assert submissions.result_json(database, submission_id) is None
-    assert read_ranking(database, "lattice").entries == ()
+    assert read_ranking(database, "lattice", "sha256:0").entries == ()
 
 
 def test_concurrent_uploads_do_not_exceed_quota(database: Database, alice: TokenModel) -> None:

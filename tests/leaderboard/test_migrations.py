@@ -155,7 +155,7 @@ def test_database_of_revision_2_keeps_error_maps_and_gets_view_errors(url: str, 
     with closing(Database(url)) as database:
         assert picture_webp(database, "one", "lattice/0000", "error") == b"webp"
         assert picture_facts(database, "one") == {"lattice/0000": ({}, ["error"])}
-        [entry] = read_ranking(database, "lattice").entries
+        [entry] = read_ranking(database, "lattice", "sha256:0").entries
         assert (entry.id, entry.submitter, entry.rank) == ("one", "alice", 1)
         assert find_token(database, "a token") is not None
         with database.read() as session:

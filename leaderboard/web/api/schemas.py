@@ -13,6 +13,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from leaderboard.db.models import SubmissionModel
+from leaderboard.db.submissions import SCORED
 from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.submission.metadata import MethodDetails
 
@@ -161,14 +162,18 @@ class Leaderboard(BaseModel):
     rows: list[LeaderboardRow]
 
 
-def submission_schema(
-    record: SubmissionModel, url: str, outdated: str | None = None, result: dict[str, Any] | None = None
-) -> Submission:
-    """Return the API response for a submission.
+def outdated_note(record: SubmissionModel, dataset_digest: str) -> str | None:
+    """Return why a result is not of the dataset with ``dataset_digest``, or None if it is."""
+    if record.status != SCORED or record.dataset_digest == dataset_digest:
+        return None
+    reason = "its archive is not kept, so that it is neither scored against the present dataset nor ranked"
+    return f"the result belongs to the dataset {record.dataset_digest}; {reason}"
 
-    ``url`` is the address of its page, ``outdated`` says why its result is of another dataset, and ``result`` is
-    its result JSON.
-    """
+
+def submission_schema(
+    record: SubmissionModel, url: str, outdated: str | None, result: dict[str, Any] | None
+) -> Submission:
+    """Return the API response for a submission: address of its page, ``outdated_note``, result JSON."""
     return Submission.model_validate(
         {
             **{column.key: getattr(record, column.key) for column in SubmissionModel.__table__.columns},

@@ -8,12 +8,12 @@ from __future__ import annotations
 import json
 from typing import Annotated, Any
 
-import structlog
 from fastapi import APIRouter, HTTPException, Path, Request, Response
 
 from leaderboard.db import submissions
 from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.service import Service
+from leaderboard.storage.retention import delete_archives
 from leaderboard.uploads.accept import accept_upload
 from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES, UploadForm, too_large
 from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, RequiredToken, ServiceDep, service_of
@@ -23,11 +23,11 @@ from leaderboard.web.api.schemas import (
     SubmissionChange,
     SubmissionList,
     errors,
+    outdated_note,
     submission_schema,
 )
 
 MAX_PATCH_BYTES = 32 << 10
-_LOG = structlog.get_logger("submissions")
 router = APIRouter(prefix="/api/v1/submissions", tags=["submissions"], responses=errors(429, 503))
 
 SubmissionId = Annotated[str, Path(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9_-]+$")]
@@ -155,10 +155,7 @@ def edit_submission(service: Service, record: SubmissionModel, change: Submissio
 def delete_submission(service: Service, record: SubmissionModel) -> None:
     """Delete a submission, its archive and its results."""
     submissions.remove(service.database, record.id)
-    try:
-        service.archives.delete(record.id)
-    except OSError as error:  # Storage unavailable: the retention deletes it later, as the row says.
-        _LOG.warning("archive not deleted", submission=record.id[:6], error=str(error))
+    delete_archives(service.archives, [record.id])
 
 
 def check_length(request: Request) -> None:
@@ -179,18 +176,8 @@ def _accepted(request: Request, response: Response, accepted: tuple[SubmissionMo
 
 
 def _schema(request: Request, record: SubmissionModel, result: dict[str, Any] | None = None) -> Submission:
-    outdated = outdated_note(service_of(request), record)
+    outdated = outdated_note(record, service_of(request).folder.digest)
     return submission_schema(record, page_url(request, record), outdated, result)
-
-
-def outdated_note(service: Service, record: SubmissionModel) -> str | None:
-    """Return why the result of a submission is not one of the present dataset, or None."""
-    if record.status != submissions.SCORED or record.dataset_digest == service.folder.digest:
-        return None
-    return (
-        f"the result belongs to another dataset, {record.dataset_digest}; its archive is not kept, so that it cannot "
-        "be scored against the present one and is not ranked"
-    )
 
 
 def get_submission(service: Service, submission_id: str) -> SubmissionModel:

@@ -20,7 +20,8 @@ from leaderboard.db.rankings import (
 from leaderboard.db.submissions import QUEUED, SCORED, SCORING, result_json, result_notes
 from leaderboard.service import Service
 from leaderboard.web.api.auth import ServiceDep
-from leaderboard.web.api.submissions import SubmissionId, get_submission, outdated_note
+from leaderboard.web.api.schemas import outdated_note
+from leaderboard.web.api.submissions import SubmissionId, get_submission
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.pages.leaderboard import NameQuery, disclosed_row
 from leaderboard.web.pages.rendering import PICTURE_TITLES, clean_text, render
@@ -75,7 +76,7 @@ def submission_page(
         place=queue_position(service.database, record),
         submitter=submitter_name(service.database, record),
         details=_details(record),
-        outdated=outdated_note(service, record),
+        outdated=outdated_note(record, service.folder.digest),
         **{"reason": record.reason, **scored},
     )
 
