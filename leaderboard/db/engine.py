@@ -108,19 +108,19 @@ class Database:
     def problems(self) -> list[str]:
         """Return what is damaged: pages and references of an SQLite database, and results that are no JSON."""
         found: list[str] = []
-        with self.read() as session:
-            if not self.has_row_locks:
-                pages = session.scalars(text("PRAGMA integrity_check(5)")).all()
-                if pages != ["ok"]:
-                    return [f"the database is damaged: {page}" for page in pages]
-                for table, row, parent, _ in session.execute(text("PRAGMA foreign_key_check")):
-                    found.append(f"row {row} of {table} refers to a missing row of {parent}")
-            results = select(ResultModel.submission_id, ResultModel.json)
-            for submission_id, content in session.execute(results, execution_options={"yield_per": 20}):
-                try:
-                    json.loads(content)
-                except ValueError:
-                    found.append(f"the result of submission {submission_id} is no JSON")
+        try:
+            with self.read() as session:
+                for pragma in () if self.has_row_locks else ("integrity_check(5)", "foreign_key_check"):
+                    rows = session.execute(text(f"PRAGMA {pragma}"))
+                    found += [f"the database is damaged: {pragma} finds {row}" for row in rows if row != ("ok",)]
+                results = select(ResultModel.submission_id, ResultModel.json)
+                for submission_id, content in session.execute(results, execution_options={"yield_per": 20}):
+                    try:
+                        json.loads(content)
+                    except ValueError:
+                        found.append(f"the result of submission {submission_id} is no JSON")
+        except DatabaseError as error:
+            found.append(f"the database is damaged: {error.orig}")
         return found
 
     def close(self) -> None:

@@ -79,11 +79,9 @@ def test_age_is_that_of_file(folder: Path, new_file: Callable[[], Path]) -> None
     assert archives.age_s("deleted meanwhile") == 0
 
 
-def test_killed_copy_from_another_device_leaves_no_archive(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_copy_from_another_device_leaves_no_archive(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     archives = ArchiveStore(folder)
-    with tempfile.TemporaryDirectory(dir="/dev/shm") as device:  # noqa: S108
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as device:
         source = Path(device) / "one.upload"
         source.write_bytes(CONTENT)
         assert source.stat().st_dev != folder.stat().st_dev

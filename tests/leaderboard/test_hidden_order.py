@@ -73,7 +73,9 @@ def test_order_and_ranks_use_rounded_errors(database: Database, hidden: Database
     assert [entry.rank for entry in entries] == [1 + sum(other < error for other in shown) for error in shown]
     ages = [(error, entry.created_at) for error, entry in zip(shown, entries, strict=True)]
     assert ages == sorted(ages), "rows with equal errors are in order of age, not of their exact errors"
-    assert [entry.rank for entry in read_ranking(database, "lattice", digest).entries] == list(range(1, len(exact) + 1))
+    assert [entry.rank for entry in read_ranking(database, "lattice", digest).entries] == list(
+        range(1, len(exact) + 1)
+    )
 
 
 def test_option_changes_responses_of_the_same_database_and_their_etags(

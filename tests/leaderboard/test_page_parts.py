@@ -102,7 +102,9 @@ def test_equal_errors_share_a_rank_overall_and_in_their_class(database: Database
     assert entries["s3"].rank >= 3
     assert (entries["s0"].class_rank, entries["s2"].class_rank, entries["s3"].class_rank) == (1, 1, 2)
     assert {entry.class_rank for entry in entries.values() if entry.inputs is None} == {None}
-    shown = make_config_ranking(read_ranking(database, "lattice", "sha256:0"), "lattice", Selection(inputs="rgb"), False)
+    shown = make_config_ranking(
+        read_ranking(database, "lattice", "sha256:0"), "lattice", Selection(inputs="rgb"), False
+    )
     assert [line.entry.id for line in shown.lines] == ["s0", "s3"]
     assert [line.entry.rank for line in shown.lines] == [1, entries["s3"].rank]
 
