@@ -12,15 +12,12 @@ from typing import Any
 from leaderboard.db.engine import database_errors, sqlite_path
 from leaderboard.log_setup import set_up_logs
 from leaderboard.settings import RENAMED_SETTINGS, Settings, read_settings
-from leaderboard.storage.archive_store import state_lock
-from rebar_depth_bench.atomic_io import write_error
+from leaderboard.storage.archive_store import make_folder, state_lock
 from rebar_depth_bench.console import replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.terminal import use_plain_characters
 from rebar_depth_bench.version import software_version
 
-_MAY_CREATE = ("serve", "token")
-"""Commands that make a leaderboard where there is none."""
 _STORED = ("state_dir", "db")
 _WITH_ARCHIVES = (*_STORED, "archives")
 _SCORING = ("score_time", "score_memory", "lease_seconds", "error_maps", "hidden_truth")
@@ -67,7 +64,7 @@ def _run(options: argparse.Namespace) -> None:
     settings = read_settings(options.settings, overrides if needs_data else {**overrides, "data": ""})
     set_up_logs()
     database = sqlite_path(settings.database_url)
-    if options.command not in _MAY_CREATE and database is not None and not database.is_file():
+    if options.command not in ("serve", "token") and database is not None and not database.is_file():
         raise InputError(f"{database}: the database does not exist, expected the database of a leaderboard")
     with ExitStack() as stack:
         if options.command != "check":  # It creates nothing, and may run beside anything.
@@ -87,14 +84,10 @@ def _run(options: argparse.Namespace) -> None:
 def _make_state_dir(folder: Path) -> None:
     """Create the state folder with mode 0700, because the ids in it give access to unpublished submissions.
 
-    Raises ``InputError`` if others may read an existing folder, and ``InputError`` or ``OutputError`` if it cannot
-    be created.
+    Raises ``InputError`` if others may read an existing folder, and the errors of ``make_folder``.
     """
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        mode = stat.S_IMODE(folder.stat().st_mode)
-    except OSError as error:
-        raise write_error(f"the state folder {folder}", error) from None
+    make_folder(folder, "the state folder")
+    mode = stat.S_IMODE(folder.stat().st_mode)
     if mode & 0o077:
         raise InputError(f"the state folder {folder}: has mode {mode:04o}, expected 0700; run: chmod 700 {folder}")
 
@@ -129,8 +122,9 @@ def argument_parser() -> argparse.ArgumentParser:
             command.add_argument("--hash-archives", action="store_true", help="read all archives, too")
         if name == "backup":
             command.add_argument("target", type=Path, metavar="FOLDER", help="folder to write the backup to")
-            what = "delete archives of removed and pruned submissions from FOLDER"
-            command.add_argument("--prune", action="store_true", help=what)
+            command.add_argument(
+                "--prune", action="store_true", help="delete from it what is removed or pruned here"
+            )
     return parser
 
 

@@ -12,7 +12,6 @@ from datetime import UTC, datetime
 
 import structlog
 from sqlalchemy import select
-from sqlalchemy.exc import DatabaseError
 
 from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import Database, sqlite_path, without_password
@@ -22,15 +21,9 @@ from leaderboard.db.tokens import create_token, list_tokens, replace_token, revo
 from leaderboard.scoring.worker import process_queue
 from leaderboard.service import disk_problem, queue_problems
 from leaderboard.settings import Settings
+from leaderboard.storage import retention
 from leaderboard.storage.archive_store import ArchiveStore, archive_problem
 from leaderboard.storage.backup import back_up
-from leaderboard.storage.retention import (
-    delete_archives,
-    expired_archives,
-    orphaned_archives,
-    prune_archives,
-    unneeded_archives,
-)
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.verification import file_problems
 from rebar_depth_bench.errors import InputError, StorageError, problem_summary
@@ -104,20 +97,19 @@ def _remove(database: Database, settings: Settings, options: argparse.Namespace)
     if not options.id.isascii() or submissions.find(database, options.id) is None:
         raise InputError(f"there is no submission {options.id!r}")
     submissions.remove(database, options.id)
-    delete_archives(ArchiveStore(settings.archive_dir), [options.id])
+    retention.delete_archives(ArchiveStore(settings.archive_dir), [options.id])
 
 
 def _prune(database: Database, settings: Settings, options: argparse.Namespace) -> None:
     archives = ArchiveStore(settings.archive_dir)
     if options.orphans:
-        pruned = orphaned_archives(database, archives)
+        pruned = retention.orphaned_archives(database, archives)
         if not options.dry_run:
-            delete_archives(archives, pruned)
+            retention.delete_archives(archives, pruned)
     elif settings.archive_days:
-        expired = expired_archives(database, open_folder(settings.data), settings)
-        pruned = [record.id for record in expired]
+        pruned = retention.expired_archives(database, open_folder(settings.data), settings)
         if not options.dry_run:
-            prune_archives(database, archives, pruned)
+            retention.prune_archives(database, archives, pruned)
     else:
         raise InputError("archive_days is 0, which keeps every archive; expected --archive-days DAYS")
     for submission_id in pruned:
@@ -140,19 +132,13 @@ def _check(settings: Settings, options: argparse.Namespace) -> None:
     archives = ArchiveStore(settings.archive_dir, create=False)
     with closing(Database(settings.database_url, read_only=True)) as database:
         database.check_schema()
-        problems, of_dataset = database.problems(), list[str]()
-        try:
-            problems += [*_archive_problems(database, archives, options.hash_archives), *queue_problems(database)]
-            of_dataset = _dataset_problems(database, settings, archives)
-        except DatabaseError:
-            if not problems:
-                raise
+        problems = [*database.problems(), *_archive_problems(database, archives, options.hash_archives)]
+        problems += queue_problems(database)
+        of_dataset = _dataset_problems(database, settings, archives)
     for name, folder in (("the state folder", settings.state_dir), ("the archives", settings.archive_dir)):
         problems += disk_problem(folder, name) if folder.is_dir() else []
-    if problems:
-        raise StorageError(problem_summary([*problems, *of_dataset]))
-    if of_dataset:
-        raise InputError(problem_summary(of_dataset))
+    if problems or of_dataset:
+        raise (StorageError if problems else InputError)(problem_summary([*problems, *of_dataset]))
     print(f"dataset, database, {counted(len(archives.ids()), 'archive')}, disk and queue are in order")
 
 
@@ -163,9 +149,9 @@ def _archive_problems(database: Database, archives: ArchiveStore, hashed: bool) 
     for name, problem in found.items():
         if problem and rows[name]:
             yield f"the archive of submission {name} {problem}"
-    for name in unneeded_archives(rows, archives):
+    for name in retention.unneeded_archives(rows, archives):
         yield f"the archive {name}.zip exists, but its row says deleted; serve deletes it within an hour"
-    for name in orphaned_archives(database, archives):
+    for name in retention.orphaned_archives(database, archives):
         yield f"the archive {name}.zip has no submission; prune --orphans deletes it"
 
 

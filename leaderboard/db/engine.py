@@ -101,9 +101,8 @@ class Database:
         expected = ScriptDirectory(str(MIGRATIONS)).get_current_head()
         if found != expected:
             schema = "holds no leaderboard" if found is None else f"has the schema {found} of another version"
-            raise InputError(
-                f"{without_password(self._url)}: {schema}, expected {expected}; serve upgrades an earlier one"
-            )
+            url = without_password(self._url)
+            raise InputError(f"{url}: {schema}, expected {expected}; serve upgrades an earlier one")
 
     def problems(self) -> list[str]:
         """Return what is damaged: pages and references of an SQLite database, and results that are no JSON."""

@@ -139,10 +139,8 @@ def requeue_stale(database: Database, dataset_digest: str, archive_ids: Collecti
         return len(stale)
 
 
-def stale_submissions(
-    session: Session, dataset_digest: str, archive_ids: Collection[str]
-) -> list[SubmissionModel]:
-    """Return the submissions of other datasets, and those whose result is of other definitions.
+def stale_submissions(session: Session, digest: str, archive_ids: Collection[str]) -> list[SubmissionModel]:
+    """Return the submissions of other datasets than the one with ``digest``, and those of other definitions.
 
     Results stay as they are if their archive is pruned, or not among ``archive_ids``.
     """
@@ -155,7 +153,7 @@ def stale_submissions(
     stale = []
     for record, content in session.execute(query, execution_options={"yield_per": 20}):
         scored, has_archive = record.status == SCORED, record.id in archive_ids and not record.archive_deleted_at
-        is_other = record.dataset_digest != dataset_digest or (scored and _has_other_definitions(content or b""))
+        is_other = record.dataset_digest != digest or (scored and _has_other_definitions(content or b""))
         if is_other and (has_archive or not scored):
             stale.append(record)
     return stale

@@ -40,10 +40,7 @@ class ViewPicture:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of scoring: the result JSON, notes on possible mistakes, pictures; or the reason of the failure.
-
-    ``archive_missing`` tells that it has failed because there is no archive.
-    """
+    """Outcome of scoring: the result JSON, notes on possible mistakes, pictures; or the reason of the failure."""
 
     result: bytes | None = None
     notes: Sequence[str] = ()

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from rebar_depth_bench.atomic_io import atomic_replace, exclusive_lock, fsync_path
+from rebar_depth_bench.atomic_io import atomic_replace, exclusive_lock, fsync_path, write_error
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import InputError
 
@@ -27,7 +27,7 @@ class ArchiveStore:
     """Storage of submission archives by submission id. Methods raise ``OSError`` if the folder is unusable."""
 
     def __init__(self, folder: Path, *, create: bool = True) -> None:
-        """Create the folder, which machines may share. Raises ``InputError`` if that is not possible."""
+        """Create the folder, which machines may share. Raises the errors of ``make_folder``."""
         self._folder = folder
         if create:
             make_folder(folder, "the archive storage")
@@ -60,16 +60,13 @@ class ArchiveStore:
 
     def ids(self) -> set[str]:
         """Return the ids of all stored archives, none if the folder does not exist."""
-        if not self._folder.exists():
-            return set()
-        return {path.stem for path in self._folder.iterdir() if path.suffix == ".zip"}
+        return {path.stem for path in self._folder.glob("*.zip")}
 
     def age_s(self, submission_id: str) -> float:
         """Return the age of an archive in seconds; 0 if it was deleted since it was listed."""
-        try:
+        with suppress(FileNotFoundError):
             return time.time() - self.file(submission_id).stat().st_mtime
-        except FileNotFoundError:
-            return 0.0
+        return 0.0
 
     def file(self, submission_id: str) -> Path:
         """Return the place of an archive, which may not exist."""
@@ -77,11 +74,11 @@ class ArchiveStore:
 
 
 def make_folder(folder: Path, name: str) -> None:
-    """Create a folder with mode 0700 unless it exists. Raises ``InputError`` if that is not possible."""
+    """Create a folder with mode 0700 unless it exists. Raises the errors of ``write_error``."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: cannot access {name}: {error.strerror}") from None
+        raise write_error(f"{name} {folder}", error) from None
 
 
 def archive_problem(path: Path, row: tuple[str, int], hashed: bool) -> str | None:

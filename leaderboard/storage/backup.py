@@ -8,7 +8,10 @@ from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 
-from leaderboard.db.engine import Database, sqlite_path
+from sqlalchemy import select
+
+from leaderboard.db.engine import Database, database_errors, sqlite_path
+from leaderboard.db.models import SubmissionModel
 from leaderboard.db.submissions import archive_rows
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import (
@@ -23,7 +26,6 @@ from rebar_depth_bench.atomic_io import atomic_replace, write_error
 from rebar_depth_bench.errors import InputError, StorageError, problem_summary
 
 DATABASE, FORMER, ARCHIVES = "leaderboard.sqlite", "leaderboard.sqlite.1", "archives"
-FOLDER_MODE = 0o700
 Rows = Mapping[str, tuple[str, int] | None]
 """SHA-256 and size of archives by submission id, as ``archive_rows`` returns them."""
 
@@ -47,11 +49,11 @@ def back_up(settings: Settings, target: Path, prune: bool) -> None:
         database.check_schema()
         rows: Rows = archive_rows(database)
     try:
-        target.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
+        target.mkdir(mode=0o700, parents=True, exist_ok=True)
         with state_lock(target, alone=True):
             if any(target.iterdir()) and not any((target / name).exists() for name in (DATABASE, ARCHIVES)):
                 raise InputError(f"{target}: contains other files, expected a new folder or an earlier backup")
-            target.chmod(FOLDER_MODE)
+            target.chmod(0o700)
             archives, copies = ArchiveStore(settings.archive_dir), ArchiveStore(target / ARCHIVES)
             for leftover in [*target.glob(f".{DATABASE}*.tmp*"), *(target / ARCHIVES).glob(".*.zip.*.tmp")]:
                 leftover.unlink()  # Of a backup that was killed.
@@ -83,14 +85,13 @@ def _copy_board(
             rows = archive_rows(database)
         if lost := former_ids - rows.keys():
             raise InputError(
-                f"{target}: has {len(lost)} submissions that {source} lacks, such as {min(lost)}; expected an "
-                "earlier backup of this leaderboard, or a new folder"
+                f"{target}: has {len(lost)} submissions that {source} lacks, as {min(lost)}; expected a new folder"
             )
         missing = _copy_archives(rows, archives, copies)
         if former.is_file():
             with atomic_replace(target / FORMER, FILE_MODE) as kept:
                 shutil.copyfile(former, kept)
-    for suffix in ("-wal", "-shm"):  # Empty: what they held is part of the former database.
+    for suffix in ("-wal", "-shm"):  # Of a program that has opened the former database since it was read.
         Path(f"{former}{suffix}").unlink(missing_ok=True)
     return rows, missing
 
@@ -132,15 +133,14 @@ def _copy_database(source: Path, copy: Path) -> None:
             raise StorageError(f"{source}: cannot be copied to {copy}: {error}") from None
 
 
-def _submission_ids(database: Path) -> set[str]:
-    """Return the ids of all submissions of an earlier backup, and move its write-ahead log into the database.
+def _submission_ids(database_file: Path) -> set[str]:
+    """Return the ids of all submissions of an earlier backup, whose write-ahead log becomes part of the database.
 
     A log that a killed server left would otherwise be applied to the database that replaces this one.
     """
-    with closing(sqlite3.connect(database)) as connection:
-        try:
-            ids = {submission_id for (submission_id,) in connection.execute("SELECT id FROM submissions")}
-            connection.execute("PRAGMA journal_mode=DELETE")  # Fails while a program has the database open.
-        except sqlite3.DatabaseError as error:
-            raise InputError(f"{database}: cannot be read: {error}; expected a sound backup") from None
+    url = f"sqlite:///{database_file.absolute()}"
+    with database_errors(url, InputError), closing(Database(url)) as database, database.read() as session:
+        ids = set(session.scalars(select(SubmissionModel.id)))
+    if Path(f"{database_file}-wal").exists():
+        raise InputError(f"{database_file}: a program has it open, expected a backup that none uses")
     return ids

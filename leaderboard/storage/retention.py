@@ -28,14 +28,14 @@ RETENTION_INTERVAL_S = 3600.0
 _LOG = structlog.get_logger("retention")
 
 
-def expired_archives(database: Database, folder: DatasetFolder, settings: Settings) -> list[SubmissionModel]:
-    """Return the ended submissions whose archive may be deleted, oldest first.
+def expired_archives(database: Database, folder: DatasetFolder, settings: Settings) -> list[str]:
+    """Return the ids of the ended submissions whose archive may be deleted, oldest first.
 
     They are older than ``archive_days`` days, and no public row of them is ranked up to ``archive_ranks`` in one
     of the configs of the dataset.
     """
     query = (
-        select(SubmissionModel)
+        select(SubmissionModel.id)
         .where(
             SubmissionModel.status.in_((SCORED, FAILED)),
             SubmissionModel.archive_deleted_at.is_(None),
@@ -51,7 +51,7 @@ def expired_archives(database: Database, folder: DatasetFolder, settings: Settin
         for entry in read_ranking(database, config, folder.digest).entries
         if entry.rank is not None and entry.rank <= settings.archive_ranks
     }
-    return [record for record in old if record.id not in kept]
+    return [submission_id for submission_id in old if submission_id not in kept]
 
 
 def prune_archives(database: Database, archives: ArchiveStore, submission_ids: Iterable[str]) -> None:
@@ -89,7 +89,7 @@ def archive_retention(
         while not stop.is_set():
             try:
                 expired = expired_archives(database, folder, settings) if settings.archive_days else []
-                prune_archives(database, archives, [record.id for record in expired])
+                prune_archives(database, archives, expired)
             except (*DATABASE_UNAVAILABLE, DatabaseError, OSError) as error:
                 _LOG.warning("archives not deleted", error=type(error).__name__)
             stop.wait(RETENTION_INTERVAL_S)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import statistics
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -32,12 +33,10 @@ def is_http_url(url: str) -> bool:
     return valid and url.isprintable() and " " not in url and len(url) <= _MAX_URL_CHARACTERS
 
 
-def _can_be_stored(text: str) -> bool:
-    """Return whether text has neither NUL, which PostgreSQL cannot store, nor surrogates, which UTF-8 has not."""
-    return not any(char == "\0" or "\ud800" <= char <= "\udfff" for char in text)
-
-
-_Description = Annotated[str, Expected("text without NUL and surrogates", _can_be_stored)]
+# PostgreSQL cannot store NUL, and UTF-8 has no surrogates.
+_Description = Annotated[
+    str, Expected("text without NUL and surrogates", lambda value: not re.search("[\0\ud800-\udfff]", value))
+]
 _HttpUrl = Annotated[
     str,
     Expected(

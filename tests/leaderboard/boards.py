@@ -30,7 +30,7 @@ from tests.bench.reporting.results import result, scored_view
 DIGEST, OTHER_DIGEST = "sha256:" + "0" * 64, "sha256:" + "1" * 64
 _PROCESSES = multiprocessing.get_context("forkserver")
 _OPERATIONS = ("os.rename", "os.remove", "os.chmod", "shutil.copyfile", "sqlite3.connect")
-"""Audit events of what changes a folder; Python reports ``replace`` as ``rename``, and ``unlink`` as ``remove``."""
+"""Audit events of changes of a folder; Python reports ``replace`` as ``rename``, and ``unlink`` as ``remove``."""
 
 
 def board_settings(state: Path, **values: object) -> Settings:

@@ -66,7 +66,7 @@ def test_missing_archive_raises_on_read_but_not_on_delete(folder: Path) -> None:
 
 def test_unusable_folder_is_an_input_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match="cannot access the archive storage"):
+    with pytest.raises(InputError, match=r"the archive storage .* cannot be written"):
         ArchiveStore(tmp_path / "file" / "kept")
 
 
@@ -91,9 +91,10 @@ def test_killed_copy_from_another_device_leaves_no_archive(folder: Path, monkeyp
             assert archives.ids() == set()
             raise KeyboardInterrupt
 
-        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        with monkeypatch.context() as patch:
             patch.setattr(shutil, "copyfile", copy_half)
-            archives.put("an-id", source)
+            with pytest.raises(KeyboardInterrupt):
+                archives.put("an-id", source)
         assert source.read_bytes() == CONTENT
         archives.put("an-id", source)
         assert not source.exists()

@@ -1,4 +1,4 @@
-"""Kills at every commit, rename and deletion of backup, prune, retention and rescoring: rows and files agree after."""
+"""Kills at every commit, rename and deletion of backup, prune, retention and rescoring: nothing is lost."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MAX_OPERATIONS = 200
 def kill_everywhere(
     operation: Callable[..., object], check: Callable[..., object], prepare: Callable[[], tuple[object, ...]]
 ) -> None:
-    """Kill an operation before its first, second, ... change until it ends; check each time, with its arguments."""
+    """Kill an operation before its first, second, ... change until it ends; check its arguments each time."""
     for kill_at in range(1, MAX_OPERATIONS):
         arguments = prepare()
         was_killed = killed(kill_at, operation, *arguments)

@@ -5,7 +5,6 @@ The docstrings of the models are part of the OpenAPI document.
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from datetime import datetime
 from typing import Any, Literal
@@ -168,23 +167,6 @@ def outdated_note(record: SubmissionModel, dataset_digest: str) -> str | None:
         return None
     reason = "its archive is not kept, so that it is neither scored against the present dataset nor ranked"
     return f"the result belongs to the dataset {record.dataset_digest}; {reason}"
-
-
-def submission_schema(
-    record: SubmissionModel, url: str, outdated: str | None, result: dict[str, Any] | None
-) -> Submission:
-    """Return the API response for a submission: address of its page, ``outdated_note``, result JSON."""
-    return Submission.model_validate(
-        {
-            **{column.key: getattr(record, column.key) for column in SubmissionModel.__table__.columns},
-            **json.loads(record.details),
-            "url": url,
-            "method_url": record.url,
-            "archive_kept": record.archive_deleted_at is None,
-            "outdated": outdated,
-            "result": result,
-        }
-    )
 
 
 Responses = dict[int | str, dict[str, Any]]

@@ -24,7 +24,6 @@ from leaderboard.web.api.schemas import (
     SubmissionList,
     errors,
     outdated_note,
-    submission_schema,
 )
 
 MAX_PATCH_BYTES = 32 << 10
@@ -176,8 +175,17 @@ def _accepted(request: Request, response: Response, accepted: tuple[SubmissionMo
 
 
 def _schema(request: Request, record: SubmissionModel, result: dict[str, Any] | None = None) -> Submission:
-    outdated = outdated_note(record, service_of(request).folder.digest)
-    return submission_schema(record, page_url(request, record), outdated, result)
+    return Submission.model_validate(
+        {
+            **{column.key: getattr(record, column.key) for column in SubmissionModel.__table__.columns},
+            **json.loads(record.details),
+            "url": page_url(request, record),
+            "method_url": record.url,
+            "archive_kept": record.archive_deleted_at is None,
+            "outdated": outdated_note(record, service_of(request).folder.digest),
+            "result": result,
+        }
+    )
 
 
 def get_submission(service: Service, submission_id: str) -> SubmissionModel:
