@@ -122,9 +122,7 @@ def argument_parser() -> argparse.ArgumentParser:
             command.add_argument("--hash-archives", action="store_true", help="read all archives, too")
         if name == "backup":
             command.add_argument("target", type=Path, metavar="FOLDER", help="folder to write the backup to")
-            command.add_argument(
-                "--prune", action="store_true", help="delete from it what is removed or pruned here"
-            )
+            command.add_argument("--prune", action="store_true", help="delete what is removed or pruned from it")
     return parser
 
 
