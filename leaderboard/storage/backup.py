@@ -90,8 +90,11 @@ def _copy_board(
         missing = _copy_archives(rows, archives, copies)
         if former.is_file():
             with atomic_replace(target / FORMER, FILE_MODE) as kept:
-                shutil.copyfile(former, kept)
-    for suffix in ("-wal", "-shm"):  # Of a program that has opened the former database since it was read.
+                _copy_database(former, kept)
+            # SQLite has moved the log of a killed server into the former database; it would damage the new one.
+            if Path(f"{former}-wal").exists():
+                raise InputError(f"{former}: a program has it open, expected a backup that none uses")
+    for suffix in ("-wal", "-shm"):  # Of a program that has opened the former database since.
         Path(f"{former}{suffix}").unlink(missing_ok=True)
     return rows, missing
 
@@ -134,13 +137,8 @@ def _copy_database(source: Path, copy: Path) -> None:
 
 
 def _submission_ids(database_file: Path) -> set[str]:
-    """Return the ids of all submissions of an earlier backup, whose write-ahead log becomes part of the database.
-
-    A log that a killed server left would otherwise be applied to the database that replaces this one.
-    """
+    """Return the ids of all submissions of an earlier backup, including those in its write-ahead log."""
     url = f"sqlite:///{database_file.absolute()}"
-    with database_errors(url, InputError), closing(Database(url)) as database, database.read() as session:
-        ids = set(session.scalars(select(SubmissionModel.id)))
-    if Path(f"{database_file}-wal").exists():
-        raise InputError(f"{database_file}: a program has it open, expected a backup that none uses")
-    return ids
+    former = closing(Database(url, read_only=True))
+    with database_errors(url, InputError), former as database, database.read() as session:
+        return set(session.scalars(select(SubmissionModel.id)))

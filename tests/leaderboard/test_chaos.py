@@ -1,4 +1,4 @@
-"""kill -9 of server, scorers, database and backups, prune, restore: accepted submissions are scored exactly once."""
+"""kill -9 of server, scorers, database and backups, prune, restore: what is accepted is scored exactly once."""
 
 from __future__ import annotations
 

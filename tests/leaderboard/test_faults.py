@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -43,6 +47,13 @@ def kill_everywhere(
     raise AssertionError(f"more than {MAX_OPERATIONS} operations")
 
 
+def change_and_die(settings: Settings, submission_id: str) -> None:
+    """Change a row of a backup, as a server that is killed does: the change is in the write-ahead log only."""
+    with opened(settings) as (database, _):
+        submissions.change(database, submission_id, {"description": "changed in the backup"})
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("prune", [False, True])
 def test_killed_backup_is_whole_and_can_be_repeated(tmp_path: Path, prune: bool) -> None:
@@ -50,8 +61,8 @@ def test_killed_backup_is_whole_and_can_be_repeated(tmp_path: Path, prune: bool)
     token = make_board(settings)
     removed, pruned, kept = (add_submission(settings, token, content) for content in (b"1", b"2", b"3"))
     back_up(settings, target, prune=False)
-    with opened(board_settings(target)) as (database, _):  # The backup was served: it has a write-ahead log.
-        submissions.change(database, kept, {"description": "changed in the backup"})
+    assert killed(MAX_OPERATIONS, change_and_die, board_settings(target), kept)
+    assert (target / "leaderboard.sqlite-wal").stat().st_size > 0
     with opened(settings) as (database, archives):
         submissions.remove(database, removed)
         prune_archives(database, archives, [pruned])
@@ -77,6 +88,10 @@ def test_killed_backup_is_whole_and_can_be_repeated(tmp_path: Path, prune: bool)
         assert facts(backup) == shown
         others = [path.name for path in target.rglob("*") if path.name.startswith(".") or "wal" in path.name]
         assert others == []
+        if found == earlier:
+            with closing(sqlite3.connect(target / "leaderboard.sqlite.1")) as former:
+                query = "SELECT description FROM submissions WHERE id = ?"
+                assert former.execute(query, (kept,)).fetchone() == ("changed in the backup",)
 
     kill_everywhere(back_up, check, prepare)
 
