@@ -8,6 +8,7 @@ import signal
 import sqlite3
 import stat
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from contextlib import closing, suppress
@@ -281,7 +282,7 @@ def make_shell(tmp_path: Path) -> Callable[[Path], Callable[[str], str]]:
     def make(root: Path) -> Callable[[str], str]:
         def shell(commands: str) -> str:
             text = commands.replace("/backups", str(tmp_path / "backups")).replace("ROOT", str(root))
-            environment = {**os.environ, "PATH": f"{Path(os.sys.executable).parent}:{os.environ['PATH']}"}
+            environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
             finished = subprocess.run(
                 ["bash", "-u", "-c", text],
                 cwd=tmp_path,
