@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import stat
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from leaderboard.db.engine import database_errors, sqlite_path
 from leaderboard.log_setup import set_up_logs
 from leaderboard.settings import RENAMED_SETTINGS, Settings, read_settings
-from rebar_depth_bench.atomic_io import write_error
+from leaderboard.storage.archive_store import make_folder, state_lock
 from rebar_depth_bench.console import replace_renamed_options, run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.terminal import use_plain_characters
@@ -29,11 +31,11 @@ COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "tokens": ("list the tokens with their submissions and bytes as CSV", _STORED),
     "submissions": ("list the submissions of all tokens as CSV", _STORED),
     "prune": (
-        "delete archives of ended submissions by age and rank, as the settings say",
+        "delete archives of ended submissions by age and rank, as the settings say, or those without a submission",
         ("data", *_WITH_ARCHIVES, "archive_days", "archive_ranks"),
     ),
     "check": (
-        "check dataset, database, archives, disk and queue, and print what is wrong",
+        "check dataset, database, archives, disk and queue, and print what is wrong; nothing is changed",
         ("data", *_WITH_ARCHIVES),
     ),
     "remove": ("delete a submission of any owner, with its archive and results", _WITH_ARCHIVES),
@@ -58,30 +60,34 @@ def _run(options: argparse.Namespace) -> None:
     _, names = COMMANDS[options.command]
     values = {name: getattr(options, name, None) for name in names}
     overrides: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
-    settings = read_settings(options.settings, overrides if "data" in names else {**overrides, "data": ""})
+    needs_data = "data" in names and not getattr(options, "orphans", False)
+    settings = read_settings(options.settings, overrides if needs_data else {**overrides, "data": ""})
     set_up_logs()
-    _make_state_dir(settings.state_dir)
-    if options.command == "serve":
-        from leaderboard.web.server import serve
+    database = sqlite_path(settings.database_url)
+    if options.command not in ("serve", "token") and database is not None and not database.is_file():
+        raise InputError(f"{database}: the database does not exist, expected the database of a leaderboard")
+    with ExitStack() as stack:
+        if options.command != "check":  # It creates nothing, and may run beside anything.
+            _make_state_dir(settings.state_dir)
+            stack.enter_context(state_lock(settings.state_dir))
+        stack.enter_context(database_errors(settings.database_url))
+        if options.command == "serve":
+            from leaderboard.web.server import serve
 
-        serve(settings)
-    else:
-        from leaderboard.operations import run_operation
+            serve(settings)
+        else:
+            from leaderboard.operations import run_operation
 
-        run_operation(options.command, settings, options)
+            run_operation(options.command, settings, options)
 
 
 def _make_state_dir(folder: Path) -> None:
     """Create the state folder with mode 0700, because the ids in it give access to unpublished submissions.
 
-    Raises ``InputError`` if others may read an existing folder, and ``InputError`` or ``OutputError`` if it cannot
-    be created.
+    Raises ``InputError`` if others may read an existing folder, and the errors of ``make_folder``.
     """
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        mode = stat.S_IMODE(folder.stat().st_mode)
-    except OSError as error:
-        raise write_error(f"the state folder {folder}", error) from None
+    make_folder(folder, "the state folder")
+    mode = stat.S_IMODE(folder.stat().st_mode)
     if mode & 0o077:
         raise InputError(f"the state folder {folder}: has mode {mode:04o}, expected 0700; run: chmod 700 {folder}")
 
@@ -111,8 +117,12 @@ def argument_parser() -> argparse.ArgumentParser:
             command.add_argument("id", metavar="ID", help="id of the submission, the last part of its URL")
         if name == "prune":
             command.add_argument("--dry-run", action="store_true", help="print the ids, but delete nothing")
+            command.add_argument("--orphans", action="store_true", help="delete the archives without a submission")
+        if name == "check":
+            command.add_argument("--hash-archives", action="store_true", help="read all archives, too")
         if name == "backup":
             command.add_argument("target", type=Path, metavar="FOLDER", help="folder to write the backup to")
+            command.add_argument("--prune", action="store_true", help="delete what is removed or pruned from it")
     return parser
 
 

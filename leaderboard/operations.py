@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 
@@ -15,19 +14,19 @@ import structlog
 from sqlalchemy import select
 
 from leaderboard.db import jobs, submissions
-from leaderboard.db.engine import Database, without_password
+from leaderboard.db.engine import Database, sqlite_path, without_password
 from leaderboard.db.models import SubmissionModel, TokenModel
-from leaderboard.db.submissions import DELETED
+from leaderboard.db.submissions import DELETED, archive_rows
 from leaderboard.db.tokens import create_token, list_tokens, replace_token, revoke_token
 from leaderboard.scoring.worker import process_queue
 from leaderboard.service import disk_problem, queue_problems
 from leaderboard.settings import Settings
-from leaderboard.storage.archive_store import ArchiveStore
+from leaderboard.storage import retention
+from leaderboard.storage.archive_store import ArchiveStore, archive_problem
 from leaderboard.storage.backup import back_up
-from leaderboard.storage.retention import delete_archives, expired_archives
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.verification import file_problems
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.errors import InputError, StorageError, problem_summary
 from rebar_depth_bench.reporting.formatting import counted
 from rebar_depth_bench.reporting.tables import csv_text
 from rebar_depth_bench.version import software_version
@@ -37,15 +36,14 @@ Cell = str | float | None
 
 
 def run_operation(command: str, settings: Settings, options: argparse.Namespace) -> None:
-    """Run a command on the database of the settings, and print its output. Raises ``InputError``."""
-    if command == "backup":
-        print(back_up(settings, options.target))
+    """Run a command on the database of the settings, and print its output.
+
+    Raises ``InputError``, and ``StorageError`` for stored data that are missing or damaged.
+    """
+    if command in ("backup", "check"):
+        (_back_up if command == "backup" else _check)(settings, options)
         return
     with closing(Database(settings.database_url)) as database:
-        if command == "score" and database.file is not None and not database.file.is_file():
-            raise InputError(
-                f"{settings.database_url}: the database does not exist, expected the database of a server"
-            )
         database.migrate()
         _OPERATIONS[command](database, settings, options)
 
@@ -96,40 +94,77 @@ def _submissions(database: Database, _: Settings, __: argparse.Namespace) -> Non
 
 
 def _remove(database: Database, settings: Settings, options: argparse.Namespace) -> None:
-    if submissions.find(database, options.id) is None:
+    if not options.id.isascii() or submissions.find(database, options.id) is None:
         raise InputError(f"there is no submission {options.id!r}")
     submissions.remove(database, options.id)
-    ArchiveStore(settings.archive_dir).delete(options.id)
+    retention.delete_archives(ArchiveStore(settings.archive_dir), [options.id])
 
 
 def _prune(database: Database, settings: Settings, options: argparse.Namespace) -> None:
-    if not settings.archive_days:
+    archives = ArchiveStore(settings.archive_dir)
+    if options.orphans:
+        pruned = retention.orphaned_archives(database, archives)
+        if not options.dry_run:
+            retention.delete_archives(archives, pruned)
+    elif settings.archive_days:
+        pruned = retention.expired_archives(database, open_folder(settings.data), settings)
+        if not options.dry_run:
+            retention.prune_archives(database, archives, pruned)
+    else:
         raise InputError("archive_days is 0, which keeps every archive; expected --archive-days DAYS")
-    expired = expired_archives(database, open_folder(settings.data).configs, settings)
-    if not options.dry_run:
-        delete_archives(database, ArchiveStore(settings.archive_dir), expired)
-    for record in expired:
-        print(record.id)
+    for submission_id in pruned:
+        print(submission_id)
 
 
-def _check(database: Database, settings: Settings, _: argparse.Namespace) -> None:
-    """Print that all is well. Raises ``InputError`` with everything that is wrong."""
-    folder = open_folder(settings.data)
-    problems = [str(problem) for problem in file_problems(folder)]
-    if stale := jobs.count_stale_submissions(database, folder.digest):
-        problems.append(f"{counted(stale, 'submission')} of another dataset than {folder.digest}")
-    archives = ArchiveStore(settings.archive_dir).ids()
-    query = select(SubmissionModel.id).where(
-        SubmissionModel.status != DELETED, SubmissionModel.archive_deleted_at.is_(None)
-    )
+def _back_up(settings: Settings, options: argparse.Namespace) -> None:
+    if sqlite_path(settings.database_url) is None:
+        note = "only archives are copied; save the rows with pg_dump before, so that each has its archive"
+        print(f"the database is PostgreSQL: {note}", file=sys.stderr)
+    back_up(settings, options.target, options.prune)
+    print(options.target)
+
+
+def _check(settings: Settings, options: argparse.Namespace) -> None:
+    """Print that all is well; nothing is written or created.
+
+    Raises ``StorageError`` with everything that is wrong, and ``InputError`` if only the dataset is.
+    """
+    archives = ArchiveStore(settings.archive_dir, create=False)
+    with closing(Database(settings.database_url, read_only=True)) as database:
+        database.check_schema()
+        problems = [*database.problems(), *_archive_problems(database, archives, options.hash_archives)]
+        problems += queue_problems(database)
+        of_dataset = _dataset_problems(database, settings, archives)
+    for name, folder in (("the state folder", settings.state_dir), ("the archives", settings.archive_dir)):
+        problems += disk_problem(folder, name) if folder.is_dir() else []
+    if problems or of_dataset:
+        raise (StorageError if problems else InputError)(problem_summary([*problems, *of_dataset]))
+    print(f"dataset, database, {counted(len(archives.ids()), 'archive')}, disk and queue are in order")
+
+
+def _archive_problems(database: Database, archives: ArchiveStore, hashed: bool) -> Iterator[str]:
+    rows = archive_rows(database)
+    found = {name: archive_problem(archives.file(name), row, hashed) for name, row in rows.items() if row}
+    rows = archive_rows(database)  # Again, because archives may have been deleted meanwhile.
+    for name, problem in found.items():
+        if problem and rows[name]:
+            yield f"the archive of submission {name} {problem}"
+    for name in retention.unneeded_archives(rows, archives):
+        yield f"the archive {name}.zip exists, but its row says deleted; serve deletes it within an hour"
+    for name in retention.orphaned_archives(database, archives):
+        yield f"the archive {name}.zip has no submission; prune --orphans deletes it"
+
+
+def _dataset_problems(database: Database, settings: Settings, archives: ArchiveStore) -> list[str]:
+    try:
+        folder = open_folder(settings.data)
+    except InputError as error:
+        return [str(error)]
     with database.read() as session:
-        missing = [submission_id for submission_id in session.scalars(query) if submission_id not in archives]
-    problems += [f"the archive of submission {submission_id} is missing" for submission_id in missing]
-    problems += [*disk_problem(settings.state_dir), *queue_problems(database)]
-    if problems:
-        raise InputError("\n".join([f"{counted(len(problems), 'problem')}:", *(f"  - {one}" for one in problems)]))
-    free = shutil.disk_usage(settings.state_dir).free
-    print(f"dataset, database, {counted(len(archives), 'archive')} and queue are in order; {free >> 30} GiB free")
+        stale = jobs.stale_submissions(session, folder.digest, archives.ids())
+    others = sum(record.dataset_digest != folder.digest for record in stale)
+    text = f"{counted(others, 'submission')} of another dataset than {folder.digest}"
+    return [*map(str, file_problems(folder)), *([text] if others else [])]
 
 
 def _print_csv(head: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
@@ -147,5 +182,4 @@ _OPERATIONS: dict[str, Callable[[Database, Settings, argparse.Namespace], None]]
     "submissions": _submissions,
     "remove": _remove,
     "prune": _prune,
-    "check": _check,
 }

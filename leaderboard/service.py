@@ -14,7 +14,7 @@ from pathlib import Path
 import structlog
 from anyio import CapacityLimiter, Lock
 from huggingface_hub.repocard import metadata_load
-from sqlalchemy import func, select
+from sqlalchemy import func, not_, select
 
 from leaderboard.db import jobs
 from leaderboard.db.engine import Database
@@ -24,9 +24,7 @@ from leaderboard.db.versions import CurrentRankings, VersionReader
 from leaderboard.metrics import ServiceMetrics
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import ArchiveStore, delete_abandoned_uploads, make_folder
-from leaderboard.storage.retention import remove_orphan_archives
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, open_folder
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.view_ids import TEST_SPLIT, config_of
 
 SIMULTANEOUS_CHECKS = 2
@@ -66,11 +64,11 @@ class Service:
 
 @contextmanager
 def open_service(settings: Settings) -> Iterator[Service]:
-    """Open the service: migrate the database, and remove abandoned uploads and archives.
+    """Open the service: migrate the database, and remove abandoned uploads.
 
-    Submissions whose result is of another protocol are scored again if their archive is kept. Raises
+    Submissions whose result is of other definitions are scored again if their archive is kept. Raises
     ``InputError`` if the dataset, the database or the archive storage is unusable, and if the leaderboard has
-    submissions of another dataset, unless the setting ``rescore`` is on.
+    submissions of another dataset with their archives, unless the setting ``rescore`` is on.
     """
     folder, manifest = open_folder(settings.data), manifest_state(settings.data)
     name, licence = _read_card(settings.data)
@@ -82,10 +80,8 @@ def open_service(settings: Settings) -> Iterator[Service]:
         )
         archives = ArchiveStore(settings.archive_dir)
         database.migrate()
-        remove_orphan_archives(database, archives)
-        _check_dataset_unchanged(folder, database, settings.rescore)
-        if requeued := jobs.requeue_other_protocols(database, archives.ids()):
-            _LOG.info("results of another protocol; submissions requeued", submissions=requeued)
+        if requeued := jobs.requeue_stale(database, folder.digest, archives.ids(), settings.rescore):
+            _LOG.info("results of another dataset or definition; submissions requeued", submissions=requeued)
         versions = stack.enter_context(closing(VersionReader(database)))
         yield Service(
             settings=settings,
@@ -95,7 +91,7 @@ def open_service(settings: Settings) -> Iterator[Service]:
             spool=settings.spool,
             metrics=ServiceMetrics(database),
             versions=versions,
-            rankings=CurrentRankings(database, versions),
+            rankings=CurrentRankings(database, versions, folder.digest),
             dataset_name=name,
             dataset_licence=licence,
             manifest_state=manifest,
@@ -123,20 +119,6 @@ def manifest_state(data: str) -> tuple[int, int] | None:
     return status.st_size, status.st_mtime_ns
 
 
-def _check_dataset_unchanged(folder: DatasetFolder, database: Database, rescore: bool) -> None:
-    """Ensure that all submissions belong to the dataset ``folder``, so that results never mix two datasets.
-
-    Submissions of other datasets are requeued if ``rescore`` is True; otherwise raises ``InputError``.
-    """
-    stale = jobs.count_stale_submissions(database, folder.digest)
-    if stale and not rescore:
-        raise InputError(
-            f"{folder.root}: the dataset digest is {folder.digest}, but {stale} submissions of this leaderboard "
-            "belong to another dataset; use --rescore true to score them against this one"
-        )
-    jobs.requeue_stale_submissions(database, folder.digest)
-
-
 def service_problems(service: Service) -> list[str]:
     """Return what is wrong with a running service. Raises the errors of an unavailable database."""
     problems = [*_dataset_problems(service), *disk_problem(service.spool)]
@@ -156,18 +138,16 @@ def _dataset_problems(service: Service) -> list[str]:
     ]
 
 
-def disk_problem(folder: Path) -> list[str]:
+def disk_problem(folder: Path, name: str = "the state folder") -> list[str]:
     """Return whether the disk of a folder is nearly full."""
     free = shutil.disk_usage(folder).free
-    return [] if free >= MIN_FREE_BYTES else [f"the disk of the state folder has {free >> 20} MiB left"]
+    return [] if free >= MIN_FREE_BYTES else [f"the disk of {name} has {free >> 20} MiB left"]
 
 
 def queue_problems(database: Database) -> list[str]:
     """Return whether the oldest queued submission waits although no submission is being scored."""
     oldest = select(func.min(SubmissionModel.created_at)).where(SubmissionModel.status == QUEUED)
-    active = select(func.count()).where(
-        SubmissionModel.status == SCORING, SubmissionModel.lease_until > time.time()
-    )
+    active = select(func.count()).where(SubmissionModel.status == SCORING, not_(jobs.is_free(time.time())))
     with database.read() as session:
         queued_since, scoring = session.scalar(oldest), session.scalar(active)
     if queued_since is None or scoring or time.time() - queued_since < STALLED_S:

@@ -24,6 +24,8 @@ from rebar_depth_bench.submission.metadata import is_http_url
 from rebar_depth_bench.validation import format_location, short_repr
 
 GIB = 1 << 30
+MAX_LEASE_S = 600.0
+"""Largest setting ``lease_seconds``; a lease that ends much later was made by a clock that was wrong."""
 
 
 RENAMED_SETTINGS = {
@@ -99,7 +101,10 @@ class Settings(BaseSettings):
         ByteSize(4 * GIB), gt=0, description="memory limit for checking or scoring an archive"
     )
     lease_seconds: float = Field(
-        20.0, gt=0, description="time without a heartbeat from a worker after which its job is reassigned"
+        20.0,
+        gt=0,
+        le=MAX_LEASE_S,
+        description="time without a heartbeat from a worker after which its job is reassigned, at most 600",
     )
     max_connections: int = Field(1000, ge=1, description="maximum number of open connections")
     max_connections_per_address: int = Field(

@@ -52,13 +52,13 @@ def write_error(target: object, error: OSError) -> OutputError | InputError:
 
 
 @contextmanager
-def atomic_replace(target: Path) -> Iterator[Path]:
+def atomic_replace(target: Path, mode: int = 0) -> Iterator[Path]:
     """Yield a temporary path in the target's folder; on a clean exit, flush it and rename it to ``target``.
 
-    Missing parent folders are created. A replaced file passes on its permissions; a new one has those of the
-    umask. On an exception the temporary file is removed and an existing ``target`` is left unchanged. Raises
-    ``InputError`` if ``target`` is a folder, a device or a pipe, or its name is impossible, and ``OutputError`` if
-    it or its folder cannot be written.
+    Missing parent folders are created. The permissions are ``mode``, or for 0, those of a replaced file, or
+    of the umask. On an exception the temporary file is removed and an existing ``target`` is left unchanged.
+    Raises ``InputError`` if ``target`` is a folder, a device or a pipe, or its name is impossible, and
+    ``OutputError`` if it or its folder cannot be written.
     """
     if target.is_dir():
         raise InputError(f"{target}: is a folder, expected the name of a file to write")
@@ -67,13 +67,13 @@ def atomic_replace(target: Path) -> Iterator[Path]:
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666))
+        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode or 0o666))
     except OSError as error:
         raise write_error(target, error) from None
     try:
         with named_write_errors(target):
             yield temporary
-            if target.exists():
+            if not mode and target.exists():
                 temporary.chmod(stat.S_IMODE(target.stat().st_mode) & 0o777)
             fsync_path(temporary)
             temporary.replace(target)

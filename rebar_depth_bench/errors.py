@@ -105,6 +105,10 @@ class OutputError(RebarDepthError):
     """Output that this machine cannot write: no space, quota or permission left, or past the file-size limit."""
 
 
+class StorageError(RebarDepthError):
+    """Stored data of a leaderboard that are missing or damaged, or a machine that cannot store or score more."""
+
+
 class HubError(RebarDepthError):
     """Hugging Face Hub that cannot be reached, fails, or gives an answer that cannot be used."""
 

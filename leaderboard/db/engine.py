@@ -1,20 +1,22 @@
-"""Database engine for SQLite and PostgreSQL: read sessions, write sessions and schema migration."""
+"""Database engine for SQLite and PostgreSQL: read sessions, write sessions, schema migration and checks."""
 
 from __future__ import annotations
 
+import json
 import re
+import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event, inspect
+from sqlalchemy import Connection, Engine, create_engine, event, inspect, select, text
 from sqlalchemy.exc import ArgumentError, DatabaseError, InterfaceError, NoSuchModuleError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.orm import Session
 
-from leaderboard.db.models import Base
-from rebar_depth_bench.errors import InputError
+from leaderboard.db.models import Base, ResultModel
+from rebar_depth_bench.errors import InputError, StorageError
 
 MIGRATIONS = Path(__file__).parent / "migrations"
 SQLITE_BUSY_TIMEOUT_S = 30
@@ -33,13 +35,15 @@ class Database:
 
     With ``hidden_truth``, the functions of this package return only the disclosed part of the stored scores
     (``rebar_depth_bench.scoring.disclosure``). What is stored does not depend on it.
+
+    With ``read_only``, an SQLite database must exist, and nothing is written or created to read it.
     """
 
-    def __init__(self, url: str, *, hidden_truth: bool = False) -> None:
+    def __init__(self, url: str, *, hidden_truth: bool = False, read_only: bool = False) -> None:
         """Create the engine. Raises ``InputError`` if ``url`` is not a valid database URL."""
-        self.hidden_truth = hidden_truth
+        self.hidden_truth, self._url = hidden_truth, url
         try:
-            self._engine = _engine(url)
+            self._engine = _engine(url, read_only)
         except (ArgumentError, NoSuchModuleError, ImportError, OSError) as error:
             raise InputError(f"{without_password(url)}: invalid database URL: {error}") from None
         self.file = sqlite_path(url)
@@ -66,15 +70,16 @@ class Database:
     def migrate(self) -> None:
         """Create the schema or upgrade it; services that start simultaneously take turns.
 
-        Raises ``InputError`` if the database is unavailable.
+        Raises ``InputError`` if the database is unavailable or has the schema of a later version.
         """
         from alembic import command  # Half a second to import, which processes that only score do not need.
         from alembic.config import Config
+        from alembic.util import CommandError
 
         config = Config()
         config.set_main_option("script_location", str(MIGRATIONS))
         try:
-            with self._write_engine.begin() as connection:
+            with database_errors(self._url, InputError), self._write_engine.begin() as connection:
                 if self.has_row_locks:
                     connection.exec_driver_sql("SELECT pg_advisory_xact_lock(7241053)")
                 config.attributes["connection"] = connection
@@ -83,10 +88,39 @@ class Database:
                 else:
                     Base.metadata.create_all(connection, checkfirst=False)
                     command.stamp(config, "head")
-        except (*DATABASE_UNAVAILABLE, DatabaseError) as error:
-            url = self._engine.url.render_as_string(hide_password=True)
-            reason = " ".join(str(getattr(error, "orig", error)).split())
-            raise InputError(f"{url}: the database is unavailable: {reason}") from None
+        except CommandError:  # There is no migration from the revision that it has.
+            self.check_schema()
+
+    def check_schema(self) -> None:
+        """Raise ``InputError`` unless the database has the schema of this version."""
+        from alembic.migration import MigrationContext
+        from alembic.script import ScriptDirectory
+
+        with self._engine.connect() as connection:
+            found = MigrationContext.configure(connection).get_current_revision()
+        expected = ScriptDirectory(str(MIGRATIONS)).get_current_head()
+        if found != expected:
+            schema = "holds no leaderboard" if found is None else f"has the schema {found} of another version"
+            url = without_password(self._url)
+            raise InputError(f"{url}: {schema}, expected {expected}; serve upgrades an earlier one")
+
+    def problems(self) -> list[str]:
+        """Return what is damaged: pages and references of an SQLite database, and results that are no JSON."""
+        found: list[str] = []
+        try:
+            with self.read() as session:
+                for pragma in () if self.has_row_locks else ("integrity_check(5)", "foreign_key_check"):
+                    rows = session.execute(text(f"PRAGMA {pragma}"))
+                    found += [f"the database is damaged: {pragma} finds {row}" for row in rows if row != ("ok",)]
+                results = select(ResultModel.submission_id, ResultModel.json)
+                for submission_id, content in session.execute(results, execution_options={"yield_per": 20}):
+                    try:
+                        json.loads(content)
+                    except ValueError:
+                        found.append(f"the result of submission {submission_id} is no JSON")
+        except DatabaseError as error:
+            found.append(f"the database is damaged: {error.orig}")
+        return found
 
     def close(self) -> None:
         """Close all connections."""
@@ -104,7 +138,17 @@ def sqlite_path(url: str) -> Path | None:
     return Path(url.removeprefix(prefix)) if url.startswith(prefix) else None
 
 
-def _engine(url: str) -> Engine:
+@contextmanager
+def database_errors(url: str, kind: type[InputError | StorageError] = StorageError) -> Iterator[None]:
+    """Raise the errors of a database that is unavailable or damaged as errors of a ``kind`` that name it."""
+    try:
+        yield
+    except (*DATABASE_UNAVAILABLE, DatabaseError) as error:
+        reason = " ".join(str(getattr(error, "orig", error)).split())
+        raise kind(f"{without_password(url)}: the database is unavailable: {reason}") from None
+
+
+def _engine(url: str, read_only: bool) -> Engine:
     path = sqlite_path(url)
     if path is None:
         return create_engine(
@@ -115,6 +159,11 @@ def _engine(url: str) -> Engine:
             pool_size=10,
             max_overflow=10,
         )
+    if read_only:
+        # Without a write-ahead log nobody has the database open, and SQLite would create one to read it.
+        mode = "mode=ro" if Path(f"{path}-wal").exists() else "immutable=1"
+        uri = f"{path.resolve().as_uri()}?{mode}"
+        return create_engine(url, creator=lambda: sqlite3.connect(uri, uri=True))
     path.parent.mkdir(parents=True, exist_ok=True)
     engine = create_engine(
         url, hide_parameters=True, connect_args={"timeout": SQLITE_BUSY_TIMEOUT_S}, pool_size=20, max_overflow=20

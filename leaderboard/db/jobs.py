@@ -12,7 +12,7 @@ import time
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, func, or_, select, update
+from sqlalchemy import ColumnElement, and_, or_, select, update
 from sqlalchemy.engine import CursorResult
 from sqlalchemy.orm import Session
 
@@ -29,6 +29,8 @@ from leaderboard.db.models import (
 from leaderboard.db.submissions import FAILED, QUEUED, SCORED, SCORING, delete_results
 from leaderboard.db.view_errors import view_errors
 from leaderboard.scoring.sandbox import Outcome
+from leaderboard.settings import MAX_LEASE_S
+from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 MAX_ATTEMPTS = 5
@@ -46,8 +48,7 @@ def claim(database: Database, scorer: str, lease_s: float) -> str | None:
     while True:
         with database.write() as session:
             now = time.time()
-            is_free = or_(SubmissionModel.lease_until.is_(None), SubmissionModel.lease_until < now)
-            waiting = and_(SubmissionModel.status.in_((QUEUED, SCORING)), is_free)
+            waiting = and_(SubmissionModel.status.in_((QUEUED, SCORING)), is_free(now))
             order = (SubmissionModel.attempts, SubmissionModel.created_at)
             oldest = select(SubmissionModel).where(waiting).order_by(*order).limit(1)
             if database.has_row_locks:
@@ -61,6 +62,16 @@ def claim(database: Database, scorer: str, lease_s: float) -> str | None:
                 return record.id
             record.status, record.finished_at = FAILED, now
             record.reason = f"scoring was started {record.attempts} times but never finished"
+
+
+def is_free(now: float) -> ColumnElement[bool]:
+    """Return the condition that no lease holds a submission at Unix time ``now``.
+
+    A lease that ends later than any lease can was made before the clock was set back, and holds nothing. Twice the
+    longest one leaves room for the clocks of other machines.
+    """
+    lease_until = SubmissionModel.lease_until
+    return or_(lease_until.is_(None), lease_until < now, lease_until > now + 2 * MAX_LEASE_S)
 
 
 def renew(database: Database, submission_id: str, scorer: str, lease_s: float) -> bool:
@@ -82,7 +93,10 @@ def release(database: Database, submission_id: str, scorer: str, wait_s: float =
 
 
 def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome) -> bool:
-    """Store the outcome in one transaction if ``scorer`` still holds the lease; return whether it did."""
+    """Store the outcome in one transaction if ``scorer`` still holds the lease; return whether it did.
+
+    If the archive is missing, a result that was to be computed again stays, with its dataset.
+    """
     result = None if outcome.result is None else json.loads(outcome.result)
     values = {
         "status": FAILED if result is None else SCORED,
@@ -91,6 +105,9 @@ def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome
         "lease_until": None,
     }
     with database.write() as session:
+        if outcome.archive_missing and (kept := session.get(ResultModel, submission_id)):
+            digest = json.loads(kept.json)["dataset"]["digest"]
+            values |= {"status": SCORED, "reason": None, "dataset_digest": digest}
         if not _update_one(session, _has_lease(submission_id, scorer), values):
             return False
         if result is not None:
@@ -100,41 +117,55 @@ def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome
     return True
 
 
-def count_stale_submissions(database: Database, dataset_digest: str) -> int:
-    """Return the number of submissions that belong to another dataset than the one with ``dataset_digest``."""
-    with database.read() as session:
-        return session.scalar(select(func.count()).where(_is_stale(dataset_digest))) or 0
+def requeue_stale(database: Database, dataset_digest: str, archive_ids: Collection[str], rescore: bool) -> int:
+    """Requeue the stale submissions for scoring against a dataset; return their number.
 
-
-def requeue_stale_submissions(database: Database, dataset_digest: str) -> None:
-    """Requeue the submissions of other datasets for scoring against this one; old results stay until replaced."""
+    Old results stay until they are replaced. Raises ``InputError`` if there are submissions of other datasets,
+    unless ``rescore`` is True.
+    """
     with database.write() as session:
-        values = {"status": QUEUED, "attempts": 0, "finished_at": None, "dataset_digest": dataset_digest}
-        session.execute(update(SubmissionModel).where(_is_stale(dataset_digest)).values(**values))
-        increment_content_version(session)
+        stale = stale_submissions(session, dataset_digest, archive_ids)
+        others = sum(record.dataset_digest != dataset_digest for record in stale)
+        if others and not rescore:
+            raise InputError(
+                f"the dataset digest is {dataset_digest}, but {others} submissions of this leaderboard belong to "
+                "another dataset; use --rescore true to score them against this one"
+            )
+        for record in stale:
+            record.status, record.attempts, record.finished_at = QUEUED, 0, None
+            record.dataset_digest = dataset_digest
+        if stale:
+            increment_content_version(session)
+        return len(stale)
 
 
-def requeue_other_protocols(database: Database, archive_ids: Collection[str]) -> int:
-    """Requeue the scored submissions whose result is of another protocol; return their number.
+def stale_submissions(session: Session, digest: str, archive_ids: Collection[str]) -> list[SubmissionModel]:
+    """Return the submissions of other datasets than the one with ``digest``, and those of other definitions.
 
-    ``archive_ids`` are those of the submissions whose archive is kept; the results of others stay.
+    Results stay as they are if their archive is pruned, or not among ``archive_ids``.
     """
     query = (
-        select(SubmissionModel)
-        .join(ResultModel, ResultModel.submission_id == SubmissionModel.id)
-        .where(SubmissionModel.status == SCORED, ResultModel.protocol != PROTOCOL)
+        select(SubmissionModel, ResultModel.json)
+        .outerjoin(ResultModel, ResultModel.submission_id == SubmissionModel.id)
+        .where(SubmissionModel.status.in_((QUEUED, SCORING, SCORED)))
+        .with_for_update(of=SubmissionModel)
     )
-    with database.write() as session:
-        requeued = [record for record in session.scalars(query) if record.id in archive_ids]
-        for record in requeued:
-            record.status, record.attempts, record.finished_at = QUEUED, 0, None
-        increment_content_version(session)
-        return len(requeued)
+    stale = []
+    for record, content in session.execute(query, execution_options={"yield_per": 20}):
+        scored, has_archive = record.status == SCORED, record.id in archive_ids and not record.archive_deleted_at
+        is_other = record.dataset_digest != digest or (scored and _has_other_definitions(content or b""))
+        if is_other and (has_archive or not scored):
+            stale.append(record)
+    return stale
 
 
-def _is_stale(dataset_digest: str) -> ColumnElement[bool]:
-    is_active = SubmissionModel.status.in_((QUEUED, SCORING, SCORED))
-    return and_(is_active, SubmissionModel.dataset_digest != dataset_digest)
+def _has_other_definitions(content: bytes) -> bool:
+    """Return whether a result JSON was computed with other definitions than those of this version."""
+    try:
+        result: dict[str, Any] = json.loads(content)
+    except ValueError:  # Damaged: it is computed again, too.
+        return True
+    return bool(result["protocol"] != PROTOCOL)
 
 
 def _stored(submission_id: str, outcome: Outcome, result: Mapping[str, Any]) -> Iterator[Base]:

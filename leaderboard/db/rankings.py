@@ -109,10 +109,13 @@ class Ranking:
         return [entry for entry in self.entries if inputs is None or entry.inputs == inputs]
 
 
-def read_ranking(database: Database, config: str, viewer: TokenModel | None = None) -> Ranking:
+def read_ranking(
+    database: Database, config: str, dataset_digest: str, viewer: TokenModel | None = None
+) -> Ranking:
     """Return the public rows of a config and those of ``viewer``, of results that this version can read.
 
-    Equal rank errors share a rank. A row that is not public has no rank and does not affect the ranks of others.
+    Results of another dataset than the one with ``dataset_digest`` are left out. Equal rank errors share a
+    rank. A row that is not public has no rank and does not affect the ranks of others.
     """
     own = false() if viewer is None else SubmissionModel.token_id == viewer.id
     query = (
@@ -123,6 +126,7 @@ def read_ranking(database: Database, config: str, viewer: TokenModel | None = No
         .where(
             LeaderboardRowModel.config == config,
             SubmissionModel.status == SCORED,
+            SubmissionModel.dataset_digest == dataset_digest,
             SubmissionModel.public | own,
             ResultModel.protocol.in_((PROTOCOL, OLD_PROTOCOL)),
         )

@@ -177,6 +177,20 @@ def of_token(database: Database, token: TokenModel) -> list[SubmissionModel]:
         return list(session.scalars(own.order_by(SubmissionModel.created_at.desc())))
 
 
+def archive_rows(database: Database) -> dict[str, tuple[str, int] | None]:
+    """Return the archive of every submission by id, also of removed ones: its SHA-256 and its size in bytes.
+
+    None stands for an archive that is not kept: its row says that it was deleted with its submission or pruned.
+    """
+    of_archive = (SubmissionModel.archive_sha256, SubmissionModel.archive_bytes)
+    query = select(SubmissionModel.id, SubmissionModel.status, SubmissionModel.archive_deleted_at, *of_archive)
+    with database.read() as session:
+        return {
+            submission_id: None if status == DELETED or deleted_at is not None else (sha256, size)
+            for submission_id, status, deleted_at, sha256, size in session.execute(query)
+        }
+
+
 def delete_results(session: Session, submission_id: str) -> None:
     """Delete what scoring has stored of a submission."""
     for table in (PictureImageModel, PictureModel, LeaderboardRowModel, ResultModel):

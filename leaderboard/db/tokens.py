@@ -16,6 +16,7 @@ from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.db.submissions import DELETED
 from leaderboard.names import name_problem, normalised
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.validation import short_repr
 
 PREFIX = "rdb_"
 MAX_NAME = 100
@@ -26,10 +27,7 @@ def create_token(database: Database, name: str) -> str:
 
     Raises ``InputError`` if the name is taken, blank, longer than ``MAX_NAME`` characters or not printable.
     """
-    name = normalised(name)
-    if not name or len(name) > MAX_NAME or (problem := name_problem(name)):
-        expected = f"expected 1 to {MAX_NAME} printable characters"
-        raise InputError(f"the token name is {name!r}, {problem or expected}")
+    name = _checked_name(name)
     token = PREFIX + secrets.token_urlsafe(32)
     try:
         with database.write() as session:
@@ -37,6 +35,15 @@ def create_token(database: Database, name: str) -> str:
     except IntegrityError:
         raise InputError(f"a token for {name!r} already exists, expected another name or --replace") from None
     return token
+
+
+def _checked_name(name: str) -> str:
+    """Return a name normalised. Raises ``InputError`` if no token can have it."""
+    name = normalised(name)
+    has_length = 0 < len(name) <= MAX_NAME
+    if problem := name_problem(name) if has_length else f"expected 1 to {MAX_NAME} printable characters":
+        raise InputError(f"the token name is {short_repr(name)}, {problem}")
+    return name
 
 
 def replace_token(database: Database, name: str) -> str:
@@ -52,6 +59,7 @@ def revoke_token(database: Database, name: str) -> None:
 
 
 def _change(database: Database, name: str, values: Mapping[str, Any]) -> None:
+    name = _checked_name(name)
     with database.write() as session:
         changed = session.scalar(
             update(TokenModel).where(TokenModel.name == name).values(**values).returning(TokenModel.id)

@@ -9,7 +9,7 @@ from contextlib import suppress
 from sqlalchemy import select
 
 from leaderboard.db.engine import Database
-from leaderboard.db.models import ContentVersionModel
+from leaderboard.db.models import ContentVersionModel, TokenModel
 from leaderboard.db.rankings import Ranking, read_ranking
 
 
@@ -51,20 +51,22 @@ class VersionReader:
 
 
 class CurrentRankings:
-    """Rankings of the public rows, each read from the database once per content version; thread-safe."""
+    """Rankings of a dataset's public rows, each read from the database once per content version; thread-safe."""
 
-    def __init__(self, database: Database, versions: VersionReader) -> None:
-        self._database, self._versions = database, versions
+    def __init__(self, database: Database, versions: VersionReader, dataset_digest: str) -> None:
+        self._database, self._versions, self._dataset_digest = database, versions, dataset_digest
         self._lock = threading.Lock()
         self._version, self._by_config = -1, dict[str, Ranking]()
 
-    def of(self, config: str) -> Ranking:
-        """Return the current ranking of a config."""
+    def of(self, config: str, viewer: TokenModel | None = None) -> Ranking:
+        """Return the current ranking of a config, with the rows of ``viewer``."""
+        if viewer is not None:
+            return read_ranking(self._database, config, self._dataset_digest, viewer)
         with self._lock:
             version = self._versions.unchanged()
             version = self._versions.read() if version is None else version
             if version != self._version:
                 self._version, self._by_config = version, {}
             if config not in self._by_config:
-                self._by_config[config] = read_ranking(self._database, config)
+                self._by_config[config] = read_ranking(self._database, config, self._dataset_digest)
             return self._by_config[config]

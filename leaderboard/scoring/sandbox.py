@@ -46,6 +46,7 @@ class Outcome:
     notes: Sequence[str] = ()
     pictures: Sequence[ViewPicture] = ()
     reason: str | None = None
+    archive_missing: bool = False
 
 
 def _with_problems(task: Callable[P, T]) -> Callable[P, T | Problems]:

@@ -127,7 +127,7 @@ class _Worker:
                 should_continue=lambda: self._keeps_lease(record.id),
             )
         except ArchiveNotFoundError:
-            return Outcome(reason="the archive is no longer in the archive storage")
+            return Outcome(reason="the archive is no longer in the archive storage", archive_missing=True)
         except TimeLimitError:
             return Outcome(reason=f"scoring took longer than the limit of {settings.score_time:g} s")
         except StoppedError:

@@ -61,7 +61,7 @@ def serve(settings: Settings) -> None:
         details = {"version": software_version(), "dataset": service.folder.digest, "scorers": settings.workers}
         details["hidden_truth"] = settings.hidden_truth
         _LOG.info("serving", database=without_password(settings.database_url), **details)
-        stores = (service.database, service.archives, service.folder.configs, settings)
+        stores = (service.database, service.archives, service.folder, settings)
         with (
             metrics_server(service),
             archive_retention(*stores),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import statistics
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -32,8 +33,10 @@ def is_http_url(url: str) -> bool:
     return valid and url.isprintable() and " " not in url and len(url) <= _MAX_URL_CHARACTERS
 
 
-# PostgreSQL cannot store NUL.
-_Description = Annotated[str, Expected("text without NUL", lambda value: "\0" not in value)]
+# PostgreSQL cannot store NUL, and UTF-8 has no surrogates.
+_Description = Annotated[
+    str, Expected("text without NUL and surrogates", lambda value: not re.search("[\0\ud800-\udfff]", value))
+]
 _HttpUrl = Annotated[
     str,
     Expected(

@@ -63,6 +63,16 @@ class Postgres:
         self._run("createdb", "-h", str(self.folder), "-U", "board", name)
         return f"postgresql://board@/{name}?host={self.folder}"
 
+    def run(self, program: str, *arguments: str, output: Path | None = None, input: Path | None = None) -> None:
+        """Run a program of PostgreSQL as its user, with a file as standard output or input."""
+        command = [str(self.binaries / program), *arguments]
+        content = b"" if input is None else input.read_bytes()
+        finished = subprocess.run(
+            command, check=True, user=_user(), stdout=subprocess.PIPE, cwd="/", input=content
+        )
+        if output is not None:
+            output.write_bytes(finished.stdout)
+
     def _run(self, program: str, *arguments: str, check: bool = True) -> int:
         command = [str(self.binaries / program), *arguments]
         return subprocess.run(command, check=check, user=_user(), capture_output=True, cwd="/").returncode

@@ -248,6 +248,17 @@ def test_always_public_submission_cannot_be_hidden(board: SharedServer) -> None:
     assert call(board.server, "GET", path).json()["public"] is True
 
 
+@pytest.mark.parametrize(
+    "key", ["description", "url", "code_url", "licence", "training_data", "parameters", "public", "a\\ud800"]
+)
+def test_lone_surrogate_is_422(private_server: Server, small_archive: Path, key: str) -> None:
+    token = private_server.token(f"broken text {key.isalpha()} {key[:4]} {key[-3:].isalpha()}")
+    submission_id = private_server.submit_accepted(small_archive, token)
+    body = b'{"%s": "https://example.org/\\ud800"}' % key.encode()
+    response = call(private_server, "PATCH", f"{API}/{submission_id}", token, content=body)
+    assert response.status_code == 422, response.text
+
+
 def test_only_owner_can_delete_submission(private_server: Server, write_archive: WriteArchive) -> None:
     token, other_token = private_server.token("tidy"), private_server.token("nosy")
     submission_id = private_server.submit_accepted(write_archive("short-lived"), token)

@@ -29,6 +29,7 @@ from leaderboard.settings import read_settings
 from leaderboard.web import cache
 from leaderboard.web.app import make_app
 from leaderboard.web.cache import CacheMiddleware
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.submission import SubmissionMeta
 from tests.bench.reporting.results import result, scored_view
 from tests.synthetic_dataset import scale_errors, write_dataset
@@ -48,10 +49,17 @@ def add_scored_submission(
     record = find_token(database, token)
     assert record is not None
     submission_id = submissions.new_id()
-    upload = Upload(SubmissionMeta(method=method), submission_id * 2, 1, "sha256:0")
+    upload = Upload(SubmissionMeta(method=method), submission_id * 2, 1, digest_of_board(database))
     submissions.accept(database, submission_id, record, upload, Quota(1000, 1 << 40), public)
     finish_scoring(database, submission_id, method, error)
     return submission_id
+
+
+def digest_of_board(database: Database) -> str:
+    """Return the digest of the dataset that is beside the state folder, if there is one."""
+    assert database.file is not None
+    root = database.file.parents[1] / "dataset"
+    return open_folder(root).digest if root.is_dir() else "sha256:0"
 
 
 def finish_scoring(database: Database, submission_id: str, method: str, error: float) -> None:
@@ -138,14 +146,14 @@ def test_every_change_of_shown_content_increments_the_version(database: Database
     assert version_after(lambda: add_scored_submission(database, token, "n", 1.0)) > 0
     assert version_after(lambda: submissions.change(database, submission_id, {"public": False})) > 0
     assert version_after(lambda: submissions.change(database, submission_id, {"description": "x"})) > 0
-    assert version_after(lambda: jobs.requeue_stale_submissions(database, "sha256:1")) > 0
+    assert version_after(lambda: jobs.requeue_stale(database, "sha256:1", {submission_id}, True)) > 0
     assert version_after(lambda: finish_scoring(database, submission_id, "m", 2.0)) > 0
     assert version_after(lambda: submissions.remove(database, submission_id)) > 0
 
 
 def test_claims_and_renewals_keep_the_version(database: Database, token: str) -> None:
     submission_id = add_scored_submission(database, token, "m", 1.0)
-    jobs.requeue_stale_submissions(database, "sha256:1")
+    assert jobs.requeue_stale(database, "sha256:1", {submission_id}, True) == 1
     before = content_version(database)
     assert jobs.claim(database, "scorer", 60) == submission_id
     assert jobs.renew(database, submission_id, "scorer", 60)

@@ -1,11 +1,14 @@
-"""kill -9 of the server, scorers and database: every accepted submission is scored exactly once."""
+"""kill -9 of server, scorers, database and backups, prune, restore: what is accepted is scored exactly once."""
 
 from __future__ import annotations
 
 import itertools
 import json
 import os
+import shutil
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections import Counter
@@ -23,6 +26,7 @@ from leaderboard.db.jobs import MAX_ATTEMPTS
 from tests.leaderboard.conftest import WriteArchive
 from tests.leaderboard.postgres import Postgres, RunPostgres
 from tests.leaderboard.serving import SCORING, RunServer, Server, distinct_archive, make_token
+from tests.leaderboard.test_operations import run
 from tests.processes import descendants, is_running, processes_below, wait_until
 from tests.requirements import Repetitions
 
@@ -134,6 +138,44 @@ class Service:
             time.sleep(0.3)
             self.postgres.start()
 
+    def back_up(self, rng: np.random.Generator) -> None:
+        """Kill a backup, then make one."""
+        command = [sys.executable, "-m", "leaderboard", "backup", str(self.backup), *self.place()]
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        time.sleep(rng.uniform(0.5, 2.5))
+        process.kill()
+        process.wait()
+        self.run("backup", self.backup, "--prune")
+
+    def prune(self) -> None:
+        """Delete the archives of all ended submissions but the best."""
+        self.run("prune", "--data", self.root, "--archive-days", "0.00001", "--archive-ranks", "1")
+
+    def restore(self) -> None:
+        """Lose the state folder of a killed server, and restore the backup that was made just before."""
+        if self.postgres is not None:
+            return
+        assert self.server is not None
+        self.server.process.kill()
+        self.server.process.wait()
+        self.running.close()
+        self.run("backup", self.backup)
+        shutil.rmtree(self.state)
+        state = run("backup", self.state, "--state-dir", self.backup)
+        assert state.returncode == 0, state.stderr
+        self.start()
+
+    def place(self) -> list[str]:
+        return ["--state-dir", str(self.state), "--db", self.db]
+
+    def run(self, command: str, *options: object) -> None:
+        process = run(command, *options, *self.place())
+        assert process.returncode == 0, process.stderr
+
+    @property
+    def backup(self) -> Path:
+        return self.state.with_name("backup")
+
 
 @pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.nightly)])
 def service(
@@ -154,19 +196,26 @@ def service(
 def test_accepted_submissions_are_scored_once(
     service: Service, write_archive: WriteArchive, repetitions: Repetitions
 ) -> None:
-    num_kills = repetitions(3, 100)
+    num_kills = repetitions(6, 100)
     archive = write_archive("chaos", configs=("lattice-orbit",))
     uploads = Uploads(archive, make_token(service.state, "alice", service.db), service.url)
     threads = [threading.Thread(target=uploads.run) for _ in range(UPLOADERS)]
     for thread in threads:
         thread.start()
     rng = np.random.default_rng(20261121)
-    kill_actions = [service.kill_server, lambda: service.kill_scorer(rng), service.kill_database]
+    kill_actions = [
+        service.kill_server,
+        lambda: service.back_up(rng),
+        lambda: service.kill_scorer(rng),
+        service.prune,
+        service.kill_database,
+        service.restore,
+    ]
     try:
         for k in range(num_kills):
             uploads.wait_for(int(rng.integers(3)))
             time.sleep(rng.uniform(*PAUSE_S))
-            kill_actions[k % 3]()
+            kill_actions[k % len(kill_actions)]()
     finally:
         uploads.ended.set()
         for thread in threads:
@@ -197,5 +246,8 @@ def test_accepted_submissions_are_scored_once(
     scored = set(uploads.accepted) - set(failed)
     assert scored <= set(shown)
     assert len(shown) - len(scored) <= len(uploads.begun) - uploads.answers.count(202)
-    stored_ids = {path.stem for path in (service.state / "archives").glob("*.zip")}
-    assert set(shown) <= stored_ids
+    service.run("check", "--data", service.root, "--hash-archives")  # Rows and archives agree.
+    service.run("backup", service.backup, "--prune")
+    folders = (service.backup, service.state)
+    backed_up, stored = ({path.name for path in (folder / "archives").iterdir()} for folder in folders)
+    assert backed_up <= stored

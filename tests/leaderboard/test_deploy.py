@@ -50,7 +50,7 @@ def image_environment() -> dict[str, str]:
 def test_deployed_settings_exist() -> None:
     for file in [*sorted((ROOT / "deploy").iterdir()), OPERATOR]:
         names = {name.lower() for name in re.findall(rf"{PREFIX}(\w+)", file.read_text())}
-        assert names or file.suffix == ".conf", f"{file.name}: nothing is set"
+        assert names or file.suffix in (".conf", ".timer"), f"{file.name}: nothing is set"
         allowed = NON_SETTINGS if file.suffix == ".md" else set()
         assert names <= set(Settings.model_fields) | allowed, file.name
 
@@ -124,6 +124,19 @@ def test_ports_volumes_and_database_are_consistent(compose: dict[str, Any]) -> N
     assert declared == {name for name in used if name.isidentifier()}
     assert services["database"]["environment"]["POSTGRES_USER"] == "board"
     assert services["database"]["environment"]["POSTGRES_DB"] == "board"
+
+
+def test_systemd_units_run_commands_that_exist(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "".join(file.read_text() for file in sorted((ROOT / "deploy").glob("*.service")))
+    for name, value in re.findall(rf"^Environment=({PREFIX}\w+)=(.+)$", text, re.MULTILINE):
+        monkeypatch.setenv(name, value)
+    settings = Settings()  # type: ignore[call-arg]
+    commands = re.findall(r"^ExecStart=/opt/leaderboard/bin/rebar-leaderboard (.+)$", text, re.MULTILINE)
+    options = [argument_parser().parse_args(shlex.split(command)) for command in commands]
+    assert [one.command for one in options] == ["backup", "check", "serve"]
+    assert f"ReadWritePaths={settings.state_dir} {options[0].target}" in text
+    (unit,) = (ROOT / "deploy").glob("*.timer")
+    assert unit.with_suffix(".service").is_file()
 
 
 def test_images_have_no_registry(compose: dict[str, Any]) -> None:

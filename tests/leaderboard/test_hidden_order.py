@@ -19,7 +19,7 @@ from leaderboard.db.tokens import create_token
 from leaderboard.service import open_service
 from leaderboard.settings import read_settings
 from leaderboard.web.app import make_app
-from tests.leaderboard.test_cache import API, BOARD, CSV, add_scored_submission, get_response
+from tests.leaderboard.test_cache import API, BOARD, CSV, add_scored_submission, digest_of_board, get_response
 from tests.synthetic_dataset import write_dataset
 
 
@@ -66,13 +66,16 @@ def test_order_and_ranks_use_rounded_errors(database: Database, hidden: Database
     exact = [0.0625, 0.0624, 0.0626, 0.06249, 0.0635, *(round(rng.uniform(0.06, 0.065), 12) for _ in range(15))]
     ids = [add_scored_submission(database, token, f"m{k}", 1.0) for k in range(len(exact))]
     set_errors(database, dict(zip(ids, exact, strict=True)))
-    entries = read_ranking(hidden, "lattice").entries
+    digest = digest_of_board(database)
+    entries = read_ranking(hidden, "lattice", digest).entries
     shown = [json.loads(entry.table_json)["rank_error"] for entry in entries]
     assert shown == sorted(round(error, 3) for error in exact)
     assert [entry.rank for entry in entries] == [1 + sum(other < error for other in shown) for error in shown]
     ages = [(error, entry.created_at) for error, entry in zip(shown, entries, strict=True)]
     assert ages == sorted(ages), "rows with equal errors are in order of age, not of their exact errors"
-    assert [entry.rank for entry in read_ranking(database, "lattice").entries] == list(range(1, len(exact) + 1))
+    assert [entry.rank for entry in read_ranking(database, "lattice", digest).entries] == list(
+        range(1, len(exact) + 1)
+    )
 
 
 def test_option_changes_responses_of_the_same_database_and_their_etags(

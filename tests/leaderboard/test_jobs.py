@@ -19,7 +19,7 @@ from leaderboard.db.rankings import picture_facts, picture_webp, read_ranking
 from leaderboard.db.submissions import Quota, QuotaExceededError, Upload
 from leaderboard.db.tokens import create_token, find_token, list_tokens, replace_token, revoke_token
 from leaderboard.scoring.sandbox import Outcome, ViewPicture
-from leaderboard.settings import read_settings
+from leaderboard.settings import MAX_LEASE_S, read_settings
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.submission import SubmissionMeta
 from tests.bench.reporting.results import result, scored_view
@@ -148,7 +148,7 @@ def test_job_scored_twice_has_one_result(database: Database, alice: TokenModel) 
     assert submissions.result_notes(database, submission_id) == ["a note"]
     assert picture_facts(database, submission_id) == {"lattice/0000": ({"near": "1 m"}, ["error", "truth"])}
     assert picture_webp(database, submission_id, "lattice/0000", "truth") == b"true"
-    [row] = read_ranking(database, "lattice").entries
+    [row] = read_ranking(database, "lattice", "sha256:0").entries
     assert json.loads(row.table_json) == json.loads(second)["tables"]["lattice"]
 
 
@@ -162,7 +162,7 @@ def test_submission_deleted_while_scoring_stays_deleted(database: Database, alic
     )
     assert submissions.find(database, submission_id) is None
     assert submissions.result_json(database, submission_id) is None
-    assert read_ranking(database, "lattice").entries == ()
+    assert read_ranking(database, "lattice", "sha256:0").entries == ()
 
 
 def test_concurrent_uploads_do_not_exceed_quota(database: Database, alice: TokenModel) -> None:
@@ -227,6 +227,29 @@ def test_token_is_found_only_by_exact_value(database: Database) -> None:
     assert [find_token(database, other) for other in (token[:-1], token + "x", token.lower(), "", "bob")] == [
         None
     ] * 5
+
+
+@pytest.mark.parametrize("status", ["queued", "scoring"])
+def test_clock_that_was_set_back_blocks_no_job(
+    database: Database, alice: TokenModel, monkeypatch: pytest.MonkeyPatch, status: str
+) -> None:
+    [submission_id] = queue(database, alice, 1)
+    assert jobs.claim(database, "s", MAX_LEASE_S) == submission_id
+    if status == "queued":
+        jobs.release(database, submission_id, "s", wait_s=MAX_LEASE_S)
+    assert jobs.claim(database, "other", 1.0) is None, "a lease of another worker may be longer"
+    yesterday = time.time() - 86400
+    monkeypatch.setattr(time, "time", lambda: yesterday)
+    assert get_submission(database, submission_id).status == status
+    assert jobs.claim(database, "other", LEASE_S) == submission_id
+
+
+@pytest.mark.parametrize("name", ["", " ", "x" * 101, "a\udcff", "a\0"])
+def test_impossible_token_names_are_refused_in_words(database: Database, name: str) -> None:
+    for make in (create_token, replace_token, revoke_token):
+        with pytest.raises(InputError, match="the token name is"):
+            make(database, name)
+    assert list_tokens(database) == []
 
 
 def test_released_job_with_wait_is_claimed_later(database: Database, alice: TokenModel) -> None:

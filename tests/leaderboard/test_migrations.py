@@ -25,6 +25,7 @@ from leaderboard.db.tokens import create_token, digest, find_token
 from leaderboard.db.versions import VersionReader
 from leaderboard.db.view_errors import unpack_view_errors
 from leaderboard.settings import Settings
+from rebar_depth_bench.errors import InputError
 from tests.bench.reporting.results import result, scored_view
 from tests.leaderboard.old_schema import create_old_schema
 
@@ -155,7 +156,7 @@ def test_database_of_revision_2_keeps_error_maps_and_gets_view_errors(url: str, 
     with closing(Database(url)) as database:
         assert picture_webp(database, "one", "lattice/0000", "error") == b"webp"
         assert picture_facts(database, "one") == {"lattice/0000": ({}, ["error"])}
-        [entry] = read_ranking(database, "lattice").entries
+        [entry] = read_ranking(database, "lattice", "sha256:0").entries
         assert (entry.id, entry.submitter, entry.rank) == ("one", "alice", 1)
         assert find_token(database, "a token") is not None
         with database.read() as session:
@@ -184,6 +185,17 @@ def test_database_of_revision_1_migrates(url: str, engine: Engine) -> None:
     assert differences(engine, Base.metadata) == []
     with closing(Database(url)) as database, closing(VersionReader(database)) as versions:
         assert versions.read() == 1
+
+
+def test_database_of_another_version_is_refused_in_words(url: str, engine: Engine) -> None:
+    with closing(Database(url)) as database:
+        database.migrate()
+        database.check_schema()
+        with engine.begin() as connection:
+            connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0999'")
+        for use in (database.migrate, database.check_schema):
+            with pytest.raises(InputError, match="has the schema 0999 of another version, expected 0"):
+                use()
 
 
 def test_migrations_are_linear() -> None:

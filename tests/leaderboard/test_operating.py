@@ -128,20 +128,26 @@ def test_second_backup_copies_only_new_archives(
         before = inodes_and_mtimes(backup / "archives")
         assert set(before) == {f"{first}.zip"}
         second, lost = server.submit_accepted(small_archive, token), server.submit_accepted(small_archive, token)
-    (state / "archives" / f"{lost}.zip").unlink()  # as if deleted during the backup
+    (state / "archives" / f"{lost}.zip").unlink()
     process = run_command("backup", backup, "--state-dir", state)  # No service is running.
-    assert process.returncode == 0, process.stderr
+    assert process.returncode == 1, process.stderr
+    assert f"the archive of submission {lost} is missing" in process.stderr
     after = inodes_and_mtimes(backup / "archives")
     assert set(after) == {*before, f"{second}.zip"}
     assert {name: after[name] for name in before} == before
     copies = [folder / "archives" / f"{second}.zip" for folder in (backup, state)]
     assert copies[0].read_bytes() == copies[1].read_bytes()
     assert len(statuses(backup)) == 3
-    assert sorted(path.name for path in backup.iterdir()) == ["archives", "leaderboard.sqlite"]
-    assert run_command("remove", second, "--state-dir", state).returncode == 0
-    assert run_command("backup", backup, "--state-dir", state).returncode == 0
+    assert sorted(path.name for path in backup.iterdir()) == [
+        "archives",
+        "leaderboard.sqlite",
+        "leaderboard.sqlite.1",
+    ]
+    for removed in (second, lost):
+        assert run_command("remove", removed, "--state-dir", state).returncode == 0
+    assert run_command("backup", backup, "--prune", "--state-dir", state).returncode == 0
     assert inodes_and_mtimes(backup / "archives") == before
-    assert statuses(backup).count("deleted") == 1
+    assert statuses(backup).count("deleted") == 2
     assert [path.stat().st_mode & 0o077 for path in (state, backup)] == [0, 0]
 
 

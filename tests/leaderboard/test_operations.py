@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -15,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from rebar_depth_bench.data.manifest import open_folder
+from tests.leaderboard.boards import add_submission, board_settings, make_board
 from tests.leaderboard.conftest import WriteArchive
 from tests.leaderboard.serving import RunServer, Server
 
@@ -133,13 +136,122 @@ def test_prune_deletes_old_archives_but_not_the_best(
     assert run("check", *options).returncode == 0
 
 
-def test_check_names_everything_that_is_wrong(server: Server, scored: dict[str, str], tiny_root: Path) -> None:
-    archive = server.state / "archives" / f"{scored['best']}.zip"
-    archive.rename(archive.with_suffix(".away"))
-    process = run("check", "--state-dir", server.state, "--data", tiny_root)
-    archive.with_suffix(".away").rename(archive)
-    assert process.returncode == 2
-    assert f"the archive of submission {scored['best']} is missing" in process.stderr
+@pytest.mark.slow
+def test_check_names_everything_that_is_wrong(tmp_path: Path, tiny_root: Path) -> None:
+    settings = board_settings(tmp_path / "state")
+    token = make_board(settings)
+    sound, damaged, truncated, missing, left, gone = (
+        add_submission(settings, token, content) for content in (b"1", b"2", b"3", b"4", b"5", b"6")
+    )
+    digest = open_folder(tiny_root).digest
+    archives = settings.archive_dir
+    with closing(sqlite3.connect(settings.state_dir / "leaderboard.sqlite")) as connection:
+        connection.execute("UPDATE submissions SET dataset_digest = ?", (digest,))
+        connection.commit()
+
+    def check(*options: object, root: Path = tiny_root) -> tuple[int, str]:
+        before = [(path, path.stat().st_mtime_ns) for path in sorted(settings.state_dir.rglob("*"))]
+        process = run("check", "--state-dir", settings.state_dir, "--data", root, *options)
+        assert "Traceback" not in process.stderr
+        assert [(path, path.stat().st_mtime_ns) for path in sorted(settings.state_dir.rglob("*"))] == before
+        return process.returncode, process.stdout + process.stderr
+
+    assert check("--hash-archives")[0] == 0
+    assert check(root=tmp_path)[0] == 2
+    (archives / f"{damaged}.zip").write_bytes(b"X")
+    assert check()[0] == 0
+    assert check("--hash-archives") == (
+        1,
+        f"error: 1 problem\n  - the archive of submission {damaged} has another SHA-256 than its row\n",
+    )
+    (archives / f"{truncated}.zip").write_bytes(b"")
+    (archives / f"{missing}.zip").unlink()
+    for name, age_s in (("orphan", 7200), ("upload", 0)):
+        (archives / f"{name}.zip").write_bytes(b"of nobody")
+        os.utime(archives / f"{name}.zip", (time.time() - age_s,) * 2)
+    with closing(sqlite3.connect(settings.state_dir / "leaderboard.sqlite")) as connection:
+        connection.execute("UPDATE submissions SET archive_deleted_at = 1 WHERE id = ?", (left,))
+        connection.execute("UPDATE results SET json = 'x' WHERE submission_id = ?", (gone,))
+        other = "UPDATE submissions SET dataset_digest = 'sha256:1' WHERE id = ?"
+        connection.execute(other, (sound,))
+        waits = "UPDATE submissions SET status = 'queued', created_at = 1 WHERE id = ?"
+        connection.execute(waits, (damaged,))
+        connection.commit()
+    status, text = check()
+    assert status == 1
+    for words in (
+        f"the result of submission {gone} is no JSON",
+        f"the archive of submission {truncated} has 0 bytes, expected 1",
+        f"the archive of submission {missing} is missing",
+        f"the archive {left}.zip exists, but its row says deleted",
+        "the archive orphan.zip has no submission",
+        "no worker scores, and a submission has waited",
+        f"1 submission of another dataset than {digest}",
+    ):
+        assert words in text
+    assert "error: 7 problems" in text
+    assert run("prune", "--orphans", "--dry-run", "--state-dir", settings.state_dir).stdout == "orphan\n"
+    assert (archives / "orphan.zip").exists()
+    assert run("prune", "--orphans", "--state-dir", settings.state_dir).stdout == "orphan\n"
+    assert {path.stem for path in archives.iterdir()} == {sound, damaged, truncated, left, gone, "upload"}
+
+
+@pytest.mark.slow
+def test_commands_on_a_board_that_is_not_there_create_nothing(tmp_path: Path, tiny_root: Path) -> None:
+    state = ("--state-dir", tmp_path / "typo")
+    for command in ("check", "prune", "score", "tokens", "submissions"):
+        data = () if command in ("tokens", "submissions") else ("--data", tiny_root)
+        process = run(command, *data, *state)
+        assert process.returncode == 2, command
+        assert "the database does not exist, expected the database of a leaderboard" in process.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_damaged_database_is_named_by_every_command(tmp_path: Path, tiny_root: Path) -> None:
+    settings = board_settings(tmp_path / "state")
+    add_submission(settings, make_board(settings), b"1")
+    database = settings.state_dir / "leaderboard.sqlite"
+    content = bytearray(database.read_bytes())
+    for page in range(4096, len(content), 4096):
+        content[page : page + 100] = b"\xff" * 100
+    data = ("--data", tiny_root)
+    commands = {
+        "serve": (*data, "--port", "0"),
+        "check": data,
+        "prune": ("--orphans",),
+        "tokens": (),
+        "token": ("bob",),
+        "backup": (tmp_path / "backup",),
+    }
+    for damaged, names in ((bytes(content), commands), (b"no database" * 1000, ("serve", "check"))):
+        database.write_bytes(damaged)
+        for command in names:
+            process = run(command, *commands[command], "--state-dir", settings.state_dir)
+            assert process.returncode in (1, 2), (command, process.stderr)
+            assert process.returncode == 1 or command != "check"
+            assert "error: " in process.stderr, command
+            assert "Traceback" not in process.stderr, command
+        assert database.read_bytes() == damaged
+
+
+def test_older_database_keeps_newer_archives(
+    tiny_root: Path, tmp_path: Path, small_archive: Path, running_server: RunServer
+) -> None:
+    state = tmp_path / "state"
+    with running_server(tiny_root, state, workers=0) as server:
+        token = server.token("alice")
+        old = server.submit_accepted(small_archive, token)
+    shutil.copy(state / "leaderboard.sqlite", tmp_path / "older.sqlite")
+    with running_server(tiny_root, state, workers=0) as server:
+        newer = server.submit_accepted(small_archive, token)
+        assert server.process.poll() is None
+    shutil.copy(tmp_path / "older.sqlite", state / "leaderboard.sqlite")
+    archive = state / "archives" / f"{newer}.zip"
+    os.utime(archive, (0, 0))
+    with running_server(tiny_root, state, workers=0) as server:
+        assert run("check", "--state-dir", state, "--data", tiny_root).stderr.count(newer) == 1
+    assert {path.stem for path in (state / "archives").iterdir()} == {old, newer}
 
 
 def test_permissive_state_folder_is_refused(tmp_path: Path) -> None:

@@ -75,7 +75,7 @@ def make_submission(
 
 
 def test_leaderboard_entries_are_public_and_in_order(database: Database) -> None:
-    shown = [(row.rank, row.id) for row in read_ranking(database, "lattice").entries]
+    shown = [(row.rank, row.id) for row in read_ranking(database, "lattice", "sha256:0").entries]
     assert shown == [(1, "s2"), (2, "s0"), (3, "s4"), (4, "s3"), (None, "s6"), (None, "s5")]
 
 
@@ -96,19 +96,21 @@ def test_equal_errors_share_a_rank_overall_and_in_their_class(database: Database
             row.rank_error, row.ranked = error, True
             record = session.get_one(SubmissionModel, name)
             record.inputs, record.public = inputs, True
-    entries = {entry.id: entry for entry in read_ranking(database, "lattice").entries}
+    entries = {entry.id: entry for entry in read_ranking(database, "lattice", "sha256:0").entries}
     assert (entries["s0"].rank, entries["s2"].rank) == (1, 1)
     assert entries["s3"].rank is not None
     assert entries["s3"].rank >= 3
     assert (entries["s0"].class_rank, entries["s2"].class_rank, entries["s3"].class_rank) == (1, 1, 2)
     assert {entry.class_rank for entry in entries.values() if entry.inputs is None} == {None}
-    shown = make_config_ranking(read_ranking(database, "lattice"), "lattice", Selection(inputs="rgb"), False)
+    shown = make_config_ranking(
+        read_ranking(database, "lattice", "sha256:0"), "lattice", Selection(inputs="rgb"), False
+    )
     assert [line.entry.id for line in shown.lines] == ["s0", "s3"]
     assert [line.entry.rank for line in shown.lines] == [1, entries["s3"].rank]
 
 
 def test_pages_divide_the_rows(database: Database) -> None:
-    ranking = read_ranking(database, "lattice")
+    ranking = read_ranking(database, "lattice", "sha256:0")
     full = make_config_ranking(ranking, "lattice", Selection(), False)
     pages = [make_config_ranking(ranking, "lattice", Selection(page=page), False, 4) for page in (1, 2, 3)]
     assert [[line.entry.id for line in page.lines] for page in pages] == [
@@ -124,7 +126,7 @@ def test_pages_divide_the_rows(database: Database) -> None:
 
 @pytest.mark.parametrize(("most", "has_chart"), [(None, True), (6, True), (5, False)])
 def test_chart_has_all_rows_or_is_left_out(database: Database, most: int | None, has_chart: bool) -> None:
-    ranking = read_ranking(database, "lattice")
+    ranking = read_ranking(database, "lattice", "sha256:0")
     shown = make_config_ranking(ranking, "lattice", Selection(), False, page_rows=2, max_plotted=most)
     assert (shown.plotted, shown.chart is not None) == (6, has_chart)
     if shown.chart:
@@ -132,7 +134,7 @@ def test_chart_has_all_rows_or_is_left_out(database: Database, most: int | None,
 
 
 def test_search_selects_by_method_and_submitter(database: Database) -> None:
-    ranking = read_ranking(database, "lattice")
+    ranking = read_ranking(database, "lattice", "sha256:0")
     found = {
         text: make_config_ranking(ranking, "lattice", Selection(text=text), False).row_count
         for text in ("S2", "alice", "nobody")

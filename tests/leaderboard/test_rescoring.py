@@ -9,7 +9,19 @@ from pathlib import Path
 
 import httpx2
 
+from leaderboard.db import jobs
+from leaderboard.scoring.sandbox import Outcome
+from leaderboard.storage.retention import prune_archives
 from leaderboard.uploads.accept import UNAVAILABLE_MESSAGE
+from tests.leaderboard.boards import (
+    DIGEST,
+    OTHER_DIGEST,
+    add_submission,
+    board_settings,
+    facts,
+    make_board,
+    opened,
+)
 from tests.leaderboard.serving import RunScorer, RunServer, Server, submission_row
 from tests.processes import wait_until
 from tests.synthetic_dataset import write_archive, write_dataset
@@ -61,6 +73,57 @@ def test_other_dataset_is_rejected_without_rescore_option(tmp_path: Path, runnin
         assert [result["dataset"]["digest"] for result in after] == [digest, digest]
         assert [result["tables"] for result in after] == [result["tables"] for result in before]
         assert ids_and_ranks(server) == ranks
+
+
+def test_pruned_submission_keeps_its_result_and_leaves_the_ranking(
+    tmp_path: Path, running_server: RunServer
+) -> None:
+    state, archive = tmp_path / "state", tmp_path / "archive.zip"
+    first, second = tmp_path / "first", tmp_path / "second"
+    write_dataset(first, ["lattice"], 3)
+    write_dataset(second, ["lattice", "pile"], 3)
+    write_archive(archive, ["lattice"], 3, "m", 1)
+    with running_server(first, state) as server:
+        token = server.token("alice")
+        pruned, lost, kept = [server.submit_accepted(archive, token) for _ in range(3)]
+        before = {name: server.wait_until_ended(name)["result"] for name in (pruned, lost, kept)}
+    settings = board_settings(state)
+    with opened(settings) as (database, archives):
+        prune_archives(database, archives, [pruned])
+        (settings.archive_dir / f"{lost}.zip").unlink()
+    digest = before[pruned]["dataset"]["digest"]
+    with running_server(second, state, rescore=True) as server:
+        assert server.wait_until_ended(kept)["result"]["dataset"]["digest"] != digest
+    with running_server(second, state) as server:  # No submission is stale any more.
+        assert ids_and_ranks(server) == [(kept, 1)]
+        for name in (pruned, lost):
+            shown = server.wait_until_ended(name)
+            assert (shown["status"], shown["reason"], shown["result"]) == ("scored", None, before[name])
+            assert shown["outdated"].startswith(f"the result belongs to the dataset {digest}; its archive is not")
+            page = httpx2.get(f"{server.url}/submissions/{name}", timeout=60)
+            assert page.status_code == 200
+            assert shown["outdated"] in page.text
+        assert server.wait_until_ended(kept)["outdated"] is None
+    with running_server(first, state, rescore=True) as server:  # The dataset is back.
+        server.wait_until_ended(kept)
+        assert {name for name, _ in ids_and_ranks(server)} == {pruned, lost, kept}
+
+
+def test_archive_that_is_lost_while_it_waits_costs_no_result(tmp_path: Path) -> None:
+    settings = board_settings(tmp_path / "state")
+    token = make_board(settings)
+    first, waiting = add_submission(settings, token, b"1"), add_submission(settings, token, b"2", scored=False)
+    with opened(settings) as (database, archives):
+        assert jobs.requeue_stale(database, OTHER_DIGEST, archives.ids(), rescore=True) == 2
+        for submission_id in (first, waiting):
+            archives.delete(submission_id)
+            assert jobs.claim(database, "scorer", 60) == submission_id
+            missing = Outcome(reason="the archive is missing", archive_missing=True)
+            assert jobs.finish(database, submission_id, "scorer", missing)
+    assert facts(settings) == {
+        first: ("scored", DIGEST, DIGEST, False),
+        waiting: ("failed", OTHER_DIGEST, None, False),
+    }
 
 
 def test_scorer_with_other_dataset_releases_job(

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, HTTPException, Query, Response
 
 from leaderboard.db.models import TokenModel
-from leaderboard.db.rankings import LeaderboardEntry, read_ranking
+from leaderboard.db.rankings import LeaderboardEntry
 from leaderboard.service import Service
 from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, ServiceDep
 from leaderboard.web.api.schemas import Leaderboard, LeaderboardRow, Responses, errors
@@ -80,8 +80,7 @@ def _rows(service: Service, config: str, inputs: str | None, token: TokenModel |
     if config not in service.folder.configs:
         known = ", ".join(service.folder.configs)
         raise HTTPException(404, f"the dataset has no config {config!r}, expected one of {known}")
-    ranking = service.rankings.of(config) if token is None else read_ranking(service.database, config, token)
-    return ranking.of_class(inputs)
+    return service.rankings.of(config, token).of_class(inputs)
 
 
 def _response(content: str, media_type: str, token: TokenModel | None) -> Response:

@@ -5,7 +5,6 @@ The docstrings of the models are part of the OpenAPI document.
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from datetime import datetime
 from typing import Any, Literal
@@ -13,6 +12,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from leaderboard.db.models import SubmissionModel
+from leaderboard.db.submissions import SCORED
 from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.submission.metadata import MethodDetails
 
@@ -94,6 +94,7 @@ class Submission(BaseModel):
     archive_sha256: str
     archive_bytes: int
     archive_kept: bool = Field(description="whether the archive is kept; without it nothing is scored again")
+    outdated: str | None = Field(None, description="why the result is of another dataset; null if it is not")
     result: dict[str, Any] | None = None
 
 
@@ -160,18 +161,12 @@ class Leaderboard(BaseModel):
     rows: list[LeaderboardRow]
 
 
-def submission_schema(record: SubmissionModel, url: str, result: dict[str, Any] | None = None) -> Submission:
-    """Return the API response for a submission; ``url`` is the address of its page, ``result`` its result JSON."""
-    return Submission.model_validate(
-        {
-            **{column.key: getattr(record, column.key) for column in SubmissionModel.__table__.columns},
-            **json.loads(record.details),
-            "url": url,
-            "method_url": record.url,
-            "archive_kept": record.archive_deleted_at is None,
-            "result": result,
-        }
-    )
+def outdated_note(record: SubmissionModel, dataset_digest: str) -> str | None:
+    """Return why a result is not of the dataset with ``dataset_digest``, or None if it is."""
+    if record.status != SCORED or record.dataset_digest == dataset_digest:
+        return None
+    reason = "its archive is not kept, so that it is neither scored against the present dataset nor ranked"
+    return f"the result belongs to the dataset {record.dataset_digest}; {reason}"
 
 
 Responses = dict[int | str, dict[str, Any]]

@@ -8,12 +8,12 @@ from __future__ import annotations
 import json
 from typing import Annotated, Any
 
-import structlog
 from fastapi import APIRouter, HTTPException, Path, Request, Response
 
 from leaderboard.db import submissions
 from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.service import Service
+from leaderboard.storage.retention import delete_archives
 from leaderboard.uploads.accept import accept_upload
 from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES, UploadForm, too_large
 from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, RequiredToken, ServiceDep, service_of
@@ -23,11 +23,10 @@ from leaderboard.web.api.schemas import (
     SubmissionChange,
     SubmissionList,
     errors,
-    submission_schema,
+    outdated_note,
 )
 
 MAX_PATCH_BYTES = 32 << 10
-_LOG = structlog.get_logger("submissions")
 router = APIRouter(prefix="/api/v1/submissions", tags=["submissions"], responses=errors(429, 503))
 
 SubmissionId = Annotated[str, Path(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9_-]+$")]
@@ -87,7 +86,7 @@ async def upload_form(
 def list_own(request: Request, service: ServiceDep, token: RequiredToken) -> SubmissionList:
     """Return the submissions of the token, newest first, without their results."""
     records = submissions.of_token(service.database, token)
-    return SubmissionList(submissions=[submission_schema(record, page_url(request, record)) for record in records])
+    return SubmissionList(submissions=[_schema(request, record) for record in records])
 
 
 @router.get("/{submission_id}", responses=errors(401, 404, 422), openapi_extra=WITHOUT_TOKEN)
@@ -95,7 +94,7 @@ def look_up(submission_id: SubmissionId, request: Request, service: ServiceDep, 
     """Return a submission. Its id cannot be guessed and gives read access without a token."""
     record = get_submission(service, submission_id)
     result = submissions.result_json(service.database, submission_id)
-    return submission_schema(record, page_url(request, record), None if result is None else json.loads(result))
+    return _schema(request, record, None if result is None else json.loads(result))
 
 
 @router.get(
@@ -130,7 +129,7 @@ def edit(
     """Publish a submission's rows, withdraw them, or change what is said about the method; only as the owner."""
     record = get_own_submission(service, submission_id, token)
     edit_submission(service, record, change)
-    return submission_schema(get_submission(service, submission_id), page_url(request, record))
+    return _schema(request, get_submission(service, submission_id))
 
 
 @router.delete("/{submission_id}", status_code=204, responses=errors(401, 403, 404, 422))
@@ -155,10 +154,7 @@ def edit_submission(service: Service, record: SubmissionModel, change: Submissio
 def delete_submission(service: Service, record: SubmissionModel) -> None:
     """Delete a submission, its archive and its results."""
     submissions.remove(service.database, record.id)
-    try:
-        service.archives.delete(record.id)
-    except OSError as error:  # Storage unavailable: the orphaned archive is removed at a later startup.
-        _LOG.warning("archive not deleted", submission=record.id[:6], error=str(error))
+    delete_archives(service.archives, [record.id])
 
 
 def check_length(request: Request) -> None:
@@ -175,7 +171,21 @@ def _accepted(request: Request, response: Response, accepted: tuple[SubmissionMo
     record, is_new = accepted
     response.status_code = 202 if is_new else 200
     response.headers["Location"] = request.url_for("look_up", submission_id=record.id).path
-    return submission_schema(record, page_url(request, record))
+    return _schema(request, record)
+
+
+def _schema(request: Request, record: SubmissionModel, result: dict[str, Any] | None = None) -> Submission:
+    return Submission.model_validate(
+        {
+            **{column.key: getattr(record, column.key) for column in SubmissionModel.__table__.columns},
+            **json.loads(record.details),
+            "url": page_url(request, record),
+            "method_url": record.url,
+            "archive_kept": record.archive_deleted_at is None,
+            "outdated": outdated_note(record, service_of(request).folder.digest),
+            "result": result,
+        }
+    )
 
 
 def get_submission(service: Service, submission_id: str) -> SubmissionModel:

@@ -20,6 +20,7 @@ from leaderboard.db.rankings import (
 from leaderboard.db.submissions import QUEUED, SCORED, SCORING, result_json, result_notes
 from leaderboard.service import Service
 from leaderboard.web.api.auth import ServiceDep
+from leaderboard.web.api.schemas import outdated_note
 from leaderboard.web.api.submissions import SubmissionId, get_submission
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.pages.leaderboard import NameQuery, disclosed_row
@@ -75,6 +76,7 @@ def submission_page(
         place=queue_position(service.database, record),
         submitter=submitter_name(service.database, record),
         details=_details(record),
+        outdated=outdated_note(record, service.folder.digest),
         **{"reason": record.reason, **scored},
     )
 
