@@ -31,6 +31,7 @@ from leaderboard.db.view_errors import view_errors
 from leaderboard.scoring.sandbox import Outcome
 from leaderboard.settings import MAX_LEASE_S
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 MAX_ATTEMPTS = 5
@@ -165,7 +166,7 @@ def _has_other_definitions(content: bytes) -> bool:
         result: dict[str, Any] = json.loads(content)
     except ValueError:  # Damaged: it is computed again, too.
         return True
-    return bool(result["protocol"] != PROTOCOL)
+    return bool(result["protocol"] != PROTOCOL or result.get("intervals") != INTERVALS)
 
 
 def _stored(submission_id: str, outcome: Outcome, result: Mapping[str, Any]) -> Iterator[Base]:
