@@ -21,8 +21,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float64
 from numpy import ndarray
-from outputs import add_outputs, number, only_config, run_script, write_outputs
 
+from outputs import add_outputs, number, only_config, run_script, write_outputs
 from rebar_depth_bench.console import ProgressBars, add_data
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.parallel import map_with_progress

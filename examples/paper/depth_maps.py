@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from outputs import only_config
 
+from outputs import only_config
 from rebar_depth_bench.captures.folder import is_capture, open_capture
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256

@@ -20,8 +20,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float64
 from numpy import ndarray
-from outputs import add_outputs, flat_table, number, run_script, write_outputs
 
+from outputs import add_outputs, flat_table, number, run_script, write_outputs
 from rebar_depth_bench.console import ProgressBars, add_archive, add_data
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.errors import InputError

@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from depth_maps import DepthMaps, open_maps
 from jaxtyping import Float
 from numpy import ndarray
-from outputs import add_outputs, number, run_script, write_outputs
 from PIL import Image as Picture
 
+from depth_maps import DepthMaps, open_maps
+from outputs import add_outputs, number, run_script, write_outputs
 from rebar_depth_bench.captures.views import ImageViews
 from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.errors import InputError

@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from depth_maps import DepthMaps, labelled, masked, open_data
 from jaxtyping import Float
 from numpy import ndarray
-from outputs import add_outputs, flat_table, number, run_script, write_outputs
 from scipy.stats import kendalltau
 
+from depth_maps import DepthMaps, labelled, masked, open_data
+from outputs import add_outputs, flat_table, number, run_script, write_outputs
 from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.parallel import map_with_progress

@@ -61,7 +61,7 @@ def score_single_bar(
 def single_bar_scores(
     submission: SubmissionReader, truths: ConfigTruth, scores: Sequence[ViewScore]
 ) -> list[SingleBarScore]:
-    """Return the score on the single-bar pixels of each view of a config, given the scores of its views in order."""
+    """Return the scores on single-bar pixels of all views of a config, given their scores in the same order."""
     return [
         score_single_bar(truth, truths.single_bar(position), submission.read(truth.view_id), score.scale)
         for position, (truth, score) in enumerate(zip(truths, scores, strict=True))

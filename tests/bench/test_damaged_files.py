@@ -18,16 +18,16 @@ pytest.importorskip("pydantic_settings")
 
 import numpy as np
 from PIL import Image
+from rebar_depth_bench.captures.kitti_calibration import read_camera, read_pair
+from rebar_depth_bench.captures.kitti_images import read_images
+from rebar_depth_bench.studies.depth_source import open_depths
+from rebar_depth_bench.studies.kitti.ground_truth import find_truth, project_scan, read_scan, read_truth
 
 from leaderboard.settings import read_settings
 from rebar_depth_bench.captures.camera_files import read_cameras
 from rebar_depth_bench.captures.folder import open_capture
-from rebar_depth_bench.captures.kitti_calibration import read_camera, read_pair
-from rebar_depth_bench.captures.kitti_images import read_images
 from rebar_depth_bench.errors import InputError, terminal_text
 from rebar_depth_bench.scoring.result_io import read_result
-from rebar_depth_bench.studies.depth_source import open_depths
-from rebar_depth_bench.studies.kitti.ground_truth import find_truth, project_scan, read_scan, read_truth
 from rebar_depth_bench.submission.metadata import parse_metadata
 from tests.bench.captures import calibration_files as calibrations
 from tests.bench.captures.test_cameras_toml import BOARD, POSES

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from rebar_depth_bench.studies.kitti.ground_truth import find_truth, read_truth
 
 from rebar_depth_bench.scoring.result_io import read_result
-from rebar_depth_bench.studies.kitti.ground_truth import find_truth, read_truth
 from tests.bench.studies import captures, kitti_folder
 from tests.fuzz.dataset_entries import write_dataset_and_archive
 from tests.fuzz.entry_point import EntryPoint, bench

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-
 from rebar_depth_bench.captures.kitti import is_kitti, open_kitti
 from rebar_depth_bench.captures.kitti_calibration import read_pair
 from rebar_depth_bench.captures.kitti_images import KittiImage, eigen_test_images, read_images
 from rebar_depth_bench.captures.opening import open_images
+
 from rebar_depth_bench.errors import DatasetError, InputError
 from tests.bench.studies import kitti_folder as kitti
 

@@ -11,6 +11,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from rebar_depth_bench.studies.distance.command import run_distance_study
+from rebar_depth_bench.studies.pseudo_reference.command import run_pseudo_reference_study
+from rebar_depth_bench.studies.scale_anchor.command import run_anchor_study
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.columns import COLUMNS
@@ -32,9 +35,6 @@ from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.result_io import read_result
 from rebar_depth_bench.scoring.score import score_evaluation
-from rebar_depth_bench.studies.distance.command import run_distance_study
-from rebar_depth_bench.studies.pseudo_reference.command import run_pseudo_reference_study
-from rebar_depth_bench.studies.scale_anchor.command import run_anchor_study
 from tests.synthetic_dataset import HEIGHT, WIDTH, drop_scene_column, write_dataset, write_split_dataset
 
 SCENES = {"a": "train", "b-1": "train", "c": "validation", "d": "test", "e": "test"}

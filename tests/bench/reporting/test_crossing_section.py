@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rebar_depth_bench.studies.distance.command import run_distance_study
+from rebar_depth_bench.studies.distance.output import to_json, to_page
 from rich.console import Console
 
 import rebar_depth_bench as rdb
@@ -21,8 +23,6 @@ from rebar_depth_bench.reporting.html.crossing_picture import crossing_pictures,
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.score import score_evaluation
-from rebar_depth_bench.studies.distance.command import run_distance_study
-from rebar_depth_bench.studies.distance.output import to_json, to_page
 from tests.bench.extended.cage_scenes import HEIGHT, WIDTH
 from tests.mat_dataset import CONFIG, VIEWS, write_mat_dataset
 

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from markupsafe import Markup
+from rebar_depth_bench.reporting.html.study_page import PageFigure, PageTable, StudyPage, render_study
 
 from rebar_depth_bench.reporting.charts.axes import LogAxis
 from rebar_depth_bench.reporting.charts.lines import (
@@ -23,7 +24,6 @@ from rebar_depth_bench.reporting.charts.lines import (
     linear_axis,
     log_axis,
 )
-from rebar_depth_bench.reporting.html.study_page import PageFigure, PageTable, StudyPage, render_study
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE
 

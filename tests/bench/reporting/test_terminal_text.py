@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rebar_depth_bench.reporting.html.study_page import PageTable, StudyPage
+from rebar_depth_bench.studies.common import print_page
 from rich.console import Console
 
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.reporting.comparison_tables import print_comparison, print_paper_table
-from rebar_depth_bench.reporting.html.study_page import PageTable, StudyPage
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.studies.common import print_page
 from tests.bench.reporting.results import result, scored_view
 
 NAME = "[link=x]a[/link]\x1b[2J\x9b2J\u202e\x07[/]"

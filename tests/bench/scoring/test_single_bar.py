@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
+from rebar_depth_bench.studies.distance.command import run_distance_study
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.extended.full_mask import REGION_NUMBERS, full_mask_samples
@@ -21,7 +22,6 @@ from rebar_depth_bench.extended.single_bar import single_bar_samples
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels
 from rebar_depth_bench.scoring.single_bar import SingleBarScore
-from rebar_depth_bench.studies.distance.command import run_distance_study
 from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth
 from tests.ground_truth import truth_of
 

@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 from types import ModuleType
 
-from rebar_depth_bench.console import add_commands, run_command
 from rebar_depth_bench.studies.registry import STUDIES
+
+from rebar_depth_bench.console import add_commands, run_command
 
 
 def run_study(module: ModuleType, *arguments: str | Path) -> int:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-
 from rebar_depth_bench.captures.kitti_images import KittiImage, eigen_test_images
 
 WIDTH, HEIGHT = 124, 38

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from rebar_depth_bench.errors import InputError, SubmissionError
-from rebar_depth_bench.scoring.score import score
 from rebar_depth_bench.studies.registry import STUDIES
 from rebar_depth_bench.studies.scale_anchor.command import run_anchor_study
 from rebar_depth_bench.studies.scale_anchor.output import to_page
+
+from rebar_depth_bench.errors import InputError, SubmissionError
+from rebar_depth_bench.scoring.score import score
 from rebar_depth_bench.submission import SubmissionWriter
 from tests.bench.studies.commands import run_study_command
 

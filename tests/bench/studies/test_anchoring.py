@@ -11,9 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-
-from rebar_depth_bench.scoring.ground_truth import ViewTruth
-from rebar_depth_bench.scoring.metrics import depth_metrics
 from rebar_depth_bench.studies.common import ViewPairs, pair_with_truth
 from rebar_depth_bench.studies.scale_anchor.study import (
     ScaledArchive,
@@ -25,6 +22,9 @@ from rebar_depth_bench.studies.scale_anchor.study import (
     summarize_draws,
     view_ratio,
 )
+
+from rebar_depth_bench.scoring.ground_truth import ViewTruth
+from rebar_depth_bench.scoring.metrics import depth_metrics
 
 
 def make_pairs(p_m: np.ndarray, z_m: np.ndarray, scored_px: int | None = None) -> ViewPairs:

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from rebar_depth_bench.studies.depth_source import open_depths
 
 from rebar_depth_bench import SubmissionWriter
 from rebar_depth_bench.captures.folder import is_capture, open_capture
 from rebar_depth_bench.errors import CalibrationError, InputError, ProblemCode, SubmissionError
-from rebar_depth_bench.studies.depth_source import open_depths
 from rebar_depth_bench.submission import EntryError
 from tests.bench.studies.captures import ZED_CALIBRATION, write_capture
 from tests.bench.submission.zips import exr, npz, png

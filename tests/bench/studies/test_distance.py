@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rebar_depth_bench.studies.distance.command import run_distance_study
+from rebar_depth_bench.studies.distance.output import to_page
 
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.scoring.score import score
-from rebar_depth_bench.studies.distance.command import run_distance_study
-from rebar_depth_bench.studies.distance.output import to_page
 from tests.bench.studies.commands import run_study_command
 
 Depths = dict[str, np.ndarray]

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rebar_depth_bench.studies.distance.study import ALL_CONFIGS, DistancePoint, bin_views, fit_scale_slope
 
 from rebar_depth_bench.scoring.bootstrap import MIN_VIEWS
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.single_bar import SingleBarScore
 from rebar_depth_bench.scoring.view_score import ViewScore
-from rebar_depth_bench.studies.distance.study import ALL_CONFIGS, DistancePoint, bin_views, fit_scale_slope
 
 SWEEP_M = [0.22 * 7.0 ** (step / 11) for step in range(12) for _ in range(8)]
 

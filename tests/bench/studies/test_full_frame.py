@@ -9,8 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.studies.pseudo_reference.study import (
     DepthRange,
     FrameScore,
@@ -21,6 +19,8 @@ from rebar_depth_bench.studies.pseudo_reference.study import (
     restrict_to_pixels,
     score_frame,
 )
+
+from rebar_depth_bench.errors import InputError
 
 ALLOWED = DepthRange(0.5, 10.0)
 SHAPE = (4, 6)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
 from rebar_depth_bench.studies.kitti.metrics import CROPS, KittiMetrics, crop_mask, score_image, scored_mask
 
 NO_CROP = CROPS["none"]

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-
-from rebar_depth_bench import SubmissionWriter
-from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.studies.kitti import command as study_module
 from rebar_depth_bench.studies.kitti.command import run_kitti_study
 from rebar_depth_bench.studies.kitti.ground_truth import find_truth, read_truth
 from rebar_depth_bench.studies.kitti.metrics import CROPS, scored_mask
 from rebar_depth_bench.studies.kitti.result import KittiProtocol
+
+from rebar_depth_bench import SubmissionWriter
+from rebar_depth_bench.errors import SubmissionError
 from tests.bench.studies import kitti_folder as kitti
 from tests.bench.studies.commands import run_study
 

@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-
 from rebar_depth_bench.captures.kitti_calibration import KittiCamera, read_camera
 from rebar_depth_bench.captures.kitti_images import eigen_test_images, parse_images
-from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.studies.kitti.ground_truth import (
     find_truth,
     project_scan,
     read_scan,
     read_truth,
 )
+
+from rebar_depth_bench.errors import DatasetError, InputError
 from tests.bench.studies import kitti_folder as kitti
 
 

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.studies.pseudo_reference import command as study_module
 from rebar_depth_bench.studies.pseudo_reference.command import run_pseudo_reference_study
 from rebar_depth_bench.studies.pseudo_reference.result import PseudoReferenceResult, kendall_tau
 from rebar_depth_bench.studies.pseudo_reference.study import DepthRange
+
+from rebar_depth_bench.errors import InputError
 from tests.bench.studies.captures import HEIGHT, VIEWS, WIDTH, Depth, exact_depth, write_capture, write_depths
 from tests.bench.studies.commands import run_study
 

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from rebar_depth_bench.studies.depth_source import open_depths
+from rebar_depth_bench.studies.kitti import command as kitti_command
+from rebar_depth_bench.studies.kitti.ground_truth import find_truth, read_truth
 
 from rebar_depth_bench.captures.folder import open_capture
 from rebar_depth_bench.captures.image_header import read_image_shape
 from rebar_depth_bench.errors import DatasetError, InputError, Problem, SubmissionError
-from rebar_depth_bench.studies.depth_source import open_depths
-from rebar_depth_bench.studies.kitti import command as kitti_command
-from rebar_depth_bench.studies.kitti.ground_truth import find_truth, read_truth
 from rebar_depth_bench.submission import EntryError, open_submission
 from rebar_depth_bench.submission.metadata import MAX_METADATA_BYTES
 from rebar_depth_bench.submission.zip_directory import FileSource

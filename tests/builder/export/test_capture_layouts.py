@@ -12,19 +12,19 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from dataset_builder.export.calibration_text import kitti_cam_to_cam, stereolabs_conf
+from dataset_builder.export.kitti import kitti_depth_png
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-
-from dataset_builder.export import export
-from dataset_builder.export.calibration_text import kitti_cam_to_cam, stereolabs_conf
-from dataset_builder.export.kitti import kitti_depth_png
-from dataset_builder.export.run import LAYOUTS
-from rebar_depth_bench import load
-from rebar_depth_bench.captures.folder import open_capture
 from rebar_depth_bench.captures.kitti import open_kitti
 from rebar_depth_bench.captures.kitti_calibration import read_pair
 from rebar_depth_bench.captures.kitti_images import read_images
+
+from dataset_builder.export import export
+from dataset_builder.export.run import LAYOUTS
+from rebar_depth_bench import load
+from rebar_depth_bench.captures.folder import open_capture
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError
