@@ -57,7 +57,7 @@ def open_maps(
         yield _folder_maps(Path(path), expected, png_scale, complete=optional is not None)
         return
     present = _entry_stems(Path(path)).intersection(() if optional is None else optional)
-    with open_submission(path, expected | dict.fromkeys(present, _MAX_SHAPE)) as reader:
+    with open_submission(path, {**expected, **dict.fromkeys(present, _MAX_SHAPE)}) as reader:
         problems = [problem for problem in reader.problems() if problem.where.rpartition(".")[0] not in present]
         if reader.meta is None or problems:
             raise SubmissionError.from_problems(path, problems)

@@ -28,7 +28,7 @@ from outputs import add_outputs, number, run_script, write_outputs
 from rebar_depth_bench.captures.views import ImageViews
 from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.geometry.stereo_calibration import Lens, MonoCalibration, StereoCalibration
+from rebar_depth_bench.geometry.stereo_calibration import Calibration, Lens, MonoCalibration, StereoCalibration
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.runner import predict_views
 from rebar_depth_bench.parallel import map_with_progress
@@ -52,7 +52,6 @@ METRICS = ("abs_rel", "rmse_m", "log_rmse", "delta1", "delta2", "delta3")
 NO_ERRORS = dict.fromkeys(METRICS)
 MIN_DEPTH_M = 1e-3
 DepthMap = Float[ndarray, "h w"]
-Calibration = dict[str, Float[ndarray, "..."]]
 
 
 def argument_parser() -> argparse.ArgumentParser:
@@ -91,7 +90,7 @@ def truth_file(root: Path, kind: str, image: Any) -> Path | None:
     return next((file for file in files if file.exists()), None)
 
 
-def calibration(day: Path, name: str) -> Calibration:
+def read_calibration(day: Path, name: str) -> dict[str, Float[ndarray, ...]]:
     """Return the numbers of a calibration file of a day by key; projections are 3 x 4, rotations 3 x 3."""
     pairs = (line.split(":", 1) for line in (day / name).read_text().splitlines() if ":" in line)
     numbers = {key: np.array(text.split(), float) for key, text in pairs if key != "calib_time"}
@@ -106,7 +105,7 @@ def read_truth(image: Any, root: Path, lidar_depth: str) -> DepthMap:
     """
     if image.truth.suffix == ".png":
         return (np.asarray(Picture.open(image.truth), np.float64) / 256).astype(np.float32)
-    cam, velo = (calibration(root / image.date, name) for name in (CAM_TO_CAM, VELO_TO_CAM))
+    cam, velo = (read_calibration(root / image.date, name) for name in (CAM_TO_CAM, VELO_TO_CAM))
     rectification, cam_from_velo = np.eye(4), np.eye(4)
     rectification[:3, :3], cam_from_velo[:3] = cam["R_rect_00"], np.column_stack([velo["R"], velo["T"]])
     image_from_velo = cam[f"P_rect_0{CAMERAS[image.side]}"] @ rectification @ cam_from_velo
@@ -129,7 +128,7 @@ def truth_shape(image: Any, root: Path) -> tuple[int, int]:
     if image.truth.suffix == ".png":
         width, height = Picture.open(image.truth).size
     else:
-        width, height = map(int, calibration(root / image.date, CAM_TO_CAM)[f"S_rect_0{CAMERAS[image.side]}"])
+        width, height = map(int, read_calibration(root / image.date, CAM_TO_CAM)[f"S_rect_0{CAMERAS[image.side]}"])
     return height, width
 
 
@@ -158,20 +157,20 @@ def score_image(image: Any, source: DepthMaps, options: argparse.Namespace) -> d
     p_m, z_m = predicted_m[valid].astype(np.float64), truth_m[scored][valid].astype(np.float64)
     scale = median_scale(p_m, float(np.median(z_m))) if len(p_m) else None
     with np.errstate(over="ignore", under="ignore"):
-        aligned = {"native": p_m, "scaled": (scale or 1.0) * p_m}
+        aligned = {"native": p_m, "scaled": p_m if scale is None else scale * p_m}
     return {
         "name": image.Index,
         "scored_px": len(predicted_m),
         "coverage": len(p_m) / max(len(predicted_m), 1),
         "scale": scale,
-        **{name: errors(one, z_m, options.cap) if scale else NO_ERRORS for name, one in aligned.items()},
+        **{name: errors(one, z_m, options.cap) if len(p_m) else NO_ERRORS for name, one in aligned.items()},
     }
 
 
 def tabulate(images: list[dict[str, Any]]) -> dict[str, Any]:
     """Return means over images, the median of s, and 95 % block bootstrap intervals over images."""
     values = pd.json_normalize(images).drop(columns=["name", "scored_px"]).astype(float)
-    coverage, scored = mean(values.pop("coverage").tolist()), int(values["scale"].count())
+    coverage, scored = mean(values.pop("coverage").tolist()) or 0.0, int(values["scale"].count())
     values["scale_median"] = values.pop("scale")
     resampling = resample(range(len(values)))
     draws = resampling.means(values.to_numpy())
@@ -199,15 +198,16 @@ def image_views(root: Path, images: pd.DataFrame) -> list[ImageViews]:
     """Return the rectified colour images by day and side; camera 3 has the right images of those of camera 2."""
     views = []
     for (date, side), of_day in images.groupby(["date", "side"]):
-        cam = calibration(root / date, CAM_TO_CAM)
+        cam = read_calibration(root / date, CAM_TO_CAM)
         left, right = (pictures(root, of_day, camera) for camera in (CAMERAS[side], CAMERAS["r"]))
-        Ps, size = [cam[f"P_rect_0{camera}"] for camera in CAMERAS.values()], map(int, cam["S_rect_02"])
-        lenses = [Lens(*P[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), (0.0,) * 5) for P in Ps]
-        x_m = (Ps[1][0, 3] / Ps[1][0, 0] - Ps[0][0, 3] / Ps[0][0, 0]).item()
+        Ps = [cam[f"P_rect_0{camera}"].tolist() for camera in CAMERAS.values()]
+        one, other = (Lens(P[0][0], P[1][1], P[0][2], P[1][2], (0.0, 0.0, 0.0, 0.0, 0.0)) for P in Ps)
+        width, height = map(int, cam["S_rect_02"])
+        cameras: Calibration = MonoCalibration(width, height, one if side == "l" else other)
         if side == "l" and left.keys() == right.keys():
-            cameras = StereoCalibration(*size, *lenses, (0.0, 0.0, 0.0), (x_m, 0.0, 0.0))
-        else:
-            right, cameras = {}, MonoCalibration(*size, lenses[side == "r"])
+            x_m = Ps[1][0][3] / Ps[1][0][0] - Ps[0][0][3] / Ps[0][0][0]
+            cameras = StereoCalibration(width, height, one, other, (0.0, 0.0, 0.0), (x_m, 0.0, 0.0))
+        right = right if isinstance(cameras, StereoCalibration) else {}
         views.append(ImageViews(root, f"kitti-{date}-{side}", left, right, cameras))
     return views
 
@@ -239,10 +239,9 @@ def run(options: argparse.Namespace) -> None:
         "images": scored,
     }
     table = pd.DataFrame({"alignment": key, **means[key]} for key in ("native", "scaled"))
-    notes = [f"{key}: {means[key]}" for key in ("images", "images_scored", "coverage", "complete", "scale_median")]
+    notes = [PUBLISHED, *(f"{key}: {means[key]}" for key in (*[*means][:4], "scale_median"))]
     errors_of = pd.json_normalize(scored)[["native.abs_rel", "scaled.abs_rel"]]
     draw = partial(errors_of.plot.hist, bins=30, alpha=0.5, xlabel="AbsRel of an image")
-    notes.append(PUBLISHED)
     write_outputs(options, content, table, list(table), notes, lambda figure: draw(ax=figure.subplots()))
 
 

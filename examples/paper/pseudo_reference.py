@@ -107,7 +107,7 @@ def score_frame(
         index = np.flatnonzero(~np.isnan(reference_m)).astype(np.uint32)
         z_m = reference_m.ravel()[index].astype(np.float64)
         truth = ViewTruth(view_id, index, z_m, float(np.median(z_m))) if len(index) else None
-        scores |= {(method, name): truth and score_view(truth, p_m) for method, p_m in predictions.items()}
+        scores |= {(method, name): score_view(truth, p) if truth else None for method, p in predictions.items()}
     return {name: float((~np.isnan(one)).mean()) for name, one in maps.items()}, scores, agreements
 
 
@@ -160,8 +160,7 @@ def run(options: argparse.Namespace) -> None:
     data = open_data(options.data, options.config)
     clip = partial(masked, near_m=options.near, far_m=options.far)
     with ExitStack() as stack, ProgressBars() as bars:
-        paths = (*options.methods, *options.reference)
-        opened = [stack.enter_context(data.open_maps(path)) for path in paths]
+        opened = [stack.enter_context(data.open_maps(path)) for path in options.methods + options.reference]
         data = data.of_split(opened)
         sources, count = labelled(opened, EXACT), len(options.methods)
         methods, references = dict([*sources.items()][:count]), dict([*sources.items()][count:])
@@ -191,7 +190,8 @@ def run(options: argparse.Namespace) -> None:
         "agreement": agreed.groupby(PAIR, sort=False, as_index=False).agg(OVER_VIEWS).to_dict("records"),
     }
     table = flat_table([{key: value for key, value in row.items() if key != "ci95"} for row in rows])
-    notes = [f"{name}: {ranking}" for name, ranking in content["rankings"].items()]
+    ranked = [(name, key, one) for name, of_one in content["rankings"].items() for key, one in of_one.items()]
+    notes = [f"{name}, {key}: {' < '.join(one['order'])}, tau {one['tau']}" for name, key, one in ranked]
     write_outputs(options, content, table, list(table), [*notes, PUBLISHED], partial(draw_figure, rows=table))
 
 
