@@ -1,4 +1,4 @@
-"""Pipes, devices, links and huge pictures in the place of the files that studies read."""
+"""Pipes, devices, links and huge pictures in the place of archives and of the files of captures."""
 
 from __future__ import annotations
 
@@ -8,24 +8,16 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 from PIL import Image
-from rebar_depth_bench.studies.depth_source import open_depths
-from rebar_depth_bench.studies.kitti import command as kitti_command
-from rebar_depth_bench.studies.kitti.ground_truth import find_truth, read_truth
 
 from rebar_depth_bench.captures.folder import open_capture
 from rebar_depth_bench.captures.image_header import read_image_shape
-from rebar_depth_bench.errors import DatasetError, InputError, Problem, SubmissionError
+from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.submission import EntryError, open_submission
-from rebar_depth_bench.submission.metadata import MAX_METADATA_BYTES
 from rebar_depth_bench.submission.zip_directory import FileSource
-from tests.bench.studies import kitti_folder as kitti
-from tests.bench.studies.captures import write_capture
-from tests.bench.studies.commands import run_study
+from tests.bench.captures.example_capture import write_capture
 
-DEPTH = np.ones((3, 4), np.float32)
 VIEWS = {"walk/a": (3, 4), "walk/b": (3, 4)}
 
 Replace = Callable[[Path], None]
@@ -55,61 +47,6 @@ def locations(problems: tuple[Problem, ...]) -> list[tuple[str, str]]:
     return [(problem.code, problem.where) for problem in problems]
 
 
-@pytest.fixture
-def depths(tmp_path: Path) -> Path:
-    """Return a folder of two depth maps and their metadata."""
-    for name in ("a.npy", "b.npy"):
-        np.save(tmp_path / name, DEPTH)
-    (tmp_path / "submission.json").write_text('{"method": "m"}')
-    return tmp_path
-
-
-@pytest.mark.parametrize("replace", [to_pipe, to_device, to_nothing])
-def test_depth_folder_refuses_what_is_no_file(replace: Replace, depths: Path) -> None:
-    replace(depths / "b.npy")
-    replace(depths / "submission.json")
-    with pytest.raises(SubmissionError) as caught:
-        open_depths(depths, VIEWS)
-    assert locations(caught.value.problems) == [("kind", "b.npy"), ("unreadable", "submission.json")]
-
-
-def test_depth_file_that_becomes_pipe_is_refused(depths: Path) -> None:
-    with open_depths(depths, VIEWS) as source:
-        to_pipe(depths / "a.npy")
-        with pytest.raises(EntryError, match="it is a named pipe"):
-            source.read("walk/a")
-
-
-def test_links_in_depth_folder_are_followed(depths: Path) -> None:
-    for name in ("a.npy", "submission.json"):
-        to_link(depths / name)
-    with open_depths(depths, VIEWS) as source:
-        assert (source.method, source.view_ids) == ("m", tuple(VIEWS))
-        assert np.array_equal(source.read("walk/a"), DEPTH)
-
-
-def test_folder_name_that_is_not_text_is_a_printable_method_name(tmp_path: Path) -> None:
-    folder = tmp_path / os.fsdecode(b"a\xff\x1b[2J")
-    folder.mkdir()
-    np.save(folder / "a.npy", DEPTH)
-    with open_depths(folder, VIEWS) as source:
-        assert source.method == "a\N{REPLACEMENT CHARACTER}\N{REPLACEMENT CHARACTER}[2J"
-
-
-@pytest.mark.parametrize(
-    ("content", "code"),
-    [
-        (b'{"method": "m", "x": "' + b"x" * MAX_METADATA_BYTES + b'"}', "size"),
-        (b'{"method": "m", "method": "n"}', "duplicate"),
-    ],
-)
-def test_metadata_of_depth_folder_is_limited_and_strict(content: bytes, code: str, depths: Path) -> None:
-    (depths / "submission.json").write_bytes(content)
-    with pytest.raises(SubmissionError) as caught:
-        open_depths(depths, VIEWS)
-    assert locations(caught.value.problems) == [(code, "submission.json")]
-
-
 @pytest.mark.parametrize("replace", [to_pipe, to_device])
 def test_archive_that_is_no_file_is_refused(replace: Replace, tmp_path: Path) -> None:
     replace(tmp_path / "a.zip")
@@ -117,53 +54,6 @@ def test_archive_that_is_no_file_is_refused(replace: Replace, tmp_path: Path) ->
         FileSource(tmp_path / "a.zip")
     with open_submission(tmp_path / "a.zip", VIEWS) as reader:
         assert locations(reader.structure_problems) == [("kind", "")]
-
-
-@pytest.mark.parametrize("replace", [to_pipe, to_device])
-def test_kitti_predictions_that_are_no_file_exit_with_status_2(
-    replace: Replace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    kitti.write_raw(tmp_path / "kitti", kitti.first_images(1))
-    replace(tmp_path / "a.zip")
-    options = ("--predictions", tmp_path / "a.zip", "--kitti", tmp_path / "kitti", "--ground-truth", "raw")
-    assert run_study(kitti_command, *options) == 2
-    assert "not a regular file" in capsys.readouterr().err
-
-
-def kitti_files(root: Path) -> list[Path]:
-    image = kitti.first_images(1)[0]
-    day = root / image.date
-    return [kitti.scan_path(root, image), day / "calib_cam_to_cam.txt", day / "calib_velo_to_cam.txt"]
-
-
-@pytest.mark.parametrize("index", range(3))
-@pytest.mark.parametrize("replace", [to_pipe, to_device])
-def test_raw_kitti_file_that_is_no_file_is_refused(replace: Replace, index: int, tmp_path: Path) -> None:
-    images = kitti.first_images(1)
-    kitti.write_raw(tmp_path, images)
-    path = kitti_files(tmp_path)[index]
-    replace(path)
-    with pytest.raises(DatasetError, match=path.name) as caught:
-        read_truth(find_truth(tmp_path, images, "raw")[0][0])
-    assert locations(caught.value.problems) == [("unreadable", "")]
-
-
-def test_links_in_kitti_folder_are_followed(tmp_path: Path) -> None:
-    images = kitti.first_images(1)
-    kitti.write_raw(tmp_path, images)
-    expected = read_truth(find_truth(tmp_path, images, "raw")[0][0])
-    to_link(kitti_files(tmp_path)[0])
-    assert np.array_equal(read_truth(find_truth(tmp_path, images, "raw")[0][0]), expected)
-
-
-@pytest.mark.parametrize("replace", [to_pipe, to_device])
-def test_improved_kitti_map_that_is_no_file_is_refused(replace: Replace, tmp_path: Path) -> None:
-    images = kitti.first_images(1)
-    path = kitti.improved_path(tmp_path, images[0])
-    path.parent.mkdir(parents=True)
-    replace(path)
-    with pytest.raises(DatasetError, match=path.name):
-        find_truth(tmp_path, images, "improved")
 
 
 @pytest.mark.parametrize("replace", [to_pipe, to_device, to_nothing])
@@ -215,11 +105,9 @@ def test_pixel_limit_can_be_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     (tmp_path / "a.png").write_bytes(png_header(20_000, 20_000))
     monkeypatch.setenv("REBAR_MAX_IMAGE_PIXELS", "400000000")
     assert read_image_shape(tmp_path / "a.png") == (20_000, 20_000)
-    images = kitti.first_images(1)
-    kitti.write_improved(kitti.improved_path(tmp_path, images[0]), np.ones((3, 4)))
-    monkeypatch.setenv("REBAR_MAX_IMAGE_PIXELS", "11")
-    with pytest.raises(DatasetError, match="3 x 4"):
-        find_truth(tmp_path, images, "improved")
+    monkeypatch.setenv("REBAR_MAX_IMAGE_PIXELS", "399999999")
+    with pytest.raises(EntryError, match="20000 x 20000"):
+        read_image_shape(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize(
