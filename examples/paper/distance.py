@@ -152,15 +152,15 @@ def draw_figure(figure: Figure, views: pd.DataFrame, bins: pd.DataFrame) -> None
     """Draw s of views and bins, and native (solid) and scaled (dashed) errors of bins, over distance."""
     scale_axes, error_axes = figure.subplots(1, 2)
     for colour, (config, of_config) in enumerate(bins.groupby("config", sort=False)):
-        of_views, distance_m = views[views["config"] == config], of_config["distance_m"]
+        of_views, x_m = views[views["config"] == config], of_config["distance_m"]
         scale_axes.scatter(of_views["distance_m"], of_views["scale"], 8, f"C{colour}", alpha=0.4)
-        scale_axes.plot(distance_m, of_config["scale"], f"C{colour}o-", label=config)
-        error_axes.plot(distance_m, of_config[ERRORS[0]], f"C{colour}o-")
-        error_axes.plot(distance_m, of_config[ERRORS[1]], f"C{colour}o--")
+        scale_axes.plot(x_m, of_config["scale"], f"C{colour}o-", label=config)
+        error_axes.plot(x_m, of_config[ERRORS[0]], f"C{colour}o-", x_m, of_config[ERRORS[1]], f"C{colour}o--")
     scale_axes.axhline(1.0, color="black", linestyle="--", linewidth=1)
     scale_axes.legend()
-    for axes, title in ((scale_axes, "s = median(z) / median(p)"), (error_axes, "AbsRel")):
-        axes.set(xscale="log", yscale="log", xlabel="distance, m", ylabel=title)
+    error_scale = "log" if (bins[ERRORS] > 0).any(axis=None) else "linear"
+    scale_axes.set(xscale="log", yscale="log", xlabel="distance, m", ylabel="s = median(z) / median(p)")
+    error_axes.set(xscale="log", yscale=error_scale, xlabel="distance, m", ylabel="AbsRel")
 
 
 def run(options: argparse.Namespace) -> None:

@@ -25,6 +25,7 @@ from PIL import Image as Picture
 
 from depth_maps import DepthMaps, open_maps
 from outputs import add_outputs, number, run_script, write_outputs
+from rebar_depth_bench.captures.image_header import read_image_shape
 from rebar_depth_bench.captures.views import ImageViews
 from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.errors import InputError
@@ -126,9 +127,8 @@ def read_truth(image: Any, root: Path, lidar_depth: str) -> DepthMap:
 def truth_shape(image: Any, root: Path) -> tuple[int, int]:
     """Return the (H, W) of the ground truth of an image."""
     if image.truth.suffix == ".png":
-        width, height = Picture.open(image.truth).size
-    else:
-        width, height = map(int, read_calibration(root / image.date, CAM_TO_CAM)[f"S_rect_0{CAMERAS[image.side]}"])
+        return read_image_shape(image.truth)
+    width, height = map(int, read_calibration(root / image.date, CAM_TO_CAM)[f"S_rect_0{CAMERAS[image.side]}"])
     return height, width
 
 

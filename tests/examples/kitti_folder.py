@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
-from rebar_depth_bench.captures.kitti_images import KittiImage, eigen_test_images
+from PIL import Image as Picture
 
+EIGEN_SPLIT = Path("examples/paper/kitti_eigen_test_697.txt")
 WIDTH, HEIGHT = 124, 38
 FX, CX, CY = 72.15377, 60.95593, 17.2854
 PX, PY, PZ = 4.485728, 0.02163791, 0.002745884
@@ -45,9 +46,25 @@ delta_f: 0.000000e+00 0.000000e+00
 Scan = NDArray[np.float32]
 
 
-def first_images(count: int) -> tuple[KittiImage, ...]:
-    """Return the first ``count`` images of the Eigen test split."""
-    return eigen_test_images()[:count]
+@dataclass(frozen=True)
+class Image:
+    """Image of the Eigen test split."""
+
+    date: str
+    drive: str
+    frame: str
+    side: str
+
+    @property
+    def name(self) -> str:
+        """Name of the prediction."""
+        return f"{self.drive}_{self.frame}_{self.side}"
+
+
+def first_images(count: int) -> tuple[Image, ...]:
+    """Return the first ``count`` images of the Eigen test split, by drive and frame."""
+    lines = EIGEN_SPLIT.read_text().splitlines()
+    return tuple(Image(*line.replace("/", " ").split()) for line in sorted(lines)[:count])
 
 
 def random_scan(seed: int, count: int = 4000) -> Scan:
@@ -68,12 +85,12 @@ def write_day(day: Path, cam_to_cam: str = CAM_TO_CAM, velo_to_cam: str = VELO_T
     (day / "calib_velo_to_cam.txt").write_text(velo_to_cam)
 
 
-def scan_path(root: Path, image: KittiImage) -> Path:
+def scan_path(root: Path, image: Image) -> Path:
     """Return the path of an image's scan."""
     return root / image.date / image.drive / "velodyne_points" / "data" / f"{image.frame}.bin"
 
 
-def write_raw(root: Path, images: tuple[KittiImage, ...]) -> None:
+def write_raw(root: Path, images: tuple[Image, ...]) -> None:
     """Write the raw data of images, each with its own scan."""
     for seed, image in enumerate(images):
         write_day(root / image.date)
@@ -82,7 +99,15 @@ def write_raw(root: Path, images: tuple[KittiImage, ...]) -> None:
         path.write_bytes(random_scan(seed).tobytes())
 
 
-def improved_path(root: Path, image: KittiImage, part: str = "val") -> Path:
+def write_picture(root: Path, image: Image, camera: int) -> Path:
+    """Write a random picture of a colour camera and return its path."""
+    path = root / image.date / image.drive / f"image_{camera:02d}" / "data" / f"{image.frame}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Picture.fromarray(np.random.default_rng(camera).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)).save(path)
+    return path
+
+
+def improved_path(root: Path, image: Image, part: str = "val") -> Path:
     """Return the path of an image's improved depth map."""
     return root / part / image.drive / "proj_depth" / "groundtruth" / "image_02" / f"{image.frame}.png"
 
@@ -90,7 +115,7 @@ def improved_path(root: Path, image: KittiImage, part: str = "val") -> Path:
 def write_improved(path: Path, depth_m: NDArray[Any]) -> None:
     """Write a depth map in KITTI's format: 16-bit PNG of metres times 256."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.round(depth_m * 256).astype(np.uint16)).save(path)
+    Picture.fromarray(np.round(depth_m * 256).astype(np.uint16)).save(path)
 
 
 def project_reference(scan: Scan) -> dict[tuple[int, int], tuple[float, float]]:

@@ -10,14 +10,14 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
-import anchor
 import numpy as np
 import pytest
-from anchor import draw_scales, errors_at_scales, spread
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+import anchor
+from anchor import draw_scales, errors_at_scales, spread
 from rebar_depth_bench import SubmissionWriter
 from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.scoring.metrics import depth_metrics
@@ -141,7 +141,10 @@ def test_outputs_are_deterministic_and_inputs_are_kept(
     assert files["png"].startswith(b"\x89PNG")
     content = json.loads(files["json"])
     assert [len(row["draws"]) for row in content["rows"]] == [24, 24]
-    assert content["dataset"]["digest"] == json.loads((tiny_root / "manifest.json").read_text())["ground_truth"]["digest"]
+    assert (
+        content["dataset"]["digest"]
+        == json.loads((tiny_root / "manifest.json").read_text())["ground_truth"]["digest"]
+    )
     header, first, _ = files["csv"].decode().splitlines()
     row = dict(zip(header.split(","), first.split(","), strict=True))
     assert float(row["scale_mean"]) == content["rows"][0]["scale"]["mean"]
@@ -166,7 +169,9 @@ def views(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
 
 
 @given(views(), st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=5))
-def test_errors_at_scales_match_scaled_prediction(pair: tuple[np.ndarray, np.ndarray], scales: list[float]) -> None:
+def test_errors_at_scales_match_scaled_prediction(
+    pair: tuple[np.ndarray, np.ndarray], scales: list[float]
+) -> None:
     p_m, z_m = pair
     zero_crossings = z_m / p_m  # Scales at which a pixel's error changes sign.
     all_scales = np.array([*scales, 1.0, *zero_crossings[:5]])

@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from rebar_depth_bench.reporting.table_page import PageTable, TablePage, print_page
 from rich.console import Console
 
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.reporting.comparison_tables import print_comparison, print_paper_table
+from rebar_depth_bench.reporting.table_page import PageTable, TablePage, print_page
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import Result

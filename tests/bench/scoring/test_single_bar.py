@@ -6,22 +6,23 @@ import math
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
-from rebar_depth_bench.studies.distance.command import run_distance_study
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.extended.full_mask import REGION_NUMBERS, full_mask_samples
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, MIN_PIXELS, profile_samples
 from rebar_depth_bench.extended.single_bar import single_bar_samples
+from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.ground_truth import config_truth
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels
-from rebar_depth_bench.scoring.single_bar import SingleBarScore
+from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.single_bar import SingleBarScore, mean_single_bar, single_bar_scores
 from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth
 from tests.ground_truth import truth_of
 
