@@ -12,7 +12,7 @@ import pandas as pd
 
 from rebar_depth_bench.console import require_extra, run_command
 from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.errors import InputError, printable, terminal_text
+from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
 from rebar_depth_bench.outputs import output_file, write_output
 from rebar_depth_bench.reporting.tables import frame_csv
@@ -28,6 +28,8 @@ FIGURE_METADATA: Mapping[str, Mapping[str, None]] = {
     ".pdf": {"CreationDate": None},
 }
 """Formats of figures, and metadata without which the same numbers give the same bytes."""
+_MAX_LINE = 10_000
+"""Largest number of characters in a printed line."""
 
 
 def number(kind: type[Number], low: float, high: float = math.inf) -> Callable[[str], Number]:
@@ -114,10 +116,17 @@ def write_outputs(
         with rc_context({"svg.hashsalt": "paper"}), output_file(options.figure) as path:
             figure.savefig(path, format=suffix[1:], dpi=150, metadata=FIGURE_METADATA[suffix])
     if prints_table(options):
-        rows = table[[*shown]].to_string(index=False, na_rep="-", float_format="{:.4g}".format)
+        names = table[[*shown]].map(lambda cell: printable(cell) if isinstance(cell, str) else cell)
+        rows = names.to_string(index=False, na_rep="-", float_format="{:.4g}".format)
         archives = [f"{printable(one['method'])}: sha256:{one['sha256']}" for one in content["submissions"]]
         dataset = [f"dataset {content['dataset']['digest']}"] if content["dataset"] else []
-        print(terminal_text("\n".join([rows, "", *notes, f"{content['protocol']}", *dataset, *archives])))
+        lines = "\n".join([rows, "", *notes, content["protocol"], *dataset, *archives]).split("\n")
+        print("\n".join(printable(line, _MAX_LINE) for line in lines))
+
+
+def figure_text(value: Any) -> Any:
+    """Return a name as the text of a figure, in which $ would begin a formula; other values unchanged."""
+    return printable(value).replace("$", r"\$") if isinstance(value, str) else value
 
 
 def _round(value: Any) -> Any:

@@ -217,6 +217,19 @@ def test_data_are_restricted_to_the_split_of_the_maps(tmp_path: Path, capsys: py
 
 
 @pytest.mark.slow
+def test_names_of_methods_are_plain_text(lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, method in (("a.zip", "$\\frac$ [/]"), ("b.zip", "$")):
+        with rdb.SubmissionWriter(tmp_path / name, method) as writer:
+            for view in range(VIEWS):
+                writer.add(f"zed/{view:06d}", exact_depth(view))
+    methods = (tmp_path / "a.zip", tmp_path / "b.zip")
+    written_files(pseudo_reference, tmp_path, *methods, "--reference", lab / "stereo", "--data", lab / "zed")
+    printed = capsys.readouterr().out
+    assert r"$\frac$" in printed
+    assert all(line.isprintable() for line in printed.split("\n"))
+
+
+@pytest.mark.slow
 def test_outputs_are_deterministic(lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = (lab / "mono", lab / "other", "--reference", lab / "stereo", lab / "colmap", "--data", lab / "zed")
     files = written_files(pseudo_reference, tmp_path, *arguments)
