@@ -79,6 +79,9 @@ def test_views_without_prediction_are_excluded(
     assert study["views_without_prediction"] == [blank]
     assert [row["k"] for row in study["rows"]] == [1, 8]
     assert study["left_out_k"] == [9, 50]
+    native = score(archive, tiny_root).tables["lattice"].native
+    assert native is not None
+    assert study["given"]["abs_rel"] == pytest.approx(native.abs_rel, rel=1e-9)
     assert "without prediction: 1 of 9 views" in capsys.readouterr().out
     nothing = archive_of({view: -depth_m for view, depth_m in noisy.items()}, "nothing.zip")
     assert run(anchor, nothing, "--data", tiny_root, "--num-anchor-views", "2", "3") == 2
