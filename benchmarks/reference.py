@@ -24,10 +24,12 @@ from dataset_builder.cli import main as rebar_build
 from rebar_depth_bench import score
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.cli.main import main as rebar_bench
+from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.ground_truth import config_truth
 from rebar_depth_bench.scoring.metrics import mean
-from rebar_depth_bench.scoring.single_bar import mean_single_bar
-from rebar_depth_bench.studies.distance.command import run_distance_study
-from rebar_depth_bench.studies.distance.study import DistancePoint
+from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.single_bar import SingleBarScore, mean_single_bar, single_bar_scores
+from rebar_depth_bench.scoring.view_score import ViewScore
 from rebar_depth_bench.submission.metadata import METADATA_NAME
 from rebar_depth_bench.view_ids import TEST_SPLIT, config_of
 
@@ -166,21 +168,28 @@ def _single_bar(archive: Path, root: Path) -> dict[str, dict[str, float | int | 
 
     The share is a mean over all views. The errors are means over the views with a predicted single-bar pixel.
     """
-    points_by_config: dict[str, list[DistancePoint]] = {}
-    for point in run_distance_study(archive, root).points:
-        points_by_config.setdefault(point.config, []).append(point)
-    return {config: _single_bar_means(points) for config, points in points_by_config.items()}
+    means = {}
+    with open_evaluation(archive, root) as evaluation:
+        scores = {view.view_id: view for view in score_evaluation(evaluation).views}
+        for config in evaluation.configs:
+            truths = config_truth(evaluation.folder, config)
+            of_config = [scores[view_id] for view_id in truths.view_ids]
+            single_bar = single_bar_scores(evaluation.submission, truths, of_config)
+            means[config.name] = _single_bar_means(of_config, single_bar)
+    return means
 
 
-def _single_bar_means(points: Sequence[DistancePoint]) -> dict[str, float | int | None]:
-    scores = [point.score for point in points if point.single_bar.native]
-    means = mean_single_bar([point.single_bar for point in points])
+def _single_bar_means(
+    scores: Sequence[ViewScore], single_bar: Sequence[SingleBarScore]
+) -> dict[str, float | int | None]:
+    means = mean_single_bar(single_bar)
+    scored = [score for score, one in zip(scores, single_bar, strict=True) if one.native]
     return {
         "share": means.share,
-        "views": len(scores),
-        "native_abs_rel_interior": mean([score.native.abs_rel for score in scores if score.native]),
+        "views": len(scored),
+        "native_abs_rel_interior": mean([score.native.abs_rel for score in scored if score.native]),
         "native_abs_rel_single_bar": means.native.abs_rel if means.native else None,
-        "scaled_abs_rel_interior": mean([score.scaled.abs_rel for score in scores if score.scaled]),
+        "scaled_abs_rel_interior": mean([score.scaled.abs_rel for score in scored if score.scaled]),
         "scaled_abs_rel_single_bar": means.scaled.abs_rel if means.scaled else None,
     }
 

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -117,38 +116,6 @@ def _print_line(started: _Started, now: float, line: str, tenth: int) -> None:
         started.tenth, started.printed_s = tenth, now
         sys.stderr.write(line + "\n")  # In one call: several threads may write lines.
         sys.stderr.flush()
-
-
-class Command(Protocol):
-    """Interface of the module of a command or study: one-line summary, arguments and entry point."""
-
-    SUMMARY: str
-
-    @property
-    def add_arguments(self) -> Callable[[argparse.ArgumentParser], None]:
-        """Function that adds the command's arguments to its parser."""
-
-    @property
-    def run(self) -> Callable[[argparse.Namespace], None]:
-        """Function that runs the command: results to standard output, progress to standard error.
-
-        Raises ``RebarDepthError``.
-        """
-
-
-def add_commands(
-    parser: argparse.ArgumentParser, commands: Mapping[str, Command], metavar: str
-) -> argparse._SubParsersAction[argparse.ArgumentParser]:
-    """Add a subcommand for each command to a parser, and return the object to which more can be added.
-
-    Each subcommand sets the default ``run`` to the entry point of its command.
-    """
-    subparsers = parser.add_subparsers(required=True, metavar=metavar)
-    for name, command in commands.items():
-        subparser = subparsers.add_parser(name, help=command.SUMMARY, description=command.SUMMARY)
-        command.add_arguments(subparser)
-        subparser.set_defaults(run=command.run)
-    return subparsers
 
 
 def require_extra(extra: str, modules: Sequence[str]) -> None:

@@ -2,7 +2,7 @@
 
 Runs the same commands in two checkouts, each with its own ``.venv``, and compares every file that they write:
 dataset folders of all configs, two variants and the example scenes (of the new checkout), exports, archives, and
-the JSON, CSV, LaTeX and HTML of scoring, comparison, tables and studies; also the database schema and the OpenAPI
+the JSON, CSV, LaTeX and HTML of scoring, comparison and tables; also the database schema and the OpenAPI
 document of the leaderboard.
 
     python scripts/compare_versions.py OLD_CHECKOUT NEW_CHECKOUT --work DIR [--demo]
@@ -96,13 +96,6 @@ def commands(work: Path, examples: Path, demo: bool) -> Iterator[list[str]]:
         yield [*bench, "score", scaled, *at, "--extended", *files, "--extended-csv", f"{out}/extended.csv"]
         yield [*bench, "compare", exact, scaled, holes, *at, "--json", f"{out}/c.json", "--csv", f"{out}/c.csv"]
         yield [*bench, "table", exact, scaled, holes, *at, "--latex", f"{out}/t.tex", "--csv", f"{out}/t.csv"]
-        for study, *more in (
-            ("anchor", "--config", "lattice"),
-            ("distance",),
-            ("pseudo-reference", "--config", "lattice", "--reference", exact),
-        ):
-            outputs = [word for kind in ("json", "csv", "html") for word in (f"--{kind}", f"{out}/{study}.{kind}")]
-            yield [*bench, "study", study, scaled, *more, *at, *outputs]
     service = work / "service"
     service.mkdir(parents=True, exist_ok=True)
     yield ["-c", SERVICE, f"{root}", f"{service}"]

@@ -110,7 +110,7 @@ SWEEPS: Mapping[str, Callable[[], ConfigSpec]] = {
     "pile-distance": lambda: ConfigSpec("pile-distance", _pile_scene(), geometric_sweep(0.50, 2.2, 45.0)),
     "pier-distance": lambda: ConfigSpec("pier-distance", _pier_scene(), geometric_sweep(5.0, 17.0, 7.0)),
 }
-"""Factories of the distance sweeps for ``rebar-bench study distance``; built only if named.
+"""Factories of the distance sweeps for ``examples/paper/distance.py``; built only if named.
 
 A sweep starts where the steel fills the frame. It ends at the limit of the laboratory, or where bars become too
 thin to have interior pixels.

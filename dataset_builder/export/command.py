@@ -8,7 +8,7 @@ from pathlib import Path
 from rebar_depth_bench.console import ProgressBars
 from rebar_depth_bench.view_ids import SPLITS
 
-SUMMARY = "export a dataset folder as plain files, as a capture, or as KITTI's raw data"
+SUMMARY = "export a dataset folder as plain files, with COLMAP's and nerfstudio's cameras"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,13 +30,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="number of views per config, or per scene of a config with splits, evenly spaced over the views of "
         "the folder (default: all)",
     )
-    parser.add_argument(
-        "--layout",
-        choices=("plain", "zed", "kitti"),
-        default="plain",
-        help="plain: images, exact depth, masks, COLMAP, nerfstudio; zed: a capture; kitti: KITTI's raw data "
-        "(default: %(default)s)",
-    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -49,7 +42,6 @@ def run(options: argparse.Namespace) -> None:
             options.out,
             options.config,
             options.views,
-            options.layout,
             progress=bars.update,
             split=options.split,
         )

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dataset_builder.config.trajectories import subset
-from dataset_builder.export.kitti import KittiLayout
-from dataset_builder.export.layout import ExportedConfig, Layout
-from dataset_builder.export.plain import PlainLayout
+from dataset_builder.export.colmap import cameras_txt, images_txt, points_txt
+from dataset_builder.export.images import EXPORT_FILES
+from dataset_builder.export.metadata import cameras_json, exported_files, readme_txt
+from dataset_builder.export.nerfstudio import transforms_json
 from dataset_builder.export.target import ExportedPart, export_target
 from dataset_builder.export.views import CameraView, StoredView, stored_views
-from dataset_builder.export.zed import ZedLayout
 from rebar_depth_bench.atomic_io import write_bytes, write_error, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
 from rebar_depth_bench.data.dataset_config import DatasetConfig
@@ -20,9 +20,8 @@ from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
 
-LAYOUTS: Mapping[str, Layout] = {"plain": PlainLayout(), "zed": ZedLayout(), "kitti": KittiLayout()}
-"""Layouts of an export by name."""
-DEFAULT_LAYOUT = "plain"
+_FOLDERS = (".", "sparse/0", *sorted({file.folder for file in EXPORT_FILES.values()}))
+"""Folders with files, relative to that of a config, which is "."."""
 
 
 @dataclass(frozen=True)
@@ -51,23 +50,21 @@ def export(
     to: str | Path,
     configs: Sequence[str] | None = None,
     views: int | None = None,
-    layout: str = DEFAULT_LAYOUT,
     progress: Progress = silent,
     split: str | None = None,
 ) -> ExportSummary:
     """Export configs (default: all) of the dataset folder ``root``, each into its own folder below ``to``.
 
-    ``layout`` is a name in ``LAYOUTS``. A scene of a config with splits has a folder of its own,
-    ``<config>/<split>-<scene>``, since each has its own cameras. ``split`` chooses the scenes of one split
-    (default: all) and leaves out configs that lack it, unless they are named. ``views`` selects that many views
-    of a config, or of each scene, spread evenly. Files are written atomically, images before the metadata that
-    refers to them. An interrupted export is resumed by calling it again: images that exist are kept, and the
-    result is byte-identical to that of an uninterrupted export. ``progress`` counts views.
+    A scene of a config with splits has a folder of its own, ``<config>/<split>-<scene>``, since each has its own
+    cameras. ``split`` chooses the scenes of one split (default: all) and leaves out configs that lack it, unless
+    they are named. ``views`` selects that many views of a config, or of each scene, spread evenly. Files are
+    written atomically, images before the metadata that refers to them. An interrupted export is resumed by calling
+    it again: images that exist are kept, and the result is byte-identical to that of an uninterrupted export.
+    ``progress`` counts views.
 
     Raises ``DatasetError`` for a folder that is not a complete local dataset folder, an unknown config or split,
-    or data that contradict the manifest; ``InputError`` for fewer than one view, for a config that the layout
-    cannot hold and for a ``to`` that contains anything but an earlier export of the same data in this layout;
-    ``OutputError`` for one that cannot be written.
+    or data that contradict the manifest; ``InputError`` for fewer than one view and for a ``to`` that contains
+    anything but an earlier export of the same data; ``OutputError`` for one that cannot be written.
     """
     folder = _local_folder(root)
     chosen = [folder.config(name) for name in dict.fromkeys(configs or _with_split(folder, split))]
@@ -75,20 +72,15 @@ def export(
         if config.imported is not None:
             raise InputError(f"{root}: config {config.name} was imported, expected configs that were rendered")
     parts = _by_folder(chosen, split)
-    for config in parts.values():
-        LAYOUTS[layout].check(config)
     wanted = {name: _select_view_ids(config, views) for name, config in parts.items()}
-    targets = {
-        name: ExportedPart(_key(config), wanted[name], tuple(LAYOUTS[layout].folders(config)))
-        for name, config in parts.items()
-    }
+    targets = {name: ExportedPart(_key(config), wanted[name], _FOLDERS) for name, config in parts.items()}
     has_bars = BARS_FILE in folder.files
     bars = read_bars(folder.verified_file(BARS_FILE)) if has_bars else {}
     target = Path(to)
     try:
-        with export_target(target, folder, layout, targets):
+        with export_target(target, folder, targets):
             exported = [
-                _export_config(LAYOUTS[layout], folder, name, config, wanted[name], bars, target, progress)
+                _export_config(folder, name, config, wanted[name], bars, target, progress)
                 for name, config in parts.items()
             ]
     except OSError as error:  # Only writing raises OSError here: reading raises DatasetError.
@@ -144,7 +136,6 @@ def _key(config: DatasetConfig) -> str:
 
 
 def _export_config(
-    layout: Layout,
     folder: DatasetFolder,
     name: str,
     config: DatasetConfig,
@@ -158,20 +149,42 @@ def _export_config(
     into = to / name
     written = files = 0
     for stored in stored_views(config, wanted):
-        view_files, view_written = _write_missing(layout, stored, into)
+        view_files, view_written = _write_missing(stored, into)
         files, written = files + view_files, written + view_written
         views.append(stored.view)
         progress(f"export of {name}", len(views), len(wanted))
-    for path, text in layout.texts(ExportedConfig(folder, config, views, bars)).items():
+    for path, text in _texts(folder, config, views, bars).items():
         write_text(into / path, text)
     return ConfigExport(name, len(views), written, files - written)
 
 
-def _write_missing(layout: Layout, stored: StoredView, into: Path) -> tuple[int, int]:
+def _texts(
+    folder: DatasetFolder, config: DatasetConfig, views: Sequence[CameraView], bars: Mapping[str, tuple[Bar, ...]]
+) -> dict[str, str]:
+    """Return the metadata by path; COLMAP's and nerfstudio's files describe colour images."""
+    texts = {
+        "cameras.json": cameras_json(folder, config, views),
+        "README.txt": readme_txt(folder, config, len(views)),
+    }
+    if config.colour is not None:
+        texts |= {
+            "sparse/0/cameras.txt": cameras_txt(views),
+            "sparse/0/images.txt": images_txt(views),
+            "sparse/0/points3D.txt": points_txt(bars.get(config.scene.name, ())),
+            "transforms.json": transforms_json(views),
+        }
+    return texts
+
+
+def _write_missing(stored: StoredView, into: Path) -> tuple[int, int]:
     """Write those image files of a view that do not exist yet; return the numbers of all and of those written."""
-    images = list(layout.images(stored.config, stored.view))
-    missing = [image for image in images if not (into / image.path).is_file()]
+    images = [
+        (into / file.path(stored.view.stem(eye)), f"{eye}_{file.column}", file.encode)
+        for eye in stored.view.cameras
+        for file in exported_files(stored.config).values()
+    ]
+    missing = [image for image in images if not image[0].is_file()]
     decoded = stored.decode() if missing else {}
-    for image in missing:
-        write_bytes(into / image.path, image.encode(decoded[image.column]))
+    for path, column, encode in missing:
+        write_bytes(path, encode(decoded[column]))
     return len(images), len(missing)

@@ -13,7 +13,7 @@ from pydantic import Strict
 
 from rebar_depth_bench.atomic_io import exclusive_lock, temporary_target, write_error, write_text
 from rebar_depth_bench.data.manifest import DatasetFolder
-from rebar_depth_bench.errors import InputError, escape_text
+from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.paths import check_no_links, remove_file
 from rebar_depth_bench.reading import parse_json, read_file
@@ -49,7 +49,6 @@ class _Marker(StrictModel):
     """Content of ``MARKER``."""
 
     format: Annotated[str, one_of(FORMAT)]
-    layout: str = "plain"
     dataset: str
     configs: dict[str, _ExportedConfig]
 
@@ -58,14 +57,13 @@ class _Marker(StrictModel):
 def export_target(
     to: Path,
     folder: DatasetFolder,
-    layout: str,
     parts: Mapping[str, ExportedPart],
 ) -> Iterator[None]:
-    """Prepare and lock ``to`` for an export of ``parts`` in a layout; their keys are folders below ``to``.
+    """Prepare and lock ``to`` for an export of ``parts``, whose keys are folders below ``to``.
 
     Context manager; the lock is held until it exits. ``export.json`` in the folder records the dataset and, for
     each config, its build and its views. Temporary files left by a killed export are removed. Raises
-    ``InputError`` if the folder contains anything else, another dataset, layout or build, or views that are not
+    ``InputError`` if the folder contains anything else, another dataset or build, or views that are not
     wanted now, a link in place of a folder that the export writes to, or if another export holds the lock.
     """
     _check_target(to, folder)
@@ -80,10 +78,10 @@ def export_target(
             stack.enter_context(exclusive_lock(to))  # Locking the folder itself leaves no file behind.
         except BlockingIOError:
             raise InputError(f"{to}: another export is using this folder") from None
-        exported = _merged_configs(to, folder, layout, parts)
+        exported = _merged_configs(to, folder, parts)
         for path in (to, *(to / name for name in folders)):
             _remove_temporary_files(path, MARKER if path == to else None)
-        marker = _Marker(format=FORMAT, layout=layout, dataset=folder.digest, configs=exported)
+        marker = _Marker(format=FORMAT, dataset=folder.digest, configs=exported)
         write_text(to / MARKER, json.dumps(marker.model_dump()) + "\n")
         yield
 
@@ -113,20 +111,20 @@ def _check_target(to: Path, folder: DatasetFolder) -> None:
 
 
 def _merged_configs(
-    to: Path, folder: DatasetFolder, layout: str, parts: Mapping[str, ExportedPart]
+    to: Path, folder: DatasetFolder, parts: Mapping[str, ExportedPart]
 ) -> dict[str, _ExportedConfig]:
     """Return the configs in ``to`` after the export: earlier ones remain, wanted ones are added or extended."""
     configs = {name: _ExportedConfig(key=part.key, views=tuple(part.view_ids)) for name, part in parts.items()}
-    earlier = _read_marker(to / MARKER, folder, layout) if (to / MARKER).is_file() else {}
+    earlier = _read_marker(to / MARKER, folder) if (to / MARKER).is_file() else {}
     for name in earlier.keys() & configs.keys():
         _check_same_build(to, name, earlier[name], configs[name])
     return {**earlier, **configs}
 
 
-def _read_marker(path: Path, folder: DatasetFolder, layout: str) -> dict[str, _ExportedConfig]:
+def _read_marker(path: Path, folder: DatasetFolder) -> dict[str, _ExportedConfig]:
     """Return the configs of an earlier export from its ``export.json``.
 
-    Raises ``InputError`` if the file is invalid, has another format or names another dataset or layout.
+    Raises ``InputError`` if the file is invalid, has another format or names another dataset.
     """
     values, problems = parse_json(read_file(path, JSON_BYTES, "the record of an export", InputError))
     marker = None if problems else validate_table(_Marker, values, problems)
@@ -136,11 +134,6 @@ def _read_marker(path: Path, folder: DatasetFolder, layout: str) -> dict[str, _E
         raise InputError(
             f"{path.parent}: contains an export of dataset {marker.dataset}, expected {folder.digest} "
             f"as in {folder.root}; choose another folder"
-        )
-    if marker.layout != layout:
-        raise InputError(
-            f"{path.parent}: contains an export in the layout {escape_text(marker.layout)}, expected {layout}; "
-            "choose another folder"
         )
     return marker.configs
 

@@ -1,1 +1,1 @@
-"""Images with known cameras that are no dataset folder: captures, image folders, and KITTI's raw data."""
+"""Images with known cameras that are no dataset folder: captures and image folders."""

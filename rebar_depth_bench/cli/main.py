@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
 
 from rebar_depth_bench.cli import (
     cache,
@@ -22,11 +23,28 @@ from rebar_depth_bench.cli import (
     verify,
     view,
 )
-from rebar_depth_bench.console import Command, add_commands, replace_renamed_options, run_command
+from rebar_depth_bench.console import run_command
 from rebar_depth_bench.output_options import check_outputs
-from rebar_depth_bench.studies.registry import STUDIES
 from rebar_depth_bench.terminal import use_plain_characters
 from rebar_depth_bench.version import software_version
+
+
+class Command(Protocol):
+    """Interface of the module of a command: one-line summary, arguments and entry point."""
+
+    SUMMARY: str
+
+    @property
+    def add_arguments(self) -> Callable[[argparse.ArgumentParser], None]:
+        """Function that adds the command's arguments to its parser."""
+
+    @property
+    def run(self) -> Callable[[argparse.Namespace], None]:
+        """Function that runs the command: results to standard output, progress to standard error.
+
+        Raises ``RebarDepthError``.
+        """
+
 
 COMMANDS: Mapping[str, Command] = {
     "score": score,
@@ -45,16 +63,11 @@ COMMANDS: Mapping[str, Command] = {
     "demo": demo,
 }
 
-RENAMED_OPTIONS = {"--given-scale": "--baseline-scale", "--k": "--num-anchor-views"}
-"""Old option strings that are still accepted, and their new names."""
-
-_STUDY_SUMMARY = "run a study of the paper on your own archives"
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-bench`` and return its exit code."""
     use_plain_characters()
-    options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
+    options = argument_parser().parse_args(arguments)
     os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")  # ``datasets`` reads it at import.
     return run_command(lambda: _run(options), interrupted=getattr(options, "interrupted", "interrupted"))
 
@@ -71,6 +84,9 @@ def argument_parser() -> argparse.ArgumentParser:
         description="Score metric depth on reinforcement against exact ground truth.",
     )
     parser.add_argument("--version", action="version", version=software_version())
-    commands = add_commands(parser, COMMANDS, "COMMAND")
-    add_commands(commands.add_parser("study", help=_STUDY_SUMMARY, description=_STUDY_SUMMARY), STUDIES, "NAME")
+    subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
+    for name, command in COMMANDS.items():
+        subparser = subparsers.add_parser(name, help=command.SUMMARY, description=command.SUMMARY)
+        command.add_arguments(subparser)
+        subparser.set_defaults(run=command.run)
     return parser

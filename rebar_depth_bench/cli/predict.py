@@ -6,11 +6,12 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from rebar_depth_bench.captures.opening import open_images
+from rebar_depth_bench.captures.camera_files import CAMERAS_FILE
+from rebar_depth_bench.captures.folder import is_capture, open_capture
 from rebar_depth_bench.captures.views import ImageViews
 from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
 from rebar_depth_bench.console import ProgressBars, add_seconds, positive_number, print_notice
-from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods import METHODS, MultiViewMethod, find_method
@@ -32,18 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.set_defaults(interrupted="interrupted; run the same command again to resume")
     parser.add_argument("method", metavar="METHOD", help=names)
-    data = (
-        "dataset folder, Hub repository, capture (left/, right/, calibration.conf), image folder with "
-        "cameras.toml, or KITTI's raw data"
-    )
+    data = "dataset folder, Hub repository, capture (left/, right/, calibration.conf) or images with their cameras"
     parser.add_argument("--data", required=True, metavar="ROOT", help=data)
     add_expect_digest(parser)
-    parser.add_argument(
-        "--images",
-        type=Path,
-        metavar="FILE",
-        help="list of KITTI images, one <date>/<drive> <frame> l|r per line (default: the Eigen test split)",
-    )
     add_output_file(parser, "--out", "submission archive (zip) to write", metavar="ARCHIVE", required=True)
     parser.add_argument(
         "--config",
@@ -106,14 +98,22 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _open_views(options: argparse.Namespace) -> Sequence[Views]:
-    """Return the views of the data; print which digests of a dataset were verified."""
-    images = open_images(options.data, options.images)
-    if images is None:
+    """Return the views of a dataset, whose verified digests are printed, or of a folder of images.
+
+    Raises ``InputError`` for a folder that is neither, and for options of datasets with a folder of images.
+    """
+    path = Path(options.data)
+    if not path.is_dir() or (path / MANIFEST_FILE).exists():
         folder = open_folder(options.data, expect_digest=options.expect_digest)
         print_verified(folder)
         return dataset_views(folder, options.config, options.split or TEST_SPLIT)
+    if not is_capture(path):
+        raise InputError(
+            f"{path}: has no {MANIFEST_FILE}, no left/, and no images with {CAMERAS_FILE} or a calibration, "
+            "expected a complete dataset folder written by rebar-build, or images with their cameras"
+        )
     for option in ("config", "split", "expect_digest"):
         if getattr(options, option) is not None:
             name = f"--{option.replace('_', '-')}"
             raise InputError(f"{options.data}: {name} is given, which is for dataset folders only")
-    return images
+    return [open_capture(path)]

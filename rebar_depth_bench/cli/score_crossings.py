@@ -14,8 +14,7 @@ from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.detections import detection_page
-from rebar_depth_bench.reporting.html.study_page import render_study
-from rebar_depth_bench.studies.common import print_page
+from rebar_depth_bench.reporting.table_page import print_page, render_page
 from rebar_depth_bench.submission import INPUTS
 
 SUMMARY = "score detected crossings of bars: precision, recall, average precision, position"
@@ -72,7 +71,7 @@ def run(options: argparse.Namespace) -> None:
     if options.json:
         write_output(options.json, result.to_json())
     if options.html:
-        write_output(options.html, render_study(page))
+        write_output(options.html, render_page(page))
     if prints_table(options):
         print_page(page, Console())
     if result.outside:

@@ -10,7 +10,7 @@ from rebar_depth_bench.detections.result import AVERAGE_PRECISION_MM, DetectionR
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.lines import HEIGHT, LEFT, RIGHT, TOP, ChartText, LinearAxis, Series, chart
-from rebar_depth_bench.reporting.html.study_page import Columns, PageFigure, PageTable, StudyPage, page_table
+from rebar_depth_bench.reporting.table_page import Columns, PageFigure, PageTable, TablePage, page_table
 from rebar_depth_bench.version import software_version
 
 Row = tuple[str, DetectionTable]
@@ -30,7 +30,7 @@ _ERRORS: dict[str, tuple[str, str]] = {
 }
 
 
-def detection_page(result: DetectionResult) -> StudyPage:
+def detection_page(result: DetectionResult) -> TablePage:
     """Return the page of a result; its tables are also those of the terminal."""
     rows: list[Row] = list(result.tables.items())
     if len(rows) > 1:
@@ -38,8 +38,8 @@ def detection_page(result: DetectionResult) -> StudyPage:
     threshold = result.least_confidence
     matched = "all detections" if threshold is None else f"detections with a confidence of {threshold:g} or more"
     method = printable(result.meta.method)
-    return StudyPage(
-        study="crossings",
+    return TablePage(
+        subject="crossings",
         title=f"{method}: detected crossings of bars",
         lead=f"Crossings that the left image shows well enough are to be found. Matched within "
         f"{1000 * MATCH_M:g} mm: {matched}.",

@@ -1,9 +1,8 @@
 """Published numbers of the paper, shown beside results and never ranked with them.
 
 Source: "Benchmarking Metric Depth for Construction Perception: Industrial Rebar Scenes with Exact Synthetic Ground
-Truth", Tables I and II, sections III.A and III.C. The authors measured on their own renders and recordings;
-``PublishedPart.mark`` states this and accompanies the numbers wherever they are shown. Numbers are kept as
-strings, so that they are printed as published.
+Truth", Table I. The authors measured on their own renders; ``PublishedPart.mark`` states this and accompanies the
+numbers wherever they are shown. Numbers are kept as strings, so that they are printed as published.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from pydantic import TypeAdapter
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """Row of a method in Table I or II: RMSE (cm) and AbsRel native, AbsRel_s oracle-scaled, median s.
+    """Row of a method in Table I: RMSE (cm) and AbsRel native, AbsRel_s oracle-scaled, median s.
 
     ``median_anchored`` means that the scale was taken from ground truth (the dagger of Table I).
     """
@@ -47,35 +46,6 @@ class PublishedScene:
 
 
 @dataclass(frozen=True)
-class PublishedReference:
-    """One pseudo-reference of Table II: its coverage of pixels (per cent) and its rows, in the table's order."""
-
-    coverage_percent: str
-    rows: tuple[PublishedRow, ...]
-
-
-@dataclass(frozen=True)
-class PublishedKitti:
-    """KITTI numbers of a method stated in the text of section III.A; None for a number that is not stated."""
-
-    method: str
-    abs_rel: str | None = None
-    rmse_m: str | None = None
-    delta1: str | None = None
-
-
-@dataclass(frozen=True)
-class PublishedAnchor:
-    """Scale-anchor numbers of section III.C: deviation of the mean scale of one known-depth view from that of the
-    ArUco markers (per cent), and RMSE (centimetres) at the scale of 6 and of 12 markers.
-    """
-
-    one_view_scale_within_percent: str
-    rmse_cm_6_markers: str
-    rmse_cm_12_markers: str
-
-
-@dataclass(frozen=True)
 class PublishedPart:
     """Source of one part of the numbers: place in the paper, protocol, and the mark shown with the numbers."""
 
@@ -86,18 +56,11 @@ class PublishedPart:
 
 @dataclass(frozen=True)
 class PublishedNumbers:
-    """Published numbers that are shown beside results.
-
-    The keys of ``parts`` are ``synthetic`` (``scenes``, Table I), ``physical`` (``references``, Table II),
-    ``kitti`` and ``anchor``.
-    """
+    """Published numbers that are shown beside results: the scenes of Table I, whose part is ``synthetic``."""
 
     title: str
     parts: Mapping[str, PublishedPart]
     scenes: Mapping[str, PublishedScene]
-    references: Mapping[str, PublishedReference]
-    kitti: tuple[PublishedKitti, ...]
-    anchor: PublishedAnchor
 
 
 OTHER_OPTICS_MARK = "§"
@@ -110,14 +73,7 @@ OTHER_OPTICS_NOTE = (
 def load_published() -> PublishedNumbers:
     """Return the published numbers from the package's ``published.json``, which is read once."""
     content = json.loads(files("rebar_depth_bench.reporting").joinpath("published.json").read_text("utf-8"))
-    values = {
-        "title": content.pop("title"),
-        "parts": content,
-        "scenes": content["synthetic"]["scenes"],
-        "references": content["physical"]["references"],
-        "kitti": content["kitti"]["figures"],
-        "anchor": content["anchor"],
-    }
+    values = {"title": content.pop("title"), "parts": content, "scenes": content["synthetic"]["scenes"]}
     return TypeAdapter(PublishedNumbers).validate_python(values)
 
 

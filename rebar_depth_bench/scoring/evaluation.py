@@ -1,4 +1,4 @@
-"""Open submission and dataset folder, shared by scoring, extended measures, studies and reports."""
+"""Open submission and dataset folder, shared by scoring, extended measures and reports."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Evaluation:
             raise SubmissionError.from_problems(self.submission.path, problems)
 
     def provenance(self) -> Provenance:
-        """Return the provenance of a study of the submission."""
+        """Return the provenance of an analysis of the submission."""
         archives = (ArchiveIdentity(self.method, self.submission.sha256()),)
         return Provenance(PROTOCOL, self.folder.digest, self.folder.version, archives)
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rebar_depth_bench.errors import printable
 from rebar_depth_bench.version import software_version
 
 
@@ -20,10 +19,10 @@ class ArchiveIdentity:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Provenance of the numbers of a comparison or study.
+    """Provenance of the numbers of a comparison, or of an analysis of archives.
 
     ``protocol`` names the definitions of the numbers; changed definitions have a new name. ``dataset_digest`` and
-    ``dataset_version`` are None if the reference of a study is not a dataset folder.
+    ``dataset_version`` are None if the reference is not a dataset folder.
     """
 
     protocol: str
@@ -40,22 +39,3 @@ class Provenance:
             "submissions": [{"method": archive.method, "sha256": archive.sha256} for archive in self.archives],
             "software": {"version": software_version()},
         }
-
-    def csv_cells(self) -> dict[str, str | None]:
-        """Return the provenance of a study of one archive as the last cells of each of its CSV rows."""
-        return {
-            "dataset_digest": self.dataset_digest,
-            "dataset_version": self.dataset_version,
-            "submission_sha256": self.archives[0].sha256,
-            "software_version": software_version(),
-        }
-
-    def lines(self) -> list[tuple[str, str]]:
-        """Return the provenance as printable (label, value) pairs."""
-        dataset = []
-        if self.dataset_digest is not None:
-            dataset = [("Dataset", f"{self.dataset_version} ({self.dataset_digest})")]
-        archives = [(f"Archive of {archive.method}", f"sha256:{archive.sha256}") for archive in self.archives]
-        software = [("Software", f"rebar-depth-bench {software_version()}")]
-        lines = [("Protocol", self.protocol), *dataset, *archives, *software]
-        return [(printable(label), printable(value)) for label, value in lines]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.ground_truth import ViewTruth
+from rebar_depth_bench.scoring.ground_truth import ConfigTruth, ViewTruth
 from rebar_depth_bench.scoring.metrics import (
     DepthMetrics,
     is_valid_prediction,
@@ -22,6 +22,8 @@ from rebar_depth_bench.scoring.metrics import (
     mean_metrics,
     metrics_at_scales,
 )
+from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.submission import SubmissionReader
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,16 @@ def score_single_bar(
         return SingleBarScore(share, coverage, None, None)
     (native, scaled), _ = metrics_at_scales(p_m[chosen], truth.depth_m[chosen], (1.0, scale), ())
     return SingleBarScore(share, coverage, native, scaled)
+
+
+def single_bar_scores(
+    submission: SubmissionReader, truths: ConfigTruth, scores: Sequence[ViewScore]
+) -> list[SingleBarScore]:
+    """Return the scores on single-bar pixels of all views of a config, given their scores in the same order."""
+    return [
+        score_single_bar(truth, truths.single_bar(position), submission.read(truth.view_id), score.scale)
+        for position, (truth, score) in enumerate(zip(truths, scores, strict=True))
+    ]
 
 
 def mean_single_bar(scores: Sequence[SingleBarScore]) -> SingleBarScore:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from tests.fuzz.capture_entries import CAPTURE_ENTRIES
 from tests.fuzz.dataset_entries import DATASET_ENTRIES
 from tests.fuzz.entry_point import EntryPoint
 from tests.fuzz.model_entries import MODEL_ENTRIES
 from tests.fuzz.scene_entries import SCENE_ENTRIES
-from tests.fuzz.study_entries import STUDY_ENTRIES
 
 ENTRY_POINTS: Mapping[str, EntryPoint] = {
-    entry.name: entry for entry in (*DATASET_ENTRIES, *SCENE_ENTRIES, *STUDY_ENTRIES, *MODEL_ENTRIES)
+    entry.name: entry for entry in (*DATASET_ENTRIES, *SCENE_ENTRIES, *CAPTURE_ENTRIES, *MODEL_ENTRIES)
 }
 """Entry points by name."""
 

@@ -13,12 +13,11 @@ from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
-from PIL import Image
 
 from rebar_depth_bench.console import EXIT_DONE, EXIT_INPUT
 from rebar_depth_bench.data.codecs import encode_depth
+from tests.bench.captures.example_capture import write_capture
 from tests.bench.methods.onnx_models import write_mixer_model, write_toml
-from tests.bench.studies import captures, kitti_folder
 from tests.building import TINY as TINY_SIZE
 from tests.fuzz.dataset_entries import CONFIG
 from tests.fuzz.hostile import declare_image_size
@@ -119,27 +118,23 @@ def _unread_model_data(workspace: Workspace) -> Arguments:
     return "predict", write_toml(folder), *_data(workspace), "--out", workspace.out / "p.zip"
 
 
-def _study_of_pipe(study: str, workspace: Workspace) -> Arguments:
+def _manifest_is_pipe(workspace: Workspace) -> Arguments:
     _replace_by_pipe(workspace.case / "root" / "manifest.json")
-    return "study", study, workspace.case / "a.zip", *_data(workspace), "--json", workspace.out / "s.json"
+    return "score", workspace.case / "a.zip", *_data(workspace), "--json", workspace.out / "s.json"
 
 
 def _capture_of_devices(workspace: Workspace) -> Arguments:
-    capture = captures.write_capture(workspace.case / "zed", 1)
+    capture = write_capture(workspace.case / "zed", 1)
     (capture / "left" / "000000.png").unlink()
     (capture / "left" / "000000.png").symlink_to("/dev/zero")
-    depths = captures.write_depths(workspace.case / "maps", {0: captures.exact_depth(0)})
-    return "study", "pseudo-reference", depths, "--reference", depths, "--data", capture
+    return "predict", "sgbm", "--data", capture, "--out", workspace.out / "p.zip"
 
 
-def _huge_kitti_map(workspace: Workspace) -> Arguments:
-    [image] = kitti_folder.first_images(1)
-    path = kitti_folder.improved_path(workspace.case / "kitti", image)
-    path.parent.mkdir(parents=True)
-    Image.fromarray(np.zeros((38, 124), np.uint16)).save(path)
+def _huge_picture(workspace: Workspace) -> Arguments:
+    capture = write_capture(workspace.case / "zed", 1)
+    path = capture / "left" / "000000.png"
     path.write_bytes(declare_image_size(path.read_bytes(), 60_000, 60_000))
-    paths = ("--predictions", workspace.case, "--kitti", workspace.case / "kitti")
-    return "study", "kitti", *paths, "--ground-truth", "improved", "--json", workspace.out / "k.json"
+    return "predict", "sgbm", "--data", capture, "--out", workspace.out / "p.zip"
 
 
 def _verify_outside(workspace: Workspace) -> Arguments:
@@ -216,10 +211,9 @@ KNOWN_CASES = (
     KnownCase("predict: view id is a path", BENCH, _view_id_is_path),
     KnownCase("predict: truncated shard", BENCH, _truncated_shard, kept_outputs=(".p.zip.views*",)),
     KnownCase("predict: model is a pipe", BENCH, _unread_model_data),
-    KnownCase("study anchor: manifest is a pipe", BENCH, partial(_study_of_pipe, "anchor")),
-    KnownCase("study distance: manifest is a pipe", BENCH, partial(_study_of_pipe, "distance")),
-    KnownCase("study pseudo-reference: picture is a device", BENCH, _capture_of_devices),
-    KnownCase("study kitti: huge depth map", BENCH, _huge_kitti_map),
+    KnownCase("score: manifest is a pipe", BENCH, _manifest_is_pipe),
+    KnownCase("predict: picture is a device", BENCH, _capture_of_devices),
+    KnownCase("predict: huge picture", BENCH, _huge_picture),
     KnownCase("verify: file outside", BENCH, _verify_outside),
     KnownCase("cache: folder is a link", BENCH, _clear_linked_cache),
     KnownCase("submit: token file is a device", BENCH, _no_server),

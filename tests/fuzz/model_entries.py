@@ -18,9 +18,9 @@ from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import find_method
 from tests.bench.methods.onnx_models import write_mixer_model, write_toml
+from tests.fuzz.capture_entries import write_result
 from tests.fuzz.dataset_entries import CONFIG, ROOT, check_predictions, write_dataset
 from tests.fuzz.entry_point import EntryPoint, bench
-from tests.fuzz.study_entries import write_result
 from tests.fuzz.workspace import CASE, OUT, Workspace
 
 _STOPPING_METHOD = """

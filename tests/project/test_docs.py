@@ -8,6 +8,7 @@ import shlex
 import tomllib
 from argparse import ArgumentParser, _SubParsersAction
 from collections.abc import Iterator
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -66,6 +67,26 @@ def commands() -> list[str]:
 def test_documented_commands_parse(command: str) -> None:
     program, *arguments = shlex.split(command, comments=True)
     assert PARSERS[program].parse_args(arguments)
+
+
+def script_commands() -> list[str]:
+    lines = [line for page in PAGES for line in shell_lines(page)]
+    return sorted({line for line in lines if line.startswith("python examples/paper/")})
+
+
+@pytest.mark.parametrize("command", script_commands())
+def test_documented_commands_of_the_paper_parse(command: str) -> None:
+    _, script, *arguments = shlex.split(command, comments=True)
+    assert import_module(Path(script).stem).argument_parser().parse_args(arguments)
+
+
+def test_every_script_of_the_paper_is_listed_and_short() -> None:
+    scripts = {Path(shlex.split(command)[1]).name for command in script_commands()}
+    assert scripts == {"anchor.py", "distance.py", "kitti.py", "pseudo_reference.py"}
+    page = (DOCS / "paper.md").read_text()
+    for path in (ROOT / "examples" / "paper").glob("*.py"):
+        assert len(path.read_text().splitlines()) <= (250 if path.name == "kitti.py" else 200)
+        assert path.name not in scripts or f"[{path.name}](../examples/paper/{path.name})" in page
 
 
 def subparsers(parser: ArgumentParser) -> dict[str, ArgumentParser]:

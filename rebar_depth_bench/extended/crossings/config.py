@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.extended.crossings.evaluate import crossing_samples, view_crossings
@@ -24,6 +25,11 @@ class ConfigReaches:
 
     source: CrossingsSource
     by_alignment: Mapping[str, tuple[Reach, ...]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object: the file of the crossings, and the reaches by alignment."""
+        reaches = {name: [reach.to_dict() for reach in of_one] for name, of_one in self.by_alignment.items()}
+        return {"crossings": asdict(self.source), **reaches}
 
 
 def config_reaches(

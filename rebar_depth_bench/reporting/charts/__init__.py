@@ -1,1 +1,1 @@
-"""Inline SVG charts of reports and study pages."""
+"""Inline SVG charts of reports and pages of tables."""

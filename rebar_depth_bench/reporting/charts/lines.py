@@ -1,6 +1,6 @@
-"""Line charts of the studies as inline SVG: areas, points, lines with markers and error bars.
+"""Line charts as inline SVG: lines with markers on linear axes.
 
-Colours are classes of ``study.css`` (``c0``, ``c1``, ...), so that the charts follow light and dark mode.
+Colours are classes of ``table_page.css`` (``c0``, ``c1``, ...), so that the charts follow light and dark mode.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting.charts.axes import (
     WIDTH,
     Axis,
-    LogAxis,
     multiples,
     select_spaced,
     svg_figure,
@@ -58,18 +57,11 @@ class LinearAxis:
 
 @dataclass(frozen=True)
 class Series:
-    """Data of one name and colour: points, a line with markers, bars (x, low, high), an area (x, low, high).
-
-    Values are in the units of the axes. ``hollow`` draws rings and a dashed line, for scaled numbers.
-    """
+    """Line with markers of one name and colour; values are in the units of the axes."""
 
     name: str
     colour: int
-    cloud: Sequence[Point] = ()
     line: Sequence[Point] = ()
-    bars: Sequence[tuple[float, float, float]] = ()
-    area: Sequence[tuple[float, float, float]] = ()
-    hollow: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,50 +74,10 @@ class ChartText:
     y: str
 
 
-_MAX_DRAWN_VALUE = 1e12
-"""Magnitude to which values are clipped before the range of an axis is computed."""
-
-
-def linear_axis(values: Sequence[float], start: float, end: float) -> LinearAxis:
-    """Return a linear axis over the finite ``values`` and 0, with a margin at both ends."""
-    finite = [min(max(value, -_MAX_DRAWN_VALUE), _MAX_DRAWN_VALUE) for value in values if math.isfinite(value)]
-    low, high = min([0.0, *finite]), max([0.0, *finite])
-    margin = 0.08 * (high - low) or 1e-6
-    return LinearAxis(low - margin, high + margin, start, end)
-
-
-def log_axis(values: Sequence[float], start: float, end: float) -> LogAxis:
-    """Return a logarithmic axis over the finite positive ``values``, with a margin at both ends."""
-    positive = [
-        min(max(value, 1 / _MAX_DRAWN_VALUE), _MAX_DRAWN_VALUE)
-        for value in values
-        if math.isfinite(value) and value > 0
-    ]
-    low, high = min(positive, default=1.0), max(positive, default=1.0)
-    margin = max((high / low) ** 0.04, 1.02) if high > low else 1.5
-    return LogAxis(low / margin, high * margin, start, end)
-
-
-def chart(
-    series: Sequence[Series],
-    x_axis: Axis,
-    y_axis: Axis,
-    text: ChartText,
-    *,
-    x_ticks: Sequence[float] | None = None,
-    reference: float | None = None,
-) -> Markup:
-    """Return the SVG chart of ``series``.
-
-    A dashed line is drawn at y = ``reference``, and a legend if there are two or more names. ``x_ticks`` replaces
-    the ticks of the x axis.
-    """
-    ticks = x_axis.ticks() if x_ticks is None else list(x_ticks)
-    body = _grid(x_axis, y_axis, ticks)
-    if reference is not None:
-        body += f'<path class="one" d="M{LEFT:g} {y_axis.at(reference):.1f}H{RIGHT:g}"/>'
-    layers = (_area, _cloud, _bars, _line)
-    body += "".join(draw(entry, x_axis, y_axis) for draw in layers for entry in series)
+def chart(series: Sequence[Series], x_axis: Axis, y_axis: Axis, text: ChartText) -> Markup:
+    """Return the SVG chart of ``series``, with a legend if there are two or more names."""
+    body = _grid(x_axis, y_axis)
+    body += "".join(_line(entry, x_axis, y_axis) for entry in series)
     body += _text(LEFT, 16, text.y) + _text(RIGHT, HEIGHT + 36, text.x, "end")
     names = list(dict.fromkeys((entry.name, entry.colour) for entry in series))
     legend = _legend(names) if len(names) > 1 else ""
@@ -134,7 +86,8 @@ def chart(
     return svg_figure(text.title, text.description, height, body + legend)
 
 
-def _grid(x_axis: Axis, y_axis: Axis, x_ticks: Sequence[float]) -> str:
+def _grid(x_axis: Axis, y_axis: Axis) -> str:
+    x_ticks = x_axis.ticks()
     lines = "".join(f"M{LEFT:g} {y_axis.at(tick):.1f}H{RIGHT:g}" for tick in y_axis.ticks())
     lines += "".join(f"M{x_axis.at(tick):.1f} {HEIGHT:g}v4" for tick in x_ticks)
     labels = "".join(_text(LEFT - 6, y_axis.at(tick) + 4, _y_tick_label(tick), "end") for tick in y_axis.ticks())
@@ -145,39 +98,15 @@ def _grid(x_axis: Axis, y_axis: Axis, x_ticks: Sequence[float]) -> str:
     return f'<path class="axis" d="{lines}"/>{labels}'
 
 
-def _area(series: Series, x_axis: Axis, y_axis: Axis) -> str:
-    finite = [(x, low, high) for x, low, high in series.area if math.isfinite(low) and math.isfinite(high)]
-    if not finite:
-        return ""
-    upper = [f"{x_axis.at(x):.1f} {y_axis.at(high):.1f}" for x, _, high in finite]
-    lower = [f"{x_axis.at(x):.1f} {y_axis.at(low):.1f}" for x, low, _ in reversed(finite)]
-    return f'<path class="area {_colour(series)}" d="M{"L".join([*upper, *lower])}Z"/>'
-
-
-def _cloud(series: Series, x_axis: Axis, y_axis: Axis) -> str:
-    path = "".join(f"M{x_axis.at(x):.1f} {y_axis.at(y):.1f}h0" for x, y in _finite_points(series.cloud))
-    return f'<path class="cloud {_colour(series)}" d="{path}"/>' if path else ""
-
-
-def _bars(series: Series, x_axis: Axis, y_axis: Axis) -> str:
-    path = "".join(
-        f"M{x_axis.at(x):.1f} {y_axis.at(low):.1f}V{y_axis.at(high):.1f}"
-        for x, low, high in series.bars
-        if math.isfinite(low) and math.isfinite(high)
-    )
-    return f'<path class="bars {_colour(series)}" d="{path}"/>' if path else ""
-
-
 def _line(series: Series, x_axis: Axis, y_axis: Axis) -> str:
-    points = [(x_axis.at(x), y_axis.at(y)) for x, y in _finite_points(series.line)]
+    finite = [(x, y) for x, y in series.line if math.isfinite(x) and math.isfinite(y)]
+    points = [(x_axis.at(x), y_axis.at(y)) for x, y in finite]
     if not points:
         return ""
+    colour = f"c{series.colour % COLOURS}"
     path = "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
-    dashed, marker = (" dashed", "hollow") if series.hollow else ("", "disc")
-    markers = "".join(
-        f'<circle class="{marker} {_colour(series)}" cx="{x:.1f}" cy="{y:.1f}" r="3.4"/>' for x, y in points
-    )
-    return f'<path class="line{dashed} {_colour(series)}" d="M{path}"/>{markers}'
+    markers = "".join(f'<circle class="disc {colour}" cx="{x:.1f}" cy="{y:.1f}" r="3.4"/>' for x, y in points)
+    return f'<path class="line {colour}" d="M{path}"/>{markers}'
 
 
 def _legend(names: Sequence[tuple[str, int]]) -> str:
@@ -188,14 +117,6 @@ def _legend(names: Sequence[tuple[str, int]]) -> str:
         parts.append(f'<circle class="disc c{colour % COLOURS}" cx="{x + 4:.1f}" cy="{y - 4:g}" r="4"/>')
         parts.append(_text(x + 13, y, printable(name, 24)))
     return "".join(parts)
-
-
-def _finite_points(points: Sequence[Point]) -> list[Point]:
-    return [(x, y) for x, y in points if math.isfinite(x) and math.isfinite(y)]
-
-
-def _colour(series: Series) -> str:
-    return f"c{series.colour % COLOURS}"
 
 
 def _y_tick_label(value: float) -> str:

@@ -1,1 +1,1 @@
-"""HTML reports and study pages: contexts, templates, scripts and style sheets."""
+"""HTML reports and pages of tables: contexts, templates, scripts and style sheets."""

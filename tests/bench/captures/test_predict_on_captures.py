@@ -11,8 +11,8 @@ pytest.importorskip("cv2")
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.submission import SubmissionReader
 from tests.bench.captures import calibration_files as files
+from tests.bench.captures.example_capture import write_capture
 from tests.bench.captures.test_cameras_toml import write_images
-from tests.bench.studies.captures import write_capture
 
 ERROR = 2
 
@@ -30,7 +30,6 @@ def predict(root: Path, archive: Path, *options: str, method: str = "sgbm") -> i
         ("sgbm", ("--config", "lattice"), "--config is given, which is for dataset folders only"),
         ("sgbm", ("--split", "test"), "--split is given"),
         ("sgbm", ("--expect-digest", "sha256:" + "0" * 64), "--expect-digest is given"),
-        ("sgbm", ("--images", "images.txt"), "which is for KITTI's raw data only"),
     ],
 )
 def test_request_that_captures_cannot_serve_is_refused(

@@ -60,7 +60,6 @@ def test_prediction_on_a_full_disk_is_finished_by_a_later_run(new_disk: NewDisk,
         ("table", "--latex", "tex"),
         ("table", "--figure", "svg"),
         ("table", "--figure", "png"),
-        ("study anchor --config lattice", "--json", "json"),
     ],
 )
 def test_outputs_on_full_and_read_only_disks(

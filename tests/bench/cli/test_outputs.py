@@ -23,7 +23,6 @@ def test_output_that_is_an_input_is_rejected(tmp_path: Path, capsys: pytest.Capt
         ["score", str(archive), "--data", str(data), "--json", str(data / "manifest.json")],
         ["compare", "b.zip", str(archive), "--data", str(data), "--csv", str(archive)],
         ["table", "b.zip", str(archive), "--data", str(data), "--latex", str(archive)],
-        ["study", "anchor", str(archive), "--data", str(data), "--csv", str(archive)],
         ["predict", "constant", "--data", str(archive), "--out", str(archive)],
     ]
     for command in commands:
@@ -79,8 +78,8 @@ def test_new_files_in_new_folders_are_accepted(tmp_path: Path) -> None:
 
 def test_renamed_options_work_with_a_warning(capsys: pytest.CaptureFixture[str]) -> None:
     renamed = {"--given-scale": "--baseline-scale", "--k": "--num-anchor-views"}
-    arguments = ["study", "anchor", "--k", "1", "--given-scale=2", "a.zip"]
-    expected = ["study", "anchor", "--num-anchor-views", "1", "--baseline-scale=2", "a.zip"]
+    arguments = ["command", "--k", "1", "--given-scale=2", "a.zip"]
+    expected = ["command", "--num-anchor-views", "1", "--baseline-scale=2", "a.zip"]
     assert replace_renamed_options(arguments, renamed) == expected
     assert capsys.readouterr().err == (
         "warning: --k is deprecated, use --num-anchor-views\n"

@@ -46,7 +46,7 @@ def test_json_or_csv_on_standard_output_replaces_the_table(
         finished = run_in_process(main, "score", archive, "--data", tiny_root, option, "-")
         assert (finished.returncode, finished.stdout) == (0, Path(file).read_text(encoding="utf-8"))
         assert finished.stderr
-    for command in (("compare", archive, archive), ("study", "anchor", archive), ("table", archive)):
+    for command in (("compare", archive, archive), ("table", archive)):
         option = "--csv" if command[0] == "table" else "--json"
         finished = run_in_process(main, *command, "--data", tiny_root, option, "-")
         assert finished.returncode == 0, finished.stderr

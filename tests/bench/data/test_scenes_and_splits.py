@@ -32,9 +32,6 @@ from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.result_io import read_result
 from rebar_depth_bench.scoring.score import score_evaluation
-from rebar_depth_bench.studies.distance.command import run_distance_study
-from rebar_depth_bench.studies.pseudo_reference.command import run_pseudo_reference_study
-from rebar_depth_bench.studies.scale_anchor.command import run_anchor_study
 from tests.synthetic_dataset import HEIGHT, WIDTH, drop_scene_column, write_dataset, write_split_dataset
 
 SCENES = {"a": "train", "b-1": "train", "c": "validation", "d": "test", "e": "test"}
@@ -133,37 +130,6 @@ def test_report_shows_views_of_the_split(root: Path, tmp_path: Path) -> None:
         result = score_evaluation(evaluation)
         panels = list(iter_view_panels({"cages": list(result.views)}, evaluation))
     assert [panel.view_id for panel in panels] == view_ids("train")
-
-
-def test_anchor_study_of_several_scenes(root: Path, tmp_path: Path) -> None:
-    study = run_anchor_study(write_truth(root, tmp_path / "a.zip", "test"), root, given_scale=1.0, counts=[2])
-    assert (study.views, study.markers) == (SPLIT_VIEWS["test"], None)
-
-
-def test_pseudo_reference_study_is_restricted_to_the_split_of_the_archives(root: Path, tmp_path: Path) -> None:
-    method = write_truth(root, tmp_path / "a.zip", "train", factor=1.25)
-    reference = write_truth(root, tmp_path / "b.zip", "train")
-    study = run_pseudo_reference_study([str(method)], [str(reference)], str(root))
-    assert study.data == "config cages (train)"
-    for row in study.rows:
-        assert (row.table.split, row.table.views) == ("train", SPLIT_VIEWS["train"])
-        assert row.table.coverage == 1.0
-        assert row.table.native is not None
-        assert row.table.native.abs_rel == pytest.approx(0.25)
-    other = write_truth(root, tmp_path / "c.zip", "test")
-    with pytest.raises(InputError, match="truth the split train and truth the split test, expected one split"):
-        run_pseudo_reference_study([str(method)], [str(other)], str(root))
-
-
-def test_distance_study_resamples_scenes(root: Path, tmp_path: Path) -> None:
-    """The six views of a split are enough for an interval, its two scenes are not."""
-    archive = write_truth(root, tmp_path / "a.zip", "train", factor=1.25)
-    study = run_distance_study(archive, root, bins_per_decade=1)
-    [whole] = study.slopes
-    assert whole.views == SPLIT_VIEWS["train"]
-    [one_bin] = study.bins
-    assert (one_bin.views_scored, one_bin.scale.interval) == (SPLIT_VIEWS["train"], None)
-    assert whole.slope.interval is None
 
 
 INFO = MethodInfo("shifted", "test", ("left_depth", "scene"), False, "here", "none")

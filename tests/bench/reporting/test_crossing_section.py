@@ -1,4 +1,4 @@
-"""Tests of crossings in report, terminal and distance study: marks by error, reach, tables and provenance."""
+"""Tests of crossings in report and terminal: marks by error, reach, tables and provenance."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from rich.console import Console
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.extended.crossings.config import config_reaches
 from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.crossing_texts import reach_sentence
@@ -21,8 +22,6 @@ from rebar_depth_bench.reporting.html.crossing_picture import crossing_pictures,
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.score import score_evaluation
-from rebar_depth_bench.studies.distance.command import run_distance_study
-from rebar_depth_bench.studies.distance.output import to_json, to_page
 from tests.bench.extended.cage_scenes import HEIGHT, WIDTH
 from tests.mat_dataset import CONFIG, VIEWS, write_mat_dataset
 
@@ -133,17 +132,15 @@ def test_terminal_states_the_reach(mat: tuple[Path, Depths], tmp_path: Path) -> 
     assert reach_sentence("scaled", result.tables[CONFIG].reaches["scaled"][1]) in " ".join(text.split())
 
 
-def test_distance_study_states_the_reach(mat: tuple[Path, Depths], tmp_path: Path) -> None:
+def test_reaches_without_the_other_measures_are_the_same(mat: tuple[Path, Depths], tmp_path: Path) -> None:
     root, depths = mat
     archive = archive_of(tmp_path / "a.zip", depths, {0: 3.0})
-    study = run_distance_study(archive, root)
-    found = study.reaches[CONFIG].by_alignment
-    assert dict(found) == extended(archive, root).tables[CONFIG].reaches
-    page = to_page(study)
-    assert page.tables[0].rows[0] == [CONFIG, "native", "5", "none tested", "–", "–"]
-    total = sum(int(row[2]) for row in page.tables[1].rows)
-    assert total == 4 * VIEWS
-    assert f"{CONFIG}, Native: 95 % of the judged crossings within 5 mm: none tested." in page.lead
-    content = json.loads(json.dumps(to_json(study)))["crossing_reach"][CONFIG]
+    with open_evaluation(archive, root) as evaluation:
+        scales = {view.view_id: view.scale for view in score_evaluation(evaluation).views}
+        [config] = [config for config in evaluation.configs if config.name == CONFIG]
+        found = config_reaches(evaluation, config, scales)
+    assert dict(found.by_alignment) == extended(archive, root).tables[CONFIG].reaches
+    content = json.loads(json.dumps(found.to_dict()))
     assert content["crossings"]["file"] == "crossings.parquet"
     assert [reach["limit_mm"] for reach in content["native"]] == [5, 2]
+    assert sum(one["crossings"] for one in content["native"][0]["bins"]) == 4 * VIEWS

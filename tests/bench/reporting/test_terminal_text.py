@@ -7,17 +7,15 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rich.console import Console
 
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.reporting.comparison_tables import print_comparison, print_paper_table
-from rebar_depth_bench.reporting.html.study_page import PageTable, StudyPage
+from rebar_depth_bench.reporting.table_page import PageTable, TablePage, print_page
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.studies.common import print_page
 from tests.bench.reporting.results import result, scored_view
 
 NAME = "[link=x]a[/link]\x1b[2J\x9b2J\u202e\x07[/]"
@@ -30,9 +28,9 @@ def hostile_result() -> Result:
     return replace(shown, dataset_version=NAME, dataset_digest=NAME, submission_sha256=NAME, software_version=NAME)
 
 
-def page() -> StudyPage:
-    return StudyPage(
-        study="anchor",
+def page() -> TablePage:
+    return TablePage(
+        subject="crossings",
         title=NAME,
         lead=NAME,
         stamps=[(NAME, NAME)],
@@ -50,7 +48,7 @@ def page() -> StudyPage:
         lambda console: print_comparison(compare(hostile_result(), hostile_result()), console),
         lambda console: print_page(page(), console),
     ],
-    ids=["score", "table", "compare", "study"],
+    ids=["score", "table", "compare", "score-crossings"],
 )
 @pytest.mark.parametrize("width", [60, 160])
 def test_names_print_as_plain_text(show: Callable[[Console], None], width: int) -> None:
@@ -89,13 +87,3 @@ def test_methods_and_their_errors_print_as_plain_text(
     assert main([*arguments, "--config", "lattice"]) == 0
     noted = capsys.readouterr().err
     assert all(line.isprintable() for line in noted.split("\n")), noted
-
-
-def test_folder_name_of_depth_maps_is_not_sent_to_terminal(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = tmp_path / "\x1b[2J"
-    folder.mkdir()
-    np.save(folder / "a.npy", np.ones((3, 4), np.float32))
-    assert main(["study", "pseudo-reference", str(folder), "--reference", str(folder), "--data", str(folder)]) == 2
-    assert capsys.readouterr().err.replace("\n", "").isprintable()

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +17,12 @@ import rebar_depth_bench as rdb
 from rebar_depth_bench.extended.full_mask import REGION_NUMBERS, full_mask_samples
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, MIN_PIXELS, profile_samples
 from rebar_depth_bench.extended.single_bar import single_bar_samples
+from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.ground_truth import config_truth
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels
-from rebar_depth_bench.scoring.single_bar import SingleBarScore
-from rebar_depth_bench.studies.distance.command import run_distance_study
+from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.single_bar import SingleBarScore, mean_single_bar, single_bar_scores
 from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth
 from tests.ground_truth import truth_of
 
@@ -182,31 +183,33 @@ def test_rendered_views(tiny_root: Path) -> None:
     assert min(shares) < max(shares) < 1
 
 
-def test_study_reports_share_and_errors(tiny_root: Path, tiny_truth: Depths, archive_of: Archive) -> None:
+def test_scores_of_a_config_are_those_of_its_pixels(
+    tiny_root: Path, tiny_truth: Depths, archive_of: Archive
+) -> None:
     rng = np.random.default_rng(5)
     noisy = {view: z * rng.uniform(0.8, 1.3, z.shape).astype(np.float32) for view, z in tiny_truth.items()}
-    study = run_distance_study(archive_of(noisy), tiny_root, configs=["lattice"])
+    with open_evaluation(archive_of(noisy), tiny_root) as evaluation:
+        views = score_evaluation(evaluation).views
+        truths = config_truth(evaluation.folder, evaluation.configs[0])
+        scores = single_bar_scores(evaluation.submission, truths, views)
     images = rendered(tiny_root, "lattice")
-    for point in study.points:
-        bars, inside, z_m = images[point.score.view_id]
+    for view, score in zip(views, scores, strict=True):
+        bars, inside, z_m = images[view.view_id]
         pixels = np.flatnonzero(inside)
         chosen = pixels[np.array(expected_pixels(bars, pixels))]
-        assert point.single_bar.share == len(chosen) / len(pixels)
+        assert score.share == len(chosen) / len(pixels)
         if not len(chosen):
-            assert point.single_bar == SingleBarScore(0.0, None, None, None)
+            assert score == SingleBarScore(0.0, None, None, None)
             continue
-        z, p = (image.ravel().astype(np.float64) for image in (z_m, noisy[point.score.view_id]))
+        z, p = (image.ravel().astype(np.float64) for image in (z_m, noisy[view.view_id]))
         scale = np.median(z[pixels]) / np.median(p[pixels])
-        assert point.single_bar.coverage == 1.0
+        assert score.coverage == 1.0
         errors = [np.mean(np.abs(s * p[chosen] - z[chosen]) / z[chosen]) for s in (1.0, scale)]
-        assert point.single_bar.native is not None
-        assert point.single_bar.scaled is not None
-        found = [point.single_bar.native.abs_rel, point.single_bar.scaled.abs_rel]
-        assert found == pytest.approx(errors, rel=1e-9)
-    for bin_ in study.bins:
-        of_bin: list[Any] = [p for p in study.points if bin_.low_m <= p.distance_m < bin_.high_m]
-        assert bin_.single_bar.share == pytest.approx(np.mean([point.single_bar.share for point in of_bin]))
-        for name in METRIC_NAMES:
-            values = [getattr(point.single_bar.scaled, name) for point in of_bin if point.single_bar.scaled]
-            of_all = getattr(bin_.single_bar.scaled, name, None)
-            assert of_all == (pytest.approx(np.mean(values)) if values else None)
+        assert score.native is not None
+        assert score.scaled is not None
+        assert [score.native.abs_rel, score.scaled.abs_rel] == pytest.approx(errors, rel=1e-9)
+    means = mean_single_bar(scores)
+    assert means.share == pytest.approx(np.mean([score.share for score in scores]))
+    for name in METRIC_NAMES:
+        values = [getattr(score.scaled, name) for score in scores if score.scaled]
+        assert getattr(means.scaled, name) == pytest.approx(np.mean(values))

@@ -83,20 +83,6 @@ def test_link_in_place_of_the_folder_of_a_scene_is_refused(root: Path, tmp_path:
     assert not list(outside.iterdir())
 
 
-@pytest.mark.parametrize("layout", ["zed", "kitti"])
-def test_scene_of_every_layout_is_a_folder_of_its_own(root: Path, tmp_path: Path, layout: str) -> None:
-    export(root, tmp_path / "out", layout=layout)
-    for name in FOLDERS.values():
-        found = files(tmp_path / "out" / name)
-        if layout == "zed":
-            images = {f"{eye}/{index:04d}.png" for eye in ("left", "right") for index in range(VIEWS)}
-            assert found == images | {"calibration.conf", "cameras.toml"}
-        else:
-            drive = "2000_01_01_drive_0001_sync"
-            assert sum(path.startswith(f"{drive}/proj_depth/groundtruth/image_02/") for path in found) == VIEWS
-            assert f"2000_01_01/{drive}/image_02/data/{VIEWS - 1:010d}.png" in found
-
-
 def test_command_exports_a_split(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["export", str(root), "--out", str(tmp_path / "out"), "--split", "train", "--views", "1"]
     assert main(command) == 0

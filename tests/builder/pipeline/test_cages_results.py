@@ -101,8 +101,6 @@ def test_commands_work_on_several_scenes(root: Path, tmp_path: Path) -> None:
         ("score", archive, "--data", root, "--html", tmp_path / "r.html", "--groups-csv", tmp_path / "g.csv"),
         ("table", archive, constant, "--data", root, "--latex", tmp_path / "t.tex"),
         ("compare", archive, constant, "--data", root),
-        ("study", "distance", archive, "--data", root),
-        ("study", "pseudo-reference", constant, "--reference", archive, "--data", root),
     )
     for command in commands:
         process = run_in_process(rebar_bench, *command)

@@ -1,0 +1,140 @@
+"""Options, tables, files and figures of the scripts."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import pandas as pd
+
+from rebar_depth_bench.console import require_extra, run_command
+from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.errors import InputError, printable
+from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
+from rebar_depth_bench.outputs import output_file, write_output
+from rebar_depth_bench.reporting.tables import frame_csv
+from rebar_depth_bench.scoring.rounding import rounded
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Number = TypeVar("Number", int, float)
+FIGURE_METADATA: Mapping[str, Mapping[str, None]] = {
+    ".png": {},
+    ".svg": {"Date": None},
+    ".pdf": {"CreationDate": None},
+}
+"""Formats of figures, and metadata without which the same numbers give the same bytes."""
+_MAX_LINE = 10_000
+"""Largest number of characters in a printed line."""
+
+
+def number(kind: type[Number], low: float, high: float = math.inf) -> Callable[[str], Number]:
+    """Return the ``type`` of an option that is a finite number of ``kind`` from ``low`` to ``high``."""
+
+    def convert(text: str) -> Number:
+        value = kind(text)
+        if not (math.isfinite(value) and low <= value <= high):
+            raise argparse.ArgumentTypeError(f"{text} is not a number from {low:g} to {high:g}")
+        return value
+
+    return convert
+
+
+def only_config(path: str, configs: Sequence[DatasetConfig], wanted: str | None) -> DatasetConfig:
+    """Return the config ``wanted``, or the only one if it is None. Raises ``InputError`` if there is none."""
+    names = [config.name for config in configs]
+    name = wanted or names[0]
+    if name not in names or (wanted is None and len(names) > 1):
+        raise InputError(f"{path}: holds {', '.join(names)}, expected --config with one of them")
+    return configs[names.index(name)]
+
+
+def add_outputs(parser: argparse.ArgumentParser) -> None:
+    """Add the options ``--json``, ``--csv`` and ``--figure``."""
+    add_output_file(parser, "--json", "write every number as JSON")
+    add_output_file(parser, "--csv", "write the table as CSV")
+    add_output_file(parser, "--figure", f"write the figure as {', '.join(FIGURE_METADATA)}")
+
+
+def run_script(
+    parser: argparse.ArgumentParser,
+    run: Callable[[argparse.Namespace], None],
+    arguments: Sequence[str] | None = None,
+) -> int:
+    """Run a script with its arguments; return its exit status: 2 for invalid input, which is printed."""
+    options = parser.parse_args(arguments)
+
+    def checked() -> None:
+        check_outputs(vars(options))
+        if options.figure and options.figure.suffix not in FIGURE_METADATA:
+            raise InputError(f"--figure names {options.figure}, expected one of *{', *'.join(FIGURE_METADATA)}")
+        run(options)
+
+    return run_command(checked)
+
+
+def flat_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Return nested rows as a table: ``{a: {value, interval}}`` becomes the columns a, a_low and a_high."""
+    table = pd.json_normalize([*rows], sep="_").rename(columns=lambda name: name.removesuffix("_value"))
+    for name in [name for name in table if name.endswith(("_interval", "_range"))]:
+        ends = [pair or (math.nan, math.nan) for pair in table[name]]
+        place, stem = table.columns.get_loc(name), name.removesuffix("_interval")
+        table.insert(place, f"{stem}_low", [low for low, _ in ends])
+        table.insert(place + 1, f"{stem}_high", [high for _, high in ends])
+        table = table.drop(columns=name)
+    return table
+
+
+def write_outputs(
+    options: argparse.Namespace,
+    content: Mapping[str, Any],
+    table: pd.DataFrame,
+    shown: Sequence[str],
+    notes: Sequence[str],
+    draw: Callable[[Figure], None],
+) -> None:
+    """Write the requested files; print the columns ``shown`` and the notes unless a file is standard output.
+
+    ``content`` is the JSON object, with its provenance; ``table`` the CSV; ``draw`` draws into an empty figure.
+    """
+    if options.json:
+        text = json.dumps(_round(content), indent=1, ensure_ascii=False, allow_nan=False)
+        write_output(options.json, f"{text}\n")
+    if options.csv:
+        write_output(options.csv, frame_csv(table.map(_round)))
+    if options.figure:
+        require_extra("plot", ["matplotlib"])
+        from matplotlib import rc_context
+        from matplotlib.figure import Figure
+
+        suffix, figure = options.figure.suffix, Figure(figsize=(9, 4.5), layout="constrained")
+        draw(figure)
+        with rc_context({"svg.hashsalt": "paper"}), output_file(options.figure) as path:
+            figure.savefig(path, format=suffix[1:], dpi=150, metadata=FIGURE_METADATA[suffix])
+    if prints_table(options):
+        names = table[[*shown]].map(lambda cell: printable(cell) if isinstance(cell, str) else cell)
+        rows = names.to_string(index=False, na_rep="-", float_format="{:.4g}".format)
+        archives = [f"{printable(one['method'])}: sha256:{one['sha256']}" for one in content["submissions"]]
+        dataset = [f"dataset {content['dataset']['digest']}"] if content["dataset"] else []
+        lines = "\n".join([rows, "", *notes, content["protocol"], *dataset, *archives]).split("\n")
+        print("\n".join(printable(line, _MAX_LINE) for line in lines))
+
+
+def figure_text(value: Any) -> Any:
+    """Return a name as the text of a figure, in which $ would begin a formula; other values unchanged."""
+    return printable(value).replace("$", r"\$") if isinstance(value, str) else value
+
+
+def _round(value: Any) -> Any:
+    """Return a JSON value with 12 significant digits of each number, and null for undefined numbers."""
+    if isinstance(value, float):
+        return rounded(value)
+    if isinstance(value, Mapping):
+        return {key: _round(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_round(item) for item in value]
+    return value

@@ -1,1 +1,0 @@
-"""Distance study: scale and error against distance."""

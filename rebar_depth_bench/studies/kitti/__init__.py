@@ -1,1 +1,0 @@
-"""KITTI study: published metrics on the Eigen split."""

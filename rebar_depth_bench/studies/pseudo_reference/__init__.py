@@ -1,1 +1,0 @@
-"""Pseudo-reference study: full-frame scores against estimated depth."""

@@ -1,1 +1,0 @@
-"""Scale-anchor study: scale from a few views of known depth."""

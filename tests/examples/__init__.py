@@ -1,0 +1,1 @@
+"""Scripts of ``examples``, run on small data."""

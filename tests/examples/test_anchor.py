@@ -1,0 +1,216 @@
+"""Figure 3 on the tiny rendered dataset: known scales, consistency with the scorer, draws, bad input."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import statistics
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+import anchor
+from anchor import draw_scales, errors_at_scales, spread
+from rebar_depth_bench import SubmissionWriter
+from rebar_depth_bench.errors import SubmissionError
+from rebar_depth_bench.scoring.metrics import depth_metrics
+from rebar_depth_bench.scoring.score import score
+from tests.examples.scripts import result_of, run, written_files
+
+Depths = dict[str, np.ndarray]
+Archive = Callable[..., Path]
+TRUE_SCALE = 1.7
+
+
+@pytest.fixture
+def noisy(tiny_truth: Depths) -> Depths:
+    """Return predictions that need ``TRUE_SCALE``, with 1 % noise per view, 3 % per pixel and a tenth missing."""
+    rng = np.random.default_rng(7)
+    predictions = {}
+    for view, depth_m in tiny_truth.items():
+        p_m = depth_m / TRUE_SCALE * np.exp(rng.normal(0, 0.01)) * (1 + rng.normal(0, 0.03, depth_m.shape))
+        p_m[rng.random(depth_m.shape) < 0.1] = np.nan
+        predictions[view] = p_m.astype(np.float32)
+    return predictions
+
+
+def test_known_scale_is_recovered(noisy: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path) -> None:
+    counts = ("--num-anchor-views", "1", "2", "3", "5", "9")
+    options = (archive_of(noisy), "--data", tiny_root, "--baseline-scale", str(TRUE_SCALE), *counts)
+    study = result_of(anchor, tmp_path, *options)
+    for row in study["rows"][:4]:
+        assert row["scale"]["low"] <= TRUE_SCALE <= row["scale"]["high"]
+        assert row["deviation_percent"]["low"] <= 0 <= row["deviation_percent"]["high"]
+    deviations = [row["scale"]["sd"] for row in study["rows"]]
+    assert deviations[0] > 2 * deviations[3], "more views, less spread"
+    all_views = study["rows"][-1]["scale"]
+    assert all_views["low"] == all_views["high"] == study["all_views"]["scale"]
+    assert all_views["mean"] == pytest.approx(TRUE_SCALE, rel=0.01)
+    assert study["coverage"] == pytest.approx(0.9, abs=0.02)
+    assert study["markers"] == 6
+
+
+def test_errors_match_score_of_scaled_archive(
+    noisy: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
+) -> None:
+    """Write the archive again in float32, multiplied by a drawn scale, and score it with the protocol's scorer."""
+    options = ("--data", tiny_root, "--num-anchor-views", "1", "3", "--draws", "2")
+    study = result_of(anchor, tmp_path, archive_of(noisy), *options)
+    for scaled in (study["given"], study["all_views"], *study["rows"][0]["draws"], study["rows"][1]["draws"][0]):
+        depths_m = {view: scaled["scale"] * depth_m.astype(np.float64) for view, depth_m in noisy.items()}
+        native = score(archive_of(depths_m, "scaled.zip"), tiny_root).tables["lattice"].native
+        assert native is not None
+        assert (scaled["abs_rel"], scaled["rmse_cm"]) == pytest.approx((native.abs_rel, native.rmse_cm), rel=1e-7)
+
+
+def test_views_without_prediction_are_excluded(
+    noisy: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    blank = sorted(noisy)[2]
+    archive = archive_of({**noisy, blank: np.zeros_like(noisy[blank])})
+    study = result_of(anchor, tmp_path, archive, "--data", tiny_root, "--num-anchor-views", "1", "8", "9", "50")
+    assert study["views_without_prediction"] == [blank]
+    assert [row["k"] for row in study["rows"]] == [1, 8]
+    assert study["left_out_k"] == [9, 50]
+    native = score(archive, tiny_root).tables["lattice"].native
+    assert native is not None
+    assert study["given"]["abs_rel"] == pytest.approx(native.abs_rel, rel=1e-9)
+    assert "without prediction: 1 of 9 views" in capsys.readouterr().out
+    nothing = archive_of({view: -depth_m for view, depth_m in noisy.items()}, "nothing.zip")
+    assert run(anchor, nothing, "--data", tiny_root, "--num-anchor-views", "2", "3") == 2
+    assert "0 of 9 views of lattice have a prediction, expected at least 2" in capsys.readouterr().err
+
+
+def test_bad_archive_is_refused_as_by_score(
+    noisy: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad = tmp_path / "bad.zip"
+    with zipfile.ZipFile(archive_of(noisy)) as source, zipfile.ZipFile(bad, "w") as target:
+        for name in source.namelist():
+            content = source.read(name)
+            target.writestr(name, content[:-7] if name.endswith(("0.npy", "5.npy")) else content)
+    for archive in (bad, tmp_path / "none.zip"):
+        with pytest.raises(SubmissionError) as by_score:
+            score(archive, tiny_root)
+        assert run(anchor, archive, "--data", tiny_root) == 2
+        assert capsys.readouterr().err.endswith(f"error: {by_score.value}\n")
+
+
+def test_archive_of_several_configs_needs_config_option(
+    tiny_truth: Depths, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    archive = tmp_path / "both.zip"
+    shape = next(iter(tiny_truth.values())).shape
+    manifest = json.loads((tiny_root / "manifest.json").read_text())
+    with SubmissionWriter(archive, method="test") as writer:
+        for config in manifest["configs"].values():
+            for view in config["views"]:
+                writer.add(view["view_id"], np.ones(shape, np.float32))
+    for wanted in ((), ("--config", "pier")):
+        assert run(anchor, archive, "--data", tiny_root, *wanted) == 2
+        assert "holds lattice, lattice-orbit, expected --config with one of them" in capsys.readouterr().err
+    options = ("--config", "lattice-orbit", "--num-anchor-views", "1")
+    assert result_of(anchor, tmp_path, archive, "--data", tiny_root, *options)["views"] == 2
+
+
+@pytest.mark.parametrize(
+    "option",
+    [("--baseline-scale", "0"), ("--num-anchor-views", "0"), ("--draws", "0"), ("--seed", "-1")],
+)
+def test_numbers_out_of_range_are_refused(
+    option: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        run(anchor, tmp_path / "a.zip", "--data", tmp_path, *option)
+    assert caught.value.code == 2
+    assert f"argument {option[0]}: {option[1]} is not a number from" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_outputs_are_deterministic_and_inputs_are_kept(
+    noisy: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    archive = archive_of(noisy)
+    arguments = (archive, "--data", tiny_root, "--num-anchor-views", "1", "5")
+    files = written_files(anchor, tmp_path, *arguments)
+    assert files == written_files(anchor, tmp_path, *arguments)
+    assert files["png"].startswith(b"\x89PNG")
+    content = json.loads(files["json"])
+    assert [len(row["draws"]) for row in content["rows"]] == [24, 24]
+    assert (
+        content["dataset"]["digest"]
+        == json.loads((tiny_root / "manifest.json").read_text())["ground_truth"]["digest"]
+    )
+    header, first, _ = files["csv"].decode().splitlines()
+    row = dict(zip(header.split(","), first.split(","), strict=True))
+    assert float(row["scale_mean"]) == content["rows"][0]["scale"]["mean"]
+    assert "Paper, Sec. III.C" in capsys.readouterr().out
+    for name in ("figure.svg", "figure.pdf"):
+        contents = []
+        for _ in range(2):
+            assert run(anchor, *arguments, "--figure", tmp_path / name) == 0
+            contents.append((tmp_path / name).read_bytes())
+        assert contents[0] == contents[1]
+    before = archive.read_bytes()
+    for option, target in (("--json", archive), ("--figure", tmp_path / "a.gif")):
+        assert run(anchor, *arguments, option, target) == 2
+    assert archive.read_bytes() == before
+
+
+@st.composite
+def views(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
+    depths = hnp.arrays(np.float64, draw(st.integers(1, 40)), elements=st.floats(0.05, 50.0))
+    z_m = draw(depths)
+    return draw(hnp.arrays(np.float64, len(z_m), elements=st.floats(0.05, 50.0))), z_m
+
+
+@given(views(), st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=5))
+def test_errors_at_scales_match_scaled_prediction(
+    pair: tuple[np.ndarray, np.ndarray], scales: list[float]
+) -> None:
+    p_m, z_m = pair
+    zero_crossings = z_m / p_m  # Scales at which a pixel's error changes sign.
+    all_scales = np.array([*scales, 1.0, *zero_crossings[:5]])
+    abs_rel, rmse_cm = errors_at_scales(p_m, z_m, all_scales)
+    expected = [depth_metrics(scale * p_m, z_m) for scale in all_scales]
+    assert abs_rel == pytest.approx([m.abs_rel for m in expected], rel=1e-9, abs=1e-12)
+    assert rmse_cm == pytest.approx([m.rmse_cm for m in expected], rel=1e-9, abs=1e-11)
+
+
+def test_overflowing_errors_are_infinite_without_warning() -> None:
+    errors = errors_at_scales(np.array([1e200, 1.0]), np.array([1.0, 1.0]), np.array([1.0, 2.0]))
+    assert np.isinf(errors[1]).all()
+    assert math.isnan(spread([1.0, math.inf])["mean"] or 0.0)
+
+
+def test_views_are_drawn_without_replacement_by_seed_and_k() -> None:
+    ratios = 2.0 ** np.arange(5)
+    possible = {float(np.median(three)) for three in itertools.combinations(ratios, 3)}
+    assert set(draw_scales(ratios, 3, 300, 0).tolist()) == possible == {2.0, 4.0, 8.0}
+    assert set(draw_scales(ratios, 5, 50, 0).tolist()) == {4.0}
+    first = draw_scales(ratios, 3, 24, 0).tolist()
+    assert draw_scales(ratios, 3, 12, 0).tolist() == first[:12]
+    assert draw_scales(ratios, 3, 24, 1).tolist() != first
+
+
+def test_views_are_drawn_uniformly() -> None:
+    draws = 6000
+    values, counts = np.unique(draw_scales(np.arange(1.0, 7.0), 1, draws, 3), return_counts=True)
+    assert values.tolist() == [1, 2, 3, 4, 5, 6]
+    expected = draws / 6
+    assert np.sum((counts - expected) ** 2 / expected) < 20.5  # Chi-square, 5 degrees of freedom: p = 0.001.
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=30))
+def test_spread_matches_statistics_module(values: list[float]) -> None:
+    found = spread(values)
+    assert found["mean"] == pytest.approx(statistics.fmean(values), rel=1e-12, abs=1e-9)
+    assert found["sd"] == pytest.approx(statistics.stdev(values), rel=1e-9, abs=1e-9)
+    assert (found["low"], found["high"]) == (min(values), max(values))
