@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Print what a push changes, and publish it with ``--yes``."""
-    repository = Repository(check_repository_id(options.hub_id, "--hub-id"), "dataset", options.revision)
+    repository = Repository(check_repository_id(options.hub_id, "--hub-id"), options.revision)
     if not re.fullmatch(PATH_PATTERN, options.revision):
         raise InputError(f"--revision is {escape_text(options.revision)}, expected the name of a branch")
     require_online()
