@@ -18,7 +18,6 @@ from rebar_depth_bench.cli import (
     submit,
     table,
     verify,
-    view,
 )
 from rebar_depth_bench.console import Command, add_commands, replace_renamed_options, run_command
 from rebar_depth_bench.output_options import check_outputs
@@ -37,7 +36,6 @@ COMMANDS: Mapping[str, Command] = {
     "predict": predict,
     "submit": submit,
     "cache": cache,
-    "view": view,
     "demo": demo,
 }
 
