@@ -6,10 +6,10 @@ import argparse
 import re
 import sys
 
+from dataset_builder.push.errors import require_online, require_token
+from dataset_builder.push.repository import MAIN_BRANCH, Repository, check_repository_id
 from rebar_depth_bench.console import ProgressBars, print_notice
 from rebar_depth_bench.errors import InputError, escape_text
-from rebar_depth_bench.hub.errors import require_online, require_token
-from rebar_depth_bench.hub.repository import MAIN_BRANCH, Repository, check_repository_id
 from rebar_depth_bench.paths import PATH_PATTERN
 
 SUMMARY = "publish a dataset folder as a dataset repository of the Hugging Face Hub"

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dataset_builder.push.errors import hub_errors
+from dataset_builder.push.repository import Changes, Remote, Repository
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.hub.errors import hub_errors
-from rebar_depth_bench.hub.repository import Changes, Remote, Repository
 from rebar_depth_bench.progress import Progress, silent
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dataset_builder.push.errors import hub_errors
 from rebar_depth_bench.errors import InputError, escape_text, printable
-from rebar_depth_bench.hub.errors import hub_errors
 
 if TYPE_CHECKING:
     from huggingface_hub.hf_api import RepoFile
