@@ -158,8 +158,8 @@ def test_gltf_is_refused_with_a_conversion_that_keeps_bars_and_height(tmp_path: 
     bars = scene_cage(write_scene(tmp_path, keys.format("obj"))).bars
     for bar in bars:
         assert np.ptp(bar.bar.axis_m, axis=0)[2] == pytest.approx(0.5, abs=1e-4)
-    x_m = sorted(bar.bar.axis_m[0][0] for bar in bars)
-    np.testing.assert_allclose(np.diff(x_m), [0.1, 0.2], atol=1e-4)
+    starts_m = sorted(bar.bar.axis_m[0][0] for bar in bars)
+    np.testing.assert_allclose(np.diff(starts_m), [0.1, 0.2], atol=1e-4)
 
 
 def test_placement_is_part_of_the_spec(tmp_path: Path) -> None:
