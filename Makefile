@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo quick test nightly versions docs dist format env-dev env-space system-packages cards sample-data clean
+.PHONY: help demo quick test nightly versions docs dist format env-dev system-packages cards sample-data clean
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -21,7 +21,7 @@ quick: env-dev ## Format, lint, types, import contracts, and the fast tests that
 test: system-packages env-dev ## Everything that CI runs: quick, and real renders, servers, databases and browser
 	scripts/check.sh $(BIN) test
 
-nightly: system-packages env-dev env-space ## Everything, with the long stress tests and 10,000 damaged inputs
+nightly: system-packages env-dev ## Everything, with the long stress tests and 10,000 damaged inputs
 	scripts/check.sh $(BIN) nightly
 	$(BIN)/python -m tests.fuzz --cases 10000 --log fuzz.jsonl
 
@@ -49,11 +49,8 @@ sample-data: system-packages env-dev ## Render the dataset in tests/data again, 
 env-dev: ## Make .venv for developing and testing
 	@scripts/environment.sh $(PYTHON) $(VENV) dev
 
-env-space: ## Make .venv-space for the Gradio app in examples/space, which is tested only where it exists
-	@scripts/environment.sh $(PYTHON) $(VENV)-space space
-
 system-packages: ## Check the system packages that rendering and testing need; as root on Debian, install them
 	@scripts/system_packages.sh blender browser uploads
 
 clean: ## Remove the environments and the demo's output
-	rm -rf $(VENV) $(VENV)-space $(VENV)-3.* build dist *.egg-info demo-output
+	rm -rf $(VENV) $(VENV)-3.* build dist *.egg-info demo-output

@@ -104,9 +104,7 @@ def _add_cages_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options for user's meshes and scenes, and for variants."""
-    parser.add_argument(
-        "--mesh", metavar="FILE", help="STL, PLY, OBJ or glTF file that replaces the lattice's rods"
-    )
+    parser.add_argument("--mesh", metavar="FILE", help="STL, PLY or OBJ file that replaces the lattice's rods")
     add_mesh_unit(parser)
     parser.add_argument(
         "--scene",

@@ -10,7 +10,6 @@ _EXTRA_MODULES = (
     "fastapi",
     "limits",
     "multipart",
-    "prometheus_client",
     "pydantic_settings",
     "sqlalchemy",
     "structlog",

@@ -1,4 +1,4 @@
-"""Service context shared by the routes: settings, dataset, database, archives, limits, metrics; and its checks."""
+"""Service context shared by the routes: settings, dataset, database, archives, limits; and its checks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from leaderboard.db.engine import Database
 from leaderboard.db.models import SubmissionModel
 from leaderboard.db.submissions import QUEUED, SCORING
 from leaderboard.db.versions import CurrentRankings, VersionReader
-from leaderboard.metrics import ServiceMetrics
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import ArchiveStore, delete_abandoned_uploads, make_folder
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, open_folder
@@ -46,7 +45,6 @@ class Service:
     database: Database
     archives: ArchiveStore
     spool: Path
-    metrics: ServiceMetrics
     versions: VersionReader
     rankings: CurrentRankings
     dataset_name: str
@@ -89,7 +87,6 @@ def open_service(settings: Settings) -> Iterator[Service]:
             database=database,
             archives=archives,
             spool=settings.spool,
-            metrics=ServiceMetrics(database),
             versions=versions,
             rankings=CurrentRankings(database, versions, folder.digest),
             dataset_name=name,

@@ -56,9 +56,6 @@ class Settings(BaseSettings):
         "",
         description="address of the leaderboard behind a proxy, for links; requests for other hosts are refused",
     )
-    metrics_port: int = Field(
-        0, ge=0, le=65535, description="port on 127.0.0.1 for Prometheus metrics; 0: no metrics"
-    )
     title: str = Field("Rebar depth leaderboard", description="title shown on the pages")
     contact: str = Field("", description="how to reach the operator for a token, shown on the pages")
     dataset_url: str = Field("", description="address from which submitters get the dataset, for links")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import ConfigDict, Strict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from rebar_depth_bench.errors import (
     MAX_PROBLEMS_SHOWN,
@@ -71,20 +71,6 @@ class Submission(_Answer):
     url: Annotated[str, _matches(r"https?://[^\s/][^\s]{0,1999}", "an http or https URL")]
     reason: Annotated[str, Expected("the reason of the failure")] | None = None
     archive_sha256: Annotated[str, _matches("[0-9a-f]{64}", "64 hex digits")] | None = None
-
-
-class OwnSubmission(Submission):
-    """Submission as its owner sees it in a list."""
-
-    method: Annotated[str, text(1000)]
-    public: bool
-    created_at: Annotated[str, text(100)]
-
-
-class SubmissionList(_Answer):
-    """Submissions of a token, newest first."""
-
-    submissions: Annotated[tuple[OwnSubmission, ...], Strict(False)]
 
 
 _Model = TypeVar("_Model", bound=_Answer)

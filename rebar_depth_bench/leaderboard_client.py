@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any, BinaryIO, Self
@@ -18,11 +18,9 @@ from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.leaderboard_answers import (
     SUBMISSION_ID,
     AnswerError,
-    OwnSubmission,
     Response,
     ServiceError,
     Submission,
-    SubmissionList,
     TokenInfo,
     detail,
     server_text,
@@ -93,28 +91,6 @@ class LeaderboardClient:
         Raises ``InputError`` for an unknown token or a wrong URL, ``ServiceError`` if the service does not answer.
         """
         return self._call("GET", "token", _deadline(REQUEST_TIMEOUT_S)).answer(TokenInfo, 200)
-
-    def submissions(self) -> tuple[OwnSubmission, ...]:
-        """Return the submissions of the token, newest first. Raises the errors of ``token``."""
-        answer = self._call("GET", "submissions", _deadline(REQUEST_TIMEOUT_S)).answer(SubmissionList, 200)
-        return answer.submissions
-
-    def change(self, submission_id: str, values: Mapping[str, object]) -> OwnSubmission:
-        """Change a submission of the token and return it: ``public`` and what is said about the method.
-
-        Raises ``InputError`` for another owner's or an unknown submission and for values that are refused, and
-        ``ServiceError`` if the service does not answer.
-        """
-        path = f"submissions/{_checked_id(submission_id)}"
-        response = self._call("PATCH", path, _deadline(REQUEST_TIMEOUT_S), json=dict(values))
-        return response.answer(OwnSubmission, 200)
-
-    def delete(self, submission_id: str) -> None:
-        """Delete a submission of the token with its archive and results. Raises the errors of ``change``."""
-        path = f"submissions/{_checked_id(submission_id)}"
-        response = self._call("DELETE", path, _deadline(REQUEST_TIMEOUT_S))
-        if response.status != 204:
-            response.answer(OwnSubmission, 204)
 
     def wait(self, submission_id: str, progress: Progress = silent, limit_s: float = WAIT_S) -> Submission:
         """Poll until the submission is scored or failed, and return it.

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Makes or reuses a virtual environment with one of the project's extras, or with what the app in examples/space needs.
+# Makes or reuses a virtual environment with one of the project's extras.
 # The extra "test" works on any supported version of Python.
-# usage: scripts/environment.sh PYTHON VENV EXTRA|space
+# usage: scripts/environment.sh PYTHON VENV EXTRA
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=$1 venv=$2 extra=$3
@@ -20,17 +20,12 @@ version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 
 # The file holds a digest of the requirements that were installed; other requirements install anew.
 installed="$venv/.installed-$extra"
-space=examples/space/requirements.txt
-wanted=$(cat pyproject.toml constraints.txt $space | "$python" -c 'import hashlib, sys; print(hashlib.sha256(sys.stdin.buffer.read()).hexdigest())')
+wanted=$(cat pyproject.toml constraints.txt | "$python" -c 'import hashlib, sys; print(hashlib.sha256(sys.stdin.buffer.read()).hexdigest())')
 if [ ! -x "$venv/bin/python" ] || [ "$(cat "$installed" 2>/dev/null)" != "$wanted" ]; then
     echo "installing the environment into $venv (a few minutes the first time)" >&2
     "$venv/bin/python" -m pip --version >/dev/null 2>&1 || "$python" -m venv --clear "$venv"
-    packages=(--constraint constraints.txt --editable ".[$extra]")
-    if [ "$extra" = space ]; then # Gradio needs an older pillow.
-        grep -v '^pillow==' constraints.txt >"$venv/constraints.txt"
-        packages=(--constraint "$venv/constraints.txt" --requirement "$space" --editable .)
-    fi
-    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check "${packages[@]}"
+    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
+        --constraint constraints.txt --editable ".[$extra]"
     echo "$wanted" >"$installed"
 fi
 

@@ -50,7 +50,7 @@ FIXTURE_MARKERS = {
     "chromium_program": "browser",
 }
 """Markers by the fixtures that start something heavy; a test has them through whichever fixtures it requests."""
-SHARED_SERVER_FILES = {f"tests/leaderboard/test_{name}.py" for name in ("browser", "client", "pages", "space")}
+SHARED_SERVER_FILES = {f"tests/leaderboard/test_{name}.py" for name in ("browser", "client", "pages")}
 """Files whose tests use the servers of the fixtures ``board`` and ``waiting``."""
 TIERS = {
     "quick": {*FIXTURE_MARKERS.values(), "slow", "nightly"},

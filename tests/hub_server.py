@@ -258,12 +258,9 @@ class HubServer:
                 files[value["path"]] = self.objects[value["oid"]]
             elif line["key"] == "deletedFile":
                 del files[value["path"]]
-        is_request = request.query_params.get("create_pr") == "1"
-        branch = "refs/pr/1" if is_request else argument
-        commit = repository.commit(branch, files, header["summary"])
-        url = f"{self.url}/{key}"
-        answer = {"commitUrl": f"{url}/commit/{commit}", "commitOid": commit, "pullRequestUrl": None}
-        return JSONResponse(answer | ({"pullRequestUrl": f"{url}/discussions/1"} if is_request else {}))
+        commit = repository.commit(argument, files, header["summary"])
+        url = f"{self.url}/{key}/commit/{commit}"
+        return JSONResponse({"commitUrl": url, "commitOid": commit, "pullRequestUrl": None})
 
 
 def _oid(name: str, content: bytes) -> str:

@@ -36,18 +36,6 @@ def is_present(probe: str) -> bool:
     return chromium_path() is not None if probe == "chromium" else shutil.which(probe) is not None
 
 
-def space_python() -> Path | None:
-    """Return the Python of the environment of ``examples/space`` (``make env-space``), or None without it.
-
-    Gradio needs another pillow than the project, so the app cannot run in the environment of the tests.
-    ``REBAR_SPACE_PYTHON`` names another one.
-    """
-    if named := os.environ.get("REBAR_SPACE_PYTHON"):
-        return Path(named)
-    folder = Path(__file__).parents[1] / ".venv-space"
-    return folder / "bin" / "python" if (folder / ".installed-space").exists() else None
-
-
 def require(use: str) -> None:
     """Skip the test unless the packages of ``use`` are installed; fail instead where ``CI`` is true."""
     # Fonts change only how pages look, and other distributions keep them elsewhere.

@@ -9,9 +9,6 @@ from rich.table import Table
 
 from rebar_depth_bench.errors import problem_summary
 
-NO_COLOUR = "built without colour"
-"""Reason for which checks of colour are skipped."""
-
 
 @dataclass(frozen=True)
 class Check:

@@ -20,8 +20,6 @@ from dataset_builder.audit.cycles_depth import cycles_difference_m, cycles_verdi
 from dataset_builder.audit.files import check_crossings, check_files, row_problems
 from dataset_builder.audit.geometry import axis_verdict, board_verdict, max_axis_distance_ratio, view_board_error
 from dataset_builder.audit.imported import imported_checks
-from dataset_builder.audit.markers import detect_view_markers, marker_verdict
-from dataset_builder.audit.photometric import photometric_fit, photometric_verdict
 from dataset_builder.audit.report import AuditReport, Check
 from dataset_builder.audit.scenes import cage_checks, merged_checks
 from dataset_builder.audit.stereo_consistency import epipolar_counts, epipolar_verdict
@@ -40,14 +38,12 @@ from rebar_depth_bench.progress import Progress, silent
 class ViewCheck:
     """Check over the views of a config: ``measure`` is applied to each view, ``verdict`` to all measurements.
 
-    ``views`` evenly spaced views of a config are measured, all of them if it is None; of a config without colour,
-    none for a check that ``needs_colour``.
+    ``views`` evenly spaced views of a config are measured, all of them if it is None.
     """
 
     measure: Callable[[AuditedConfig, AuditedView], Any]
     verdict: Callable[[AuditedConfig, Sequence[Any]], Check]
     views: int | None = None
-    needs_colour: bool = False
 
 
 VIEW_CHECKS: tuple[ViewCheck, ...] = (
@@ -56,15 +52,13 @@ VIEW_CHECKS: tuple[ViewCheck, ...] = (
     ViewCheck(epipolar_counts, epipolar_verdict),
     # The camera check compares K and distortion of every view, so a few views suffice for the lens model.
     ViewCheck(view_projection_error_px, projection_verdict, views=12),
-    ViewCheck(photometric_fit, photometric_verdict, needs_colour=True),
-    ViewCheck(detect_view_markers, marker_verdict, needs_colour=True),
 )
 """Checks of every view, in the order of the report."""
 
 
 _NOT_AUDITED = {"left_preview"}
 SAMPLED_SCENES = 8
-"""Scenes of a config of several scenes in which colour is checked and depth is rendered again."""
+"""Scenes of a config of several scenes in which depth is rendered again."""
 
 
 def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent) -> AuditReport:
@@ -101,7 +95,7 @@ def _config_checks(config: DatasetConfig, root: Path, depth_views: int, progress
 def _scenes_checks(config: DatasetConfig, root: Path, depth_views: int, progress: Progress) -> Iterator[Check]:
     """Yield the checks of a config of several scenes, each of all scenes together.
 
-    Colour is checked, and depth rendered again, in ``SAMPLED_SCENES`` of them.
+    Depth is rendered again in ``SAMPLED_SCENES`` of them.
     """
     scenes = config.by_scene()
     sampled = set(subset(len(scenes), SAMPLED_SCENES))
@@ -110,22 +104,20 @@ def _scenes_checks(config: DatasetConfig, root: Path, depth_views: int, progress
         views = depth_views if number in sampled else 0
         steel = read_bars(root / BARS_FILE)[scene.scene.name]
         checks += cage_checks(scene, steel)
-        checks += _scene_checks(scene, root, views, silent, with_colour=number in sampled)
+        checks += _scene_checks(scene, root, views, silent)
         progress(f"audit of {config.name}", number + 1, len(scenes))
     yield from merged_checks(config.name, checks)
 
 
-def _scene_checks(
-    config: DatasetConfig, root: Path, depth_views: int, progress: Progress, *, with_colour: bool = True
-) -> Iterator[Check]:
+def _scene_checks(config: DatasetConfig, root: Path, depth_views: int, progress: Progress) -> Iterator[Check]:
     """Yield the checks of a config of one scene, or restricted to one scene."""
     name, mesh = config.label, root / config.mesh
     steel = read_bars(root / BARS_FILE)[config.scene.name]
     variants, board = config.scene.appearance.variants, config.scene.board
-    audited = AuditedConfig(name, variants, steel, board, config.colour is not None)
+    audited = AuditedConfig(name, variants, steel, board)
     aim_m, aim_problems = checked_aim_point_m(config, mesh)
     expected = expected_views(config, aim_m, steel)
-    accumulator = _AuditAccumulator(config, audited, expected, depth_views, with_colour)
+    accumulator = _AuditAccumulator(config, audited, expected, depth_views)
     for row in iterate_rows(config, [column for column in COLUMNS if column not in _NOT_AUDITED]):
         accumulator.add(row)
         progress(f"audit of {name}", accumulator.rows, len(config.views))
@@ -150,17 +142,11 @@ class _AuditAccumulator:
         audited: AuditedConfig,
         expected: Sequence[ExpectedView],
         depth_views: int,
-        with_colour: bool,
     ) -> None:
         self._config, self._audited, self._expected = config, audited, expected
         self._bar_ids = {bar.bar_id for bar in audited.steel}
         self._rays = RayCache()
-        self._measured = [
-            set()
-            if check.needs_colour and not (with_colour and audited.has_colour)
-            else set(subset(len(config.views), check.views))
-            for check in VIEW_CHECKS
-        ]
+        self._measured = [set(subset(len(config.views), check.views)) for check in VIEW_CHECKS]
         self._cycles_indices = set(subset(len(config.views), depth_views) if depth_views else ())
         self._problems: list[str] = []
         self.rows = 0

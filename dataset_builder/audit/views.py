@@ -12,8 +12,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import ESTIMATED_ROLE
-from dataset_builder.scene.variants import LIGHT_SLOT, PROPS_SLOT, variants_of_slot
-from dataset_builder.scene.variants.image_light import IMAGE_LIGHTS
+from dataset_builder.scene.variants import PROPS_SLOT, variants_of_slot
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
@@ -29,7 +28,6 @@ class AuditedConfig:
     variants: tuple[str, ...]
     steel: tuple[Bar, ...]
     board: BoardSpec | None
-    has_colour: bool = True
 
     @property
     def bars_with_known_axis(self) -> tuple[Bar, ...]:
@@ -40,11 +38,6 @@ class AuditedConfig:
     def has_props(self) -> bool:
         """Whether the scene has props, which may stand on the board or hide it."""
         return bool(variants_of_slot(self.variants, PROPS_SLOT))
-
-    @property
-    def light_may_hide_markers(self) -> bool:
-        """Whether the light may hide markers from the detector; panoramas are exposed like the standard light."""
-        return not set(variants_of_slot(self.variants, LIGHT_SLOT)) <= set(IMAGE_LIGHTS)
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,8 +80,20 @@ class MeshFileSpec(PinnedFile):
     kind: str = "mesh-file"
 
 
+_GLTF_CONVERSION = (
+    ": convert glTF to OBJ, as with python -c "
+    "\"import trimesh; trimesh.load_scene('FILE.glb').export('FILE.obj')\", "
+    'and name the OBJ file in a scene TOML with mesh = "FILE.obj", unit = "m" and up = "y"'
+)
 _LIMITS = {".toml": TOML_BYTES, ".ifc": IFC_BYTES}
 """Limits of the files of an assembly by suffix; those of meshes have ``MESH_BYTES``."""
+
+
+def unsupported_type(path: str | os.PathLike[str], kind: str, expected: str) -> str:
+    """Return the message about a file of a type that is not read; for glTF it names the conversion."""
+    suffix = Path(path).suffix.lower()
+    conversion = _GLTF_CONVERSION if suffix in (".glb", ".gltf") else ""
+    return f"{path}: unsupported {kind} file type {suffix!r}, expected {expected}{conversion}"
 
 
 def read_assembly_file(path: str | os.PathLike[str], kind: str, suffixes: Collection[str]) -> bytes:
@@ -91,5 +103,5 @@ def read_assembly_file(path: str | os.PathLike[str], kind: str, suffixes: Collec
     """
     suffix = Path(path).suffix.lower()
     if suffix not in suffixes:
-        raise MeshError(f"{path}: unsupported {kind} file type {suffix!r}, expected {', '.join(suffixes)}")
+        raise MeshError(unsupported_type(path, kind, ", ".join(suffixes)))
     return read_file(Path(path), _LIMITS.get(suffix, MESH_BYTES), f"a {kind} file", MeshError)

@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from dataset_builder.config.cages import CAGES
 from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
-from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
+from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec, unsupported_type
 from dataset_builder.config.scene_name import scene_name_of
 from dataset_builder.config.scene_schema import SCENE_NAME, SceneToml, read_scene_toml
 from dataset_builder.config.specs import (
@@ -34,7 +34,7 @@ from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.scene.assemblies import aim_point_m, check_above_ground, check_fits, make_assembly
 from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, read_cage
-from dataset_builder.scene.assemblies.mesh_file import default_up, mesh_file_spec
+from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
 from dataset_builder.scene.assemblies.mesh_import import SUFFIXES as MESH_SUFFIXES
 from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.errors import InputError, MeshError
@@ -152,7 +152,7 @@ def _read_scene(path: Path) -> SceneToml:
     if suffix == ".ifc":
         return SceneToml(ifc=path.name)
     if suffix != ".toml":
-        raise InputError(f"{path}: unsupported scene file type {suffix!r}, expected .toml or .ifc")
+        raise InputError(unsupported_type(path, "scene", ".toml or .ifc"))
     return read_scene_toml(read_file(path, TOML_BYTES, "a scene file", InputError), str(path), RESERVED_NAMES)
 
 
@@ -168,10 +168,9 @@ def _check_name(name: str, path: Path) -> None:
 def _assembly_spec(scene_toml: SceneToml, path: Path) -> CageFileSpec | MeshFileSpec:
     if scene_toml.mesh is not None:
         mesh = str(path.parent / scene_toml.mesh)
-        placement = scene_toml.placement(default_up(mesh))
-        return mesh_file_spec(mesh, scene_toml.unit_m, placement, scene_toml.selections)
+        return mesh_file_spec(mesh, scene_toml.unit_m, scene_toml.placement, scene_toml.selections)
     file = path if scene_toml.ifc is None else path.parent / scene_toml.ifc
-    return cage_file_spec(str(file), scene_toml.placement("z"), scene_toml.selections, scene_toml.trust)
+    return cage_file_spec(str(file), scene_toml.placement, scene_toml.selections, scene_toml.trust)
 
 
 @contextmanager

@@ -35,7 +35,7 @@ from typing import Annotated, Any
 from pydantic import Strict, ValidationInfo, field_validator
 
 from dataset_builder.config.camera_tables import AnyCamerasTable, camera_conflicts, list_of, read_cameras
-from dataset_builder.config.file_specs import Origin, PlacementSpec, Up
+from dataset_builder.config.file_specs import Origin, PlacementSpec
 from dataset_builder.config.source_tables import (
     MAX_SELECTIONS,
     OriginKey,
@@ -160,7 +160,7 @@ class SceneToml(StrictModel):
     environment: Annotated[str, one_of(*SURROUNDINGS)] | None = None
     board: Annotated[int | bool, Expected("6, 12 or false", lambda markers: markers in (0, 6, 12))] | None = None
     cameras: AnyCamerasTable | None = None
-    up: UpKey | None = None
+    up: UpKey = "z"
     origin: OriginKey | None = None
     rotate_deg: RotationKey = 0.0
     translate: TranslationKey = (0.0, 0.0, 0.0)
@@ -172,11 +172,12 @@ class SceneToml(StrictModel):
         """One file unit in metres; 1.0 if an IFC scene has no unit."""
         return _unit_m(self.unit)
 
-    def placement(self, up: Up) -> PlacementSpec:
-        """Return the placement, metres; ``up`` is the default vertical axis of the file that the scene names."""
+    @property
+    def placement(self) -> PlacementSpec:
+        """Placement in metres."""
         x, y, z = (to_metres(value, self.unit_m) for value in self.translate)
         origin: Origin = self.origin or ("keep" if self.bar else "centre")
-        return PlacementSpec(self.up or up, origin, self.rotate_deg, (x, y, z))
+        return PlacementSpec(self.up, origin, self.rotate_deg, (x, y, z))
 
     @property
     def selections(self) -> tuple[Selection, ...]:

@@ -2,7 +2,7 @@
 
 ```toml
 ifc = "building.ifc"          # or mesh = "cage.stl", a file beside this one
-up = "z"                      # vertical axis of the file, or "y"; default: y for glTF, else z
+up = "z"                      # vertical axis of the file, the default, or "y"
 origin = "centre"             # above the world's origin and on the ground, the default for mesh and ifc; or "keep"
 rotate_deg = 30               # about the vertical axis, after centring
 translate = [0.5, 0, 0]       # at last; in this file's unit

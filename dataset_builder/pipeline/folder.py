@@ -24,7 +24,6 @@ from rebar_depth_bench.view_ids import SPLITS
 MESHES = "meshes"
 PICTURES = "pictures"
 CARD = "README.md"
-EVAL_FILE = "eval.yaml"
 LOCK = "lock"
 SHARD_DIGEST_CHARACTERS = 12
 
@@ -101,7 +100,7 @@ def remove_unlisted_files(out: Path, listed: Collection[str]) -> None:
 
 def remove_temporary_files(out: Path) -> None:
     """Delete the temporary files that a killed build left."""
-    top_names = re.compile("|".join(map(re.escape, (MANIFEST_FILE, BARS_FILE, CROSSINGS_FILE, CARD, EVAL_FILE))))
+    top_names = re.compile("|".join(map(re.escape, (MANIFEST_FILE, BARS_FILE, CROSSINGS_FILE, CARD))))
     for folder, own_name in [(out, top_names), *_own_folders(out)]:
         for path in list(folder.iterdir()):
             target = temporary_target(path.name)

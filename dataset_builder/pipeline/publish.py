@@ -1,10 +1,10 @@
 """Publishing of staged configs into the dataset folder, and the lock that allows one build per folder.
 
 Files are written in an order that can be repaired after an interruption at any point: first the shards, whose
-names contain the digest of their content; then mesh, contact sheet, bars and crossings; then the other pictures,
-the card and ``eval.yaml``; the manifest last. Files that the new manifest does not list are removed afterwards. If
-the card, ``eval.yaml``, bars, crossings or pictures of a folder do not match its manifest, a build was interrupted
-in between or an earlier version built it, and the next build repairs them.
+names contain the digest of their content; then mesh, contact sheet, bars and crossings; then the other pictures
+and the card; the manifest last. Files that the new manifest does not list are removed afterwards. If the card,
+bars, crossings or pictures of a folder do not match its manifest, a build was interrupted in between or an earlier
+version built it, and the next build repairs them.
 """
 
 from __future__ import annotations
@@ -15,14 +15,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from cards import benchmark_tasks, dataset_card
+from cards import dataset_card
 from dataset_builder.config.catalog import CONFIGS
 from dataset_builder.config.specs import SceneConfigSpec
 from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.contact_sheet import write_contact_sheet, write_scenes_strip
 from dataset_builder.pipeline.folder import (
     CARD,
-    EVAL_FILE,
     LOCK,
     MESHES,
     PICTURES,
@@ -92,13 +91,13 @@ def scene_entries(config: DatasetConfig) -> Mapping[str, Mapping[str, Any]]:
 
 
 def repair_metadata(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    """Rewrite bars, crossings, card, ``eval.yaml``, pictures and manifest if any of them does not match.
+    """Rewrite bars, crossings, card, pictures and manifest if any of them does not match.
 
     ``plans`` are those of one config.
     """
     folder = open_folder(out)
     config = folder.config(plans[0].spec.name)
-    if not _files_match(folder, (BARS_FILE, CROSSINGS_FILE, CARD, EVAL_FILE, STRIP, config.sheet)):
+    if not _files_match(folder, (BARS_FILE, CROSSINGS_FILE, CARD, STRIP, config.sheet)):
         write_contact_sheet(config, out / config.sheet)
         write_scene_bars(out, {plan.spec.scene.name: assembly_bars(plan.spec.scene.assembly) for plan in plans})
         write_manifest(out, folder.config_by_name)
@@ -196,7 +195,7 @@ def publish_shards(
 
 
 def write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
-    """Write contact sheets that are missing, strip, card, ``eval.yaml`` and manifest; remove files not listed."""
+    """Write contact sheets that are missing, strip, card and manifest; remove files not listed."""
     order = [*CONFIGS, *sorted(set(configs) - set(CONFIGS))]
     ordered = [configs[name] for name in order if name in configs]
     version, digest = software_version(), views_digest(view for config in ordered for view in config.views)
@@ -206,10 +205,7 @@ def write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
     by_scene = {_strip_key(config): config for config in reversed(ordered)}
     write_scenes_strip(list(reversed(by_scene.values())), out / STRIP)
     write_text(out / CARD, dataset_card(version, digest, ordered))
-    write_text(
-        out / EVAL_FILE, benchmark_tasks([config.name for config in ordered if TEST_SPLIT in config.splits])
-    )
-    metadata = {CARD, EVAL_FILE, BARS_FILE, CROSSINGS_FILE}
+    metadata = {CARD, BARS_FILE, CROSSINGS_FILE}
     manifest = {
         "format": MANIFEST_FORMAT,
         "version": version,

@@ -6,10 +6,10 @@ import argparse
 import re
 import sys
 
+from dataset_builder.push.errors import require_online, require_token
+from dataset_builder.push.repository import MAIN_BRANCH, Repository, check_repository_id
 from rebar_depth_bench.console import ProgressBars, print_notice
 from rebar_depth_bench.errors import InputError, escape_text
-from rebar_depth_bench.hub.errors import require_online, require_token
-from rebar_depth_bench.hub.repository import MAIN_BRANCH, Repository, check_repository_id
 from rebar_depth_bench.paths import PATH_PATTERN
 
 SUMMARY = "publish a dataset folder as a dataset repository of the Hugging Face Hub"
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Print what a push changes, and publish it with ``--yes``."""
-    repository = Repository(check_repository_id(options.hub_id, "--hub-id"), "dataset", options.revision)
+    repository = Repository(check_repository_id(options.hub_id, "--hub-id"), options.revision)
     if not re.fullmatch(PATH_PATTERN, options.revision):
         raise InputError(f"--revision is {escape_text(options.revision)}, expected the name of a branch")
     require_online()

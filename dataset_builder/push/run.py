@@ -9,12 +9,12 @@ from typing import Any
 from huggingface_hub import DatasetCard, HfApi
 from huggingface_hub.constants import REPOCARD_NAME
 
+from dataset_builder.push.commit import commit_changes
+from dataset_builder.push.errors import hub_errors
+from dataset_builder.push.repository import Changes, Remote, Repository, changes
 from dataset_builder.push.verified import VerifiedFolder
 from rebar_depth_bench.data.manifest import MANIFEST_FILE
 from rebar_depth_bench.errors import InputError, escape_text, problem_summary
-from rebar_depth_bench.hub.commit import commit_changes
-from rebar_depth_bench.hub.errors import hub_errors
-from rebar_depth_bench.hub.repository import Changes, Remote, Repository, changes
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.reading import parse_json
 from rebar_depth_bench.version import software_version

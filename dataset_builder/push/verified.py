@@ -9,11 +9,11 @@ from pathlib import Path
 from huggingface_hub import DatasetCard
 from huggingface_hub.constants import REPOCARD_NAME
 
+from dataset_builder.push.repository import LocalFile
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, open_folder
 from rebar_depth_bench.data.verification import file_problems
 from rebar_depth_bench.errors import DatasetError, Problem, escape_text, exception_summary
-from rebar_depth_bench.hub.repository import LocalFile
 from rebar_depth_bench.progress import Progress, silent
 
 

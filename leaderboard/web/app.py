@@ -67,7 +67,6 @@ def make_app(service: Service) -> FastAPI:
         RequestMiddleware,
         reads=settings.read_rate_limit,
         writes=settings.write_rate_limit,
-        metrics=service.metrics,
     )
     app.add_middleware(EarlyResponseMiddleware)
     app.add_exception_handler(HTTPException, _handle_http_exception)

@@ -1,4 +1,4 @@
-"""ASGI middleware: rate limits, security headers, access log, metrics, and early responses to uploads."""
+"""ASGI middleware: rate limits, security headers, access log, and early responses to uploads."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from leaderboard.metrics import ServiceMetrics
 from leaderboard.web.pages.rendering import error_response
 
 CONTENT_POLICY = (
@@ -38,19 +37,18 @@ BODY_IDLE_S = 60.0
 """Time without a byte of the body after which a request is regarded as given up."""
 _HEALTH_CHECKS = parse("600/minute")
 _READ_METHODS = ("GET", "HEAD", "OPTIONS")
-_KNOWN_METHODS = (*_READ_METHODS, "POST", "PUT", "PATCH", "DELETE")
 _LOG = structlog.get_logger("http")
 
 
 class RequestMiddleware:
-    """ASGI middleware for rate limits, security headers, access log and metrics.
+    """ASGI middleware for rate limits, security headers and access log.
 
     Rate limits are per client address, that of the connection; behind a proxy uvicorn takes it from the headers.
     ``reads`` and ``writes`` are limits such as ``600/minute``.
     """
 
-    def __init__(self, app: ASGIApp, *, reads: str, writes: str, metrics: ServiceMetrics) -> None:
-        self._app, self._metrics = app, metrics
+    def __init__(self, app: ASGIApp, *, reads: str, writes: str) -> None:
+        self._app = app
         self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
         self._reads, self._writes = parse(reads), parse(writes)
 
@@ -96,10 +94,6 @@ class RequestMiddleware:
 
     def _log_request(self, method: str, scope: Mapping[str, object], status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", "none")  # Not the path, which may contain a private id.
-        # Clients can send any method name, and each label value would create a permanent time series.
-        method = method if method in _KNOWN_METHODS else "other"
-        self._metrics.requests.labels(method, route, str(status)).inc()
-        self._metrics.request_seconds.labels(method, route).observe(seconds)
         _LOG.info("request", method=method, route=route, status=status, ms=round(1000 * seconds, 1))
 
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 import signal
 import socket
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 
 import structlog
 import uvicorn
-from prometheus_client import start_http_server
 
 from leaderboard.db.engine import without_password
 from leaderboard.scoring.worker import running_workers
-from leaderboard.service import Service, open_service
+from leaderboard.service import open_service
 from leaderboard.settings import Settings
 from leaderboard.storage.retention import archive_retention
 from leaderboard.web.app import make_app
@@ -62,32 +59,10 @@ def serve(settings: Settings) -> None:
         details["hidden_truth"] = settings.hidden_truth
         _LOG.info("serving", database=without_password(settings.database_url), **details)
         stores = (service.database, service.archives, service.folder, settings)
-        with (
-            metrics_server(service),
-            archive_retention(*stores),
-            running_workers(service.database, settings) as workers,
-        ):
+        with archive_retention(*stores), running_workers(service.database, settings) as workers:
             service.workers.extend(workers)
             server.run(sockets=[listener])
         _LOG.info("stopped")
-
-
-@contextmanager
-def metrics_server(service: Service) -> Iterator[None]:
-    """Serve the metrics on a port of their own, which only this machine can reach, if the settings name one.
-
-    Raises ``InputError`` if the port is in use.
-    """
-    with ExitStack() as stack:
-        if port := service.settings.metrics_port:
-            try:
-                server, thread = start_http_server(port, "127.0.0.1", service.metrics.registry)
-            except OSError as error:
-                reason = f"cannot listen on this port for metrics: {error.strerror}"
-                raise InputError(f"127.0.0.1:{port}: {reason}") from None
-            for end in (thread.join, server.server_close, server.shutdown):
-                stack.callback(end)
-        yield
 
 
 def listening_socket(settings: Settings) -> socket.socket:

@@ -14,14 +14,11 @@ from rebar_depth_bench.cli import (
     demo,
     methods,
     predict,
-    push_results,
     score,
     score_crossings,
-    submissions,
     submit,
     table,
     verify,
-    view,
 )
 from rebar_depth_bench.console import run_command
 from rebar_depth_bench.output_options import check_outputs
@@ -56,10 +53,7 @@ COMMANDS: Mapping[str, Command] = {
     "methods": methods,
     "predict": predict,
     "submit": submit,
-    "submissions": submissions,
-    "push-results": push_results,
     "cache": cache,
-    "view": view,
     "demo": demo,
 }
 

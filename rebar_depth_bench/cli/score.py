@@ -14,7 +14,6 @@ from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.outputs import write_output
-from rebar_depth_bench.reporting.eval_results import check_hub_id, eval_results
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.html.view_browser import VIEWS_SHOWN
@@ -48,10 +47,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also compute boundary, point cloud, layer, per-bar inspection and alignment measures",
     )
     add_output_file(parser, "--extended-csv", "write the extended measures as CSV (implies --extended)")
-    add_output_file(
-        parser, "--eval-results", "write the rank errors as .eval_results YAML of the Hugging Face Hub"
-    )
-    parser.add_argument("--hub-id", metavar="ID", help="id of the dataset on the Hub, for --eval-results")
     add_workers(parser)
 
 
@@ -59,17 +54,12 @@ def run(options: argparse.Namespace) -> None:
     """Score an archive, write the requested files and print the tables."""
     if options.html_views < 0:
         raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
-    if options.hub_id and not options.eval_results:
-        raise InputError("--hub-id is given without --eval-results, expected both or neither")
-    hub_id = check_hub_id(options.hub_id) if options.eval_results else ""
     with open_evaluation(options.archive, options.data, expect_digest=options.expect_digest) as evaluation:
         with ProgressBars() as bars:
             result = score_evaluation(evaluation, workers=options.workers, progress=bars.update)
             if options.extended or options.extended_csv:
                 extended = score_extended(result, evaluation, workers=options.workers, progress=bars.update)
                 result = replace(result, extended=extended)
-        if options.eval_results:  # Before any file is written: it fails if no config is ranked.
-            entries, notes = eval_results(result, evaluation.folder, hub_id)
         names = ", ".join(config.name for config in evaluation.configs)
         print_verified(
             evaluation.folder, f"views of {names} verified when their ground truth was stored in the cache"
@@ -77,10 +67,6 @@ def run(options: argparse.Namespace) -> None:
         mistakes = diagnose(evaluation)
         if options.html:
             write_report(result, evaluation, options.html, mistakes=mistakes, views_shown=options.html_views)
-    if options.eval_results:
-        write_output(options.eval_results, entries)
-        for note in notes:
-            print_notice(note)
     if options.json:
         write_output(options.json, result.to_json())
     if options.csv:

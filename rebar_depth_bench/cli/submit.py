@@ -31,15 +31,6 @@ _MAX_TOKEN_CHARACTERS = 10_000
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     add_archive(parser)
-    add_leaderboard(parser)
-    waiting = parser.add_mutually_exclusive_group()
-    waiting.add_argument("--no-wait", action="store_true", help="do not wait until the submission is scored")
-    add_seconds(waiting, "--wait", WAIT_S, "time limit on waiting until the submission is scored")
-    add_output_file(parser, "--json", "write the result as JSON")
-
-
-def add_leaderboard(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that name the leaderboard and the token."""
     parser.add_argument("--url", required=True, help="URL of the leaderboard")
     parser.add_argument(
         "--token-file",
@@ -47,6 +38,10 @@ def add_leaderboard(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help=f"file with the token (default: the environment variable {TOKEN_VARIABLE}, or a prompt)",
     )
+    waiting = parser.add_mutually_exclusive_group()
+    waiting.add_argument("--no-wait", action="store_true", help="do not wait until the submission is scored")
+    add_seconds(waiting, "--wait", WAIT_S, "time limit on waiting until the submission is scored")
+    add_output_file(parser, "--json", "write the result as JSON")
 
 
 def run(options: argparse.Namespace) -> None:

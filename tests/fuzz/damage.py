@@ -197,8 +197,6 @@ _ARCHIVE: Mapping[str, Damage] = {"entries": _damage_archive}
 _IMAGE: Mapping[str, Damage] = {"size": containers.damage_image_size}
 _LEVELS: Mapping[str, Mapping[str, Damage]] = {
     ".conf": _TEXT,
-    ".glb": _TEXT,
-    ".gltf": _JSON,
     ".ifc": _TEXT,
     ".json": _JSON,
     ".md": _TEXT,

@@ -41,10 +41,7 @@ METADATA = (
     f"{ROOT}/bars.parquet",
     f"{ROOT}/crossings.parquet",
 )
-OPTIONAL_OUTPUTS = (
-    *("--html", "r.html", "--csv", "r.csv", "--extended-csv", "e.csv", "--html-views", "1"),
-    *("--eval-results", "h.yaml", "--hub-id", "org/rebar"),
-)
+OPTIONAL_OUTPUTS = (*("--html", "r.html", "--csv", "r.csv", "--extended-csv", "e.csv", "--html-views", "1"),)
 
 
 def write_dataset(workspace: Workspace) -> None:
@@ -185,7 +182,6 @@ _DATASET_FILES = (
     "README.md",
     "bars.parquet",
     "crossings.parquet",
-    "eval.yaml",
     "pictures/*.webp",
     "meshes/*.ply",
     "*/test-*.parquet",

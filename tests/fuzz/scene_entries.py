@@ -35,15 +35,6 @@ def _dataset_ply(path: Path) -> None:
     write_mesh_ply(path, np.asarray(_rods().vertices), np.asarray(_rods().faces), bar_id)
 
 
-def _scene(path: Path) -> None:
-    trimesh.Scene({f"rod {number}": rod for number, rod in enumerate(_RODS)}).export(path)
-
-
-def _gltf(path: Path) -> None:
-    scene = trimesh.Scene({f"rod {number}": rod for number, rod in enumerate(_RODS)})
-    path.write_bytes(trimesh.exchange.gltf.export_gltf(scene, embed_buffers=True)["model.gltf"])
-
-
 def _read_mesh(path: Path) -> object:
     return [(bar.bar_id, bar.diameter_m, bar.axis_m) for bar in load_cage(mesh_file_spec(path, "m")).bars]
 
@@ -103,8 +94,6 @@ SCENE_ENTRIES = (
     _mesh("mesh: ASCII STL", 4, "a.stl", lambda path: _rods().export(path, file_type="stl_ascii")),
     # A truncated OBJ file is a shorter OBJ file.
     _mesh("mesh: OBJ", 4, "a.obj", lambda path: _rods().export(path), shows_truncation=False),
-    _mesh("mesh: glTF", 5, "a.gltf", _gltf),
-    _mesh("mesh: binary glTF", 4, "a.glb", _scene),
     _calibration("calibration: TOML", 8, "rig.toml", partial(_text, TOML)),
     _calibration("calibration: conf", 8, "SN1.conf", partial(_text, CONF)),
 )

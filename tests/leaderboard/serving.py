@@ -42,11 +42,6 @@ class Server:
     state: Path
     db: str = ""
     log: list[str] = field(default_factory=list)
-    metrics_port: int = 0
-
-    def metrics(self) -> str:
-        """Return the metrics of the server."""
-        return str(httpx2.get(f"http://127.0.0.1:{self.metrics_port}/metrics", timeout=30).text)
 
     def token(self, name: str) -> str:
         """Create a token with the command line."""
@@ -136,12 +131,10 @@ def running_server(
 
     The process leads its own process group, so that its child processes can be killed with it.
     """
-    metrics_port = free_port()
-    settings = {"metrics_port": metrics_port, **settings}
     options = [part for name, value in settings.items() for part in (f"--{name.replace('_', '-')}", str(value))]
     arguments = ["serve", "--data", str(root), "--state-dir", str(state), "--port", "0", *options]
     with _running_command(arguments, environment or {}) as (process, log):
-        yield Server(_address(process, log), process, state, str(settings.get("db", "")), log, metrics_port)
+        yield Server(_address(process, log), process, state, str(settings.get("db", "")), log)
 
 
 @contextmanager

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import csv
+import html
 import io
 import json
+import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -18,6 +21,7 @@ import pytest
 
 from rebar_depth_bench import load
 from rebar_depth_bench.errors import Problem
+from tests import requirements
 from tests.leaderboard.conftest import SharedServer, WriteArchive, filled_board
 from tests.leaderboard.postgres import Postgres
 from tests.leaderboard.serving import RunServer, Server, distinct_archive
@@ -236,6 +240,29 @@ def test_private_submission_is_visible_to_owner_only(private_server: Server, wri
         is False
     )
     assert submission_id not in {row["id"] for row in rows(private_server)}
+
+
+def test_curl_commands_of_the_page_list_edit_and_delete(
+    private_server: Server, write_archive: WriteArchive
+) -> None:
+    requirements.require("uploads")
+    token = private_server.token("curl")
+    submission_id = private_server.submit_accepted(write_archive("by curl", 1.05), token)
+    private_server.wait_until_ended(submission_id)
+    page = call(private_server, "GET", "/how-to-submit").text
+    (commands,) = re.findall(r'id="manage">(.*?)</pre>', page, re.DOTALL)
+    environment = {**os.environ, "REBAR_LEADERBOARD_TOKEN": token}
+    answers = []
+    for command in re.split(r"\n(?=curl)", html.unescape(commands)):
+        script = command.replace("/ID", f"/{submission_id}").replace("curl ", "curl -sS -w '\n%{http_code}' ")
+        done = subprocess.run(["sh", "-c", script], capture_output=True, text=True, check=True, env=environment)
+        body, _, status = done.stdout.rpartition("\n")
+        answers.append((status, json.loads(body or "{}")))
+    (listed, owned), (changed, edited), (deleted, _) = answers
+    assert (listed, changed, deleted) == ("200", "200", "204")
+    assert [(own["id"], own["public"]) for own in owned["submissions"]] == [(submission_id, False)]
+    assert (edited["public"], edited["code_url"]) == (True, "https://example.org")
+    assert call(private_server, "GET", f"{API}/{submission_id}").status_code == 404
 
 
 def test_always_public_submission_cannot_be_hidden(board: SharedServer) -> None:

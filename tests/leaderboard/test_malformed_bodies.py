@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -236,15 +235,12 @@ def test_randomly_damaged_body_is_422(upload_server: UploadServer) -> None:
         assert upload_server.post(bytes(body)).status == 422, bytes(body)
 
 
-def test_unknown_methods_share_one_metric_label(upload_server: UploadServer) -> None:
+def test_unknown_methods_leave_nothing_in_memory(upload_server: UploadServer) -> None:
     before = memory_bytes(upload_server.server.process.pid), num_open_files(upload_server.server.process.pid)
     for number in range(300):
         assert (
             exchange(upload_server.server.url, request_head("/healthz", (), method=f"WORD{number}")).status == 405
         )
-    metrics = upload_server.server.metrics()
-    assert not re.search("WORD[0-9]", metrics)
-    assert re.search(r'rebar_requests_total\{method="other",route="/healthz",status="405"\} 300', metrics)
     after = memory_bytes(upload_server.server.process.pid), num_open_files(upload_server.server.process.pid)
     assert after[0] - before[0] < 4 << 20
     assert after[1] <= before[1] + 2

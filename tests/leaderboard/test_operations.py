@@ -1,4 +1,4 @@
-"""Commands of operators: tokens, submissions, prune, check; and ``rebar-bench submissions`` of submitters."""
+"""Commands of operators: tokens, submissions, prune, check."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
+import httpx2
 import pytest
 
 from rebar_depth_bench.data.manifest import open_folder
@@ -22,10 +23,9 @@ from tests.leaderboard.conftest import WriteArchive
 from tests.leaderboard.serving import RunServer, Server
 
 
-def run(*arguments: object, module: str = "leaderboard", token: str = "") -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", module, *map(str, arguments)]
-    environment = {**os.environ, "REBAR_LEADERBOARD_TOKEN": token}
-    return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "leaderboard", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def table(process: subprocess.CompletedProcess[str]) -> list[dict[str, str]]:
@@ -56,11 +56,9 @@ def scored(server: Server, write_archive: WriteArchive) -> dict[str, str]:
     for submission_id in ids.values():
         assert server.wait_until_ended(submission_id)["status"] == "scored"
     for name in ("best", "worst"):
-        process = run(
-            *("submissions", "publish", ids[name], "--url", server.url), module="rebar_depth_bench", token=token
-        )
-        assert process.returncode == 0, process.stderr
-    return {**ids, "token": token}
+        address, headers = f"{server.url}/api/v1/submissions/{ids[name]}", {"Authorization": f"Bearer {token}"}
+        assert httpx2.patch(address, json={"public": True}, headers=headers).status_code == 200
+    return ids
 
 
 def test_tokens_and_submissions_are_listed(server: Server, scored: dict[str, str], tiny_root: Path) -> None:
@@ -79,39 +77,6 @@ def test_tokens_and_submissions_are_listed(server: Server, scored: dict[str, str
     process = run("check", "--state-dir", server.state, "--data", tiny_root)
     assert process.returncode == 0, process.stderr
     assert "are in order" in process.stdout
-
-
-def test_owner_lists_edits_and_deletes_submissions(
-    server: Server, scored: dict[str, str], write_archive: WriteArchive
-) -> None:
-    token = server.token("bob")
-    submission_id = server.submit_accepted(write_archive("bobs", configs=("lattice-orbit",)), token)
-    server.wait_until_ended(submission_id)
-
-    def own(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return run("submissions", *arguments, "--url", server.url, module="rebar_depth_bench", token=token)
-
-    assert own("list").stdout.split()[:3] == [submission_id, "scored", "private"]
-    assert "public" in own("publish", submission_id).stdout
-    assert "private" in own("withdraw", submission_id).stdout
-    edit = own("edit", submission_id, "--set", "licence=MIT", "--set", "code_url=https://example.org/code")
-    assert edit.returncode == 0, edit.stderr
-    shown = server.wait_until_ended(submission_id)
-    assert (shown["licence"], shown["code_url"]) == ("MIT", "https://example.org/code")
-    assert own("edit", submission_id, "--set", "licence=").returncode == 0
-    assert server.wait_until_ended(submission_id)["licence"] is None
-    for arguments, words in (
-        (("edit", submission_id, "--set", "method=x"), "expected KEY=VALUE with one of the keys"),
-        (("edit", submission_id, "--set", "code_url=ftp://x"), "the request is malformed"),
-        (("publish", scored["best"]), "you are not the owner"),
-        (("delete", "0" * 32), "no such submission"),
-    ):
-        process = own(*arguments)
-        assert process.returncode == 2, arguments
-        assert words in process.stderr
-        assert "Traceback" not in process.stderr
-    assert own("delete", submission_id).returncode == 0
-    assert own("list").stdout == ""
 
 
 def test_prune_deletes_old_archives_but_not_the_best(

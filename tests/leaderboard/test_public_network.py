@@ -210,11 +210,6 @@ def test_requests_for_other_hosts_are_refused(proxied: Server, host: str, status
     assert httpx2.get(f"{proxied.url}/how-to-submit", headers={"Host": host}).status_code == status
 
 
-def test_metrics_have_a_port_of_their_own(server: Server) -> None:
-    assert httpx2.get(f"{server.url}/metrics").status_code == 404
-    assert "rebar_requests_total" in server.metrics()
-
-
 def test_health_tells_of_a_lost_dataset(tiny_root: Path, tmp_path: Path, running_server: RunServer) -> None:
     data = tmp_path / "data"
     data.mkdir()

@@ -12,7 +12,7 @@ from datasets import load_dataset
 
 import rebar_depth_bench as rdb
 from benchmarks import steel_coverage
-from cards import benchmark_card, benchmark_tasks, dataset_card
+from cards import benchmark_card, dataset_card
 from cards.dataset import column_rows
 from cards.steel import steel_by_config
 from dataset_builder.config.catalog import CONFIGS, SWEEPS
@@ -144,14 +144,3 @@ def test_card_states_what_distances_are_to(tiny_root: Path) -> None:
     }
     assert "| 0.22-0.43 m, nearest steel | 7.4-26.3 m |" in rows["pier"]
     assert "| 0.22-0.43 m | – |" in rows["older"]
-
-
-def test_benchmark_tasks_are_the_configs_of_the_folder(tiny_root: Path) -> None:
-    text = (tiny_root / "eval.yaml").read_text()
-    assert text == benchmark_tasks(open_folder(tiny_root).config_by_name)
-    content = yaml.safe_load(text)
-    assert content["tasks"] == [
-        {"id": name, "config": name, "split": "test"} for name in ("lattice", "lattice-orbit")
-    ]
-    assert set(content) == {"name", "description", "evaluation_framework", "tasks"}
-    assert "rank_error of protocol rebar-2: from 0 to 1, lower is better" in content["description"]

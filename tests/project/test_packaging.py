@@ -137,7 +137,6 @@ def test_wheel_alone_exports(installed: Path, tmp_path: Path) -> None:
         (("rebar-build", "inspect", str(ROOT / "examples" / "beam.toml")), "build"),
         (("rebar-leaderboard", "serve", "--data", str(TINY_DATASET)), "server"),
         (("rebar-bench", "demo"), "build"),
-        (("rebar-bench", "view", str(TINY_DATASET), "lattice/0028", "--out", "view.rrd"), "view"),
         (("rebar-bench", "predict", "sgbm", "--data", str(TINY_DATASET), "--out", "a.zip"), "methods"),
     ],
     ids=lambda value: " ".join(value[:2]) if isinstance(value, tuple) else None,

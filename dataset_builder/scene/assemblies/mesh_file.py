@@ -1,4 +1,4 @@
-"""User mesh files (STL, PLY, OBJ, glTF) as cages.
+"""User mesh files (STL, PLY, OBJ) as cages.
 
 The module ``mesh_import`` defines what counts as a bar in each format and which id it gets. The centreline and the
 diameter of each bar are fitted to its mesh (``scene.assemblies.surface_bar``).
@@ -11,13 +11,11 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
-from dataset_builder.config.file_specs import MeshFileSpec, PlacementSpec, Up, read_assembly_file
+from dataset_builder.config.file_specs import MeshFileSpec, PlacementSpec, read_assembly_file
 from dataset_builder.config.scene_schema import UNITS_M
 from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
 from dataset_builder.scene.assemblies.mesh_import import (
-    GLTF_SUFFIXES,
     MAX_FLOAT32_SPACING_M,
     SUFFIXES,
     MeshPart,
@@ -36,9 +34,8 @@ def mesh_file_spec(
 ) -> MeshFileSpec:
     """Return the spec of a mesh file, which fixes its present content by SHA-256.
 
-    ``unit`` is the length of one file unit: a name from ``UNITS_M``, or a number of metres. glTF is in metres
-    by its specification, so ``"m"`` is right for it unless its exporter deviates. The default placement keeps the
-    file's coordinates; only glTF, which is y up, is turned.
+    ``unit`` is the length of one file unit: a name from ``UNITS_M``, or a number of metres. The default placement
+    keeps the file's coordinates.
 
     Raises ``MeshError`` if the unit is unknown, the file cannot be read or its suffix is unknown.
     """
@@ -47,12 +44,7 @@ def mesh_file_spec(
     unit_m = UNITS_M[unit] if isinstance(unit, str) else float(unit)
     _check_unit(unit_m, str(path))
     digest = hashlib.sha256(read_assembly_file(path, "mesh", SUFFIXES)).hexdigest()
-    return MeshFileSpec(os.fspath(path), digest, unit_m, placement or PlacementSpec(default_up(path)), select)
-
-
-def default_up(path: str | os.PathLike[str]) -> Up:
-    """Return the vertical axis of a mesh file: y for glTF by its specification, z for others by custom."""
-    return "y" if Path(path).suffix.lower() in GLTF_SUFFIXES else "z"
+    return MeshFileSpec(os.fspath(path), digest, unit_m, placement or PlacementSpec(), select)
 
 
 def read_mesh(spec: MeshFileSpec) -> Cage:

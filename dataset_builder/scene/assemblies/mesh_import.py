@@ -2,10 +2,8 @@
 
 - The dataset's own PLY layout (``dataset_builder.scene.mesh_ply``) is used unchanged: the faces with one
   ``bar_id`` form a part with that id; faces with id 0 (board, table) are left out.
-- Every other file is read by ``mesh_formats``. If it holds several glTF nodes or OBJ objects (``o``), each is a
-  part. Parts are numbered from 1 in the order of their names, with numbers within names compared by value ("bar2"
-  before "bar10"). An unnamed node is named by its index, and trimesh appends "_1", "_2", ... to a repeated
-  node name.
+- Every other file is read by ``mesh_formats``. If it holds several OBJ objects (``o``), each is a part. Parts are
+  numbered from 1 in the order of their names, with numbers within names compared by value ("bar2" before "bar10").
 - A file with one object (any STL or PLY) is split into connected components after vertices closer than 10 nm
   are merged. Components are numbered from 1 in the order of their first faces. Bars that share a vertex are
   one part.
@@ -18,40 +16,30 @@ import it on use.
 
 from __future__ import annotations
 
-import io
 import logging
 import re
 import warnings
-from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import shorten
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Integer
 from numpy import ndarray
 
 from dataset_builder.config.file_specs import MeshFileSpec
-from dataset_builder.scene.assemblies.mesh_formats.gltf import check_gltf
 from dataset_builder.scene.assemblies.mesh_formats.obj import read_obj
-from dataset_builder.scene.assemblies.mesh_formats.parsing import MalformedMeshError, Surface, check_surface
+from dataset_builder.scene.assemblies.mesh_formats.parsing import MalformedMeshError, Surface
 from dataset_builder.scene.assemblies.mesh_formats.ply import read_ply
 from dataset_builder.scene.assemblies.mesh_formats.stl import read_stl
 from dataset_builder.scene.mesh_ply import has_mesh_ply_header, parse_mesh_ply
 from dataset_builder.scene.model import MAX_BARS, NOT_STEEL, Mesh
 from rebar_depth_bench.errors import DatasetError, MeshError
 
-if TYPE_CHECKING:
-    import trimesh
-
-SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
+SUFFIXES = (".obj", ".ply", ".stl")
 """Supported suffixes of mesh files, in lower case."""
-
-GLTF_SUFFIXES = (".glb", ".gltf")
-"""Suffixes of glTF files, which are y up by their specification."""
 
 MAX_FLOAT32_SPACING_M = 1e-4
 """Largest distance of neighbouring 32-bit coordinates that is accepted, metres."""
@@ -108,26 +96,16 @@ def _dataset_ply_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
 
 def _read_objects(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
     """Return the objects of any other file, without ids, ordered by name, without empty ones."""
-    suffix = Path(spec.path).suffix.lower()
-    match suffix:
+    match Path(spec.path).suffix.lower():
         case ".stl":
             surfaces: Mapping[str, Surface] = {"": read_stl(content)}
         case ".ply":
             surfaces = {"": read_ply(content)}
-        case ".obj":
-            surfaces = read_obj(content)
         case _:
-            check_gltf(content, suffix == ".glb")
-            return _gltf_objects(content, suffix[1:], spec.unit_m)
-    return _objects(
-        surfaces, spec.unit_m, max((_spacing(vertices) for vertices, _ in surfaces.values()), default=0.0)
-    )
-
-
-def _objects(surfaces: Mapping[str, Surface], unit_m: float, spacing: float) -> list[MeshPart]:
-    """Return surfaces as objects; ``spacing`` is that of their coordinates, in units of the file."""
+            surfaces = read_obj(content)
+    spacing_m = spec.unit_m * max((_spacing(vertices) for vertices, _ in surfaces.values()), default=0.0)
     return [
-        MeshPart(0, name, Mesh(vertices.astype(np.float64) * unit_m, faces.astype(np.int32)), spacing * unit_m)
+        MeshPart(0, name, Mesh(vertices.astype(np.float64) * spec.unit_m, faces.astype(np.int32)), spacing_m)
         for name, (vertices, faces) in sorted(surfaces.items(), key=lambda item: _natural_sort_key(item[0]))
         if len(faces)
     ]
@@ -136,33 +114,6 @@ def _objects(surfaces: Mapping[str, Surface], unit_m: float, spacing: float) -> 
 def _spacing(vertices: Float[ndarray, "v 3"]) -> float:
     """Return the distance of the largest coordinate from the next that the file can store; 0 for float64."""
     return float(np.spacing(np.abs(vertices).max(initial=0))) if vertices.dtype == np.float32 else 0.0
-
-
-def _gltf_objects(content: bytes, file_type: str, unit_m: float) -> list[MeshPart]:
-    """Return the nodes with a surface; the primitives of a node are joined."""
-    import trimesh
-
-    scene = trimesh.load_scene(
-        io.BytesIO(content), file_type=file_type, resolver={}, process=False, skip_materials=True
-    )
-    bodies = defaultdict(list)
-    for body in scene.dump():
-        if isinstance(body, trimesh.Trimesh) and len(body.faces):
-            surface = check_surface((np.asarray(body.vertices), np.asarray(body.faces, np.int64)), str, str)
-            bodies[_object_name(scene, body)].append(surface)
-    joined = {name: trimesh.util.append_faces(*zip(*parts, strict=True)) for name, parts in bodies.items()}
-    # Coordinates are 32-bit before the transforms of the nodes, which are decimal numbers.
-    stored = [np.asarray(geometry.vertices, np.float32) for geometry in scene.geometry.values()]
-    return _objects(joined, unit_m, max(map(_spacing, stored), default=0.0))
-
-
-def _object_name(scene: trimesh.Scene, body: trimesh.Trimesh) -> str:
-    """Return the name of the glTF node or OBJ object that ``body`` belongs to."""
-    node = str(body.metadata["node"])
-    parent = str(scene.graph.transforms.parents.get(node))
-    # trimesh adds the primitives of a glTF node as its children, named "<node>_<six random letters>".
-    is_primitive = body.metadata.get("from_gltf_primitive") and node[:-7] == parent
-    return parent if is_primitive else node
 
 
 def _natural_sort_key(name: str) -> tuple[list[str | int], str]:

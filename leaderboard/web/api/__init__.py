@@ -1,1 +1,1 @@
-"""HTTP API below ``/api/v1``, with health and metrics endpoints."""
+"""HTTP API below ``/api/v1``, with the health endpoint."""

@@ -33,10 +33,21 @@ def test_sound_folder_passes_with_one_line(copy: Path) -> None:
     digest = open_folder(copy).digest
     finished = run_bench("verify", copy)
     assert (finished.returncode, finished.stdout.count("\n")) == (0, 1), finished.stderr
-    assert f"no problem found in 11 files, 11 views; dataset {digest}" in finished.stdout
-    assert "files: 11 of 11" in finished.stderr
+    assert f"no problem found in 10 files, 11 views; dataset {digest}" in finished.stdout
+    assert "files: 10 of 10" in finished.stderr
     files_only = run_bench("verify", copy, "--files-only")
     assert "views" not in files_only.stdout
+
+
+def test_file_that_builds_no_longer_write_is_verified_if_it_is_listed(copy: Path) -> None:
+    (copy / "eval.yaml").write_text("name: Industrial rebar metric depth\n")
+    sha256 = file_sha256(copy / "eval.yaml")
+    change_manifest(copy, lambda manifest, _: manifest["files"].update({"eval.yaml": sha256}))
+    assert "no problem found in 11 files" in run_bench("verify", copy).stdout
+    (copy / "eval.yaml").write_text("name: another\n")
+    finished = run_bench("verify", copy)
+    assert finished.returncode == 2
+    assert "eval.yaml: SHA-256 is " in finished.stderr
 
 
 def test_changed_missing_and_further_files_are_listed(copy: Path) -> None:

@@ -259,24 +259,21 @@ def test_leftovers_of_kill_after_publishing_are_repaired(small_root: Path, run_b
         (small_root / BUILD_FOLDER / f"two-bars-{name}" / "rows").mkdir(parents=True)
     assert "up to date" in run_build("--out", small_root, *SMALL).stdout
     assert not (small_root / BUILD_FOLDER).exists()
-    for name in ("README.md", "bars.parquet", "crossings.parquet", "eval.yaml"):
+    for name in ("README.md", "bars.parquet", "crossings.parquet"):
         (small_root / name).unlink()
         assert "up to date" in run_build("--out", small_root, *SMALL).stdout
         assert contents(small_root) == before
 
 
-@pytest.mark.parametrize("name", ["eval.yaml", "crossings.parquet"])
-def test_folder_of_earlier_version_loads_and_gets_its_files(tiny_root: Path, tmp_path: Path, name: str) -> None:
-    """Load and continue a folder of a version that did not write a file."""
+def test_folder_of_earlier_version_loads_and_gets_its_files(tiny_root: Path, tmp_path: Path) -> None:
+    """Load and continue a folder of a version that did not write the crossings."""
     root = tmp_path / "older"
     shutil.copytree(tiny_root, root)
     before = contents(root)
     manifest = json.loads((root / "manifest.json").read_text())
-    del manifest["files"][name]
-    if name == "crossings.parquet":
-        del manifest["crossings"]
+    del manifest["files"]["crossings.parquet"], manifest["crossings"]
     (root / "manifest.json").write_text(json.dumps(manifest))
-    (root / name).unlink()
+    (root / "crossings.parquet").unlink()
     assert len(rdb.load(root, "lattice-orbit")) == 2
     build(BuildRequest(("lattice-orbit",), 2, 160, 90, colour=colour_spec(quality="preview")), root)
     assert contents(root) == before

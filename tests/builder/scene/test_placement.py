@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +20,7 @@ from dataset_builder.scene.assemblies.cage import Cage, CageBar
 from dataset_builder.scene.assemblies.cage_assembly import cage_assembly
 from dataset_builder.scene.assemblies.placement import placed
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.errors import InputError, MeshError
 from tests.builder.config.scene_files import BAR, MM, write_scene
 
 COORDINATE = st.floats(-1e6, 1e6)
@@ -137,12 +140,26 @@ def test_mesh_file_alone_keeps_its_coordinates(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cage.world_from_source, np.diag([0.01, 0.01, 0.01, 1]))
 
 
-def test_gltf_is_y_up_unless_the_scene_says_otherwise(tmp_path: Path) -> None:
+def test_gltf_is_refused_with_a_conversion_that_keeps_bars_and_height(tmp_path: Path) -> None:
+    """Follow the message: nodes with transforms become objects of an OBJ file, whose vertical axis is y."""
     rod = trimesh.creation.cylinder(0.006, segment=[[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]], sections=24)
-    trimesh.Scene({"rod": rod}).export(tmp_path / "a.glb")
-    for up, axis in (("", 2), ('up = "z"\n', 1)):
-        (bar,) = scene_cage(write_scene(tmp_path, f'mesh = "a.glb"\nunit = "m"\n{up}')).bars
-        assert np.ptp(bar.bar.axis_m, axis=0)[axis] == pytest.approx(0.5, abs=1e-4)
+    scene = trimesh.Scene()
+    for x_m in (0.0, 0.1, 0.3):
+        scene.add_geometry(rod, transform=trimesh.transformations.translation_matrix([x_m, 0.0, 0.0]))
+    scene.export(tmp_path / "FILE.glb")
+    keys = 'mesh = "FILE.{}"\nunit = "m"\nup = "y"\n'
+    for path in (tmp_path / "FILE.glb", write_scene(tmp_path, keys.format("glb"))):
+        with pytest.raises(
+            InputError, match=r"\.glb'.*mesh = \"FILE.obj\", unit = \"m\" and up = \"y\"$"
+        ) as caught:
+            scene_cage(path)
+    (program,) = re.findall('python -c "(.*?)"', str(caught.value))
+    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=True)
+    bars = scene_cage(write_scene(tmp_path, keys.format("obj"))).bars
+    for bar in bars:
+        assert np.ptp(bar.bar.axis_m, axis=0)[2] == pytest.approx(0.5, abs=1e-4)
+    starts_m = sorted(bar.bar.axis_m[0][0] for bar in bars)
+    np.testing.assert_allclose(np.diff(starts_m), [0.1, 0.2], atol=1e-4)
 
 
 def test_placement_is_part_of_the_spec(tmp_path: Path) -> None:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dataset_builder.push.errors import hub_errors
+from dataset_builder.push.repository import Changes, Remote, Repository
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.hub.errors import hub_errors
-from rebar_depth_bench.hub.repository import Changes, Remote, Repository
 from rebar_depth_bench.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -27,10 +27,8 @@ def commit_changes(
     changes: Changes,
     message: str,
     progress: Progress = silent,
-    *,
-    create_pr: bool = False,
 ) -> str:
-    """Upload files and make one commit, or a pull request of it; return its URL. ``progress`` counts files.
+    """Upload files and make one commit; return its URL. ``progress`` counts files.
 
     The commit is refused if the branch is no longer at ``remote.commit``. Raises ``InputError`` if a file does not
     have its expected SHA-256 any more, and as ``hub_errors`` does.
@@ -43,7 +41,7 @@ def commit_changes(
     with hub_errors(f"{repository.id} cannot be written"):
         additions = [CommitOperationAdd(name, file.path) for name, file in changes.sent.items()]
         deletions = [CommitOperationDelete(name, is_folder=False) for name in changes.deleted]
-        _upload(api, repository, additions, progress, create_pr=create_pr)
+        _upload(api, repository, additions, progress)
         for addition, file in zip(additions, changes.sent.values(), strict=True):
             if addition.upload_info.sha256.hex() != file.sha256:
                 raise InputError(f"{file.path}: was changed while it was uploaded; nothing is published")
@@ -51,12 +49,11 @@ def commit_changes(
             repository.id,
             [*additions, *deletions],
             commit_message=message,
-            repo_type=repository.type,
+            repo_type="dataset",
             revision=repository.branch,
             parent_commit=remote.commit,
-            create_pr=create_pr,
         )
-        return str(commit.pr_url if create_pr else commit.commit_url)
+        return str(commit.commit_url)
 
 
 def _upload(
@@ -64,8 +61,6 @@ def _upload(
     repository: Repository,
     additions: list[CommitOperationAdd],
     progress: Progress,
-    *,
-    create_pr: bool,
 ) -> None:
     """Upload the content of large files; small ones are part of the commit."""
     for first in range(0, len(additions), _FILES_AT_ONCE):
@@ -73,9 +68,8 @@ def _upload(
         api.preupload_lfs_files(
             repository.id,
             group,
-            repo_type=repository.type,
+            repo_type="dataset",
             revision=repository.branch,
-            create_pr=create_pr,
             num_threads=_FILES_AT_ONCE,
             free_memory=False,
             gitignore_content=_IGNORE_NOTHING,

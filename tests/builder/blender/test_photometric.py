@@ -1,4 +1,4 @@
-"""Photometric audit: the left image warped by depth and cameras compared with the right image."""
+"""Photometric check on synthetic pictures: sound ones pass, and small errors of cameras and depth are reported."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import rebar_depth_bench as rdb
-from dataset_builder.audit.photometric import best_shift_px, photometric_fit, photometric_verdict
 from dataset_builder.audit.report import Check
 from dataset_builder.audit.views import AuditedConfig, AuditedView, RayCache, view_from_row
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from tests.builder.audit.audit_scene import RIGS, config, view, with_baseline, with_depth, with_K_shift
+from tests.builder.blender.photometric import best_shift_px, photometric_fit, photometric_verdict
+
+pytestmark = pytest.mark.nightly
 
 Damage = Callable[[AuditedView], AuditedView]
 DAMAGES: dict[str, Damage] = {
@@ -33,7 +35,6 @@ def verdict(audited: AuditedConfig, views: list[AuditedView]) -> Check:
     return photometric_verdict(audited, [photometric_fit(audited, audited_view) for audited_view in views])
 
 
-@pytest.mark.slow
 @EVERY_GRID
 def test_correct_images_fit_within_0_05_px(rig: str) -> None:
     fit = photometric_fit(config(), view(rig))
@@ -43,7 +44,6 @@ def test_correct_images_fit_within_0_05_px(rig: str) -> None:
     assert verdict(config(), [view(rig)]).passed
 
 
-@pytest.mark.slow
 @EVERY_GRID
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_small_errors_are_reported_on_every_grid(rig: str, damage: str) -> None:

@@ -1,4 +1,4 @@
-"""Marker check of the audit: ArUco corners that OpenCV detects, against the projections of the cameras.
+"""Marker check of pictures: ArUco corners that OpenCV detects, against the projections of the cameras.
 
 The check covers the detected corners, the share of visible markers that are detected, and the camera poses that
 ``cv2.solvePnP`` recovers from them.
@@ -29,8 +29,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.audit.report import NO_COLOUR, Check
+from dataset_builder.audit.report import Check
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from dataset_builder.scene.variants import LIGHT_SLOT, variants_of_slot
+from dataset_builder.scene.variants.image_light import IMAGE_LIGHTS
 from rebar_depth_bench.geometry.aruco_board import MARKER_MODULES, BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.aruco_detection import Corners, detected_corners_px
 from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX, Camera, camera_centre, project, rigid, transform
@@ -148,7 +150,7 @@ Principal points that are half a pixel off in both eyes give 0.5 px, in one eye 
 MAX_INSET_PX = 1.0
 """Largest fitted inset, pixels."""
 MIN_DETECTED_SHARE = 0.5
-"""Least share of the visible markers that must be detected; not applied where ``light_may_hide_markers``."""
+"""Least share of the visible markers that must be detected; not applied where the light may hide markers."""
 MAX_POSE_MM_PER_M = 8.0
 """Largest median position error, millimetres per metre of distance from the board's middle."""
 MAX_POSE_DEG = 0.5
@@ -200,13 +202,11 @@ def marker_verdict(config: AuditedConfig, views: Sequence[Sequence[DetectedMarke
     name = f"{config.name}: ArUco markers"
     if config.board is None:
         return Check.skip(name, "no board in this scene")
-    if not config.has_colour:
-        return Check.skip(name, NO_COLOUR)
     eyes = [eye for view in views for eye in view]
     expected, detected = sum(eye.expected for eye in eyes), sum(len(eye.detected_px) for eye in eyes)
     if not expected:
         return Check.skip(name, f"no unoccluded marker of {MIN_MARKER_WIDTH_PX:g} px or more")
-    min_share = 0.0 if config.light_may_hide_markers else MIN_DETECTED_SHARE
+    min_share = 0.0 if _light_may_hide_markers(config) else MIN_DETECTED_SHARE
     missing = (
         ()
         if detected >= min_share * expected
@@ -233,6 +233,11 @@ def marker_verdict(config: AuditedConfig, views: Sequence[Sequence[DetectedMarke
         f"median {MAX_POSE_MM_PER_M:g} mm/m, {MAX_POSE_DEG:g} deg",
         (*missing, *_marker_problems(inset_px, corner_rms_px, centre_rms_px, off_mm, off_deg)),
     )
+
+
+def _light_may_hide_markers(config: AuditedConfig) -> bool:
+    """Return whether the light may hide markers from the detector; panoramas are exposed as the standard light."""
+    return not set(variants_of_slot(config.variants, LIGHT_SLOT)) <= set(IMAGE_LIGHTS)
 
 
 def _nominal_pose_errors(eyes: Sequence[DetectedMarkers], inset_px: float) -> Float64[ndarray, "n 2"]:

@@ -1,14 +1,14 @@
-"""Repositories of the Hugging Face Hub: ids, files at a commit, and the changes that publish local files."""
+"""Dataset repositories of the Hugging Face Hub: ids, files at a commit, and changes that publish local files."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
+from dataset_builder.push.errors import hub_errors
 from rebar_depth_bench.errors import InputError, escape_text, printable
-from rebar_depth_bench.hub.errors import hub_errors
 
 if TYPE_CHECKING:
     from huggingface_hub.hf_api import RepoFile
@@ -33,10 +33,9 @@ def check_repository_id(text: str, option: str) -> str:
 
 @dataclass(frozen=True)
 class Repository:
-    """Repository on the Hub, and the branch of it that is read and written."""
+    """Dataset repository on the Hub, and the branch of it that is read and written."""
 
     id: str
-    type: Literal["dataset", "model"]
     branch: str = MAIN_BRANCH
 
     @property
@@ -44,7 +43,7 @@ class Repository:
         """Address of the repository's page."""
         from huggingface_hub import constants
 
-        return f"{constants.ENDPOINT}/{'datasets/' if self.type == 'dataset' else ''}{self.id}"
+        return f"{constants.ENDPOINT}/datasets/{self.id}"
 
     def remote(self) -> Remote:
         """Return what the Hub has: the files of the branch, or of the main branch if there is no such branch.
@@ -58,15 +57,15 @@ class Repository:
         api, has_branch = HfApi(), True
         with hub_errors(f"{self.id} cannot be read"):
             try:
-                info = api.repo_info(self.id, repo_type=self.type, revision=self.branch)
+                info = api.repo_info(self.id, repo_type="dataset", revision=self.branch)
             except GatedRepoError:
                 raise
             except RepositoryNotFoundError:
                 return Remote()
             except RevisionNotFoundError:
-                info, has_branch = api.repo_info(self.id, repo_type=self.type), False
+                info, has_branch = api.repo_info(self.id, repo_type="dataset"), False
             commit = str(info.sha)
-            tree = api.list_repo_tree(self.id, recursive=True, revision=commit, repo_type=self.type)
+            tree = api.list_repo_tree(self.id, recursive=True, revision=commit, repo_type="dataset")
             files = {str(entry.path): entry for entry in tree if isinstance(entry, RepoFile)}
             return Remote(commit, has_branch, bool(info.private), files)
 

@@ -1,4 +1,4 @@
-"""Photometric check: the right colour image, warped through depth and cameras, against the left one.
+"""Photometric check of pictures: the right one, warped through depth and cameras, against the left one.
 
 The right image is sampled where the points of the left pixels project, and at whole-pixel shifts from there along
 u and v. If depth, poses, K and images are consistent, the images match best at zero shift. Whole-pixel shifts all
@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
-from dataset_builder.audit.report import NO_COLOUR, Check
+from dataset_builder.audit.report import Check
 from dataset_builder.audit.stereo_consistency import project_into
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
 from rebar_depth_bench.geometry.cameras import camera_centre
@@ -131,8 +131,6 @@ def best_shift_px(cost: Float64[ndarray, " n"]) -> float:
 def photometric_verdict(config: AuditedConfig, fits: Sequence[PhotometricFit]) -> Check:
     """Return the check of the best shift of all views together, and of each view alone."""
     name = f"{config.name}: right image warped to the left by depth"
-    if not config.has_colour:
-        return Check.skip(name, NO_COLOUR)
     pixels = sum(fit.pixels for fit in fits)
     if pixels < _MIN_PIXELS:
         return Check.skip(name, f"only {pixels} textured pixels visible to both eyes")

@@ -1,4 +1,4 @@
-"""Audit of markers: positions detected by OpenCV compared with projections by the stored cameras."""
+"""Marker check on synthetic pictures: sound ones pass, and small errors of the cameras are reported."""
 
 from __future__ import annotations
 
@@ -7,7 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dataset_builder.audit.markers import (
+from dataset_builder.audit.report import Check
+from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from rebar_depth_bench.geometry.aruco_board import marker_corners_m
+from tests.builder.audit.audit_scene import BOARD, RIGS, config, view, with_baseline, with_K_shift
+from tests.builder.blender.markers import (
     DetectedMarkers,
     detect_markers,
     detect_view_markers,
@@ -17,10 +21,8 @@ from dataset_builder.audit.markers import (
     min_width_px,
     projected_corners_px,
 )
-from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
-from rebar_depth_bench.geometry.aruco_board import marker_corners_m
-from tests.builder.audit.audit_scene import BOARD, RIGS, config, view, with_baseline, with_K_shift
+
+pytestmark = pytest.mark.nightly
 
 EVERY_GRID = pytest.mark.parametrize("rig", RIGS)
 
@@ -30,7 +32,6 @@ def verdict(*views: AuditedView, of: AuditedConfig | None = None) -> Check:
     return marker_verdict(audited, [detect_view_markers(audited, audited_view) for audited_view in views])
 
 
-@pytest.mark.slow
 @EVERY_GRID
 def test_detected_markers_match_projections(rig: str) -> None:
     detections = [detect_markers(eye, BOARD) for eye in view(rig).eyes.values()]
@@ -94,7 +95,6 @@ def with_slipped_corners(eyes: list[DetectedMarkers], markers: int) -> list[Dete
     return slipped
 
 
-@pytest.mark.slow
 def test_only_a_single_slipped_corner_is_left_out() -> None:
     eyes = detect_view_markers(config(), view("ideal"))
     check = marker_verdict(config(), [with_slipped_corners(eyes, 1)])
@@ -106,7 +106,6 @@ def test_only_a_single_slipped_corner_is_left_out() -> None:
         assert any(problem.startswith(f"{count} of {detected} markers have a corner") for problem in problems)
 
 
-@pytest.mark.slow
 def test_half_pixel_shift_of_K_is_reported_with_sensor() -> None:
     shifted = with_K_shift(view("ideal"), ("left", "right"), 0, 0.5)
     check = verdict(shifted, of=config(variants=("sensor",)))
@@ -123,7 +122,6 @@ def test_occluded_markers_are_not_expected() -> None:
     assert steel.expected == 0
 
 
-@pytest.mark.slow
 def test_check_is_skipped_without_large_markers_or_board() -> None:
     far = view("ideal", distance_m=1.6)
     assert verdict(far).measured.startswith("no unoccluded marker")

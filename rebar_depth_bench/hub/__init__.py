@@ -1,1 +1,0 @@
-"""Repositories of the Hugging Face Hub that this project publishes to, through ``huggingface_hub``."""
