@@ -22,7 +22,7 @@ from rebar_depth_bench.cli import (
     verify,
     view,
 )
-from rebar_depth_bench.console import Command, add_commands, replace_renamed_options, run_command
+from rebar_depth_bench.console import Command, add_commands, run_command
 from rebar_depth_bench.output_options import check_outputs
 from rebar_depth_bench.studies.registry import STUDIES
 from rebar_depth_bench.terminal import use_plain_characters
@@ -45,16 +45,13 @@ COMMANDS: Mapping[str, Command] = {
     "demo": demo,
 }
 
-RENAMED_OPTIONS = {"--given-scale": "--baseline-scale", "--k": "--num-anchor-views"}
-"""Old option strings that are still accepted, and their new names."""
-
 _STUDY_SUMMARY = "run a study of the paper on your own archives"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-bench`` and return its exit code."""
     use_plain_characters()
-    options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
+    options = argument_parser().parse_args(arguments)
     os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")  # ``datasets`` reads it at import.
     return run_command(lambda: _run(options), interrupted=getattr(options, "interrupted", "interrupted"))
 
