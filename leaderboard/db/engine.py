@@ -23,6 +23,7 @@ DATABASE_UNAVAILABLE = (OperationalError, InterfaceError, PoolTimeoutError)
 _POSTGRESQL_TIMEOUTS = {"connect_timeout": 10, "tcp_user_timeout": 30_000}
 """Timeouts for an unresponsive PostgreSQL server: connect in seconds, unacknowledged TCP data in ms."""
 _IMMEDIATE = "immediate"
+_OWN_TABLES = frozenset({"alembic_version", *Base.metadata.tables})
 
 
 class Database:
@@ -66,7 +67,7 @@ class Database:
     def migrate(self) -> None:
         """Create the schema or upgrade it; services that start simultaneously take turns.
 
-        Raises ``InputError`` if the database is unavailable.
+        Raises ``InputError`` if the database is unavailable, or has a schema that no migration leads from.
         """
         from alembic import command  # Half a second to import, which processes that only score do not need.
         from alembic.config import Config
@@ -78,7 +79,8 @@ class Database:
                 if self.has_row_locks:
                     connection.exec_driver_sql("SELECT pg_advisory_xact_lock(7241053)")
                 config.attributes["connection"] = connection
-                if inspect(connection).has_table("alembic_version"):
+                if not _OWN_TABLES.isdisjoint(inspect(connection).get_table_names()):
+                    _check_revision(connection)
                     command.upgrade(config, "head")
                 else:
                     Base.metadata.create_all(connection, checkfirst=False)
@@ -139,3 +141,16 @@ def _configure_sqlite(connection: Any, _: Any) -> None:
 def _begin_transaction(connection: Connection) -> None:
     immediate = connection.get_execution_options().get(_IMMEDIATE, False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
+
+
+def _check_revision(connection: Connection) -> None:
+    """Raise ``InputError`` unless there is a migration from the revision of the database's schema."""
+    from alembic.migration import MigrationContext
+    from alembic.script import ScriptDirectory
+
+    found = MigrationContext.configure(connection).get_current_revision()
+    known = [script.revision for script in ScriptDirectory(str(MIGRATIONS)).walk_revisions()]
+    if found not in known:
+        url = connection.engine.url.render_as_string(hide_password=True)
+        schema = "a schema without a revision" if found is None else f"the schema of revision {found}"
+        raise InputError(f"{url}: the database has {schema}, expected {' or '.join(known)}, or a new database")
