@@ -28,7 +28,7 @@ from leaderboard.db.models import (
 from leaderboard.db.submissions import QUEUED, SCORED
 from leaderboard.db.view_errors import rank_ranges
 from rebar_depth_bench.scoring.disclosure import DisclosedTable, disclosed_number
-from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL, PROTOCOL
+from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.submission.metadata import INPUTS
 
 _CACHED_TABLES = 4096
@@ -124,7 +124,7 @@ def read_ranking(database: Database, config: str, viewer: TokenModel | None = No
             LeaderboardRowModel.config == config,
             SubmissionModel.status == SCORED,
             SubmissionModel.public | own,
-            ResultModel.protocol.in_((PROTOCOL, OLD_PROTOCOL)),
+            ResultModel.protocol == PROTOCOL,
         )
         .order_by(SubmissionModel.created_at)
     )

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.reference import NO_REFERENCE
 from rebar_depth_bench.scoring.rounding import rounded
 from rebar_depth_bench.view_ids import config_of
 
@@ -54,19 +53,14 @@ _DIFFERENCE_COLUMNS = (
 
 
 def table_values(table: Mapping[str, Any]) -> list[Any]:
-    """Return a config's numbers in the order of ``TABLE_COLUMNS``, from its table in the result's JSON.
-
-    Tables of the previous protocol have no rank error and no reference errors.
-    """
-    reference = table.get("reference") or NO_REFERENCE.to_dict()
+    """Return a config's numbers in the order of ``TABLE_COLUMNS``, from its table in the result's JSON."""
     return [
-        *(table[key] for key in ("views", "views_scored", "coverage", "ranked")),
-        table.get("rank_error"),
+        *(table[key] for key in ("views", "views_scored", "coverage", "ranked", "rank_error")),
         *table["native"].values(),
         *table["scaled"].values(),
         table["scale_median"],
         *table["within_mm"].values(),
-        *(error for errors in reference.values() for error in errors.values()),
+        *(error for errors in table["reference"].values() for error in errors.values()),
     ]
 
 

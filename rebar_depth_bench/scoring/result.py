@@ -36,7 +36,7 @@ _NOTEBOOK_COLUMNS = (
 class Table:
     """Metrics of one config: means over its views, and the median of their scale factors.
 
-    ``rank_error`` is None in results of the previous protocol; ``reference`` are the config's reference errors,
+    ``rank_error`` is None without views; ``reference`` are the config's reference errors,
     and ``published`` is the scene of the paper's Table I that it shows, if any. ``split`` is None for a config of
     one scene. ``truth_sigma_m`` is the standard deviation of the ground truth's depth, None where it is exact.
     ``intervals`` has the 95 % block bootstrap interval of each of ``VIEW_METRICS``, None where it is undefined.
@@ -74,10 +74,7 @@ class Table:
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """Result of scoring one submission, with the digests and versions of its inputs.
-
-    ``protocol`` is another than ``PROTOCOL`` only if the result was read from a file of the previous protocol.
-    """
+    """Result of scoring one submission, with the digests and versions of its inputs."""
 
     method: str
     submission_sha256: str
@@ -170,7 +167,7 @@ def tabulate(
         views_scored=len(predicted),
         coverage=mean([view.coverage for view in views]),
         ranked=bool(views) and not declared.uses_ground_truth,
-        rank_error=mean([view.rank_error for view in views if view.rank_error is not None]),
+        rank_error=mean([view.rank_error for view in views]),
         native=native,
         scaled=scaled,
         scale_median=median([view.scale for view in predicted if view.scale is not None]) if predicted else None,

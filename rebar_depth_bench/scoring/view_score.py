@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,15 +23,12 @@ _VIEW_INDEX = re.compile("[0-9]{4}")
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Metrics of one view; ``scale``, ``native`` and ``scaled`` are None without valid predictions.
-
-    ``rank_error`` is None in results of the previous protocol.
-    """
+    """Metrics of one view; ``scale``, ``native`` and ``scaled`` are None without valid predictions."""
 
     view_id: str
     scored_px: int
     coverage: float
-    rank_error: float | None
+    rank_error: float
     scale: float | None
     native: DepthMetrics | None
     scaled: DepthMetrics | None
@@ -105,7 +101,5 @@ def protocol_indices(view_ids: Sequence[str]) -> list[int]:
 
 
 def sort_key_worst_first(view: ViewScore) -> float:
-    """Return the sort key of a view: its rank error, or native AbsRel in results of the previous protocol."""
-    if view.rank_error is not None:
-        return view.rank_error
-    return math.inf if view.native is None else view.native.abs_rel
+    """Return the sort key of a view: its rank error."""
+    return view.rank_error

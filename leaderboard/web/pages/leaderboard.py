@@ -167,7 +167,7 @@ def make_config_ranking(
         selection=selection,
         row_count=len(rows),
         pages=pages,
-        references=next(filter(None, references), []),  # Tables of the previous protocol have none.
+        references=next(filter(None, references), []),  # A table without views has none.
         lines=lines,
         published=published,
         distance=distance,

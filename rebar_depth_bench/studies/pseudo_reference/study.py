@@ -2,7 +2,7 @@
 
 Instead of a steel mask, the scored pixels are those where both reference and prediction have depth. Paper, II.C:
 "Physical monocular scores use the full frame: pixels where that pseudo-reference is valid and the prediction is
-finite and positive in the evaluation range". The metrics of a view are those of ``rebar-1`` on these pixels
+finite and positive in the evaluation range". The metrics of a view are those of ``rebar-2`` on these pixels
 (``scoring.score.score_view``), scaled by the view's own s = median(z) / median(p).
 """
 

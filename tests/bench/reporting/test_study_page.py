@@ -38,7 +38,7 @@ def study_page(text: str = "plain") -> StudyPage:
         study="anchor",
         title=f"{text}: one scale for all",
         lead=f"lead {text}",
-        stamps=[("Protocol", "rebar-1"), (f"Archive of {text}", "sha256:12")],
+        stamps=[("Protocol", "rebar-2"), (f"Archive of {text}", "sha256:12")],
         figures=[PageFigure(chart(series, X_AXIS, Y_AXIS, chart_text), f"Figure {text}", f"caption {text}")],
         tables=[PageTable(f"table {text}", [("k", "views"), (text, "")], [["1", text], ["2", "−0.5"]])],
         notes=[f"note {text}"],
@@ -47,7 +47,7 @@ def study_page(text: str = "plain") -> StudyPage:
 
 def test_page_shows_all_content() -> None:
     page = Page(render_study(study_page()))
-    for stated in ("plain: one scale for all", "lead plain", "rebar-1", "sha256:12", "Figure plain", "note plain"):
+    for stated in ("plain: one scale for all", "lead plain", "rebar-2", "sha256:12", "Figure plain", "note plain"):
         assert stated in page.text
     assert (page.count("h1"), page.count("svg"), page.count("table"), page.count("td")) == (1, 1, 1, 2)
 
