@@ -57,7 +57,6 @@ class SubmissionModel(Base):
     method: Mapped[str] = mapped_column(String(200))
     description: Mapped[str | None] = mapped_column(Text)
     url: Mapped[str | None] = mapped_column(Text)
-    uses_intrinsics: Mapped[bool | None]
     inputs: Mapped[str | None] = mapped_column(String(20))
     uses_ground_truth: Mapped[bool | None]
     archive_sha256: Mapped[str] = mapped_column(String(64))

@@ -48,7 +48,6 @@ class LeaderboardEntry:
     method: str
     submitter: str
     url: str | None
-    uses_intrinsics: bool | None
     inputs: str | None
     uses_ground_truth: bool | None
     created_at: float
@@ -80,7 +79,6 @@ _COLUMNS = (
     SubmissionModel.method,
     TokenModel.name,
     SubmissionModel.url,
-    SubmissionModel.uses_intrinsics,
     SubmissionModel.inputs,
     SubmissionModel.uses_ground_truth,
     SubmissionModel.created_at,
