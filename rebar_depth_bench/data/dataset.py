@@ -17,14 +17,7 @@ from rebar_depth_bench.data.columns import COLUMNS, features, validated_columns
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.shards import (
-    SCENE_COLUMN,
-    all_rows,
-    check_shards,
-    damaged_error,
-    iterate_shards,
-    lacks_scene_column,
-)
+from rebar_depth_bench.data.shards import all_rows, check_shards, damaged_error, iterate_shards
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.view_ids import TEST_SPLIT
@@ -111,19 +104,15 @@ def load_undecoded(
             split=datasets.NamedSplit(split),
         )
     paths = [glob.escape(str(config.file(shard).absolute())) for shard in config.shards]
-    is_old = lacks_scene_column(config)
-    present = [name for name in COLUMNS if not is_old or name != SCENE_COLUMN]
     try:
         loaded = datasets.load_dataset(
             "parquet",
             config.name,
             data_files={split: paths},
-            columns=present,
-            features=datasets.Features({name: undecoded[name] for name in present}),
+            columns=list(COLUMNS),
+            features=undecoded,
             split=split,
         )
-        if is_old:
-            loaded = loaded.add_column(SCENE_COLUMN, [config.scene.name] * len(loaded))
     except Exception as error:  # ``datasets`` raises many types, which depend on the damage.
         raise damaged_error(config, error) from error
     return loaded.select_columns(list(selected))
