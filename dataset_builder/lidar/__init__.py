@@ -42,6 +42,8 @@ from rebar_depth_bench.geometry.cameras import Camera, fold_radius, project
 from rebar_depth_bench.methods import MethodInfo, MultiViewMethod, Prepared, Views
 from rebar_depth_bench.progress import Progress
 
+__all__ = ["LIDAR_MOBILE", "LIDAR_SURVEY", "MOBILE", "SURVEY", "ScannerSpec", "lidar_method", "scan_depth_m"]
+
 _COLUMNS = ("left_K", "left_distortion", "left_cam_from_world")
 """Dataset columns that the method reads."""
 
@@ -70,20 +72,19 @@ def lidar_method(name: str, spec: ScannerSpec, what: str) -> MultiViewMethod:
         height, width = views.grid
 
         def run(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
-            camera = Camera(*(row[column] for column in _COLUMNS), width, height)
+            camera = Camera(row["left_K"], row["left_distortion"], row["left_cam_from_world"], width, height)
             return scan_depth_m(caster, spec, camera, row["view_id"])
 
         return Prepared(run, {"scanner": json.loads(parameters)})
 
     parameters = json.dumps(asdict(spec))
     # The digest distinguishes scanners of the same name with different parameters.
-    digest = hashlib.sha256(parameters.encode()).hexdigest()[:12]
+    source = f"this project, scanner {hashlib.sha256(parameters.encode()).hexdigest()[:12]}"
     summary = (
         f"simulated laser scanner, {what}, {-1000 * spec.position_left_m[1]:.0f} mm above the left camera, pose"
         " known exactly; reads the scene's mesh: a simulation, not a measurement on images; no prediction at"
         f" ranges below {spec.min_range_m:g} m"
     )
-    source = f"this project, scanner {digest}"
     info = MethodInfo(name, summary, _COLUMNS, True, source, "Apache-2.0", uses_ground_truth=True, inputs="lidar")
     return MultiViewMethod(info, prepare, check)
 

@@ -242,15 +242,14 @@ def reported_range_m(
     weighted by intensity. No reported range therefore mixes surfaces that are farther apart than that.
     """
     detectable = (range_m >= spec.min_range_m) & (range_m <= spec.max_range_m)
+    hit_m = np.where(detectable, range_m, np.inf)
     intensity = np.where(detectable, cos_incidence, 0.0)
     moment = intensity * np.where(detectable, range_m, 0.0)
-    nearest_m = np.where(detectable, range_m, np.inf).min(axis=1)
     farthest_m = np.where(detectable, range_m, 0.0).max(axis=1)
-    several = farthest_m - nearest_m > spec.range_resolution_m
+    several = farthest_m - hit_m.min(axis=1) > spec.range_resolution_m
     total = intensity.sum(axis=1)
     detected = (total >= spec.least_share * range_m.shape[1]) & (total > 0)
     reported_m = np.where(detected, moment.sum(axis=1) / np.where(detected, total, 1.0), np.nan)
-    hit_m = np.where(detectable, range_m, np.inf)
     reported_m[several] = _strongest_return_m(spec, hit_m[several], intensity[several], moment[several])
     return reported_m
 
@@ -309,4 +308,4 @@ def simulate_scan(
     # The seed depends on the view id alone. One number is drawn for every beam, with or without a return, so that
     # a beam's noise does not depend on other beams.
     seed = int.from_bytes(hashlib.sha256(view_id.encode()).digest()[:8], "little")
-    return range_m + spec.noise_m * np.random.default_rng(seed).standard_normal(len(row))
+    return np.asarray(range_m + spec.noise_m * np.random.default_rng(seed).standard_normal(len(row)))
