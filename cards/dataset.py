@@ -233,8 +233,8 @@ def _reference(references: References | None, name: str) -> str:
 
 def _samples(colour: Mapping[str, Any]) -> str:
     """Return the samples per pixel, and those around the steel if they differ."""
-    samples, steel_samples = colour["samples"], colour.get("steel_samples")
-    return f"{samples}" if steel_samples in (None, samples) else f"{samples}, {steel_samples} around steel"
+    samples, steel_samples = colour["samples"], colour["steel_samples"]
+    return f"{samples}" if steel_samples == samples else f"{samples}, {steel_samples} around steel"
 
 
 def _steel_source(assembly: Mapping[str, Any]) -> str:
