@@ -13,14 +13,13 @@ from cards.templates import render
 from rebar_depth_bench.data.columns import COLUMN_DESCRIPTIONS, column_kind, features
 from rebar_depth_bench.data.config_tables import References
 from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.shards import SCENE_COLUMN, lacks_scene_column
 from rebar_depth_bench.data.trajectory import CENTRE, NEAREST_STEEL, SURVEY
 from rebar_depth_bench.reporting.formatting import DASH
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.view_ids import TEST_SPLIT
 
 if TYPE_CHECKING:
-    from datasets import DatasetInfo, Features
+    from datasets import DatasetInfo
 
 PRETTY_NAME = "Industrial rebar metric depth"
 _OPTICS_TEXTS = {
@@ -111,21 +110,13 @@ def _dataset_info(config: DatasetConfig, version: str) -> DatasetInfo:
         for split in config.splits
     }
     return DatasetInfo(
-        features=_stored_features(config),
+        features=features(),
         splits=SplitDict(splits),
         config_name=config.name,
         version=version,
         dataset_size=size,
         download_size=size,
     )
-
-
-def _stored_features(config: DatasetConfig) -> Features:
-    """Return the features of a config's shards; those of earlier versions have no column ``scene``."""
-    from datasets import Features
-
-    is_old = lacks_scene_column(config)
-    return Features({name: kind for name, kind in features().items() if not is_old or name != SCENE_COLUMN})
 
 
 def _split_bytes(config: DatasetConfig, split: str) -> int:
@@ -242,8 +233,8 @@ def _reference(references: References | None, name: str) -> str:
 
 def _samples(colour: Mapping[str, Any]) -> str:
     """Return the samples per pixel, and those around the steel if they differ."""
-    samples, steel_samples = colour["samples"], colour.get("steel_samples")
-    return f"{samples}" if steel_samples in (None, samples) else f"{samples}, {steel_samples} around steel"
+    samples, steel_samples = colour["samples"], colour["steel_samples"]
+    return f"{samples}" if steel_samples == samples else f"{samples}, {steel_samples} around steel"
 
 
 def _steel_source(assembly: Mapping[str, Any]) -> str:

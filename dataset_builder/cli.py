@@ -20,7 +20,7 @@ from dataset_builder.config.specs import CPU
 from dataset_builder.export import command as export_command
 from dataset_builder.importing import command as import_command
 from dataset_builder.push import command as push_command
-from rebar_depth_bench.console import ProgressBars, Rate, replace_renamed_options, require_extra, run_command
+from rebar_depth_bench.console import ProgressBars, Rate, require_extra, run_command
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
 from rebar_depth_bench.outputs import write_output
@@ -39,14 +39,12 @@ CAGES_OPTIONS = ("split", "scenes", "views_per_scene")
 """Options of the scenes of ``cages``; each is None if it is not given."""
 COLOUR_OPTIONS = ("sampling", "quality", "samples", "device")
 """Options that only colour has; each is None if it is not given."""
-RENAMED_OPTIONS = {"--to": "--out"}
-"""Old option strings that are still accepted, and their new names."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-build``; return its exit status."""
     use_plain_characters()
-    options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
+    options = argument_parser().parse_args(arguments)
     interrupted = "interrupted; run the same command again to continue"
     return run_command(lambda: options.run(options), interrupted=interrupted)
 

@@ -11,9 +11,9 @@ from typing import Any
 
 from leaderboard.db.engine import database_errors, sqlite_path
 from leaderboard.log_setup import set_up_logs
-from leaderboard.settings import RENAMED_SETTINGS, Settings, read_settings
+from leaderboard.settings import Settings, read_settings
 from leaderboard.storage.archive_store import make_folder, state_lock
-from rebar_depth_bench.console import replace_renamed_options, run_command
+from rebar_depth_bench.console import run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.terminal import use_plain_characters
 from rebar_depth_bench.version import software_version
@@ -46,13 +46,11 @@ COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
 All settings can also be set in a TOML file or the environment.
 """
 
-RENAMED_OPTIONS = {f"--{old}": f"--{new.replace('_', '-')}" for old, new in RENAMED_SETTINGS.items()}
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return the exit status: 0 = success, 2 = invalid input, 1 = any other error."""
     use_plain_characters()
-    options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
+    options = argument_parser().parse_args(arguments)
     return run_command(lambda: _run(options), interrupted="stopped")
 
 

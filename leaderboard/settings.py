@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlsplit
@@ -16,7 +14,6 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError
 
-from rebar_depth_bench.console import warn_deprecated
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import parse_toml, read_file
@@ -26,17 +23,6 @@ from rebar_depth_bench.validation import format_location, short_repr
 GIB = 1 << 30
 MAX_LEASE_S = 600.0
 """Largest setting ``lease_seconds``; a lease that ends much later was made by a clock that was wrong."""
-
-
-RENAMED_SETTINGS = {
-    "lease": "lease_seconds",
-    "public": "default_visibility",
-    "reads": "read_rate_limit",
-    "scorers": "workers",
-    "state": "state_dir",
-    "writes": "write_rate_limit",
-}
-"""Old names of settings that are still accepted, and their new names."""
 
 
 class Settings(BaseSettings):
@@ -189,7 +175,7 @@ def read_settings(file: Path | None, overrides: dict[str, Any]) -> Settings:
     """
     file_values = {} if file is None else _read_file(file)
     try:
-        return Settings(**{**_from_old_variables(), **file_values, **overrides})
+        return Settings(**{**file_values, **overrides})
     except ValidationError as error:
         raise InputError("settings: " + "; ".join(_format_error(details) for details in error.errors())) from None
 
@@ -200,34 +186,14 @@ def _read_file(file: Path) -> dict[str, Any]:
     Unknown names are refused here, because ``BaseSettings`` has parameters that are no settings (``_env_file``).
     """
     content, problems = parse_toml(read_file(file, TOML_BYTES, "a TOML file with settings", InputError))
-    for name in content:
-        new_name, place = RENAMED_SETTINGS.get(name, name), format_location("", name)
-        if new_name not in Settings.model_fields:
-            problems.append(Problem("unknown", place, "there is no such setting"))
-        elif new_name != name and new_name in content:
-            problems.append(Problem("duplicate", place, f"{new_name} is given twice", "one of its names"))
+    problems += [
+        Problem("unknown", format_location("", name), "there is no such setting")
+        for name in content
+        if name not in Settings.model_fields
+    ]
     if problems:
         raise InputError.from_problems(file, problems)
-    return _with_new_names(content, "setting ")
-
-
-def _from_old_variables() -> dict[str, Any]:
-    """Return settings that the environment holds under old names only."""
-    prefix = "REBAR_LEADERBOARD_"
-    old = {
-        name: os.environ[f"{prefix}{name.upper()}"]
-        for name, new in RENAMED_SETTINGS.items()
-        if f"{prefix}{name.upper()}" in os.environ and f"{prefix}{new.upper()}" not in os.environ
-    }
-    return _with_new_names(old, "variable for ")
-
-
-def _with_new_names(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """Return settings with their present names, with a warning for each old name."""
-    for name in values:
-        if name in RENAMED_SETTINGS:
-            warn_deprecated(f"{prefix}{name}", RENAMED_SETTINGS[name])
-    return {RENAMED_SETTINGS.get(name, name): value for name, value in values.items()}
+    return content
 
 
 _SECRET_SETTINGS = ("db",)

@@ -1,4 +1,4 @@
-"""Command-line basics of all programs: progress, exit codes, shared and renamed options."""
+"""Command-line basics of all programs: progress, exit codes, and shared options."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -208,23 +208,3 @@ def positive_number(text: str, expected: str, high: float = sys.float_info.max) 
 def print_notice(text: str) -> None:
     """Print text to standard error; control characters of names in it are shown as escapes."""
     print(terminal_text(text), file=sys.stderr)
-
-
-def warn_deprecated(old: str, new: str) -> None:
-    """Print a warning to standard error that the name ``old`` of an option or setting is replaced by ``new``."""
-    print(f"warning: {old} is deprecated, use {new}", file=sys.stderr)
-
-
-def replace_renamed_options(arguments: Sequence[str] | None, renamed: Mapping[str, str]) -> list[str]:
-    """Return command-line arguments with renamed options under their new names, with a warning for each.
-
-    ``arguments`` are those of the process if None; ``renamed`` maps old option strings to new ones.
-    """
-    replaced = []
-    for argument in sys.argv[1:] if arguments is None else arguments:
-        option, equals, value = argument.partition("=")
-        if option in renamed:
-            warn_deprecated(option, renamed[option])
-            argument = f"{renamed[option]}{equals}{value}"
-        replaced.append(argument)
-    return replaced

@@ -45,18 +45,13 @@ for name, gain, noise in (("exact", 1.0, 0.0), ("scaled", 1.3, 0.02), ("holes", 
 """Three submissions made from ground truth with a fixed seed, so that both versions score the same predictions."""
 
 SERVICE = """
-import json, os, sqlite3, sys
+import json, sqlite3, sys
 from pathlib import Path
 root, out = map(Path, sys.argv[1:])
-try:
-    from leaderboard.web.app import make_app
-    from leaderboard.service import open_service
-except ImportError:
-    from leaderboard.app import make_app
-    from leaderboard.service import open_service
+from leaderboard.web.app import make_app
+from leaderboard.service import open_service
 from leaderboard.settings import read_settings
-os.environ["REBAR_LEADERBOARD_STATE"] = str(out / "state")  # both versions know this name
-with open_service(read_settings(None, {"data": str(root)})) as service:
+with open_service(read_settings(None, {"data": str(root), "state_dir": str(out / "state")})) as service:
     (out / "openapi.json").write_text(json.dumps(make_app(service).openapi(), indent=1))
 with sqlite3.connect(out / "state" / "leaderboard.sqlite") as connection:
     rows = connection.execute("select sql from sqlite_master where sql is not null order by name")
@@ -77,7 +72,7 @@ def commands(work: Path, examples: Path, demo: bool) -> Iterator[list[str]]:
         yield [*build, f"{scenes}", "--scene", f"{examples / scene}", "--views", "1", *TINY]
     mesh = ["--mesh", f"{root}/meshes/lattice.ply", "--views", "1", *TINY]
     yield [*build, f"{work}/mesh", "--config", "lattice", *mesh]
-    yield ["-m", "dataset_builder", "export", f"{root}", "--to", f"{work}/export", "--config", "lattice", "pier"]
+    yield ["-m", "dataset_builder", "export", f"{root}", "--out", f"{work}/export", "--config", "lattice", "pier"]
     roots: list[tuple[Path, Path, tuple[str, ...]]] = [
         (root, results, ("lattice", "pile", "pier", "lattice-orbit", *sweeps))
     ]
@@ -121,10 +116,7 @@ def digests(work: Path) -> dict[str, str]:
     found = {}
     for path in sorted(work.rglob("*")):
         name = path.relative_to(work).as_posix()
-        # Earlier versions cached ground truth in the dataset folder.
-        skipped = (
-            name.startswith(("hf/", "cache/", "service/state")) or ".rebar-cache" in name or name == "log.txt"
-        )
+        skipped = name.startswith(("hf/", "cache/", "service/state")) or name == "log.txt"
         if path.is_file() and not skipped:
             content = path.read_bytes()
             if name == "service/openapi.json":

@@ -97,13 +97,6 @@ def write_split_dataset(
     _write_manifest(root, {"cages": entry}, records, {BARS_FILE: file_sha256(root / BARS_FILE)})
 
 
-def drop_scene_column(folder: Path) -> None:
-    """Rewrite the shards in a folder as earlier versions wrote them, without the column ``scene``."""
-    for shard in folder.glob("*.parquet"):
-        table = pq.read_table(shard).drop_columns(["scene"])
-        pq.write_table(table.replace_schema_metadata(None), shard, row_group_size=1)
-
-
 def write_archive(path: Path, configs: Sequence[str], views: int, method: str, seed: int) -> None:
     """Write a submission with a prediction for every view: ground-truth depth with 2 % Gaussian noise, float32."""
     rng = np.random.default_rng(seed)

@@ -37,7 +37,7 @@ def check_crossings(folder: DatasetFolder, root: Path) -> Check:
     """Check that the table of crossings holds the crossings of the bars, to ``_CROSSING_TOLERANCE_M``."""
     bars = read_bars(root / BARS_FILE)
     if CROSSINGS_FILE not in folder.files:
-        return Check("crossings of the bars", "none", "written by an earlier version")
+        return Check("crossings of the bars", "none", f"the folder has no {CROSSINGS_FILE}")
     stored = folder_crossings(folder, bars).by_scene
     expected = {
         scene: crossings for scene, of_scene in bars.items() if len(crossings := scene_crossings(of_scene))

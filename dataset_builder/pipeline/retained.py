@@ -44,8 +44,7 @@ class _Scene(_Table):
 
 class _Colour(_Table):
     samples: _Count
-    steel_samples: _Count | None = None
-    """None in entries of versions that sampled uniformly."""
+    steel_samples: _Count
 
 
 class _Rig(_Table):

@@ -171,8 +171,8 @@ def open_data(path: str, wanted: str | None) -> Data:
         return Data(f"capture {capture.config}", views, views, camera=capture.describe_camera())
     folder = open_folder(path)
     config = only_config(path, [*folder.config_by_name.values()], wanted)
-    views = dict.fromkeys(config.view_ids, config.grid)
-    return Data(f"config {config.name}", views, folder.expected_views(), config, folder.digest, folder.version)
+    of_config = dict.fromkeys(config.view_ids, config.grid)
+    return Data(f"config {config.name}", of_config, folder.expected_views(), config, folder.digest, folder.version)
 
 
 def labelled(sources: Sequence[DepthMaps], reserved: str) -> dict[str, DepthMaps]:

@@ -25,6 +25,7 @@ DATABASE_UNAVAILABLE = (OperationalError, InterfaceError, PoolTimeoutError)
 _POSTGRESQL_TIMEOUTS = {"connect_timeout": 10, "tcp_user_timeout": 30_000}
 """Timeouts for an unresponsive PostgreSQL server: connect in seconds, unacknowledged TCP data in ms."""
 _IMMEDIATE = "immediate"
+_OWN_TABLES = frozenset({"alembic_version", *Base.metadata.tables})
 
 
 class Database:
@@ -70,39 +71,28 @@ class Database:
     def migrate(self) -> None:
         """Create the schema or upgrade it; services that start simultaneously take turns.
 
-        Raises ``InputError`` if the database is unavailable or has the schema of a later version.
+        Raises ``InputError`` if the database is unavailable, or has a schema that no migration leads from.
         """
         from alembic import command  # Half a second to import, which processes that only score do not need.
         from alembic.config import Config
-        from alembic.util import CommandError
 
         config = Config()
         config.set_main_option("script_location", str(MIGRATIONS))
-        try:
-            with database_errors(self._url, InputError), self._write_engine.begin() as connection:
-                if self.has_row_locks:
-                    connection.exec_driver_sql("SELECT pg_advisory_xact_lock(7241053)")
-                config.attributes["connection"] = connection
-                if inspect(connection).has_table("alembic_version"):
-                    command.upgrade(config, "head")
-                else:
-                    Base.metadata.create_all(connection, checkfirst=False)
-                    command.stamp(config, "head")
-        except CommandError:  # There is no migration from the revision that it has.
-            self.check_schema()
+        with database_errors(self._url, InputError), self._write_engine.begin() as connection:
+            if self.has_row_locks:
+                connection.exec_driver_sql("SELECT pg_advisory_xact_lock(7241053)")
+            config.attributes["connection"] = connection
+            if not _OWN_TABLES.isdisjoint(inspect(connection).get_table_names()):
+                _check_revision(connection, upgradable=True)
+                command.upgrade(config, "head")
+            else:
+                Base.metadata.create_all(connection, checkfirst=False)
+                command.stamp(config, "head")
 
     def check_schema(self) -> None:
         """Raise ``InputError`` unless the database has the schema of this version."""
-        from alembic.migration import MigrationContext
-        from alembic.script import ScriptDirectory
-
         with self._engine.connect() as connection:
-            found = MigrationContext.configure(connection).get_current_revision()
-        expected = ScriptDirectory(str(MIGRATIONS)).get_current_head()
-        if found != expected:
-            schema = "holds no leaderboard" if found is None else f"has the schema {found} of another version"
-            url = without_password(self._url)
-            raise InputError(f"{url}: {schema}, expected {expected}; serve upgrades an earlier one")
+            _check_revision(connection, upgradable=False)
 
     def problems(self) -> list[str]:
         """Return what is damaged: pages and references of an SQLite database, and results that are no JSON."""
@@ -188,3 +178,17 @@ def _configure_sqlite(connection: Any, _: Any) -> None:
 def _begin_transaction(connection: Connection) -> None:
     immediate = connection.get_execution_options().get(_IMMEDIATE, False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
+
+
+def _check_revision(connection: Connection, *, upgradable: bool) -> None:
+    """Raise ``InputError`` unless the database has the newest schema, or an ``upgradable`` earlier one."""
+    from alembic.migration import MigrationContext
+    from alembic.script import ScriptDirectory
+
+    found = MigrationContext.configure(connection).get_current_revision()
+    known = [script.revision for script in ScriptDirectory(str(MIGRATIONS)).walk_revisions()]
+    known = known if upgradable else known[:1]
+    if found not in known:
+        url = connection.engine.url.render_as_string(hide_password=True)
+        schema = "a schema without a revision" if found is None else f"the schema of revision {found}"
+        raise InputError(f"{url}: the database has {schema}, expected {' or '.join(known)}, or a new database")

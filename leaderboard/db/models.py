@@ -19,8 +19,6 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 
-from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL
-
 
 class Base(DeclarativeBase):
     """Declarative base class of the models."""
@@ -59,7 +57,6 @@ class SubmissionModel(Base):
     method: Mapped[str] = mapped_column(String(200))
     description: Mapped[str | None] = mapped_column(Text)
     url: Mapped[str | None] = mapped_column(Text)
-    uses_intrinsics: Mapped[bool | None]
     inputs: Mapped[str | None] = mapped_column(String(20))
     uses_ground_truth: Mapped[bool | None]
     archive_sha256: Mapped[str] = mapped_column(String(64))
@@ -87,7 +84,7 @@ class ResultModel(Base):
 
     submission_id: Mapped[str] = mapped_column(ForeignKey("submissions.id"), primary_key=True)
     json: Mapped[bytes] = mapped_column(LargeBinary)
-    protocol: Mapped[str] = mapped_column(String(20), server_default=OLD_PROTOCOL)
+    protocol: Mapped[str] = mapped_column(String(20))
     notes: Mapped[str] = mapped_column(Text, server_default="[]")
 
 

@@ -28,7 +28,7 @@ from leaderboard.db.models import (
 from leaderboard.db.submissions import QUEUED, SCORED
 from leaderboard.db.view_errors import rank_ranges
 from rebar_depth_bench.scoring.disclosure import DisclosedTable, disclosed_number
-from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL, PROTOCOL
+from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.submission.metadata import INPUTS
 
 _CACHED_TABLES = 4096
@@ -48,7 +48,6 @@ class LeaderboardEntry:
     method: str
     submitter: str
     url: str | None
-    uses_intrinsics: bool | None
     inputs: str | None
     uses_ground_truth: bool | None
     created_at: float
@@ -80,7 +79,6 @@ _COLUMNS = (
     SubmissionModel.method,
     TokenModel.name,
     SubmissionModel.url,
-    SubmissionModel.uses_intrinsics,
     SubmissionModel.inputs,
     SubmissionModel.uses_ground_truth,
     SubmissionModel.created_at,
@@ -128,7 +126,7 @@ def read_ranking(
             SubmissionModel.status == SCORED,
             SubmissionModel.dataset_digest == dataset_digest,
             SubmissionModel.public | own,
-            ResultModel.protocol.in_((PROTOCOL, OLD_PROTOCOL)),
+            ResultModel.protocol == PROTOCOL,
         )
         .order_by(SubmissionModel.created_at)
     )

@@ -78,7 +78,7 @@ def accept(
         if duplicate := find_duplicate(session, token, upload.sha256):
             return duplicate
         check_quota(session, token, quota, upload.size)
-        declared = ("method", "description", "url", "uses_intrinsics", "inputs", "uses_ground_truth")
+        declared = ("method", "description", "url", "inputs", "uses_ground_truth")
         record = SubmissionModel(
             id=submission_id,
             token_id=token.id,

@@ -54,7 +54,7 @@ _UNIT_TOLERANCE = 1e-6
 class FolderCrossings:
     """Crossings of the scenes of a dataset folder, and the file that they come from, with its hex SHA-256.
 
-    ``source`` is ``crossings.parquet``, or ``bars.parquet`` in folders of versions that wrote no crossings.
+    ``source`` is ``crossings.parquet``, or ``bars.parquet`` in folders without that file.
     """
 
     by_scene: Mapping[str, Crossings]

@@ -44,7 +44,7 @@ BARS_SCHEMA = pa.schema(
 """Schema of ``bars.parquet``; ``axis`` is the centreline as a polyline in the world frame, metres.
 
 Axis and diameter are null for steel whose surface is not that of one round bar. ``nominal_axis`` is the centreline
-in the design, null for bars that are not in a design; files of earlier versions have no such column.
+in the design, null for bars that are not in a design; the column may be absent.
 """
 _OPTIONAL = frozenset({NOMINAL_AXIS})
 

@@ -34,7 +34,7 @@ class DatasetConfig(Located):
     ``manifest_entry`` is the entry of the whole config as it was written, with all parameters of the build.
     ``has_splits`` is False for a config of one scene, whose views are all in the split ``test`` and have ids
     ``<config>/<0000>``; in other configs the ids are ``<config>/<split>-<scene>-<0000>``. ``reference`` is None in
-    folders of earlier versions, ``colour`` in configs without colour, whose colour columns are null in every row.
+    configs of several scenes, ``colour`` in configs without colour, whose colour columns are null in every row.
     ``imported`` is None in configs that were rendered.
     """
 

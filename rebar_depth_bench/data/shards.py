@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,7 +17,6 @@ from rebar_depth_bench.limits import CELL_BYTES
 
 _VALUES = {"K": 9, "distortion": 5, "cam_from_world": 16}
 """Numbers in a cell, by column kind; the other columns have one value per cell."""
-SCENE_COLUMN = "scene"
 
 
 def check_shards(config: DatasetConfig) -> None:
@@ -63,23 +62,13 @@ def iterate_shards(
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of ``shards``, with the cells of ``columns`` encoded; only one is in memory at a time.
 
-    Shards of earlier versions, which have no column ``scene``, are completed. Raises ``DatasetError`` for a
-    damaged shard.
+    Raises ``DatasetError`` for a damaged shard.
     """
     table = _shard_table(config, ("view_id", *columns))
     for shard in shards:
         with _open_shard(config, shard, table) as (file, _):
             for row in read_rows(file, table.schema):
-                yield _completed_row(config, row, columns)
-
-
-def lacks_scene_column(config: DatasetConfig) -> bool:
-    """Return whether the first shard of a config is of an earlier version, without the column ``scene``.
-
-    Raises ``DatasetError`` as ``check_shards``.
-    """
-    with _open_shard(config, config.shards[0], _shard_table(config, ROW_SCHEMA.names)) as (file, _):
-        return SCENE_COLUMN not in file.schema_arrow.names
+                yield {name: row[name] for name in columns}
 
 
 def rows_at(config: DatasetConfig, columns: Sequence[str], positions: Sequence[int]) -> Iterator[dict[str, Any]]:
@@ -94,7 +83,7 @@ def rows_at(config: DatasetConfig, columns: Sequence[str], positions: Sequence[i
         with _open_shard(config, shard, table) as (file, rows):
             row_groups = [position - first for position in positions if first <= position < first + rows]
             for row in read_rows(file, table.schema, row_groups=row_groups):
-                yield _completed_row(config, row, columns)
+                yield {name: row[name] for name in columns}
         first += rows
 
 
@@ -105,26 +94,18 @@ def damaged_error(config: DatasetConfig, error: Exception, shard: str = "") -> D
     return DatasetError(f"{place}{reason}; rebar-bench verify {config.root} lists damaged files")
 
 
-def rows_table(columns: Sequence[str], max_rows: int, optional: Iterable[str] = ()) -> Table:
-    """Return the table that a Parquet file with ``columns`` of dataset rows must hold; some may be absent."""
+def rows_table(columns: Sequence[str], max_rows: int) -> Table:
+    """Return the table that a Parquet file with ``columns`` of dataset rows must hold."""
     return Table(
         pa.schema([ROW_SCHEMA.field(name) for name in dict.fromkeys(columns)]),
         max_rows=max_rows,
         max_bytes=max_rows * len(columns) * CELL_BYTES.value(),
         max_values={name: _VALUES.get(column_kind(name), 1) for name in columns},
-        optional=frozenset(optional),
     )
 
 
 def _shard_table(config: DatasetConfig, columns: Sequence[str]) -> Table:
-    return rows_table(columns, len(config.views), () if config.has_splits else (SCENE_COLUMN,))
-
-
-def _completed_row(config: DatasetConfig, row: Mapping[str, Any], columns: Sequence[str]) -> dict[str, Any]:
-    """Return the cells of ``columns``; a config of several scenes always has the column ``scene``."""
-    if SCENE_COLUMN in columns and SCENE_COLUMN not in row:
-        row = {**row, SCENE_COLUMN: config.scene.name}
-    return {name: row[name] for name in columns}
+    return rows_table(columns, len(config.views))
 
 
 @contextmanager

@@ -65,10 +65,7 @@ def _file_problem(folder: DatasetFolder, name: str, sha256: str) -> Problem | No
 
 
 def _existing_files(root: Path) -> set[str]:
-    """Return the relative POSIX paths of everything in a folder but folders.
-
-    Hidden files and folders at the top level are left out, for example the cache of an earlier version.
-    """
+    """Return the relative POSIX paths of all files in a folder that are not hidden at its top level."""
     names = set()
     for folder, subfolders, files in os.walk(root):
         links = [name for name in subfolders if Path(folder, name).is_symlink()]

@@ -10,7 +10,7 @@ from rebar_depth_bench.errors import printable
 from rebar_depth_bench.scoring.bootstrap import MIN_BLOCKS
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.metrics import METRICS, DepthMetrics
-from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, OLD_PROTOCOL, WITHIN_MM
+from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, WITHIN_MM
 from rebar_depth_bench.scoring.result import Table
 from rebar_depth_bench.submission.metadata import Declaration
 
@@ -189,8 +189,6 @@ def unranked_reason(table: Table) -> str:
         return ""
     if table.views == 0:
         return "no views"
-    if table.rank_error is None:
-        return f"a result of {OLD_PROTOCOL}, which has no rank error"
     return "the submission declares that it uses ground truth"
 
 

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, Field
 
 from rebar_depth_bench.errors import InputError, Problem, SubmissionError
 from rebar_depth_bench.reading import parse_json
-from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL, PROTOCOL
+from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result_io import (
     LIMITED,
     DatasetJson,
@@ -54,20 +54,17 @@ _Number = Annotated[float, Field(ge=0, le=1), AfterValidator(disclosed_number)] 
 
 
 class DisclosedTable(StoredModel):
-    """Disclosed part of the table of a config.
-
-    ``rank_error`` is None without scored views and in results of the previous protocol.
-    """
+    """Disclosed part of the table of a config; ``rank_error`` is None without scored views."""
 
     coverage: _Number
     ranked: bool
-    rank_error: _Number = None
+    rank_error: _Number
 
 
 class DisclosedResult(StoredModel):
     """Disclosed part of a result; ``hidden_truth`` distinguishes it from a whole result."""
 
-    protocol: Annotated[str, one_of(PROTOCOL, OLD_PROTOCOL)]
+    protocol: Annotated[str, one_of(PROTOCOL)]
     hidden_truth: Literal[True] = True
     dataset: DatasetJson
     submission: SubmissionJson

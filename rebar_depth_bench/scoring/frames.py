@@ -54,12 +54,11 @@ _DIFFERENCE_COLUMNS = (
 def table_values(table: Mapping[str, Any]) -> list[Any]:
     """Return a config's numbers in the order of ``TABLE_COLUMNS``, from its table in the result's JSON.
 
-    Tables of earlier versions have no rank error, or lack reference errors.
+    ``scaled_constant`` is missing in results that a leaderboard keeps from an earlier version.
     """
-    reference = table.get("reference") or {}
+    reference = table["reference"]
     return [
-        *(table[key] for key in ("views", "views_scored", "coverage", "ranked")),
-        table.get("rank_error"),
+        *(table[key] for key in ("views", "views_scored", "coverage", "ranked", "rank_error")),
         *(table[alignment][name] for alignment in ALIGNMENTS for name in METRIC_NAMES),
         table["scale_median"],
         *(table["within_mm"][str(tolerance)] for tolerance in WITHIN_MM),

@@ -12,9 +12,6 @@ from numpy import ndarray
 PROTOCOL = "rebar-2"
 """Name of the scoring protocol."""
 
-OLD_PROTOCOL = "rebar-1"
-"""Name of the previous protocol, whose results can be read: the same metrics without ``rank_error``."""
-
 WITHIN_MM = (3, 5, 10, 20)
 """Tolerances in millimetres for the share of scored pixels within a given absolute error."""
 

@@ -36,12 +36,11 @@ _NOTEBOOK_COLUMNS = (
 class Table:
     """Metrics of one config: means over its views, and the median of their scale factors.
 
-    ``rank_error`` is None in results of the previous protocol; ``reference`` are the config's reference errors,
+    ``rank_error`` is None without views; ``reference`` are the config's reference errors,
     and ``published`` is the scene of the paper's Table I that it shows, if any. ``scaled_constant`` has AbsRel and
     RMSE (cm) of a constant after scaling on the predicted pixels, to compare with ``scaled``. ``split`` is None
     for a config of one scene. ``truth_sigma_m`` is the standard deviation of the ground truth's depth, None where
-    it is exact.
-    ``intervals`` has the 95 % bootstrap interval of each of ``VIEW_METRICS``, None where it is undefined.
+    it is exact. ``intervals`` has the 95 % bootstrap interval of each of ``VIEW_METRICS``, None where undefined.
     ``groups`` has the tables of groups of views by grouping (see ``groups.GROUPINGS``) and group, of a config with
     splits; they have no groups.
     """
@@ -79,7 +78,6 @@ class Table:
 class Result:
     """Result of scoring one submission, with the digests and versions of its inputs.
 
-    ``protocol`` is another than ``PROTOCOL`` only if the result was read from a file of the previous protocol.
     ``intervals`` states how the intervals were computed; None in a file of an earlier version, which does not.
     """
 
@@ -177,7 +175,7 @@ def tabulate(
         views_scored=len(predicted),
         coverage=mean([view.coverage for view in views]),
         ranked=bool(views) and not declared.uses_ground_truth,
-        rank_error=mean([view.rank_error for view in views if view.rank_error is not None]),
+        rank_error=mean([view.rank_error for view in views]),
         native=native,
         scaled=scaled,
         scale_median=median([view.scale for view in predicted if view.scale is not None]) if predicted else None,

@@ -16,7 +16,7 @@ from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.reading import parse_json
 from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.protocol import OLD_PROTOCOL, PROTOCOL, WITHIN_MM
+from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
 from rebar_depth_bench.scoring.published_match import PublishedMatch
 from rebar_depth_bench.scoring.reference import Reference
 from rebar_depth_bench.scoring.result import Result, Table
@@ -29,8 +29,7 @@ from rebar_depth_bench.view_ids import SPLITS, config_of
 def read_result(data: bytes, where: str) -> Result:
     """Return the result in ``data`` without extended measures; ``where`` names the source in error messages.
 
-    Results of the previous protocol have no rank error and are not ranked. Raises ``InputError`` with all problems
-    if ``data`` is not a result of either protocol.
+    Raises ``InputError`` with all problems if ``data`` is not a result of ``PROTOCOL``.
     """
     if len(data) > JSON_BYTES.value():
         problem = Problem("size", "", f"the result has {len(data)} bytes", JSON_BYTES.allowed())
@@ -201,8 +200,8 @@ class _TableJson(_AlignedJson):
     ranked: bool
     scale_median: _Size | None
     within_mm: Annotated[dict[str, _Share | None], _WITHIN, LIMITED]
-    rank_error: _Share | None = None
-    reference: _ReferenceJson = _ReferenceJson()
+    rank_error: _Share | None
+    reference: _ReferenceJson
     published: _PublishedJson | None = None
     split: Annotated[str, one_of(*SPLITS)] | None = None
     truth_sigma_m: _Size | None = None
@@ -273,7 +272,7 @@ class _ViewJson(_AlignedJson):
     view_id: Name
     scored_px: _Count
     coverage: _Share
-    rank_error: _Share | None = None
+    rank_error: _Share
     scale: _Size | None
     within_mm: Annotated[dict[str, _Share], _WITHIN, LIMITED]
 
@@ -329,7 +328,7 @@ class _MethodJson(StoredModel):
 class _ResultJson(StoredModel):
     """Content of a result file."""
 
-    protocol: Annotated[str, one_of(PROTOCOL, OLD_PROTOCOL)]
+    protocol: Annotated[str, one_of(PROTOCOL)]
     dataset: DatasetJson
     submission: SubmissionJson
     software: SoftwareJson
@@ -344,14 +343,12 @@ class _ResultJson(StoredModel):
             raise field_error("views: a view_id occurs twice", "each view once", "duplicate")
         if not {config_of(view_id) for view_id in view_ids} <= self.tables.keys():
             raise field_error("views: a view belongs to no config of the tables", "views of these", "conflict")
-        errors = [view.rank_error for view in self.views]
         groups = [
             table
             for tables in self.tables.values()
             for group in tables.groups.values()
             for table in group.values()
         ]
-        errors += [table.rank_error for table in (*self.tables.values(), *groups) if table.views]
-        if self.protocol == PROTOCOL and None in errors:
-            raise field_error("a view or table has no rank_error", f"one in results of {PROTOCOL}", "missing")
+        if any(table.views and table.rank_error is None for table in (*self.tables.values(), *groups)):
+            raise field_error("a table of views has no rank_error", "one in each of them", "missing")
         return self

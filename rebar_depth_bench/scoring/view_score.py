@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,14 +25,13 @@ _VIEW_INDEX = re.compile("[0-9]{4,9}")
 class ViewScore:
     """Metrics of one view; ``scale``, ``native`` and ``scaled`` are None without valid predictions.
 
-    ``rank_error`` is None in results of the previous protocol. ``scaled_constant`` is as in ``Table``; it is
-    None in results that were read from a file.
+    ``scaled_constant`` is as in ``Table``; it is None in results that were read from a file.
     """
 
     view_id: str
     scored_px: int
     coverage: float
-    rank_error: float | None
+    rank_error: float
     scale: float | None
     native: DepthMetrics | None
     scaled: DepthMetrics | None
@@ -119,7 +117,5 @@ def protocol_indices(view_ids: Sequence[str]) -> list[int]:
 
 
 def sort_key_worst_first(view: ViewScore) -> float:
-    """Return the sort key of a view: its rank error, or native AbsRel in results of the previous protocol."""
-    if view.rank_error is not None:
-        return view.rank_error
-    return math.inf if view.native is None else view.native.abs_rel
+    """Return the sort key of a view: its rank error."""
+    return view.rank_error

@@ -101,9 +101,8 @@ class MethodDetails(StrictModel):
 class SubmissionMeta(MethodDetails):
     """Values declared in ``submission.json``; None where a key is absent. Unknown keys are ignored.
 
-    ``inputs`` and ``uses_ground_truth`` are those of ``Declaration``; ``uses_intrinsics``, which older archives
-    have, does not set them. ``depth_scale`` is in metres per unit of a PNG value. ``runtime`` is the author's own
-    report, kept unchanged; nothing is computed from it.
+    ``inputs`` and ``uses_ground_truth`` are those of ``Declaration``. ``depth_scale`` is in metres per unit of a
+    PNG value. ``runtime`` is the author's own report, kept unchanged; nothing is computed from it.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -111,7 +110,6 @@ class SubmissionMeta(MethodDetails):
     method: Annotated[str, text(MAX_METHOD_CHARACTERS, "a printable name")]
     inputs: Annotated[str, one_of(*INPUTS)] | None = None
     uses_ground_truth: Flag | None = None
-    uses_intrinsics: Flag | None = None
     depth_scale: _Scale | None = None
     runtime: _Runtime | None = None
 

@@ -56,7 +56,6 @@ class SubmissionWriter:
         parameters: float | str | None = None,
         inputs: str | None = None,
         uses_ground_truth: bool | None = None,
-        uses_intrinsics: bool | None = None,
         runtime: Mapping[str, object] | None = None,
         notes: Mapping[str, object] | None = None,
         compress: bool = False,
@@ -74,7 +73,6 @@ class SubmissionWriter:
             "parameters": parameters,
             "inputs": inputs,
             "uses_ground_truth": uses_ground_truth,
-            "uses_intrinsics": uses_intrinsics,
             "runtime": None if runtime is None else dict(runtime),
             "notes": None if notes is None else dict(notes),
         }

@@ -93,7 +93,7 @@ translation_m = [0.12, 0, 0]
 baseline_m = 0.12
 """
 SUBMISSION = [
-    Record(b"submission.json", b'{"method": 7, "url": "ftp://x", "uses_intrinsics": 1, "depth_scale": -1}'),
+    Record(b"submission.json", b'{"method": 7, "url": "ftp://x", "uses_ground_truth": 1, "depth_scale": -1}'),
     Record(b"lattice/0000.npy", npy(DEPTH.astype(np.int32))),
     Record(b"lattice/0001.npy", npy(DEPTH)[:-4]),
     Record(b"lattice/0001.npz", npz(a=DEPTH, b=DEPTH)),

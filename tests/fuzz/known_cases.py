@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
-from rebar_depth_bench.console import EXIT_DONE, EXIT_INPUT
+from rebar_depth_bench.console import EXIT_INPUT
 from rebar_depth_bench.data.codecs import encode_depth
 from tests.bench.captures.example_capture import write_capture
 from tests.bench.methods.onnx_models import write_mixer_model, write_toml
@@ -75,11 +75,6 @@ def _digest_is_path(workspace: Workspace) -> Arguments:
     _edit_manifest(workspace, lambda m: m["configs"][CONFIG].update(ground_truth_digest="/../../../victim"))
     outputs = ("--json", workspace.out / "r.json", "--html", workspace.out / "r.html", "--extended")
     return "score", workspace.case / "a.zip", *_data(workspace), *outputs
-
-
-def _forged_cache(workspace: Workspace) -> Arguments:
-    (workspace.case / "root" / ".rebar-cache").symlink_to(workspace.case / "victim")
-    return "score", workspace.case / "a.zip", *_data(workspace)
 
 
 def _deep_manifest(workspace: Workspace) -> Arguments:
@@ -204,7 +199,6 @@ _LONG_KEY = "a." * 30_000 + "a = 1\n"
 
 KNOWN_CASES = (
     KnownCase("score: digest is a path", BENCH, _digest_is_path),
-    KnownCase("score: cache in the dataset is a link", BENCH, _forged_cache, (EXIT_DONE,)),
     KnownCase("check: deep manifest", BENCH, _deep_manifest),
     KnownCase("table: archive is a pipe", BENCH, _archive_is_pipe),
     KnownCase("compare: huge depth", BENCH, _huge_depth),

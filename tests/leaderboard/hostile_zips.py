@@ -209,7 +209,7 @@ def _invalid_metadata(random: np.random.Generator, valid: ValidArchive) -> bytes
         '{"method": "m"}'.encode("utf-16"), b'{"method": "m", "x": 1e999}', b'{"method": "m", "x": NaN}',
         b'{"method": "m", "x": ' + b"9" * 5000 + b"}", b'{"method": "\\ud800"}', b'{"method": "m\\u0000"}',
         b'{"method": "m", "description": "\\u0000"}', b'{"method": "m", "description": "\\udfff"}',
-        b'{"method": 1, "url": 2, "description": [], "uses_intrinsics": 3, "runtime": [], "depth_scale": "x"}',
+        b'{"method": 1, "url": 2, "description": [], "uses_ground_truth": 3, "runtime": [], "depth_scale": "x"}',
         b'{"method": "m", "url": "javascript:alert(1)"}', b'{"method": "m", "url": "http://[::1"}',
         b'{"method": "' + b"m" * 201 + b'"}', b'{"method": "m", "depth_scale": -1e-999}',
         json.dumps({"method": "m", "description": "x" * 5_000_000}).encode(),

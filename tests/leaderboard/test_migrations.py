@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 import subprocess
 import sys
@@ -10,24 +9,18 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Column, Engine, MetaData, String, create_engine, insert, inspect
+from sqlalchemy import Column, Engine, MetaData, String, create_engine, inspect
 
 from leaderboard.db.engine import MIGRATIONS, Database
-from leaderboard.db.models import Base, LeaderboardRowModel
-from leaderboard.db.rankings import picture_facts, picture_webp, read_ranking
-from leaderboard.db.tokens import create_token, digest, find_token
-from leaderboard.db.versions import VersionReader
-from leaderboard.db.view_errors import unpack_view_errors
+from leaderboard.db.models import Base
+from leaderboard.db.tokens import create_token, find_token
 from leaderboard.settings import Settings
 from rebar_depth_bench.errors import InputError
-from tests.bench.reporting.results import result, scored_view
-from tests.leaderboard.old_schema import create_old_schema
 
 _MIGRATE = """
 import sys
@@ -130,75 +123,34 @@ def test_concurrent_migrations_succeed(url: str, engine: Engine) -> None:
     assert differences(engine, Base.metadata) == []
 
 
-def test_database_of_revision_2_keeps_error_maps_and_gets_view_errors(url: str, engine: Engine) -> None:
-    document = result(*(scored_view(f"lattice/{index:04d}") for index in range(3))).to_dict()
-    with engine.begin() as connection:
-        create_old_schema(connection, "0002")
-        tables = MetaData()
-        tables.reflect(connection)
-        rows: dict[str, dict[str, Any]] = {
-            "tokens": {"id": 1, "name": "alice", "sha256": digest("a token"), "created_at": 1.0},
-            "submissions": {**SUBMISSION, "id": "one", "token_id": 1},
-            "results": {"submission_id": "one", "json": json.dumps(document).encode(), "protocol": "rebar-2"},
-            "board_rows": {
-                "submission_id": "one",
-                "config": "lattice",
-                "ranked": True,
-                "rank_error": 0.5,
-                "json": json.dumps(document["tables"]["lattice"]),
-            },
-            "pictures": {"submission_id": "one", "view_id": "lattice/0000", "webp": b"webp"},
-        }
-        for name, row in rows.items():
-            connection.execute(insert(tables.tables[name]), row)
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        ("UPDATE alembic_version SET version_num = '0002'", "the schema of revision 0002"),
+        ("DELETE FROM alembic_version", "a schema without a revision"),
+        ("DROP TABLE alembic_version", "a schema without a revision"),
+    ],
+)
+def test_database_of_another_revision_is_refused(url: str, engine: Engine, change: str, found: str) -> None:
     migrate(url)
-    assert differences(engine, Base.metadata) == []
-    with closing(Database(url)) as database:
-        assert picture_webp(database, "one", "lattice/0000", "error") == b"webp"
-        assert picture_facts(database, "one") == {"lattice/0000": ({}, ["error"])}
-        [entry] = read_ranking(database, "lattice", "sha256:0").entries
-        assert (entry.id, entry.submitter, entry.rank) == ("one", "alice", 1)
-        assert find_token(database, "a token") is not None
-        with database.read() as session:
-            packed = session.get_one(LeaderboardRowModel, ("one", "lattice")).view_errors
-    assert packed is not None
-    assert unpack_view_errors(packed)[1].tolist() == [view["rank_error"] for view in document["views"]]
-
-
-SUBMISSION = {
-    "method": "m",
-    "archive_sha256": "0" * 64,
-    "archive_bytes": 1,
-    "status": "scored",
-    "public": True,
-    "created_at": 1.0,
-    "finished_at": 2.0,
-    "attempts": 1,
-    "dataset_digest": "sha256:0",
-}
-
-
-def test_database_of_revision_1_migrates(url: str, engine: Engine) -> None:
     with engine.begin() as connection:
-        create_old_schema(connection, "0001")
-    migrate(url)
-    assert differences(engine, Base.metadata) == []
-    with closing(Database(url)) as database, closing(VersionReader(database)) as versions:
-        assert versions.read() == 1
-
-
-def test_database_of_another_version_is_refused_in_words(url: str, engine: Engine) -> None:
+        connection.exec_driver_sql(change)
     with closing(Database(url)) as database:
-        database.migrate()
-        database.check_schema()
-        with engine.begin() as connection:
-            connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0999'")
         for use in (database.migrate, database.check_schema):
-            with pytest.raises(InputError, match="has the schema 0999 of another version, expected 0"):
+            with pytest.raises(InputError, match=f"the database has {found}, expected 0003, or a new database"):
                 use()
+    with engine.connect() as connection:
+        tables = inspect(connection).get_table_names()
+    assert set(Base.metadata.tables) <= set(tables)
 
 
-def test_migrations_are_linear() -> None:
+def test_tables_of_other_programs_are_left_alone(url: str, engine: Engine) -> None:
+    with engine.begin() as connection:
+        connection.exec_driver_sql("CREATE TABLE foreign_table (id INTEGER)")
+    migrate(url)
+    assert set(inspect(engine).get_table_names()) == {*Base.metadata.tables, "alembic_version", "foreign_table"}
+
+
+def test_migrations_have_one_base() -> None:
     scripts = ScriptDirectory(str(MIGRATIONS))
-    assert len(scripts.get_heads()) == 1
-    assert len(scripts.get_bases()) == 1
+    assert (scripts.get_heads(), scripts.get_bases()) == (["0003"], ["0003"])

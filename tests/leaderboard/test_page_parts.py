@@ -23,6 +23,7 @@ from leaderboard.web.pages.rendering import clean_text, error_response, format_s
 from leaderboard.web.pages.selection import COLUMNS, RANK, Selection, parse_selection
 from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.reporting.html.rows import table_row
+from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result_io import read_result
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 
@@ -43,7 +44,8 @@ def database(tmp_path: Path) -> Iterator[Database]:
             table = {**result_dict["tables"]["lattice"], "ranked": index not in UNRANKED}
             session.add(make_submission(f"s{index}", 100.0 + index, public=index not in HIDDEN))
             session.flush()
-            session.add(ResultModel(submission_id=f"s{index}", json=json.dumps(result_dict).encode()))
+            result_json = json.dumps(result_dict).encode()
+            session.add(ResultModel(submission_id=f"s{index}", json=result_json, protocol=PROTOCOL))
             session.add(
                 LeaderboardRowModel(
                     submission_id=f"s{index}",
@@ -160,7 +162,7 @@ def test_missing_values_are_sorted_last_in_both_orders(errors: list[float | None
 
 def entry_of(name: str, table: dict[str, Any]) -> LeaderboardEntry:
     return LeaderboardEntry(
-        *(name, "lattice", name, "alice", None, None, None, None, 0.0, True, True, None, None, json.dumps(table))
+        *(name, "lattice", name, "alice", None, None, None, 0.0, True, True, None, None, json.dumps(table))
     )
 
 

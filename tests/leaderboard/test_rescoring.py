@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import httpx2
@@ -124,6 +126,27 @@ def test_archive_that_is_lost_while_it_waits_costs_no_result(tmp_path: Path) -> 
         first: ("scored", DIGEST, DIGEST, False),
         waiting: ("failed", OTHER_DIGEST, None, False),
     }
+
+
+def test_results_of_another_protocol_are_scored_again_or_unranked(
+    tmp_path: Path, running_server: RunServer
+) -> None:
+    root, state, archive = tmp_path / "root", tmp_path / "state", tmp_path / "archive.zip"
+    write_dataset(root, ["lattice"], 2)
+    write_archive(archive, ["lattice"], 2, "m", 1)
+    with running_server(root, state) as server:
+        kept, lost = (server.submit_accepted(archive, server.token(name)) for name in ("alice", "bob"))
+        before = [server.wait_until_ended(submission_id)["result"] for submission_id in (kept, lost)]
+    with closing(sqlite3.connect(state / "leaderboard.sqlite")) as connection, connection:
+        other = ("rebar-1", b'{"protocol": "rebar-1"}')
+        connection.execute("UPDATE results SET protocol = ?, json = ?", other)
+    (state / "archives" / f"{lost}.zip").unlink()
+    with running_server(root, state) as server:
+        assert server.wait_until_ended(kept)["result"] == before[0]
+        assert ids_and_ranks(server) == [(kept, 1)]
+        page = httpx2.get(f"{server.url}/submissions/{lost}", timeout=60)
+        assert page.status_code == 200
+        assert "another version" in page.text
 
 
 def test_scorer_with_other_dataset_releases_job(

@@ -1,4 +1,4 @@
-"""Settings: sources, precedence, validation messages and deprecated names."""
+"""Settings: sources, precedence and validation messages."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from typing import Any
 import pytest
 from pydantic import ByteSize
 
-from leaderboard.cli import COMMANDS, RENAMED_OPTIONS, argument_parser
-from leaderboard.settings import RENAMED_SETTINGS, Settings, read_settings
+from leaderboard.cli import COMMANDS, argument_parser
+from leaderboard.settings import Settings, read_settings
 from leaderboard.storage.archive_store import ArchiveStore
-from rebar_depth_bench.console import replace_renamed_options
 from rebar_depth_bench.errors import InputError
 
 PASSWORD = "Hunter2"
@@ -31,7 +30,6 @@ FILES = {
     "type": b'quota = "many"',
     "malformed": b"port = = 1",
     "parameter": b"_env_file = '/dev/zero'",
-    "twice": b"workers = 3\nscorers = 2",
     "long": f"quota = '{'many' * 200_000}'".encode(),
     "escape": rb'"\u001b[2J" = 1',
     "latin": b'title = "\xe4"',
@@ -56,7 +54,6 @@ CASES = {
     "unknown key": Case("quotta: there is no such setting", "--settings HERE/unknown"),
     "unknown key with a secret": Case("dbb: there is no such setting", "--settings HERE/secret"),
     "parameter of the settings class": Case("_env_file: there is no such setting", "--settings HERE/parameter"),
-    "setting under both names": Case("scorers: workers is given twice", "--settings HERE/twice"),
     "device as TOML file": Case("cannot be read: it is a device", "--settings /dev/zero"),
     "long value": Case(r"quota: .{100,200}$", "--settings HERE/long"),
     "escape sequence": Case(r"'\\x1b\[2J': there is no such setting", "--settings HERE/escape"),
@@ -193,29 +190,6 @@ def test_precedence_is_command_line_file_environment(settings_file: Path, monkey
     assert (settings.title, settings.quota, settings.lease_seconds) == ("from command line", 7, 9.0)
     assert (settings.data, settings.port) == ("from-file", Settings.model_fields["port"].default)
     assert read_settings(None, {"data": "x"}).title == "from environment"
-
-
-@pytest.mark.parametrize(("old", "new"), RENAMED_SETTINGS.items())
-def test_old_setting_names_work_with_a_warning(
-    old: str, new: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    value = example_value(new)
-    expected = getattr(read_settings(None, {"data": "x", new: value}), new)
-    (tmp_path / "old.toml").write_text(f"{old} = {value if value.isdigit() else repr(value)}\n")
-    assert getattr(read_settings(tmp_path / "old.toml", {"data": "x"}), new) == expected
-    assert f"warning: setting {old} is deprecated, use {new}\n" in capsys.readouterr().err
-    monkeypatch.setenv(PREFIX + old.upper(), value)
-    assert getattr(read_settings(None, {"data": "x"}), new) == expected
-    assert f"warning: variable for {old} is deprecated, use {new}\n" in capsys.readouterr().err
-    arguments = replace_renamed_options(["serve", f"--{old}", value], RENAMED_OPTIONS)
-    assert getattr(argument_parser().parse_args(arguments), new) == value
-    assert f"--{old} is deprecated" in capsys.readouterr().err
-
-
-def test_new_environment_name_precedes_the_old_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(f"{PREFIX}LEASE", "9")
-    monkeypatch.setenv(f"{PREFIX}LEASE_SECONDS", "7")
-    assert read_settings(None, {"data": "x"}).lease_seconds == 7.0
 
 
 def example_value(name: str) -> str:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from datasets import load_dataset
 
 import rebar_depth_bench as rdb
 from benchmarks import steel_coverage
@@ -24,7 +22,6 @@ from rebar_depth_bench.data.columns import features
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.trajectory import CENTRE, NEAREST_STEEL
 from rebar_depth_bench.methods import own_methods
-from tests.synthetic_dataset import drop_scene_column
 
 
 def test_benchmark_card_in_repository_is_up_to_date() -> None:
@@ -73,20 +70,6 @@ def test_dataset_card_is_rendered_from_manifest(tiny_root: Path) -> None:
     folder = open_folder(tiny_root)
     card = dataset_card(folder.version, folder.digest, list(folder.config_by_name.values()))
     assert card == (tiny_root / "README.md").read_text()
-
-
-def test_card_of_an_older_folder_describes_its_shards(tiny_root: Path, tmp_path: Path) -> None:
-    root = tmp_path / "older"
-    shutil.copytree(tiny_root, root)
-    drop_scene_column(root / "lattice")
-    folder = open_folder(root)
-    card = dataset_card(folder.version, folder.digest, list(folder.config_by_name.values()))
-    (root / "README.md").write_text(card)
-    loaded = {name: load_dataset(str(root), name, split="test") for name in folder.configs}
-    assert {name: "scene" in rows.column_names for name, rows in loaded.items()} == {
-        "lattice": False,
-        "lattice-orbit": True,
-    }
 
 
 def test_steel_on_cards_is_of_all_views_of_all_configs() -> None:

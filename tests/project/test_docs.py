@@ -182,7 +182,7 @@ def test_formats_list_columns_and_keys() -> None:
     page = DOCS / "formats.md"
     listed = first_column(page)
     assert {*COLUMNS, *BARS_SCHEMA.names, *CROSSINGS_SCHEMA.names} <= set(listed)
-    assert set(SubmissionMeta.model_fields) - {"uses_intrinsics"} <= set(listed)
+    assert set(SubmissionMeta.model_fields) <= set(listed)
     descriptions = {COLUMN_DESCRIPTIONS[column_kind(name)] for name in COLUMNS}
     assert all(f"| {description} |" in page.read_text() for description in descriptions)
 

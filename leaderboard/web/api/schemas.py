@@ -144,7 +144,6 @@ class LeaderboardRow(BaseModel):
     method: str
     submitter: str
     url: str | None
-    uses_intrinsics: bool | None
     inputs: str | None = Field(description="input class, as declared by the submitter")
     uses_ground_truth: bool | None = Field(description="as declared; such rows are not ranked")
     created_at: datetime

@@ -156,7 +156,7 @@ def _result_context(service: Service, record: SubmissionModel, full_config: str 
         if service.settings.hidden_truth:
             disclosed = read_disclosed(data, record.id)
             rows = [disclosed_row(name, table) for name, table in disclosed.tables.items()]
-            return {**context, "result_protocol": disclosed.protocol, "configs": rows}
+            return {**context, "configs": rows}
         result = read_result(data, record.id)
     except InputError:
         return {"scored": False, "reason": _UNREADABLE, "configs": [], "ranks": {}}
@@ -164,7 +164,6 @@ def _result_context(service: Service, record: SubmissionModel, full_config: str 
     configs = [_config_views(name, views[name], name == full_config) for name in result.tables]
     return {
         **context,
-        "result_protocol": result.protocol,
         "configs": configs,
         "dash_in_views": any(row.has_dash() for config in configs for row in config.worst),
         "pictured": _pictured_views(service, record.id, result),
@@ -205,10 +204,7 @@ def _others(service: Service, record: SubmissionModel) -> list[LeaderboardEntry]
 
 
 def _pictured_views(service: Service, submission_id: str, result: Result) -> list[dict[str, Any]]:
-    """Return the views with pictures, grouped by config and sorted worst first.
-
-    Pictures that an earlier version stored have no facts: size, and texts of their colour bars.
-    """
+    """Return the views with pictures, grouped by config and sorted worst first."""
     pictures = picture_facts(service.database, submission_id)
     views = [view for view in result.views if view.view_id in pictures]
     order = {config: index for index, config in enumerate(result.tables)}

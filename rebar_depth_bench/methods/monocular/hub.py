@@ -14,10 +14,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from rebar_depth_bench.errors import MethodError, exception_summary
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.monocular.third_party import check_folder, with_weights_digest
+from rebar_depth_bench.methods.monocular.third_party import (
+    check_folder,
+    check_weights_loaded,
+    import_package,
+    import_torch,
+    safetensors_names,
+    translate_errors,
+    with_weights_digest,
+)
 
 
 def snapshot(repository: str, file: str, local_hint: str) -> Path:
@@ -120,6 +129,19 @@ class HubModel:
     install: str
     load: Callable[[Path], Predictor]
     check: Callable[[Path], None] = accept_any_config
+
+
+def load_network(name: str, module: str, network: str, install: str, folder: Path) -> tuple[Any, Any]:
+    """Return torch, and the class ``network`` of a package's module with the weights of a folder.
+
+    The network runs on the GPU if torch finds one. Raises ``MethodError`` if torch or the package is missing, or
+    if the weights are incomplete.
+    """
+    torch = import_torch(name)
+    package = import_package(module, name, install)
+    with translate_errors(name, torch, f"{folder.name} cannot be loaded"):
+        model = getattr(package, network).from_pretrained(str(folder), local_files_only=True)
+        return torch, check_weights_loaded(name, torch, model, safetensors_names(folder / WEIGHTS))
 
 
 def hub_method(model: HubModel) -> Method:

@@ -22,6 +22,7 @@ from numpy import ndarray
 from rebar_depth_bench.data.digests import files_digest
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
+from rebar_depth_bench.methods.huggingface.families import resized
 from rebar_depth_bench.methods.monocular.conversions import (
     Letterbox,
     crop_margins,
@@ -32,8 +33,10 @@ from rebar_depth_bench.methods.monocular.conversions import (
 from rebar_depth_bench.methods.monocular.hub import announce_download, download_error
 from rebar_depth_bench.methods.monocular.third_party import (
     check_folder,
-    check_weights_loaded,
+    image_tensor,
     import_torch,
+    load_checkpoint,
+    shape_error,
     torch_device,
     translate_errors,
     with_weights_digest,
@@ -85,25 +88,19 @@ def load_predictor(folder: Path, checkpoint: Path) -> Predictor:
     """
     torch = import_torch(NAME)
     with translate_errors(NAME, torch, f"{folder.name} cannot be loaded"):
-        model = torch.hub.load(str(folder), HUB_ENTRY_POINT, source="local", pretrain=False)
-        weights = torch.load(checkpoint, map_location="cpu", weights_only=False)["model_state_dict"]
-        model.load_state_dict(weights, strict=False)
-        model = check_weights_loaded(NAME, torch, model, weights)
+        network = torch.hub.load(str(folder), HUB_ENTRY_POINT, source="local", pretrain=False)
+        model = load_checkpoint(NAME, torch, network, checkpoint, "model_state_dict", strict=False)
 
     def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         grid = row["left_rgb"].shape[:2]
         letterbox = fit_letterbox(grid, INPUT_SIZE_PX)
         with translate_errors(NAME, torch, "inference failed"), torch.inference_mode():
-            raw_output = model.inference(
-                {"input": network_input(row["left_rgb"], letterbox).to(torch_device(torch))}
-            )[0]
+            tensor = network_input(row["left_rgb"], letterbox).to(torch_device(torch))
+            raw_output = model.inference({"input": tensor})[0]
             padded_depth = raw_output.float().cpu().reshape(raw_output.shape[-2:])
         if tuple(padded_depth.shape) != INPUT_SIZE_PX:
-            raise MethodError(
-                f"{NAME}: the network returned depth of shape {tuple(padded_depth.shape)}, "
-                f"expected {INPUT_SIZE_PX}"
-            )
-        canonical = _resize_bilinear(torch, crop_margins(padded_depth, letterbox.margins)[None, None], grid)[0, 0]
+            raise shape_error(NAME, padded_depth.shape, f"{INPUT_SIZE_PX}")
+        canonical = resized(crop_margins(padded_depth, letterbox.margins), grid, "bilinear")
         return metric3d_depth_m(np.asarray(canonical.numpy()), row["left_K"], letterbox.scale)
 
     return predict
@@ -114,20 +111,10 @@ def network_input(rgb: UInt8[ndarray, "H W 3"], letterbox: Letterbox) -> Any:
 
     Source: ``hubconf.py`` of Metric3D, with torch's bilinear interpolation instead of OpenCV's, which is equal.
     """
-    torch = import_torch(NAME)
-    planes = torch.from_numpy(rgb.transpose(2, 0, 1).astype(np.float32))[None]
-    resized = (
-        _resize_bilinear(torch, planes, (letterbox.height_px, letterbox.width_px))[0]
-        .round()
-        .numpy()
-        .transpose(1, 2, 0)
-    )
-    normalised = (padded(resized, letterbox.margins, MARGIN_RGB) - MEAN_RGB) / STD_RGB
-    return torch.from_numpy(normalised.astype(np.float32).transpose(2, 0, 1).copy())[None]
-
-
-def _resize_bilinear(torch: Any, planes: Any, grid: tuple[int, int]) -> Any:
-    return torch.nn.functional.interpolate(planes, size=grid, mode="bilinear", align_corners=False)
+    torch, size = import_torch(NAME), (letterbox.height_px, letterbox.width_px)
+    planes = [resized(plane, size, "bilinear").round().numpy() for plane in image_tensor(torch, rgb)[0]]
+    letterboxed = padded(np.stack(planes, axis=-1), letterbox.margins, MARGIN_RGB)
+    return image_tensor(torch, (letterboxed - MEAN_RGB) / STD_RGB)
 
 
 def cached_metric3d_method() -> Method:
@@ -144,9 +131,8 @@ def cached_metric3d_method() -> Method:
     if not (folder / HUBCONF).is_file():
         source = "https://github.com/YvanYin/Metric3D"
         announce_download(NAME, "its code, which is then executed,", source, LOCAL_COPY_HINT)
-        with translate_errors(
-            NAME, torch, f"its code from {source} cannot be downloaded or run; {LOCAL_COPY_HINT}"
-        ):
+        doing = f"its code from {source} cannot be downloaded or run; {LOCAL_COPY_HINT}"
+        with translate_errors(NAME, torch, doing):
             torch.hub.load(REPOSITORY, HUB_ENTRY_POINT, pretrain=False, trust_repo=True)
     if not checkpoint.is_file():
         announce_download(NAME, "the weights", WEIGHTS_URL, LOCAL_COPY_HINT)

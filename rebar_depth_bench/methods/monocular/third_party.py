@@ -13,6 +13,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Num
+from numpy import ndarray
+
 from rebar_depth_bench.data.digests import files_digest
 from rebar_depth_bench.errors import MethodError, Problem
 from rebar_depth_bench.limits import JSON_BYTES
@@ -119,6 +123,23 @@ def check_weights_loaded(method: str, torch: Any, network: Any, loaded_names: It
     if missing:
         print(f"{message}: {', '.join(missing)}", file=sys.stderr, flush=True)
     return network.to(torch_device(torch)).eval()
+
+
+def image_tensor(torch: Any, rgb: Num[ndarray, "h w 3"]) -> Any:
+    """Return an image as a 1 x 3 x h x w float32 tensor with the same values."""
+    return torch.from_numpy(rgb.transpose(2, 0, 1).astype(np.float32))[None]
+
+
+def shape_error(method: str, shape: Sequence[int], expected: str) -> MethodError:
+    """Return the error of a network whose depth has another shape than ``expected``."""
+    return MethodError(f"{method}: the network returned depth of shape {tuple(shape)}, expected {expected}")
+
+
+def load_checkpoint(method: str, torch: Any, network: Any, path: Path, key: str, *, strict: bool = True) -> Any:
+    """Return a network with the weights under ``key`` of a pickled checkpoint; see ``check_weights_loaded``."""
+    weights = torch.load(path, map_location="cpu", weights_only=False)[key]
+    network.load_state_dict(weights, strict=strict)
+    return check_weights_loaded(method, torch, network, weights)
 
 
 def torch_device(torch: Any) -> str:

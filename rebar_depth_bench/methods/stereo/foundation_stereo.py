@@ -25,23 +25,25 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.errors import MethodError, Problem
+from rebar_depth_bench.geometry.calibration_documents import parse_document
+from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.monocular.conversions import crop_margins, margins_to_multiple, padded
 from rebar_depth_bench.methods.monocular.third_party import (
-    check_weights_loaded,
+    image_tensor,
     import_package,
     import_torch,
+    load_checkpoint,
     on_sys_path,
     torch_device,
     translate_errors,
@@ -50,29 +52,23 @@ from rebar_depth_bench.methods.monocular.third_party import (
 from rebar_depth_bench.methods.stereo.disparity import (
     SEARCH_SHARE_OF_WIDTH,
     STEREO_COLUMNS,
-    Matcher,
     StereoImages,
     largest_disparity_px,
     rectified_images,
     stereo_depth_m,
 )
-from rebar_depth_bench.methods.stereo.foundation_stereo_files import (
-    CHECKPOINT_FILE,
-    INSTALL_HINT,
-    NAME,
-    SETTINGS_FILE,
-    Installation,
-    find_installation,
-    read_settings,
-)
-from rebar_depth_bench.methods.stereo.passes import (
-    SMALL_RATIO,
-    Passes,
-    choose_passes,
-    full_size_disparity_px,
-    resized,
-)
+from rebar_depth_bench.methods.stereo.passes import SMALL_RATIO, choose_passes, full_size_disparity_px, resized
+from rebar_depth_bench.reading import read_file
+from rebar_depth_bench.validation import short_repr
 
+NAME = "foundation-stereo"
+CODE_FILE, SETTINGS_FILE, CHECKPOINT_FILE = "core/foundation_stereo.py", "cfg.yaml", "model_best_bp2.pth"
+WEIGHTS_FOLDER = Path("pretrained_models", "23-51-11")
+INSTALL_HINT = (
+    "git clone https://github.com/NVlabs/FoundationStereo, put the folder 23-51-11 linked in its readme (Google "
+    f"Drive) into FoundationStereo/{WEIGHTS_FOLDER.parent}, install its requirements, and pass the clone as "
+    f"{NAME}:FoundationStereo"
+)
 SIDE_MULTIPLE_PX, ITERATIONS = 32, 32
 INFO = MethodInfo(
     name=NAME,
@@ -85,70 +81,59 @@ INFO = MethodInfo(
 )
 
 
+class Settings(dict[str, Any]):
+    """Dictionary with attribute access, which is all that the network requires of its settings."""
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self[name]
+        except KeyError:
+            raise AttributeError(f"{SETTINGS_FILE} has no {name}") from None
+
+
 def foundation_stereo_method(folder: Path, nearest_m: float | None = None) -> Method:
     """Return FoundationStereo from a clone of its repository, or with other weights in a folder inside a clone.
 
     ``nearest_m`` is the declared distance of the nearest surface, metres, which chooses the mode (see the module).
     Raises ``MethodError`` if code, checkpoint or ``cfg.yaml`` is missing.
     """
-    installation = find_installation(folder)
+    weights = folder if (folder / CHECKPOINT_FILE).is_file() else folder / WEIGHTS_FOLDER
+    start = folder.resolve()
+    clone = next((candidate for candidate in (start, *start.parents) if (candidate / CODE_FILE).is_file()), None)
+    if not folder.is_dir() or clone is None:
+        raise MethodError(
+            f"{NAME}:{folder}: no clone of FoundationStereo with {CODE_FILE}; to install it: {INSTALL_HINT}"
+        )
+    files = [weights / CHECKPOINT_FILE, weights / SETTINGS_FILE]
+    for file in files:
+        if not file.is_file():
+            raise MethodError(f"{NAME}:{folder}: no {file.name} in {weights}; to install it: {INSTALL_HINT}")
     nearest = "" if nearest_m is None else f", nearest distance {nearest_m} m"
-    info = with_weights_digest(
-        replace(INFO, summary=f"{INFO.summary}{nearest}"),
-        installation.weights.name,
-        [installation.weights / CHECKPOINT_FILE, installation.weights / SETTINGS_FILE],
-    )
-    return Method(
-        info,
-        load=partial(load_predictor, installation, nearest_m),
-        notes=partial(_notes, installation, nearest_m),
-    )
+    info = with_weights_digest(replace(INFO, summary=f"{INFO.summary}{nearest}"), weights.name, files)
+    return Method(info, partial(load_predictor, clone, weights, nearest_m), partial(_notes, weights, nearest_m))
 
 
-def load_predictor(installation: Installation, nearest_m: float | None = None) -> Predictor:
-    """Return the predictor of an installation, on the GPU if torch finds one.
+def load_predictor(clone: Path, weights: Path, nearest_m: float | None = None) -> Predictor:
+    """Return the predictor with the code of a clone and a folder of weights, on the GPU if torch finds one.
 
     Raises ``MethodError`` if torch, OpenCV or a module that its code imports is missing, or if the weights are
     incomplete.
     """
     torch = import_torch(NAME)
     import_package("cv2", NAME, "pip install 'rebar-depth-bench[methods]'")
-    settings = read_settings(installation)
-    if downloads := _possible_downloads(torch):
-        print(f"{NAME}: its code may download {' and '.join(downloads)}", file=sys.stderr, flush=True)
-    with (
-        translate_errors(NAME, torch, f"{installation.weights} cannot be loaded"),
-        on_sys_path(installation.clone),
-    ):
-        code = importlib.import_module("core.foundation_stereo")
-        _check_module_origin(code, installation.clone)
-        checkpoint = torch.load(installation.weights / CHECKPOINT_FILE, map_location="cpu", weights_only=False)[
-            "model"
-        ]
-        model = code.FoundationStereo(settings)
-        model.load_state_dict(checkpoint)
-        model = check_weights_loaded(NAME, torch, model, checkpoint)
-
-    def passes_of(images: StereoImages) -> Passes:
-        return choose_passes(largest_disparity_px(images, nearest_m), settings.max_disp)
-
-    return partial(stereo_depth_m, match=_matcher(torch, model, passes_of))
-
-
-def _matcher(torch: Any, model: Any, passes_of: Callable[[StereoImages], Passes]) -> Matcher:
-    """Return the matcher that runs a loaded network with the passes chosen for the images."""
+    settings = _read_settings(weights)
+    model = _load_network(torch, clone, weights, settings)
 
     def match(images: StereoImages) -> ndarray:
-        passes = passes_of(images)
+        passes = choose_passes(largest_disparity_px(images, nearest_m), settings.max_disp)
         left, right = (resized(image, passes.scale) for image in (images.left_rgb, images.right_rgb))
         margins = margins_to_multiple((left.shape[0], left.shape[1]), SIDE_MULTIPLE_PX)
-        cuda = torch.cuda.is_available()
         with (
             translate_errors(NAME, torch, "inference failed"),
             torch.inference_mode(),
-            torch.autocast("cuda", enabled=cuda),
+            torch.autocast("cuda", enabled=torch.cuda.is_available()),
         ):
-            pair = [_to_tensor(torch, padded(image, margins)) for image in (left, right)]
+            pair = [image_tensor(torch, padded(image, margins)).to(torch_device(torch)) for image in (left, right)]
             if passes.hierarchical:  # Spelled so by its authors.
                 disparity_px = model.run_hierachical(
                     *pair, iters=ITERATIONS, test_mode=True, small_ratio=SMALL_RATIO
@@ -159,24 +144,36 @@ def _matcher(torch: Any, model: Any, passes_of: Callable[[StereoImages], Passes]
         cropped_px = np.asarray(crop_margins(padded_px, margins), np.float32)
         return full_size_disparity_px(cropped_px, (images.left_rgb.shape[0], images.left_rgb.shape[1]))
 
-    return match
+    return partial(stereo_depth_m, match=match)
 
 
-def _notes(installation: Installation, nearest_m: float | None, row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the mode and scale for a row, with the numbers from which they are chosen."""
-    volume_px = read_settings(installation).max_disp
-    largest_px = largest_disparity_px(rectified_images(row)[0], nearest_m)
-    passes = choose_passes(largest_px, volume_px)
-    declared = (
-        f"{SEARCH_SHARE_OF_WIDTH:g} of the width" if nearest_m is None else f"nearest distance {nearest_m} m"
+def _read_settings(weights: Path) -> Settings:
+    """Return the network's settings. Raises ``MethodError`` if they or the end of its cost volume are invalid."""
+    path, problems = weights / SETTINGS_FILE, list[Problem]()
+    settings = Settings(
+        parse_document(path.name, read_file(path, TOML_BYTES, "a YAML file", MethodError), problems)
     )
-    return {
-        "mode": passes.mode,
-        "scale": round(passes.scale, 4),
-        "largest_disparity_px": round(largest_px, 1),
-        "largest_disparity_from": declared,
-        "cost_volume_px": volume_px,
-    }
+    if problems:
+        raise MethodError.from_problems(path, problems)
+    settings.setdefault("vit_size", "vitl")
+    volume_px = settings.get("max_disp")
+    if type(volume_px) is not int or volume_px <= 0:
+        raise MethodError(
+            f"{path}: max_disp is {short_repr(volume_px)}, expected the end of the cost volume, whole pixels"
+        )
+    return settings
+
+
+def _load_network(torch: Any, clone: Path, weights: Path, settings: Settings) -> Any:
+    """Return the network with its weights, after a notice of the files that its code may download."""
+    if downloads := _possible_downloads(torch):
+        print(f"{NAME}: its code may download {' and '.join(downloads)}", file=sys.stderr, flush=True)
+    with translate_errors(NAME, torch, f"{weights} cannot be loaded"), on_sys_path(clone):
+        code = importlib.import_module("core.foundation_stereo")
+        if not Path(str(code.__file__)).resolve().is_relative_to(clone.resolve()):
+            raise MethodError(f"{NAME}: core is already imported from {code.__file__}, expected it from {clone}")
+        network = code.FoundationStereo(settings)
+        return load_checkpoint(NAME, torch, network, weights / CHECKPOINT_FILE, "model")
 
 
 def _possible_downloads(torch: Any) -> list[str]:
@@ -194,15 +191,21 @@ def _possible_downloads(torch: Any) -> list[str]:
     return downloads
 
 
-def _to_tensor(torch: Any, rgb: UInt8[ndarray, "h w 3"]) -> Any:
-    """Return an image as a 1 x 3 x h x w float32 tensor, values 0 to 255."""
-    return torch.from_numpy(rgb.transpose(2, 0, 1).astype(np.float32))[None].to(torch_device(torch))
-
-
-def _check_module_origin(code: Any, clone: Path) -> None:
-    """Raise ``MethodError`` if ``core`` was imported from another package of the same name."""
-    if not Path(code.__file__).resolve().is_relative_to(clone.resolve()):
-        raise MethodError(f"{NAME}: core is already imported from {code.__file__}, expected it from {clone}")
+def _notes(weights: Path, nearest_m: float | None, row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the mode and scale for a row, with the numbers from which they are chosen."""
+    volume_px = _read_settings(weights).max_disp
+    largest_px = largest_disparity_px(rectified_images(row)[0], nearest_m)
+    passes = choose_passes(largest_px, volume_px)
+    declared = (
+        f"{SEARCH_SHARE_OF_WIDTH:g} of the width" if nearest_m is None else f"nearest distance {nearest_m} m"
+    )
+    return {
+        "mode": passes.mode,
+        "scale": round(passes.scale, 4),
+        "largest_disparity_px": round(largest_px, 1),
+        "largest_disparity_from": declared,
+        "cost_volume_px": volume_px,
+    }
 
 
 def _raise_without_folder() -> Predictor:

@@ -8,7 +8,6 @@ import pytest
 
 from rebar_depth_bench import InputError
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.console import replace_renamed_options
 from rebar_depth_bench.output_options import check_outputs
 
 
@@ -74,14 +73,3 @@ def test_folder_named_like_config_or_method_is_no_input(tmp_path: Path, monkeypa
 
 def test_new_files_in_new_folders_are_accepted(tmp_path: Path) -> None:
     check_outputs({"json": tmp_path / "a" / "b.json", "csv": tmp_path / "c.csv", "data": str(tmp_path / "data")})
-
-
-def test_renamed_options_work_with_a_warning(capsys: pytest.CaptureFixture[str]) -> None:
-    renamed = {"--given-scale": "--baseline-scale", "--k": "--num-anchor-views"}
-    arguments = ["command", "--k", "1", "--given-scale=2", "a.zip"]
-    expected = ["command", "--num-anchor-views", "1", "--baseline-scale=2", "a.zip"]
-    assert replace_renamed_options(arguments, renamed) == expected
-    assert capsys.readouterr().err == (
-        "warning: --k is deprecated, use --num-anchor-views\n"
-        "warning: --given-scale is deprecated, use --baseline-scale\n"
-    )

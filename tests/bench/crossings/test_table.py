@@ -1,4 +1,4 @@
-"""Tests of the table of crossings: round trip, folders of earlier versions, and validation."""
+"""Tests of the table of crossings: round trip, folders without it, and validation."""
 
 from __future__ import annotations
 

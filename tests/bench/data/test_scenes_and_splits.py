@@ -13,9 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.columns import COLUMNS
 from rebar_depth_bench.data.config_tables import ViewRecord
-from rebar_depth_bench.data.dataset import ConfigViews, iterate_rows
+from rebar_depth_bench.data.dataset import ConfigViews
 from rebar_depth_bench.data.digests import views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.data.verification import truth_problems
@@ -32,7 +31,7 @@ from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.result_io import read_result
 from rebar_depth_bench.scoring.score import score_evaluation
-from tests.synthetic_dataset import HEIGHT, WIDTH, drop_scene_column, write_dataset, write_split_dataset
+from tests.synthetic_dataset import HEIGHT, WIDTH, write_dataset, write_split_dataset
 
 SCENES = {"a": "train", "b-1": "train", "c": "validation", "d": "test", "e": "test"}
 VIEWS = 3
@@ -206,25 +205,12 @@ def test_what_needs_one_scene_refuses_several(root: Path) -> None:
 
 
 @pytest.mark.parametrize("streaming", [False, True])
-@pytest.mark.parametrize("columns", [None, ["scene"], ["view_id"], ["scene", "view_id"]])
-def test_older_folder_without_scene_column_loads(
-    tmp_path: Path, streaming: bool, columns: list[str] | None
-) -> None:
-    write_dataset(tmp_path / "old", ["lattice"], 2)
-    drop_scene_column(tmp_path / "old" / "lattice")
-    rows = list(rdb.load(tmp_path / "old", "lattice", streaming=streaming, columns=columns))
-    assert [list(row) for row in rows] == [list(columns or COLUMNS)] * 2
-    assert all(row.get("scene", "lattice") == "lattice" for row in rows)
-    config = open_folder(tmp_path / "old").config("lattice")
-    assert [row["scene"] for row in iterate_rows(config, ["scene"])] == ["lattice"] * 2
-    assert list(truth_problems(config)) == []
-
-
-def test_scene_column_is_required_where_configs_have_several_scenes(tmp_path: Path) -> None:
-    write_split_dataset(tmp_path / "new", SCENES, 1)
-    drop_scene_column(tmp_path / "new" / "cages")
+def test_shards_without_the_column_scene_are_refused(tmp_path: Path, streaming: bool) -> None:
+    write_dataset(tmp_path / "new", ["lattice"], 2)
+    for shard in (tmp_path / "new" / "lattice").glob("*.parquet"):
+        pq.write_table(pq.read_table(shard).drop_columns(["scene"]), shard, row_group_size=1)
     with pytest.raises(DatasetError, match="no columns named scene"):
-        rdb.load(tmp_path / "new", "cages")
+        list(rdb.load(tmp_path / "new", "lattice", streaming=streaming))
 
 
 def test_rows_under_another_scene_are_refused(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Tests of full-mask measures: a hand-computed case, and agreement with the rebar-1 scorer on the interior."""
+"""Tests of full-mask measures: a hand-computed case, and agreement with the scorer on the interior."""
 
 from __future__ import annotations
 

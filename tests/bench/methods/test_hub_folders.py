@@ -21,7 +21,7 @@ import sys
 from dataclasses import replace
 from rebar_depth_bench.console import run_command
 from rebar_depth_bench.methods.monocular.hub import hub_method
-from rebar_depth_bench.methods.monocular.unidepth import UNIDEPTH_MODEL
+from rebar_depth_bench.methods.monocular.hub_networks import UNIDEPTH_MODEL
 
 def show(folder):
     print(*sorted(one.name for one in folder.iterdir()))

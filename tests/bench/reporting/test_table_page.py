@@ -25,7 +25,7 @@ def table_page(text: str = "plain") -> TablePage:
         subject="crossings",
         title=f"{text}: one scale for all",
         lead=f"lead {text}",
-        stamps=[("Protocol", "rebar-1"), (f"Archive of {text}", "sha256:12")],
+        stamps=[("Protocol", "rebar-2"), (f"Archive of {text}", "sha256:12")],
         figures=[PageFigure(chart(series, X_AXIS, Y_AXIS, chart_text), f"Figure {text}", f"caption {text}")],
         tables=[PageTable(f"table {text}", [("k", "views"), (text, "")], [["1", text], ["2", "−0.5"]])],
         notes=[f"note {text}"],
@@ -34,7 +34,7 @@ def table_page(text: str = "plain") -> TablePage:
 
 def test_page_shows_all_content() -> None:
     page = Page(render_page(table_page()))
-    for stated in ("plain: one scale for all", "lead plain", "rebar-1", "sha256:12", "Figure plain", "note plain"):
+    for stated in ("plain: one scale for all", "lead plain", "rebar-2", "sha256:12", "Figure plain", "note plain"):
         assert stated in page.text
     assert (page.count("h1"), page.count("svg"), page.count("table"), page.count("td")) == (1, 1, 1, 2)
 

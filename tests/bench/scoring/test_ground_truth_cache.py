@@ -1,11 +1,9 @@
-"""Tests of the cache of ground truth: damage never changes a score; caches in dataset folders are ignored."""
+"""Tests of the cache of ground truth: damage never changes a score."""
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,6 @@ from rebar_depth_bench.bar_crossings.table import write_crossings
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import read_bars, write_bars
 from rebar_depth_bench.data.codecs import decode, encode_depth
-from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.data.eye_view import EyeTruth
 from rebar_depth_bench.data.manifest import open_folder
@@ -116,47 +113,6 @@ def test_cache_of_other_views_is_refused(tiny_root: Path, archive: Path, empty_c
     [other] = {*empty_cache.iterdir()} - {path}
     other.replace(path)
     assert score(archive, tiny_root).to_json() == expected
-
-
-def write_old_cache(config: DatasetConfig, folder: Path) -> None:
-    """Write a cache as earlier versions kept it in the dataset folder, with a false depth and sound checksums."""
-    truth = config_truth(open_folder(config.root), config)
-    path = folder / ".rebar-cache" / f"rebar-1-{config.name}-{config.ground_truth_digest[7:39]}"
-    path.mkdir(parents=True, exist_ok=True)
-    starts, checksums, arrays = [0], [], []
-    for view in truth:
-        depth_m = np.full_like(view.depth_m, 7)
-        starts.append(starts[-1] + len(depth_m))
-        checksums.append(zlib.crc32(depth_m.tobytes(), zlib.crc32(view.index.tobytes())))
-        arrays.append((view.index.tobytes(), depth_m.tobytes()))
-    (path / "index").write_bytes(b"".join(index for index, _ in arrays))
-    (path / "depth_m").write_bytes(b"".join(depth_m for _, depth_m in arrays))
-    notes = [7.0] * len(truth)
-    index = {"view_ids": truth.view_ids, "starts": starts, "checksums": checksums, "notes": notes}
-    (path / "views.json").write_text(json.dumps(index))
-
-
-def test_cache_in_dataset_folder_is_ignored(tiny_root: Path, archive: Path, copy: Path, empty_cache: Path) -> None:
-    expected = score(archive, tiny_root).to_json()
-    write_old_cache(open_folder(copy).config(CONFIG), copy)
-    before = tree(copy)
-    for path in empty_cache.iterdir():
-        path.unlink()
-    assert score(archive, copy).to_json() == expected
-    assert tree(copy) == before
-
-
-@pytest.mark.usefixtures("empty_cache")
-def test_linked_cache_in_dataset_folder_is_not_followed(copy: Path, archive: Path, tmp_path: Path) -> None:
-    outside = tmp_path / "Documents"
-    (outside / "rebar-1-lattice-orbit-00000000000000000000000000000000").mkdir(parents=True)
-    (outside / "letter.txt").write_text("precious")
-    (copy / ".rebar-cache").symlink_to(outside)
-    before, listing = tree(tmp_path / "dataset"), sorted(outside.rglob("*"))
-    score(archive, copy)
-    load_steel_truth(open_folder(copy), open_folder(copy).config(CONFIG))
-    assert tree(copy) == before
-    assert sorted(outside.rglob("*")) == listing
 
 
 @pytest.mark.usefixtures("empty_cache")

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rebar_depth_bench.errors import ProblemCode
-from rebar_depth_bench.submission.metadata import Declaration, SubmissionMeta, parse_metadata
+from rebar_depth_bench.submission.metadata import SubmissionMeta, parse_metadata
 from tests.bench.submission.conftest import Check, located
 from tests.bench.submission.zips import DEPTH, FIRST, SECOND, Record, deflated, png
 
@@ -17,7 +17,7 @@ def test_optional_and_unknown_keys_are_accepted() -> None:
     for text in (b'{"method": "m", "colour": [1]}', b'{"method": "m", "url": null, "depth_scale": null}'):
         assert parse_metadata(text) == (SubmissionMeta(method="m"), [])
     full: dict[str, Any] = {
-        "method": "Größe 2", "description": "d", "url": "http://x.org", "uses_intrinsics": False,
+        "method": "Größe 2", "description": "d", "url": "http://x.org",
         "inputs": "rgb+K", "uses_ground_truth": False, "depth_scale": 1, "runtime": {"seconds": 1.5},
     }  # fmt: skip
     assert parse_metadata(json.dumps(full).encode()) == (SubmissionMeta(**full), [])
@@ -53,7 +53,6 @@ def test_runtime_is_kept_unchanged(runtime: str) -> None:
         ('{"method": "m", "url": "javascript:alert(1)"}', "invalid", ": url"),
         ('{"method": "m", "url": "http://[::1"}', "invalid", ": url"),
         ('{"method": "m", "url": true}', "invalid", ": url"),
-        ('{"method": "m", "uses_intrinsics": 1}', "invalid", ": uses_intrinsics"),
         ('{"method": "m", "inputs": "sonar"}', "invalid", ": inputs"),
         ('{"method": "m", "inputs": ["rgb"]}', "invalid", ": inputs"),
         ('{"method": "m", "uses_ground_truth": "no"}', "invalid", ": uses_ground_truth"),
@@ -70,12 +69,6 @@ def test_invalid_metadata_is_rejected(check: Check, text: str, code: ProblemCode
     (problem,) = check([Record(b"submission.json", text.encode()), FIRST, SECOND])
     assert (problem.code, problem.where) == (code, f"submission.json{key}")
     assert str(problem).isprintable()
-
-
-def test_intrinsics_do_not_declare_inputs() -> None:
-    meta, _ = parse_metadata(b'{"method": "m", "uses_intrinsics": true}')
-    assert meta is not None
-    assert meta.declaration == Declaration(None, None)
 
 
 def test_constant_that_is_not_json_is_named() -> None:

@@ -38,7 +38,6 @@ def test_written_archive_reads_back(tmp_path: Path, compress: bool) -> None:
         compress=compress,
         description="d",
         url="https://x.org/a",
-        uses_intrinsics=True,
         runtime={"gpu": "none"},
     )
     assert check_archive(path, EXPECTED) == []
@@ -51,7 +50,7 @@ def test_written_archive_reads_back(tmp_path: Path, compress: bool) -> None:
         meta = reader.meta
     assert meta is not None
     assert (meta.method, meta.description, meta.url) == ("my model", "d", "https://x.org/a")
-    assert (meta.uses_intrinsics, meta.runtime, meta.depth_scale) == (True, {"gpu": "none"}, None)
+    assert (meta.runtime, meta.depth_scale) == ({"gpu": "none"}, None)
 
 
 def test_zipfile_and_numpy_read_written_archive(tmp_path: Path) -> None:
@@ -180,7 +179,7 @@ def test_add_requires_open_writer_and_finite_seconds(tmp_path: Path) -> None:
         ({"method": " "}, "method"),
         ({"method": "m" * 201}, "method"),
         ({"method": "m", "url": "ftp://x"}, "url"),
-        ({"method": "m", "uses_intrinsics": "yes"}, "uses_intrinsics"),
+        ({"method": "m", "uses_ground_truth": "yes"}, "uses_ground_truth"),
         ({"method": "m", "runtime": {"s": float("nan")}}, ""),
         ({"method": "m", "runtime": {"s": object()}}, ""),
     ],

@@ -6,13 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from dataset_builder.lidar import SURVEY, ScannerSpec
-from dataset_builder.lidar.beams import visible_sector
-from dataset_builder.lidar.project import LeftCamera, left_depth_m
-from dataset_builder.lidar.simulate import noise_generator, simulate_scan
+from dataset_builder.lidar import SURVEY, ScannerSpec, scan_depth_m
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
-from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
+from rebar_depth_bench.geometry.cameras import Camera, ideal_K
 
 WIDTH, HEIGHT = 64, 36
 FAR_M = 100.0
@@ -22,10 +19,10 @@ PERFECT = replace(
     azimuth_step_rad=0.01,
     elevation_step_rad=0.01,
     elevation_limits_rad=(-1.5, 1.5),
-    divergence_rad=0.0,
-    exit_diameter_m=0.0,
+    divergence_sigma_rad=0.0,
+    exit_sigma_m=0.0,
     rays_per_beam=1,
-    min_range_m=0.0,
+    min_range_m=0.1,
     noise_m=0.0,
 )
 """Scanner with infinitely thin beams and without noise."""
@@ -57,16 +54,12 @@ def concatenate_meshes(*meshes: WorldMesh) -> WorldMesh:
     )
 
 
-def camera(distortion: np.ndarray | None = None) -> LeftCamera:
-    """Return a small left camera."""
+def camera(distortion: np.ndarray | None = None) -> Camera:
+    """Return a small left camera at the world origin."""
     lens = np.zeros(5) if distortion is None else distortion
-    K = ideal_K(WIDTH, HEIGHT)
-    return LeftCamera(K, lens, pixel_rays(K, WIDTH, HEIGHT, lens))
+    return Camera(ideal_K(WIDTH, HEIGHT), lens, np.eye(4), WIDTH, HEIGHT)
 
 
-def scan_depth_m(spec: ScannerSpec, mesh: WorldMesh, view: LeftCamera | None = None) -> np.ndarray:
+def scanned_depth_m(spec: ScannerSpec, mesh: WorldMesh, view: Camera | None = None) -> np.ndarray:
     """Return the planar depth of a scan on the pixel grid of the left camera, in metres."""
-    view = view or camera()
-    sector = visible_sector(spec, view.rays)
-    range_m = simulate_scan(RayCaster(mesh), spec, sector, spec.lidar_from_left, noise_generator("test/0000"))
-    return left_depth_m(spec, sector, range_m, view)
+    return scan_depth_m(RayCaster(mesh), spec, view or camera(), "test/0000")

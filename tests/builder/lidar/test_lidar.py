@@ -13,16 +13,23 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from dataset_builder.lidar import MOBILE, SURVEY, ScannerSpec
-from dataset_builder.lidar.beams import beam_angles, beam_pattern, directions_from_angles, sub_rays, visible_sector
-from dataset_builder.lidar.scanner import BeamWidth, ReturnMode
-from dataset_builder.lidar.simulate import noise_generator, reported_range_m, simulate_scan
+from dataset_builder.lidar.scanner import (
+    beam_angles,
+    beam_pattern,
+    directions_from_angles,
+    reported_range_m,
+    simulate_scan,
+    sub_rays,
+    visible_beams,
+)
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K, look_at, pixel_rays
 from tests.builder.lidar.lidar_scenes import PERFECT, camera, concatenate_meshes, wall
 
-SHARE_OF_PEAK = {"1/e2": math.exp(-2), "1/e": math.exp(-1), "fwhm": 0.5}
-WIDE_BEAM = replace(PERFECT, divergence_rad=0.01, exit_diameter_m=0.004, rays_per_beam=400, range_resolution_m=0.1)
+WIDE_BEAM = replace(
+    PERFECT, divergence_sigma_rad=0.0025, exit_sigma_m=0.001, rays_per_beam=400, range_resolution_m=0.1
+)
 HALF_STEP_RAD = 0.005
 
 
@@ -40,24 +47,28 @@ def beam_axis_x_m(depth_m: float) -> float:
 
 
 def sigma_on_wall_m(spec: ScannerSpec, depth_m: float) -> float:
-    diameter_m = math.hypot(spec.exit_diameter_m, spec.divergence_rad * depth_m)  # The hyperbola of ISO 11146-1.
-    return diameter_m / 4 if spec.beam_width == "1/e2" else diameter_m / 8**0.5
+    """Return the beam's sigma by the hyperbola of ISO 11146-1, in metres."""
+    return math.hypot(spec.exit_sigma_m, spec.divergence_sigma_rad * depth_m)
 
 
-@pytest.mark.parametrize("width", SHARE_OF_PEAK)
-def test_beam_width_matches_data_sheet_definition(width: BeamWidth) -> None:
-    spec = replace(WIDE_BEAM, beam_width=width)
-    exit_exponent = (spec.exit_diameter_m / 2 / spec.exit_sigma_m) ** 2 / 2
-    assert math.exp(-exit_exponent) == pytest.approx(SHARE_OF_PEAK[width], rel=1e-12)
-    divergence_exponent = (spec.divergence_rad / 2 / spec.divergence_sigma_rad) ** 2 / 2
-    assert math.exp(-divergence_exponent) == pytest.approx(SHARE_OF_PEAK[width], rel=1e-12)
+@pytest.mark.parametrize(
+    ("spec", "share_of_peak", "divergence_rad", "exit_diameter_m"),
+    [(SURVEY, math.exp(-1), 0.3e-3, 2.12e-3), (MOBILE, 0.5, math.radians(0.18), 10e-3)],
+)
+def test_beam_width_matches_data_sheet_definition(
+    spec: ScannerSpec, share_of_peak: float, divergence_rad: float, exit_diameter_m: float
+) -> None:
+    exit_exponent = (exit_diameter_m / 2 / spec.exit_sigma_m) ** 2 / 2
+    assert math.exp(-exit_exponent) == pytest.approx(share_of_peak, rel=1e-12)
+    divergence_exponent = (divergence_rad / 2 / spec.divergence_sigma_rad) ** 2 / 2
+    assert math.exp(-divergence_exponent) == pytest.approx(share_of_peak, rel=1e-12)
 
 
 @given(st.floats(0, 50), st.floats(-1, 1), st.floats(-1, 1), st.sampled_from([2, 24, 60]))
 def test_sub_rays_have_gaussian_beam_width_at_any_range(
     range_m: float, azimuth: float, elevation: float, count: int
 ) -> None:
-    spec = replace(WIDE_BEAM, beam_width="1/e2", rays_per_beam=count)
+    spec = replace(WIDE_BEAM, rays_per_beam=count)
     angles = np.array([azimuth]), np.array([elevation])
     origins, directions = sub_rays(spec, *angles)
     offsets_m = (origins + range_m * directions - range_m * directions_from_angles(*angles)[:, None])[0]
@@ -82,24 +93,24 @@ def test_beam_pattern_is_isotropic_gaussian() -> None:
 @given(st.floats(0.15, 30), st.floats(-0.06, 0.06), st.floats(-0.06, 0.06))
 def test_visible_sector_contains_all_pixels_at_any_depth(depth_m: float, right_m: float, down_m: float) -> None:
     spec = replace(PERFECT, position_left_m=(right_m, down_m, 0.0))
-    rays = camera().rays
-    sector = visible_sector(spec, rays)
+    rays = camera().rays()
+    rows, columns = visible_beams(spec, rays)
     x, y, z = np.moveaxis(depth_m * rays - np.array([right_m, down_m, 0.0]), -1, 0)
     column = np.floor(np.arctan2(x, z) / 0.01)
     row = np.floor(np.arctan2(-y, np.hypot(x, z)) / 0.01)
-    assert column.min() >= sector.first_column
-    assert column.max() < sector.first_column + sector.columns
-    assert row.min() >= sector.first_row
-    assert row.max() < sector.first_row + sector.rows
+    assert column.min() >= columns.min()
+    assert column.max() <= columns.max()
+    assert row.min() >= rows.min()
+    assert row.max() <= rows.max()
 
 
 def test_rows_are_limited_to_scanner_field_of_view() -> None:
     K = ideal_K(1280, 720)
-    sector = visible_sector(MOBILE, pixel_rays(K, 1280, 720))
-    assert (sector.first_row, sector.rows) == (-64, 128)
-    highest = (sector.first_row + sector.rows - 0.5) * MOBILE.elevation_step_rad
-    assert math.degrees(highest) == pytest.approx(22.5)
-    assert visible_sector(replace(PERFECT, elevation_limits_rad=(1.4, 1.5)), camera().rays).rows == 0
+    rows, _ = visible_beams(MOBILE, pixel_rays(K, 1280, 720))
+    assert (rows.min(), rows.max()) == (-64, 63)
+    assert math.degrees((rows.max() + 0.5) * MOBILE.elevation_step_rad) == pytest.approx(22.5)
+    rows, _ = visible_beams(replace(PERFECT, elevation_limits_rad=(1.4, 1.5)), camera().rays())
+    assert len(rows) == 0
 
 
 def test_hits_match_ground_truth_depth_and_incidence() -> None:
@@ -107,7 +118,7 @@ def test_hits_match_ground_truth_depth_and_incidence() -> None:
     mesh = WorldMesh(
         np.array([[-9.0, -9, 0], [9, -9, 0], [0, 9, 0]]), np.array([[0, 1, 2]], np.int32), np.ones(1, np.uint16)
     )
-    left, rays = camera(), camera().rays
+    left, rays = camera(), camera().rays()
     truth = RayCaster(mesh).cast(Camera(left.K, left.distortion, pose, rays.shape[1], rays.shape[0]))
     directions = rays.reshape(-1, 3) @ pose[:3, :3]
     centre = np.linalg.inv(pose)[:3, 3]
@@ -137,32 +148,26 @@ def test_edge_within_range_resolution_gives_weighted_mean(covered_sigma: float, 
 
 @pytest.mark.slow
 @settings(max_examples=40)
-@given(st.floats(-2.5, 2.5), st.floats(0.15, 5), st.sampled_from(["strongest", "first"]))
-def test_edge_beyond_range_resolution_gives_one_surface(
-    covered_sigma: float, step_m: float, reports: ReturnMode
-) -> None:
-    spec = replace(WIDE_BEAM, reports=reports, least_share=0.1)
-    edge_m = beam_axis_x_m(2.0) + covered_sigma * sigma_on_wall_m(spec, 2.0)
+@given(st.floats(-2.5, 2.5), st.floats(0.15, 5))
+def test_edge_beyond_range_resolution_gives_one_surface(covered_sigma: float, step_m: float) -> None:
+    edge_m = beam_axis_x_m(2.0) + covered_sigma * sigma_on_wall_m(WIDE_BEAM, 2.0)
     depth_m = (
-        single_beam_range_m(spec, concatenate_meshes(wall(2.0, right_m=edge_m), wall(2.0 + step_m)))
+        single_beam_range_m(WIDE_BEAM, concatenate_meshes(wall(2.0, right_m=edge_m), wall(2.0 + step_m)))
         * math.cos(HALF_STEP_RAD) ** 2
     )
     share = NormalDist().cdf(covered_sigma)
-    threshold = 0.5 if reports == "strongest" else 0.1
-    if abs(share - threshold) > 0.02:
-        assert depth_m == pytest.approx(2.0 if share > threshold else 2.0 + step_m, abs=2e-3)
+    if abs(share - 0.5) > 0.02:
+        assert depth_m == pytest.approx(2.0 if share > 0.5 else 2.0 + step_m, abs=2e-3)
 
 
-@pytest.mark.parametrize("reports", ["strongest", "first"])
 @pytest.mark.parametrize("width_sigma", [0.1, 0.2, 0.3, 1.0, 2.0, 4.0])
-def test_rod_thinner_than_footprint_needs_enough_light(reports: ReturnMode, width_sigma: float) -> None:
-    spec = replace(WIDE_BEAM, reports=reports, least_share=0.1)
+def test_rod_thinner_than_footprint_needs_enough_light(width_sigma: float) -> None:
+    spec = replace(WIDE_BEAM, least_share=0.1)
     middle_m, half_m = beam_axis_x_m(2.0), width_sigma / 2 * sigma_on_wall_m(spec, 2.0)
     mesh = concatenate_meshes(wall(2.0, middle_m - half_m, middle_m + half_m), wall(5.0))
     share = math.erf(width_sigma / 2 / 2**0.5)
-    visible = share > (0.5 if reports == "strongest" else 0.1)
     depth_m = single_beam_range_m(spec, mesh) * math.cos(HALF_STEP_RAD) ** 2
-    assert depth_m == pytest.approx(2.0 if visible else 5.0, abs=2e-3)
+    assert depth_m == pytest.approx(2.0 if share > 0.5 else 5.0, abs=2e-3)
     without_background_m = single_beam_range_m(spec, wall(2.0, middle_m - half_m, middle_m + half_m))
     assert math.isnan(without_background_m) == (share < 0.1)
 
@@ -181,18 +186,21 @@ def test_rod_thinner_than_step_is_missed_at_expected_rate() -> None:
 
 
 def test_noise_has_specified_sigma_and_is_deterministic() -> None:
-    noisy = replace(PERFECT, noise_m=0.004, noise_per_m=0.002)
-    caster, sector = RayCaster(wall(3.0)), visible_sector(PERFECT, camera().rays)
-    pose = PERFECT.lidar_from_left
-    clean_m = simulate_scan(caster, PERFECT, sector, pose, noise_generator("a/0000"))
-    noisy_m = simulate_scan(caster, noisy, sector, pose, noise_generator("a/0000"))
-    normalised = ((noisy_m - clean_m) / (0.004 + 0.002 * clean_m)).ravel()
+    noisy = replace(PERFECT, noise_m=0.004)
+    beams = visible_beams(PERFECT, camera().rays())
+
+    def scan_m(spec: ScannerSpec, mesh: WorldMesh, view_id: str) -> np.ndarray:
+        return simulate_scan(RayCaster(mesh), spec, *beams, np.eye(4), view_id)
+
+    clean_m = scan_m(PERFECT, wall(3.0), "a/0000")
+    noisy_m = scan_m(noisy, wall(3.0), "a/0000")
+    normalised = (noisy_m - clean_m) / 0.004
     assert len(normalised) > 10_000
     assert normalised.mean() == pytest.approx(0, abs=5 / len(normalised) ** 0.5)
     assert normalised.std() == pytest.approx(1, abs=5 / (2 * len(normalised)) ** 0.5)
-    assert noisy_m.tobytes() == simulate_scan(caster, noisy, sector, pose, noise_generator("a/0000")).tobytes()
-    assert not np.isclose(noisy_m, simulate_scan(caster, noisy, sector, pose, noise_generator("a/0001"))).all()
-    half_wall_m = simulate_scan(RayCaster(wall(3.0, left_m=0.0)), noisy, sector, pose, noise_generator("a/0000"))
+    assert noisy_m.tobytes() == scan_m(noisy, wall(3.0), "a/0000").tobytes()
+    assert not np.isclose(noisy_m, scan_m(noisy, wall(3.0), "a/0001")).all()
+    half_wall_m = scan_m(noisy, wall(3.0, left_m=0.0), "a/0000")
     has_return = np.isfinite(half_wall_m)
     assert 0.4 < has_return.mean() < 0.6
     assert np.array_equal(half_wall_m[has_return], noisy_m[has_return]), (
@@ -215,7 +223,7 @@ def reference_range_m(spec: ScannerSpec, range_m: np.ndarray, cosines: np.ndarra
     detectable = [(light, group) for light, group in group_lights if light >= min_light and light > 0]
     if not detectable:
         return math.nan
-    light, group = max(detectable, key=lambda pair: pair[0]) if spec.reports == "strongest" else detectable[0]
+    light, group = max(detectable, key=lambda pair: pair[0])
     return sum(r * c for r, c in group) / light
 
 
@@ -229,18 +237,14 @@ CHAINED_RANGES_M = np.tile(
 @given(
     arrays(float, (3, 6), elements=RANGE_VALUES_M, fill=st.nothing()),
     arrays(float, (3, 6), elements=st.integers(0, 64).map(lambda value: value / 64)),
-    st.sampled_from(["strongest", "first"]),
     st.sampled_from([0.0, 0.15, 0.4]),
     st.permutations(range(6)),
 )
-@example(CHAINED_RANGES_M, np.ones((3, 6)), "strongest", 0.0, [5, 3, 1, 0, 2, 4])
-@example(CHAINED_RANGES_M, np.ones((3, 6)), "first", 0.0, [5, 3, 1, 0, 2, 4])
+@example(CHAINED_RANGES_M, np.ones((3, 6)), 0.0, [5, 3, 1, 0, 2, 4])
 def test_returns_do_not_depend_on_order_of_rays(
-    range_m: np.ndarray, cosines: np.ndarray, reports: ReturnMode, least: float, order: list[int]
+    range_m: np.ndarray, cosines: np.ndarray, least: float, order: list[int]
 ) -> None:
-    spec = replace(
-        WIDE_BEAM, reports=reports, least_share=least, range_resolution_m=0.12, min_range_m=0.5, max_range_m=20.0
-    )
+    spec = replace(WIDE_BEAM, least_share=least, range_resolution_m=0.12, min_range_m=0.5, max_range_m=20.0)
     reported_m = reported_range_m(spec, range_m, cosines)
     expected = [reference_range_m(spec, *beam) for beam in zip(range_m, cosines, strict=True)]
     assert reported_m == pytest.approx(expected, rel=1e-12, nan_ok=True)
@@ -253,7 +257,7 @@ def test_surface_below_min_range_occludes_without_return() -> None:
     assert math.isnan(single_beam_range_m(spec, concatenate_meshes(wall(0.5), wall(2.0))))
     assert single_beam_range_m(spec, wall(0.7)) == pytest.approx(0.7 / math.cos(HALF_STEP_RAD) ** 2)
     assert math.isnan(single_beam_range_m(replace(spec, max_range_m=0.65), wall(0.7)))
-    assert single_beam_range_m(replace(spec, min_range_m=0.0), concatenate_meshes(wall(0.5), wall(2.0))) < 0.6
+    assert single_beam_range_m(replace(spec, min_range_m=0.1), concatenate_meshes(wall(0.5), wall(2.0))) < 0.6
 
 
 @pytest.mark.parametrize(
@@ -262,11 +266,12 @@ def test_surface_below_min_range_occludes_without_return() -> None:
         ({"azimuth_step_rad": 0.0}, "steps are not above 0"),
         ({"elevation_step_rad": math.nan}, "steps are not above 0"),
         ({"elevation_limits_rad": (0.2, 0.1)}, "elevation limits"),
-        ({"divergence_rad": -1e-3}, "width is below 0"),
+        ({"divergence_sigma_rad": -1e-3}, "width is below 0"),
         ({"rays_per_beam": 7}, "not 1 or an even number"),
         ({"rays_per_beam": 0}, "not 1 or an even number"),
         ({"least_share": 1.5}, "least_share"),
-        ({"min_range_m": 5.0, "max_range_m": 4.0}, "0 <= min < max"),
+        ({"min_range_m": 5.0, "max_range_m": 4.0}, "0 < min < max"),
+        ({"min_range_m": 0.0}, "0 < min < max"),
         ({"noise_m": -0.1}, "noise is below 0"),
     ],
 )

@@ -10,7 +10,15 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from tests.builder.lidar.lidar_scenes import HEIGHT, PERFECT, WIDTH, camera, concatenate_meshes, scan_depth_m, wall
+from tests.builder.lidar.lidar_scenes import (
+    HEIGHT,
+    PERFECT,
+    WIDTH,
+    camera,
+    concatenate_meshes,
+    scanned_depth_m,
+    wall,
+)
 
 DISTORTION = np.array([-0.175, 0.028, 6.7e-5, -1.5e-4, 0.0])
 STEPS_RAD = st.floats(0.01, 0.1)
@@ -23,7 +31,7 @@ def test_wall_depth_is_exact_and_complete_at_any_step(
     depth_m: float, across: float, up: float, right_m: float, down_m: float, distorted: bool
 ) -> None:
     spec = replace(PERFECT, azimuth_step_rad=across, elevation_step_rad=up, position_left_m=(right_m, down_m, 0.0))
-    depths_m = scan_depth_m(spec, wall(depth_m), camera(DISTORTION if distorted else None))
+    depths_m = scanned_depth_m(spec, wall(depth_m), camera(DISTORTION if distorted else None))
     assert np.isfinite(depths_m).all()
     assert depths_m == pytest.approx(np.full((HEIGHT, WIDTH), depth_m), rel=2e-7)
 
@@ -38,8 +46,8 @@ def test_slanted_wall_error_is_at_most_one_cell(
 ) -> None:
     spec = replace(PERFECT, azimuth_step_rad=step, elevation_step_rad=step, position_left_m=(right_m, -0.03, 0.0))
     view = camera(DISTORTION if distorted else None)
-    scanned_m = scan_depth_m(spec, wall(depth_m, slope=slope), view)
-    x = view.rays[..., 0]
+    scanned_m = scanned_depth_m(spec, wall(depth_m, slope=slope), view)
+    x = view.rays()[..., 0]
     expected_m = depth_m / (1 - slope * x)  # z = depth + slope x z
     assert np.isfinite(scanned_m).mean() > 0.995
     cell = 1 / (1 - abs(slope) * np.abs(x).max()) * (1 + np.abs(x).max() ** 2) * step
@@ -50,8 +58,8 @@ def test_nearer_surface_wins_in_left_view() -> None:
     """Scan from 0.3 m to the right, where the wall behind the strip is visible, unlike from the left camera."""
     spec = replace(PERFECT, position_left_m=(0.3, 0.0, 0.0))
     strip, background = wall(1.0, -0.05, 0.05), wall(2.0)
-    depths_m = scan_depth_m(spec, concatenate_meshes(strip, background))
-    x = camera().rays[..., 0]
+    depths_m = scanned_depth_m(spec, concatenate_meshes(strip, background))
+    x = camera().rays()[..., 0]
     on_strip = np.abs(x) < 0.05 - 0.011  # away from the edge by more than a cell
     assert depths_m[on_strip] == pytest.approx(np.ones(on_strip.sum()), rel=1e-6)
     # On the wall, the strip occludes x from 2 (-0.05 - 0.3) + 0.3 to 2 (0.05 - 0.3) + 0.3 for the scanner.
@@ -67,12 +75,12 @@ def test_single_column_of_beams_fills_only_its_cell() -> None:
     step = 0.04
     spec = replace(PERFECT, azimuth_step_rad=step, elevation_step_rad=step, position_left_m=(0.0, 0.0, 0.0))
     middle = math.tan(step / 2)
-    depths_m = scan_depth_m(spec, wall(1.0, middle - 0.002, middle + 0.002))
-    azimuth = np.arctan(camera().rays[0, :, 0])
+    depths_m = scanned_depth_m(spec, wall(1.0, middle - 0.002, middle + 0.002))
+    azimuth = np.arctan(camera().rays()[0, :, 0])
     in_cell = (azimuth >= 0) & (azimuth < step)
     assert in_cell.sum() == 1
     assert np.array_equal(np.isfinite(depths_m), np.broadcast_to(in_cell, depths_m.shape))
-    missed_m = scan_depth_m(spec, wall(1.0, middle + 0.002, middle + 0.006))
+    missed_m = scanned_depth_m(spec, wall(1.0, middle + 0.002, middle + 0.006))
     assert not np.isfinite(missed_m).any()
 
 
@@ -80,8 +88,8 @@ def test_cell_extends_only_into_empty_cells() -> None:
     step, near_m = 0.095, 0.15
     spec = replace(PERFECT, azimuth_step_rad=step, elevation_step_rad=step)
     edge_m = near_m * math.tan(step)  # boundary between two columns of cells
-    depths_m = scan_depth_m(spec, concatenate_meshes(wall(near_m, right_m=edge_m), wall(0.25)))
-    azimuth = np.arctan(camera().rays[..., 0])  # The scanner is above the camera: same azimuths.
+    depths_m = scanned_depth_m(spec, concatenate_meshes(wall(near_m, right_m=edge_m), wall(0.25)))
+    azimuth = np.arctan(camera().rays()[..., 0])  # The scanner is above the camera: same azimuths.
     beyond = azimuth >= step
     assert azimuth[beyond].min() < step + 0.06 / near_m * step / 2, "no pixel that a cell could reach"
     assert depths_m[~beyond] == pytest.approx(near_m, rel=1e-6)
@@ -90,17 +98,19 @@ def test_cell_extends_only_into_empty_cells() -> None:
 
 @pytest.mark.slow
 def test_mixed_return_is_between_both_surfaces() -> None:
-    wide = replace(PERFECT, divergence_rad=0.02, exit_diameter_m=0.001, rays_per_beam=24, range_resolution_m=0.5)
-    edge_m = camera().rays[0, WIDTH // 2, 0]  # The near wall ends at the centre of a pixel column.
+    wide = replace(
+        PERFECT, divergence_sigma_rad=0.005, exit_sigma_m=0.00025, rays_per_beam=24, range_resolution_m=0.5
+    )
+    edge_m = camera().rays()[0, WIDTH // 2, 0]  # The near wall ends at the centre of a pixel column.
     mesh = concatenate_meshes(wall(1.0, -10.0, edge_m), wall(1.3))
-    mixed, separated = (scan_depth_m(replace(wide, range_resolution_m=metres), mesh) for metres in (0.5, 0.1))
+    mixed, separated = (scanned_depth_m(replace(wide, range_resolution_m=metres), mesh) for metres in (0.5, 0.1))
     assert ((mixed > 1.01) & (mixed < 1.29)).sum() == HEIGHT
     assert not ((separated > 1.01) & (separated < 1.29)).any()
 
 
 def test_no_depth_below_minimum_range() -> None:
-    depths_m = scan_depth_m(replace(PERFECT, min_range_m=0.6), wall(0.5))
-    range_m = np.linalg.norm(0.5 * camera().rays - np.array(PERFECT.position_left_m), axis=-1)
+    depths_m = scanned_depth_m(replace(PERFECT, min_range_m=0.6), wall(0.5))
+    range_m = np.linalg.norm(0.5 * camera().rays() - np.array(PERFECT.position_left_m), axis=-1)
     cell_m = 0.01
     assert np.isfinite(depths_m[range_m > 0.6 + cell_m]).all()
     assert (range_m > 0.6 + cell_m).any()
