@@ -48,6 +48,8 @@ def back_up(settings: Settings, target: Path, prune: bool) -> None:
     with closing(Database(settings.database_url, read_only=True)) as database:
         database.check_schema()
         rows: Rows = archive_rows(database)
+        if source is None and (problems := database.problems()):
+            raise StorageError(f"nothing was copied: {problem_summary(problems)}")
     try:
         target.mkdir(mode=0o700, parents=True, exist_ok=True)
         with state_lock(target, alone=True):

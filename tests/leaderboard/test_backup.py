@@ -15,8 +15,10 @@ from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
+from sqlalchemy import update
 
 from leaderboard.db import submissions
+from leaderboard.db.models import ResultModel
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import state_lock
 from leaderboard.storage.backup import back_up
@@ -237,7 +239,10 @@ def test_backup_of_postgresql_is_restored_from_dump_and_archives(
         prune_archives(database, archives, [first])
     assert run("backup", target, "--state-dir", settings.state_dir, "--db", url, "--prune").returncode == 0
     assert names(target / "archives") == names(settings.archive_dir)
-    assert "postgresql" in url
+    with opened(settings) as (database, _), database.write() as session:
+        session.execute(update(ResultModel).values(json=b"x"))
+    with pytest.raises(StorageError, match="is no JSON"):
+        back_up(settings, target, prune=False)
 
 
 def shell_of(page: Path, heading: str) -> list[str]:

@@ -175,21 +175,22 @@ def test_killed_rescoring_keeps_every_result(tmp_path: Path, new_database: Calla
         token = make_board(settings)
         ids[:] = [add_submission(settings, token, content) for content in (b"1", b"2", b"3", b"4")]
         prune(settings, ids[:1])
+        (settings.archive_dir / f"{ids[0]}.zip").write_bytes(b"1")  # As a crash leaves it.
         (settings.archive_dir / f"{ids[1]}.zip").unlink()
         return (settings,)
 
     def check(settings: Settings) -> None:
-        old = ("scored", DIGEST, DIGEST, False)
+        pruned, lost = (("scored", DIGEST, DIGEST, has_archive) for has_archive in (True, False))
         for name, (status, dataset, of_result, has_archive) in facts(settings).items():
             if name in ids[:2]:
-                assert (status, dataset, of_result, has_archive) == old
+                assert (status, dataset, of_result, has_archive) == (pruned if has_archive else lost)
             else:
                 assert has_archive
                 assert of_result in (DIGEST, OTHER_DIGEST)
                 assert status in ("queued", "scoring") or dataset == of_result
         rescore(settings)
         new = ("scored", OTHER_DIGEST, OTHER_DIGEST, True)
-        assert facts(settings) == dict(zip(ids, (old, old, new, new), strict=True))
+        assert facts(settings) == dict(zip(ids, (pruned, lost, new, new), strict=True))
 
     kill_everywhere(rescore, check, prepare)
 
