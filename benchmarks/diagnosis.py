@@ -119,7 +119,7 @@ def _reorder(images: Sequence[Image], order: Sequence[int]) -> list[Image]:
 
 
 def _logarithm(depth_m: Image) -> Image:
-    return np.log(depth_m, out=np.full_like(depth_m, np.nan), where=depth_m > 0)
+    return np.asarray(np.log(depth_m, out=np.full_like(depth_m, np.nan), where=depth_m > 0))
 
 
 def _disparity(depth_m: Image) -> Image:

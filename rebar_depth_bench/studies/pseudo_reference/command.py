@@ -217,9 +217,9 @@ def _open_data(data: str, config: str | None) -> _StudyData:
         if config is not None:
             raise InputError(f"{data}: is a capture, expected no --config (found {config!r})")
         capture = open_capture(data)
-        views = capture.expected_views()
+        captured = capture.expected_views()
         name = f"capture {capture.config}"
-        return _StudyData(name, views, views, camera=capture.describe_camera())
+        return _StudyData(name, captured, captured, camera=capture.describe_camera())
     folder = open_folder(data)
     if config is None and len(folder.configs) != 1:
         raise InputError(
