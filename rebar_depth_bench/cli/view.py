@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
@@ -37,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--signed-error",
-        type=_positive_millimetres,
+        type=partial(positive_number, expected="a length above 0 mm"),
         metavar="MM",
         help="colour predictions by their error instead: from MM too near (blue) to MM too far (brown)",
     )
@@ -67,10 +68,6 @@ def run(options: argparse.Namespace) -> None:
     write_output(out, recording)
     if prints_table(options):
         print(out)
-
-
-def _positive_millimetres(text: str) -> float:
-    return positive_number(text, "a length above 0 mm")
 
 
 def _print_view_notes(view: ShownView) -> None:
