@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cards.reference import number, percent
+from rebar_depth_bench.detections.result import AVERAGE_PRECISION_MM
 
 FILES = ("crossings.json", "crossings-cages.json")
 """Files of results: of the scenes, and of generated scenes."""
@@ -66,5 +67,5 @@ def _bin_rows(depth: Mapping[str, Any]) -> Iterator[list[str]]:
 
 def _detector_cells(table: Mapping[str, Any]) -> Iterator[str]:
     yield from (percent(table[name]) for name in ("precision", "recall", "f1"))
-    yield from (percent(value) for value in table["average_precision"].values())
+    yield from (percent(table["average_precision"][str(limit_mm)]) for limit_mm in AVERAGE_PRECISION_MM)
     yield from (number(table[name], 2, " mm") for name in ("position_mm", "position_p95_mm"))

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 
 from rich.console import Console
@@ -186,15 +187,11 @@ def add_seconds(container: argparse._ActionsContainer, option: str, default: flo
     """Add ``option``, a duration in seconds, to a parser or a group of options."""
     container.add_argument(
         option,
-        type=_positive_seconds,
+        type=partial(positive_number, expected=f"a number above 0, up to {MAX_SECONDS:g}", high=MAX_SECONDS),
         default=default,
         metavar="SECONDS",
         help=f"{summary} (default: {default:g})",
     )
-
-
-def _positive_seconds(text: str) -> float:
-    return positive_number(text, f"a number above 0, up to {MAX_SECONDS:g}", MAX_SECONDS)
 
 
 def positive_number(text: str, expected: str, high: float = sys.float_info.max) -> float:

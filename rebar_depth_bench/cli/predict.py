@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from rebar_depth_bench.captures.camera_files import CAMERAS_FILE
@@ -56,16 +57,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_seconds(parser, "--view-timeout", VIEW_TIMEOUT_S, limit)
     parser.add_argument(
         "--nearest-distance",
-        type=_positive_metres,
+        type=partial(positive_number, expected="a distance above 0 m"),
         metavar="METRES",
         help="distance of the nearest surface, known before the capture, from which foundation-stereo:FOLDER "
         "chooses its mode (default: from half of the image width). One measured in the scored depth, masks, "
         "meshes or poses makes the submission a user of ground truth",
     )
-
-
-def _positive_metres(text: str) -> float:
-    return positive_number(text, "a distance above 0 m")
 
 
 def format_note(value: object) -> str:

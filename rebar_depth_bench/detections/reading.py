@@ -8,6 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -90,9 +91,8 @@ def _read_csv(path: Path, problems: list[Problem]) -> RawDetections | None:
         found = f"byte {error.start} is not UTF-8"
         problems.append(Problem("syntax", "", found, "a Parquet file, or a CSV file in UTF-8"))
         return None
-    lines = io.StringIO(text)
-    metadata, first = _csv_metadata(lines)
-    reader = csv.reader(lines, strict=True)
+    metadata, first = _csv_metadata(text)
+    reader = csv.reader(islice(io.StringIO(text), first, None), strict=True)
     try:
         rows = ((first + reader.line_num, row) for row in reader if row)
         _, head = next(rows, (0, []))
@@ -106,15 +106,12 @@ def _read_csv(path: Path, problems: list[Problem]) -> RawDetections | None:
         return None
 
 
-def _csv_metadata(lines: io.StringIO) -> tuple[dict[str, str], int]:
-    """Read the lines ``# key: value`` at the start of a CSV; return their values and their number."""
+def _csv_metadata(text: str) -> tuple[dict[str, str], int]:
+    """Return the values of the lines ``# key: value`` at the start of a CSV, and the number of these lines."""
     metadata: dict[str, str] = {}
     count = 0
-    while True:
-        start = lines.tell()
-        line = lines.readline()
+    for line in io.StringIO(text):
         if not line.startswith("#"):
-            lines.seek(start)
             break
         count += 1
         key, _, value = line[1:].partition(":")

@@ -31,7 +31,7 @@ def entries_to_csv(rows: Sequence[LeaderboardEntry], hidden_truth: bool = False)
         [
             *(row.rank, row.class_rank, row.id, row.method, row.submitter),
             *(row.inputs, row.uses_ground_truth, row.config),
-            *(row.table.values() if hidden_truth else table_values(row.table)),
+            *((row.table[name] for name in columns) if hidden_truth else table_values(row.table)),
         ]
         for row in rows
     )
