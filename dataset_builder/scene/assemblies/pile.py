@@ -5,7 +5,7 @@ plane is approximately z = 0, the long side runs along x, the hooks are in the c
 centroid of the centreline is the origin.
 
 The poses are stored with the package, because a simulation gives different last digits on another machine.
-``dataset_builder.scene.assemblies.pile_simulation`` computed them and can compute them again.
+``scripts/simulate_pile.py`` of the repository computed them and can compute them again.
 """
 
 from __future__ import annotations
