@@ -75,8 +75,8 @@ def mistakes(rows: Sequence[Mapping[str, ndarray]]) -> dict[str, Callable[[Seque
         "upside-down": np.flipud,
         "rotated": lambda p: p[::-1, ::-1],
         "shift": partial(shift, shift=(2, -3), order=0),
-        "log": _logarithm,
-        "log10": lambda p: _logarithm(p) / np.log(10),
+        "log": lambda p: np.log(np.where(p > 0, p, np.nan)),
+        "log10": lambda p: np.log10(np.where(p > 0, p, np.nan)),
         "normalised": lambda p: p / np.nanmax(p),
         "negative": np.negative,
         "infinite": lambda p: np.full_like(p, np.inf),
@@ -116,10 +116,6 @@ def _map_images(make: Callable[[Image], Image], images: Sequence[Image]) -> list
 
 def _reorder(images: Sequence[Image], order: Sequence[int]) -> list[Image]:
     return [images[n] for n in order]
-
-
-def _logarithm(depth_m: Image) -> Image:
-    return np.asarray(np.log(depth_m, out=np.full_like(depth_m, np.nan), where=depth_m > 0))
 
 
 def _disparity(depth_m: Image) -> Image:

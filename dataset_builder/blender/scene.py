@@ -10,10 +10,6 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.blender.deck import deck
-from dataset_builder.blender.hall import ROOF, hall
-from dataset_builder.blender.hall import WALLS as HALL_WALLS
-from dataset_builder.blender.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M, WALLS, laboratory
 from dataset_builder.blender.lights import (
     DECK_LIGHT,
     HALL_LIGHT,
@@ -30,11 +26,15 @@ from dataset_builder.blender.materials import (
     paper,
     surface_variation,
 )
-from dataset_builder.blender.outdoors import outdoors
 from dataset_builder.blender.panorama import add_panorama, let_light_through
 from dataset_builder.config.specs import SceneSpec
 from dataset_builder.config.surroundings import check_suitable
 from dataset_builder.scene.board_texture import board_texture
+from dataset_builder.scene.environments.deck import deck
+from dataset_builder.scene.environments.hall import ROOF, hall
+from dataset_builder.scene.environments.hall import WALLS as HALL_WALLS
+from dataset_builder.scene.environments.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M, WALLS, laboratory
+from dataset_builder.scene.environments.outdoors import outdoors
 from dataset_builder.scene.model import Assembly, Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box
 from dataset_builder.scene.variants import LIGHT_SLOT, STEEL_SLOT, check_variants, exclusive_variant

@@ -1,6 +1,7 @@
 """Surroundings of the steel by environment: space for cameras and steel, and the variants that suit them.
 
-The surfaces and lights of the environments are in ``dataset_builder.blender``, which runs in its own process.
+The surfaces of the environments are in ``dataset_builder.scene.environments``, their lights in
+``dataset_builder.blender.lights``.
 """
 
 from __future__ import annotations

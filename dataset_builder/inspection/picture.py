@@ -64,11 +64,15 @@ _SIDES = (
 
 @dataclass(frozen=True, eq=False)
 class _Stroke:
-    """Line to draw: points (world, metres), diameter (0 for an edge of a mesh) and colour."""
+    """Line to draw: points (world, metres), diameter (0 for an edge of a mesh) and colour.
+
+    ``tips`` are its first and last point (0, -1) that are ends of a bar, where its outline is round.
+    """
 
     points_m: Float64[ndarray, "n 3"]
     diameter_m: float
     colour: tuple[int, int, int]
+    tips: tuple[int, ...] = ()
 
 
 def inspection_picture(inspection: Inspection) -> bytes:
@@ -118,7 +122,9 @@ def _strokes(bars: Sequence[CageBar], colours: dict[float | None, tuple[int, int
             continue
         axis_m = np.array(bar.bar.axis_m)
         lines = [axis_m] if whole else np.stack([axis_m[:-1], axis_m[1:]], axis=1)
-        strokes += [_Stroke(line_m, bar.bar.diameter_m, colour) for line_m in lines]
+        for number, line_m in enumerate(lines):
+            tips = (*((0,) if number == 0 else ()), *((-1,) if number == len(lines) - 1 else ()))
+            strokes.append(_Stroke(line_m, bar.bar.diameter_m, colour, tips))
     return strokes
 
 
@@ -179,20 +185,25 @@ def _draw_strokes(draw: ImageDraw.ImageDraw, strokes: Sequence[_Stroke], project
         colour = np.array(stroke.colour) + haze[index] * (255 - np.array(stroke.colour))
         width = round(max(stroke.diameter_m * projection.px_per_m, _OVERSAMPLING))
         if width >= 4 * _OVERSAMPLING:
-            _draw_rod(draw, places, width, 0.55 * colour)
+            # Round outlines at the joints of a bend would cover the pieces beside them.
+            _draw_rod(draw, places, places[list(stroke.tips)], width, 0.55 * colour)
             width -= 2 * _OVERSAMPLING
-        _draw_rod(draw, places, width, colour)
+        _draw_rod(draw, places, places, width, colour)
 
 
 def _draw_rod(
-    draw: ImageDraw.ImageDraw, places: Float64[ndarray, "n 2"], width: int, colour: Float64[ndarray, " 3"]
+    draw: ImageDraw.ImageDraw,
+    places: Float64[ndarray, "n 2"],
+    discs: Float64[ndarray, "m 2"],
+    width: int,
+    colour: Float64[ndarray, " 3"],
 ) -> None:
-    """Draw a line with round ends, which also joins the pieces of a bend."""
+    """Draw a line through ``places``, with discs that round its ends and join the pieces of a bend."""
     red, green, blue = colour.round().astype(int).tolist()
     draw.line(places.ravel().tolist(), fill=(red, green, blue), width=width)
     if width > 2 * _OVERSAMPLING:
         radius = (width - 1) / 2
-        for x, y in places.tolist():
+        for x, y in discs.tolist():
             draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=(red, green, blue))
 
 

@@ -12,8 +12,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from dataset_builder.inspection.overlaps import MAX_PAIRS, MIN_OVERLAP_M
-from dataset_builder.inspection.summary import BarGroup, Inspection
+from dataset_builder.inspection.summary import MAX_PAIRS, MIN_OVERLAP_M, BarGroup, Inspection
 from dataset_builder.scene.assemblies.cage import CageBar
 from rebar_depth_bench.reporting.formatting import counted
 from rebar_depth_bench.reporting.tables import plain_text, print_unwrapped

@@ -1,4 +1,4 @@
-"""Summary of a cage: groups of bars, the box of its steel, and overlaps."""
+"""Summary of a cage: groups of bars, the box of its steel, and bars that penetrate each other."""
 
 from __future__ import annotations
 
@@ -11,11 +11,21 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.inspection.overlaps import Overlap, TooManyNeighboursError, overlaps
 from dataset_builder.scene.assemblies.cage import Cage, CageBar
+from rebar_depth_bench.bar_crossings.axis_segments import AxisSegments, TooManyNeighboursError
+from rebar_depth_bench.data.bars import Bar, with_axis
+from rebar_depth_bench.geometry.segments import closest_points_m
 
 STEEL_KG_PER_M3 = 7850.0
 """Density of reinforcing steel (EN 1992-1-1, 3.2.7)."""
+
+MIN_OVERLAP_M = 0.0005
+"""Smallest overlap that counts, metres: bars that touch overlap by rounding errors."""
+
+MAX_PAIRS = 20_000_000
+"""Largest number of pairs of neighbouring pieces of axes that are compared."""
+
+_CHUNK = 500_000
 
 Box = Float64[ndarray, "2 3"]
 """Lower and upper corner."""
@@ -35,6 +45,16 @@ class BarGroup:
     bars: int
     length_m: float | None
     mass_kg: float | None
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Two bars that penetrate each other by ``depth_m``, and the point (world) where they do so most."""
+
+    bar_a: int
+    bar_b: int
+    depth_m: float
+    point_m: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +80,34 @@ def inspect_cage(cage: Cage, name: str) -> Inspection:
     except TooManyNeighboursError:
         found = None
     return Inspection(name, cage, tuple(_groups(cage.bars)), box_m, found)
+
+
+def overlaps(bars: Sequence[Bar]) -> list[Overlap]:
+    """Return the pairs of bars that penetrate each other by more than ``MIN_OVERLAP_M``, the deepest first.
+
+    Bars without axis are left out. Raises ``TooManyNeighboursError`` for more than ``MAX_PAIRS`` neighbours.
+    """
+    measured = with_axis(bars)
+    axes = AxisSegments.of_bars(measured)
+    pairs = axes.near_pairs(0.0, MAX_PAIRS)
+    pairs = pairs[axes.bar[pairs[:, 0]] != axes.bar[pairs[:, 1]]]
+    ends_m = axes.start_m + axes.vector_m
+    deepest: dict[tuple[int, int], tuple[float, list[float]]] = {}
+    for first in range(0, len(pairs), _CHUNK):
+        i, j = pairs[first : first + _CHUNK].T
+        on_a, on_b = closest_points_m(axes.start_m[i], ends_m[i], axes.start_m[j], ends_m[j])
+        radii_m = (axes.diameter_m[axes.bar[i]] + axes.diameter_m[axes.bar[j]]) / 2
+        depth_m = radii_m - np.linalg.norm(on_a - on_b, axis=1)
+        for index in np.flatnonzero(depth_m > MIN_OVERLAP_M).tolist():
+            a, b = int(axes.bar[i[index]]), int(axes.bar[j[index]])
+            found_m = float(depth_m[index])
+            if found_m > deepest.get((a, b), (0.0, []))[0]:
+                deepest[a, b] = found_m, ((on_a[index] + on_b[index]) / 2).tolist()
+    found = [
+        Overlap(measured[a].bar_id, measured[b].bar_id, depth_m, (x, y, z))
+        for (a, b), (depth_m, (x, y, z)) in deepest.items()
+    ]
+    return sorted(found, key=lambda overlap: (-overlap.depth_m, overlap.bar_a, overlap.bar_b))
 
 
 def bar_box_m(bar: CageBar) -> Box:

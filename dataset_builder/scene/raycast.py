@@ -18,10 +18,10 @@ from jaxtyping import Bool, Float64, Int32, UInt16
 from numpy import ndarray
 
 from dataset_builder.scene.model import WorldMesh
-from dataset_builder.scene.shapes.segments import closest_points_m
 from rebar_depth_bench.data.eye_view import EyeView
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, matrix_product
+from rebar_depth_bench.geometry.segments import closest_points_m
 
 _MISS = -1
 _OUTSIDE_M = 1e-4

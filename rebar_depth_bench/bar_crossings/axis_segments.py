@@ -18,6 +18,10 @@ _MIN_PIECE_M = 0.02
 _MAX_PIECES = 200_000
 
 
+class TooManyNeighboursError(Exception):
+    """So many bars are close to each other that they are not compared."""
+
+
 @dataclass(frozen=True, eq=False)
 class AxisSegments:
     """Segments of the axes of all bars of a scene (world, metres), bar by bar, in order along the axes.
@@ -74,10 +78,11 @@ class AxisSegments:
         """Return the lengths of some segments."""
         return np.asarray(np.linalg.norm(self.vector_m[segments], axis=1))
 
-    def near_pairs(self, max_gap_m: float) -> Int64[ndarray, "p 2"]:
+    def near_pairs(self, max_gap_m: float, max_pairs: int | None = None) -> Int64[ndarray, "p 2"]:
         """Return the pairs of segments (lower first, ascending) that can have ``max_gap_m`` or less between bars.
 
         All such pairs are returned, and some whose bars are farther apart. Long segments are searched in pieces.
+        Raises ``TooManyNeighboursError`` for more than ``max_pairs`` pairs of pieces.
         """
         from scipy.spatial import cKDTree  # A quarter of a second to import.
 
@@ -91,7 +96,10 @@ class AxisSegments:
         share = (number + 0.5) / pieces[segment]
         middles_m = self.start_m[segment] + share[:, None] * self.vector_m[segment]
         reach_m = piece_m + float(self.diameter_m.max()) + max_gap_m
-        found = segment[cKDTree(middles_m).query_pairs(reach_m, output_type="ndarray")].reshape(-1, 2)
+        tree = cKDTree(middles_m)
+        if max_pairs is not None and tree.count_neighbors(tree, reach_m) > 2 * max_pairs:
+            raise TooManyNeighboursError
+        found = segment[tree.query_pairs(reach_m, output_type="ndarray")].reshape(-1, 2)
         found = np.sort(found[found[:, 0] != found[:, 1]], axis=1)
         keys = np.unique(found[:, 0] * len(pieces) + found[:, 1])
         return np.column_stack([keys // len(pieces), keys % len(pieces)])
@@ -103,32 +111,3 @@ def _without_repeated(points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "m 
         return points_m
     differs = np.linalg.norm(np.diff(points_m, axis=0), axis=1) > 0
     return np.asarray(points_m[np.concatenate([[True], differs])])
-
-
-def closest_on_segments(
-    start_a: Float64[ndarray, "p 3"],
-    vector_a: Float64[ndarray, "p 3"],
-    start_b: Float64[ndarray, "p 3"],
-    vector_b: Float64[ndarray, "p 3"],
-) -> tuple[Float64[ndarray, " p"], Float64[ndarray, " p"]]:
-    """Return the shares (0 to 1) along two segments at which they are closest to each other.
-
-    Of parallel segments, one of the closest pairs of points is returned. Source: Ericson, "Real-Time Collision
-    Detection", 2005, section 5.1.9.
-    """
-    between = start_a - start_b
-    aa, bb = _dot(vector_a, vector_a), _dot(vector_b, vector_b)
-    ab, a_between, b_between = _dot(vector_a, vector_b), _dot(vector_a, between), _dot(vector_b, between)
-    determinant = aa * bb - ab**2
-    oblique = determinant > 1e-12 * aa * bb
-    share_a = np.where(oblique, (ab * b_between - a_between * bb) / np.where(oblique, determinant, 1.0), 0.0).clip(
-        0, 1
-    )
-    share_b = (ab * share_a + b_between) / bb
-    clipped_b = share_b.clip(0, 1)
-    share_a = np.where(share_b == clipped_b, share_a, ((ab * clipped_b - a_between) / aa).clip(0, 1))
-    return share_a, clipped_b
-
-
-def _dot(a: Float64[ndarray, "n 3"], b: Float64[ndarray, "n 3"]) -> Float64[ndarray, " n"]:
-    return np.asarray(np.einsum("ni,ni->n", a, b))

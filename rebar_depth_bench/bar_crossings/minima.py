@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.bar_crossings.axis_segments import ROUNDING_M, AxisSegments, closest_on_segments
+from rebar_depth_bench.bar_crossings.axis_segments import ROUNDING_M, AxisSegments
+from rebar_depth_bench.geometry.segments import closest_on_segments
 
 
 @dataclass(frozen=True, eq=False)

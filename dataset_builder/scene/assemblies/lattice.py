@@ -35,10 +35,8 @@ def lattice_assembly(spec: LatticeSpec) -> Assembly:
     """Return the lattice of ``spec``, centred on x = y = 0, from z = 0 (plus ``LIFT_M``) upwards, metres.
 
     Bars are numbered from 1: first the rods along x, then along y, then along z. Within a family the higher of
-    the two other axes varies fastest, both from the negative side. Raises ``ValueError`` if the rods of
-    ``spec`` would touch or leave the cube.
+    the two other axes varies fastest, both from the negative side. The pitch divides the extent.
     """
-    _check_spec(spec)
     line_m = np.array([[-spec.extent_m / 2, 0.0, 0.0], [spec.extent_m / 2, 0.0, 0.0]])
     along_x = {diameter_m: ribbed_bar_mesh(line_m, diameter_m) for diameter_m in spec.diameters_m}
     return Assembly.from_meshes(
@@ -54,21 +52,6 @@ def _layer_offset_m(spec: LatticeSpec) -> float:
 
 def _rods_per_axis(spec: LatticeSpec) -> int:
     return round(spec.extent_m / spec.pitch_m)
-
-
-def _check_spec(spec: LatticeSpec) -> None:
-    """Raise ``ValueError`` unless values are positive, the pitch divides the extent and rods do not touch."""
-    if min(spec.extent_m, spec.pitch_m, *spec.diameters_m) <= 0:
-        raise ValueError(f"extent, pitch and diameters must be positive: {spec}")
-    if not np.isclose(_rods_per_axis(spec) * spec.pitch_m, spec.extent_m, rtol=1e-9):
-        raise ValueError(f"extent_m is {spec.extent_m}, expected a multiple of pitch_m, {spec.pitch_m}")
-    # Between two layers of one family lies one layer of each other family, which needs a gap to both.
-    needed_m = 2 * _layer_offset_m(spec)
-    if spec.pitch_m < needed_m:
-        raise ValueError(
-            f"pitch_m {spec.pitch_m} is too small for crossing rods of {max(spec.diameters_m)} m:"
-            f" {needed_m:.5f} m or more is needed for a gap of {CLEAR_GAP_M} m"
-        )
 
 
 def _rods(spec: LatticeSpec) -> list[_Rod]:

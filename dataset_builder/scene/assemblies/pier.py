@@ -15,7 +15,6 @@ from dataset_builder.scene.assemblies.lattice import LIFT_M
 from dataset_builder.scene.assemblies.pier_layout import (
     BentBarType,
     PierLayout,
-    check_stock_length,
     pier_layout,
     tie_row,
     vertical_positions_m,
@@ -59,8 +58,6 @@ def pier_assembly(spec: PierSpec) -> Assembly:
     the tie runs along x; on odd levels x and y are exchanged. Laps end in 135 degree hooks round verticals, into
     the core. A tie holds two opposite verticals, with a 135 degree hook at one end and a 90 degree hook at the
     other; the ends alternate from one tie of a direction to the next.
-
-    Raises ``ValueError`` if bars of ``spec`` would touch, would not fit or would be longer than stock bars.
     """
     return Assembly.from_meshes(
         (
@@ -151,8 +148,7 @@ def _bent_shape(role: str, bar_type: BentBarType, corners: Float64[ndarray, "n 2
 
 
 def _bar_shape(role: str, diameter_m: float, line_m: Float64[ndarray, "n 3"]) -> _BarShape:
-    """Return the shape of a bar; raise ``ValueError`` if it is longer than a stock bar."""
-    check_stock_length(role, float(np.linalg.norm(np.diff(line_m, axis=0), axis=1).sum()))
+    """Return the shape of a bar, whose mesh has more rings than its centreline has points."""
     return _BarShape(role, diameter_m, line_m, plain_bar_mesh(_with_rings_added(line_m), diameter_m))
 
 

@@ -1,4 +1,4 @@
-"""Positions of the bars of a square pier cage, and checks that a spec leaves room for them. World frame, metres.
+"""Positions of the bars of a square pier cage. World frame, metres.
 
 The cage stands on z = 0, centred on x = y = 0. The verticals stand in four rows, each counted from the
 negative side; hoops lie outside of them, ties hook round them. Every level is a stack of three layers, each
@@ -7,9 +7,9 @@ one bar thick: the first half hoop, the second half hoop, the tie.
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from itertools import count
-from math import ceil, gcd, inf, sqrt
+from math import ceil, gcd, sqrt
 
 import numpy as np
 from jaxtyping import Float64
@@ -27,9 +27,6 @@ HOOK_EXTENSION_DIAMETERS = 10.0
 
 MIN_LAP_DIAMETERS = 40.0
 """Least straight overlap of two half hoops in diameters; laps end on verticals and are therefore longer."""
-
-STOCK_LENGTH_M = 12.0
-"""Length of the longest stock bar, metres."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +70,7 @@ class PierLayout:
 
 
 def pier_layout(spec: PierSpec) -> PierLayout:
-    """Return the positions of all bars of ``spec``; raise ``ValueError`` if they would not fit or collide."""
-    _check_spec_values(spec)
+    """Return the positions of all bars of ``spec``, which has room for them; its verticals are a multiple of 4."""
     vertical_m = plain_outer_radius_m(spec.vertical_diameter_m)
     hoop = _bent_bar_type(spec.hoop_diameter_m, vertical_m)
     tie = _bent_bar_type(spec.tie_diameter_m, vertical_m)
@@ -83,7 +79,6 @@ def pier_layout(spec: PierSpec) -> PierLayout:
     corner_m = hoop_line_m - _corner_inset_m(hoop, vertical_m)
     rows_m = np.linspace(-corner_m, corner_m, spec.verticals // 4 + 1)
     spacing_m = float(rows_m[1] - rows_m[0])
-    _check_hooks(spacing_m, vertical_m, hoop)
     return PierLayout(
         hoop=hoop,
         tie=tie,
@@ -116,28 +111,6 @@ def tie_row(tie_number: int, intervals: int) -> int:
     return 1 + step * tie_number % rows
 
 
-def check_stock_length(role: str, length_m: float) -> None:
-    """Raise ``ValueError`` if a bar is longer than the longest stock bar."""
-    if length_m > STOCK_LENGTH_M:
-        raise ValueError(
-            f"a {role} of this pier is {length_m:.2f} m long, expected at most {STOCK_LENGTH_M} m "
-            "(the longest stock bar)"
-        )
-
-
-def _check_spec_values(spec: PierSpec) -> None:
-    """Raise ``ValueError`` unless the values of ``spec`` are positive, finite and consistent."""
-    if not all(0 < value < inf for value in astuple(spec) if not isinstance(value, str)):
-        raise ValueError(f"lengths, diameters and counts must be positive and finite: {spec}")
-    if spec.verticals % 4:
-        raise ValueError(f"verticals is {spec.verticals}, expected a multiple of 4: the cage has four equal sides")
-    if spec.tie_diameter_m > spec.hoop_diameter_m:
-        raise ValueError(
-            f"ties of {spec.tie_diameter_m} m are thicker than hoops of {spec.hoop_diameter_m} m, "
-            "expected at most the same diameter: their hooks would protrude from the cage"
-        )
-
-
 def _bent_bar_type(diameter_m: float, vertical_m: float) -> BentBarType:
     """Return the bar type with the smallest mandrel of EN 1992-1-1, or a larger one if a vertical requires it."""
     outer_m = plain_outer_radius_m(diameter_m)
@@ -150,47 +123,20 @@ def _corner_inset_m(hoop: BentBarType, vertical_m: float) -> float:
     return hoop.bend_radius_m - clearance_m / sqrt(2)
 
 
-def _check_hooks(spacing_m: float, vertical_m: float, bar_type: BentBarType) -> None:
-    """Raise ``ValueError`` if the end of a hook, 45 degrees inwards, could reach the next vertical or row."""
-    reach_m = (bar_type.bend_radius_m + bar_type.hook_extension_m) / sqrt(2) + bar_type.outer_radius_m
-    needed_m = reach_m + CLEAR_GAP_M + vertical_m
-    if spacing_m < needed_m:
-        raise ValueError(
-            f"verticals are {spacing_m:.4f} m apart, but the hooks of {bar_type.diameter_m} m bars need "
-            f"{needed_m:.4f} m"
-        )
-
-
 def _lap_rows(intervals: int, spacing_m: float, diameter_m: float) -> tuple[int, int]:
-    """Return the indices of the verticals at which a side's lap begins and ends, centred on the side.
-
-    Raises ``ValueError`` if the side has too few intervals for the lap.
-    """
+    """Return the indices of the verticals at which a side's lap begins and ends, centred on the side."""
     spanned_intervals = ceil(MIN_LAP_DIAMETERS * diameter_m / spacing_m)
     low = (intervals - spanned_intervals) // 2
-    if low < 1:
-        raise ValueError(
-            f"a lap of {MIN_LAP_DIAMETERS * diameter_m:.3f} m takes {spanned_intervals} spaces between verticals, "
-            f"a side has {intervals}, expected {spanned_intervals + 2} or more"
-        )
     return low, low + spanned_intervals
 
 
 def _level_layers_m(spec: PierSpec, hoop: BentBarType, tie: BentBarType) -> tuple[tuple[float, float, float], ...]:
-    """Return the heights of first half hoop, second half hoop and tie of each level, evenly spaced.
-
-    Raises ``ValueError`` if the levels are closer than the height of one level's three layers.
-    """
+    """Return the heights of first half hoop, second half hoop and tie of each level, evenly spaced."""
     above_first = np.cumsum(
         [0.0, 2 * hoop.outer_radius_m + CLEAR_GAP_M, hoop.outer_radius_m + CLEAR_GAP_M + tie.outer_radius_m]
     )
     stack_m = hoop.outer_radius_m + float(above_first[2]) + tie.outer_radius_m
     pitch_m = spec.height_m / spec.levels
-    if pitch_m < stack_m + CLEAR_GAP_M:
-        raise ValueError(
-            f"{spec.levels} levels in {spec.height_m} m are {pitch_m:.4f} m apart, "
-            f"but two half hoops and a tie above each other need {stack_m + CLEAR_GAP_M:.4f} m"
-        )
     lowest_m = (pitch_m - stack_m) / 2 + hoop.outer_radius_m
     heights = lowest_m + pitch_m * np.arange(spec.levels)[:, None] + above_first
     return tuple((float(first), float(second), float(tied)) for first, second, tied in heights)

@@ -5,16 +5,14 @@ plane is approximately z = 0, the long side runs along x, the hooks are in the c
 centroid of the centreline is the origin.
 
 The poses are stored with the package, because a simulation gives different last digits on another machine.
-``dataset_builder.scene.assemblies.pile_simulation`` computed them and can compute them again.
+``scripts/simulate_pile.py`` of the repository computed them and can compute them again.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -25,7 +23,6 @@ from dataset_builder.scene.model import Assembly, Mesh, axis_of
 from dataset_builder.scene.shapes.bar_mesh import RibPattern, outer_radius_m, ribbed_bar_mesh
 from dataset_builder.scene.shapes.links import stirrup_centreline_m
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import MeshError
 
 STATES_DIR = Path(__file__).with_name("settled")
 """Directory of stored states, ``<name>.json``; a stored state never changes, a new pile gets a new name."""
@@ -34,8 +31,6 @@ RIBS = RibPattern(segments_per_row=8)
 """The default rib pattern with two mesh segments fewer per row: 57 thousand triangles per stirrup."""
 
 ROLE = "stirrup"
-UNIT_TOLERANCE = 1e-9
-"""Largest deviation of a stored quaternion's norm from 1."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +42,7 @@ class Pose:
 
 
 def pile_assembly(spec: PileSpec) -> Assembly:
-    """Return the stirrups of ``spec`` in their stored poses (world, metres), numbered from 1 in drop order.
-
-    Raises ``MeshError`` if the state is unknown, incomplete or belongs to other stirrups.
-    """
+    """Return the stirrups of ``spec`` in their stored poses (world, metres), numbered from 1 in drop order."""
     line_m = spec_centreline_m(spec)
     local = ribbed_bar_mesh(line_m, spec.diameter_m, RIBS)
     return Assembly.from_meshes(
@@ -65,12 +57,9 @@ def pile_assembly(spec: PileSpec) -> Assembly:
 def spec_centreline_m(spec: PileSpec) -> Float64[ndarray, "n 3"]:
     """Return the stirrup centreline of ``spec`` in the stirrup's own frame, metres.
 
-    Meshes and the simulation both use it. Raises ``MeshError`` if the stirrup cannot be bent.
+    Meshes and the simulation both use it.
     """
-    try:
-        return stirrup_centreline_m(spec.size_m, spec.diameter_m, outer_radius_m(spec.diameter_m, RIBS))
-    except ValueError as error:
-        raise MeshError(f"no valid stirrup for {spec}: {error}") from None
+    return stirrup_centreline_m(spec.size_m, spec.diameter_m, outer_radius_m(spec.diameter_m, RIBS))
 
 
 def points_in_world_m(points_m: Float64[ndarray, "n 3"], pose: Pose) -> Float64[ndarray, "n 3"]:
@@ -87,47 +76,8 @@ def points_in_world_m(points_m: Float64[ndarray, "n 3"], pose: Pose) -> Float64[
 
 
 def load_settled_poses(spec: PileSpec) -> tuple[Pose, ...]:
-    """Return the poses stored as ``spec.state``.
-
-    Raises ``MeshError`` if the state is unknown, cannot be read or does not fit ``spec``.
-    """
-    path = STATES_DIR / f"{spec.state}.json"
-    known = sorted(stored.stem for stored in STATES_DIR.glob("*.json"))
-    if spec.state not in known:
-        raise MeshError(f"no settled state {spec.state!r}, expected one of {', '.join(known)}")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        _check_stored_stirrups(spec, content["pile"])
-        poses = tuple(_parse_pose(number, stored) for number, stored in enumerate(content["stirrups"], start=1))
-        if len(poses) != spec.stirrups:
-            raise ValueError(f"{len(poses)} poses, expected {spec.stirrups}")
-    except (ValueError, KeyError, TypeError) as error:
-        raise MeshError(f"settled state {spec.state!r} ({path.name}) cannot be read: {error!r}") from None
-    return poses
-
-
-def _check_stored_stirrups(spec: PileSpec, stored: Mapping[str, Any]) -> None:
-    """Raise ``MeshError`` unless a stored state belongs to the stirrups of ``spec``.
-
-    Poses are valid only for the stirrups that were simulated; others would float or intersect.
-    """
-    requested = {"stirrups": spec.stirrups, "diameter_m": spec.diameter_m, "size_m": list(spec.size_m)}
-    differing = [
-        f"{name} {requested[name]}, stored {stored[name]}" for name in requested if stored[name] != requested[name]
-    ]
-    if differing:
-        raise MeshError(
-            f"settled state {spec.state!r} does not match the requested stirrups: {'; '.join(differing)}"
-        )
-
-
-def _parse_pose(number: int, stored: Mapping[str, Any]) -> Pose:
-    """Return a pose from its JSON object; raise ``ValueError`` unless it is finite with a unit quaternion."""
-    x, y, z = (float(value) for value in stored["position_m"])
-    quaternion = tuple(float(value) for value in stored["quaternion_wxyz"])
-    # The negated comparison also rejects NaN.
-    if len(quaternion) != 4 or not abs(float(np.linalg.norm(quaternion)) - 1) < UNIT_TOLERANCE:
-        raise ValueError(f"stirrup {number} has the quaternion {quaternion}, expected four numbers of norm 1")
-    if not np.isfinite([x, y, z]).all():
-        raise ValueError(f"stirrup {number} is at {(x, y, z)}, expected finite metres")
-    return Pose((x, y, z), quaternion)
+    """Return the poses stored as ``spec.state``, those of the stirrups of ``spec``."""
+    content = json.loads((STATES_DIR / f"{spec.state}.json").read_text(encoding="utf-8"))
+    return tuple(
+        Pose(tuple(stored["position_m"]), tuple(stored["quaternion_wxyz"])) for stored in content["stirrups"]
+    )

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-from dataset_builder.scene.shapes.segments import closest_points_m
+from rebar_depth_bench.geometry.segments import closest_points_m
 
 NEAR_M = 0.05
 """Distance up to which bars are compared, metres; bars that are farther apart have an infinite clearance."""

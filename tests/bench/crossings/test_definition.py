@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
 
-from rebar_depth_bench.bar_crossings.axis_segments import closest_on_segments
 from rebar_depth_bench.bar_crossings.definition import MAX_GAP_M, Crossings, scene_crossings
 from rebar_depth_bench.data.bars import Bar
 
@@ -250,21 +249,6 @@ def test_every_sharp_minimum_of_a_brute_force_search_is_a_crossing(seed: int) ->
             if middles and angle > 21:
                 assert np.count_nonzero(chosen) == 1
                 assert np.linalg.norm((found.point_a_m + found.point_b_m)[chosen][0] / 2 - middles[0]) < 0.01
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_closest_points_beat_a_grid_of_points(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    start_a, vector_a, start_b, vector_b = rng.uniform(-1, 1, (4, 1, 3))
-    if seed % 5 == 0:
-        vector_b = vector_a * rng.uniform(-2, 2)
-    share_a, share_b = closest_on_segments(start_a, vector_a, start_b, vector_b)
-    assert 0 <= share_a[0] <= 1
-    assert 0 <= share_b[0] <= 1
-    best_m = np.linalg.norm(start_a + share_a * vector_a - start_b - share_b * vector_b)
-    grid = np.linspace(0, 1, 41)[:, None]
-    distance_m = np.linalg.norm((start_a + grid * vector_a)[:, None] - (start_b + grid * vector_b), axis=2)
-    assert best_m <= distance_m.min() + 1e-9
 
 
 def test_lattice_has_375_contacts(tiny_root) -> None:  # type: ignore[no-untyped-def]

@@ -18,9 +18,9 @@ import trimesh
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.blender import deck, hall
 from dataset_builder.config.specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
 from dataset_builder.config.surroundings import SURROUNDINGS
+from dataset_builder.scene.environments import deck, hall
 from dataset_builder.scene.model import Part, WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.solids import merge_meshes

@@ -19,10 +19,6 @@ from jaxtyping import Float64
 from numpy import ndarray
 from scipy.spatial import ConvexHull
 
-from dataset_builder.blender.deck import deck
-from dataset_builder.blender.hall import hall
-from dataset_builder.blender.laboratory import laboratory
-from dataset_builder.blender.outdoors import CLEAR_M, SLAB_HALF_M, outdoors
 from dataset_builder.config.catalog import LATTICE_DOME, LATTICE_RING, PIER_DOME, PILE_DOME
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import (
@@ -39,6 +35,10 @@ from dataset_builder.scene.assemblies import aim_point_m
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.assemblies.pile import pile_assembly
+from dataset_builder.scene.environments.deck import deck
+from dataset_builder.scene.environments.hall import hall
+from dataset_builder.scene.environments.laboratory import laboratory
+from dataset_builder.scene.environments.outdoors import CLEAR_M, SLAB_HALF_M, outdoors
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.variants.props import PROP_BUILDERS, make_props

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataset_builder.blender.outdoors import CLEAR_M
 from dataset_builder.config.catalog import LATTICE_DOME, PIER_DOME, PILE_DOME
 from dataset_builder.config.scene_file import OUTDOORS_CAMERA_RADIUS_M
 from dataset_builder.config.specs import DomeSpec, PierSpec, RigSpec
 from dataset_builder.config.trajectories import camera_offsets_m, poses, view_count
 from dataset_builder.scene.assemblies import aim_point_m
 from dataset_builder.scene.assemblies.pier import pier_assembly
+from dataset_builder.scene.environments.outdoors import CLEAR_M
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.steel_distance import Cylinders, radii_at_steel_distance_m
 from rebar_depth_bench.data.bars import Bar

@@ -7,6 +7,7 @@ import math
 from io import BytesIO, StringIO
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -188,3 +189,15 @@ def test_notes_are_cut_and_lengths_come_last(capsys: pytest.CaptureFixture[str])
     assert lines[0] == "note: a: a gap"
     assert len(lines) == MAX_NOTES + 1
     assert "11 more notes" in lines[-1]
+
+
+def test_bends_are_drawn_in_one_colour() -> None:
+    """The outline of a piece covered the piece before it, so that a bend had dark stripes."""
+    corners_m = np.array([[0, 0, 0.1], [0.5, 0, 0.1], [0.5, 0.35, 0.1]])
+    bar = CageBar("a", Bar(1, "bar", 0.04, axis_of(bent_line_m(corners_m, 0.1))))
+    with Image.open(BytesIO(inspection_picture(inspect_cage(Cage((bar,)), "a")))) as picture:
+        top = np.asarray(picture)[730 : 730 + 640, :960].astype(int)
+    is_steel = top.max(axis=2) - top.min(axis=2) > 40
+    inner = cv2.erode(is_steel.astype(np.uint8), np.ones((13, 13), np.uint8)) > 0
+    assert inner.sum() > 1000
+    assert len(np.unique(top[inner], axis=0)) == 1

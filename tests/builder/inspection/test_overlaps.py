@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dataset_builder.inspection import overlaps as module
-from dataset_builder.inspection.overlaps import MIN_OVERLAP_M, TooManyNeighboursError, overlaps
+from dataset_builder.inspection import summary as module
+from dataset_builder.inspection.summary import MIN_OVERLAP_M, overlaps
 from dataset_builder.scene.model import axis_of
+from rebar_depth_bench.bar_crossings.axis_segments import TooManyNeighboursError
 from rebar_depth_bench.data.bars import Bar
 
 

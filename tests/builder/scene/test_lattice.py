@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -103,17 +102,3 @@ def test_other_extent_and_pitch() -> None:
     bigger = lattice_assembly(LatticeSpec(extent_m=0.12, pitch_m=0.03, diameters_m=(0.008, 0.006)))
     assert len(bigger.bars) == 48
     assert min(gap_m(a, b) for a, b in combinations(bigger.bars, 2)) == pytest.approx(CLEAR_GAP_M, abs=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"pitch_m": 0.015}, "multiple of pitch_m"),
-        ({"pitch_m": 0.0125}, "too small"),
-        ({"diameters_m": (0.010, 0.004)}, "too small"),
-        ({"extent_m": -0.1}, "positive"),
-    ],
-)
-def test_invalid_lattices_are_rejected(change: dict[str, float], reason: str) -> None:
-    with pytest.raises(ValueError, match=reason):
-        lattice_assembly(replace(SPEC, **change))  # type: ignore[arg-type]

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import pi
 
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import strategies as st
 
 from dataset_builder.config.specs import PierSpec
 from dataset_builder.scene.assemblies import aim_point_m, make_assembly
@@ -215,55 +212,7 @@ def test_pier_is_deterministic(pier: Assembly) -> None:
         assert part.mesh.vertices_m.tobytes() == repeated_part.mesh.vertices_m.tobytes()
 
 
-@pytest.mark.slow
-@settings(
-    max_examples=15,
-    suppress_health_check=[HealthCheck.too_slow],
-    phases=[Phase.explicit, Phase.reuse, Phase.generate],  # Shrinking would take minutes.
-)
-@given(
-    side_m=st.floats(0.6, 3.0),
-    verticals=st.sampled_from([12, 16, 20, 24, 32, 44]),
-    levels=st.integers(1, 3),
-    pitch_m=st.floats(0.02, 0.15),
-    diameters_m=st.tuples(*[st.sampled_from([0.006, 0.008, 0.012, 0.016, 0.020, 0.025, 0.040])] * 3),
-)
-def test_random_pier_is_clear_or_rejected(
-    side_m: float, verticals: int, levels: int, pitch_m: float, diameters_m: tuple[float, float, float]
-) -> None:
-    vertical_m, tie_m, hoop_m = diameters_m[0], *sorted(diameters_m[1:])
-    spec = PierSpec("pier", side_m, pitch_m * levels, verticals, levels, vertical_m, hoop_m, tie_m)
-    try:
-        assembly = pier_assembly(spec)
-    except ValueError:
-        return
-    assert len(assembly.bars) == verticals + 3 * levels
-    assert least_gap_m(assembly) > CLEAR_GAP_M / 2
-    vertices_m = np.concatenate([part.mesh.vertices_m for part in assembly.parts])
-    np.testing.assert_allclose(np.ptp(vertices_m, axis=0), [side_m, side_m, spec.height_m], atol=1e-3)
-
-
 def test_small_pier() -> None:
     small = pier_assembly(SMALL_SPEC)
     assert len(small.bars) == 32 + 3 * 4
     assert 0.44e-3 < least_gap_m(small) <= 0.5e-3 + 1e-12
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"verticals": 94}, "multiple of 4"),
-        ({"side_m": -1.0}, "positive"),
-        ({"height_m": float("nan")}, "finite"),
-        ({"tie_diameter_m": 0.020}, "ties of 0.02 m are thicker than hoops of 0.016 m"),
-        ({"levels": 0}, "positive"),
-        ({"levels": 200}, "two half hoops and a tie"),
-        ({"verticals": 132}, "the hooks of 0.016 m bars need"),
-        ({"side_m": 1.0, "verticals": 20}, "a lap of 0.640 m takes 4 spaces"),
-        ({"height_m": 13.0}, "a vertical of this pier is 13.00 m long"),
-        ({"side_m": 6.0}, "a hoop of this pier is 13"),
-    ],
-)
-def test_invalid_piers_are_rejected(change: dict[str, float], reason: str) -> None:
-    with pytest.raises(ValueError, match=reason):
-        pier_assembly(replace(SPEC, **change))  # type: ignore[arg-type]

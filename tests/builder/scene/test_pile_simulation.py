@@ -22,16 +22,18 @@ from dataset_builder.scene.assemblies.pile import (
     points_in_world_m,
     spec_centreline_m,
 )
-from dataset_builder.scene.assemblies.pile_checks import DropSpec, drop_poses, free_markers
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
-mujoco = pytest.importorskip("mujoco", reason="pip install 'rebar-depth-bench[physics]'")
+mujoco = pytest.importorskip("mujoco", reason="it is in the extra dev")
 
-from dataset_builder.scene.assemblies.pile_simulation import (  # noqa: E402
+from scripts.simulate_pile import (  # noqa: E402
     PHYSICS,
+    DropSpec,
     SettledPile,
     drop_pile,
+    drop_poses,
     find_problems,
+    free_markers,
     simulate_drop,
 )
 
@@ -136,7 +138,7 @@ def test_command_rejects_negative_seed(tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-m",
-        "dataset_builder.scene.assemblies.pile_simulation",
+        "scripts.simulate_pile",
         "--seed",
         "-1",
         "--out",

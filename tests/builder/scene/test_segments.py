@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dataset_builder.scene.shapes.segments import closest_points_m
+from rebar_depth_bench.geometry.segments import closest_points_m
 
 SHARES = np.linspace(0, 1, 201)
 

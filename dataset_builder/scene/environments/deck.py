@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dataset_builder.blender.outdoors import GROUND_HALF_M, GROUND_M, placed, ring, site
+from dataset_builder.scene.environments.outdoors import GROUND_HALF_M, GROUND_M, placed, ring, site
 from dataset_builder.scene.model import Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box, merge_meshes, rotated_box, transformed
 
