@@ -62,12 +62,13 @@ def _run(options: argparse.Namespace) -> None:
     settings = read_settings(options.settings, overrides if needs_data else {**overrides, "data": ""})
     set_up_logs()
     database = sqlite_path(settings.database_url)
-    if options.command not in ("serve", "token") and database is not None and not database.is_file():
-        raise InputError(f"{database}: the database does not exist, expected the database of a leaderboard")
+    is_missing = database is not None and not database.is_file() and options.command not in ("serve", "token")
     with ExitStack() as stack:
-        if options.command != "check":  # It creates nothing, and may run beside anything.
+        if options.command != "check" and (settings.state_dir.exists() or not is_missing):  # It writes nothing.
             _make_state_dir(settings.state_dir)
             stack.enter_context(state_lock(settings.state_dir))
+        if is_missing:
+            raise InputError(f"{database}: the database does not exist, expected the database of a leaderboard")
         stack.enter_context(database_errors(settings.database_url))
         if options.command == "serve":
             from leaderboard.web.server import serve

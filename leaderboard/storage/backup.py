@@ -141,6 +141,5 @@ def _copy_database(source: Path, copy: Path) -> None:
 def _submission_ids(database_file: Path) -> set[str]:
     """Return the ids of all submissions of an earlier backup, including those in its write-ahead log."""
     url = f"sqlite:///{database_file.absolute()}"
-    former = closing(Database(url, read_only=True))
-    with database_errors(url, InputError), former as database, database.read() as session:
+    with database_errors(url, InputError), closing(Database(url, read_only=True)) as one, one.read() as session:
         return set(session.scalars(select(SubmissionModel.id)))
