@@ -81,8 +81,8 @@ def _is_scene_name(name: str) -> bool:
 
 
 SCENE_NAME = Expected(
-    "a name of lower-case letters, digits and hyphens that starts with a letter or digit and does not end in a "
-    "variant's name",
+    "a name of at most 63 lower-case letters, digits and hyphens that starts with a letter or digit and does not "
+    "end in a variant's name",
     _is_scene_name,
 )
 """Description of scene names, which are also the names of configs."""

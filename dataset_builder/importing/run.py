@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from dataset_builder.config.scene_file import RESERVED_NAMES
 from dataset_builder.config.scene_name import scene_name_of
+from dataset_builder.config.scene_schema import SCENE_NAME
 from dataset_builder.importing.bars_file import read_bars_file
 from dataset_builder.importing.layout import Layout, read_layout
 from dataset_builder.importing.views import SourceViews, open_views
@@ -26,7 +26,7 @@ from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest
 from rebar_depth_bench.data.eye_view import truth_from_row
 from rebar_depth_bench.errors import InputError, escape_text
-from rebar_depth_bench.paths import NAME_PATTERN, remove_folder
+from rebar_depth_bench.paths import remove_folder
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.view_ids import view_id
@@ -64,10 +64,9 @@ def plan_import(path: Path, name: str) -> Import:
 
     Raises ``InputError`` with all problems of the layout, its cameras or its bars, and for a reserved name.
     """
-    is_name = scene_name_of(Path(f"{name}.toml")) == name and re.fullmatch(NAME_PATTERN, name)
+    is_name = scene_name_of(Path(f"{name}.toml")) == name and SCENE_NAME.accept(name)
     if not is_name or name in RESERVED_NAMES:
-        expected = "expected a name of at most 200 of a-z, 0-9 and - that is not a standard one"
-        raise InputError(f"--config is {escape_text(name)}, {expected}")
+        raise InputError(f"--config is {escape_text(name)}, expected {SCENE_NAME.text}, not a standard one")
     layout = read_layout(path)
     views = open_views(path, layout)
     bars = read_bars_file(path.parent / layout.bars.file) if layout.bars is not None else ()

@@ -82,7 +82,7 @@ def test_invalid_cameras_are_refused_with_their_line(folder: Path) -> None:
         plan_import(layout, "mock-up")
 
 
-@pytest.mark.parametrize("name", ["lattice", "meshes", "Mock-Up", "a/b", "", "..", "cages x", "a" * 201])
+@pytest.mark.parametrize("name", ["lattice", "meshes", "Mock-Up", "a/b", "", "..", "cages x", "a" * 64, "a" * 201])
 def test_name_that_is_no_config_is_refused(name: str, folder: Path) -> None:
     with pytest.raises(InputError, match="--config"):
         plan_import(data.write_layout(folder), name)
