@@ -21,14 +21,12 @@ from leaderboard.db.models import (
     LeaderboardRowModel,
     PictureImageModel,
     PictureModel,
-    ResultModel,
     SubmissionModel,
     TokenModel,
 )
 from leaderboard.db.submissions import QUEUED, SCORED
 from leaderboard.db.view_errors import rank_ranges
 from rebar_depth_bench.scoring.disclosure import DisclosedTable, disclosed_number
-from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.submission.metadata import INPUTS
 
 _CACHED_TABLES = 4096
@@ -110,7 +108,7 @@ class Ranking:
 def read_ranking(
     database: Database, config: str, dataset_digest: str, viewer: TokenModel | None = None
 ) -> Ranking:
-    """Return the public rows of a config and those of ``viewer``, of results that this version can read.
+    """Return the public rows of a config and those of ``viewer``.
 
     Results of another dataset than the one with ``dataset_digest`` are left out. Equal rank errors share a
     rank. A row that is not public has no rank and does not affect the ranks of others.
@@ -120,13 +118,11 @@ def read_ranking(
         select(*_COLUMNS)
         .join(SubmissionModel, SubmissionModel.id == LeaderboardRowModel.submission_id)
         .join(TokenModel, TokenModel.id == SubmissionModel.token_id)
-        .join(ResultModel, ResultModel.submission_id == SubmissionModel.id)
         .where(
             LeaderboardRowModel.config == config,
             SubmissionModel.status == SCORED,
             SubmissionModel.dataset_digest == dataset_digest,
             SubmissionModel.public | own,
-            ResultModel.protocol == PROTOCOL,
         )
         .order_by(SubmissionModel.created_at)
     )

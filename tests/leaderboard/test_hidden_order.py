@@ -123,7 +123,7 @@ def test_results_of_other_protocols_are_shown_without_error(apps: list[FastAPI],
     for address in ("/", BOARD, CSV):
         assert get_response(app, address)[0] == 200
     rows = json.loads(get_response(app, API)[2])["rows"]
-    assert [(row["id"], row["rank"]) for row in rows] == [(known, 1)]
+    assert [(row["id"], row["rank"]) for row in rows] == [(known, 1), (unknown, 1)]
     assert b"another version" in get_response(app, f"/submissions/{unknown}")[2]
     answer = json.loads(get_response(app, f"/api/v1/submissions/{unknown}")[2])
     assert answer["result"] == {"hidden_truth": True}

@@ -10,6 +10,7 @@ from contextlib import closing
 from pathlib import Path
 
 import httpx2
+import pytest
 
 from leaderboard.db import jobs
 from leaderboard.scoring.sandbox import Outcome
@@ -128,8 +129,9 @@ def test_archive_that_is_lost_while_it_waits_costs_no_result(tmp_path: Path) -> 
     }
 
 
-def test_results_of_another_protocol_are_scored_again_or_unranked(
-    tmp_path: Path, running_server: RunServer
+@pytest.mark.parametrize("changed", ["protocol", "intervals"])
+def test_results_of_other_definitions_are_scored_again_or_stay(
+    tmp_path: Path, running_server: RunServer, changed: str
 ) -> None:
     root, state, archive = tmp_path / "root", tmp_path / "state", tmp_path / "archive.zip"
     write_dataset(root, ["lattice"], 2)
@@ -137,16 +139,19 @@ def test_results_of_another_protocol_are_scored_again_or_unranked(
     with running_server(root, state) as server:
         kept, lost = (server.submit_accepted(archive, server.token(name)) for name in ("alice", "bob"))
         before = [server.wait_until_ended(submission_id)["result"] for submission_id in (kept, lost)]
+    earlier = before[0] | {"protocol": "rebar-0"} if changed == "protocol" else before[0].copy()
+    earlier.pop("intervals") if changed == "intervals" else None
     with closing(sqlite3.connect(state / "leaderboard.sqlite")) as connection, connection:
-        other = ("rebar-1", b'{"protocol": "rebar-1"}')
-        connection.execute("UPDATE results SET protocol = ?, json = ?", other)
+        stored = (earlier["protocol"], json.dumps(earlier).encode())
+        connection.execute("UPDATE results SET protocol = ?, json = ?", stored)
     (state / "archives" / f"{lost}.zip").unlink()
     with running_server(root, state) as server:
         assert server.wait_until_ended(kept)["result"] == before[0]
-        assert ids_and_ranks(server) == [(kept, 1)]
+        assert server.wait_until_ended(lost)["result"] == earlier
+        assert ids_and_ranks(server) == [(kept, 1), (lost, 1)]
         page = httpx2.get(f"{server.url}/submissions/{lost}", timeout=60)
         assert page.status_code == 200
-        assert "another version" in page.text
+        assert ("another version" in page.text) == (changed == "protocol")
 
 
 def test_scorer_with_other_dataset_releases_job(
