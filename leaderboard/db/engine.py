@@ -95,7 +95,7 @@ class Database:
             _check_revision(connection, upgradable=False)
 
     def problems(self) -> list[str]:
-        """Return what is damaged: pages and references of an SQLite database, and results that are no JSON."""
+        """Return what is damaged: pages and references of an SQLite database, and results."""
         found: list[str] = []
         try:
             with self.read() as session:
@@ -105,9 +105,9 @@ class Database:
                 results = select(ResultModel.submission_id, ResultModel.json)
                 for submission_id, content in session.execute(results, execution_options={"yield_per": 20}):
                     try:
-                        json.loads(content)
-                    except ValueError:
-                        found.append(f"the result of submission {submission_id} is no JSON")
+                        parsed_result(content)
+                    except ValueError as error:
+                        found.append(f"the result of submission {submission_id} is {error}")
         except DatabaseError as error:
             found.append(f"the database is damaged: {error.orig}")
         return found
@@ -115,6 +115,18 @@ class Database:
     def close(self) -> None:
         """Close all connections."""
         self._engine.dispose()
+
+
+def parsed_result(content: bytes) -> dict[str, Any]:
+    """Return a stored result as its JSON object. Raises ``ValueError`` for content that is no result."""
+    try:
+        result: dict[str, Any] = json.loads(content)
+    except ValueError:
+        raise ValueError("no JSON") from None
+    match result:
+        case {"protocol": str(), "dataset": {"digest": str()}, "tables": dict()}:
+            return result
+    raise ValueError("no result of scoring")
 
 
 def without_password(url: str) -> str:

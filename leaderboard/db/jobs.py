@@ -10,13 +10,14 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 from sqlalchemy import ColumnElement, and_, or_, select, update
 from sqlalchemy.engine import CursorResult
 from sqlalchemy.orm import Session
 
-from leaderboard.db.engine import Database
+from leaderboard.db.engine import Database, parsed_result
 from leaderboard.db.models import (
     Base,
     LeaderboardRowModel,
@@ -107,8 +108,9 @@ def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome
     }
     with database.write() as session:
         if outcome.archive_missing and (kept := session.get(ResultModel, submission_id)):
-            digest = json.loads(kept.json)["dataset"]["digest"]
-            values |= {"status": SCORED, "reason": None, "dataset_digest": digest}
+            with suppress(ValueError):  # A damaged result is not kept.
+                digest = parsed_result(kept.json)["dataset"]["digest"]
+                values |= {"status": SCORED, "reason": None, "dataset_digest": digest}
         if not _update_one(session, _has_lease(submission_id, scorer), values):
             return False
         if result is not None:
@@ -125,7 +127,7 @@ def requeue_stale(database: Database, dataset_digest: str, archive_ids: Collecti
     unless ``rescore`` is True.
     """
     with database.write() as session:
-        stale = stale_submissions(session, dataset_digest, archive_ids)
+        stale = stale_submissions(session, dataset_digest, archive_ids, lock=True)
         others = sum(record.dataset_digest != dataset_digest for record in stale)
         if others and not rescore:
             raise InputError(
@@ -140,17 +142,21 @@ def requeue_stale(database: Database, dataset_digest: str, archive_ids: Collecti
         return len(stale)
 
 
-def stale_submissions(session: Session, digest: str, archive_ids: Collection[str]) -> list[SubmissionModel]:
+def stale_submissions(
+    session: Session, digest: str, archive_ids: Collection[str], *, lock: bool = False
+) -> list[SubmissionModel]:
     """Return the submissions of other datasets than the one with ``digest``, and those of other definitions.
 
-    Results stay as they are if their archive is pruned, or not among ``archive_ids``.
+    Results stay as they are if their archive is pruned, or not among ``archive_ids``. With ``lock``, the rows are
+    locked until the session ends.
     """
     query = (
         select(SubmissionModel, ResultModel.json)
         .outerjoin(ResultModel, ResultModel.submission_id == SubmissionModel.id)
         .where(SubmissionModel.status.in_((QUEUED, SCORING, SCORED)))
-        .with_for_update(of=SubmissionModel)
     )
+    if lock:
+        query = query.with_for_update(of=SubmissionModel)
     stale = []
     for record, content in session.execute(query, execution_options={"yield_per": 20}):
         scored, has_archive = record.status == SCORED, record.id in archive_ids and not record.archive_deleted_at
@@ -163,7 +169,7 @@ def stale_submissions(session: Session, digest: str, archive_ids: Collection[str
 def _has_other_definitions(content: bytes) -> bool:
     """Return whether a result JSON was computed with other definitions than those of this version."""
     try:
-        result: dict[str, Any] = json.loads(content)
+        result = parsed_result(content)
     except ValueError:  # Damaged: it is computed again, too.
         return True
     return bool(result["protocol"] != PROTOCOL or result.get("intervals") != INTERVALS)
@@ -172,7 +178,7 @@ def _has_other_definitions(content: bytes) -> bool:
 def _stored(submission_id: str, outcome: Outcome, result: Mapping[str, Any]) -> Iterator[Base]:
     """Yield the rows of what scoring has found out."""
     notes = json.dumps(list(outcome.notes))
-    yield ResultModel(submission_id=submission_id, json=outcome.result, protocol=result["protocol"], notes=notes)
+    yield ResultModel(submission_id=submission_id, json=outcome.result, notes=notes)
     for config, table in result["tables"].items():
         yield LeaderboardRowModel(
             submission_id=submission_id,

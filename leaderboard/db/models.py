@@ -75,7 +75,7 @@ class SubmissionModel(Base):
 
 
 class ResultModel(Base):
-    """The result JSON of a scored submission, byte-identical to that of the command line, and its protocol.
+    """The result JSON of a scored submission, byte-identical to that of the command line.
 
     ``notes`` is a JSON array of sentences on possible mistakes in the submission.
     """
@@ -84,7 +84,6 @@ class ResultModel(Base):
 
     submission_id: Mapped[str] = mapped_column(ForeignKey("submissions.id"), primary_key=True)
     json: Mapped[bytes] = mapped_column(LargeBinary)
-    protocol: Mapped[str] = mapped_column(String(20))
     notes: Mapped[str] = mapped_column(Text, server_default="[]")
 
 

@@ -10,13 +10,14 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from leaderboard.scoring.isolation import UnavailableError
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError, Problem, RebarDepthError, SubmissionError
-from rebar_depth_bench.scoring.view_score import ViewScore, sort_key_worst_first
+from rebar_depth_bench.scoring.view_score import ViewScore
 from rebar_depth_bench.submission import SubmissionMeta, open_submission
 from rebar_depth_bench.view_ids import TEST_SPLIT, config_of, split_of
 
@@ -109,7 +110,7 @@ def score(archive: Path, data: str, dataset_digest: str, error_maps: int, hidden
 
 def views_to_picture(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
     """Return the ``count`` worst of the views by rank error, and the median view, worst first."""
-    worst_first = sorted(views, key=sort_key_worst_first, reverse=True)
+    worst_first = sorted(views, key=attrgetter("rank_error"), reverse=True)
     median = worst_first[len(worst_first) // 2 : len(worst_first) // 2 + 1]
     return [*worst_first[:count], *(view for view in median if view not in worst_first[:count])]
 

@@ -68,6 +68,13 @@ class ArchiveStore:
             return time.time() - self.file(submission_id).stat().st_mtime
         return 0.0
 
+    def delete_leftovers(self, age_s: float) -> None:
+        """Delete the temporary files of copies that were killed: those that have not changed for ``age_s``."""
+        for path in self._folder.glob(".*.zip.*.tmp"):
+            with suppress(FileNotFoundError):
+                if time.time() - path.stat().st_mtime >= age_s:
+                    path.unlink()
+
     def file(self, submission_id: str) -> Path:
         """Return the place of an archive, which may not exist."""
         return self._folder / f"{submission_id}.zip"

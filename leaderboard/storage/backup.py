@@ -55,10 +55,13 @@ def back_up(settings: Settings, target: Path, prune: bool) -> None:
         with state_lock(target, alone=True):
             if any(target.iterdir()) and not any((target / name).exists() for name in (DATABASE, ARCHIVES)):
                 raise InputError(f"{target}: contains other files, expected a new folder or an earlier backup")
+            if source is None and (target / DATABASE).exists():
+                raise InputError(f"{target}: is the backup of an SQLite leaderboard, expected another folder")
             target.chmod(0o700)
             archives, copies = ArchiveStore(settings.archive_dir), ArchiveStore(target / ARCHIVES)
-            for leftover in [*target.glob(f".{DATABASE}*.tmp*"), *(target / ARCHIVES).glob(".*.zip.*.tmp")]:
-                leftover.unlink()  # Of a backup that was killed.
+            copies.delete_leftovers(0)  # Of a backup that was killed.
+            for leftover in target.glob(f".{DATABASE}*.tmp*"):
+                leftover.unlink()
             if source is None:
                 missing = _copy_archives(rows, archives, copies)
             else:

@@ -90,6 +90,7 @@ def archive_retention(
             try:
                 expired = expired_archives(database, folder, settings) if settings.archive_days else []
                 prune_archives(database, archives, expired)
+                archives.delete_leftovers(ORPHAN_AGE_S)
             except (*DATABASE_UNAVAILABLE, DatabaseError, OSError) as error:
                 _LOG.warning("archives not deleted", error=type(error).__name__)
             stop.wait(RETENTION_INTERVAL_S)

@@ -106,6 +106,7 @@ def local_path(root: str, name: str, commit: str = "") -> Path:
 def _download(root: str, name: str, commit: str) -> Path:
     # Imported on use: it takes a fifth of a second, which local folders do not need.
     from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
+    from huggingface_hub.errors import HfHubHTTPError
 
     repository, revision = _hub_root(root)
     folder = Path(repository).parent
@@ -120,8 +121,9 @@ def _download(root: str, name: str, commit: str) -> Path:
             get_hf_file_metadata(hf_hub_url(repository, name, repo_type="dataset", revision=revision))
         return Path(download())
     except Exception as error:  # The errors of the HTTP client have no base class in the Hub's package.
-        with suppress(Exception):
-            return Path(download(local_files_only=True))
+        if not isinstance(error, HfHubHTTPError) or error.response.status_code >= 500:  # The Hub cannot be asked.
+            with suppress(Exception):
+                return Path(download(local_files_only=True))
         raise _download_error(root, name, error) from None
 
 

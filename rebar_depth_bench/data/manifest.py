@@ -75,7 +75,7 @@ class _Manifest(ManifestTable):
     """Manifest of the supported format; its configs are validated one by one."""
 
     version: Annotated[str, text(100)]
-    protocol: Annotated[str, one_of("rebar-2")] = "rebar-2"
+    protocol: Annotated[str, one_of("rebar-2")]
     ground_truth: _GroundTruth
     configs: Annotated[dict[str, dict[str, Any]], Expected("a table of one or more configs", bool)]
     files: dict[RelativePath, Sha256]

@@ -164,7 +164,8 @@ def _with_file_digest(path: Path, method: AnyMethod) -> AnyMethod:
 def _import_file(path: Path) -> ModuleType:
     """Import a Python file as a module; its folder stays the first of ``sys.path``, as for a script.
 
-    Files beside it can thus also be imported when the method is loaded. No ``__pycache__`` appears beside them.
+    Files beside it can thus also be imported when the method is loaded. The process writes no bytecode from then
+    on, so that no ``__pycache__`` appears beside them.
 
     Raises ``MethodError`` if the file is missing or cannot be imported.
     """

@@ -114,8 +114,3 @@ def protocol_indices(view_ids: Sequence[str]) -> list[int]:
         if indices == sorted(indices):
             return indices
     return list(range(len(suffixes)))
-
-
-def sort_key_worst_first(view: ViewScore) -> float:
-    """Return the sort key of a view: its rank error."""
-    return view.rank_error

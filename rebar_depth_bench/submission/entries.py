@@ -16,13 +16,12 @@ from rebar_depth_bench.submission.metadata import MAX_METADATA_BYTES, METADATA_N
 from rebar_depth_bench.view_ids import config_of, split_of
 
 ExpectedViews = Mapping[str, tuple[int, int]]
+"""Mapping of every view_id of a dataset folder to its (H, W) in pixels."""
 
 
 class CaptureViews(dict[str, tuple[int, int]]):
     """Expected views of a capture, whose ids are names of pictures and never name a split."""
 
-
-"""Mapping of every view_id of a dataset folder to its (H, W) in pixels."""
 
 _ANY_SUFFIX = f"one of {', '.join(FORMATS)}"
 _ZIP_HINT = "zip with: zip -r submission.zip submission.json <config> -x '*.DS_Store'"

@@ -17,6 +17,7 @@ import pytest
 from leaderboard.storage.archive_store import ArchiveNotFoundError, ArchiveStore
 from leaderboard.storage.retention import ORPHAN_AGE_S
 from leaderboard.uploads.accept import UNAVAILABLE_MESSAGE
+from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.errors import InputError
 from tests.leaderboard.serving import RunServer, make_token, running_scorer
 from tests.processes import wait_until
@@ -100,6 +101,20 @@ def test_killed_copy_from_another_device_leaves_no_archive(folder: Path, monkeyp
         assert not source.exists()
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == {"an-id.zip": CONTENT}
     assert stat.S_IMODE(archives.path("an-id").stat().st_mode) == 0o600
+
+
+def test_leftovers_of_killed_copies_are_deleted_when_they_are_old(folder: Path) -> None:
+    archives, now = ArchiveStore(folder), time.time()
+    with atomic_replace(folder / "an-id.zip") as temporary:
+        temporary.write_bytes(CONTENT)
+        for name in (temporary.name, "kept.zip"):
+            (folder / name).write_bytes(CONTENT)
+            os.utime(folder / name, (now - 5000, now - 5000))
+        archives.delete_leftovers(5100)
+        assert temporary.exists()
+        archives.delete_leftovers(3600)
+        assert [path.name for path in folder.iterdir()] == ["kept.zip"]
+        temporary.write_bytes(CONTENT)
 
 
 def test_other_files_are_not_listed(folder: Path) -> None:

@@ -92,11 +92,12 @@ def test_damaged_database_replaces_no_backup(board: tuple[Settings, str], tmp_pa
     with pytest.raises(StorageError, match="the database is damaged"):
         back_up(settings, target, prune=False)
     assert tree(target) == before
-    with closing(sqlite3.connect(target / "leaderboard.sqlite")) as connection:
-        connection.execute("UPDATE results SET json = 'x'")
-        connection.commit()
-    with pytest.raises(StorageError, match="is no JSON"):
-        back_up(board_settings(target), tmp_path / "second", prune=False)
+    for content, words in (("x", "is no JSON"), ("{}", "is no result"), ('{"protocol": 2}', "is no result")):
+        with closing(sqlite3.connect(target / "leaderboard.sqlite")) as connection:
+            connection.execute("UPDATE results SET json = ?", (content,))
+            connection.commit()
+        with pytest.raises(StorageError, match=words):
+            back_up(board_settings(target), tmp_path / "second", prune=False)
     assert not (tmp_path / "second" / "leaderboard.sqlite").exists()
     (target / "leaderboard.sqlite").write_bytes(b"no database" * 1000)
     sound = board_settings(tmp_path / "sound")
@@ -230,6 +231,11 @@ def test_backup_of_postgresql_is_restored_from_dump_and_archives(
     assert process.returncode == 0, process.stderr
     assert "save the rows with pg_dump before" in process.stderr
     assert names(target) == {"archives"}
+    other = board_settings(tmp_path / "other")
+    make_board(other)
+    back_up(other, tmp_path / "of-sqlite", prune=False)
+    with pytest.raises(InputError, match="is the backup of an SQLite leaderboard"):
+        back_up(settings, tmp_path / "of-sqlite", prune=False)
     restored = board_settings(tmp_path / "restored", db=postgres.new_database(f"restored_{time.time_ns()}"))
     postgres.run("pg_restore", "--dbname", restored.db, input=dump)
     shutil.copytree(target / "archives", restored.archive_dir)

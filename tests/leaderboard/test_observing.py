@@ -18,7 +18,6 @@ from tests.processes import wait_until
 
 PASSWORD = "correct-horse-battery"
 WRONG_TOKEN = "rdb_nobody-ever-made-this-token"
-UPLOAD = ("POST", "/api/v1/submissions")
 
 
 @dataclass(frozen=True)

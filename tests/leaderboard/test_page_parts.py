@@ -23,7 +23,6 @@ from leaderboard.web.pages.rendering import clean_text, error_response, format_s
 from leaderboard.web.pages.selection import COLUMNS, RANK, Selection, parse_selection
 from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.reporting.html.rows import table_row
-from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result_io import read_result
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 
@@ -45,7 +44,7 @@ def database(tmp_path: Path) -> Iterator[Database]:
             session.add(make_submission(f"s{index}", 100.0 + index, public=index not in HIDDEN))
             session.flush()
             result_json = json.dumps(result_dict).encode()
-            session.add(ResultModel(submission_id=f"s{index}", json=result_json, protocol=PROTOCOL))
+            session.add(ResultModel(submission_id=f"s{index}", json=result_json))
             session.add(
                 LeaderboardRowModel(
                     submission_id=f"s{index}",

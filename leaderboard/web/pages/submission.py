@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
@@ -43,7 +44,7 @@ from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.disclosure import read_disclosed
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.result_io import read_result
-from rebar_depth_bench.scoring.view_score import ViewScore, sort_key_worst_first
+from rebar_depth_bench.scoring.view_score import ViewScore
 from rebar_depth_bench.submission import Declaration
 from rebar_depth_bench.view_ids import config_of
 
@@ -178,7 +179,7 @@ def _result_context(service: Service, record: SubmissionModel, full_config: str 
 
 def _config_views(name: str, views: Sequence[ViewScore], list_all: bool) -> ConfigViewTables:
     """Return the chart and the worst views of a config, and, if ``list_all``, all views, sorted worst first."""
-    worst_first = sorted(views, key=sort_key_worst_first, reverse=True)
+    worst_first = sorted(views, key=attrgetter("rank_error"), reverse=True)
     return ConfigViewTables(
         name=printable(name),
         chart=score_charts.views_chart(name, views),
@@ -208,7 +209,7 @@ def _pictured_views(service: Service, submission_id: str, result: Result) -> lis
     pictures = picture_facts(service.database, submission_id)
     views = [view for view in result.views if view.view_id in pictures]
     order = {config: index for index, config in enumerate(result.tables)}
-    views.sort(key=lambda view: (order[config_of(view.view_id)], -sort_key_worst_first(view)))
+    views.sort(key=lambda view: (order[config_of(view.view_id)], -view.rank_error))
     return [
         {
             "row": view_row(view),

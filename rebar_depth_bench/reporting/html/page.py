@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_publis
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.view_score import ViewScore, sort_key_worst_first
+from rebar_depth_bench.scoring.view_score import ViewScore
 from rebar_depth_bench.submission import SubmissionReader
 from rebar_depth_bench.view_ids import config_of
 
@@ -171,7 +172,7 @@ def views_by_config(result: Result) -> Mapping[str, list[ViewScore]]:
 
 
 def _config_views(name: str, views: Sequence[ViewScore]) -> ConfigViewTables:
-    worst = sorted(views, key=sort_key_worst_first, reverse=True)[:WORST_SHOWN]
+    worst = sorted(views, key=attrgetter("rank_error"), reverse=True)[:WORST_SHOWN]
     return ConfigViewTables(
         name=printable(name),
         chart=score_charts.views_chart(name, views),

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.reporting.html.rows import ScoreRow, view_row
 from rebar_depth_bench.reporting.html.view_images import ViewImages, ViewPanels, view_images
-from rebar_depth_bench.scoring.view_score import ViewScore, sort_key_worst_first
+from rebar_depth_bench.scoring.view_score import ViewScore
 from rebar_depth_bench.view_ids import config_of
 
 VIEWS_SHOWN = 12
@@ -56,7 +57,7 @@ def views_to_show(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
     """
     if count < 0:
         raise InputError(f"views to show: {count}, expected 0 or more of each config")
-    worst_first = sorted(views, key=sort_key_worst_first, reverse=True)
+    worst_first = sorted(views, key=attrgetter("rank_error"), reverse=True)
     if len(worst_first) <= count:
         return worst_first
     worst = (count + 1) // 2
@@ -83,7 +84,7 @@ def _worst_first_key(view: ViewPanels, configs: Sequence[str]) -> tuple[int, flo
     config = config_of(view.view_id)
     return (
         configs.index(config) if config in configs else len(configs),
-        -sort_key_worst_first(view.score),
+        -view.score.rank_error,
         view.view_id,
     )
 

@@ -101,6 +101,21 @@ def test_hub_without_answer_is_asked_once(hub: HubServer, monkeypatch: pytest.Mo
     assert asked == ["/datasets/org/data/resolve/main/manifest.json", "/org/model/resolve/main/config.json"]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("status", "is_read"), [(503, True), (404, False), (401, False)])
+def test_cached_manifest_is_read_only_without_an_answer(
+    reading_hub: HubServer, tmp_path: Path, status: int, is_read: bool
+) -> None:
+    home = tmp_path / "home"
+    assert run_script("org/data", home, reading_hub.url).returncode == 0
+    reading_hub.faults["HEAD *"] = lambda _: Response(status_code=status)
+    try:
+        finished = run_script("org/data", home, reading_hub.url)
+    finally:
+        reading_hub.faults.clear()
+    assert (finished.returncode == 0) == is_read, finished.stderr
+
+
 def test_missing_folder_in_a_folder_is_not_asked_at_the_hub(
     hub: HubServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

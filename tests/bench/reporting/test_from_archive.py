@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,6 @@ from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.score import score_evaluation
-from rebar_depth_bench.scoring.view_score import sort_key_worst_first
 
 
 def test_report_embeds_requested_views_worst_first(
@@ -25,7 +25,7 @@ def test_report_embeds_requested_views_worst_first(
     )
     with open_evaluation(archive, tiny_root) as evaluation:
         result = score_evaluation(evaluation)
-        worst_first = [view.view_id for view in sorted(result.views, key=sort_key_worst_first, reverse=True)]
+        worst_first = [view.view_id for view in sorted(result.views, key=attrgetter("rank_error"), reverse=True)]
         page = tmp_path / "page.html"
         write_report(result, evaluation, page, views_shown=3)
         text = page.read_text(encoding="utf-8")
