@@ -63,6 +63,12 @@ def _build(options: argparse.Namespace) -> None:
 
     if options.out is None:
         raise InputError("--out ROOT is missing, expected the dataset folder to build")
+    if options.rewrite_manifest:
+        from dataset_builder.pipeline.rewrite import rewrite_manifest
+
+        rewrite_manifest(options.out)
+        print(options.out)
+        return
     if options.cluster is not None and options.dry_run:
         raise InputError(
             f"--dry-run is combined with --cluster {options.cluster}, expected only one of them: the estimate is "
@@ -102,12 +108,13 @@ def _print_estimate(request: BuildRequest, out: Path, processes: int, threads: i
     from dataset_builder.pipeline.build import plan_build
     from dataset_builder.pipeline.disk_space import check_space
     from dataset_builder.pipeline.estimate import estimate_build, estimate_lines
-    from dataset_builder.pipeline.retained import check_retained_configs
+    from dataset_builder.pipeline.retained import Finished, check_retained
 
     plans = plan_build(request, out)
-    check_retained_configs(out, plans)
+    finished = Finished(out)
+    check_retained(out, finished, plans, request.overwrite)
     with ProgressBars() as bars:
-        estimates = estimate_build(plans, out, threads, bars.update)
+        estimates = estimate_build(plans, finished, out, threads, bars.update)
     print(*map(printable, estimate_lines(estimates, out, processes)), sep="\n")
     check_space(out, [estimate.space for estimate in estimates if estimate.space])
 
@@ -133,6 +140,7 @@ def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
         variants=tuple(options.variant or ()),
         scenes=tuple(scene_config(path) for path in options.scene or ()),
         cages=_cages_request(options),
+        overwrite=tuple(options.overwrite or ()),
     )
 
 

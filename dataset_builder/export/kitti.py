@@ -34,8 +34,7 @@ class KittiLayout(Layout):
     def check(self, config: DatasetConfig) -> None:
         """Raise ``InputError`` for a config without colour or on the raw grid: KITTI's images are rectified."""
         check_layout(config, "kitti")
-        grid = (config.scene_entry.get("rig") or {}).get("grid")
-        if grid == "raw":
+        if config.scene.rig is not None and config.scene.rig.grid == "raw":
             raise InputError(
                 f"{config.root}: config {config.name} is on the raw grid, expected rectified images for "
                 "--layout kitti"

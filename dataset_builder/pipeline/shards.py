@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -104,6 +104,23 @@ def pack_shard(rows: Sequence[Path], target: Path) -> None:
     with atomic_replace(target) as temporary, pq.ParquetWriter(temporary, schema, **_PARQUET) as writer:
         for table in (first, *tables):
             writer.write_table(table.replace_schema_metadata(schema.metadata))
+
+
+def stage_published_rows(shard: Path, targets: Mapping[str, Path], records: Mapping[str, ViewRecord]) -> None:
+    """Stage the rows of a published shard whose views have ``records``, at the ``targets`` of their ids.
+
+    A shard that cannot be read, and row groups of other columns or of several rows, are left out, so that their
+    views are rendered again.
+    """
+    rows: list[pa.Table] = []
+    table = rows_table(ROW_SCHEMA.names, VIEWS_PER_SHARD)
+    with suppress(OSError, ValueError), open_regular(shard) as stream, open_parquet(stream, table) as (file, _):
+        rows += [file.read_row_group(group) for group in range(file.num_row_groups)]
+    for row in rows:
+        if row.schema.equals(ROW_SCHEMA) and row.num_rows == 1:
+            view_id = row["view_id"][0].as_py()
+            if view_id in records:
+                stage_row(targets[view_id], row, records[view_id])
 
 
 def _read_staged_row(path: Path) -> pa.Table:

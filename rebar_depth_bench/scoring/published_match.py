@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from rebar_depth_bench.data.config_tables import Assembly, SceneRig
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.trajectory import NEAREST_STEEL, Trajectory
 
@@ -34,7 +35,7 @@ class PublishedMatch:
 class _Conditions:
     """Conditions of a scene; ``optics`` are grid and baseline in metres, ``markers`` are those of the board."""
 
-    assembly: Mapping[str, Any]
+    assembly: Assembly
     markers: int
     environment: str
     trajectory: Trajectory
@@ -43,7 +44,7 @@ class _Conditions:
 
 _CONDITIONS: Mapping[str, _Conditions] = {
     "lattice": _Conditions(
-        {"kind": "lattice", "extent_m": 0.1, "pitch_m": 0.02, "diameters_m": [0.007, 0.004]},
+        Assembly(kind="lattice", extent_m=0.1, pitch_m=0.02, diameters_m=[0.007, 0.004]),
         6,
         "laboratory",
         Trajectory(
@@ -54,7 +55,7 @@ _CONDITIONS: Mapping[str, _Conditions] = {
         _ZED_RECTIFIED,
     ),
     "pile": _Conditions(
-        {"kind": "pile", "stirrups": 6, "diameter_m": 0.01, "size_m": [0.28, 0.2], "state": "pile-0"},
+        Assembly(kind="pile", stirrups=6, diameter_m=0.01, size_m=[0.28, 0.2], state="pile-0"),
         6,
         "laboratory",
         Trajectory(
@@ -65,16 +66,16 @@ _CONDITIONS: Mapping[str, _Conditions] = {
         _IDEAL,
     ),
     "pier": _Conditions(
-        {
-            "kind": "pier",
-            "side_m": 4.8,
-            "height_m": 6.67,
-            "verticals": 96,
-            "levels": 45,
-            "vertical_diameter_m": 0.032,
-            "hoop_diameter_m": 0.016,
-            "tie_diameter_m": 0.016,
-        },
+        Assembly(
+            kind="pier",
+            side_m=4.8,
+            height_m=6.67,
+            verticals=96,
+            levels=45,
+            vertical_diameter_m=0.032,
+            hoop_diameter_m=0.016,
+            tie_diameter_m=0.016,
+        ),
         0,
         "outdoors",
         Trajectory(
@@ -94,17 +95,17 @@ def published_match(config: DatasetConfig) -> PublishedMatch | None:
     Assembly, board, environment, image size and trajectory have to be equal, with all of its views and without
     appearance variants.
     """
-    is_complete = len(config.views) == config.protocol_views and config.grid == _GRID
+    is_complete = len(config.views) == config.scenes[0].protocol_views and config.grid == _GRID
     if config.imported is not None or config.has_splits or not is_complete or config.scene.appearance.variants:
         return None
-    scene, rig = config.manifest_entry["scene"], config.manifest_entry["rig"]
-    shown = (
-        scene.get("assembly"),
-        config.scene.board.markers if config.scene.board else 0,
-        scene.get("environment"),
-        config.protocol,
-    )
+    scene = config.scene
+    markers = scene.board.markers if scene.board else 0
+    shown = (scene.assembly, markers, scene.environment, scene.protocol)
     for name, expected in _CONDITIONS.items():
         if shown == (expected.assembly, expected.markers, expected.environment, expected.trajectory):
-            return PublishedMatch(name, (rig.get("grid"), rig.get("baseline_m")) == expected.optics)
+            return PublishedMatch(name, scene.rig is not None and _optics(scene.rig) == expected.optics)
     return None
+
+
+def _optics(rig: SceneRig) -> tuple[str, float]:
+    return rig.grid, rig.baseline_m
