@@ -36,7 +36,13 @@ def write_dataset(root: Path, configs: Sequence[str], views: int) -> None:
         for name in configs
     )
     (root / "README.md").write_text(f"---\nconfigs:\n{config_yaml}---\n")
-    entries = {config: _config_entry(config, config_records) for config, config_records in records.items()}
+    entries = {
+        config: {
+            **config_entry(config_records),
+            "scenes": [scene_entry(config, views, f"{config}/test.parquet")],
+        }
+        for config, config_records in records.items()
+    }
     _write_manifest(root, entries, [record for config in configs for record in records[config]], {})
 
 
@@ -82,18 +88,13 @@ def write_split_dataset(
         shard = f"cages/{split}-{scene}.parquet"
         pq.write_table(pa.concat_tables([table for table, _ in encoded]), root / shard, row_group_size=1)
         records += [record for _, record in encoded]
-        files = {"mesh": f"{scene}.ply", "shards": [shard]}
         family = (families or {}).get(scene)
-        entries.append({"name": scene, "split": split, "family": family, "board": None, **files})
+        entries.append({**scene_entry(scene, views, shard, split), "family": family})
     axis_m = ((0.0, 0.0, 0.3), (0.0, 1.0, 0.3))
     known_m = {scene: 0.001 * number for scene, number in number_of.items()} | dict(diameters_m or {})
     bars = {scene: (Bar(1, "vertical", known_m[scene], axis_m),) for scene in scenes}
     write_bars(root / BARS_FILE, bars)
-    entry = {
-        **_config_entry("cages", records),
-        "scenes": entries,
-    }
-    entry = {key: value for key, value in entry.items() if key not in ("scene", "mesh", "shards")}
+    entry = {**config_entry(records), "has_splits": True, "scenes": entries}
     _write_manifest(root, {"cages": entry}, records, {BARS_FILE: file_sha256(root / BARS_FILE)})
 
 
@@ -121,16 +122,32 @@ def _write_config(folder: Path, config: str, views: int) -> list[ViewRecord]:
     return [record for _, record in encoded]
 
 
-def _config_entry(config: str, records: Sequence[ViewRecord]) -> dict[str, object]:
+def config_entry(records: Sequence[ViewRecord], width: int = WIDTH, height: int = HEIGHT) -> dict[str, Any]:
+    """Return the entry of a config in the manifest without its scenes."""
     return {
-        "scene": {"name": config, "board": None},
-        "rig": {"height": HEIGHT, "width": WIDTH},
+        "has_splits": False,
+        "rig": {"height": height, "width": width},
+        "colour": {},
         "views": [record.model_dump() for record in records],
         "ground_truth_digest": views_digest(records),
-        "key": "",
-        "shards": [f"{config}/test.parquet"],
-        "mesh": "meshes/none.ply",
         "sheet": "pictures/none.webp",
+    }
+
+
+def scene_entry(name: str, views: int, shard: str, split: str = "test") -> dict[str, Any]:
+    """Return the entry of a scene in the manifest."""
+    return {
+        "name": name,
+        "split": split,
+        "assembly": {"kind": "bars"},
+        "board": None,
+        "protocol": {"kind": "ring", "radius_m": 1.0, "azimuths": views},
+        "protocol_views": views,
+        "rig": {"grid": "ideal", "baseline_m": BASELINE_M},
+        "key": "",
+        "mesh": "meshes/none.ply",
+        "shards": [shard],
+        "bytes": 0,
     }
 
 

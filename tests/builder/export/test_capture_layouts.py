@@ -184,8 +184,9 @@ def test_config_without_colour_is_refused(layout: str, tiny_root: Path) -> None:
 
 def test_raw_grid_is_refused_for_kitti(tiny_root: Path) -> None:
     config = open_folder(tiny_root).config("lattice")
-    entry = {**config.manifest_entry, "rig": {**config.manifest_entry["rig"], "grid": "raw"}}
-    raw = config.model_copy(update={"manifest_entry": entry})
+    assert config.scene.rig is not None
+    scene = config.scene.model_copy(update={"rig": config.scene.rig.model_copy(update={"grid": "raw"})})
+    raw = config.model_copy(update={"scenes": (scene,)})
     LAYOUTS["zed"].check(raw)
     with pytest.raises(InputError, match="raw grid"):
         LAYOUTS["kitti"].check(raw)

@@ -167,7 +167,7 @@ def test_mesh_import_of_lattice_reproduces_ground_truth(
     original, imported = open_folder(tiny_root), open_folder(tmp_path / "again")
     assert len(imported.config("lattice").views) == 3
     assert set(imported.config("lattice").views) <= set(original.config("lattice").views)
-    assert imported.config("lattice").manifest_entry["scene"]["assembly"]["path"] == "lattice.ply"
+    assert imported.config("lattice").scene.assembly.path == "lattice.ply"
     bars = (read_bars(root / "bars.parquet")["lattice"] for root in (tiny_root, tmp_path / "again"))
     for bar, imported_bar in zip(*bars, strict=True):
         assert imported_bar.bar_id == bar.bar_id
@@ -199,9 +199,9 @@ def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
     files = contents(tiny_root)
     del files["manifest.json"]
     assert manifest["files"] == files
-    scene = manifest["configs"]["lattice"]["scene"]
+    scene = manifest["configs"]["lattice"]["scenes"][0]
     assert scene["assembly"]["diameters_m"] == [0.007, 0.004]
-    assert manifest["configs"]["lattice"]["generator"]["bpy"].startswith("4.5")
+    assert scene["generator"]["bpy"].startswith("4.5")
     assert (
         "| `lattice` | lattice | 9 of 504 | 160 x 90 | 2, 8 around steel | 0.22-0.43 m |"
         in (tiny_root / "README.md").read_text()
@@ -254,7 +254,7 @@ def test_foreign_folder_is_rejected_and_unchanged(tmp_path: Path, marker: str, r
 def test_leftovers_of_kill_after_publishing_are_repaired(small_root: Path, run_build: RunBuild) -> None:
     """Remove the staging folder of a published config and restore files that contradict the manifest."""
     before = contents(small_root)
-    key = json.loads((small_root / "manifest.json").read_text())["configs"]["two-bars"]["key"]
+    key = json.loads((small_root / "manifest.json").read_text())["configs"]["two-bars"]["scenes"][0]["key"]
     for name in (key[:16], "0123456789abcdef"):
         (small_root / BUILD_FOLDER / f"two-bars-{name}" / "rows").mkdir(parents=True)
     assert "up to date" in run_build("--out", small_root, *SMALL).stdout

@@ -60,7 +60,7 @@ def test_ground_truth_equals_that_of_build_with_colour(root: Path, tiny_root: Pa
     for name, config in without.config_by_name.items():
         assert config.manifest_entry["colour"] is None
         assert config.key != with_colour.config(name).key
-        assert config.reference == with_colour.config(name).reference
+        assert config.references == with_colour.config(name).references
 
 
 def test_plain_datasets_loads_null_colour(root: Path) -> None:
