@@ -18,7 +18,6 @@ from dataset_builder.cli import argument_parser as builder_parser
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.quality import colour_spec
 from dataset_builder.pipeline.build import build
-from dataset_builder.pipeline.plan import plan_config
 from rebar_depth_bench import SubmissionWriter, load
 from rebar_depth_bench.console import EXIT_DONE
 from rebar_depth_bench.data.dataset import ConfigViews
@@ -57,10 +56,6 @@ def _write_complete_dataset(workspace: Workspace) -> None:
     write_dataset(workspace)
     root = workspace.root / ROOT
     (root / "meshes" / "lattice.ply").write_bytes(lzma.decompress((TINY / "meshes/lattice.ply.xz").read_bytes()))
-    manifest = json.loads((root / "manifest.json").read_bytes())
-    [spec] = _REQUEST.config_specs()
-    manifest["configs"][CONFIG]["key"] = plan_config(spec, _REQUEST.views, root).key
-    (root / "manifest.json").write_text(json.dumps(manifest))
 
 
 def write_dataset_and_archive(workspace: Workspace) -> None:

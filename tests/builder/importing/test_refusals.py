@@ -235,6 +235,6 @@ def test_rendered_config_is_not_replaced(
     tiny_root: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rendered = {"mock-up": open_folder(tiny_root).config("lattice")}
-    monkeypatch.setattr(run, "published_configs", lambda _: rendered)
+    monkeypatch.setattr(run.Finished, "configs", rendered)
     with pytest.raises(InputError, match="config mock-up was rendered"):
         run_import(plan_import(data.write_layout(folder), "mock-up"), tmp_path / "out")
