@@ -44,8 +44,8 @@ _SURROUNDINGS_BYTES = 1_000_000
 """Allowance for surfaces in the mesh of a scene that are no steel (0.1 MB), contact sheet and metadata."""
 
 
-_VIEW_BYTES, _SCENE_BYTES = 240, 1200
-"""Length of a view and of a scene in the manifest without their names and parameters."""
+_VIEW_BYTES, _SCENE_BYTES, _HEAD_BYTES = 280, 1200, 2000
+"""Lengths in the manifest: a view, a scene without its parameters, and the rest, with digests of their files."""
 _CAGE_BYTES = 6_000_000
 """Allowance for the mesh of a generated cage, which is not made for an estimate: the mean of 40 is 4 MB."""
 
@@ -132,7 +132,7 @@ def check_readable(plans: Sequence[ConfigPlan], finished: Finished) -> None:
     ``plans`` are those that are missing in the folder, with their cameras. Crossings need less than bars.
     """
     entries = ([config_parameters(plan.spec), plan.derived(), generator_versions()] for plan in plans)
-    manifest_bytes = sum(len(json.dumps(entry, indent=1)) + _SCENE_BYTES for entry in entries)
+    manifest_bytes = _HEAD_BYTES + sum(len(json.dumps(entry, indent=1)) + _SCENE_BYTES for entry in entries)
     manifest_bytes += sum(len(plan.indices) * (_VIEW_BYTES + len(plan.spec.view_id(0))) for plan in plans)
     bars_bytes = sum(bar.decoded_bytes for plan in plans for bar in plan.bars)
     if finished.folder is not None:
