@@ -37,6 +37,8 @@ _EXTRA_MODULES = ("bpy", "cv2", "embreex", "trimesh")
 
 CAGES_OPTIONS = ("split", "scenes", "views_per_scene")
 """Options of the scenes of ``cages``; each is None if it is not given."""
+BUILD = "build"
+COMMANDS = (BUILD, "audit", "export", "import", "inspect", "push")
 COLOUR_OPTIONS = ("sampling", "quality", "samples", "device")
 """Options that only colour has; each is None if it is not given."""
 RENAMED_OPTIONS = {"--to": "--out"}
@@ -46,9 +48,16 @@ RENAMED_OPTIONS = {"--to": "--out"}
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-build``; return its exit status."""
     use_plain_characters()
-    options = argument_parser().parse_args(replace_renamed_options(arguments, RENAMED_OPTIONS))
+    words = replace_renamed_options(arguments, RENAMED_OPTIONS)
+    options = argument_parser().parse_args(with_command(words))
     interrupted = "interrupted; run the same command again to continue"
     return run_command(lambda: options.run(options), interrupted=interrupted)
+
+
+def with_command(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line that begins with a command; without one, it is ``build``."""
+    has_command = words and words[0] in (*COMMANDS, "-h", "--help", "--version")
+    return [*words] if has_command else [BUILD, *words]
 
 
 def _check_extra() -> None:
@@ -61,6 +70,11 @@ def _build(options: argparse.Namespace) -> None:
     from dataset_builder.pipeline.build import build
     from dataset_builder.pipeline.devices import Devices, find_devices
 
+    if commands := [name for name in options.config or () if name in COMMANDS]:
+        raise InputError(
+            f"--config is followed by the command {commands[0]}, expected names of configs; a command is the first "
+            f"word: rebar-build {commands[0]} ..."
+        )
     if options.out is None:
         raise InputError("--out ROOT is missing, expected the dataset folder to build")
     if options.rewrite_manifest:
@@ -243,13 +257,19 @@ def argument_parser() -> argparse.ArgumentParser:
     """Return the argument parser of ``rebar-build``."""
     parser = argparse.ArgumentParser(
         prog="rebar-build",
-        description="Render a dataset folder of stereo views with exact depth, or resume an interrupted build.",
+        description="Build, check and convert dataset folders of stereo views with exact depth.",
+        epilog=f"Without a command, the options are those of {BUILD}: rebar-build {BUILD} --help lists them.",
     )
     parser.add_argument("--version", action="version", version=software_version())
-    add_build_arguments(parser)
-    add_scene_arguments(parser)
-    parser.set_defaults(run=_build)
-    commands = parser.add_subparsers(metavar="{audit,export,import,inspect,push}")
+    commands = parser.add_subparsers(metavar=f"{{{','.join(COMMANDS)}}}")
+    building = commands.add_parser(
+        BUILD,
+        help="render a dataset folder",
+        description="Render a dataset folder of stereo views with exact depth, or resume an interrupted build.",
+    )
+    add_build_arguments(building)
+    add_scene_arguments(building)
+    building.set_defaults(run=_build)
     auditing = commands.add_parser("audit", help="check a dataset folder and its ground truth")
     _add_audit_arguments(auditing)
     auditing.set_defaults(run=_audit)

@@ -48,11 +48,11 @@ def converted(manifest: Mapping[str, Any]) -> dict[str, Any]:
     """Return a manifest of the earlier format in the present one; what is not valid in it stays so."""
     configs = manifest.get("configs")
     if isinstance(configs, dict):
-        configs = {name: _converted_config(entry) for name, entry in configs.items()}
+        configs = {name: _converted_config(name, entry) for name, entry in configs.items()}
     return {**manifest, "format": MANIFEST_FORMAT, "configs": configs}
 
 
-def _converted_config(entry: Any) -> Any:
+def _converted_config(name: str, entry: Any) -> Any:
     """Return the entry of a config: an entry of one scene had its parameters and files beside ``scene``."""
     if not isinstance(entry, dict):
         return entry
@@ -66,7 +66,7 @@ def _converted_config(entry: Any) -> Any:
             del files["rig"]
         parts = {"has_splits": False, "scenes": [{**scene, "split": TEST_SPLIT, **files}]}
         references = {TEST_SPLIT: entry["reference"]} if "reference" in entry else {}
-    kept = {key: entry[key] for key in _OF_CONFIG if key in entry}
+    kept = {"name": name, **{key: entry[key] for key in _OF_CONFIG if key in entry}}
     if isinstance(rig := kept.get("rig"), dict):
         kept["rig"] = {key: rig[key] for key in ("width", "height") if key in rig}
     return {**kept, **parts, "references": references}

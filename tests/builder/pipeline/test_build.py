@@ -111,7 +111,7 @@ def test_worker_count_does_not_change_bytes(
 def test_second_build_is_up_to_date(small_root: Path, run_build: RunBuild) -> None:
     before = contents(small_root)
     mtimes_ns = {path: path.stat().st_mtime_ns for path in small_root.rglob("*.parquet")}
-    process = run_build("--out", small_root, *SMALL)
+    process = run_build("build", "--out", small_root, *SMALL)
     assert "up to date: two-bars" in process.stdout
     assert contents(small_root) == before
     assert mtimes_ns == {path: path.stat().st_mtime_ns for path in small_root.rglob("*.parquet")}
@@ -145,7 +145,7 @@ def test_build_survives_single_render_crash(small_root: Path, tmp_path: Path, st
 
 def test_rebuild_with_other_size_invalidates_cache(tmp_path: Path, run_build: RunBuild) -> None:
     root = tmp_path / "dataset"
-    small = ("--scene", str(TWO_BARS), "--views", "2", "--samples", "1")
+    small = ("--scene", str(TWO_BARS), "--views", "2", "--samples", "1", "--overwrite", "two-bars")
     assert run_build("--out", root, *small, "--width", "96", "--height", "54").returncode == 0
     first = datasets.load_dataset(str(root), "two-bars", split="test")
     assert first[0]["left_rgb"].size == (96, 54)
@@ -222,6 +222,8 @@ def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
             ("--no-colour", "--quality", "high", "--sampling", "uniform", "--device", "cpu"),
             "--no-colour is combined with --sampling uniform, --quality high, --device cpu, expected only one",
         ),
+        (("--config", "lattice", "audit", "ROOT"), "--config is followed by the command audit"),
+        (("--views", "3", "audit", "tiny"), "unrecognized arguments: audit tiny"),
         (("--mesh", "nothing.stl"), "nothing.stl"),
         (("--mesh", __file__), "unsupported mesh file type '.py', expected"),
     ],

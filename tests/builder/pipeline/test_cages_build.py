@@ -165,7 +165,7 @@ def test_scenes_with_colour_are_rendered_and_differ(tmp_path: Path, run_build: R
     assert all(row["left_rgb"].std() > 5 for row in rows)
     assert not np.array_equal(rows[0]["left_rgb"], rows[1]["left_rgb"])
     refused = run_build("--out", other, *cages("test", 1), *GROUND_TRUTH)
-    assert (refused.returncode, "with colour" in refused.stderr) == (2, True)
+    assert (refused.returncode, "colour is {'samples'" in refused.stderr) == (2, True)
 
 
 @pytest.mark.parametrize(
@@ -192,10 +192,13 @@ def test_unusable_requests_are_refused_without_a_folder(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ((*cages("test", 1), *GROUND_TRUTH, "--seed", "1"), "contains 3 other scenes of cages"),
+        (
+            (*cages("test", 1), *GROUND_TRUTH, "--seed", "1"),
+            "3 other scenes have another image size, colour, seed or version",
+        ),
         (
             (*cages("train", 2), "--width", "64", "--height", "36", "--no-colour"),
-            "contains 1 other scenes of cages",
+            "1 other scenes have another image size, colour, seed or version",
         ),
     ],
 )

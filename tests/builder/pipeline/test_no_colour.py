@@ -136,7 +136,8 @@ def test_config_with_colour_is_not_replaced(tiny_root: Path, tmp_path: Path, run
     before = contents(tiny_root)
     process = run_build("--out", tiny_root, "--config", "pile", "lattice", *SIZE, "--no-colour")
     assert process.returncode == 2
-    assert "contains lattice with colour, which --no-colour would replace" in process.stderr
+    assert "config lattice: 9 finished views would be lost" in process.stderr
+    assert "colour is {'samples': 2, 'steel_samples': 8" in process.stderr
     assert contents(tiny_root) == before
     assert not (tiny_root / BUILD_FOLDER).exists()
 
@@ -153,7 +154,7 @@ def test_colour_replaces_build_without(tmp_path: Path, run_build: RunBuild) -> N
     assert run_build("--out", colour, *TWO_VIEWS, *TINY).returncode == 0
     assert run_build("--out", root, *TWO_VIEWS, *SIZE, "--no-colour").returncode == 0
     assert contents(root) != contents(colour)
-    assert "built: two-bars" in run_build("--out", root, *TWO_VIEWS, *TINY).stdout
+    assert "built: two-bars" in run_build("--out", root, *TWO_VIEWS, *TINY, "--overwrite", "two-bars").stdout
     assert contents(root) == contents(colour)
 
 
