@@ -66,23 +66,26 @@ def _check_extra() -> None:
 
 
 def _build(options: argparse.Namespace) -> None:
-    _check_extra()
-    from dataset_builder.pipeline.build import build
-    from dataset_builder.pipeline.devices import Devices, find_devices
-
     if commands := [name for name in options.config or () if name in COMMANDS]:
         raise InputError(
-            f"--config is followed by the command {commands[0]}, expected names of configs; a command is the first "
-            f"word: rebar-build {commands[0]} ..."
+            f"--config is followed by the command {commands[0]}, expected names of configs; a command is the "
+            f"first word: rebar-build {commands[0]} ..."
         )
     if options.out is None:
         raise InputError("--out ROOT is missing, expected the dataset folder to build")
     if options.rewrite_manifest:
+        names = ("config", "scene", "mesh", "views", "overwrite", "dry_run")
+        if given := [f"--{name.replace('_', '-')}" for name in names if getattr(options, name)]:
+            raise InputError(f"--rewrite-manifest is combined with {', '.join(given)}, expected only --out ROOT")
         from dataset_builder.pipeline.rewrite import rewrite_manifest
 
         rewrite_manifest(options.out)
         print(options.out)
         return
+    _check_extra()
+    from dataset_builder.pipeline.build import build
+    from dataset_builder.pipeline.devices import Devices, find_devices
+
     if options.cluster is not None and options.dry_run:
         raise InputError(
             f"--dry-run is combined with --cluster {options.cluster}, expected only one of them: the estimate is "

@@ -198,7 +198,7 @@ def test_unusable_requests_are_refused_without_a_folder(
         ),
         (
             (*cages("train", 2), "--width", "64", "--height", "36", "--no-colour"),
-            "1 other scenes have another image size, colour, seed or version",
+            "1 other scenes have another image size",
         ),
     ],
 )
