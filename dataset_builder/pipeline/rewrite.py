@@ -62,8 +62,8 @@ def _converted_config(name: str, entry: Any) -> Any:
     else:
         scene = entry["scene"] if isinstance(entry.get("scene"), dict) else {}
         files = {key: entry[key] for key in (*_OF_SCENE, *_OF_FILES) if key in entry}
-        if "imported" in entry:  # Its rig has only the size of the images.
-            del files["rig"]
+        if "imported" in entry:  # Its rig has only the size of the images, and it has no trajectory.
+            files = {key: value for key, value in files.items() if key not in ("rig", "protocol")}
         parts = {"has_splits": False, "scenes": [{**scene, "split": TEST_SPLIT, **files}]}
         references = {TEST_SPLIT: entry["reference"]} if "reference" in entry else {}
     kept = {"name": name, **{key: entry[key] for key in _OF_CONFIG if key in entry}}
