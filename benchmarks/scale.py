@@ -191,7 +191,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, help="folder for the datasets (default: that for temporary files)")
     options = parser.parse_args()
     print(machine_description())
-    opened, rows = _Opened(), []
+    opened, rows = _Opened(), list[list[object]]()
     for scenes in sorted({*options.scenes, *options.audit}):
         with _work_folder(options.work) as folder:
             rows += measure(folder / "dataset", scenes, scenes in options.audit, opened)

@@ -95,21 +95,16 @@ _SceneBars = Mapping[str, tuple[Bar, ...]]
 def _config_checks(
     config: DatasetConfig, root: Path, bars: _SceneBars, depth_views: int, progress: Progress
 ) -> Iterator[Check]:
+    """Yield the checks of a config; those of several scenes are made of all scenes together.
+
+    Of these, colour is checked, and depth rendered again, in ``SAMPLED_SCENES`` only.
+    """
     if config.imported is not None:
         yield from imported_checks(config, config.imported, bars.get(config.scene.name, ()), progress)
-    elif config.has_splits:
-        yield from _scenes_checks(config, root, bars, depth_views, progress)
-    else:
+        return
+    if not config.has_splits:
         yield from _scene_checks(config, root, bars, depth_views, progress)
-
-
-def _scenes_checks(
-    config: DatasetConfig, root: Path, bars: _SceneBars, depth_views: int, progress: Progress
-) -> Iterator[Check]:
-    """Yield the checks of a config of several scenes, each of all scenes together.
-
-    Colour is checked, and depth rendered again, in ``SAMPLED_SCENES`` of them.
-    """
+        return
     scenes = config.by_scene()
     sampled = set(subset(len(scenes), SAMPLED_SCENES))
     checks: list[Check] = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,16 +18,14 @@ from dataset_builder.pipeline.folder import check_target, remove_build_folder
 from dataset_builder.pipeline.plan import BUILD_FOLDER, KEY_CHARACTERS, generator_versions
 from dataset_builder.pipeline.publish import StagedScene, build_lock, publish, remove_leftovers
 from dataset_builder.pipeline.retained import Finished, check_retained
-from dataset_builder.pipeline.shards import Staging, encode_row, stage_row
+from dataset_builder.pipeline.shards import Staging, encode_row, stage_row, view_record
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import OPTIONAL_COLUMNS
-from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest
 from rebar_depth_bench.data.eye_view import truth_from_row
 from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.paths import remove_folder
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.view_ids import TEST_SPLIT, view_id
 
 _ROLE = "not surveyed"
@@ -147,21 +145,12 @@ def _stage_views(source: Import, staging: Staging, progress: Progress) -> set[in
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)
             identity = {"view_id": view_id(source.name, index), "scene": source.name}
-            stage_row(path, encode_row({**identity, **columns}), _record(identity["view_id"], columns))
+            row = {**dict.fromkeys(OPTIONAL_COLUMNS), **identity, **columns}
+            right = truth_from_row(row, "right") if row["right_depth"] is not None else None
+            record = view_record(identity["view_id"], truth_from_row(row, "left"), right)
+            stage_row(path, encode_row(row), record)
         progress(f"import of {source.name}", index + 1, len(source.views.names))
     return ids
-
-
-def _record(identity: str, columns: Mapping[str, Any]) -> ViewRecord:
-    row = {**dict.fromkeys(OPTIONAL_COLUMNS), **columns}
-    left, mask = truth_from_row(row, "left"), row["left_mask"]
-    return ViewRecord(
-        view_id=identity,
-        left=left.digest(),
-        right=truth_from_row(row, "right").digest() if row["right_depth"] is not None else None,
-        steel_px=None if mask is None else int(np.count_nonzero(mask)),
-        scored_px=len(scored_pixels(mask, left.depth_m)),
-    )
 
 
 def _config_entry(source: Import) -> dict[str, Any]:

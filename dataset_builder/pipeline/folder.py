@@ -102,6 +102,21 @@ def file_matches(folder: DatasetFolder, name: str) -> bool:
     return path.is_file() and file_sha256(path) == folder.files.get(name)
 
 
+def stored_bars_path(out: Path, folder: DatasetFolder) -> Path:
+    """Return the path of the bars of all scenes that the manifest describes.
+
+    It is that of ``bars.parquet``, or of the copy that an interrupted build has left. Raises ``InputError`` if
+    neither matches its digest.
+    """
+    for path in (out / BARS_FILE, out / BUILD_FOLDER / BARS_FILE):
+        if path.is_file() and file_sha256(path) == folder.files.get(BARS_FILE):
+            return path
+    raise InputError(
+        f"{out}: {BARS_FILE} does not match the manifest, expected the bars of the scenes that are not built now; "
+        "restore the file, or build all configs in another folder"
+    )
+
+
 def remove_unlisted_files(out: Path, listed: Collection[str]) -> None:
     """Delete the shards, meshes and pictures whose paths in ``out`` are not ``listed``."""
     for folder, own_name in _own_folders(out):

@@ -33,6 +33,7 @@ from dataset_builder.pipeline.folder import (
     file_matches,
     remove_temporary_files,
     remove_unlisted_files,
+    stored_bars_path,
 )
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_record, split_into_shards
@@ -253,7 +254,7 @@ def write_folder(
     scenes. Digests, bars and crossings of all others are those of ``folder``, the dataset so far: files are not
     hashed again, so that damage still shows. Returns the dataset that the folder then holds.
 
-    Raises ``InputError`` if the bars of another scene are needed and ``bars.parquet`` does not match its digest.
+    Raises ``InputError`` as ``stored_bars_path`` if the bars of another scene are needed.
     """
     order = [*CONFIGS, *sorted(set(configs) - set(CONFIGS))]
     ordered = [configs[name] for name in order if name in configs]
@@ -305,7 +306,9 @@ def _write_scene_bars(
     others = {scene.name for config in configs for scene in config.scenes} - bars.keys()
     known: dict[str, Crossings] = {}
     if others and folder is not None:
-        stored = _stored_bars(out, folder)
+        content = stored_bars_path(out, folder).read_bytes()
+        write_bytes(out / BUILD_FOLDER / BARS_FILE, content)  # The old ones, until the manifest is written.
+        stored = read_bars(out / BUILD_FOLDER / BARS_FILE)
         bars = {**{scene: stored.get(scene, ()) for scene in others}, **bars}
         same_rules = crossing_parameters().items() <= folder.crossings.items()
         if same_rules and file_matches(folder, CROSSINGS_FILE):
@@ -313,23 +316,6 @@ def _write_scene_bars(
             known = {scene: crossings[scene] for scene in others & crossings.keys()}
     write_bars(out / BARS_FILE, bars)
     write_crossings(out / CROSSINGS_FILE, bars, known)
-
-
-def _stored_bars(out: Path, folder: DatasetFolder) -> dict[str, tuple[Bar, ...]]:
-    """Return the bars of all scenes of the folder, after saving their file until the new manifest is written.
-
-    Raises ``InputError`` unless ``bars.parquet``, or the copy that an interrupted build has saved, matches the
-    manifest.
-    """
-    saved = out / BUILD_FOLDER / BARS_FILE
-    for path in (out / BARS_FILE, saved):
-        if path.is_file() and file_sha256(path) == folder.files.get(BARS_FILE):
-            write_bytes(saved, path.read_bytes())
-            return read_bars(saved)
-    raise InputError(
-        f"{out}: {BARS_FILE} does not match the manifest, expected the bars of the scenes that are not built now; "
-        "restore the file, or build all configs in another folder"
-    )
 
 
 def _strip_key(config: DatasetConfig) -> str:

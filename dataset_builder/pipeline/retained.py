@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dataset_builder.config.specs import SceneConfigSpec
-from dataset_builder.pipeline.folder import MESHES, PICTURES, SHARD_NAME, file_matches
+from dataset_builder.pipeline.folder import MESHES, PICTURES, SHARD_NAME, file_matches, stored_bars_path
 from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, stage_published_rows
 from dataset_builder.pipeline.work_units import stage_mesh_digest
@@ -172,6 +172,9 @@ def check_retained(out: Path, finished: Finished, plans: Sequence[ConfigPlan], o
     planned = [config for config in kept if config.name in by_name]
     if problems := [one for config in planned for one in _loss_problems(finished, config, by_name[config.name])]:
         raise InputError.from_problems(out, problems)
+    scenes = {plan.spec.scene.name for plan in plans}
+    if any(scene.name not in scenes for config in kept for scene in config.scenes):
+        stored_bars_path(out, finished.folder)
     for config in kept:
         _check_scene(out, config, plans)
         _check_files(out, config, by_name.get(config.name, ()))

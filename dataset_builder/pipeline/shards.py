@@ -23,7 +23,7 @@ from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.columns import COLUMNS, ROW_SCHEMA, column_kind, features
 from rebar_depth_bench.data.config_tables import ViewRecord
-from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeView, absent_cell
+from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeTruth, EyeView, absent_cell
 from rebar_depth_bench.data.parquet import open_parquet
 from rebar_depth_bench.data.shards import rows_table
 from rebar_depth_bench.errors import InputError, Problem, escape_text
@@ -159,7 +159,7 @@ def encode_view(view: View) -> tuple[pa.Table, ViewRecord]:
         columns |= {f"{name}_{kind}": getattr(eye, kind) for kind in ("rgb", "mask", "bars")}
         columns |= {f"{name}_{kind}": getattr(eye.camera, kind) for kind in CAMERA_KINDS}
         columns[f"{name}_depth"] = eye.depth_m
-    return encode_row(columns), _view_record(view)
+    return encode_row(columns), view_record(view.view_id, view.left, view.right)
 
 
 def encode_row(columns: Mapping[str, Any]) -> pa.Table:
@@ -196,12 +196,12 @@ def _image_cell(content: bytes) -> dict[str, bytes | None]:
     return {"bytes": content, "path": None}
 
 
-def _view_record(view: View) -> ViewRecord:
-    left = view.left
+def view_record(view_id: str, left: EyeTruth, right: EyeTruth | None) -> ViewRecord:
+    """Return the record of a view for the manifest; ``right`` is None without depth of the right camera."""
     return ViewRecord(
-        view_id=view.view_id,
+        view_id=view_id,
         left=left.digest(),
-        right=view.right.digest(),
-        steel_px=int(np.count_nonzero(left.mask)),
+        right=right.digest() if right is not None else None,
+        steel_px=None if left.mask is None else int(np.count_nonzero(left.mask)),
         scored_px=len(scored_pixels(left.mask, left.depth_m)),
     )

@@ -35,7 +35,7 @@ class PublishedMatch:
 class _Conditions:
     """Conditions of a scene; ``optics`` are grid and baseline in metres, ``markers`` are those of the board."""
 
-    assembly: Assembly
+    assembly: Mapping[str, Any]
     markers: int
     environment: str
     trajectory: Trajectory
@@ -44,7 +44,7 @@ class _Conditions:
 
 _CONDITIONS: Mapping[str, _Conditions] = {
     "lattice": _Conditions(
-        Assembly(kind="lattice", extent_m=0.1, pitch_m=0.02, diameters_m=[0.007, 0.004]),
+        {"kind": "lattice", "extent_m": 0.1, "pitch_m": 0.02, "diameters_m": [0.007, 0.004]},
         6,
         "laboratory",
         Trajectory(
@@ -55,7 +55,7 @@ _CONDITIONS: Mapping[str, _Conditions] = {
         _ZED_RECTIFIED,
     ),
     "pile": _Conditions(
-        Assembly(kind="pile", stirrups=6, diameter_m=0.01, size_m=[0.28, 0.2], state="pile-0"),
+        {"kind": "pile", "stirrups": 6, "diameter_m": 0.01, "size_m": [0.28, 0.2], "state": "pile-0"},
         6,
         "laboratory",
         Trajectory(
@@ -66,16 +66,16 @@ _CONDITIONS: Mapping[str, _Conditions] = {
         _IDEAL,
     ),
     "pier": _Conditions(
-        Assembly(
-            kind="pier",
-            side_m=4.8,
-            height_m=6.67,
-            verticals=96,
-            levels=45,
-            vertical_diameter_m=0.032,
-            hoop_diameter_m=0.016,
-            tie_diameter_m=0.016,
-        ),
+        {
+            "kind": "pier",
+            "side_m": 4.8,
+            "height_m": 6.67,
+            "verticals": 96,
+            "levels": 45,
+            "vertical_diameter_m": 0.032,
+            "hoop_diameter_m": 0.016,
+            "tie_diameter_m": 0.016,
+        },
         0,
         "outdoors",
         Trajectory(
@@ -102,7 +102,8 @@ def published_match(config: DatasetConfig) -> PublishedMatch | None:
     markers = scene.board.markers if scene.board else 0
     shown = (scene.assembly, markers, scene.environment, scene.protocol)
     for name, expected in _CONDITIONS.items():
-        if shown == (expected.assembly, expected.markers, expected.environment, expected.trajectory):
+        assembly = Assembly.model_validate(expected.assembly)
+        if shown == (assembly, expected.markers, expected.environment, expected.trajectory):
             return PublishedMatch(name, scene.rig is not None and _optics(scene.rig) == expected.optics)
     return None
 

@@ -167,7 +167,7 @@ def test_mesh_import_of_lattice_reproduces_ground_truth(
     original, imported = open_folder(tiny_root), open_folder(tmp_path / "again")
     assert len(imported.config("lattice").views) == 3
     assert set(imported.config("lattice").views) <= set(original.config("lattice").views)
-    assert imported.config("lattice").scene.assembly.path == "lattice.ply"
+    assert imported.config("lattice").scene.entry["assembly"]["path"] == "lattice.ply"
     bars = (read_bars(root / "bars.parquet")["lattice"] for root in (tiny_root, tmp_path / "again"))
     for bar, imported_bar in zip(*bars, strict=True):
         assert imported_bar.bar_id == bar.bar_id

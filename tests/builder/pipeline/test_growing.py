@@ -180,8 +180,10 @@ def test_damage_of_other_configs_gets_no_new_digest(tmp_path: Path, pattern: str
 def test_damaged_bars_of_other_scenes_are_refused(tmp_path: Path) -> None:
     built(tmp_path, lattice(2))
     (tmp_path / BARS_FILE).unlink()
+    renderer = PreparedRows()
     with pytest.raises(InputError, match=r"bars\.parquet does not match the manifest"):
-        built(tmp_path, cages(1))
+        build(cages(1), tmp_path, cluster=renderer)
+    assert renderer.rendered == []
 
 
 def test_publication_that_was_interrupted_after_writing_bars_is_continued(tmp_path: Path) -> None:
