@@ -14,41 +14,14 @@ from dataset_builder.cli import main
 from dataset_builder.importing.run import plan_import, run_import
 from dataset_builder.pipeline.publish import manifest_text
 from rebar_depth_bench.cli.main import main as rebar_bench
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, OLD_FORMAT, open_folder
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.errors import DatasetError
 from tests.builder.importing import source_data
 from tests.building import contents
 from tests.commands import run_in_process
-from tests.synthetic_dataset import write_split_dataset
+from tests.synthetic_dataset import write_earlier_manifest, write_split_dataset
 
 Entry = dict[str, Any]
-
-
-def earlier(manifest: Entry) -> Entry:
-    """Return a manifest in the earlier format, in which an entry of one scene had its parameters beside it."""
-    configs = {name: _earlier_config(dict(entry)) for name, entry in manifest["configs"].items()}
-    return {**manifest, "format": OLD_FORMAT, "configs": configs}
-
-
-def _earlier_config(entry: Entry) -> Entry:
-    views = {"protocol_views": len(entry["views"])}
-    sizes = {"bytes": sum(scene["bytes"] for scene in entry["scenes"])}
-    if entry.pop("has_splits"):
-        return {**entry, "key": "k", **views, **sizes}
-    [scene] = entry.pop("scenes")
-    of_scene = {key: scene.pop(key) for key in ("protocol_views", "key", "mesh", "shards")}
-    of_scene |= {key: scene.pop(key) for key in ("aim_point_m", "generator") if key in scene}
-    references = {"reference": entry.pop("references")["test"]}
-    beside = {"protocol": scene.pop("protocol", None), "rig": scene.pop("rig", entry["rig"])}
-    del scene["split"], scene["bytes"]
-    return {**entry, **beside, **of_scene, **references, **sizes, "scene": scene}
-
-
-def write_earlier(root: Path) -> Entry:
-    """Write the manifest of a folder in the earlier format; return it as it was."""
-    manifest: Entry = json.loads((root / MANIFEST_FILE).read_text())
-    (root / MANIFEST_FILE).write_text(json.dumps(earlier(json.loads(json.dumps(manifest)))))
-    return manifest
 
 
 @pytest.fixture
@@ -60,7 +33,7 @@ def test_manifest_is_converted_without_any_other_change(root: Path, tiny_root: P
     source = tmp_path / "source"
     source_data.write_source(source, source_data.sample_rows(tiny_root), tiny_root)
     run_import(plan_import(source_data.write_layout(source), "mock-up"), root)
-    before, manifest = contents(root), write_earlier(root)
+    before, manifest = contents(root), write_earlier_manifest(root)
     process = run_in_process(main, "--out", root, "--rewrite-manifest")
     assert (process.returncode, process.stderr) == (0, "")
     assert json.loads((root / MANIFEST_FILE).read_text()) == manifest
@@ -81,7 +54,7 @@ def test_config_with_splits_and_one_scene_keeps_its_view_ids(tmp_path: Path) -> 
     }
     (tmp_path / MANIFEST_FILE).write_text(json.dumps(manifest))
     ids = open_folder(tmp_path).config("cages").view_ids
-    write_earlier(tmp_path)
+    write_earlier_manifest(tmp_path)
     assert run_in_process(main, "--out", tmp_path, "--rewrite-manifest").returncode == 0
     config = open_folder(tmp_path).config("cages")
     assert (config.has_splits, config.view_ids, ids) == (True, ids, ("cages/test-a-0000", "cages/test-a-0001"))
@@ -96,7 +69,7 @@ def test_config_with_splits_and_one_scene_keeps_its_view_ids(tmp_path: Path) -> 
     ],
 )
 def test_other_commands_name_the_option(root: Path, command: Any, arguments: tuple[str, ...]) -> None:
-    write_earlier(root)
+    write_earlier_manifest(root)
     before = contents(root)
     process = run_in_process(command, *(root if word == "ROOT" else word for word in arguments))
     assert (process.returncode, process.stdout) == (2, "")
@@ -118,7 +91,7 @@ def test_other_commands_name_the_option(root: Path, command: Any, arguments: tup
     ],
 )
 def test_invalid_manifest_is_not_converted(root: Path, change: Callable[[Entry], object], where: str) -> None:
-    write_earlier(root)
+    write_earlier_manifest(root)
     manifest = json.loads((root / MANIFEST_FILE).read_text())
     change(manifest)
     (root / MANIFEST_FILE).write_text(json.dumps(manifest))
