@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
+from functools import cache
 from typing import Any, TypeVar
 
 from pydantic import create_model
@@ -55,13 +56,18 @@ def cage_spec(config: DatasetConfig) -> GeneratedCageSpec:
     return _read_spec(config, "assembly", GeneratedCageSpec)
 
 
+@cache
+def _model_of(key: str, spec: Hashable) -> type[StrictModel]:
+    """Return the model of a table whose only key has a spec."""
+    fields: dict[str, Any] = {key: (spec, ...)}
+    return create_model("SceneEntry", __base__=StrictModel, **fields)
+
+
 def _read_spec(config: DatasetConfig, key: str, spec: type[_Spec]) -> _Spec:
     problems: list[Problem] = []
-    fields: dict[str, Any] = {key: (spec, ...)}
-    model = create_model("SceneEntry", __base__=StrictModel, **fields)
     where = format_location("configs", config.name, "scenes", config.scene.name)
     values: dict[str, Any] = {key: config.scene.entry[key]} if key in config.scene.entry else {}
-    entry = validate_table(model, values, problems, where, from_json=True)
+    entry = validate_table(_model_of(key, spec), values, problems, where, from_json=True)
     if entry is None:
         raise DatasetError.from_problems(f"{config.root}: {MANIFEST_FILE}", problems)
     value: _Spec = getattr(entry, key)

@@ -12,6 +12,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from dataset_builder.config.manifest_specs import cage_spec
 from dataset_builder.config.specs import SceneConfigSpec
 from dataset_builder.pipeline.folder import MESHES, PICTURES, SHARD_NAME, file_matches, stored_bars_path
 from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
@@ -209,7 +210,7 @@ def _entry_problems(folder: DatasetFolder, config: DatasetConfig) -> Iterator[Pr
     where = format_location("configs", config.name)
     if not config.views:
         yield Problem("missing", f"{where}.views", "no views", "at least one view")
-    names = [("sheet", config.sheet, f"{PICTURES}/{config.name}.webp")]
+    names = [(f"{where}.sheet", config.sheet, f"{PICTURES}/{config.name}.webp")]
     for number, scene in enumerate(config.scenes):
         place = format_location(where, "scenes", number)
         if config.imported is None:
@@ -220,9 +221,14 @@ def _entry_problems(folder: DatasetFolder, config: DatasetConfig) -> Iterator[Pr
                 split = "SPLIT-SCENE" if config.has_splits else TEST_SPLIT
                 expected = f"{config.name}/{split}-NNNNN-of-NNNNN-DIGEST.parquet"
                 yield Problem("name", f"{place}: shards", f"got {shard}", expected)
-    for key, found, expected in names:
+    for place, found, expected in names:
         if found != expected:
-            yield Problem("name", key if ":" in key else f"{where}.{key}", f"got {found}", expected)
+            yield Problem("name", place, f"got {found}", expected)
+    for of_scene in config.by_scene() if config.has_splits else ():
+        try:
+            cage_spec(of_scene)
+        except DatasetError as error:
+            yield from error.problems
     for name in config.files:
         if name not in folder.files:
             yield Problem("missing", "files", f"no digest of {name} of config {config.name}", "one of each file")

@@ -189,7 +189,7 @@ def test_concurrent_build_is_rejected(tmp_path: Path, run_build: RunBuild, start
 
 
 def test_config_with_other_scene_parameters_is_rejected(tiny_root: Path, run_build: RunBuild) -> None:
-    process = run_build("--out", tiny_root, "--config", "lattice", *TINY, "--seed", "5")
+    process = run_build("--out", tiny_root, "--config", "lattice", *TINY, "--seed", "5", "--overwrite", "lattice")
     assert process.returncode == 2
     assert "config lattice-orbit was built with other parameters of scene 'lattice'" in process.stderr
 
