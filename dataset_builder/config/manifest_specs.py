@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from pydantic import create_model
 
@@ -67,7 +67,7 @@ def _read_spec(config: DatasetConfig, key: str, spec: type[_Spec]) -> _Spec:
     problems: list[Problem] = []
     where = format_location("configs", config.name, "scenes", config.scene.name)
     values: dict[str, Any] = {key: config.scene.entry[key]} if key in config.scene.entry else {}
-    entry = validate_table(_model_of(key, spec), values, problems, where, from_json=True)
+    entry = validate_table(_model_of(key, cast(Hashable, spec)), values, problems, where, from_json=True)
     if entry is None:
         raise DatasetError.from_problems(f"{config.root}: {MANIFEST_FILE}", problems)
     value: _Spec = getattr(entry, key)
