@@ -66,6 +66,7 @@ def build(
     plans = plan_build(request, out)
     finished = Finished(out)
     check_retained(out, finished, plans, request.overwrite)
+    print_notes(finished.notes(plans))
     missing = [plan for plan in plans if not finished.has(plan)]
     check_fits_on_disk(out, missing, finished)
     missing = place_cameras(missing, os.cpu_count() or 1, progress)

@@ -18,6 +18,7 @@ from dataset_builder.pipeline.folder import MESHES, PICTURES, SHARD_NAME, file_m
 from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, stage_published_rows
 from dataset_builder.pipeline.work_units import stage_mesh_digest
+from dataset_builder.scene.model import Note
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.dataset_config import DatasetConfig
@@ -77,6 +78,21 @@ class Finished:
         if name not in self._match:
             self._match[name] = self.folder is not None and file_matches(self.folder, name)
         return self._match[name]
+
+    def notes(self, plans: Sequence[ConfigPlan]) -> list[Note]:
+        """Return a note for each finished scene of which some views are not among those that are planned."""
+        found = [(plan, scene) for plan in plans if (scene := self.scene(plan)) is not None]
+        lost = [(plan, scene, len(set(scene.view_ids) - plan.view_ids.keys())) for plan, scene in found]
+        return [
+            Note(
+                f"config {scene.label}",
+                "views",
+                f"{count} of {len(scene.views)} finished views are not among the {len(plan.indices)} requested, "
+                "and are removed when these are finished",
+            )
+            for plan, scene, count in lost
+            if count
+        ]
 
     def kept_views(self, plan: ConfigPlan) -> list[ViewRecord]:
         """Return the finished views that a plan has as well and that are not staged, if all parameters are equal.

@@ -85,6 +85,14 @@ def test_growing_config_renders_only_new_views(
     assert not (tmp_path / "grown" / BUILD_FOLDER).exists()
 
 
+def test_views_that_are_not_among_more_views_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    built(tmp_path, lattice(2))
+    assert capsys.readouterr().err == ""
+    rendered, _ = built(tmp_path, lattice(3))
+    assert "config lattice: 2 of 2 finished views are not among the 3 requested" in capsys.readouterr().err
+    assert len(rendered) == 3
+
+
 def test_old_config_stays_readable_while_it_grows_and_after_an_interruption(tmp_path: Path) -> None:
     root = tmp_path / "dataset"
     built(root, lattice(9))
