@@ -100,7 +100,7 @@ class Finished:
         Those whose shards do not match their digests are left out.
         """
         scene = self.scene(plan)
-        if scene is None or scene.scene.mesh is None or differences(scene, plan):
+        if scene is None or self.folder is None or differences(scene, plan) or scene.mesh not in self.folder.files:
             return []
         views, rows = iter(scene.views), plan.view_ids
         by_shard = {shard: list(islice(views, VIEWS_PER_SHARD)) for shard in scene.scene.shards}
@@ -167,7 +167,7 @@ def _different_values(key: str, found: Any, planned: Any) -> Iterator[tuple[str,
     """Yield the keys, joined by dots, at which two JSON values differ, with both values there."""
     if isinstance(found, dict) and isinstance(planned, dict):
         for name in dict.fromkeys((*planned, *found)):
-            yield from _different_values(f"{key}.{name}".lstrip("."), found.get(name), planned.get(name))
+            yield from _different_values(format_location(key, name), found.get(name), planned.get(name))
     elif found != planned:
         yield key, found, planned
 

@@ -160,6 +160,17 @@ def test_imported_config_is_not_replaced_by_a_build(tmp_path: Path) -> None:
         built(tmp_path, lattice(6))
 
 
+def test_finished_config_without_digests_is_rendered_again(tmp_path: Path) -> None:
+    built(tmp_path, lattice(2))
+    manifest = json.loads((tmp_path / MANIFEST_FILE).read_text())
+    manifest["files"] = {BARS_FILE: manifest["files"][BARS_FILE]}
+    manifest["configs"]["lattice"]["scenes"][0]["rig"]["\x1b[2J"] = 1
+    (tmp_path / MANIFEST_FILE).write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match=r"no digest of pictures/lattice\.webp"):
+        built(tmp_path, lattice(6))
+    assert len(built(tmp_path, lattice(6, overwrite=("lattice",)))[0]) == 6
+
+
 def flip_a_byte(path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
