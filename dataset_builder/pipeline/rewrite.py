@@ -19,9 +19,11 @@ from rebar_depth_bench.data.manifest import (
 )
 from rebar_depth_bench.view_ids import TEST_SPLIT
 
-_OF_SCENE = ("protocol", "protocol_views", "rig", "aim_point_m", "world_from_source", "key", "generator", "mesh")
+_OF_SCENE = (
+    *("protocol", "protocol_views", "rig", "aim_point_m", "world_from_source", "key", "generator"),
+    *("mesh", "shards", "bytes"),
+)
 """Keys beside the scene in an entry of one scene that belong to the scene now, in the order of the manifest."""
-_OF_FILES = ("shards", "bytes")
 _OF_CONFIG = ("name", "imported", "rig", "colour", "sheet", "ground_truth_digest", "views")
 
 
@@ -38,8 +40,10 @@ def rewrite_manifest(out: Path) -> None:
         values = converted(values)
         validated_folder(values, problems, str(out), path)
         with build_lock(out / BUILD_FOLDER):
-            write_text(path, manifest_text(values))
-        remove_build_folder(out / BUILD_FOLDER)
+            try:
+                write_text(path, manifest_text(values))
+            finally:
+                remove_build_folder(out / BUILD_FOLDER)
         return
     validated_folder(values, problems, str(out), path)
 
@@ -61,7 +65,7 @@ def _converted_config(name: str, entry: Any) -> Any:
         references = entry.get("references", {})
     else:
         scene = entry["scene"] if isinstance(entry.get("scene"), dict) else {}
-        files = {key: entry[key] for key in (*_OF_SCENE, *_OF_FILES) if key in entry}
+        files = {key: entry[key] for key in _OF_SCENE if key in entry}
         if "imported" in entry:  # Its rig has only the size of the images, and it has no trajectory.
             files = {key: value for key, value in files.items() if key not in ("rig", "protocol")}
         parts = {"has_splits": False, "scenes": [{**scene, "split": TEST_SPLIT, **files}]}
