@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 
 import rebar_depth_bench as rdb
 from benchmarks.scale import PreparedRows, placed
+from dataset_builder.audit import audit, run
 from dataset_builder.config.cages import CagesRequest
 from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.pipeline import place_cameras
+from dataset_builder.pipeline import folder, place_cameras, retained
 from dataset_builder.pipeline.build import BuildSummary, build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.data.bars import BARS_FILE
@@ -101,8 +103,8 @@ def test_old_config_stays_readable_while_it_grows_and_after_an_interruption(tmp_
         build(lattice(63), root, cluster=Interrupting(1))
     assert {name: digest for name, digest in contents(root).items() if BUILD_FOLDER not in name} == before
     assert len(rdb.load(root, "lattice")) == 9
-    folder = open_folder(root)
-    assert [problem for problem in file_problems(folder, silent) if BUILD_FOLDER not in str(problem)] == []
+    problems = file_problems(open_folder(root), silent)
+    assert [problem for problem in problems if BUILD_FOLDER not in str(problem)] == []
     rendered, _ = built(root, lattice(63))
     assert 0 < len(rendered) < 63 - 9
     built(tmp_path / "at-once", lattice(63))
@@ -240,3 +242,32 @@ def test_size_of_the_manifest_is_estimated(
         built(tmp_path / "again", request_)
     estimate = int(str(caught.value).partition("about ")[2].partition(" ")[0])
     assert size <= estimate < 1.5 * size
+
+
+def counted(monkeypatch: pytest.MonkeyPatch, module: ModuleType, name: str) -> list[Path]:
+    """Record the first arguments with which a function of a module is called."""
+    calls: list[Path] = []
+    function = getattr(module, name)
+
+    def count(path: Path, *arguments: Any, **options: Any) -> Any:
+        calls.append(path)
+        return function(path, *arguments, **options)
+
+    monkeypatch.setattr(module, name, count)
+    return calls
+
+
+def test_number_of_reads_does_not_grow_with_the_number_of_scenes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built(tmp_path, cages(5, 1))
+    opened = counted(monkeypatch, retained, "open_folder")
+    hashed = counted(monkeypatch, folder, "file_sha256")
+    tables = counted(monkeypatch, run, "read_bars")
+    built(tmp_path, cages(5, 1))
+    audit(tmp_path, depth_views=0)
+    config = open_folder(tmp_path).config("cages")
+    assert (len(opened), len(tables)) == (1, 1)
+    assert sorted(path.name for path in hashed if path.parent.name in ("cages", "meshes")) == sorted(
+        Path(name).name for name in (*config.shards, *config.meshes)
+    )
