@@ -8,7 +8,7 @@ Prints seconds and opened files, in all and per scene, of folders of small gener
 - ``publish``: shards, manifest, bars, crossings, card and pictures of the staged scenes;
 - ``open``: validation of the manifest;
 - ``continue``: plan of the finished folder, whose files are compared with their digests;
-- ``add``: publication of one further scene;
+- ``add``: publication of one scene of another split;
 - ``audit``: all checks without Blender, for the numbers of scenes of ``--audit``.
 """
 
@@ -90,9 +90,9 @@ def stage_prepared(config: ConfigSpec, indices: Sequence[int], staging: Staging)
         stage_row(staging.row(index), row, record)
 
 
-def request(scenes: int) -> BuildRequest:
-    """Return the request for scenes with one view each."""
-    return BuildRequest((CAGES,), None, WIDTH, HEIGHT, None, cages=CagesRequest("test", scenes, 1))
+def request(scenes: int, split: str) -> BuildRequest:
+    """Return the request for scenes of a split with one view each."""
+    return BuildRequest((CAGES,), None, WIDTH, HEIGHT, None, cages=CagesRequest(split, scenes, 1))
 
 
 def placed(plan: ConfigPlan) -> ConfigPlan:
@@ -104,9 +104,9 @@ def placed(plan: ConfigPlan) -> ConfigPlan:
     return ScenePlan(spec, plan.indices, plan.key, plan.staging, BARS, {"family": "column"})
 
 
-def plan_missing(out: Path, scenes: int) -> tuple[Finished, list[ConfigPlan]]:
+def plan_missing(out: Path, scenes: int, split: str = "test") -> tuple[Finished, list[ConfigPlan]]:
     """Return what the folder has, and the plans of the scenes that are missing."""
-    plans = plan_build(request(scenes), out)
+    plans = plan_build(request(scenes, split), out)
     finished = Finished(out)
     check_retained(out, finished, plans, ())
     missing = [plan for plan in plans if not finished.has(plan)]
@@ -133,49 +133,32 @@ class _Opened:
         self.files += event == "open"
 
 
-class _Steps:
-    """Rows of the table of one number of scenes."""
-
-    def __init__(self, scenes: int, opened: _Opened) -> None:
-        self._scenes, self._opened = scenes, opened
-        self.rows: list[list[object]] = []
-
-    def measure(self, step: str, work: Callable[[], _Result]) -> _Result:
-        """Return the result of a step after adding its row."""
-        files, start = self._opened.files, time.perf_counter()
-        result = work()
-        seconds, files = time.perf_counter() - start, self._opened.files - files
-        self.rows.append(
-            [
-                self._scenes,
-                step,
-                f"{seconds:.2f}",
-                f"{1000 * seconds / self._scenes:.2f}",
-                files,
-                f"{files / self._scenes:.2f}",
-            ]
-        )
-        return result
+def _measured(scenes: int, step: str, opened: _Opened, work: Callable[[], _Result]) -> _Result:
+    """Return the result of a step, and print its row."""
+    files, start = opened.files, time.perf_counter()
+    result = work()
+    seconds, files = time.perf_counter() - start, opened.files - files
+    row = (scenes, step, f"{seconds:.2f}", f"{1000 * seconds / scenes:.2f}", files, f"{files / scenes:.2f}")
+    print(f"| {' | '.join(map(str, row))} |", flush=True)
+    return result
 
 
-def measure(out: Path, scenes: int, with_audit: bool, opened: _Opened) -> Iterator[list[object]]:
-    """Yield the rows of a folder of some scenes, which is written to ``out``."""
-    steps = _Steps(scenes, opened)
-    finished, missing = steps.measure("plan", lambda: plan_missing(out, scenes))
+def measure(out: Path, scenes: int, with_audit: bool, opened: _Opened) -> None:
+    """Print the rows of a folder of some scenes, which is written to ``out``."""
+    finished, missing = _measured(scenes, "plan", opened, lambda: plan_missing(out, scenes))
     plans = [placed(plan) for plan in missing]
     for plan in plans:
         stage_prepared(plan.spec, plan.indices, plan.staging)
-    steps.measure("publish", lambda: publish_missing(out, finished, plans))
-    steps.measure("open", lambda: open_folder(out))
-    _, missing = steps.measure("continue", lambda: plan_missing(out, scenes))
+    _measured(scenes, "publish", opened, lambda: publish_missing(out, finished, plans))
+    _measured(scenes, "open", opened, lambda: open_folder(out))
+    _, missing = _measured(scenes, "continue", opened, lambda: plan_missing(out, scenes))
     assert not missing
-    finished, [added] = plan_missing(out, scenes + 1)
+    finished, [added] = plan_missing(out, 1, "train")
     plan = placed(added)
     stage_prepared(plan.spec, plan.indices, plan.staging)
-    steps.measure("add", lambda: publish_missing(out, finished, [plan]))
+    _measured(scenes, "add", opened, lambda: publish_missing(out, finished, [plan]))
     if with_audit:
-        steps.measure("audit", lambda: audit(out, depth_views=0))
-    yield from steps.rows
+        _measured(scenes, "audit", opened, lambda: audit(out, depth_views=0))
 
 
 @contextmanager
@@ -195,8 +178,7 @@ def main() -> None:
     print_markdown(_HEADS, [])
     for scenes in sorted({*options.scenes, *options.audit}):
         with _work_folder(options.work) as folder:
-            for row in measure(folder / "dataset", scenes, scenes in options.audit, opened):
-                print(f"| {' | '.join(map(str, row))} |", flush=True)
+            measure(folder / "dataset", scenes, scenes in options.audit, opened)
 
 
 if __name__ == "__main__":
