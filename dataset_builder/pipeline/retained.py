@@ -184,7 +184,9 @@ def check_retained(out: Path, finished: Finished, plans: Sequence[ConfigPlan], o
     for plan in plans:
         by_name.setdefault(plan.spec.name, []).append(plan)
     kept = [config for name, config in finished.configs.items() if name not in overwrite]
-    if problems := [problem for config in kept for problem in _entry_problems(finished.folder, config)]:
+    # Of a config that is overwritten, other scenes may be kept.
+    checked = [config for config in finished.configs.values() if config.name not in overwrite or config.has_splits]
+    if problems := [problem for config in checked for problem in _entry_problems(finished.folder, config)]:
         raise DatasetError.from_problems(out / MANIFEST_FILE, problems)
     planned = [config for config in kept if config.name in by_name]
     if problems := [one for config in planned for one in _loss_problems(finished, config, by_name[config.name])]:

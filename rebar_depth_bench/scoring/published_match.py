@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rebar_depth_bench.data.config_tables import Assembly, SceneRig
+from rebar_depth_bench.data.config_tables import Assembly
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.trajectory import NEAREST_STEEL, Trajectory
 
@@ -104,9 +104,6 @@ def published_match(config: DatasetConfig) -> PublishedMatch | None:
     for name, expected in _CONDITIONS.items():
         assembly = Assembly.model_validate(expected.assembly)
         if shown == (assembly, expected.markers, expected.environment, expected.trajectory):
-            return PublishedMatch(name, scene.rig is not None and _optics(scene.rig) == expected.optics)
+            optics = None if scene.rig is None else (scene.rig.grid, scene.rig.baseline_m)
+            return PublishedMatch(name, optics == expected.optics)
     return None
-
-
-def _optics(rig: SceneRig) -> tuple[str, float]:
-    return rig.grid, rig.baseline_m

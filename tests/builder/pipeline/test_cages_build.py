@@ -256,7 +256,7 @@ def test_damaged_entry_of_a_scene_is_refused(root: Path, tmp_path: Path, run_bui
     manifest: dict[str, Any] = json.loads((copy / MANIFEST_FILE).read_text())
     manifest["configs"]["cages"]["scenes"][0]["assembly"][key] = "x"
     (copy / MANIFEST_FILE).write_text(json.dumps(manifest))
-    process = run_build("--out", copy, *cages("test", 1), *GROUND_TRUTH)
+    process = run_build("--out", copy, *cages("test", 1), *GROUND_TRUTH, "--overwrite", "cages")
     assert process.returncode == 2
     assert f"scenes 1: assembly.{key}" in process.stderr or f"assembly.{key}" in process.stderr
     assert "Traceback" not in process.stderr
