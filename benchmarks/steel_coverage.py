@@ -28,6 +28,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.trajectory import CENTRE
 from rebar_depth_bench.geometry.cameras import camera_centre
 from rebar_depth_bench.scoring.protocol import scored_pixels, single_bar_pixels
+from rebar_depth_bench.view_ids import TEST_SPLIT
 
 HEADS = ["config", "radius, m", "views", "scored", "nearest steel, m", "steel depth, m", "steel, %", "interior, %"]
 NEAREST, NEAR, FAR, STEEL, INTERIOR, SINGLE = range(6)
@@ -41,9 +42,8 @@ def main(root: str, json_file: str | None = None) -> None:
     rows, complete = [], {}
     for name, config in folder.config_by_name.items():
         views = measure_views(config, Cylinders.from_bars(bars[config.scene.name]))
-        protocol = config.manifest_entry["protocol"]
-        radii_m = protocol.get("radii_m") or protocol.get("distances_m") or [protocol["radius_m"]]
-        if len(views) == config.protocol_views:
+        radii_m = config.scene.protocol.distances_m if config.scene.protocol is not None else ()
+        if len(views) == config.scene.protocol_views:
             complete[name] = summary(config, views)
             shells = zip(radii_m, np.split(views, len(radii_m)), strict=True)
             rows += [(name, f"{radius_m:g}", *_cells(shell)) for radius_m, shell in shells if len(radii_m) > 1]
@@ -82,7 +82,7 @@ def summary(config: DatasetConfig, views: np.ndarray) -> Mapping[str, Any]:
         "scored_views": int(np.count_nonzero(scored)),
         "width": config.rig.width,
         "height": config.rig.height,
-        "distance_to": config.manifest_entry["protocol"].get("distance_to", CENTRE),
+        "distance_to": getattr(config.scene.protocol, "distance_to", CENTRE),
         "coverage": {
             "mean": _rounded(steel.mean()),
             "least": _rounded(steel.min()),
@@ -90,7 +90,7 @@ def summary(config: DatasetConfig, views: np.ndarray) -> Mapping[str, Any]:
         },
         "interior": _rounded(np.nanmean(views[:, INTERIOR])),
         "depth_m": [_rounded(np.nanmin(views[:, NEAR])), _rounded(np.nanmax(views[:, FAR]))],
-        "reference": config.manifest_entry["reference"],
+        "reference": config.references[TEST_SPLIT].model_dump(),
         "single_bar": {"share": _rounded(single[scored].mean()), "views": int(np.count_nonzero(single[scored]))},
     }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,9 +11,9 @@ from huggingface_hub import DatasetCardData
 from cards.steel import depth_text, steel_by_config
 from cards.templates import render
 from rebar_depth_bench.data.columns import COLUMN_DESCRIPTIONS, column_kind, features
-from rebar_depth_bench.data.config_tables import References
+from rebar_depth_bench.data.config_tables import Assembly, Colour, References, Scene
 from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.trajectory import CENTRE, NEAREST_STEEL, SURVEY
+from rebar_depth_bench.data.trajectory import CENTRE, NEAREST_STEEL, AnyTrajectory, Survey, Trajectory
 from rebar_depth_bench.reporting.formatting import DASH
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.view_ids import TEST_SPLIT
@@ -102,27 +102,19 @@ def _card_metadata(version: str, configs: Sequence[DatasetConfig]) -> DatasetCar
 def _dataset_info(config: DatasetConfig, version: str) -> DatasetInfo:
     from datasets import DatasetInfo, SplitDict, SplitInfo
 
-    size = config.manifest_entry["bytes"]
+    parts = {split: config.of_split(split) for split in config.splits}
     splits = {
-        split: SplitInfo(
-            split, num_examples=len(config.of_split(split).views), num_bytes=_split_bytes(config, split)
-        )
-        for split in config.splits
+        split: SplitInfo(split, num_examples=len(part.views), num_bytes=part.bytes)
+        for split, part in parts.items()
     }
     return DatasetInfo(
         features=features(),
         splits=SplitDict(splits),
         config_name=config.name,
         version=version,
-        dataset_size=size,
-        download_size=size,
+        dataset_size=config.bytes,
+        download_size=config.bytes,
     )
-
-
-def _split_bytes(config: DatasetConfig, split: str) -> int:
-    """Return the size of the shards of a split."""
-    scenes = config.manifest_entry.get("scenes", [config.manifest_entry])
-    return sum(scene["bytes"] for scene in scenes if scene.get("split", TEST_SPLIT) == split)
 
 
 def _shard_paths(config: DatasetConfig, split: str) -> str | list[str]:
@@ -137,89 +129,81 @@ def _shard_paths(config: DatasetConfig, split: str) -> str | list[str]:
 
 
 def _config_rows(config: DatasetConfig) -> list[dict[str, Any]]:
-    """Return the rows of a config in the tables: one, or one for each split of a config with splits."""
-    if config.has_splits:
-        return [_split_row(config.of_split(split), split) for split in config.splits]
-    return [_imported_row(config) if config.imported is not None else _config_row(config)]
+    """Return the rows of a config in the tables: one for each split."""
+    row = _imported_row if config.imported is not None else _split_row if config.has_splits else _config_row
+    return [_shared_row(part := config.of_split(split), split) | row(part) for split in config.splits]
 
 
-def _split_row(config: DatasetConfig, split: str) -> dict[str, Any]:
-    """Return the row of a config that is restricted to a split of generated scenes."""
-    names = {scene.name for scene in config.scenes}
-    scenes = [scene for scene in config.manifest_entry["scenes"] if scene["name"] in names]
-    distances_m = [distance_m for scene in scenes for distance_m in scene["protocol"]["distances_m"]]
-    cameras = dict.fromkeys(scene["rig"]["camera"] for scene in scenes)
-    references = References.model_validate(config.manifest_entry["references"][split])
+def _shared_row(config: DatasetConfig, split: str) -> dict[str, Any]:
+    """Return the columns that are alike for all configs, restricted to a split."""
+    rig, references = config.rig, config.references.get(split)
+    scored = [view.scored_px for view in config.views]
     return {
-        **_shared_row(config),
-        "name": f"{config.name}, {split}",
-        "steel_source": f"{len(scenes)} generated cages",
-        "distance": f"{min(distances_m):g}-{max(distances_m):g} m, random views",
+        "name": config.name,
+        "views": f"{len(config.views)}",
         "steel_depth": DASH,
-        "sheet": config.sheet if split == config.manifest_entry["scenes"][0]["split"] else None,
-        **dict.fromkeys(("variants", "panorama")),
-        "optics": f"ideal pinholes with baseline and field of view of {', '.join(sorted(cameras))}",
+        "grid": f"{rig.width} x {rig.height}",
+        "has_colour": config.colour is not None,
+        "out_of_protocol": scored.count(0),
+        "sheet": config.sheet,
         "constant": _reference(references, "constant"),
         "one_pixel": _reference(references, "one_pixel"),
-        "megabytes": f"{sum(scene['bytes'] for scene in scenes) / 1e6:.1f}",
+        "megabytes": f"{config.bytes / 1e6:.1f}",
+        **dict.fromkeys(("variants", "panorama", "imported")),
+    }
+
+
+def _split_row(config: DatasetConfig) -> dict[str, Any]:
+    """Return the columns of a split of generated scenes; the first split shows the contact sheet."""
+    trajectories = [scene.protocol for scene in config.scenes if scene.protocol is not None]
+    distances_m = [distance_m for trajectory in trajectories for distance_m in trajectory.distances_m]
+    cameras = dict.fromkeys(scene.rig.camera for scene in config.scenes if scene.rig is not None)
+    split = config.scenes[0].split
+    return {
+        **_rendered_row(config),
+        "name": f"{config.name}, {split}",
+        "steel_source": f"{len(config.scenes)} generated cages",
+        "distance": f"{min(distances_m):g}-{max(distances_m):g} m, random views",
+        "sheet": config.sheet if split == config.manifest_entry["scenes"][0]["split"] else None,
+        "optics": f"ideal pinholes with baseline and field of view of {', '.join(sorted(cameras))}",
     }
 
 
 def _config_row(config: DatasetConfig) -> dict[str, Any]:
-    """Return the row of a config of one scene that was rendered."""
-    entry = config.manifest_entry
+    """Return the columns of a config of one scene that was rendered."""
+    scene, light = config.scene, config.scene.appearance.image_light
     return {
-        **_shared_row(config),
-        "name": config.name,
-        "views": f"{len(config.views)} of {entry['protocol_views']}",
-        "steel_source": _steel_source(entry["scene"]["assembly"]),
-        "distance": _distance(entry["protocol"]),
-        "steel_depth": _steel_depth(config),
-        "sheet": config.sheet,
-        "variants": config.scene.appearance.variants,
-        "panorama": entry["scene"].get("appearance", {}).get("image_light", {}).get("image"),
-        "optics": _OPTICS_TEXTS[entry["rig"]["grid"]],
-        "constant": _reference(config.reference, "constant"),
-        "one_pixel": _reference(config.reference, "one_pixel"),
-        "megabytes": f"{entry['bytes'] / 1e6:.1f}",
+        **_rendered_row(config),
+        "views": f"{len(config.views)} of {scene.protocol_views}",
+        "steel_source": _steel_source(scene.assembly) if scene.assembly is not None else DASH,
+        "distance": _distance(scene.protocol) if scene.protocol is not None else DASH,
+        "steel_depth": _steel_depth(config.name, scene),
+        "variants": scene.appearance.variants,
+        "panorama": light.image if light is not None else None,
+        "optics": _OPTICS_TEXTS[scene.rig.grid] if scene.rig is not None else "",
     }
 
 
-def _shared_row(config: DatasetConfig) -> dict[str, Any]:
+def _rendered_row(config: DatasetConfig) -> dict[str, Any]:
     """Return the columns that all rows of rendered configs compute alike."""
     rig, views = config.rig, config.views
     steel = np.array([view.steel_px for view in views], float)
     scored = np.array([view.scored_px for view in views], float)
     with_steel = steel > 0
     return {
-        "views": f"{len(views)}",
         "samples": "no colour" if config.colour is None else _samples(config.colour),
-        "has_colour": config.colour is not None,
-        "grid": f"{rig.width} x {rig.height}",
         "steel": f"{100 * np.mean(steel) / (rig.width * rig.height):.1f} %",
         "kept": f"{100 * np.mean(scored[with_steel] / steel[with_steel]):.0f} %" if with_steel.any() else "none",
-        "out_of_protocol": int(np.count_nonzero(scored == 0)),
-        "imported": None,
     }
 
 
 def _imported_row(config: DatasetConfig) -> dict[str, Any]:
-    """Return the row of an imported config; what is not known of it is a dash."""
-    rig, scored = config.rig, [view.scored_px for view in config.views]
+    """Return the columns of an imported config; what is not known of it is a dash."""
     return {
-        "name": config.name,
-        "views": f"{len(config.views)}",
-        **dict.fromkeys(("samples", "distance", "steel_depth", "steel", "kept"), DASH),
-        **dict.fromkeys(("optics", "variants", "panorama")),
-        "has_colour": config.colour is not None,
+        **dict.fromkeys(("samples", "distance", "steel", "kept"), DASH),
         "steel_source": "imported",
-        "grid": f"{rig.width} x {rig.height}",
-        "out_of_protocol": scored.count(0),
-        "sheet": config.sheet,
-        "imported": config.manifest_entry["imported"],
-        "constant": _reference(config.reference, "constant"),
-        "one_pixel": _reference(config.reference, "one_pixel"),
-        "megabytes": f"{config.manifest_entry['bytes'] / 1e6:.1f}",
+        "optics": None,
+        "imported": config.imported,
     }
 
 
@@ -231,28 +215,32 @@ def _reference(references: References | None, name: str) -> str:
     return f"{errors.abs_rel:.4f}, {errors.rmse_cm:.2f} cm"
 
 
-def _samples(colour: Mapping[str, Any]) -> str:
+def _samples(colour: Colour) -> str:
     """Return the samples per pixel, and those around the steel if they differ."""
-    samples, steel_samples = colour["samples"], colour["steel_samples"]
+    samples, steel_samples = colour.samples, colour.steel_samples
     return f"{samples}" if steel_samples == samples else f"{samples}, {steel_samples} around steel"
 
 
-def _steel_source(assembly: Mapping[str, Any]) -> str:
-    return f"`{assembly['path']}`, not a standard one" if "path" in assembly else assembly["kind"]
+def _steel_source(assembly: Assembly) -> str:
+    return f"`{assembly.path}`, not a standard one" if assembly.path is not None else assembly.kind
 
 
-def _distance(protocol: Mapping[str, Any]) -> str:
-    if protocol["kind"] == "ring":
-        return f"{protocol['radius_m']:g} m"
-    if protocol["kind"] == SURVEY:
-        return f"{min(protocol['distances_m']):g}-{max(protocol['distances_m']):g} m, steel aimed at"
-    to_steel = ", nearest steel" if protocol.get("distance_to") == NEAREST_STEEL else ""
-    return f"{min(protocol['radii_m']):g}-{max(protocol['radii_m']):g} m{to_steel}"
+def _distance(trajectory: AnyTrajectory) -> str:
+    distances_m = trajectory.distances_m
+    if trajectory.kind == "ring":
+        return f"{distances_m[0]:g} m"
+    to_steel = ""
+    if isinstance(trajectory, Survey):
+        to_steel = ", steel aimed at"
+    elif isinstance(trajectory, Trajectory) and trajectory.distance_to == NEAREST_STEEL:
+        to_steel = ", nearest steel"
+    return f"{min(distances_m):g}-{max(distances_m):g} m{to_steel}"
 
 
-def _steel_depth(config: DatasetConfig) -> str:
+def _steel_depth(config: str, scene: Scene) -> str:
     """Return the range of steel depth of a standard config; a dash for other assemblies and trajectories."""
-    entry, steel = config.manifest_entry, steel_by_config().get(config.name)
-    if "path" in entry["scene"]["assembly"] or steel is None:
+    steel = steel_by_config().get(config)
+    if scene.assembly is None or scene.assembly.path is not None or steel is None:
         return DASH
-    return depth_text(steel) if entry["protocol"].get("distance_to", CENTRE) == steel["distance_to"] else DASH
+    distance_to = scene.protocol.distance_to if isinstance(scene.protocol, Trajectory) else CENTRE
+    return depth_text(steel) if distance_to == steel["distance_to"] else DASH

@@ -67,6 +67,18 @@ def add_build_arguments(parser: argparse.ArgumentParser) -> None:
         "nothing",
     )
     parser.add_argument(
+        "--overwrite",
+        nargs="+",
+        action="extend",
+        metavar="NAME",
+        help="finished configs of ROOT that may be replaced; to others, only views and scenes can be added",
+    )
+    parser.add_argument(
+        "--rewrite-manifest",
+        action="store_true",
+        help="only convert the manifest of ROOT, which an earlier version wrote, to the present format",
+    )
+    parser.add_argument(
         "--workers", type=int, metavar="N", help="number of parallel render processes per device (default: 1)"
     )
     parser.add_argument(

@@ -37,6 +37,8 @@ _EXTRA_MODULES = ("bpy", "cv2", "embreex", "trimesh")
 
 CAGES_OPTIONS = ("split", "scenes", "views_per_scene")
 """Options of the scenes of ``cages``; each is None if it is not given."""
+BUILD = "build"
+COMMANDS = (BUILD, "audit", "export", "import", "inspect", "push")
 COLOUR_OPTIONS = ("sampling", "quality", "samples", "device")
 """Options that only colour has; each is None if it is not given."""
 
@@ -44,9 +46,15 @@ COLOUR_OPTIONS = ("sampling", "quality", "samples", "device")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-build``; return its exit status."""
     use_plain_characters()
-    options = argument_parser().parse_args(arguments)
+    options = argument_parser().parse_args(with_command(sys.argv[1:] if arguments is None else arguments))
     interrupted = "interrupted; run the same command again to continue"
     return run_command(lambda: options.run(options), interrupted=interrupted)
+
+
+def with_command(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line that begins with a command; without one, it is ``build``."""
+    has_command = words and words[0] in (*COMMANDS, "-h", "--help", "--version")
+    return [*words] if has_command else [BUILD, *words]
 
 
 def _check_extra() -> None:
@@ -55,12 +63,26 @@ def _check_extra() -> None:
 
 
 def _build(options: argparse.Namespace) -> None:
+    if commands := [name for name in options.config or () if name in COMMANDS]:
+        raise InputError(
+            f"--config is followed by the command {commands[0]}, expected names of configs; a command is the "
+            f"first word: rebar-build {commands[0]} ..."
+        )
+    if options.out is None:
+        raise InputError("--out ROOT is missing, expected the dataset folder to build")
+    if options.rewrite_manifest:
+        names = ("config", "scene", "mesh", "views", "overwrite", "dry_run")
+        if given := [f"--{name.replace('_', '-')}" for name in names if getattr(options, name)]:
+            raise InputError(f"--rewrite-manifest is combined with {', '.join(given)}, expected only --out ROOT")
+        from dataset_builder.pipeline.rewrite import rewrite_manifest
+
+        rewrite_manifest(options.out)
+        print(options.out)
+        return
     _check_extra()
     from dataset_builder.pipeline.build import build
     from dataset_builder.pipeline.devices import Devices, find_devices
 
-    if options.out is None:
-        raise InputError("--out ROOT is missing, expected the dataset folder to build")
     if options.cluster is not None and options.dry_run:
         raise InputError(
             f"--dry-run is combined with --cluster {options.cluster}, expected only one of them: the estimate is "
@@ -100,12 +122,13 @@ def _print_estimate(request: BuildRequest, out: Path, processes: int, threads: i
     from dataset_builder.pipeline.build import plan_build
     from dataset_builder.pipeline.disk_space import check_space
     from dataset_builder.pipeline.estimate import estimate_build, estimate_lines
-    from dataset_builder.pipeline.retained import check_retained_configs
+    from dataset_builder.pipeline.retained import Finished, check_retained
 
     plans = plan_build(request, out)
-    check_retained_configs(out, plans)
+    finished = Finished(out)
+    check_retained(out, finished, plans, request.overwrite)
     with ProgressBars() as bars:
-        estimates = estimate_build(plans, out, threads, bars.update)
+        estimates = estimate_build(plans, finished, out, threads, bars.update)
     print(*map(printable, estimate_lines(estimates, out, processes)), sep="\n")
     check_space(out, [estimate.space for estimate in estimates if estimate.space])
 
@@ -131,6 +154,7 @@ def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
         variants=tuple(options.variant or ()),
         scenes=tuple(scene_config(path) for path in options.scene or ()),
         cages=_cages_request(options),
+        overwrite=tuple(options.overwrite or ()),
     )
 
 
@@ -233,13 +257,19 @@ def argument_parser() -> argparse.ArgumentParser:
     """Return the argument parser of ``rebar-build``."""
     parser = argparse.ArgumentParser(
         prog="rebar-build",
-        description="Render a dataset folder of stereo views with exact depth, or resume an interrupted build.",
+        description="Build, check and convert dataset folders of stereo views with exact depth.",
+        epilog=f"Without a command, the options are those of {BUILD}: rebar-build {BUILD} --help lists them.",
     )
     parser.add_argument("--version", action="version", version=software_version())
-    add_build_arguments(parser)
-    add_scene_arguments(parser)
-    parser.set_defaults(run=_build)
-    commands = parser.add_subparsers(metavar="{audit,export,import,inspect,push}")
+    commands = parser.add_subparsers(metavar=f"{{{','.join(COMMANDS)}}}")
+    building = commands.add_parser(
+        BUILD,
+        help="render a dataset folder",
+        description="Render a dataset folder of stereo views with exact depth, or resume an interrupted build.",
+    )
+    add_build_arguments(building)
+    add_scene_arguments(building)
+    building.set_defaults(run=_build)
     auditing = commands.add_parser("audit", help="check a dataset folder and its ground truth")
     _add_audit_arguments(auditing)
     auditing.set_defaults(run=_audit)

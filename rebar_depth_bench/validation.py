@@ -11,6 +11,7 @@ valid value::
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -29,7 +30,13 @@ _MAX_MAGNITUDE = 1e9
 _EXPLAINED = "explained"
 _INVALID_KEY = "[key]"
 """Last part of the location at which pydantic reports an invalid key of a dict."""
-_TYPES = {"model_type": "a table", "dict_type": "a table", "tuple_type": "a list"}
+_TYPES = {
+    "model_type": "a table",
+    "dict_type": "a table",
+    "dataclass_type": "a table",
+    "tuple_type": "a list",
+    "unexpected_keyword_argument": "no such key",
+}
 
 
 class StrictModel(BaseModel):
@@ -121,13 +128,22 @@ Flag = Annotated[bool, Expected("true or false")]
 
 
 def validate_table(
-    model: type[Model], values: object, problems: list[Problem], where: str = "", context: Any = None
+    model: type[Model],
+    values: object,
+    problems: list[Problem],
+    where: str = "",
+    context: Any = None,
+    *,
+    from_json: bool = False,
 ) -> Model | None:
     """Return the validated table, or None after adding all its problems to ``problems``.
 
-    ``where`` is the location of the table, and ``context`` is passed to validators (``info.context``).
+    ``where`` is the location of the table, and ``context`` is passed to validators (``info.context``). With
+    ``from_json`` the values are those of a JSON text, in which lists stand for tuples and tables for dataclasses.
     """
     try:
+        if from_json:
+            return model.model_validate_json(json.dumps(values), context=context)
         return model.model_validate(values, context=context)
     except ValidationError as error:
         problems += [_problem(details, model, where) for details in error.errors(include_url=False)]

@@ -20,6 +20,7 @@ from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT
 from rebar_depth_bench.geometry.cameras import Camera, look_at
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from tests.bench.extended.cage_scenes import FOCAL_PX, HEIGHT, WIDTH, bar, cast
+from tests.synthetic_dataset import config_entry, scene_entry
 
 VIEWS = 6
 CONFIG, CAGES = "mat", "cages"
@@ -82,27 +83,17 @@ def write_mat_dataset(root: Path, *, with_crossings: bool = True) -> dict[str, n
         pq.write_table(pa.concat_tables([table for table, _ in encoded]), root / shard, row_group_size=1)
         shards[scene] = shard, [record for _, record in encoded]
         records += shards[scene][1]
-    head = {"board": None, "mesh": "meshes/none.ply"}
-    entries[CONFIG] = _entry(shards[CONFIG][1]) | {
-        "scene": {"name": CONFIG, "board": None}, "mesh": "meshes/none.ply", "shards": [shards[CONFIG][0]],
-    }  # fmt: skip
-    entries[CAGES] = _entry([record for name in SCENES for record in shards[name][1]]) | {
-        "scenes": [
-            {**head, "name": name, "split": split, "shards": [shards[name][0]]} for name, split in SCENES.items()
-        ]
+    entries[CONFIG] = {
+        **config_entry(shards[CONFIG][1], WIDTH, HEIGHT),
+        "scenes": [scene_entry(CONFIG, VIEWS, shards[CONFIG][0])],
+    }
+    entries[CAGES] = {
+        **config_entry([record for name in SCENES for record in shards[name][1]], WIDTH, HEIGHT),
+        "has_splits": True,
+        "scenes": [scene_entry(name, 2, shards[name][0], split) for name, split in SCENES.items()],
     }
     _write_tables(root, bars, entries, records, with_crossings)
     return depths
-
-
-def _entry(records: Sequence[ViewRecord]) -> dict[str, object]:
-    return {
-        "rig": {"height": HEIGHT, "width": WIDTH},
-        "views": [record.model_dump() for record in records],
-        "ground_truth_digest": views_digest(records),
-        "key": "",
-        "sheet": "pictures/none.webp",
-    }
 
 
 def _write_tables(

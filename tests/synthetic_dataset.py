@@ -18,7 +18,7 @@ from rebar_depth_bench.data.bars import BARS_FILE, Bar, write_bars
 from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.digests import file_sha256, views_digest
 from rebar_depth_bench.data.eye_view import EyeView
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, OLD_FORMAT
 from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.view_ids import config_of
@@ -36,7 +36,13 @@ def write_dataset(root: Path, configs: Sequence[str], views: int) -> None:
         for name in configs
     )
     (root / "README.md").write_text(f"---\nconfigs:\n{config_yaml}---\n")
-    entries = {config: _config_entry(config, config_records) for config, config_records in records.items()}
+    entries = {
+        config: {
+            **config_entry(config_records),
+            "scenes": [scene_entry(config, views, f"{config}/test.parquet")],
+        }
+        for config, config_records in records.items()
+    }
     _write_manifest(root, entries, [record for config in configs for record in records[config]], {})
 
 
@@ -82,19 +88,41 @@ def write_split_dataset(
         shard = f"cages/{split}-{scene}.parquet"
         pq.write_table(pa.concat_tables([table for table, _ in encoded]), root / shard, row_group_size=1)
         records += [record for _, record in encoded]
-        files = {"mesh": f"{scene}.ply", "shards": [shard]}
         family = (families or {}).get(scene)
-        entries.append({"name": scene, "split": split, "family": family, "board": None, **files})
+        entries.append({**scene_entry(scene, views, shard, split), "family": family})
     axis_m = ((0.0, 0.0, 0.3), (0.0, 1.0, 0.3))
     known_m = {scene: 0.001 * number for scene, number in number_of.items()} | dict(diameters_m or {})
     bars = {scene: (Bar(1, "vertical", known_m[scene], axis_m),) for scene in scenes}
     write_bars(root / BARS_FILE, bars)
-    entry = {
-        **_config_entry("cages", records),
-        "scenes": entries,
-    }
-    entry = {key: value for key, value in entry.items() if key not in ("scene", "mesh", "shards")}
+    entry = {**config_entry(records), "has_splits": True, "scenes": entries}
     _write_manifest(root, {"cages": entry}, records, {BARS_FILE: file_sha256(root / BARS_FILE)})
+
+
+def _earlier(manifest: dict[str, Any]) -> dict[str, Any]:
+    """Return a manifest in the earlier format, in which an entry of one scene had its parameters beside it."""
+    configs = {name: _earlier_config(dict(entry)) for name, entry in manifest["configs"].items()}
+    return {**manifest, "format": OLD_FORMAT, "configs": configs}
+
+
+def _earlier_config(entry: dict[str, Any]) -> dict[str, Any]:
+    views = {"protocol_views": len(entry["views"])}
+    sizes = {"bytes": sum(scene["bytes"] for scene in entry["scenes"])}
+    if entry.pop("has_splits"):
+        return {**entry, "key": "k", **views, **sizes}
+    [scene] = entry.pop("scenes")
+    of_scene = {key: scene.pop(key) for key in ("protocol_views", "key", "mesh", "shards")}
+    of_scene |= {key: scene.pop(key) for key in ("aim_point_m", "generator") if key in scene}
+    references = {"reference": entry.pop("references")["test"]}
+    beside = {"protocol": scene.pop("protocol", None), "rig": scene.pop("rig", entry["rig"])}
+    del scene["split"], scene["bytes"]
+    return {**entry, **beside, **of_scene, **references, **sizes, "scene": scene}
+
+
+def write_earlier_manifest(root: Path) -> dict[str, Any]:
+    """Write the manifest of a folder in the earlier format; return it as it was."""
+    manifest: dict[str, Any] = json.loads((root / MANIFEST_FILE).read_text())
+    (root / MANIFEST_FILE).write_text(json.dumps(_earlier(json.loads(json.dumps(manifest)))))
+    return manifest
 
 
 def write_archive(path: Path, configs: Sequence[str], views: int, method: str, seed: int) -> None:
@@ -114,16 +142,32 @@ def _write_config(folder: Path, config: str, views: int) -> list[ViewRecord]:
     return [record for _, record in encoded]
 
 
-def _config_entry(config: str, records: Sequence[ViewRecord]) -> dict[str, object]:
+def config_entry(records: Sequence[ViewRecord], width: int = WIDTH, height: int = HEIGHT) -> dict[str, Any]:
+    """Return the entry of a config in the manifest without its scenes."""
     return {
-        "scene": {"name": config, "board": None},
-        "rig": {"height": HEIGHT, "width": WIDTH},
+        "has_splits": False,
+        "rig": {"height": height, "width": width},
+        "colour": {},
         "views": [record.model_dump() for record in records],
         "ground_truth_digest": views_digest(records),
-        "key": "",
-        "shards": [f"{config}/test.parquet"],
-        "mesh": "meshes/none.ply",
         "sheet": "pictures/none.webp",
+    }
+
+
+def scene_entry(name: str, views: int, shard: str, split: str = "test") -> dict[str, Any]:
+    """Return the entry of a scene in the manifest."""
+    return {
+        "name": name,
+        "split": split,
+        "assembly": {"kind": "bars"},
+        "board": None,
+        "protocol": {"kind": "ring", "radius_m": 1.0, "azimuths": views},
+        "protocol_views": views,
+        "rig": {"grid": "ideal", "baseline_m": BASELINE_M},
+        "key": "",
+        "mesh": "meshes/none.ply",
+        "shards": [shard],
+        "bytes": 0,
     }
 
 

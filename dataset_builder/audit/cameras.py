@@ -1,17 +1,17 @@
 """Camera checks of the audit: poses and intrinsics against the manifest, pixel rays against OpenCV.
 
-The expected cameras are rebuilt from the manifest entry of a config: its JSON values are parsed back to the specs
-of trajectory and rig that they were written from, and the trajectory's poses are passed through the rig.
+The expected cameras are rebuilt from the specs of trajectory and rig in the manifest: the trajectory's poses are
+passed through the rig.
 The lens model is checked by projecting the 3-D point of each pixel with ``cv2.projectPoints``: it must return to
 its pixel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,17 +20,8 @@ from numpy import ndarray
 
 from dataset_builder.audit.report import Check
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from dataset_builder.config.manifest_specs import rig_spec, trajectory_spec
 from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import (
-    DistanceSweepSpec,
-    DomeSpec,
-    FocalRigSpec,
-    RandomViewsSpec,
-    RigSpec,
-    RingSpec,
-    SurveySpec,
-    TrajectorySpec,
-)
 from dataset_builder.config.trajectories import poses, subset
 from dataset_builder.scene.assemblies import aim_point_m
 from dataset_builder.scene.mesh_ply import read_mesh_ply
@@ -39,63 +30,9 @@ from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import CAMERA_KINDS
-from rebar_depth_bench.data.trajectory import RANDOM_VIEWS
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera, camera_centre
-from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
-from rebar_depth_bench.validation import short_repr
 from rebar_depth_bench.view_ids import scene_prefix, view_id
-
-_Spec = TypeVar("_Spec")
-_TRAJECTORY_SPECS: Mapping[str, Callable[..., TrajectorySpec]] = {
-    "dome": DomeSpec,
-    "ring": RingSpec,
-    "sweep": DistanceSweepSpec,
-    "survey": SurveySpec,
-    RANDOM_VIEWS: RandomViewsSpec,
-}
-
-
-def trajectory_spec(config: DatasetConfig) -> TrajectorySpec:
-    """Return the camera trajectory of a config; raise ``DatasetError`` if its manifest entry has no valid one."""
-    return _spec_from_manifest(config, "protocol", _trajectory_from_json)
-
-
-def rig_spec(config: DatasetConfig) -> RigSpec:
-    """Return the stereo rig of a config; raise ``DatasetError`` if its manifest entry has no valid one."""
-    return _spec_from_manifest(config, "rig", _rig_from_json)
-
-
-def _spec_from_manifest(config: DatasetConfig, key: str, make_spec: Callable[[Any], _Spec]) -> _Spec:
-    entry = config.scene_entry
-    try:
-        return make_spec(entry[key])
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise DatasetError(
-            f"manifest: the {key} of config {config.label} is {short_repr(entry.get(key))}, "
-            f"expected a value that this version writes: {type(error).__name__}: {error}"
-        ) from None
-
-
-def _trajectory_from_json(values: Mapping[str, Any]) -> TrajectorySpec:
-    return _TRAJECTORY_SPECS[values["kind"]](**_lists_to_tuples(values))
-
-
-def _rig_from_json(values: Mapping[str, Any]) -> RigSpec:
-    calibration = values.get("calibration")
-    spec = FocalRigSpec if "focal_px" in values else RigSpec
-    return spec(**{**values, "calibration": None if calibration is None else _calibration_from_json(calibration)})
-
-
-def _calibration_from_json(values: Mapping[str, Any]) -> StereoCalibration:
-    lenses = {eye: Lens(**_lists_to_tuples(values[eye])) for eye in ("left", "right")}
-    return StereoCalibration(**{**_lists_to_tuples(values), **lenses})
-
-
-def _lists_to_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values with JSON lists converted to the tuples that the specs hold."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
-
 
 CAMERA_TOLERANCE = 1e-12
 """Largest absolute difference of any entry of K, distortion or pose.
@@ -133,18 +70,16 @@ def mesh_aim_point_m(mesh: Path) -> Float64[ndarray, " 3"]:
 def checked_aim_point_m(config: DatasetConfig, mesh: Path) -> tuple[Float64[ndarray, " 3"], tuple[str, ...]]:
     """Return a config's aim point, world metres, and the problems found with it.
 
-    This is ``aim_point_m`` of the manifest entry if it agrees with the middle of the mesh's steel. If the manifest
+    This is ``aim_point_m`` of its scene if it agrees with the middle of the mesh's steel. If the manifest
     has no aim point, or a different one (a problem), the middle of the steel is returned.
     """
     middle_m = mesh_aim_point_m(mesh)
-    if "aim_point_m" not in config.manifest_entry:
+    aim_m = config.scene.aim_point_m
+    if aim_m is None:
         return middle_m, ()
-    aim_m = np.asarray(config.manifest_entry["aim_point_m"], dtype=np.float64)
-    if aim_m.shape != (3,) or not np.abs(aim_m - middle_m).max() <= _AIM_TOLERANCE_M:
-        return middle_m, (
-            f"aim_point_m is {aim_m.tolist()}, expected {middle_m.tolist()}, the centre of the steel",
-        )
-    return aim_m, ()
+    if not np.abs(np.array(aim_m) - middle_m).max() <= _AIM_TOLERANCE_M:
+        return middle_m, (f"aim_point_m is {list(aim_m)}, expected {middle_m.tolist()}, the centre of the steel",)
+    return np.array(aim_m), ()
 
 
 def expected_views(

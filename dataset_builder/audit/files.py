@@ -13,7 +13,7 @@ from dataset_builder.audit.report import Check
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE, folder_crossings
-from rebar_depth_bench.data.bars import BARS_FILE, read_bars
+from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
@@ -33,9 +33,8 @@ def check_files(folder: DatasetFolder, root: Path, progress: Progress) -> Check:
     return Check("files against the manifest", f"{len(folder.files)} files", "all SHA-256 equal", tuple(problems))
 
 
-def check_crossings(folder: DatasetFolder, root: Path) -> Check:
+def check_crossings(folder: DatasetFolder, bars: Mapping[str, tuple[Bar, ...]]) -> Check:
     """Check that the table of crossings holds the crossings of the bars, to ``_CROSSING_TOLERANCE_M``."""
-    bars = read_bars(root / BARS_FILE)
     if CROSSINGS_FILE not in folder.files:
         return Check("crossings of the bars", "none", f"the folder has no {CROSSINGS_FILE}")
     stored = folder_crossings(folder, bars).by_scene

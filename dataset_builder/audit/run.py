@@ -25,7 +25,7 @@ from dataset_builder.audit.scenes import cage_checks, merged_checks
 from dataset_builder.audit.stereo_consistency import epipolar_counts, epipolar_verdict
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView, RayCache, view_from_row
 from dataset_builder.config.trajectories import subset
-from rebar_depth_bench.data.bars import BARS_FILE, read_bars
+from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
 from rebar_depth_bench.data.columns import COLUMNS
 from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.dataset_config import DatasetConfig
@@ -76,43 +76,52 @@ def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent
     files = check_files(folder, folder.local, progress)
     checks = [files]
     if files.passed:  # Rows of damaged files cannot be checked.
-        checks.append(check_crossings(folder, folder.local))
+        bars = read_bars(folder.local / BARS_FILE)
+        checks.append(check_crossings(folder, bars))
         for config in folder.config_by_name.values():
-            checks += _config_checks(config, folder.local, depth_views, progress)
+            checks += _config_checks(config, folder.local, bars, depth_views, progress)
     return AuditReport(str(root), tuple(checks))
 
 
-def _config_checks(config: DatasetConfig, root: Path, depth_views: int, progress: Progress) -> Iterator[Check]:
-    if config.imported is not None:
-        bars = read_bars(root / BARS_FILE).get(config.scene.name, ())
-        yield from imported_checks(config, config.imported, bars, progress)
-    elif config.has_splits:
-        yield from _scenes_checks(config, root, depth_views, progress)
-    else:
-        yield from _scene_checks(config, root, depth_views, progress)
+_SceneBars = Mapping[str, tuple[Bar, ...]]
 
 
-def _scenes_checks(config: DatasetConfig, root: Path, depth_views: int, progress: Progress) -> Iterator[Check]:
-    """Yield the checks of a config of several scenes, each of all scenes together.
+def _config_checks(
+    config: DatasetConfig, root: Path, bars: _SceneBars, depth_views: int, progress: Progress
+) -> Iterator[Check]:
+    """Yield the checks of a config; those of several scenes are made of all scenes together.
 
     Depth is rendered again in ``SAMPLED_SCENES`` of them.
     """
+    if config.imported is not None:
+        yield from imported_checks(config, config.imported, bars.get(config.scene.name, ()), progress)
+        return
+    if not config.has_splits:
+        yield from _scene_checks(config, root, bars, depth_views, progress)
+        return
     scenes = config.by_scene()
     sampled = set(subset(len(scenes), SAMPLED_SCENES))
     checks: list[Check] = []
     for number, scene in enumerate(scenes):
         views = depth_views if number in sampled else 0
-        steel = read_bars(root / BARS_FILE)[scene.scene.name]
-        checks += cage_checks(scene, steel)
-        checks += _scene_checks(scene, root, views, silent)
+        checks += cage_checks(scene, _steel(scene, bars))
+        checks += _scene_checks(scene, root, bars, views, silent)
         progress(f"audit of {config.name}", number + 1, len(scenes))
     yield from merged_checks(config.name, checks)
 
 
-def _scene_checks(config: DatasetConfig, root: Path, depth_views: int, progress: Progress) -> Iterator[Check]:
+def _steel(config: DatasetConfig, bars: _SceneBars) -> tuple[Bar, ...]:
+    """Return the bars of a scene; raise ``DatasetError`` if there are none."""
+    if config.scene.name not in bars:
+        raise DatasetError(f"{config.root}: {BARS_FILE} has no bars of scene {config.scene.name}, expected some")
+    return bars[config.scene.name]
+
+
+def _scene_checks(
+    config: DatasetConfig, root: Path, bars: _SceneBars, depth_views: int, progress: Progress
+) -> Iterator[Check]:
     """Yield the checks of a config of one scene, or restricted to one scene."""
-    name, mesh = config.label, root / config.mesh
-    steel = read_bars(root / BARS_FILE)[config.scene.name]
+    name, mesh, steel = config.label, root / config.mesh, _steel(config, bars)
     variants, board = config.scene.appearance.variants, config.scene.board
     audited = AuditedConfig(name, variants, steel, board)
     aim_m, aim_problems = checked_aim_point_m(config, mesh)

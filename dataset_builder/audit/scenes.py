@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy import ndarray
 
-from dataset_builder.audit.cameras import trajectory_spec
 from dataset_builder.audit.geometry import polyline_distance_m
 from dataset_builder.audit.report import Check
+from dataset_builder.config.manifest_specs import cage_spec, trajectory_spec
 from dataset_builder.config.random_views import STEEL_CLEARANCE, STEEL_CLEARANCE_M
-from dataset_builder.config.specs import GeneratedCageSpec, RandomViewsSpec
+from dataset_builder.config.specs import RandomViewsSpec
 from dataset_builder.scene.assemblies import assembly_bars
 from dataset_builder.scene.cages.clearance import Clearances
 from dataset_builder.scene.cages.generate import VERSION
@@ -52,7 +52,7 @@ def merged_checks(config: str, checks: Sequence[Check]) -> Iterator[Check]:
 def _bars_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
     """Return the check of the bars against those that the generator makes from the parameters in the manifest."""
     name = f"{scene.label}: bars and their designs"
-    spec = GeneratedCageSpec(**scene.scene_entry["assembly"])
+    spec = cage_spec(scene)
     if spec.version != VERSION:
         return Check.skip(name, f"made by version {spec.version} of the generator, this is {VERSION}")
     expected = assembly_bars(spec)

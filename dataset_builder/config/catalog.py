@@ -127,6 +127,7 @@ class BuildRequest:
     ``colour`` None builds no colour. ``mesh`` replaces the rods of the lattice. ``variants`` are names of
     ``scene.variants.VARIANTS``; they are appended to the names of configs and scenes. ``scenes`` are the configs
     of user scene files. ``cages`` are the scenes of the config of that name, if it is among the ``configs``.
+    ``overwrite`` are the names of configs whose finished views may be replaced.
     """
 
     configs: tuple[str, ...] = tuple(CONFIGS)
@@ -139,6 +140,7 @@ class BuildRequest:
     variants: tuple[str, ...] = ()
     scenes: tuple[ConfigSpec, ...] = ()
     cages: CagesRequest | None = None
+    overwrite: tuple[str, ...] = ()
 
     def config_specs(self) -> list[ConfigSpec]:
         """Return the specs of all requested configs.
@@ -154,13 +156,19 @@ class BuildRequest:
         for spec in specs:
             check_suitable(spec.scene.environment, self.variants)
         self._check_device(specs)
-        names = [spec.name for spec in specs]
-        duplicates = sorted({name for name in names if names.count(name) > 1})
+        built = [spec.name for spec in specs]
+        duplicates = sorted({name for name in built if built.count(name) > 1})
         if duplicates:
             raise InputError(
                 f"more than one config is named {', '.join(duplicates)}, expected unique names: rename the scene"
             )
-        return [*specs, *self._cage_scenes()]
+        scenes = [*specs, *self._cage_scenes()]
+        names = {spec.name for spec in scenes}
+        if unknown := [name for name in self.overwrite if name not in names]:
+            expected = f"one of the configs that are built: {', '.join(sorted(names))}"
+            problem = Problem("unknown", "--overwrite", f"got {unknown[0]!r}", expected)
+            raise InputError.from_problems("build request", [problem])
+        return scenes
 
     def _cage_scenes(self) -> list[SceneConfigSpec]:
         """Return the scenes of ``cages``, if it is requested; each draws its own variants and takes no mesh."""

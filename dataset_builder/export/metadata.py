@@ -28,8 +28,8 @@ CONVENTIONS = {
 }
 """Descriptions of units and frames, part of ``cameras.json``."""
 
-_NOT_PARAMETERS = ("views", "shards", "ground_truth_digest", "key", "mesh", "bytes")
-"""Keys of a config's manifest entry that are not scene parameters."""
+_NOT_PARAMETERS = ("shards", "key", "mesh", "bytes")
+"""Keys of a scene's manifest entry that are not its parameters."""
 
 
 def exported_files(config: DatasetConfig) -> Mapping[str, ExportFile]:
@@ -39,12 +39,13 @@ def exported_files(config: DatasetConfig) -> Mapping[str, ExportFile]:
 
 def cameras_json(folder: DatasetFolder, config: DatasetConfig, views: Sequence[CameraView]) -> str:
     """Return ``cameras.json``: conventions, origin of the data, and one entry per view and eye."""
+    parameters = {**config.scene.entry, "colour": config.manifest_entry["colour"]}
     head = {
         "conventions": CONVENTIONS,
         "dataset": {"digest": folder.digest, "version": folder.version},
         "config": config.name,
         **({"split": config.scene.split, "scene": config.scene.name} if config.has_splits else {}),
-        "parameters": {name: value for name, value in config.scene_entry.items() if name not in _NOT_PARAMETERS},
+        "parameters": {name: value for name, value in parameters.items() if name not in _NOT_PARAMETERS},
         "licence": LICENCE,
     }
     cameras = [_camera(config, view, eye, camera) for view in views for eye, camera in view.cameras.items()]

@@ -132,7 +132,7 @@ def _by_folder(chosen: Sequence[DatasetConfig], split: str | None) -> dict[str, 
 
 def _key(config: DatasetConfig) -> str:
     """Return the key of the build of a config or of a scene of it."""
-    return str(config.scene_entry.get("key", config.key))
+    return config.key
 
 
 def _export_config(

@@ -18,6 +18,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--config", required=True, metavar="NAME", help="name of the config")
     parser.add_argument(
+        "--overwrite",
+        nargs="+",
+        default=(),
+        metavar="NAME",
+        help="config of ROOT that may be replaced, if it was imported from other data",
+    )
+    parser.add_argument(
         "--dry-run",
         action="store_true",
         help="check the layout and show what it describes; nothing is written",
@@ -37,5 +44,5 @@ def run(options: argparse.Namespace) -> None:
         print(f"surveyed bars: {len(source.bars)}")
     if not options.dry_run:
         with ProgressBars() as bars:
-            run_import(source, options.out, bars.update)
+            run_import(source, options.out, bars.update, overwrite=options.overwrite)
         print(options.out)

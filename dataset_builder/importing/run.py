@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,22 +16,19 @@ from dataset_builder.importing.bars_file import read_bars_file
 from dataset_builder.importing.layout import Layout, read_layout
 from dataset_builder.importing.views import SourceViews, open_views
 from dataset_builder.pipeline.folder import check_target, remove_build_folder
-from dataset_builder.pipeline.plan import BUILD_FOLDER, generator_versions
-from dataset_builder.pipeline.publish import build_lock, publish_entry, remove_leftovers
-from dataset_builder.pipeline.retained import check_retained_configs, published_configs
-from dataset_builder.pipeline.shards import Staging, encode_row, stage_row
+from dataset_builder.pipeline.plan import BUILD_FOLDER, KEY_CHARACTERS, generator_versions
+from dataset_builder.pipeline.publish import StagedScene, build_lock, publish, remove_leftovers
+from dataset_builder.pipeline.retained import Finished, check_retained
+from dataset_builder.pipeline.shards import Staging, encode_row, stage_row, view_record
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import OPTIONAL_COLUMNS
-from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest
 from rebar_depth_bench.data.eye_view import truth_from_row
 from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.paths import remove_folder
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.scoring.protocol import scored_pixels
-from rebar_depth_bench.view_ids import view_id
+from rebar_depth_bench.view_ids import TEST_SPLIT, view_id
 
-_KEY_CHARACTERS = 16
 _ROLE = "not surveyed"
 """Role of bars that images show and no file of bars describes."""
 
@@ -73,30 +70,41 @@ def plan_import(path: Path, name: str) -> Import:
     return Import(name, views, bars)
 
 
-def run_import(source: Import, out: Path, progress: Progress = silent) -> None:
+def run_import(source: Import, out: Path, progress: Progress = silent, *, overwrite: Collection[str] = ()) -> None:
     """Write the config into the dataset folder ``out``, or continue an interrupted import.
 
     Raises ``InputError`` for images that cannot be read, for a folder that is none of a dataset, and for a config
-    of this name that was rendered; nothing is published then.
+    of this name that was rendered or, unless it is among ``overwrite``, imported from other data; nothing is
+    published then.
     """
     key = parameters_digest(_key_inputs(source, progress))
-    staging = Staging(out / BUILD_FOLDER / f"{source.name}-{key[:_KEY_CHARACTERS]}")
+    staging = Staging(out / BUILD_FOLDER / f"{source.name}-{key[:KEY_CHARACTERS]}")
     check_target(out, [source.name], [staging.root])
-    published = published_configs(out).get(source.name)
-    if published is not None and published.imported is None:
-        raise InputError(f"{out}: config {source.name} was rendered, expected another --config for imported data")
-    if published is not None and published.key == key:
-        return
+    finished = Finished(out)
+    published = finished.configs.get(source.name)
+    if published is not None:
+        if published.imported is None:
+            raise InputError(
+                f"{out}: config {source.name} was rendered, expected another --config for imported data"
+            )
+        if published.key == key and all(map(finished.matches, published.files)):
+            return
+        if published.key != key and source.name not in overwrite:
+            raise InputError(
+                f"{out}: config {source.name} has {len(published.views)} finished views, which were imported from "
+                f"other data or with another layout and would be lost; --overwrite {source.name} replaces them"
+            )
     with build_lock(out / BUILD_FOLDER):
         try:
-            check_retained_configs(out, [], {source.name})
-            remove_leftovers(out)
+            check_retained(out, finished, [], [source.name])
+            remove_leftovers(out, finished.folder)
             ids = _stage_views(source, staging, progress)
             bars = {bar.bar_id: bar for bar in source.bars}
             bars |= {bar_id: Bar.without_axis(bar_id, _ROLE) for bar_id in sorted(ids - bars.keys())}
-            scene_bars = {source.name: tuple(bars[bar_id] for bar_id in sorted(bars))}
-            indices = range(len(source.views.names))
-            publish_entry(out, source.name, _entry(source, key), staging, indices, scene_bars)
+            views = {view_id(source.name, index): index for index in range(len(source.views.names))}
+            in_order = tuple(bars[bar_id] for bar_id in sorted(bars))
+            scene = StagedScene(_scene_entry(source, key), TEST_SPLIT, staging, views, in_order)
+            publish(out, finished.folder, source.name, _config_entry(source), [scene])
             remove_folder(staging.root)
         finally:
             remove_build_folder(out / BUILD_FOLDER)
@@ -137,28 +145,19 @@ def _stage_views(source: Import, staging: Staging, progress: Progress) -> set[in
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)
             identity = {"view_id": view_id(source.name, index), "scene": source.name}
-            stage_row(path, encode_row({**identity, **columns}), _record(identity["view_id"], columns))
+            row = {**dict.fromkeys(OPTIONAL_COLUMNS), **identity, **columns}
+            right = truth_from_row(row, "right") if row["right_depth"] is not None else None
+            record = view_record(identity["view_id"], truth_from_row(row, "left"), right)
+            stage_row(path, encode_row(row), record)
         progress(f"import of {source.name}", index + 1, len(source.views.names))
     return ids
 
 
-def _record(identity: str, columns: Mapping[str, Any]) -> ViewRecord:
-    row = {**dict.fromkeys(OPTIONAL_COLUMNS), **columns}
-    left, mask = truth_from_row(row, "left"), row["left_mask"]
-    return ViewRecord(
-        view_id=identity,
-        left=left.digest(),
-        right=truth_from_row(row, "right").digest() if row["right_depth"] is not None else None,
-        steel_px=None if mask is None else int(np.count_nonzero(mask)),
-        scored_px=len(scored_pixels(mask, left.depth_m)),
-    )
-
-
-def _entry(source: Import, key: str) -> dict[str, Any]:
-    """Return the manifest entry of the config without its shards and views."""
+def _config_entry(source: Import) -> dict[str, Any]:
+    """Return the manifest entry of the config without its scene, views and digests."""
     layout, (height, width) = source.layout, source.views.grid
-    board = None if source.views.cameras.board_is_assumed else source.views.cameras.board
     return {
+        "has_splits": False,
         "imported": {
             "truth_sigma_m": layout.truth_sigma_m,
             "absent_columns": source.absent_columns,
@@ -169,12 +168,20 @@ def _entry(source: Import, key: str) -> dict[str, Any]:
             "layout": layout.model_dump(exclude_none=True),
             "views": source.views.names,
         },
-        "scene": {"name": source.name, "board": None if board is None else asdict(board)},
         "rig": {"width": width, "height": height},
         "colour": {} if "left_rgb" in layout.files.patterns else None,
-        "mesh": None,
-        "key": key,
-        "protocol": None,
+    }
+
+
+def _scene_entry(source: Import, key: str) -> dict[str, Any]:
+    """Return the manifest entry of the scene without its shards."""
+    board = None if source.views.cameras.board_is_assumed else source.views.cameras.board
+    return {
+        "name": source.name,
+        "split": TEST_SPLIT,
+        "board": None if board is None else asdict(board),
         "protocol_views": len(source.views.names),
-        "generator": generator_versions(),
+        "key": key,
+        "generator": dict(generator_versions()),
+        "mesh": None,
     }

@@ -6,7 +6,7 @@ import os
 import threading
 from collections import defaultdict
 from collections.abc import Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import Future, as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.specs import SceneConfigSpec
-from dataset_builder.pipeline.disk_space import check_fits_on_disk
+from dataset_builder.pipeline.disk_space import check_fits_on_disk, check_readable
 from dataset_builder.pipeline.folder import check_folder, remove_build_folder, remove_stagings
 from dataset_builder.pipeline.local_renderer import Renderer, local_processes
 from dataset_builder.pipeline.notes import print_notes
@@ -23,15 +23,14 @@ from dataset_builder.pipeline.place_cameras import place_cameras
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, plan_config
 from dataset_builder.pipeline.publish import (
     build_lock,
-    is_published,
-    publish_config,
+    publish_plans,
     remove_leftovers,
     repair_metadata,
 )
-from dataset_builder.pipeline.publish_scenes import publish_scenes
-from dataset_builder.pipeline.retained import check_retained_configs
+from dataset_builder.pipeline.retained import Finished, check_retained, kept_scenes
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, accept_result, remaining_units
 from dataset_builder.scene.assemblies import check_fits
+from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.progress import Progress, silent
 
 
@@ -65,14 +64,20 @@ def build(
     data does not match its digests.
     """
     plans = plan_build(request, out)
-    check_fits_on_disk(out, plans)
-    plans = place_cameras(plans, out, os.cpu_count() or 1, progress)
+    finished = Finished(out)
+    check_retained(out, finished, plans, request.overwrite)
+    print_notes(finished.notes(plans))
+    missing = [plan for plan in plans if not finished.has(plan)]
+    check_fits_on_disk(out, missing, finished)
+    missing = place_cameras(missing, os.cpu_count() or 1, progress)
+    check_readable(missing, finished)
     with build_lock(out / BUILD_FOLDER):
         try:
-            check_retained_configs(out, plans)
-            remove_leftovers(out)
+            if finished.is_outdated:
+                raise InputError(f"{out}: another build has changed the folder; run the same command again")
+            remove_leftovers(out, finished.folder)
             with nullcontext(cluster) if cluster else local_processes(workers, threads, devices) as renderer:
-                return _build_plans(plans, out, renderer, progress)
+                return _build_plans(out, finished, plans, missing, renderer, progress)
         finally:
             remove_build_folder(out / BUILD_FOLDER)
 
@@ -92,29 +97,35 @@ def plan_build(request: BuildRequest, out: Path) -> list[ConfigPlan]:
     return plans
 
 
-def _build_plans(plans: Sequence[ConfigPlan], out: Path, renderer: Renderer, progress: Progress) -> BuildSummary:
-    summary = BuildSummary()
-    for name, group in groupby(plans, key=lambda plan: plan.spec.name):
+def _build_plans(
+    out: Path,
+    finished: Finished,
+    plans: Sequence[ConfigPlan],
+    missing: Sequence[ConfigPlan],
+    renderer: Renderer,
+    progress: Progress,
+) -> BuildSummary:
+    """Build the ``missing`` plans config by config, and repair the metadata of the others."""
+    summary, folder = BuildSummary(), finished.folder
+    missing_by_name = {name: list(group) for name, group in groupby(missing, key=_name)}
+    for name, group in groupby(plans, key=_name):
         plans_of_config = list(group)
-        missing = [plan for plan in plans_of_config if not is_published(out, plan)]
-        if not missing:
-            repair_metadata(out, plans_of_config)
-            summary.up_to_date.append(name)
-        else:
-            _render(missing, renderer, progress, summary)
-            _publish(out, missing)
+        if of_config := missing_by_name.get(name):
+            for plan in of_config:
+                finished.stage_views(plan)
+            _render(of_config, renderer, progress, summary)
+            kept = kept_scenes(finished.configs.get(name), of_config)
+            folder = publish_plans(out, folder, of_config, kept)
             summary.built.append(name)
-        for plan in plans_of_config:
-            remove_stagings(plan)
+        elif folder is not None:
+            folder = repair_metadata(out, folder, plans_of_config)
+            summary.up_to_date.append(name)
+        remove_stagings(out, plans_of_config)
     return summary
 
 
-def _publish(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    """Publish the plan of a config of one scene, or those of scenes of one config."""
-    if isinstance(plans[0].spec, SceneConfigSpec):
-        publish_scenes(out, plans)
-    else:
-        publish_config(out, plans[0])
+def _name(plan: ConfigPlan) -> str:
+    return plan.spec.name
 
 
 class _ViewCount:
@@ -146,14 +157,13 @@ def _render(plans: Sequence[ConfigPlan], renderer: Renderer, progress: Progress,
         for unit in remaining_units(plan):
             waiting[renderer.submit(unit, plan.staging, partial(count.add, plan.key))] = plan, unit
     try:
-        while waiting:
-            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-                plan, unit = waiting.pop(future)  # Drop the future, which holds the rendered bytes.
-                result = future.result()
-                accept_result(unit, result, plan.staging)
-                for stage, duration_s in result.seconds.items():
-                    summary.seconds[stage] += duration_s
-                count.add(plan.key, *unit.indices)
+        for future in as_completed(list(waiting)):
+            plan, unit = waiting.pop(future)  # Drop the future, which holds the rendered bytes.
+            result = future.result()
+            accept_result(unit, result, plan.staging)
+            for stage, duration_s in result.seconds.items():
+                summary.seconds[stage] += duration_s
+            count.add(plan.key, *unit.indices)
     finally:
         for future in waiting:
             future.cancel()

@@ -63,8 +63,13 @@ def write_scenes_strip(configs: Sequence[DatasetConfig], target: Path) -> None:
 
 
 def _decoded_rows(config: DatasetConfig, positions: Sequence[int]) -> Iterator[dict[str, Any]]:
-    """Yield view id, colour and depth preview of the rows at ``positions``, counted over all shards."""
-    return map(RowDecoder.of(config).row, rows_at(config, _SHOWN_COLUMNS, positions))
+    """Yield view id, colour and depth preview of the views at ``positions``; other scenes are not opened."""
+    decoder, wanted = RowDecoder.of(config), {config.views[position].view_id for position in positions}
+    scenes = {config.scene_by_view[view_id] for view_id in wanted}
+    for scene in config.by_scene():
+        if scene.scene.name in scenes:
+            in_scene = [n for n, view_id in enumerate(scene.view_ids) if view_id in wanted]
+            yield from map(decoder.row, rows_at(scene, _SHOWN_COLUMNS, in_scene))
 
 
 def _letterboxed(rgb: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> Image.Image:

@@ -1,4 +1,4 @@
-"""Disk space of a build: its estimate, and the refusal of a build that does not fit.
+"""Sizes of a build: estimates, and the refusal of one that does not fit on the disk or could not be read.
 
 While a config is built, its rows are staged and then packed into shards beside them. The staged rows, and the
 files of an older build of the config, are deleted when it has been published. Only views that are not staged yet
@@ -8,18 +8,23 @@ The scratch folders of the workers of a cluster, which hold one work unit per re
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 from dataset_builder.config.specs import RigSpec, SceneConfigSpec
-from dataset_builder.pipeline.folder import SHARD_NAME, existing_ancestor
-from dataset_builder.pipeline.plan import ConfigPlan
-from dataset_builder.pipeline.publish import is_published
-from rebar_depth_bench.errors import OutputError
+from dataset_builder.pipeline.folder import existing_ancestor, stagings_by_label
+from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
+from dataset_builder.pipeline.retained import Finished
+from rebar_depth_bench.data.bars import BARS_FILE, decoded_bytes
+from rebar_depth_bench.data.manifest import MANIFEST_FILE
+from rebar_depth_bench.errors import InputError, OutputError
+from rebar_depth_bench.limits import JSON_BYTES, TABLE_BYTES
 
 _MEASURED_PIXELS = 640 * 360
 _COLOUR_BYTES, _TRUTH_BYTES = 1.61, 2.11
@@ -39,6 +44,8 @@ _SURROUNDINGS_BYTES = 1_000_000
 """Allowance for surfaces in the mesh of a scene that are no steel (0.1 MB), contact sheet and metadata."""
 
 
+_VIEW_BYTES, _SCENE_BYTES, _HEAD_BYTES = 280, 1200, 2000
+"""Lengths in the manifest: a view, a scene without its parameters, and the rest, with digests of their files."""
 _CAGE_BYTES = 6_000_000
 """Allowance for the mesh of a generated cage, which is not made for an estimate: the mean of 40 is 4 MB."""
 
@@ -75,18 +82,34 @@ def view_bytes(rig: RigSpec, has_colour: bool) -> int:
     return int(_MARGIN * at_measured_size * pixels * (pixels / _MEASURED_PIXELS) ** _EXPONENT)
 
 
-def config_space(plan: ConfigPlan, out: Path) -> ConfigSpace:
-    """Return the disk space of a config that is not published yet in the folder ``out``."""
-    staged = [path for index in plan.indices if (path := plan.staging.row(index)).is_file()]
-    shards = (path for path in (out / plan.spec.name).glob("*.parquet") if SHARD_NAME.fullmatch(path.name))
-    abandoned = (os.walk(staging) for staging in plan.all_stagings() if staging != plan.staging.root)
-    other_files = (Path(folder, name) for walk in abandoned for folder, _, names in walk for name in names)
+def config_space(
+    plans: Sequence[ConfigPlan], finished: Finished, stagings: Mapping[str, list[Path]]
+) -> ConfigSpace:
+    """Return the disk space of one config, of which ``plans`` are the scenes that are missing or to be replaced.
+
+    ``stagings`` are those of the folder, as ``stagings_by_label`` returns them. All rows of all scenes are staged
+    before their shards are packed.
+    """
+    staged = [path for plan in plans for index in plan.indices if (path := plan.staging.row(index)).is_file()]
+    missing = sum(len(plan.indices) for plan in plans) - len(staged)
+    replaced = [scene for plan in plans if (scene := finished.scene(plan)) is not None]
+    abandoned = (path for plan in plans for path in stagings.get(plan.spec.label, ()) if path != plan.staging.root)
+    other_files = (
+        Path(folder, name) for path in abandoned for folder, _, names in os.walk(path) for name in names
+    )
     return ConfigSpace(
         _size(staged),
-        (len(plan.indices) - len(staged)) * view_bytes(plan.spec.rig, plan.spec.colour is not None),
-        _mesh_bytes(plan),
-        _size(shards) + _size(other_files),
+        missing * view_bytes(plans[0].spec.rig, plans[0].spec.colour is not None),
+        sum(map(_mesh_bytes, plans)),
+        sum(scene.bytes for scene in replaced) + _size(other_files),
     )
+
+
+def spaces_of_configs(out: Path, plans: Sequence[ConfigPlan], finished: Finished) -> list[ConfigSpace]:
+    """Return the disk space of each config of the plans that are missing in the folder ``out``."""
+    stagings = stagings_by_label(out)
+    groups = groupby(plans, key=lambda plan: plan.spec.name)
+    return [config_space(list(of_config), finished, stagings) for _, of_config in groups]
 
 
 def needed_bytes(spaces: Iterable[ConfigSpace]) -> int:
@@ -103,13 +126,32 @@ def free_bytes(out: Path) -> int:
     return shutil.disk_usage(existing_ancestor(out)).free
 
 
-def check_fits_on_disk(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    """Raise ``OutputError`` if building the plans needs more than the free disk space.
+def check_readable(plans: Sequence[ConfigPlan], finished: Finished) -> None:
+    """Raise ``InputError`` if the folder would have a manifest or bars that are larger than their readers accept.
 
-    Whether configs are published already, which takes long in a large folder, is checked only if it matters.
+    ``plans`` are those that are missing in the folder, with their cameras. Crossings need less than bars.
     """
-    if needed_bytes(config_space(plan, out) for plan in plans) > free_bytes(out):
-        check_space(out, [config_space(plan, out) for plan in plans if not is_published(out, plan)])
+    entries = ([config_parameters(plan.spec), plan.derived(), generator_versions()] for plan in plans)
+    manifest_bytes = _HEAD_BYTES + sum(len(json.dumps(entry, indent=1)) + _SCENE_BYTES for entry in entries)
+    manifest_bytes += sum(len(plan.indices) * (_VIEW_BYTES + len(plan.spec.view_id(0))) for plan in plans)
+    bars_bytes = sum(bar.decoded_bytes for plan in plans for bar in plan.bars)
+    if finished.folder is not None:
+        manifest_bytes += Path(finished.folder.root, MANIFEST_FILE).stat().st_size
+        bars_bytes += decoded_bytes(Path(finished.folder.root, BARS_FILE))
+    for limit, size, what in (
+        (JSON_BYTES, manifest_bytes, "the manifest"),
+        (TABLE_BYTES, bars_bytes, f"the decoded {BARS_FILE}"),
+    ):
+        if size > limit.value():
+            raise InputError(
+                f"{what} of the folder would have about {size} bytes and could not be read, expected "
+                f"{limit.allowed('bytes')}; build fewer scenes or views"
+            )
+
+
+def check_fits_on_disk(out: Path, plans: Sequence[ConfigPlan], finished: Finished) -> None:
+    """Raise ``OutputError`` if building the plans, which are missing, needs more than the free disk space."""
+    check_space(out, spaces_of_configs(out, plans, finished))
 
 
 def check_space(out: Path, spaces: Iterable[ConfigSpace]) -> None:

@@ -9,16 +9,17 @@ high, the time of packing included.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass
 from itertools import groupby
 from pathlib import Path
 
 from dataset_builder.config.specs import ColourSpec, ConfigSpec, SceneConfigSpec
 from dataset_builder.pipeline.disk_space import ConfigSpace, bytes_text, config_space, free_bytes, needed_bytes
+from dataset_builder.pipeline.folder import stagings_by_label
 from dataset_builder.pipeline.place_cameras import with_cameras
 from dataset_builder.pipeline.plan import ConfigPlan
-from dataset_builder.pipeline.publish import is_published
+from dataset_builder.pipeline.retained import Finished
 from dataset_builder.pipeline.trial import Trial, run_trial
 from dataset_builder.pipeline.work_units import remaining_units
 from rebar_depth_bench.console import duration_text
@@ -59,30 +60,39 @@ class ConfigEstimate:
 
 
 def estimate_build(
-    plans: Sequence[ConfigPlan], out: Path, threads: int, progress: Progress = silent
+    plans: Sequence[ConfigPlan], finished: Finished, out: Path, threads: int, progress: Progress = silent
 ) -> list[ConfigEstimate]:
-    """Estimate the build of each plan; configs with equal scene, lenses and colour share one trial.
+    """Estimate the build of each config; those with equal scene, lenses and colour share one trial.
 
     Raises what a build raises if it cannot render a config.
     """
-    estimates, trials = [], dict[object, Trial]()
+    estimates, trials, stagings = [], dict[object, Trial](), stagings_by_label(out)
     for done, plan in enumerate(plans):
         progress("trial pictures", done, len(plans))
-        estimates.append(_estimate_config(plan, out, threads, trials))
+        estimates.append(_estimate_config(plan, finished, stagings, threads, trials))
     progress("trial pictures", len(plans), len(plans))
-    return estimates
+    return [of_scenes(list(scenes)) for _, scenes in groupby(estimates, lambda estimate: estimate.spec.name)]
 
 
-def _estimate_config(plan: ConfigPlan, out: Path, threads: int, trials: dict[object, Trial]) -> ConfigEstimate:
-    if is_published(out, plan):
+def _estimate_config(
+    plan: ConfigPlan,
+    finished: Finished,
+    stagings: Mapping[str, list[Path]],
+    threads: int,
+    trials: dict[object, Trial],
+) -> ConfigEstimate:
+    if finished.has(plan):
         return ConfigEstimate(plan.spec, len(plan.indices))
     spec = plan.spec
-    unit_views = tuple(len(unit.indices) for unit in remaining_units(plan) if unit.indices)
+    index_by_id = plan.view_ids
+    kept = {index_by_id[view.view_id] for view in finished.kept_views(plan)}
+    unit_views = tuple(len(unit.indices) for unit in remaining_units(plan, kept) if unit.indices)
     # One generated scene stands for all of them.
     key = spec.name if isinstance(spec, SceneConfigSpec) else (spec.scene, spec.rig, spec.colour)
     if unit_views and key not in trials:
         trials[key] = run_trial(with_cameras(plan).spec, plan.indices, threads)
-    return ConfigEstimate(spec, len(plan.indices), unit_views, config_space(plan, out), trials.get(key))
+    space = config_space([plan], finished, stagings)
+    return ConfigEstimate(spec, len(plan.indices), unit_views, space, trials.get(key))
 
 
 def of_scenes(estimates: Sequence[ConfigEstimate]) -> ConfigEstimate:
@@ -107,13 +117,12 @@ def makespan(durations: Sequence[float], processes: int) -> float:
     return max(busy_until)
 
 
-def estimate_lines(estimates: Sequence[ConfigEstimate], out: Path, processes: int) -> Iterator[str]:
+def estimate_lines(configs: Sequence[ConfigEstimate], out: Path, processes: int) -> Iterator[str]:
     """Yield the lines that describe the estimates of a build with this number of concurrent processes."""
-    configs = [of_scenes(list(scenes)) for _, scenes in groupby(estimates, lambda estimate: estimate.spec.name)]
     for config in configs:
         yield from _config_lines(config, processes)
     missing, views = (sum(getattr(item, name) for item in configs) for name in ("missing", "views"))
-    needed = needed_bytes(item.space for item in estimates if item.space)
+    needed = needed_bytes(item.space for item in configs if item.space)
     yield f"total: {missing} of {views} views to render, {_duration_text(configs, processes)}"
     yield f"disk space: {bytes_text(needed)} needed, {bytes_text(free_bytes(out))} free for {out}"
 

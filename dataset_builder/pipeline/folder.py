@@ -12,11 +12,12 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan
+from dataset_builder.pipeline.plan import BUILD_FOLDER, STAGING_KEY, ConfigPlan
 from rebar_depth_bench.atomic_io import temporary_target
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE
 from rebar_depth_bench.data.bars import BARS_FILE
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
+from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder
 from rebar_depth_bench.errors import InputError, OutputError
 from rebar_depth_bench.paths import check_no_links, remove_file, remove_folder
 from rebar_depth_bench.view_ids import SPLITS
@@ -39,12 +40,26 @@ SHARD_NAME = re.compile(
 def check_folder(out: Path, plans: Sequence[ConfigPlan]) -> None:
     """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder that the plans can be built in.
 
-    Raises as ``check_target`` does. A config with colour may not be built again without.
+    Raises as ``check_target`` does.
     """
-    stagings = (path for plan in plans for path in plan.all_stagings())  # Not read before ``out`` is checked.
-    check_target(out, [plan.spec.name for plan in plans], stagings)
-    if (out / MANIFEST_FILE).is_file():
-        _check_keeps_colour(out, plans)
+    labels = {plan.spec.label for plan in plans}
+
+    def stagings() -> Iterator[Path]:  # Not read before ``out`` is checked.
+        for label, paths in stagings_by_label(out).items():
+            yield from paths if label in labels else ()
+
+    check_target(out, {plan.spec.name for plan in plans}, stagings())
+
+
+def stagings_by_label(out: Path) -> dict[str, list[Path]]:
+    """Return the staging folders of ``out`` by the label of their config, those of abandoned builds included."""
+    by_label: dict[str, list[Path]] = {}
+    folder = out / BUILD_FOLDER
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        label, _, key = path.name.rpartition("-")
+        if re.fullmatch(STAGING_KEY, key):
+            by_label.setdefault(label, []).append(path)
+    return by_label
 
 
 def check_target(out: Path, configs: Collection[str], stagings: Iterable[Path]) -> None:
@@ -58,7 +73,7 @@ def check_target(out: Path, configs: Collection[str], stagings: Iterable[Path]) 
         raise InputError(f"{out}: {ancestor} is a file, expected a folder")
     if not os.access(ancestor, os.W_OK | os.X_OK):
         raise OutputError(f"{out}: cannot be written: no permission to write in {ancestor}")
-    check_no_links(out, f"{BUILD_FOLDER}/{LOCK}", MESHES, PICTURES, *configs)
+    check_no_links(out, f"{BUILD_FOLDER}/{LOCK}", f"{BUILD_FOLDER}/{BARS_FILE}", MESHES, PICTURES, *configs)
     for staging in stagings:
         check_no_links(out, os.path.relpath(staging, out))
         for folder, folders, files in os.walk(staging):
@@ -80,14 +95,25 @@ def existing_ancestor(path: Path) -> Path:
     return Path(path.anchor)
 
 
-def _check_keeps_colour(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    published = open_folder(out).config_by_name
-    names = [plan.spec.name for plan in plans if plan.spec.colour is None and plan.spec.name in published]
-    if with_colour := [name for name in names if published[name].colour is not None]:
-        raise InputError(
-            f"{out}: contains {', '.join(with_colour)} with colour, which --no-colour would replace; choose "
-            "another folder (--out) or other configs (--config)"
-        )
+def file_matches(folder: DatasetFolder, name: str) -> bool:
+    """Return whether a file of a local dataset folder exists with the digest that the manifest has for it."""
+    path = Path(folder.root, name)
+    return path.is_file() and file_sha256(path) == folder.files.get(name)
+
+
+def stored_bars_path(out: Path, folder: DatasetFolder) -> Path:
+    """Return the path of the bars of all scenes that the manifest describes.
+
+    It is that of ``bars.parquet``, or of the copy that an interrupted build has left. Raises ``InputError`` if
+    neither matches its digest.
+    """
+    for path in (out / BARS_FILE, out / BUILD_FOLDER / BARS_FILE):
+        if path.is_file() and file_sha256(path) == folder.files.get(BARS_FILE):
+            return path
+    raise InputError(
+        f"{out}: {BARS_FILE} does not match the manifest, expected the bars of the scenes that are not built now; "
+        "restore the file, or build all configs in another folder"
+    )
 
 
 def remove_unlisted_files(out: Path, listed: Collection[str]) -> None:
@@ -108,14 +134,16 @@ def remove_temporary_files(out: Path) -> None:
                 remove_file(path)
 
 
-def remove_stagings(plan: ConfigPlan) -> None:
-    """Delete all staging folders of a config, but for a build without colour only its own.
+def remove_stagings(out: Path, plans: Iterable[ConfigPlan]) -> None:
+    """Delete all staging folders of configs, but for a build without colour only its own.
 
     The others may hold views with colour, which take hundreds of times as long.
     """
-    for staging in plan.all_stagings():
-        if plan.spec.colour is not None or staging == plan.staging.root:
-            remove_folder(staging)
+    stagings = stagings_by_label(out)
+    for plan in plans:
+        for staging in stagings.get(plan.spec.label, ()):
+            if plan.spec.colour is not None or staging == plan.staging.root:
+                remove_folder(staging)
 
 
 def remove_build_folder(folder: Path) -> None:

@@ -10,7 +10,6 @@ import multiprocessing
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, cast
 
 from dataset_builder.config.camera_site import CameraSite
@@ -18,7 +17,6 @@ from dataset_builder.config.random_views import SPACING_M, with_random_stations
 from dataset_builder.config.specs import GeneratedCageSpec, RandomViewsSpec, SceneConfigSpec
 from dataset_builder.config.surroundings import SURROUNDINGS
 from dataset_builder.pipeline.plan import ConfigPlan
-from dataset_builder.pipeline.publish import is_published
 from dataset_builder.scene.assemblies.generated import cage_assembly, spec_cage
 from dataset_builder.scene.variants.props import make_props
 from rebar_depth_bench.data.bars import Bar
@@ -32,15 +30,17 @@ class ScenePlan(ConfigPlan):
     bars: tuple[Bar, ...] = ()
     record: Mapping[str, Any] = field(default_factory=dict)
 
+    def derived(self) -> dict[str, Any]:
+        """Return the family of the cage and the record of the generator."""
+        return {"family": self.record["family"], "cage": dict(self.record)}
 
-def place_cameras(
-    plans: Sequence[ConfigPlan], out: Path, processes: int, progress: Progress = silent
-) -> list[ConfigPlan]:
-    """Return the plans; those of generated scenes that are not published yet have the stations of their cameras.
+
+def place_cameras(plans: Sequence[ConfigPlan], processes: int, progress: Progress = silent) -> list[ConfigPlan]:
+    """Return the plans; those of generated scenes have the stations of their cameras.
 
     Raises ``InputError`` for a cage that cannot be generated, or round which cameras cannot be placed.
     """
-    missing = [plan for plan in plans if is_generated(plan) and not is_published(out, plan)]
+    missing = [plan for plan in plans if is_generated(plan)]
     if not missing:
         return list(plans)
     placed: dict[str, ConfigPlan] = {}

@@ -1,17 +1,20 @@
 """Publishing of staged configs into the dataset folder, and the lock that allows one build per folder.
 
 Files are written in an order that can be repaired after an interruption at any point: first the shards, whose
-names contain the digest of their content; then mesh, contact sheet, bars and crossings; then the other pictures
-and the card; the manifest last. Files that the new manifest does not list are removed afterwards. If the card,
-bars, crossings or pictures of a folder do not match its manifest, a build was interrupted in between or an earlier
-version built it, and the next build repairs them.
+names contain the digest of their content; then meshes and contact sheets; then the strip, bars, crossings and the
+card; the manifest last. Files that the new manifest does not list are removed afterwards. Until the manifest is
+written, the shards of the old one stay, and a copy of its bars is in the build folder. If the card, bars,
+crossings or pictures of a folder do not match its manifest, a build was interrupted in between, and the next build
+repairs them.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,25 +29,32 @@ from dataset_builder.pipeline.folder import (
     MESHES,
     PICTURES,
     SHARD_DIGEST_CHARACTERS,
+    file_matches,
     remove_temporary_files,
     remove_unlisted_files,
+    stored_bars_path,
 )
-from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
-from dataset_builder.pipeline.retained import entry_problems, published_configs
+from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_record, split_into_shards
-from dataset_builder.scene.assemblies import aim_point_m, assembly_bars
-from dataset_builder.scene.model import Assembly
+from dataset_builder.scene.assemblies import assembly_bars
 from rebar_depth_bench.atomic_io import exclusive_lock, write_bytes, write_error, write_text
-from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE, crossings_entry, write_crossings
+from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters
+from rebar_depth_bench.bar_crossings.table import (
+    CROSSINGS_FILE,
+    crossings_entry,
+    read_crossings,
+    write_crossings,
+)
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, write_bars
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest, views_digest
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, DatasetFolder, open_folder
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, DatasetFolder, validated_folder
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.paths import remove_file
 from rebar_depth_bench.scoring.ground_truth import reference_errors
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.version import software_version
-from rebar_depth_bench.view_ids import TEST_SPLIT, view_id
+from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
 
 STRIP = f"{PICTURES}/scenes.webp"
 """Strip with one view of each kind of assembly."""
@@ -68,114 +78,149 @@ def build_lock(folder: Path) -> Iterator[None]:
         yield
 
 
-def is_published(out: Path, plan: ConfigPlan) -> bool:
-    """Return whether the folder already contains the shards and the mesh of the plan, with matching digests."""
-    if not (out / MANIFEST_FILE).is_file():
-        return False
-    folder = open_folder(out)
-    config = folder.config_by_name.get(plan.spec.name)
-    if config is None or any(entry_problems(config)):
-        return False
-    scenes = {scene.name: scene for scene in config.scenes}
-    scene, key = scenes.get(plan.spec.scene.name), config.key
-    if isinstance(plan.spec, SceneConfigSpec):
-        key = scene_entries(config).get(plan.spec.scene.name, {}).get("key", "")
-    if scene is None or scene.mesh is None or key != plan.key:
-        return False
-    return _files_match(folder, (*scene.shards, scene.mesh))
+@dataclass(frozen=True)
+class StagedScene:
+    """Completely staged scene: its entry in the manifest without files, its view indices by id, and its bars.
+
+    ``prefix`` is the beginning of the names of its shards: the split, and the scene if the config has several.
+    """
+
+    entry: Mapping[str, Any]
+    prefix: str
+    staging: Staging
+    views: Mapping[str, int]
+    bars: tuple[Bar, ...]
 
 
-def scene_entries(config: DatasetConfig) -> Mapping[str, Mapping[str, Any]]:
-    """Return the entries of the scenes of a config of several, by name, as its manifest has them."""
-    return {entry["name"]: entry for entry in config.manifest_entry.get("scenes", ())}
+def publish_plans(
+    out: Path, folder: DatasetFolder | None, plans: Sequence[ConfigPlan], kept: Sequence[DatasetConfig]
+) -> DatasetFolder:
+    """Publish the completely staged scenes of one config beside the published scenes that are ``kept``.
+
+    Arguments and result are those of ``publish``.
+    """
+    spec = plans[0].spec
+    head = {
+        "has_splits": isinstance(spec, SceneConfigSpec),
+        "rig": {"width": spec.rig.width, "height": spec.rig.height},
+        "colour": config_parameters(spec)["colour"],
+    }
+    return publish(out, folder, spec.name, head, [_staged_scene(plan) for plan in plans], kept)
 
 
-def repair_metadata(out: Path, plans: Sequence[ConfigPlan]) -> None:
+def _staged_scene(plan: ConfigPlan) -> StagedScene:
+    spec, parameters = plan.spec, config_parameters(plan.spec)
+    entry = {
+        **parameters["scene"],
+        "split": parameters.get("split", TEST_SPLIT),
+        "protocol": parameters["protocol"],
+        "protocol_views": view_count(spec.protocol),
+        "rig": parameters["rig"],
+        **plan.derived(),
+        "key": plan.key,
+        "generator": dict(generator_versions()),
+        "mesh": f"{MESHES}/{spec.scene.name}.ply",
+    }
+    prefix = spec.scene_prefix.rstrip("-") or TEST_SPLIT
+    return StagedScene(entry, prefix, plan.staging, plan.view_ids, plan.bars)
+
+
+def publish(
+    out: Path,
+    folder: DatasetFolder | None,
+    name: str,
+    head: Mapping[str, Any],
+    staged: Sequence[StagedScene],
+    kept: Sequence[DatasetConfig] = (),
+) -> DatasetFolder:
+    """Publish a config of staged and ``kept`` scenes in ``folder``, and remove the files that it replaces.
+
+    ``head`` has the keys of the config's entry other than its scenes, views and digests. Returns the dataset that
+    the folder then holds.
+    """
+    digests: dict[str, str] = {}
+    scenes = {config.scene.name: (config.scene.entry, config.views) for config in kept}
+    for scene in staged:
+        shards = _publish_shards(out, name, scene.prefix, scene.staging, list(scene.views.values()))
+        records = [read_staged_record(scene.staging.row(index), view_id) for view_id, index in scene.views.items()]
+        size = sum((out / shard).stat().st_size for shard in shards)
+        scenes[scene.entry["name"]] = {**scene.entry, "shards": list(shards), "bytes": size}, tuple(records)
+        digests |= shards
+    ordered = sorted(scenes.values(), key=lambda scene: _order(scene[0]))
+    views = [view for _, of_scene in ordered for view in of_scene]
+    entry = {
+        "name": name,
+        **head,
+        "scenes": [scene for scene, _ in ordered],
+        "sheet": f"{PICTURES}/{name}.webp",
+        "ground_truth_digest": views_digest(views),
+        "views": [view.model_dump() for view in views],
+    }
+    published = None if folder is None else folder.config_by_name.get(name)
+    entry["references"] = _references(_config(out, name, entry), published)
+    config = _config(out, name, entry)
+    for scene in staged:
+        if mesh := scene.entry["mesh"]:
+            content = scene.staging.mesh.read_bytes()
+            write_bytes(out / mesh, content)
+            digests[mesh] = hashlib.sha256(content).hexdigest()
+    write_contact_sheet(config, out / config.sheet)
+    digests[config.sheet] = file_sha256(out / config.sheet)
+    configs = {**(folder.config_by_name if folder is not None else {}), name: config}
+    return write_folder(out, folder, configs, digests, {scene.entry["name"]: scene.bars for scene in staged})
+
+
+def _order(scene: Mapping[str, Any]) -> tuple[int, int]:
+    """Return the place of a scene: by split, then by the number of its cage."""
+    return SPLITS.index(scene["split"]), scene.get("assembly", {}).get("number", 0)
+
+
+def _config(out: Path, name: str, entry: Mapping[str, Any]) -> DatasetConfig:
+    return DatasetConfig(**DatasetConfig.fields_of_entry(name, json.loads(json.dumps(entry))), root=str(out))
+
+
+def _references(config: DatasetConfig, published: DatasetConfig | None) -> dict[str, Any]:
+    """Return the reference errors of each split; those of splits whose views have not changed are taken over."""
+    known = {}
+    if published is not None and published.imported is None:
+        known = {
+            split: published.of_split(split).views for split in published.references if split in published.splits
+        }
+    return {
+        split: published.references[split].model_dump()
+        if published is not None and known.get(split) == config.of_split(split).views
+        else reference_errors(config.of_split(split)).to_dict()
+        for split in config.splits
+    }
+
+
+def repair_metadata(out: Path, folder: DatasetFolder, plans: Sequence[ConfigPlan]) -> DatasetFolder:
     """Rewrite bars, crossings, card, pictures and manifest if any of them does not match.
 
-    ``plans`` are those of one config.
+    ``plans`` are those of one config. Returns the dataset that the folder then holds.
     """
-    folder = open_folder(out)
     config = folder.config(plans[0].spec.name)
-    if not _files_match(folder, (BARS_FILE, CROSSINGS_FILE, CARD, STRIP, config.sheet)):
-        write_contact_sheet(config, out / config.sheet)
-        write_scene_bars(out, {plan.spec.scene.name: assembly_bars(plan.spec.scene.assembly) for plan in plans})
-        write_manifest(out, folder.config_by_name)
-
-
-def _files_match(folder: DatasetFolder, names: Iterable[str]) -> bool:
-    paths = {name: Path(folder.root, name) for name in names}
-    return all(path.is_file() and file_sha256(path) == folder.files.get(name) for name, path in paths.items())
-
-
-def publish_config(out: Path, plan: ConfigPlan) -> None:
-    """Publish a completely staged config in the folder and remove the files it replaces."""
-    name, scene = plan.spec.name, plan.spec.scene.name
-    mesh = f"{MESHES}/{scene}.ply"
-    write_bytes(out / mesh, plan.staging.mesh.read_bytes())
-    entry: dict[str, Any] = {
-        **config_parameters(plan.spec),
-        "key": plan.key,
-        "aim_point_m": aim_point_m(plan.assembly).tolist(),
-        **_placement(plan.assembly),
-        "protocol_views": view_count(plan.spec.protocol),
-        "generator": generator_versions(),
-        "mesh": mesh,
-    }
-    publish_entry(out, name, entry, plan.staging, plan.indices, {scene: plan.assembly.bars})
-
-
-def publish_entry(
-    out: Path,
-    name: str,
-    parameters: Mapping[str, Any],
-    staging: Staging,
-    indices: Sequence[int],
-    bars: Mapping[str, tuple[Bar, ...]],
-) -> None:
-    """Publish a config: the staged rows, an entry with the ``parameters``, and the ``bars`` by scene."""
-    records = [read_staged_record(staging.row(index), view_id(name, index)) for index in indices]
-    shards = publish_shards(out, name, TEST_SPLIT, staging, indices)
-    entry = {
-        **parameters,
-        "sheet": f"{PICTURES}/{name}.webp",
-        "shards": shards,
-        "bytes": sum((out / shard).stat().st_size for shard in shards),
-        "ground_truth_digest": views_digest(records),
-        "views": [record.model_dump() for record in records],
-    }
-    without_reference = DatasetConfig(**DatasetConfig.fields_of_entry(name, entry), root=str(out))
-    entry["reference"] = reference_errors(without_reference).to_dict()
-    config = DatasetConfig(**DatasetConfig.fields_of_entry(name, entry), root=str(out))
+    names = (BARS_FILE, CROSSINGS_FILE, CARD, STRIP, config.sheet)
+    if all(file_matches(folder, name) for name in names):
+        return folder
     write_contact_sheet(config, out / config.sheet)
-    write_scene_bars(out, bars)
-    write_manifest(out, {**published_configs(out), config.name: config})
+    digests = {config.sheet: file_sha256(out / config.sheet)}
+    bars = {plan.spec.scene.name: assembly_bars(plan.spec.scene.assembly) for plan in plans}
+    return write_folder(out, folder, folder.config_by_name, digests, bars)
 
 
-def _placement(assembly: Assembly) -> dict[str, Any]:
-    """Return where the bars of a user's file were placed, as an entry of the manifest."""
-    matrix = assembly.world_from_source
-    return {} if matrix is None else {"world_from_source": matrix.tolist()}
-
-
-def write_scene_bars(out: Path, bars: Mapping[str, tuple[Bar, ...]]) -> None:
-    """Write the bars of some scenes into the table of bars, and the crossings of all scenes."""
-    path = out / BARS_FILE
-    published = read_bars(path) if path.is_file() else {}
-    write_bars(path, {**published, **bars})
-    write_crossings(out / CROSSINGS_FILE, {**published, **bars})
-
-
-def remove_leftovers(out: Path) -> None:
+def remove_leftovers(out: Path, folder: DatasetFolder | None) -> None:
     """Remove the files left by an interrupted build: temporary files and files not listed in the manifest."""
-    remove_unlisted_files(out, _listed_files(published_configs(out).values()))
+    remove_unlisted_files(out, _listed_files(folder.config_by_name.values() if folder is not None else ()))
     remove_temporary_files(out)
 
 
-def publish_shards(
+def _publish_shards(
     out: Path, config: str, prefix: str, staging: Staging, view_indices: Sequence[int]
-) -> list[str]:
+) -> dict[str, str]:
     """Pack the shards and give each its name in the folder, which carries the digest of all of them.
+
+    Return their SHA-256 digests by name.
 
     ``prefix`` is the beginning of the names of the files: the split, and the scene if the config has several.
     """
@@ -183,7 +228,8 @@ def publish_shards(
     packed_paths = [staging.shard(shard) for shard in range(len(shard_indices))]
     for target, indices in zip(packed_paths, shard_indices, strict=True):
         pack_shard([staging.row(index) for index in indices], target)
-    digest = parameters_digest([file_sha256(path) for path in packed_paths])[:SHARD_DIGEST_CHARACTERS]
+    digests = [file_sha256(path) for path in packed_paths]
+    digest = parameters_digest(digests)[:SHARD_DIGEST_CHARACTERS]
     names = [
         f"{config}/{prefix}-{shard:05d}-of-{len(shard_indices):05d}-{digest}.parquet"
         for shard in range(len(shard_indices))
@@ -191,21 +237,39 @@ def publish_shards(
     (out / config).mkdir(exist_ok=True)
     for path, name in zip(packed_paths, names, strict=True):
         path.replace(out / name)
-    return names
+    return dict(zip(names, digests, strict=True))
 
 
-def write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
-    """Write contact sheets that are missing, strip, card and manifest; remove files not listed."""
+def write_folder(
+    out: Path,
+    folder: DatasetFolder | None,
+    configs: Mapping[str, DatasetConfig],
+    digests: Mapping[str, str],
+    bars: Mapping[str, tuple[Bar, ...]],
+) -> DatasetFolder:
+    """Write bars, crossings, strip, card and manifest; remove files not listed.
+
+    ``digests`` are those of the shards, meshes and contact sheets that have been written, ``bars`` those of their
+    scenes. Digests, bars and crossings of all others are those of ``folder``, the dataset so far: files are not
+    hashed again, so that damage still shows. Returns the dataset that the folder then holds.
+
+    Raises ``InputError`` as ``stored_bars_path`` if the bars of another scene are needed.
+    """
     order = [*CONFIGS, *sorted(set(configs) - set(CONFIGS))]
     ordered = [configs[name] for name in order if name in configs]
     version, digest = software_version(), views_digest(view for config in ordered for view in config.views)
+    card = dataset_card(version, digest, ordered)
+    known = {**(folder.files if folder is not None else {}), **digests}
+    written = [STRIP, BARS_FILE, CROSSINGS_FILE, CARD]
     for config in ordered:
         if not (out / config.sheet).is_file():
             write_contact_sheet(config, out / config.sheet)
+            written.append(config.sheet)
     by_scene = {_strip_key(config): config for config in reversed(ordered)}
     write_scenes_strip(list(reversed(by_scene.values())), out / STRIP)
-    write_text(out / CARD, dataset_card(version, digest, ordered))
-    metadata = {CARD, BARS_FILE, CROSSINGS_FILE}
+    _write_scene_bars(out, folder, ordered, bars)
+    write_text(out / CARD, card)
+    known |= {name: file_sha256(out / name) for name in written}
     manifest = {
         "format": MANIFEST_FORMAT,
         "version": version,
@@ -213,18 +277,48 @@ def write_manifest(out: Path, configs: Mapping[str, DatasetConfig]) -> None:
         "ground_truth": {"digest": digest},
         "crossings": crossings_entry(out / CROSSINGS_FILE),
         "configs": {config.name: config.manifest_entry for config in ordered},
-        "files": {name: file_sha256(out / name) for name in sorted(metadata | _listed_files(ordered))},
+        "files": {name: known[name] for name in sorted({*written, *_listed_files(ordered)})},
     }
-    write_text(out / MANIFEST_FILE, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
+    published = validated_folder(manifest, [], str(out), out / MANIFEST_FILE)
+    write_text(out / MANIFEST_FILE, manifest_text(manifest))
+    remove_file(out / BUILD_FOLDER / BARS_FILE)
     remove_unlisted_files(out, _listed_files(ordered))
+    return published
+
+
+def manifest_text(manifest: Mapping[str, Any]) -> str:
+    """Return the text of a manifest."""
+    return json.dumps(manifest, indent=1, allow_nan=False) + "\n"
+
+
+def _write_scene_bars(
+    out: Path,
+    folder: DatasetFolder | None,
+    configs: Iterable[DatasetConfig],
+    bars: Mapping[str, tuple[Bar, ...]],
+) -> None:
+    """Write the bars and crossings of all scenes; those of scenes without new ``bars`` are taken over."""
+    others = {scene.name for config in configs for scene in config.scenes} - bars.keys()
+    known: dict[str, Crossings] = {}
+    if others and folder is not None:
+        content = stored_bars_path(out, folder).read_bytes()
+        write_bytes(out / BUILD_FOLDER / BARS_FILE, content)  # The old ones, until the manifest is written.
+        stored = read_bars(out / BUILD_FOLDER / BARS_FILE)
+        bars = {**{scene: stored.get(scene, ()) for scene in others}, **bars}
+        same_rules = crossing_parameters().items() <= folder.crossings.items()
+        if same_rules and file_matches(folder, CROSSINGS_FILE):
+            crossings = read_crossings(out / CROSSINGS_FILE)
+            known = {scene: crossings[scene] for scene in others & crossings.keys()}
+    write_bars(out / BARS_FILE, bars)
+    write_crossings(out / CROSSINGS_FILE, bars, known)
 
 
 def _strip_key(config: DatasetConfig) -> str:
     """Return the key of a panel of the strip: assembly kind, digest of a user's file, or an imported config."""
-    if config.imported is not None or config.has_splits:
+    if config.has_splits:
         return config.name
-    assembly = config.manifest_entry["scene"]["assembly"]
-    return str(assembly.get("sha256", assembly["kind"]))
+    assembly = config.scene.assembly
+    return config.name if assembly is None else assembly.sha256 or assembly.kind
 
 
 def _listed_files(configs: Iterable[DatasetConfig]) -> set[str]:

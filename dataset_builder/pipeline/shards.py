@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.columns import COLUMNS, ROW_SCHEMA, column_kind, features
 from rebar_depth_bench.data.config_tables import ViewRecord
-from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeView, absent_cell
+from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeTruth, EyeView, absent_cell
 from rebar_depth_bench.data.parquet import open_parquet
 from rebar_depth_bench.data.shards import rows_table
 from rebar_depth_bench.errors import InputError, Problem, escape_text
@@ -106,6 +106,23 @@ def pack_shard(rows: Sequence[Path], target: Path) -> None:
             writer.write_table(table.replace_schema_metadata(schema.metadata))
 
 
+def stage_published_rows(shard: Path, targets: Mapping[str, Path], records: Mapping[str, ViewRecord]) -> None:
+    """Stage the rows of a published shard whose views have ``records``, at the ``targets`` of their ids.
+
+    A shard that cannot be read, and row groups of other columns or of several rows, are left out, so that their
+    views are rendered again.
+    """
+    rows: list[pa.Table] = []
+    table = rows_table(ROW_SCHEMA.names, VIEWS_PER_SHARD)
+    with suppress(OSError, ValueError), open_regular(shard) as stream, open_parquet(stream, table) as (file, _):
+        rows += [file.read_row_group(group) for group in range(file.num_row_groups)]
+    for row in rows:
+        if row.schema.equals(ROW_SCHEMA) and row.num_rows == 1:
+            view_id = row["view_id"][0].as_py()
+            if view_id in records:
+                stage_row(targets[view_id], row, records[view_id])
+
+
 def _read_staged_row(path: Path) -> pa.Table:
     with _open_staged_row(path) as file:
         table = file.read()
@@ -142,7 +159,7 @@ def encode_view(view: View) -> tuple[pa.Table, ViewRecord]:
         columns |= {f"{name}_{kind}": getattr(eye, kind) for kind in ("rgb", "mask", "bars")}
         columns |= {f"{name}_{kind}": getattr(eye.camera, kind) for kind in CAMERA_KINDS}
         columns[f"{name}_depth"] = eye.depth_m
-    return encode_row(columns), _view_record(view)
+    return encode_row(columns), view_record(view.view_id, view.left, view.right)
 
 
 def encode_row(columns: Mapping[str, Any]) -> pa.Table:
@@ -179,12 +196,12 @@ def _image_cell(content: bytes) -> dict[str, bytes | None]:
     return {"bytes": content, "path": None}
 
 
-def _view_record(view: View) -> ViewRecord:
-    left = view.left
+def view_record(view_id: str, left: EyeTruth, right: EyeTruth | None) -> ViewRecord:
+    """Return the record of a view for the manifest; ``right`` is None without depth of the right camera."""
     return ViewRecord(
-        view_id=view.view_id,
+        view_id=view_id,
         left=left.digest(),
-        right=view.right.digest(),
-        steel_px=int(np.count_nonzero(left.mask)),
+        right=right.digest() if right is not None else None,
+        steel_px=None if left.mask is None else int(np.count_nonzero(left.mask)),
         scored_px=len(scored_pixels(left.mask, left.depth_m)),
     )

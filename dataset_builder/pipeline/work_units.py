@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -75,15 +75,18 @@ class UnitResult:
     rows: tuple[StagedRow, ...] = ()
 
 
-def remaining_units(plan: ConfigPlan) -> list[WorkUnit]:
-    """Return the units of the views not staged yet; the first one requests the mesh if that is not staged."""
+def remaining_units(plan: ConfigPlan, finished: Collection[int] = ()) -> list[WorkUnit]:
+    """Return the units of the views not staged yet; the first one requests the mesh if that is not staged.
+
+    Views with ``finished`` indices are left out.
+    """
     known_mesh_sha256, software_versions = _known_mesh_sha256(plan.staging), generator_versions()
     needs_mesh = not plan.staging.mesh.is_file()
     views = VIEWS_WITHOUT_COLOUR if plan.spec.colour is None else VIEWS_PER_SHARD
     incomplete = [
         (position * views // VIEWS_PER_SHARD, missing)
         for position, run in enumerate(split_into_shards(plan.indices, views))
-        if (missing := tuple(index for index in run if not plan.staging.row(index).is_file()))
+        if (missing := tuple(i for i in run if i not in finished and not plan.staging.row(i).is_file()))
     ]
     if needs_mesh and not incomplete:
         incomplete = [(0, ())]
@@ -169,6 +172,12 @@ def _known_mesh_sha256(staging: Staging) -> str | None:
     if not re.fullmatch(rb"[0-9a-f]{64}", content):
         raise InputError(f"{path}: is not a digest, expected 64 hexadecimal digits; delete {staging.root}")
     return content.decode()
+
+
+def stage_mesh_digest(staging: Staging, sha256: str) -> None:
+    """Require that the mesh of all views to be rendered has this digest, unless there is one already."""
+    if _known_mesh_sha256(staging) is None:
+        write_text(_mesh_digest_path(staging), sha256)
 
 
 def _mesh_digest_path(staging: Staging) -> Path:

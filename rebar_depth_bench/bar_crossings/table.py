@@ -82,9 +82,16 @@ def folder_crossings(folder: DatasetFolder, bars: Mapping[str, Sequence[Bar]] | 
     return FolderCrossings(by_scene, CROSSINGS_FILE, folder.files[CROSSINGS_FILE])
 
 
-def write_crossings(path: Path, bars: Mapping[str, Sequence[Bar]]) -> None:
-    """Write the crossings of the bars of all scenes, sorted by scene name."""
-    rows = [row for scene, of_scene in sorted(bars.items()) for row in _rows(scene, scene_crossings(of_scene))]
+def write_crossings(
+    path: Path, bars: Mapping[str, Sequence[Bar]], known: Mapping[str, Crossings] | None = None
+) -> None:
+    """Write the crossings of the bars of all scenes, sorted by scene name; ``known`` ones are not computed."""
+    by_scene = {**dict.fromkeys(bars), **(known or {})}
+    rows = [
+        row
+        for scene, crossings in sorted(by_scene.items(), key=lambda item: item[0])
+        for row in _rows(scene, scene_crossings(bars[scene]) if crossings is None else crossings)
+    ]
     with atomic_replace(path) as temporary:
         pq.write_table(pa.Table.from_pylist(rows, schema=CROSSINGS_SCHEMA), temporary)
 

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.parquet import Table, open_parquet, read_rows
+from rebar_depth_bench.data.parquet_footer import read_footer
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.limits import TABLE_BYTES
 from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN
@@ -75,6 +76,11 @@ class Bar:
         return bool(self.axis_m)
 
     @property
+    def decoded_bytes(self) -> int:
+        """Size in the decoded table, which ``TABLE_BYTES`` limits: mainly that of the points of both lines."""
+        return 24 * (len(self.axis_m) + len(self.nominal_axis_m)) + 40
+
+    @property
     def length_m(self) -> float:
         """Length of the centreline, metres; NaN without one."""
         if not self.has_axis:
@@ -93,9 +99,7 @@ def read_bars(path: Path) -> dict[str, tuple[Bar, ...]]:
     Raises ``DatasetError`` if the file is missing, is not such a table, is larger than ``TABLE_BYTES``, or holds
     an invalid bar or a repeated id.
     """
-    max_bytes = TABLE_BYTES.value()
-    max_values = {"axis": max_bytes, NOMINAL_AXIS: max_bytes}
-    table = Table(BARS_SCHEMA, max_bytes // 64, max_bytes, max_values, _OPTIONAL)
+    table = _table()
     scenes: dict[str, dict[int, Bar]] = {}
     try:
         with open_regular(path) as stream, open_parquet(stream, table) as (file, _):
@@ -110,6 +114,21 @@ def read_bars(path: Path) -> dict[str, tuple[Bar, ...]]:
         reason = escape_text(str(error) or type(error).__name__)
         raise DatasetError(f"{path}: cannot be read as a table of bars: {reason}") from error
     return {scene: tuple(bars.values()) for scene, bars in scenes.items()}
+
+
+def _table() -> Table:
+    max_bytes = TABLE_BYTES.value()
+    max_values = {"axis": max_bytes, NOMINAL_AXIS: max_bytes}
+    return Table(BARS_SCHEMA, max_bytes // 64, max_bytes, max_values, _OPTIONAL)
+
+
+def decoded_bytes(path: Path) -> int:
+    """Return the decoded size of a ``bars.parquet``, as ``TABLE_BYTES`` limits it; 0 if it cannot be read."""
+    try:
+        with open_regular(path) as stream:
+            return _table().decoded_bytes(read_footer(stream, _table().max_footer_bytes))
+    except (OSError, ValueError):
+        return 0
 
 
 def bars(root: str | Path) -> DataFrame:

@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import Field, Strict, StringConstraints, field_validator
+from pydantic import ConfigDict, Field, Strict, StringConstraints, ValidationInfo, field_validator, model_validator
 
 from rebar_depth_bench.data.columns import OPTIONAL_COLUMNS
 from rebar_depth_bench.data.manifest_table import ManifestTable
+from rebar_depth_bench.data.trajectory import AnyTrajectory, trajectory_of
 from rebar_depth_bench.errors import escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN, PATH_PATTERN, VIEW_ID_PATTERN
 from rebar_depth_bench.validation import (
     Expected,
     StrictModel,
+    Triple,
     check_unique,
     field_error,
     number,
     one_of,
+    text,
+    three_numbers,
     whole_number,
 )
-from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
+from rebar_depth_bench.view_ids import SPLITS
 
-SCENE_FILES = ("mesh", "shards")
-"""Keys of a scene that the entry of a config of one scene has beside the scene."""
 DIGEST_PATTERN = "sha256:[0-9a-f]{64}"
 Name = Annotated[str, StringConstraints(pattern=f"^{NAME_PATTERN}$"), Expected(f"a name of {NAME_LETTERS}")]
 RelativePath = Annotated[
@@ -37,6 +40,7 @@ Sha256 = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
 Digest = Annotated[str, StringConstraints(pattern=f"^{DIGEST_PATTERN}$"), Expected("sha256: and 64 hex digits")]
 _Side = Annotated[int, whole_number(1, 16384)]
 _Length = Annotated[float, number(0, 10)]
+_Count = Annotated[int, Expected("a whole number from 0", lambda count: count >= 0)]
 _Error = Annotated[float, Expected("a number from 0 to 1e+09", lambda error: 0 <= error <= 1e9)]
 """Error of a reference; it is 0 where a view has one scored pixel."""
 
@@ -56,10 +60,34 @@ class ViewRecord(StrictModel):
     scored_px: Annotated[int, Field(ge=0)]
 
 
+class ImageLight(ManifestTable):
+    """Panorama that lights a scene, by the name of its image."""
+
+    image: Annotated[str, text(200)]
+
+
 class Appearance(ManifestTable):
-    """Names of the appearance variants of a scene."""
+    """Names of the appearance variants of a scene, and its panorama if it has one."""
 
     variants: Annotated[tuple[Name, ...], Strict(False)] = ()
+    image_light: ImageLight | None = None
+
+
+class Assembly(ManifestTable):
+    """Steel of a scene: its kind, the file if it comes from one, and all other parameters as in the manifest."""
+
+    model_config = ConfigDict(extra="allow")
+
+    kind: Annotated[str, text(60)]
+    path: Annotated[str, text(1000)] | None = None
+    sha256: Annotated[str, text(64)] | None = None
+
+
+class Colour(ManifestTable):
+    """Samples per pixel of rendered colour, everywhere and around the steel; None in an imported config."""
+
+    samples: _Count | None = None
+    steel_samples: _Count | None = None
 
 
 class _BoardTable(StrictModel):
@@ -80,6 +108,9 @@ class Imported(ManifestTable):
     truth_sigma_m: Annotated[float, number(1e-9, 10)]
     absent_columns: Annotated[tuple[str, ...], Strict(False)] = ()
     has_poses: bool = True
+    description: Annotated[str, StringConstraints(max_length=1000)] = ""
+    source: Annotated[str, StringConstraints(max_length=1000)] = ""
+    licence: Annotated[str, StringConstraints(max_length=200)] = ""
 
     @field_validator("absent_columns")
     @classmethod
@@ -103,25 +134,63 @@ _NEEDED = {
 """Columns that cannot be present without the column that is the key."""
 
 
-class Scene(ManifestTable):
-    """Scene of a config, with its mesh and its shards, which hold the rows of no other scene.
+class SceneRig(ManifestTable):
+    """Optics of a scene: pixel grid, baseline in metres, and the camera by its name if it has one."""
 
-    ``board`` is the ArUco board under the assembly, or None; ``mesh`` is None in a config that was imported.
-    ``family`` is the kind of cage in a config of generated scenes, otherwise None.
+    grid: Annotated[str, one_of("ideal", "raw", "rectified")]
+    baseline_m: _Length
+    camera: Annotated[str, StringConstraints(max_length=100)] = ""
+
+
+class Scene(ManifestTable):
+    """Scene of a config, with its cameras, its mesh and its shards, which hold the rows of no other scene.
+
+    ``board`` is the ArUco board under the assembly, or None; ``protocol_views`` is the number of views of the full
+    trajectory; ``aim_point_m`` is the point that its cameras aim at, world metres, if they share one; ``bytes`` is
+    the size of the shards; ``key`` is the digest of all parameters. ``family`` is the kind of cage of a generated
+    scene, otherwise None. ``assembly``, ``protocol``, ``rig`` and ``mesh`` are None in a config that was imported.
+    ``entry`` is the scene as it was written, with all parameters of the build.
     """
 
     name: Name
-    split: Annotated[str, one_of(*SPLITS)] = TEST_SPLIT
+    split: Annotated[str, one_of(*SPLITS)]
     family: Name | None = None
+    assembly: Assembly | None = None
     board: BoardSpec | None
+    environment: Annotated[str, StringConstraints(max_length=60)] = ""
     appearance: Appearance = Appearance()
+    protocol: AnyTrajectory | None = None
+    protocol_views: Annotated[int, whole_number(1, 1_000_000)]
+    rig: SceneRig | None = None
+    aim_point_m: Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers, [x, y, z]")] | None = None
+    key: Annotated[str, StringConstraints(max_length=200)]
     mesh: RelativePath | None
     shards: Annotated[tuple[RelativePath, ...], Strict(False)]
+    bytes: _Count
+    entry: dict[str, Any] = Field(repr=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _keep_entry(cls, values: Any) -> Any:
+        return {**values, "entry": values} if isinstance(values, Mapping) else values
 
     @field_validator("board", mode="before")
     @classmethod
     def _make_board(cls, fields: Any) -> BoardSpec | None:
         return None if fields is None else BoardSpec(**_BoardTable.model_validate(fields).model_dump())
+
+    @field_validator("protocol", mode="before")
+    @classmethod
+    def _make_protocol(cls, fields: Any) -> AnyTrajectory | None:
+        return None if fields is None else trajectory_of(fields)
+
+    @field_validator("protocol_views")
+    @classmethod
+    def _check_protocol_views(cls, protocol_views: int, info: ValidationInfo) -> int:
+        trajectory = info.data.get("protocol")
+        if trajectory is not None and protocol_views != trajectory.views:
+            raise field_error(f"got {protocol_views}", f"the trajectory's {trajectory.views} views", "conflict")
+        return protocol_views
 
     @field_validator("shards")
     @classmethod

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from typing import Annotated, Any, Self
 
-from pydantic import Field, Strict, StringConstraints, ValidationInfo, field_validator
+from pydantic import Field, Strict, ValidationInfo, field_validator
 
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.config_tables import (
-    SCENE_FILES,
+    Colour,
     Digest,
     Imported,
     Name,
@@ -20,11 +20,10 @@ from rebar_depth_bench.data.config_tables import (
     Scene,
     ViewRecord,
 )
-from rebar_depth_bench.data.digests import views_digest
+from rebar_depth_bench.data.digests import parameters_digest, views_digest
 from rebar_depth_bench.data.location import Located
-from rebar_depth_bench.data.trajectory import Survey, Trajectory, trajectory_of
 from rebar_depth_bench.errors import DatasetError, escape_text
-from rebar_depth_bench.validation import Expected, check_unique, field_error, whole_number
+from rebar_depth_bench.validation import check_unique, field_error
 from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT, scene_prefix
 
 
@@ -33,9 +32,9 @@ class DatasetConfig(Located):
 
     ``manifest_entry`` is the entry of the whole config as it was written, with all parameters of the build.
     ``has_splits`` is False for a config of one scene, whose views are all in the split ``test`` and have ids
-    ``<config>/<0000>``; in other configs the ids are ``<config>/<split>-<scene>-<0000>``. ``reference`` is None in
-    configs of several scenes, ``colour`` in configs without colour, whose colour columns are null in every row.
-    ``imported`` is None in configs that were rendered.
+    ``<config>/<0000>``; in other configs the ids are ``<config>/<split>-<scene>-<0000>``. ``references`` are the
+    reference errors by split. ``colour`` is None in configs without colour, whose colour columns are null in every
+    row. ``imported`` is None in configs that were rendered.
     """
 
     name: Name
@@ -45,57 +44,52 @@ class DatasetConfig(Located):
     rig: Rig
     views: Annotated[tuple[ViewRecord, ...], Strict(False)]
     ground_truth_digest: Digest
-    protocol: Trajectory | Survey | None = None
-    protocol_views: Annotated[int, whole_number(1, 1_000_000)] = 0
-    key: Annotated[str, StringConstraints(max_length=200)]
     sheet: RelativePath
-    reference: References | None = None
-    colour: Annotated[dict[str, Any] | None, Expected("parameters of colour, or null")] = Field({}, repr=False)
+    references: dict[str, References] = Field({})
+    colour: Colour | None
     manifest_entry: dict[str, Any] = Field(repr=False)
 
     @classmethod
     def fields_of_entry(cls, name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the fields of a config from its entry in the manifest, ``root`` left out.
-
-        An entry of one scene has ``scene``, ``mesh`` and ``shards``; another has ``scenes``, each with its own.
-        """
-        fields = {**entry, "name": name, "manifest_entry": entry, "has_splits": "scenes" in entry}
-        if "scenes" not in entry and isinstance(entry.get("scene"), dict):
-            files = {key: entry[key] for key in SCENE_FILES if key in entry}
-            fields["scenes"] = [{**entry["scene"], "split": TEST_SPLIT, **files}]
-        return fields
-
-    @field_validator("protocol", mode="before")
-    @classmethod
-    def _make_protocol(cls, fields: Any) -> Trajectory | Survey | None:
-        return None if fields is None else trajectory_of(fields)
+        """Return the fields of a config from its entry in the manifest, ``root`` left out."""
+        return {**entry, "name": name, "manifest_entry": entry}
 
     @field_validator("scenes")
     @classmethod
     def _check_scenes(cls, scenes: tuple[Scene, ...], info: ValidationInfo) -> tuple[Scene, ...]:
         check_unique([scene.name for scene in scenes], "scene")
         check_unique([shard for scene in scenes for shard in scene.shards], "shard")
-        if info.data.get("imported") is None and any(scene.mesh is None for scene in scenes):
-            raise field_error("mesh is null", "the mesh of a scene that was rendered", "conflict")
+        if info.data.get("imported") is None:
+            for scene in scenes:
+                for key in ("mesh", "assembly", "protocol", "rig"):
+                    if getattr(scene, key) is None:
+                        found = f"{key} of scene {scene.name} is null"
+                        raise field_error(found, f"the {key} of a scene that was rendered", "conflict")
+        if not info.data.get("has_splits", True) and [scene.split for scene in scenes] != [TEST_SPLIT]:
+            raise field_error(f"got {len(scenes)} scenes", f"one scene of the split {TEST_SPLIT}", "conflict")
         return scenes
 
     @field_validator("views")
     @classmethod
     def _check_views(cls, views: tuple[ViewRecord, ...], info: ValidationInfo) -> tuple[ViewRecord, ...]:
         check_unique([view.view_id for view in views], "view")
-        name, rig, scenes = info.data.get("name"), info.data.get("rig"), info.data.get("scenes")
-        prefixes = (
-            {scene_prefix(scene.split, scene.name) for scene in scenes or ()} if info.data["has_splits"] else set()
-        )
+        name, rig, scenes = info.data.get("name"), info.data.get("rig"), info.data.get("scenes", ())
+        has_splits = info.data.get("has_splits", False)
+        by_prefix = {scene_prefix(scene.split, scene.name) if has_splits else "": scene for scene in scenes}
         imported: Imported | None = info.data.get("imported")
         absent = imported.absent_columns if imported is not None else ()
         for view in views:
             config, _, suffix = view.view_id.partition("/")
             if name is not None and config != name:
                 raise field_error(f"got {view.view_id}", f"view ids that start with {name}/")
-            if prefixes and (suffix.rstrip("0123456789") not in prefixes or not suffix[-4:].isdecimal()):
+            prefix = suffix.rstrip("0123456789")
+            scene, number = by_prefix.get(prefix), suffix.removeprefix(prefix)
+            if has_splits and (scene is None or len(number) < 4):
                 expected = f"{name}/<split>-<scene>-<0000> with the split and name of a scene"
                 raise field_error(f"got {view.view_id}", expected)
+            if scene is not None and number and int(number) >= scene.protocol_views:
+                expected = f"an index below {scene.protocol_views}, the protocol_views of scene {scene.name}"
+                raise field_error(f"got {view.view_id}", expected, "conflict")
             if (view.right is None) != ("right_depth" in absent) or (view.steel_px is None) != (
                 "left_mask" in absent
             ):
@@ -118,21 +112,6 @@ class DatasetConfig(Located):
             raise field_error(f"got {digest}", f"the digest of the views, {expected}", "conflict")
         return digest
 
-    @field_validator("protocol_views")
-    @classmethod
-    def _check_protocol_views(cls, protocol_views: int, info: ValidationInfo) -> int:
-        view_ids = [view.view_id for view in info.data.get("views", ())]
-        indices = [int(index) for view_id in view_ids if (index := view_id.rpartition("/")[2]).isdecimal()]
-        least = max(len(view_ids), 1 + max(indices, default=-1))
-        if protocol_views < least:
-            raise field_error(
-                f"got {protocol_views}", f"at least {least}: views and their largest index", "conflict"
-            )
-        trajectory = info.data.get("protocol")
-        if trajectory is not None and protocol_views != trajectory.views:
-            raise field_error(f"got {protocol_views}", f"the trajectory's {trajectory.views} views", "conflict")
-        return protocol_views
-
     @property
     def splits(self) -> tuple[str, ...]:
         """Splits that have scenes."""
@@ -147,15 +126,15 @@ class DatasetConfig(Located):
         return self.scenes[0]
 
     @property
-    def scene_entry(self) -> Mapping[str, Any]:
-        """Part of ``manifest_entry`` with the parameters of the only scene: all of it in a config without splits.
+    def key(self) -> str:
+        """Digest of all parameters of the scenes."""
+        keys = [scene.key for scene in self.scenes]
+        return keys[0] if len(keys) == 1 else parameters_digest(keys)
 
-        Raises ``DatasetError`` as ``scene``.
-        """
-        if not self.has_splits:
-            return self.manifest_entry
-        entries: dict[str, dict[str, Any]] = {entry["name"]: entry for entry in self.manifest_entry["scenes"]}
-        return entries[self.scene.name]
+    @property
+    def bytes(self) -> int:
+        """Size of the shards."""
+        return sum(scene.bytes for scene in self.scenes)
 
     @property
     def mesh(self) -> str:
@@ -187,18 +166,24 @@ class DatasetConfig(Located):
         if split not in self.splits:
             found = f"config {self.name} has no split {escape_text(split)}"
             raise DatasetError(f"{self.root}: {found}, expected {' or '.join(self.splits)}")
-        return self._of_scenes([scene for scene in self.scenes if scene.split == split])
+        if len(self.splits) == 1:
+            return self
+        scenes = {scene.name: scene for scene in self.scenes if scene.split == split}
+        return self._restricted(
+            scenes.values(), (view for view in self.views if self.scene_by_view[view.view_id] in scenes)
+        )
 
     def by_scene(self) -> tuple[Self, ...]:
         """Return the config restricted to each of its scenes."""
-        return tuple(self._of_scenes([scene]) for scene in self.scenes)
+        if len(self.scenes) == 1:
+            return (self,)
+        views: dict[str, list[ViewRecord]] = {scene.name: [] for scene in self.scenes}
+        for view in self.views:
+            views[self.scene_by_view[view.view_id]].append(view)
+        return tuple(self._restricted((scene,), views[scene.name]) for scene in self.scenes)
 
-    def _of_scenes(self, scenes: Collection[Scene]) -> Self:
-        if len(scenes) == len(self.scenes):
-            return self
-        names = {scene.name for scene in scenes}
-        views = tuple(view for view in self.views if self.scene_by_view[view.view_id] in names)
-        restricted = self.model_copy(update={"scenes": tuple(scenes), "views": views})
+    def _restricted(self, scenes: Iterable[Scene], views: Iterable[ViewRecord]) -> Self:
+        restricted = self.model_copy(update={"scenes": tuple(scenes), "views": tuple(views)})
         restricted.__dict__.pop("scene_by_view", None)  # The copy has the cached value of the whole config.
         return restricted
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from rebar_depth_bench.data.config_tables import DIGEST_PATTERN, SCENE_FILES, Digest, RelativePath, Sha256
+from pydantic import Field
+
+from rebar_depth_bench.data.config_tables import DIGEST_PATTERN, Digest, RelativePath, Sha256
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256, views_digest
 from rebar_depth_bench.data.location import Located, local_path
@@ -19,16 +20,23 @@ from rebar_depth_bench.reading import parse_json, read_file
 from rebar_depth_bench.validation import Expected, format_location, one_of, text, validate_table
 
 MANIFEST_FILE = "manifest.json"
-MANIFEST_FORMAT = "rebar-depth-dataset-1"
+MANIFEST_FORMAT = "rebar-depth-dataset-2"
+OLD_FORMAT = "rebar-depth-dataset-1"
+"""Format of folders that ``rebar-build --rewrite-manifest`` converts."""
 
 
 class DatasetFolder(Located):
-    """Dataset with a validated manifest; ``files`` are the hex SHA-256 digests of its files, by path."""
+    """Dataset with a validated manifest.
+
+    ``files`` are the hex SHA-256 digests of its files, by path; ``crossings`` are the parameters by which the
+    crossings of bars were found.
+    """
 
     version: str
     digest: str
     files: dict[str, str]
     config_by_name: dict[str, DatasetConfig]
+    crossings: dict[str, Any] = Field({})
 
     @property
     def configs(self) -> tuple[str, ...]:
@@ -77,6 +85,7 @@ class _Manifest(ManifestTable):
     version: Annotated[str, text(100)]
     protocol: Annotated[str, one_of("rebar-2")]
     ground_truth: _GroundTruth
+    crossings: dict[str, Any] = Field({})
     configs: Annotated[dict[str, dict[str, Any]], Expected("a table of one or more configs", bool)]
     files: dict[RelativePath, Sha256]
 
@@ -93,7 +102,31 @@ def open_folder(root: str | Path, *, expect_digest: str | None = None) -> Datase
         )
     root = str(root)
     path = local_path(root, MANIFEST_FILE)
-    values, problems = parse_json(read_file(path, JSON_BYTES, "the manifest of a dataset", DatasetError))
+    values, problems = read_manifest(path)
+    if isinstance(values, dict) and values.get("format") == OLD_FORMAT:
+        raise DatasetError(
+            f"{path}: has the format {OLD_FORMAT}, expected {MANIFEST_FORMAT}; rebar-build --out ROOT "
+            "--rewrite-manifest converts it without rendering"
+        )
+    folder = validated_folder(values, problems, root, path)
+    if expect_digest not in (None, folder.digest):
+        raise DatasetError(f"{root}: the dataset has the digest {folder.digest}, expected {expect_digest}")
+    return folder
+
+
+def read_manifest(path: Path) -> tuple[Any, list[Problem]]:
+    """Return the JSON value in a manifest, which is not checked further, or the problem of its text.
+
+    Raises ``DatasetError`` if the file cannot be read or is larger than ``JSON_BYTES``.
+    """
+    return parse_json(read_file(path, JSON_BYTES, "the manifest of a dataset", DatasetError))
+
+
+def validated_folder(values: Any, problems: list[Problem], root: str, path: Path) -> DatasetFolder:
+    """Return the dataset in ``root`` that ``read_manifest`` has read from ``path``, if there are no ``problems``.
+
+    Raises ``DatasetError`` with the problems, and with those of the values.
+    """
     # Another format would cause many other problems.
     supported = not problems and validate_table(_Format, values, problems)
     head = validate_table(_Manifest, values, problems) if supported else None
@@ -106,10 +139,14 @@ def open_folder(root: str | Path, *, expect_digest: str | None = None) -> Datase
             problems.append(Problem("conflict", "ground_truth.digest", found, expected))
     if head is None or problems:
         raise DatasetError.from_problems(path, problems)
-    digest = head.ground_truth.digest
-    if expect_digest not in (None, digest):
-        raise DatasetError(f"{root}: the dataset has the digest {digest}, expected {expect_digest}")
-    return DatasetFolder(**place, version=head.version, digest=digest, files=head.files, config_by_name=configs)
+    return DatasetFolder(
+        **place,
+        version=head.version,
+        digest=head.ground_truth.digest,
+        files=head.files,
+        config_by_name=configs,
+        crossings=head.crossings,
+    )
 
 
 def _read_configs(entries: object, place: dict[str, str], problems: list[Problem]) -> dict[str, DatasetConfig]:
@@ -122,24 +159,11 @@ def _read_configs(entries: object, place: dict[str, str], problems: list[Problem
         if entry.get("name", name) != name:
             found, expected = f"got {escape_text(str(entry['name']))}", f"{escape_text(name)}, the config's key"
             problems.append(Problem("conflict", format_location(where, "name"), found, expected))
-        fields, found_problems = DatasetConfig.fields_of_entry(name, entry), list[Problem]()
-        if config := validate_table(DatasetConfig, {**fields, **place}, found_problems, where):
+        fields = {**DatasetConfig.fields_of_entry(name, entry), **place}
+        if config := validate_table(DatasetConfig, fields, problems, where):
             configs[name] = config
-        is_one_scene = not fields["has_splits"]
-        problems += [_located_in_entry(one, where) if is_one_scene else one for one in found_problems]
     problems += _scene_problems(configs.values())
     return configs
-
-
-def _located_in_entry(problem: Problem, where: str) -> Problem:
-    """Return a problem of ``fields_of_entry`` of one scene, with its location in the entry."""
-    key = problem.where.removeprefix(where)
-    if not key.startswith(".scenes"):
-        return problem
-    key = key.removeprefix(".scenes").removeprefix(" 1:").strip()
-    is_file = key.partition(".")[0].partition(" ")[0] in SCENE_FILES
-    location = key if is_file else f"scene.{key}".removesuffix(".")
-    return replace(problem, where=f"{where}.{location}")
 
 
 def _scene_problems(configs: Iterable[DatasetConfig]) -> Iterator[Problem]:
@@ -156,6 +180,6 @@ def _scene_problems(configs: Iterable[DatasetConfig]) -> Iterator[Problem]:
             shown = (scene.board, scene.appearance, scene.mesh)
             other, expected = first.setdefault(scene.name, (config.name, shown))
             if shown != expected:
-                where = format_location("configs", config.name, "scenes" if config.has_splits else "scene")
+                where = format_location("configs", config.name, "scenes")
                 found = f"scene {scene.name} has another board, mesh or appearance than in {other}"
                 yield Problem("conflict", where, found, "one scene for each name")

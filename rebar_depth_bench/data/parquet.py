@@ -44,7 +44,7 @@ class Table:
         """Raise ``ParquetError`` if a footer declares more rows, values or bytes, or another compression."""
         if footer.rows > self.max_rows:
             raise ParquetError(f"the file has {footer.rows} rows, expected at most {self.max_rows}")
-        names, size = frozenset(self.schema.names), 0
+        names = frozenset(self.schema.names)
         for chunk in footer.chunks:
             if chunk.column in names:
                 if chunk.compression not in _COMPRESSIONS:
@@ -54,9 +54,13 @@ class Table:
                 if chunk.values > max_values:
                     found = f"column {chunk.column} has {chunk.values} values"
                     raise ParquetError(f"{found}, expected at most {max_values}")
-                size += max(8 * chunk.values, chunk.decoded_bytes)
-        if size > self.max_bytes:
+        if (size := self.decoded_bytes(footer)) > self.max_bytes:
             raise ParquetError(f"the file has {size} decoded bytes, expected at most {self.max_bytes}")
+
+    def decoded_bytes(self, footer: Footer) -> int:
+        """Return the decoded size of the columns of ``schema`` that a footer declares."""
+        chunks = (chunk for chunk in footer.chunks if chunk.column in self.schema.names)
+        return sum(max(8 * chunk.values, chunk.decoded_bytes) for chunk in chunks)
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from rebar_depth_bench.data.config_tables import Assembly
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.trajectory import NEAREST_STEEL, Trajectory
 
@@ -94,17 +95,15 @@ def published_match(config: DatasetConfig) -> PublishedMatch | None:
     Assembly, board, environment, image size and trajectory have to be equal, with all of its views and without
     appearance variants.
     """
-    is_complete = len(config.views) == config.protocol_views and config.grid == _GRID
+    is_complete = len(config.views) == config.scenes[0].protocol_views and config.grid == _GRID
     if config.imported is not None or config.has_splits or not is_complete or config.scene.appearance.variants:
         return None
-    scene, rig = config.manifest_entry["scene"], config.manifest_entry["rig"]
-    shown = (
-        scene.get("assembly"),
-        config.scene.board.markers if config.scene.board else 0,
-        scene.get("environment"),
-        config.protocol,
-    )
+    scene = config.scene
+    markers = scene.board.markers if scene.board else 0
+    shown = (scene.assembly, markers, scene.environment, scene.protocol)
     for name, expected in _CONDITIONS.items():
-        if shown == (expected.assembly, expected.markers, expected.environment, expected.trajectory):
-            return PublishedMatch(name, (rig.get("grid"), rig.get("baseline_m")) == expected.optics)
+        assembly = Assembly.model_validate(expected.assembly)
+        if shown == (assembly, expected.markers, expected.environment, expected.trajectory):
+            optics = None if scene.rig is None else (scene.rig.grid, scene.rig.baseline_m)
+            return PublishedMatch(name, optics == expected.optics)
     return None

@@ -125,8 +125,8 @@ def rejected_inputs(folder: Path) -> Mapping[str, Callable[[], object]]:
     entry = next(iter(manifest["configs"].values()))
     entry["views"][0]["steel_px"] = "many"
     entry["views"][1]["view_id"] = "../../evil"
-    entry["scene"]["board"]["markers"] = 7
-    entry["mesh"] = "../mesh.ply"
+    entry["scenes"][0]["board"]["markers"] = 7
+    entry["scenes"][0]["mesh"] = "../mesh.ply"
     del entry["rig"]["width"]
     (folder / "manifest.json").write_text(json.dumps(manifest))
     (folder / "later").mkdir()

@@ -18,7 +18,6 @@ from dataset_builder.cli import argument_parser as builder_parser
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.quality import colour_spec
 from dataset_builder.pipeline.build import build
-from dataset_builder.pipeline.plan import plan_config
 from rebar_depth_bench import SubmissionWriter, load
 from rebar_depth_bench.console import EXIT_DONE
 from rebar_depth_bench.data.dataset import ConfigViews
@@ -29,7 +28,7 @@ from rebar_depth_bench.submission import check_archive
 from tests.fuzz.entry_point import EntryPoint, bench, run_options
 from tests.fuzz.workspace import CACHE, CASE, Workspace
 from tests.mat_dataset import write_mat_dataset
-from tests.synthetic_dataset import write_split_dataset
+from tests.synthetic_dataset import write_earlier_manifest, write_split_dataset
 
 TINY = Path(__file__).parents[1] / "data" / "tiny"
 CONFIG = "lattice-orbit"
@@ -54,10 +53,6 @@ def _write_complete_dataset(workspace: Workspace) -> None:
     write_dataset(workspace)
     root = workspace.root / ROOT
     (root / "meshes" / "lattice.ply").write_bytes(lzma.decompress((TINY / "meshes/lattice.ply.xz").read_bytes()))
-    manifest = json.loads((root / "manifest.json").read_bytes())
-    [spec] = _REQUEST.config_specs()
-    manifest["configs"][CONFIG]["key"] = plan_config(spec, _REQUEST.views, root).key
-    (root / "manifest.json").write_text(json.dumps(manifest))
 
 
 def write_dataset_and_archive(workspace: Workspace) -> None:
@@ -165,6 +160,15 @@ def _listed_files(workspace: Workspace) -> bytes:
     return b"".join(path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file())
 
 
+def _write_earlier_dataset(workspace: Workspace) -> None:
+    write_dataset(workspace)
+    write_earlier_manifest(workspace.root / ROOT)
+
+
+def _rewrite(workspace: Workspace) -> None:
+    run_options(builder_parser(), "build", "--out", workspace.root / ROOT, "--rewrite-manifest")
+
+
 class _NoRenderer:
     """Renderer of a folder in which everything is up to date unless it is damaged."""
 
@@ -259,6 +263,14 @@ DATASET_ENTRIES = (
         (*METADATA[1:], f"{ROOT}/pictures/*", f"{ROOT}/*/*.parquet"),
         covered=True,
         result=_listed_files,
+    ),
+    EntryPoint(
+        "build: earlier manifest",
+        6,
+        _write_earlier_dataset,
+        _rewrite,
+        METADATA[:1],
+        may_change=(f"{ROOT}/manifest.json", f"{ROOT}/.rebar-build*"),
     ),
     EntryPoint(
         "build: existing folder",

@@ -180,7 +180,7 @@ def _linked_meshes(workspace: Workspace) -> Arguments:
 
 
 def _export_outside(workspace: Workspace) -> Arguments:
-    _edit_manifest(workspace, lambda m: m["configs"][CONFIG].update(shards=["../victim/notes.txt"]))
+    _edit_manifest(workspace, lambda m: m["configs"][CONFIG]["scenes"][0].update(shards=["../victim/notes.txt"]))
     return "export", workspace.case / "root", "--out", workspace.out / "export"
 
 

@@ -97,8 +97,7 @@ def test_steel_of_a_folder_is_measured(
         np.mean([view.scored_px / (view.steel_px or np.nan) for view in config.views]), rel=1e-5
     )
     assert entry["scored_views"] == len(config.views)
-    assert config.reference is not None
-    assert entry["reference"] == config.reference.model_dump()
+    assert entry["reference"] == config.references["test"].model_dump()
     nearest_m, near_m, far_m = views[:, :3].T
     assert (nearest_m > 0.1).all()
     assert (near_m > 0.75 * nearest_m).all()
@@ -111,13 +110,10 @@ def test_steel_of_a_folder_is_measured(
 def test_card_states_what_distances_are_to(tiny_root: Path) -> None:
     folder = open_folder(tiny_root)
     lattice = folder.config("lattice")
-    entry = lattice.manifest_entry
-    pier = lattice.model_copy(
-        update={
-            "name": "pier",
-            "manifest_entry": {**entry, "protocol": {**entry["protocol"], "distance_to": NEAREST_STEEL}},
-        }
-    )
+    assert lattice.scene.protocol is not None
+    protocol = lattice.scene.protocol.model_copy(update={"distance_to": NEAREST_STEEL})
+    scene = lattice.scene.model_copy(update={"protocol": protocol})
+    pier = lattice.model_copy(update={"name": "pier", "scenes": (scene,)})
     older = lattice.model_copy(update={"name": "pier"})
     rows = {
         kind: next(

@@ -18,6 +18,7 @@ import pytest
 
 from cards.reference import FULL_SETS, reference_context
 from dataset_builder.cli import argument_parser as build_parser
+from dataset_builder.cli import with_command
 from dataset_builder.config.catalog import CONFIGS, SWEEPS
 from dataset_builder.config.scene_schema import read_scene_toml
 from dataset_builder.importing.layout import read_layout
@@ -66,7 +67,7 @@ def commands() -> list[str]:
 @pytest.mark.parametrize("command", commands())
 def test_documented_commands_parse(command: str) -> None:
     program, *arguments = shlex.split(command, comments=True)
-    assert PARSERS[program].parse_args(arguments)
+    assert PARSERS[program].parse_args(with_command(arguments) if program == "rebar-build" else arguments)
 
 
 def script_commands() -> list[str]:

@@ -172,8 +172,9 @@ def manifest(tiny_root: Path) -> Any:
     return json.loads((tiny_root / "manifest.json").read_text())
 
 
-BOARD = "configs.lattice.scene.board"
-PROTOCOL_VIEWS = "configs.lattice.protocol_views"
+SCENE = "configs.lattice.scenes 1:"
+BOARD = f"{SCENE} board"
+PROTOCOL_VIEWS = f"{SCENE} protocol_views"
 STATION = [[1.0, 0.0, 0.5], [0.5, 0.0, 0.5]]
 SURVEY = {
     "kind": "survey",
@@ -182,8 +183,15 @@ SURVEY = {
     "seed": 0,
     "stations": [STATION] * 504,
 }
-SURVEY_PLACE = "configs.lattice.protocol"
+SURVEY_PLACE = f"{SCENE} protocol"
+ORBIT_SCENES = "configs.lattice-orbit.scenes"
+FIRST_SHARD = "lattice/test-00000-of-00002-e9a69d9d4973.parquet"
 ZEROS = "sha256:" + "0" * 64
+
+
+def scene_of(config: Any) -> Any:
+    """Return the entry of the only scene of a config."""
+    return config["scenes"][0]
 
 
 def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
@@ -194,14 +202,14 @@ def manifest_problems(folder: Path, manifest: object) -> list[tuple[str, str]]:
 
 
 def test_survey_is_a_trajectory(manifest: Any, tmp_path: Path) -> None:
-    manifest["configs"]["lattice"]["protocol"] = SURVEY
+    scene_of(manifest["configs"]["lattice"])["protocol"] = SURVEY
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     config = open_folder(tmp_path).config("lattice")
-    assert isinstance(config.protocol, Survey)
-    assert (config.protocol.views, config.protocol.distances_m) == (504, (0.5, 1.0))
-    assert config.protocol.stations[0] == ((1.0, 0.0, 0.5), (0.5, 0.0, 0.5))
+    assert isinstance(config.scene.protocol, Survey)
+    assert (config.scene.protocol.views, config.scene.protocol.distances_m) == (504, (0.5, 1.0))
+    assert config.scene.protocol.stations[0] == ((1.0, 0.0, 0.5), (0.5, 0.0, 0.5))
     assert published_match(config) is None
-    assert isinstance(open_folder(tmp_path).config("lattice-orbit").protocol, Trajectory)
+    assert isinstance(open_folder(tmp_path).config("lattice-orbit").scene.protocol, Trajectory)
 
 
 @pytest.mark.parametrize(
@@ -217,18 +225,21 @@ def test_survey_is_a_trajectory(manifest: Any, tmp_path: Path) -> None:
         (lambda _, config: config["views"][0].pop("left"), "missing", "configs.lattice.views 1: left"),
         (lambda _, config: config["views"][1].update(x=3), "unknown", "configs.lattice.views 2: x"),
         (lambda _, config: config["rig"].update(height="90"), "invalid", "configs.lattice.rig.height"),
-        (lambda _, config: config["scene"]["board"].update({"\ud800": 1}), "syntax", ""),
-        (lambda _, config: config["scene"].update(board=7), "invalid", "configs.lattice.scene.board"),
-        (lambda _, config: config["scene"].pop("board"), "missing", "configs.lattice.scene.board"),
+        (lambda _, config: scene_of(config)["board"].update({"\ud800": 1}), "syntax", ""),
+        (lambda _, config: scene_of(config).update(board=7), "invalid", BOARD),
+        (lambda _, config: scene_of(config).pop("board"), "missing", BOARD),
         *(
             (lambda _, config, key=key, name=name: config.update({key: name}), "invalid", f"configs.lattice.{key}")
-            for key in ("ground_truth_digest", "mesh", "sheet")
+            for key in ("ground_truth_digest", "sheet")
             for name in ("/../../../Documents", "../x", "/tmp/x", "a/../b", "a//b", "a\n", ".hidden", "a\\b")
         ),
-        (lambda _, config: config.update(shards=["../x.parquet"]), "invalid", "configs.lattice.shards 1"),
-        (lambda _, config: config["scene"]["board"].update(x=1), "unknown", BOARD + ".x"),
-        (lambda _, config: config["scene"]["board"].update(markers="six"), "invalid", BOARD + ".markers"),
-        (lambda _, config: config["scene"]["board"].update(width_m=float("nan")), "syntax", ""),
+        (lambda _, config: scene_of(config).update(mesh="../x"), "invalid", f"{SCENE} mesh"),
+        (lambda _, config: scene_of(config).update(mesh=None), "conflict", "configs.lattice.scenes"),
+        (lambda _, config: scene_of(config).update(split="train"), "conflict", "configs.lattice.scenes"),
+        (lambda _, config: scene_of(config).update(shards=["../x.parquet"]), "invalid", f"{SCENE} shards 1"),
+        (lambda _, config: scene_of(config)["board"].update(x=1), "unknown", BOARD + ".x"),
+        (lambda _, config: scene_of(config)["board"].update(markers="six"), "invalid", BOARD + ".markers"),
+        (lambda _, config: scene_of(config)["board"].update(width_m=float("nan")), "syntax", ""),
         (lambda manifest, _: manifest.update(configs={}), "invalid", "configs"),
         (lambda manifest, _: manifest.update(version="1\x1b[2J"), "invalid", "version"),
         (lambda manifest, _: manifest.update(protocol="rebar-0"), "invalid", "protocol"),
@@ -239,12 +250,12 @@ def test_survey_is_a_trajectory(manifest: Any, tmp_path: Path) -> None:
             "configs.lattice.ground_truth_digest",
         ),
         (lambda _, config: config.update(name="pile"), "conflict", "configs.lattice.name"),
-        (lambda _, config: config.update(shards=[]), "invalid", "configs.lattice.shards"),
-        (lambda _, config: config["shards"].append(config["shards"][0]), "duplicate", "configs.lattice.shards"),
+        (lambda _, config: scene_of(config).update(shards=[]), "invalid", f"{SCENE} shards"),
+        (lambda _, config: scene_of(config)["shards"].append(FIRST_SHARD), "duplicate", f"{SCENE} shards"),
         (lambda _, config: config.update(views=[]), "invalid", "configs.lattice.views"),
-        (lambda _, config: config.update(mesh="meshes/other.ply"), "conflict", "configs.lattice-orbit.scene"),
+        (lambda _, config: scene_of(config).update(mesh="meshes/other.ply"), "conflict", ORBIT_SCENES),
         *(
-            (lambda _, config, views=views: config.update(protocol_views=views), code, PROTOCOL_VIEWS)
+            (lambda _, config, views=views: scene_of(config).update(protocol_views=views), code, PROTOCOL_VIEWS)
             for views, code in (
                 (8, "conflict"),
                 (476, "conflict"),
@@ -255,14 +266,14 @@ def test_survey_is_a_trajectory(manifest: Any, tmp_path: Path) -> None:
             )
         ),
         (
-            lambda _, config: config["protocol"].update(distance_to="steel"),
+            lambda _, config: scene_of(config)["protocol"].update(distance_to="steel"),
             "invalid",
-            "configs.lattice.protocol.distance_to",
+            f"{SCENE} protocol.distance_to",
         ),
-        (lambda _, config: config.update(protocol=3), "invalid", "configs.lattice.protocol"),
+        (lambda _, config: scene_of(config).update(protocol=3), "invalid", f"{SCENE} protocol"),
         *(
             (
-                lambda _, config, keys=keys: config.update(protocol={**SURVEY, **keys}),
+                lambda _, config, keys=keys: scene_of(config).update(protocol={**SURVEY, **keys}),
                 code,
                 f"{SURVEY_PLACE}.{place}",
             )
@@ -275,11 +286,11 @@ def test_survey_is_a_trajectory(manifest: Any, tmp_path: Path) -> None:
             )
         ),
         (
-            lambda _, config: config.update(
+            lambda _, config: scene_of(config).update(
                 protocol={**SURVEY, "stations": [STATION] * 2, "views_per_distance": 1}
             ),
             "conflict",
-            "configs.lattice.protocol_views",
+            PROTOCOL_VIEWS,
         ),
         (
             lambda _, config: config["views"][0].update(steel_px=1 << 20, scored_px=1 << 20),
@@ -316,9 +327,9 @@ def test_damaged_manifest_raises_dataset_error(
 def test_problems_of_head_and_all_configs_are_listed(manifest: Any, tmp_path: Path) -> None:
     del manifest["version"]
     for entry in manifest["configs"].values():
-        entry["shards"] = "test.parquet"
+        scene_of(entry)["shards"] = "test.parquet"
     expected = [("missing", "version")] + [
-        ("invalid", f"configs.{name}.shards") for name in ("lattice", "lattice-orbit")
+        ("invalid", f"configs.{name}.scenes 1: shards") for name in ("lattice", "lattice-orbit")
     ]
     assert manifest_problems(tmp_path, manifest) == expected
 
@@ -343,8 +354,8 @@ def test_manifest_that_is_not_json_is_rejected(tmp_path: Path, content: bytes, c
 
 def test_board_is_read_from_manifest(manifest: Any, tmp_path: Path) -> None:
     for entry, markers in zip(manifest["configs"].values(), (12, None), strict=True):
-        entry["scene"]["name"] += str(markers)
-        entry["scene"]["board"] = None if markers is None else entry["scene"]["board"] | {"markers": markers}
+        scene_of(entry)["name"] += str(markers)
+        scene_of(entry)["board"] = None if markers is None else scene_of(entry)["board"] | {"markers": markers}
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     folder = open_folder(tmp_path)
     assert folder.config("lattice").scene.board == BoardSpec(markers=12)

@@ -368,7 +368,7 @@ def test_dataset_with_other_render_key_is_predicted_again(
     for path in tiny_root.iterdir():
         (other / path.name).symlink_to(path)
     manifest = json.loads((tiny_root / "manifest.json").read_text())
-    manifest["configs"]["lattice-orbit"]["key"] = "another"
+    manifest["configs"]["lattice-orbit"]["scenes"][0]["key"] = "another"
     (other / "manifest.json").unlink()
     (other / "manifest.json").write_text(json.dumps(manifest))
     run(other, lambda *_: None)

@@ -72,12 +72,12 @@ def test_crossings_that_are_not_those_of_the_bars_are_reported(copy: Path) -> No
     manifest["files"]["crossings.parquet"] = hashlib.sha256((copy / "crossings.parquet").read_bytes()).hexdigest()
     (copy / "manifest.json").write_text(json.dumps(manifest))
     folder = open_folder(copy)
-    check = check_crossings(folder, copy)
+    check = check_crossings(folder, bars)
     assert check.problems == ("crossings.parquet: scene lattice differs from the crossings of its bars",)
     write_crossings(copy / "crossings.parquet", bars)
     folder.files["crossings.parquet"] = hashlib.sha256((copy / "crossings.parquet").read_bytes()).hexdigest()
-    assert check_crossings(folder, copy).measured == "375 crossings"
-    assert check_crossings(folder, copy).passed
+    assert check_crossings(folder, bars).measured == "375 crossings"
+    assert check_crossings(folder, bars).passed
 
 
 def with_cells(row: Row, **cells: Any) -> Row:
@@ -115,8 +115,8 @@ def test_broken_row_invariants_are_reported(
 def test_manifest_with_other_cameras_is_reported(copy: Path) -> None:
     """Audit unchanged rows against a manifest with a longer baseline and another ring radius."""
     manifest = json.loads((copy / "manifest.json").read_text())
-    manifest["configs"]["lattice"]["rig"]["baseline_m"] = 0.121
-    manifest["configs"]["lattice-orbit"]["protocol"]["radius_m"] = 0.326
+    manifest["configs"]["lattice"]["scenes"][0]["rig"]["baseline_m"] = 0.121
+    manifest["configs"]["lattice-orbit"]["scenes"][0]["protocol"]["radius_m"] = 0.326
     (copy / "manifest.json").write_text(json.dumps(manifest))
     failures = failed_checks(copy)
     assert set(failures) == {"lattice: cameras", "lattice-orbit: cameras"}

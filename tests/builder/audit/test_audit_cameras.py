@@ -18,19 +18,19 @@ from dataset_builder.audit.cameras import (
     checked_aim_point_m,
     expected_views,
     mesh_aim_point_m,
-    rig_spec,
-    trajectory_spec,
     view_list_problems,
 )
+from dataset_builder.config.manifest_specs import rig_spec, trajectory_spec
 from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import DomeSpec, RingSpec
+from dataset_builder.config.specs import DomeSpec, RandomViewsSpec, RingSpec
 from dataset_builder.config.trajectories import poses
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.steel_distance import Cylinders
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.data.config_tables import ViewRecord
+from rebar_depth_bench.data.config_tables import Scene, ViewRecord
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.trajectory import trajectory_of
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera, camera_centre, right_camera_pose
 from tests.builder.audit.audit_scene import RIGS
@@ -42,12 +42,15 @@ DOME = DomeSpec((0.2, 0.3), (10.0, 20.0), 5)
 
 
 def manifest_config(view_ids: Sequence[str] = (), **entry: Any) -> DatasetConfig:
-    """Return a config with the given views and manifest entry, after a JSON round trip."""
+    """Return a config with the given views and the entry of its scene, after a JSON round trip."""
     truth = {"left": "0" * 64, "right": "0" * 64, "steel_px": 0, "scored_px": 0}
     views = tuple(ViewRecord.model_validate({"view_id": view_id, **truth}) for view_id in view_ids)
-    return DatasetConfig.model_construct(
-        name="c", has_splits=False, views=views, manifest_entry=json.loads(json.dumps(entry))
+    written = json.loads(json.dumps(entry))
+    protocol = trajectory_of(written["protocol"]) if "protocol" in written else None
+    scene = Scene.model_construct(
+        name="s", split="test", protocol=protocol, aim_point_m=written.get("aim_point_m"), entry=written
     )
+    return DatasetConfig.model_construct(root="x", name="c", has_splits=False, views=views, scenes=(scene,))
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -77,11 +80,26 @@ def test_dome_measured_to_steel_needs_bars_of_its_scene() -> None:
 
 
 @pytest.mark.parametrize(
-    "entry", [{}, {"rig": None}, {"rig": {"wide": 3}}, {"rig": {"calibration": {"width": 3}}}, {"rig": 7}]
+    ("entry", "place"),
+    [
+        ({}, "rig"),
+        ({"rig": None}, "rig"),
+        ({"rig": {"wide": 3}}, "rig.wide"),
+        ({"rig": {"baseline_m": "1"}}, "rig.baseline_m"),
+        ({"rig": {"calibration": {"width": 3}}}, "rig.calibration.height"),
+        ({"rig": 7}, "rig"),
+    ],
 )
-def test_damaged_rig_is_rejected(entry: dict[str, Any]) -> None:
-    with pytest.raises((DatasetError), match="the rig of config c is"):
+def test_damaged_rig_is_rejected(entry: dict[str, Any], place: str) -> None:
+    with pytest.raises(DatasetError) as caught:
         rig_spec(manifest_config(**entry))
+    assert caught.value.problems[0].where == f"configs.c.scenes.s.{place}"
+
+
+def test_damaged_trajectory_is_rejected() -> None:
+    protocol = {**asdict(RandomViewsSpec(2)), "stations": [[[0, 0, "1"], [0, 0, 0], 0]]}
+    with pytest.raises(DatasetError, match=r"protocol\.stations 1: 1: 3: got '1', expected a valid number"):
+        trajectory_spec(manifest_config(protocol=protocol))
 
 
 def test_rig_with_unknown_grid_is_rejected() -> None:
@@ -193,10 +211,9 @@ def test_aim_point_is_centre_of_steel_only(tmp_path: Path) -> None:
     assert checked_aim_point_m(manifest_config(), mesh)[0].tolist() == [0.2, 0.2, 0.1]
     aim_m, problems = checked_aim_point_m(manifest_config(aim_point_m=[0.2, 0.2, 0.101]), mesh)
     assert (aim_m.tolist(), problems) == ([0.2, 0.2, 0.101], ())
-    for wrong in ([0.2, 0.2, 0.11], [0.2, 0.2], [0.2, 0.2, float("nan")]):
-        aim_m, problems = checked_aim_point_m(manifest_config(aim_point_m=wrong), mesh)
-        assert aim_m.tolist() == [0.2, 0.2, 0.1]
-        assert "expected [0.2, 0.2, 0.1], the centre of the steel" in problems[0]
+    aim_m, problems = checked_aim_point_m(manifest_config(aim_point_m=[0.2, 0.2, 0.11]), mesh)
+    assert aim_m.tolist() == [0.2, 0.2, 0.1]
+    assert "expected [0.2, 0.2, 0.1], the centre of the steel" in problems[0]
 
 
 def test_mesh_without_steel_is_rejected(tmp_path: Path) -> None:

@@ -157,7 +157,7 @@ def test_user_scene_and_variant_are_added_to_dataset(tiny_root: Path, tmp_path: 
     variants = ["lattice-sunset-sensor", "lattice-wet-formwork"]
     assert list(entries) == ["lattice", "lattice-orbit", "beam", *variants]
     assert entries["lattice"] == json.loads(standard_manifest)["configs"]["lattice"]
-    assert entries["lattice-wet-formwork"]["scene"]["appearance"]["variants"] == ["wet", "formwork"]
+    assert entries["lattice-wet-formwork"]["scenes"][0]["appearance"]["variants"] == ["wet", "formwork"]
     assert rdb.load(root, "beam")[0]["left_mask"].any()
     other = rdb.load(root, "lattice-wet-formwork")[0]
     index = other["view_id"].rpartition("/")[2]
@@ -165,9 +165,9 @@ def test_user_scene_and_variant_are_added_to_dataset(tiny_root: Path, tmp_path: 
     assert np.array_equal(plain["left_cam_from_world"], other["left_cam_from_world"])
     assert not np.array_equal(plain["left_rgb"], other["left_rgb"])
     standard, captured = entries["lattice"], entries["lattice-sunset-sensor"]
-    appearance = captured["scene"]["appearance"]
+    appearance = captured["scenes"][0]["appearance"]
     assert (appearance["image_light"]["image"], appearance["sensor"]["jpeg_quality"]) == ("sunset", 80)
-    assert digests[captured["mesh"]] == digests[standard["mesh"]]
+    assert digests[captured["scenes"][0]["mesh"]] == digests[standard["scenes"][0]["mesh"]]
     card = (root / "README.md").read_text()
     assert "The light of `lattice-sunset-sensor` is the panorama sunset" in card
     assert card.count("panorama") == 1

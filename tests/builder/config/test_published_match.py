@@ -26,13 +26,22 @@ def config_of_spec(spec: ConfigSpec, views: int | None = None) -> DatasetConfig:
         ViewRecord(view_id=f"{spec.name}/{n:04d}", left="0" * 64, right="0" * 64, steel_px=9, scored_px=1)
         for n in range(views or count)
     ]
-    entry: dict[str, Any] = {
-        **json.loads(json.dumps(config_parameters(spec))),
-        "key": "k",
+    parameters = json.loads(json.dumps(config_parameters(spec)))
+    scene = {
+        **parameters["scene"],
+        **{key: parameters[key] for key in ("protocol", "rig")},
+        "split": "test",
         "protocol_views": count,
+        "key": "k",
         "mesh": "m.ply",
-        "sheet": "s.webp",
         "shards": ["x.parquet"],
+        "bytes": 1,
+    }
+    entry: dict[str, Any] = {
+        **{key: parameters[key] for key in ("name", "rig", "colour")},
+        "has_splits": False,
+        "scenes": [scene],
+        "sheet": "s.webp",
         "ground_truth_digest": views_digest(records),
         "views": [record.model_dump() for record in records],
     }

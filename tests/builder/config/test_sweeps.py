@@ -31,7 +31,7 @@ def test_sweeps_are_built_only_when_named() -> None:
     assert set(SWEEPS) == set(DISTANCE_RANGES_M)
     assert not set(SWEEPS) & set(CONFIGS)
     assert [spec.name for spec in BuildRequest().config_specs()] == list(CONFIGS)
-    options = argument_parser().parse_args(["--out", "root", "--config", *DISTANCE_RANGES_M])
+    options = argument_parser().parse_args(["build", "--out", "root", "--config", *DISTANCE_RANGES_M])
     assert [spec.name for spec in BuildRequest(configs=tuple(options.config)).config_specs()] == list(
         DISTANCE_RANGES_M
     )

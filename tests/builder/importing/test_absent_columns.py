@@ -118,7 +118,7 @@ ALL_BUT_BARS = ["left_mask", "right_mask", "right_bars", "right_depth", "right_r
 @pytest.mark.parametrize(
     ("change", "where"),
     [
-        (lambda entry: entry.pop("imported"), "scene"),
+        (lambda entry: entry.pop("imported"), "scenes"),
         (set_in("imported", "truth_sigma_m", value=0), "imported.truth_sigma_m"),
         (set_in("imported", "truth_sigma_m", value=None), "imported.truth_sigma_m"),
         (set_in("imported", "absent_columns", value=["left_depth"]), "imported.absent_columns"),

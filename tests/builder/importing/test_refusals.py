@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from dataset_builder.cli import main
-from dataset_builder.importing import run
 from dataset_builder.importing.run import plan_import, run_import
+from dataset_builder.pipeline.retained import Finished
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError
 from tests.bench.damage import damaged
@@ -235,6 +235,6 @@ def test_rendered_config_is_not_replaced(
     tiny_root: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rendered = {"mock-up": open_folder(tiny_root).config("lattice")}
-    monkeypatch.setattr(run, "published_configs", lambda _: rendered)
+    monkeypatch.setattr(Finished, "configs", rendered)
     with pytest.raises(InputError, match="config mock-up was rendered"):
         run_import(plan_import(data.write_layout(folder), "mock-up"), tmp_path / "out")

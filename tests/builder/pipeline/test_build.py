@@ -111,7 +111,7 @@ def test_worker_count_does_not_change_bytes(
 def test_second_build_is_up_to_date(small_root: Path, run_build: RunBuild) -> None:
     before = contents(small_root)
     mtimes_ns = {path: path.stat().st_mtime_ns for path in small_root.rglob("*.parquet")}
-    process = run_build("--out", small_root, *SMALL)
+    process = run_build("build", "--out", small_root, *SMALL)
     assert "up to date: two-bars" in process.stdout
     assert contents(small_root) == before
     assert mtimes_ns == {path: path.stat().st_mtime_ns for path in small_root.rglob("*.parquet")}
@@ -145,7 +145,7 @@ def test_build_survives_single_render_crash(small_root: Path, tmp_path: Path, st
 
 def test_rebuild_with_other_size_invalidates_cache(tmp_path: Path, run_build: RunBuild) -> None:
     root = tmp_path / "dataset"
-    small = ("--scene", str(TWO_BARS), "--views", "2", "--samples", "1")
+    small = ("--scene", str(TWO_BARS), "--views", "2", "--samples", "1", "--overwrite", "two-bars")
     assert run_build("--out", root, *small, "--width", "96", "--height", "54").returncode == 0
     first = datasets.load_dataset(str(root), "two-bars", split="test")
     assert first[0]["left_rgb"].size == (96, 54)
@@ -167,7 +167,7 @@ def test_mesh_import_of_lattice_reproduces_ground_truth(
     original, imported = open_folder(tiny_root), open_folder(tmp_path / "again")
     assert len(imported.config("lattice").views) == 3
     assert set(imported.config("lattice").views) <= set(original.config("lattice").views)
-    assert imported.config("lattice").manifest_entry["scene"]["assembly"]["path"] == "lattice.ply"
+    assert imported.config("lattice").scene.entry["assembly"]["path"] == "lattice.ply"
     bars = (read_bars(root / "bars.parquet")["lattice"] for root in (tiny_root, tmp_path / "again"))
     for bar, imported_bar in zip(*bars, strict=True):
         assert imported_bar.bar_id == bar.bar_id
@@ -189,7 +189,7 @@ def test_concurrent_build_is_rejected(tmp_path: Path, run_build: RunBuild, start
 
 
 def test_config_with_other_scene_parameters_is_rejected(tiny_root: Path, run_build: RunBuild) -> None:
-    process = run_build("--out", tiny_root, "--config", "lattice", *TINY, "--seed", "5")
+    process = run_build("--out", tiny_root, "--config", "lattice", *TINY, "--seed", "5", "--overwrite", "lattice")
     assert process.returncode == 2
     assert "config lattice-orbit was built with other parameters of scene 'lattice'" in process.stderr
 
@@ -199,9 +199,9 @@ def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
     files = contents(tiny_root)
     del files["manifest.json"]
     assert manifest["files"] == files
-    scene = manifest["configs"]["lattice"]["scene"]
+    scene = manifest["configs"]["lattice"]["scenes"][0]
     assert scene["assembly"]["diameters_m"] == [0.007, 0.004]
-    assert manifest["configs"]["lattice"]["generator"]["bpy"].startswith("4.5")
+    assert scene["generator"]["bpy"].startswith("4.5")
     assert (
         "| `lattice` | lattice | 9 of 504 | 160 x 90 | 2, 8 around steel | 0.22-0.43 m |"
         in (tiny_root / "README.md").read_text()
@@ -222,6 +222,8 @@ def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
             ("--no-colour", "--quality", "high", "--sampling", "uniform", "--device", "cpu"),
             "--no-colour is combined with --sampling uniform, --quality high, --device cpu, expected only one",
         ),
+        (("--config", "lattice", "audit", "ROOT"), "--config is followed by the command audit"),
+        (("--views", "3", "audit", "tiny"), "unrecognized arguments: audit tiny"),
         (("--mesh", "nothing.stl"), "nothing.stl"),
         (("--mesh", __file__), "unsupported mesh file type '.py', expected"),
     ],
@@ -254,7 +256,7 @@ def test_foreign_folder_is_rejected_and_unchanged(tmp_path: Path, marker: str, r
 def test_leftovers_of_kill_after_publishing_are_repaired(small_root: Path, run_build: RunBuild) -> None:
     """Remove the staging folder of a published config and restore files that contradict the manifest."""
     before = contents(small_root)
-    key = json.loads((small_root / "manifest.json").read_text())["configs"]["two-bars"]["key"]
+    key = json.loads((small_root / "manifest.json").read_text())["configs"]["two-bars"]["scenes"][0]["key"]
     for name in (key[:16], "0123456789abcdef"):
         (small_root / BUILD_FOLDER / f"two-bars-{name}" / "rows").mkdir(parents=True)
     assert "up to date" in run_build("--out", small_root, *SMALL).stdout

@@ -14,14 +14,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from dataset_builder.cli import main
-from dataset_builder.config.catalog import CONFIGS, BuildRequest
+from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.specs import ColourSpec
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.contact_sheet import write_contact_sheet
 from dataset_builder.pipeline.folder import check_folder
 from dataset_builder.pipeline.plan import ConfigPlan, plan_config
-from dataset_builder.pipeline.publish import is_published, remove_leftovers
-from dataset_builder.pipeline.retained import check_retained_configs
+from dataset_builder.pipeline.publish import remove_leftovers
+from dataset_builder.pipeline.retained import Finished, check_retained
 from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_record
 from dataset_builder.pipeline.work_units import remaining_units
 from rebar_depth_bench.data.manifest import open_folder
@@ -60,6 +60,11 @@ def edited(root: Path, change: Callable[[dict[str, Any]], object], config: str =
     (root / "manifest.json").write_text(json.dumps(manifest))
 
 
+def scene_of(config: dict[str, Any]) -> Any:
+    """Return the entry of the only scene of a config."""
+    return config["scenes"][0]
+
+
 @pytest.mark.parametrize(
     "link",
     [
@@ -88,7 +93,10 @@ def test_linked_folders_are_rejected_before_any_change(root: Path, tmp_path: Pat
     assert tree(tmp_path) == before
 
 
-@pytest.mark.parametrize("link", [".rebar-build/lock", f"{STAGING}/logs/shard-00000.log", f"{STAGING}/mesh.ply"])
+@pytest.mark.parametrize(
+    "link",
+    [".rebar-build/lock", ".rebar-build/bars.parquet", f"{STAGING}/logs/shard-00000.log", f"{STAGING}/mesh.ply"],
+)
 def test_linked_files_of_the_build_folder_are_rejected(root: Path, tmp_path: Path, link: str) -> None:
     path = root / link.format(key=small_plan(root).staging.root.name)
     path.parent.mkdir(parents=True)
@@ -142,7 +150,7 @@ def test_only_leftovers_of_builds_are_deleted(root: Path, tmp_path: Path) -> Non
     (root / "linked").symlink_to(tmp_path / "outside")
     (root / "meshes/linked.ply").symlink_to(root / "README.md")
     (root / "meshes/folder.ply").mkdir()
-    remove_leftovers(root)
+    remove_leftovers(root, open_folder(root))
     assert tree(root).keys() - before.keys() == {*others, "linked", "meshes/linked.ply"}
     assert tree(root).items() >= before.items()
     assert [path.name for path in (tmp_path / "outside").iterdir()] == [Path(own[0]).name]
@@ -154,34 +162,38 @@ def test_only_leftovers_of_builds_are_deleted(root: Path, tmp_path: Path) -> Non
     [
         (lambda entry: entry.update(sheet="notes/lattice.webp"), "sheet"),
         (lambda entry: entry.update(sheet="pictures/scenes.webp"), "sheet"),
-        (lambda entry: entry.update(mesh="README.md"), "mesh"),
-        (lambda entry: entry.update(shards=["manifest.json"]), "shards"),
-        (lambda entry: entry.pop("bytes"), "bytes"),
-        (lambda entry: entry["scene"].update(assembly=[]), "scene.assembly"),
-        (lambda entry: entry["scene"]["assembly"].update(path="a\x1b[2Jb"), "scene.assembly.path"),
-        (lambda entry: entry["rig"].update(grid="other"), "rig.grid"),
-        (lambda entry: entry["protocol"].update(radii_m=[]), "protocol.radii_m"),
+        (lambda entry: scene_of(entry).update(mesh="README.md"), "scenes 1: mesh"),
+        (lambda entry: scene_of(entry).update(shards=["manifest.json"]), "scenes 1: shards"),
+        (lambda entry: scene_of(entry).pop("bytes"), "scenes 1: bytes"),
+        (lambda entry: scene_of(entry).update(assembly=[]), "scenes 1: assembly"),
+        (lambda entry: scene_of(entry)["assembly"].update(path="a\x1b[2Jb"), "scenes 1: assembly.path"),
+        (lambda entry: scene_of(entry)["rig"].update(grid="other"), "scenes 1: rig.grid"),
+        (lambda entry: scene_of(entry).update(protocol={"kind": "spiral"}), "scenes 1: protocol"),
         (lambda entry: entry["colour"].update(samples="1"), "colour.samples"),
     ],
 )
 def test_entries_of_kept_configs_are_checked(
     root: Path, change: Callable[[dict[str, Any]], object], place: str
 ) -> None:
-    check_retained_configs(root, [small_plan(root)])
-    configs = ("lattice", "lattice-orbit")  # They have one scene.
+    check_retained(root, Finished(root), [small_plan(root)], ())
+    configs = ("lattice", "lattice-orbit")
     for config in configs:
         edited(root, change, config)
     with pytest.raises(DatasetError) as caught:
-        check_retained_configs(root, [small_plan(root)])
-    assert [problem.where for problem in caught.value.problems] == [f"configs.{name}.{place}" for name in configs]
+        check_retained(root, Finished(root), [small_plan(root)], ())
+    found = {problem.where for problem in caught.value.problems}
+    assert {f"configs.{name}.{place}" for name in configs} <= found
 
 
-def test_config_with_other_file_names_is_not_up_to_date(root: Path) -> None:
-    plan = plan_config(CONFIGS["lattice"](), 9, root)
-    edited(root, lambda entry: entry.update(key=plan.key))
-    assert is_published(root, plan)
-    edited(root, lambda entry: entry.update(sheet="pictures/other.webp"))
-    assert not is_published(root, plan)
+@pytest.mark.parametrize("keep_bytes", [None, 1000])
+def test_kept_config_with_a_missing_or_shorter_shard_is_refused(root: Path, keep_bytes: int | None) -> None:
+    shard = next(root.glob("lattice-orbit/*.parquet"))
+    content = shard.read_bytes()
+    shard.unlink()
+    if keep_bytes is not None:
+        shard.write_bytes(content[:keep_bytes])
+    with pytest.raises(InputError, match=r"config lattice-orbit: .*--config lattice-orbit"):
+        check_retained(root, Finished(root), [small_plan(root)], ())
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1" * 9, None, b"{}"])

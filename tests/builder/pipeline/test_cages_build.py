@@ -21,7 +21,6 @@ from dataset_builder.config.cages import MAX_SCENES, CagesRequest
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.specs import ColourSpec, GeneratedCageSpec, SceneConfigSpec
 from dataset_builder.pipeline.plan import BUILD_FOLDER, plan_config
-from dataset_builder.pipeline.publish import scene_entries
 from dataset_builder.scene.cages import generate as generate_module
 from dataset_builder.scene.cages.generate import drawn_family
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
@@ -83,9 +82,10 @@ def test_plain_datasets_and_load_return_the_views_of_a_split(root: Path, streami
 
 
 def test_bars_have_nominal_axes(root: Path) -> None:
+    entries = {scene.name: scene.entry for scene in open_folder(root).config("cages").scenes}
     for scene, bars in read_bars(root / BARS_FILE).items():
         designed = [bar for bar in bars if bar.nominal_axis_m]
-        record = scene_entries(open_folder(root).config("cages"))[scene]["cage"]
+        record = entries[scene]["cage"]
         assert len(bars) - len(designed) == record["doubled"]
         off_m = [np.linalg.norm(np.subtract(bar.axis_m[0], bar.nominal_axis_m[0])) for bar in designed]
         assert 0 < max(off_m) < 0.06
@@ -165,7 +165,7 @@ def test_scenes_with_colour_are_rendered_and_differ(tmp_path: Path, run_build: R
     assert all(row["left_rgb"].std() > 5 for row in rows)
     assert not np.array_equal(rows[0]["left_rgb"], rows[1]["left_rgb"])
     refused = run_build("--out", other, *cages("test", 1), *GROUND_TRUTH)
-    assert (refused.returncode, "with colour" in refused.stderr) == (2, True)
+    assert (refused.returncode, "colour is {'samples'" in refused.stderr) == (2, True)
 
 
 @pytest.mark.parametrize(
@@ -192,10 +192,13 @@ def test_unusable_requests_are_refused_without_a_folder(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ((*cages("test", 1), *GROUND_TRUTH, "--seed", "1"), "contains 3 other scenes of cages"),
+        (
+            (*cages("test", 1), *GROUND_TRUTH, "--seed", "1"),
+            "3 other scenes have another image size, colour, seed or version",
+        ),
         (
             (*cages("train", 2), "--width", "64", "--height", "36", "--no-colour"),
-            "contains 1 other scenes of cages",
+            "1 other scenes have another image size",
         ),
     ],
 )
@@ -253,7 +256,7 @@ def test_damaged_entry_of_a_scene_is_refused(root: Path, tmp_path: Path, run_bui
     manifest: dict[str, Any] = json.loads((copy / MANIFEST_FILE).read_text())
     manifest["configs"]["cages"]["scenes"][0]["assembly"][key] = "x"
     (copy / MANIFEST_FILE).write_text(json.dumps(manifest))
-    process = run_build("--out", copy, *cages("test", 1), *GROUND_TRUTH)
+    process = run_build("--out", copy, *cages("test", 1), *GROUND_TRUTH, "--overwrite", "cages")
     assert process.returncode == 2
     assert f"scenes 1: assembly.{key}" in process.stderr or f"assembly.{key}" in process.stderr
     assert "Traceback" not in process.stderr

@@ -108,7 +108,7 @@ def test_local_mesh_file_is_built_on_cluster(cluster: Cluster, tmp_path: Path, r
         assert process.returncode == 0, process.stderr
     assert contents(tmp_path / "away") == contents(tmp_path / "here")
     manifest = json.loads((tmp_path / "away" / "manifest.json").read_text())
-    assert manifest["configs"]["lattice"]["scene"]["assembly"]["path"] == "my cage.stl"
+    assert manifest["configs"]["lattice"]["scenes"][0]["assembly"]["path"] == "my cage.stl"
 
 
 def test_interrupted_build_resumes_and_dead_worker_is_replaced(

@@ -52,7 +52,7 @@ def test_build_with_bent_bar_and_plate(tmp_path: Path, run_build: RunBuild) -> N
     assert "1 of 2 bars" in note
     assert note.endswith("bar 2, plate")
     (entry,) = json.loads((root / "manifest.json").read_text())["configs"].values()
-    world_from_source = np.array(entry["world_from_source"])
+    world_from_source = np.array(entry["scenes"][0]["world_from_source"])
     line_m = LINE_M @ world_from_source[:3, :3].T + world_from_source[:3, 3]
 
     (bars,) = read_bars(root / "bars.parquet").values()

@@ -60,7 +60,7 @@ def test_ground_truth_equals_that_of_build_with_colour(root: Path, tiny_root: Pa
     for name, config in without.config_by_name.items():
         assert config.manifest_entry["colour"] is None
         assert config.key != with_colour.config(name).key
-        assert config.reference == with_colour.config(name).reference
+        assert config.references == with_colour.config(name).references
 
 
 def test_plain_datasets_loads_null_colour(root: Path) -> None:
@@ -127,7 +127,8 @@ def test_config_with_colour_is_not_replaced(tiny_root: Path, tmp_path: Path, run
     before = contents(tiny_root)
     process = run_build("--out", tiny_root, "--config", "pile", "lattice", *SIZE, "--no-colour")
     assert process.returncode == 2
-    assert "contains lattice with colour, which --no-colour would replace" in process.stderr
+    assert "config lattice: 9 finished views would be lost" in process.stderr
+    assert "colour is {'samples': 2, 'steel_samples': 8" in process.stderr
     assert contents(tiny_root) == before
     assert not (tiny_root / BUILD_FOLDER).exists()
 
@@ -144,7 +145,7 @@ def test_colour_replaces_build_without(tmp_path: Path, run_build: RunBuild) -> N
     assert run_build("--out", colour, *TWO_VIEWS, *TINY).returncode == 0
     assert run_build("--out", root, *TWO_VIEWS, *SIZE, "--no-colour").returncode == 0
     assert contents(root) != contents(colour)
-    assert "built: two-bars" in run_build("--out", root, *TWO_VIEWS, *TINY).stdout
+    assert "built: two-bars" in run_build("--out", root, *TWO_VIEWS, *TINY, "--overwrite", "two-bars").stdout
     assert contents(root) == contents(colour)
 
 

@@ -34,12 +34,12 @@ def test_build_of_life_size_column(tmp_path: Path, run_build: RunBuild) -> None:
     assert process.returncode == 0, process.stderr
 
     config = open_folder(root).config("column")
-    assert isinstance(config.protocol, Survey)
+    assert isinstance(config.scene.protocol, Survey)
     assert [view.view_id for view in config.views] == [f"column/{n:04d}" for n in (1, 3, 5, 7)]
     assert all((view.steel_px or 0) > 10 for view in config.views)
     assert all(view.scored_px > 20 for view in config.views[:2])  # Bars at 2 m are a pixel thick.
     for row, n in zip(rdb.load(root, "column"), (1, 3, 5, 7), strict=True):
-        centre_m, aimed_m = config.protocol.stations[n]
+        centre_m, aimed_m = config.scene.protocol.stations[n]
         np.testing.assert_allclose(camera_centre(row["left_cam_from_world"]), centre_m, atol=1e-9)
         steel_m = row["left_depth"][row["left_mask"]]
         distance_m = float(np.linalg.norm(np.subtract(centre_m, aimed_m)))
@@ -61,6 +61,6 @@ def test_build_of_life_size_column(tmp_path: Path, run_build: RunBuild) -> None:
     assert json.loads(result.read_text())["tables"]["column"]["rank_error"] < 1e-6
 
     manifest = json.loads((root / "manifest.json").read_text())
-    manifest["configs"]["column"]["protocol"]["stations"][3][0][2] += 1e-6
+    manifest["configs"]["column"]["scenes"][0]["protocol"]["stations"][3][0][2] += 1e-6
     (root / "manifest.json").write_text(json.dumps(manifest))
     assert [check.name for check in audit(root, depth_views=0).failures] == ["column: cameras"]

@@ -148,7 +148,7 @@ def copy_without_board(root: Path, folder: Path) -> Path:
         (copy / path.name).symlink_to(path)
     manifest = json.loads((root / "manifest.json").read_text())
     for config in manifest["configs"].values():
-        config["scene"]["board"] = None
+        config["scenes"][0]["board"] = None
     (copy / "manifest.json").unlink()
     (copy / "manifest.json").write_text(json.dumps(manifest))
     return copy

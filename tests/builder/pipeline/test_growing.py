@@ -1,0 +1,273 @@
+"""Finished configs: they grow, keep their views, and are replaced only if they are named; rows are prepared."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+import rebar_depth_bench as rdb
+from benchmarks.scale import PreparedRows, placed
+from dataset_builder.audit import audit, run
+from dataset_builder.config.cages import CagesRequest
+from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.pipeline import folder, place_cameras, retained
+from dataset_builder.pipeline.build import BuildSummary, build
+from dataset_builder.pipeline.plan import BUILD_FOLDER
+from rebar_depth_bench.data.bars import BARS_FILE
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
+from rebar_depth_bench.data.verification import file_problems
+from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.limits import JSON_BYTES, TABLE_BYTES
+from rebar_depth_bench.progress import silent
+from tests.building import contents
+
+SIZE: dict[str, Any] = {"width": 32, "height": 18, "colour": None}
+
+
+def lattice(views: int, **changes: Any) -> BuildRequest:
+    return BuildRequest(**{"configs": ("lattice",), "views": views, **SIZE, **changes})
+
+
+def cages(scenes: int, views: int = 2, split: str = "test", **changes: Any) -> BuildRequest:
+    request = {"configs": ("cages",), **SIZE, "cages": CagesRequest(split, scenes, views), **changes}
+    return BuildRequest(**request)
+
+
+@pytest.fixture(autouse=True)
+def cameras_without_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give all generated scenes the same cameras, which takes no time."""
+    monkeypatch.setattr(place_cameras, "with_cameras", placed)
+    monkeypatch.setattr("dataset_builder.pipeline.build.place_cameras", lambda plans, *_: [*map(placed, plans)])
+
+
+def built(out: Path, request: BuildRequest) -> tuple[list[str], BuildSummary]:
+    """Build with prepared rows; return the ids of the views that were rendered, and the summary."""
+    renderer = PreparedRows()
+    summary = build(request, out, cluster=renderer)
+    return renderer.rendered, summary
+
+
+class Interrupting(PreparedRows):
+    """Renderer that is interrupted after some units."""
+
+    def __init__(self, units: int) -> None:
+        super().__init__()
+        self._units = units
+
+    def submit(self, *arguments: Any) -> Any:
+        if self._units == 0:
+            raise KeyboardInterrupt
+        self._units -= 1
+        return super().submit(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "added"),
+    [
+        (lattice(2), lattice(6), 4),
+        (lattice(9), lattice(45), 36),
+        (cages(2), cages(3), 2),
+        (cages(2), cages(2, views=3), 2),
+    ],
+)
+def test_growing_config_renders_only_new_views(
+    tmp_path: Path, first: BuildRequest, then: BuildRequest, added: int
+) -> None:
+    built(tmp_path / "grown", first)
+    rendered, summary = built(tmp_path / "grown", then)
+    assert (len(rendered), summary.built) == (added, [*then.configs])
+    built(tmp_path / "at-once", then)
+    assert contents(tmp_path / "grown") == contents(tmp_path / "at-once")
+    assert built(tmp_path / "grown", then)[0] == []
+    assert not (tmp_path / "grown" / BUILD_FOLDER).exists()
+
+
+def test_views_that_are_not_among_more_views_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    built(tmp_path, lattice(2))
+    assert capsys.readouterr().err == ""
+    rendered, _ = built(tmp_path, lattice(3))
+    assert "config lattice: 2 of 2 finished views are not among the 3 requested" in capsys.readouterr().err
+    assert len(rendered) == 3
+
+
+def test_old_config_stays_readable_while_it_grows_and_after_an_interruption(tmp_path: Path) -> None:
+    root = tmp_path / "dataset"
+    built(root, lattice(9))
+    before = contents(root)
+    with pytest.raises(KeyboardInterrupt):
+        build(lattice(63), root, cluster=Interrupting(1))
+    assert {name: digest for name, digest in contents(root).items() if BUILD_FOLDER not in name} == before
+    assert len(rdb.load(root, "lattice")) == 9
+    problems = file_problems(open_folder(root), silent)
+    assert [problem for problem in problems if BUILD_FOLDER not in str(problem)] == []
+    rendered, _ = built(root, lattice(63))
+    assert 0 < len(rendered) < 63 - 9
+    built(tmp_path / "at-once", lattice(63))
+    assert contents(root) == contents(tmp_path / "at-once")
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "words"),
+    [
+        (lattice(6), lattice(2), "6 finished views would be lost: it has 6 views, 2 are requested"),
+        (lattice(6), lattice(9, width=64), "6 finished views would be lost: rig.width is 32, 64 is requested"),
+        (lattice(6), lattice(6, seed=1), "seed is 0, 1 is requested"),
+        (cages(2), cages(2, views=1), "4 finished views would be lost: it has 2 views, 1 are requested"),
+        (cages(2), cages(1, seed=1), "2 other scenes have another image size, colour, seed or version"),
+        (cages(2), cages(1, split="train", width=64), "2 other scenes have another image size"),
+    ],
+)
+def test_finished_config_is_replaced_only_if_it_is_named(
+    tmp_path: Path, first: BuildRequest, then: BuildRequest, words: str
+) -> None:
+    [name] = then.configs
+    built(tmp_path, first)
+    before = contents(tmp_path)
+    with pytest.raises(InputError, match=f"config {name}: .*--overwrite {name}") as caught:
+        built(tmp_path, then)
+    assert words in str(caught.value)
+    assert contents(tmp_path) == before
+    overwriting = BuildRequest(**{**vars(then), "overwrite": (name,)})
+    rendered, summary = built(tmp_path, overwriting)
+    config = open_folder(tmp_path).config(name)
+    assert (summary.built, set(rendered) <= set(config.view_ids)) == ([name], True)
+    assert config.rig.width == then.width
+
+
+def test_fewer_scenes_and_same_views_lose_nothing(tmp_path: Path) -> None:
+    built(tmp_path, cages(3))
+    before = contents(tmp_path)
+    assert built(tmp_path, cages(1))[1].up_to_date == ["cages"]
+    assert contents(tmp_path) == before
+
+
+def test_name_to_overwrite_has_to_be_built(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--overwrite: got 'pile', expected one of the configs .* lattice"):
+        built(tmp_path, lattice(1, overwrite=("pile",)))
+
+
+def test_imported_config_is_not_replaced_by_a_build(tmp_path: Path) -> None:
+    built(tmp_path, lattice(2))
+    manifest = json.loads((tmp_path / MANIFEST_FILE).read_text())
+    entry = manifest["configs"]["lattice"]
+    entry["imported"] = {"truth_sigma_m": 0.001}
+    entry["scenes"][0] |= {"assembly": None, "protocol": None, "rig": None, "mesh": None}
+    (tmp_path / MANIFEST_FILE).write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match="2 finished views would be lost: it was imported"):
+        built(tmp_path, lattice(6))
+
+
+def test_finished_config_without_digests_is_rendered_again(tmp_path: Path) -> None:
+    built(tmp_path, lattice(2))
+    manifest = json.loads((tmp_path / MANIFEST_FILE).read_text())
+    manifest["files"] = {BARS_FILE: manifest["files"][BARS_FILE]}
+    manifest["configs"]["lattice"]["scenes"][0]["rig"]["\x1b[2J"] = 1
+    (tmp_path / MANIFEST_FILE).write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match=r"no digest of pictures/lattice\.webp"):
+        built(tmp_path, lattice(6))
+    assert len(built(tmp_path, lattice(6, overwrite=("lattice",)))[0]) == 6
+
+
+def flip_a_byte(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def test_views_of_a_damaged_shard_are_rendered_again(tmp_path: Path) -> None:
+    built(tmp_path / "dataset", lattice(18))
+    before = contents(tmp_path / "dataset")
+    flip_a_byte(next((tmp_path / "dataset").glob("lattice/*-00001-of-*")))
+    rendered, _ = built(tmp_path / "dataset", lattice(18))
+    assert len(rendered) == 8
+    assert contents(tmp_path / "dataset") == before
+
+
+@pytest.mark.parametrize("pattern", ["lattice/*.parquet", "meshes/lattice.ply", "pictures/lattice.webp"])
+def test_damage_of_other_configs_gets_no_new_digest(tmp_path: Path, pattern: str) -> None:
+    built(tmp_path, lattice(2))
+    damaged = next(tmp_path.glob(pattern))
+    flip_a_byte(damaged)
+    built(tmp_path, cages(1))
+    problems = [problem.where for problem in file_problems(open_folder(tmp_path), silent)]
+    assert problems == [damaged.relative_to(tmp_path).as_posix()]
+
+
+def test_damaged_bars_of_other_scenes_are_refused(tmp_path: Path) -> None:
+    built(tmp_path, lattice(2))
+    (tmp_path / BARS_FILE).unlink()
+    renderer = PreparedRows()
+    with pytest.raises(InputError, match=r"bars\.parquet does not match the manifest"):
+        build(cages(1), tmp_path, cluster=renderer)
+    assert renderer.rendered == []
+
+
+def test_publication_that_was_interrupted_after_writing_bars_is_continued(tmp_path: Path) -> None:
+    root, whole = tmp_path / "dataset", tmp_path / "whole"
+    built(root, lattice(2))
+    manifest = (root / MANIFEST_FILE).read_bytes()
+    saved = (root / BARS_FILE).read_bytes()
+    built(root, cages(1))
+    shutil.copytree(root, whole)
+    (root / BUILD_FOLDER).mkdir()
+    (root / BUILD_FOLDER / BARS_FILE).write_bytes(saved)
+    (root / MANIFEST_FILE).write_bytes(manifest)
+    built(root, cages(1))
+    assert contents(root) == contents(whole)
+
+
+@pytest.mark.parametrize(("limit", "value"), [(JSON_BYTES, 5000), (TABLE_BYTES, 1000)])
+def test_folder_that_could_not_be_read_is_refused_before_rendering(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Any, value: int
+) -> None:
+    monkeypatch.setenv(limit.variable, f"{value}")
+    with pytest.raises(InputError, match=f"could not be read, expected at most {value} bytes; {limit.variable}"):
+        built(tmp_path / "dataset", cages(20))
+    assert not (tmp_path / "dataset").exists()
+
+
+@pytest.mark.parametrize("request_", [lattice(9), lattice(504), cages(80, 3)])
+def test_size_of_the_manifest_is_estimated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request_: BuildRequest
+) -> None:
+    built(tmp_path / "dataset", request_)
+    size = (tmp_path / "dataset" / MANIFEST_FILE).stat().st_size
+    monkeypatch.setenv(JSON_BYTES.variable, f"{size}")
+    with pytest.raises(InputError, match="the manifest of the folder would have about") as caught:
+        built(tmp_path / "again", request_)
+    estimate = int(str(caught.value).partition("about ")[2].partition(" ")[0])
+    assert size <= estimate < 1.5 * size
+
+
+def counted(monkeypatch: pytest.MonkeyPatch, module: ModuleType, name: str) -> list[Path]:
+    """Record the first arguments with which a function of a module is called."""
+    calls: list[Path] = []
+    function = getattr(module, name)
+
+    def count(path: Path, *arguments: Any, **options: Any) -> Any:
+        calls.append(path)
+        return function(path, *arguments, **options)
+
+    monkeypatch.setattr(module, name, count)
+    return calls
+
+
+def test_number_of_reads_does_not_grow_with_the_number_of_scenes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built(tmp_path, cages(5, 1))
+    opened = counted(monkeypatch, retained, "open_folder")
+    hashed = counted(monkeypatch, folder, "file_sha256")
+    tables = counted(monkeypatch, run, "read_bars")
+    built(tmp_path, cages(5, 1))
+    audit(tmp_path, depth_views=0)
+    config = open_folder(tmp_path).config("cages")
+    assert (len(opened), len(tables)) == (1, 1)
+    assert sorted(path.name for path in hashed if path.parent.name in ("cages", "meshes")) == sorted(
+        Path(name).name for name in (*config.shards, *config.meshes)
+    )
