@@ -1,4 +1,4 @@
-"""Build plan of a config, and its key: the digest of everything that determines the bytes of the result."""
+"""Build plan of a config, and its key: the digest of all parameters that determine the bytes of its views."""
 
 from __future__ import annotations
 
