@@ -37,7 +37,9 @@ from tests.bench.submission.zips import exr, npz, png
 CASES = 300
 SECONDS = 1.0
 DEPTH = np.linspace(0.5, 2.0, 12).reshape(3, 4).astype(np.float32)
-SETTINGS = b'data = "x"\nquota = 7\nport = 80\nmax_upload = "3GiB"\nlease_seconds = 5\nrescore = true\nscore_time = 1.5\n'
+SETTINGS = (
+    b'data = "x"\nquota = 7\nport = 80\nmax_upload = "3GiB"\nlease_seconds = 5\nrescore = true\nscore_time = 1.5\n'
+)
 
 Read = Callable[[Path, bytes], object]
 
