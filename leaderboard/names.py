@@ -11,7 +11,7 @@ import unicodedata
 
 MAX_MARKS = 2
 """Maximum number of successive combining marks; more overlap the lines above and below."""
-_BLANK = frozenset("\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0\u034f\u061c\u180e\ufe0f")
+_BLANK = frozenset("\u1680\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0\u034f\u061c\u180e\ufe0f")
 """Characters of visible categories that are drawn blank."""
 _CONFUSED_SCRIPTS = frozenset({"LATIN", "CYRILLIC", "GREEK", "ARMENIAN", "CHEROKEE"})
 """Scripts with letters that look like those of another of them."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import unicodedata
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from leaderboard.names import confused_scripts, name_problem, normalised
@@ -52,6 +52,7 @@ def test_letters_of_scripts_that_resemble_each_other_are_marked(name: str, scrip
 
 
 @given(st.text(max_size=20))
+@example("0\u16800")
 def test_accepted_names_are_printable_and_stay_as_they_are(name: str) -> None:
     plain = normalised(name)
     assert normalised(plain) == plain
