@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cards import dataset_card
+from cards.dataset import dataset_card
 from dataset_builder.config.catalog import CONFIGS
 from dataset_builder.config.specs import SceneConfigSpec
 from dataset_builder.config.trajectories import view_count
