@@ -17,8 +17,6 @@ from rebar_depth_bench.reporting.tables import results_csv
 from rebar_depth_bench.scoring.comparison import check_same_splits
 from rebar_depth_bench.scoring.score import score
 
-SUMMARY = "print several submissions and the paper's rows in the layout of its Table I"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
