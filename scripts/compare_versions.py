@@ -4,8 +4,8 @@ Runs the same commands in two checkouts, each with its own ``.venv``, and compar
 dataset folders of all configs, two variants and the example scenes (of the new checkout), exports, archives of two
 methods, and the JSON, CSV, LaTeX and HTML of scoring, comparison, tables, detections and the scripts in
 ``examples/paper``; what commands print at 80 and at 200 columns, and their help; also the database schema and the
-OpenAPI document of the leaderboard. CSV files are compared by column, and HTML pages by their visible texts and
-images.
+OpenAPI document of the leaderboard. CSV files are compared by column, archives by entry, and HTML pages by
+their visible texts and images.
 
     python scripts/compare_versions.py OLD_CHECKOUT NEW_CHECKOUT --work DIR [--data ROOT] [--demo]
 
@@ -29,6 +29,7 @@ import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -169,8 +170,7 @@ def _results(data: Path, out: Path) -> Iterator[Command]:
     at = ("--data", f"{data}")
     for method in ("constant", "sgbm"):
         yield from _run(out, f"predict-{method}", "predict", method, *at, "--out", f"{out}/{method}.zip")
-    for archive in (exact, scaled, holes, f"{out}/sgbm.zip"):
-        name = Path(archive).stem
+    for name, archive in (("exact", exact), ("scaled", scaled), ("holes", holes)):
         files = _files(out, name, "json", "csv", "html", "groups-csv")
         yield from _run(out, f"score-{name}", "score", archive, *at, *files)
         yield from _run(out, f"check-{name}", "check", archive, *at)
@@ -183,7 +183,7 @@ def _results(data: Path, out: Path) -> Iterator[Command]:
         yield from _run(out, name, "table", exact, scaled, holes, *at, *options, *files)
     detections = ("score-crossings", f"{out}/detections.csv", *at)
     yield from _run(out, "detections", *detections, *_files(out, "detections", "json", "html"))
-    yield from _run(out, "detections-confident", *detections, "--confidence", "0.5", "--config", "lattice")
+    yield from _run(out, "detections-confident", *detections, "--confidence", "0.5")
     yield from _run(out, "verify", "verify", f"{data}")
     yield from _paper(out, "distance", scaled, *at)
     yield from _paper(out, "anchor", holes, *at, "--config", "lattice", "--num-anchor-views", "1")
@@ -249,25 +249,38 @@ def _messages(text: str) -> str:
 def digests(work: Path) -> dict[str, str]:
     """Return the SHA-256 of every output below ``work`` by relative path; caches and the log are left out.
 
-    Each column of a CSV file has its own digest, so that a new column is told from a changed one.
+    Each column of a CSV file has its own digest, so that a new column is told from a changed one. So has each
+    entry of an archive; its run times are left out.
     """
     found = {}
     for path in sorted(work.rglob("*")):
         name = path.relative_to(work).as_posix()
         skipped = name.startswith(("hf/", "cache/", "service/state")) or name == "log.txt"
         if path.is_file() and not skipped:
-            content = path.read_bytes().replace(str(work).encode(), b"WORK")
-            if name == "service/openapi.json":
-                content = json.dumps(interface(json.loads(content)), sort_keys=True).encode()
-            if path.suffix == ".html":
-                content = "\n".join(page_texts(content.decode())).encode()
-            if path.suffix == ".csv":
-                header, *rows = csv.reader(content.decode().splitlines(keepends=True))
-                for column, *cells in zip(header, *rows, strict=True):
-                    found[f"{name}: {column}"] = hashlib.sha256("\n".join(cells).encode()).hexdigest()
-            else:
-                found[name] = hashlib.sha256(content).hexdigest()
+            for part, whole in _parts(path).items():
+                content = whole.replace(str(work).encode(), b"WORK")
+                found[f"{name}: {part}" if part else name] = hashlib.sha256(content).hexdigest()
     return found
+
+
+def _parts(path: Path) -> dict[str, bytes]:
+    """Return what is compared of a file, by the names of its parts; "" is the whole file."""
+    if path.suffix == ".zip":
+        with zipfile.ZipFile(path) as archive:
+            entries = {name: archive.read(name) for name in archive.namelist()}
+        meta = json.loads(entries["submission.json"])
+        meta.get("runtime", {}).pop("seconds", None)
+        return {**entries, "submission.json": json.dumps(meta).encode()}
+    if path.suffix == ".csv":
+        with path.open(newline="", encoding="utf-8") as stream:
+            header, *rows = csv.reader(stream)
+        columns = zip(header, *rows, strict=True)
+        return {column: "\n".join(cells).encode() for column, *cells in columns}
+    if path.suffix == ".html":
+        return {"": "\n".join(page_texts(path.read_text(encoding="utf-8"))).encode()}
+    if path.name == "openapi.json":
+        return {"": json.dumps(interface(json.loads(path.read_bytes())), sort_keys=True).encode()}
+    return {"": path.read_bytes()}
 
 
 class _Texts(HTMLParser):
@@ -344,7 +357,7 @@ def main() -> int:
     old, new = sides
     differing = sorted(name for name in old.keys() | new.keys() if old.get(name) != new.get(name))
     kinds = sorted({Path(name.partition(": ")[0]).suffix for name in old})
-    print(f"{len(old)} files and columns compared ({', '.join(kinds)}): {len(differing)} differ")
+    print(f"{len(old)} files, columns and entries compared ({', '.join(kinds)}): {len(differing)} differ")
     reasons = dict(pair.split("=", 1) for pair in options.expect)
     faults = 0
     for name in differing:
