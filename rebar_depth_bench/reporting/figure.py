@@ -89,13 +89,13 @@ _LIMITS = (1e-3, 1e4)
 _MARGIN_FACTORS = (0.85, 1.18)
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#a0488a", "#b07800", "#2f7f9f", "#000000")
 """Colours that people with colour blindness tell apart (after Okabe and Ito), dark enough for print."""
-_MARKERS = ("o", "s", "^", "D", "v", "*", "<", ">", "P", "X", "d", "p")
+_MARKERS: tuple[Any, ...] = ("o", "s", "^", "D", "v", "*", "<", ">", "P", "X", "d", "p")
 _MARKER_SIZES = {"D": 0.8, "s": 0.85, "*": 1.3, "x": 0.8}
 """Sizes of markers that look as large as a circle or a plus, relative to it."""
-_PUBLISHED_MARKERS = ("+", "x", (6, 2, 0), "1", "2", "3")
-_CONSTANT = {"color": "#000000", "linewidth": 0.9, "linestyle": (0, (5.5, 2.2))}
-_ONE_PIXEL = {"color": "#000000", "linewidth": 0.9, "linestyle": (0, (1.3, 2.0))}
-_DIAGONAL = {"color": _GREY, "linewidth": 0.7, "linestyle": (0, (8.5, 2.8, 1.7, 2.8))}
+_PUBLISHED_MARKERS: tuple[Any, ...] = ("+", "x", (6, 2, 0), "1", "2", "3")
+_CONSTANT: Mapping[str, Any] = {"color": "#000000", "linewidth": 0.9, "linestyle": (0, (5.5, 2.2))}
+_ONE_PIXEL: Mapping[str, Any] = {"color": "#000000", "linewidth": 0.9, "linestyle": (0, (1.3, 2.0))}
+_DIAGONAL: Mapping[str, Any] = {"color": _GREY, "linewidth": 0.7, "linestyle": (0, (8.5, 2.8, 1.7, 2.8))}
 
 
 @dataclass(frozen=True)
@@ -299,7 +299,7 @@ def _entries(content: FigureContent) -> list[tuple[str, tuple[Line2D, ...]]]:
 def _legend(figure: Figure, entries: Sequence[tuple[str, tuple[Line2D, ...]]], width: float) -> Legend:
     """Add the legend in as many columns as fit into ``width`` points, and return it."""
     names = [_shortened(figure, name, width - _SAMPLE) for name, _ in entries]
-    lines = [lines for _, lines in entries]
+    lines: list[Any] = [lines for _, lines in entries]
     for columns in range(min(len(entries), _MAX_COLUMNS), 1, -1):
         legend = figure.legend(lines, names, loc="lower left", ncols=columns)
         if _extent(legend)[0] <= width:
