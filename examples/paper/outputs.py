@@ -109,12 +109,16 @@ def write_outputs(
             draw(figure)
             write_output(options.figure, figure_bytes(figure, options.figure))
     if prints_table(options):
-        names = table[[*shown]].map(lambda cell: printable(cell) if isinstance(cell, str) else cell)
-        rows = names.to_string(index=False, na_rep="-", float_format="{:.4g}".format)
+        rows = table[[*shown]].map(plain_name).to_string(index=False, na_rep="-", float_format="{:.4g}".format)
         archives = [f"{printable(one['method'])}: sha256:{one['sha256']}" for one in content["submissions"]]
         dataset = [f"dataset {content['dataset']['digest']}"] if content["dataset"] else []
         lines = "\n".join([rows, "", *notes, content["protocol"], *dataset, *archives]).split("\n")
         print("\n".join(printable(line, _MAX_LINE) for line in lines))
+
+
+def plain_name(value: Any) -> Any:
+    """Return a name with its control characters as escapes; other values unchanged."""
+    return printable(value) if isinstance(value, str) else value
 
 
 def _round(value: Any) -> Any:
