@@ -24,6 +24,7 @@ from numpy import ndarray
 from PIL import Image, ImageDraw
 
 from benchmarks.timing import machine_description, print_markdown
+from dataset_builder.inspection.font import font
 from dataset_builder.inspection.picture import corner_view
 from dataset_builder.inspection.summary import inspect_cage
 from dataset_builder.scene.assemblies.cage import Cage
@@ -40,7 +41,6 @@ from dataset_builder.scene.cages.rules import (
     SLAB_STEEL,
     WALL_STEEL,
 )
-from rebar_depth_bench.reporting.figure.drawing import font
 
 SPLIT, COLUMNS, SHEET_CAGES = "train", 8, 64
 _PANEL_PX = (480, 320)

@@ -7,10 +7,11 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 
 from rich.console import Console
@@ -130,6 +131,35 @@ def require_extra(extra: str, modules: Sequence[str]) -> None:
             f"not installed: {', '.join(missing)}; expected the {extra} extra: "
             f"pip install 'rebar-depth-bench[{extra}]'"
         )
+
+
+@dataclass(frozen=True)
+class Command:
+    """Command of a program: its module, with ``add_arguments(parser)`` and ``run(options)``, and its summary.
+
+    ``run`` prints results to standard output and progress to standard error, and raises ``RebarDepthError``.
+    """
+
+    module: str
+    summary: str
+
+
+def add_commands(
+    subparsers: argparse._SubParsersAction[argparse.ArgumentParser],
+    commands: Mapping[str, Command],
+    words: Sequence[str] | None,
+) -> None:
+    """Add a parser for each command by name, with the arguments of those that ``words`` contains.
+
+    Only the modules of these are imported, since an import may take seconds. ``words`` are those of a command
+    line; if they are None, all commands have their arguments.
+    """
+    for name, command in commands.items():
+        parser = subparsers.add_parser(name, help=command.summary, description=command.summary)
+        if words is None or name in words:
+            module = import_module(command.module)
+            module.add_arguments(parser)
+            parser.set_defaults(run=module.run)
 
 
 def run_command(command: Callable[[], None], interrupted: str = "interrupted") -> int:

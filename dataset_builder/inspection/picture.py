@@ -12,10 +12,10 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw
 
+from dataset_builder.inspection.font import font, shortened
 from dataset_builder.inspection.summary import Inspection
 from dataset_builder.scene.assemblies.cage import CageBar
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.reporting.figure.drawing import font, shortened
 from rebar_depth_bench.reporting.formatting import counted
 
 _PANEL_PX, _MARGIN_PX, _HEAD_PX = (960, 640), 40, 90

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import pandas as pd
 
-from rebar_depth_bench.console import require_extra, run_command
+from rebar_depth_bench.console import run_command
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
-from rebar_depth_bench.outputs import output_file, write_output
+from rebar_depth_bench.outputs import write_output
+from rebar_depth_bench.reporting.figure import check_figure, figure_bytes, figure_style
 from rebar_depth_bench.reporting.tables import frame_csv
 from rebar_depth_bench.scoring.rounding import rounded
 
@@ -22,12 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Number = TypeVar("Number", int, float)
-FIGURE_METADATA: Mapping[str, Mapping[str, None]] = {
-    ".png": {},
-    ".svg": {"Date": None},
-    ".pdf": {"CreationDate": None},
-}
-"""Formats of figures, and metadata without which the same numbers give the same bytes."""
 _MAX_LINE = 10_000
 """Largest number of characters in a printed line."""
 
@@ -57,7 +52,7 @@ def add_outputs(parser: argparse.ArgumentParser) -> None:
     """Add the options ``--json``, ``--csv`` and ``--figure``."""
     add_output_file(parser, "--json", "write every number as JSON")
     add_output_file(parser, "--csv", "write the table as CSV")
-    add_output_file(parser, "--figure", f"write the figure as {', '.join(FIGURE_METADATA)}")
+    add_output_file(parser, "--figure", "write the figure (.svg, .png or .pdf)")
 
 
 def run_script(
@@ -70,8 +65,8 @@ def run_script(
 
     def checked() -> None:
         check_outputs(vars(options))
-        if options.figure and options.figure.suffix not in FIGURE_METADATA:
-            raise InputError(f"--figure names {options.figure}, expected one of *{', *'.join(FIGURE_METADATA)}")
+        if options.figure:
+            check_figure(options.figure)
         run(options)
 
     return run_command(checked)
@@ -107,26 +102,23 @@ def write_outputs(
     if options.csv:
         write_output(options.csv, frame_csv(table.map(_round)))
     if options.figure:
-        require_extra("plot", ["matplotlib"])
-        from matplotlib import rc_context
         from matplotlib.figure import Figure
 
-        suffix, figure = options.figure.suffix, Figure(figsize=(9, 4.5), layout="constrained")
-        draw(figure)
-        with rc_context({"svg.hashsalt": "paper"}), output_file(options.figure) as path:
-            figure.savefig(path, format=suffix[1:], dpi=150, metadata=FIGURE_METADATA[suffix])
+        with figure_style():
+            figure = Figure(figsize=(9, 4.5), layout="constrained")
+            draw(figure)
+            write_output(options.figure, figure_bytes(figure, options.figure))
     if prints_table(options):
-        names = table[[*shown]].map(lambda cell: printable(cell) if isinstance(cell, str) else cell)
-        rows = names.to_string(index=False, na_rep="-", float_format="{:.4g}".format)
+        rows = table[[*shown]].map(plain_name).to_string(index=False, na_rep="-", float_format="{:.4g}".format)
         archives = [f"{printable(one['method'])}: sha256:{one['sha256']}" for one in content["submissions"]]
         dataset = [f"dataset {content['dataset']['digest']}"] if content["dataset"] else []
         lines = "\n".join([rows, "", *notes, content["protocol"], *dataset, *archives]).split("\n")
         print("\n".join(printable(line, _MAX_LINE) for line in lines))
 
 
-def figure_text(value: Any) -> Any:
-    """Return a name as the text of a figure, in which $ would begin a formula; other values unchanged."""
-    return printable(value).replace("$", r"\$") if isinstance(value, str) else value
+def plain_name(value: Any) -> Any:
+    """Return a name with its control characters as escapes; other values unchanged."""
+    return printable(value) if isinstance(value, str) else value
 
 
 def _round(value: Any) -> Any:

@@ -25,7 +25,7 @@ from numpy import ndarray
 from scipy.stats import kendalltau
 
 from depth_maps import DepthMaps, labelled, masked, open_data
-from outputs import add_outputs, figure_text, flat_table, number, run_script, write_outputs
+from outputs import add_outputs, flat_table, number, plain_name, run_script, write_outputs
 from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.parallel import map_with_progress
@@ -151,7 +151,7 @@ def rankings(rows: list[dict[str, Any]], names: Sequence[str]) -> dict[str, dict
 def draw_figure(figure: Figure, rows: pd.DataFrame) -> None:
     """Draw native and scaled AbsRel of each method, in one colour for each reference."""
     for axes, name in zip(figure.subplots(1, 2), ("native", "scaled"), strict=True):
-        table = rows.map(figure_text).pivot(index="method", columns="reference", values=f"{name}_abs_rel")
+        table = rows.map(plain_name).pivot(index="method", columns="reference", values=f"{name}_abs_rel")
         table.plot.bar(ax=axes, ylabel=f"AbsRel, {name}", xlabel="", rot=20, legend=name == "native")
 
 

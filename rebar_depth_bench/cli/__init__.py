@@ -1,1 +1,1 @@
-"""Commands of ``rebar-bench``, one module each, with SUMMARY, ``add_arguments(parser)`` and ``run(options)``."""
+"""Commands of ``rebar-bench``, one module each, with ``add_arguments(parser)`` and ``run(options)``."""

@@ -8,8 +8,6 @@ from rebar_depth_bench.data.cache_folder import cache_folder, clear, entries, to
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.limits import CACHE_BYTES
 
-SUMMARY = "show or clear the cache of ground truth"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""

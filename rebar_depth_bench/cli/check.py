@@ -12,8 +12,6 @@ from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.submission import check_archive, open_submission
 
-SUMMARY = "list all problems of a submission archive"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""

@@ -15,8 +15,6 @@ from rebar_depth_bench.reporting.comparison_tables import comparison_csv, print_
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.score import score
 
-SUMMARY = "compute paired differences between submissions, with intervals"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""

@@ -74,9 +74,6 @@ def _print_step(step: str) -> None:
     print(step, file=sys.stderr, flush=True)
 
 
-SUMMARY = "render a small lattice dataset, predict, score and report"
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument(

@@ -4,64 +4,42 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+import sys
+from collections.abc import Mapping, Sequence
 
-from rebar_depth_bench.cli import (
-    cache,
-    check,
-    compare,
-    demo,
-    methods,
-    predict,
-    score,
-    score_crossings,
-    submit,
-    table,
-    verify,
-)
-from rebar_depth_bench.console import run_command
+from rebar_depth_bench.console import Command, add_commands, run_command
 from rebar_depth_bench.output_options import check_outputs
 from rebar_depth_bench.terminal import use_plain_characters
 from rebar_depth_bench.version import software_version
 
-
-class Command(Protocol):
-    """Interface of the module of a command: one-line summary, arguments and entry point."""
-
-    SUMMARY: str
-
-    @property
-    def add_arguments(self) -> Callable[[argparse.ArgumentParser], None]:
-        """Function that adds the command's arguments to its parser."""
-
-    @property
-    def run(self) -> Callable[[argparse.Namespace], None]:
-        """Function that runs the command: results to standard output, progress to standard error.
-
-        Raises ``RebarDepthError``.
-        """
-
-
+_CLI = "rebar_depth_bench.cli"
 COMMANDS: Mapping[str, Command] = {
-    "score": score,
-    "score-crossings": score_crossings,
-    "compare": compare,
-    "table": table,
-    "check": check,
-    "verify": verify,
-    "methods": methods,
-    "predict": predict,
-    "submit": submit,
-    "cache": cache,
-    "demo": demo,
+    "score": Command(f"{_CLI}.score", "score a submission archive, native and scaled"),
+    "score-crossings": Command(
+        f"{_CLI}.score_crossings",
+        "score detected crossings of bars: precision, recall, average precision, position",
+    ),
+    "compare": Command(f"{_CLI}.compare", "compute paired differences between submissions, with intervals"),
+    "table": Command(
+        f"{_CLI}.table", "print several submissions and the paper's rows in the layout of its Table I"
+    ),
+    "check": Command(f"{_CLI}.check", "list all problems of a submission archive"),
+    "verify": Command(f"{_CLI}.verify", "compare every file, view and digest of a dataset with its manifest"),
+    "methods": Command(f"{_CLI}.methods", "list the available methods"),
+    "predict": Command(f"{_CLI}.predict", "run a method on a dataset and write a submission archive"),
+    "submit": Command(
+        f"{_CLI}.submit", "upload an archive to a leaderboard, wait for its score and print the table"
+    ),
+    "cache": Command(f"{_CLI}.cache", "show or clear the cache of ground truth"),
+    "demo": Command(f"{_CLI}.demo", "render a small lattice dataset, predict, score and report"),
 }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-bench`` and return its exit code."""
     use_plain_characters()
-    options = argument_parser().parse_args(arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    options = argument_parser(words).parse_args(words)
     os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")  # ``datasets`` reads it at import.
     return run_command(lambda: _run(options), interrupted=getattr(options, "interrupted", "interrupted"))
 
@@ -71,16 +49,12 @@ def _run(options: argparse.Namespace) -> None:
     options.run(options)
 
 
-def argument_parser() -> argparse.ArgumentParser:
-    """Return the argument parser of ``rebar-bench``."""
+def argument_parser(words: Sequence[str] | None = None) -> argparse.ArgumentParser:
+    """Return the argument parser of ``rebar-bench``, complete for the command in ``words``, or for all if None."""
     parser = argparse.ArgumentParser(
         prog="rebar-bench",
         description="Score metric depth on reinforcement against exact ground truth.",
     )
     parser.add_argument("--version", action="version", version=software_version())
-    subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
-    for name, command in COMMANDS.items():
-        subparser = subparsers.add_parser(name, help=command.SUMMARY, description=command.SUMMARY)
-        command.add_arguments(subparser)
-        subparser.set_defaults(run=command.run)
+    add_commands(parser.add_subparsers(required=True, metavar="COMMAND"), COMMANDS, words)
     return parser

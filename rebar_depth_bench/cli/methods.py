@@ -14,7 +14,6 @@ from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, all_methods
 from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.reporting.tables import plain_text
 
-SUMMARY = "list the available methods"
 _ALL_VIEWS_NOTE = "prepares a whole config before it predicts any view"
 _NEEDS_COLUMN_WIDTH = len("cam_from_world,")
 

@@ -22,8 +22,6 @@ from rebar_depth_bench.methods.runner import dataset_views, predict_views
 from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
 
-SUMMARY = "run a method on a dataset and write a submission archive"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""

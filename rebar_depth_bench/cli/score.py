@@ -22,8 +22,6 @@ from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.score import score_evaluation
 
-SUMMARY = "score a submission archive, native and scaled"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""

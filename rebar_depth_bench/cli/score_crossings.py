@@ -17,8 +17,6 @@ from rebar_depth_bench.reporting.detections import detection_page
 from rebar_depth_bench.reporting.table_page import print_page, render_page
 from rebar_depth_bench.submission import INPUTS
 
-SUMMARY = "score detected crossings of bars: precision, recall, average precision, position"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""

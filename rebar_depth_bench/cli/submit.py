@@ -22,7 +22,6 @@ from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.disclosure import DECIMALS, DisclosedResult, is_disclosed, read_disclosed
 from rebar_depth_bench.scoring.result_io import read_result
 
-SUMMARY = "upload an archive to a leaderboard, wait for its score and print the table"
 TOKEN_VARIABLE = "REBAR_LEADERBOARD_TOKEN"
 """Environment variable that holds the token."""
 _MAX_TOKEN_CHARACTERS = 10_000

@@ -11,13 +11,11 @@ from rebar_depth_bench.console import ProgressBars, add_data, add_workers, print
 from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.comparison_tables import disambiguate_method_names, print_paper_table
-from rebar_depth_bench.reporting.figure.write import check_figure_path, write_figure
+from rebar_depth_bench.reporting.figure import check_figure, write_figure
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import results_csv
 from rebar_depth_bench.scoring.comparison import check_same_splits
 from rebar_depth_bench.scoring.score import score
-
-SUMMARY = "print several submissions and the paper's rows in the layout of its Table I"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_expect_digest(parser)
     add_output_file(parser, "--latex", "write the table as LaTeX (booktabs)")
     add_output_file(parser, "--csv", "write all tables as CSV")
-    add_output_file(parser, "--figure", "draw native against scaled AbsRel of all configs (.svg or .png)")
+    add_output_file(parser, "--figure", "draw native against scaled AbsRel of all configs (.svg, .png or .pdf)")
     parser.add_argument("--intervals", action="store_true", help="include the 95 %% intervals in the LaTeX table")
     parser.add_argument("--no-published", action="store_true", help="omit the paper's own rows and points")
     add_workers(parser)
@@ -38,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Score all archives, write the requested files and print the table."""
     if options.figure:
-        check_figure_path(options.figure)
+        check_figure(options.figure)
     with ProgressBars() as bars:
         results = [
             score(

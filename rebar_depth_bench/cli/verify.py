@@ -10,8 +10,6 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.verification import file_problems, truth_problems
 from rebar_depth_bench.errors import DatasetError
 
-SUMMARY = "compare every file, view and digest of a dataset with its manifest"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""

@@ -15,6 +15,7 @@ from pathlib import Path
 import grimp
 import numpy as np
 import pytest
+from _pytest.mark.structures import ParameterSet
 
 from cards.reference import FULL_SETS, reference_context
 from dataset_builder.cli import argument_parser as build_parser
@@ -137,7 +138,14 @@ def test_quick_start_lists_every_extra() -> None:
     assert set(PROJECT["optional-dependencies"]) == set(first_column(DOCS / "quick-start.md"))
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name_of)
+def pages_with_python() -> list[ParameterSet]:
+    """Return the pages with Python; the one that imports and scores 96 views takes seconds."""
+    slow = {"docs/score-by-hand.md": pytest.mark.slow}
+    pages = {name_of(page): page for page in PAGES if blocks(page, "python")}
+    return [pytest.param(page, id=name, marks=slow.get(name, ())) for name, page in pages.items()]
+
+
+@pytest.mark.parametrize("page", pages_with_python())
 def test_documented_python_runs(
     page: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 SCORING_IMPORTS = (
-    "import rebar_depth_bench as rdb; rdb.score; rdb.load; rdb.SubmissionWriter; import rebar_depth_bench.cli.main"
+    "import rebar_depth_bench as rdb; rdb.score; rdb.load; rdb.SubmissionWriter; "
+    "from rebar_depth_bench.cli.main import argument_parser; argument_parser()"
 )
 
 BUILDER_MODULES = [
@@ -44,6 +45,19 @@ def test_loading_and_scoring_import_no_heavy_packages() -> None:
 
 def test_package_import_is_lightweight() -> None:
     assert not modules_after("import rebar_depth_bench") & {"datasets", "pyarrow", "numpy", "torch"}
+
+
+@pytest.mark.parametrize(
+    ("words", "commands"),
+    [("--version", set()), ("--help", set()), ("cache", {"cache"})],
+)
+def test_a_command_line_imports_only_its_command(words: str, commands: set[str]) -> None:
+    modules = modules_after(
+        f"from rebar_depth_bench.cli.main import argument_parser; argument_parser([{words!r}])"
+    )
+    names = {name.removeprefix("rebar_depth_bench.cli.") for name in modules if "rebar_depth_bench.cli." in name}
+    assert names == {"main", *commands}
+    assert commands or not modules & {"numpy", "pyarrow", "pydantic", "jinja2"}
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.methods.runner import predict
-from rebar_depth_bench.reporting.figure.content import figure_content
+from rebar_depth_bench.reporting.figure import figure_content
 from rebar_depth_bench.reporting.html.page import iter_view_panels
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.scoring.comparison import compare

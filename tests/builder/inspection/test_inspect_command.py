@@ -15,6 +15,7 @@ from PIL import Image, ImageDraw
 from rich.console import Console
 
 from dataset_builder.cli import main
+from dataset_builder.inspection.font import font
 from dataset_builder.inspection.picture import _draw_scale_bar, inspection_picture
 from dataset_builder.inspection.report import inspection_json, print_inspection
 from dataset_builder.inspection.summary import bar_box_m, inspect_cage
@@ -201,3 +202,10 @@ def test_bends_are_drawn_in_one_colour() -> None:
     inner = cv2.erode(is_steel.astype(np.uint8), np.ones((13, 13), np.uint8)) > 0
     assert inner.sum() > 1000
     assert len(np.unique(top[inner], axis=0)) == 1
+
+
+def test_font_has_the_letters_of_names() -> None:
+    def drawn(character: str) -> bytes:
+        return bytes(font(40).getmask(character))
+
+    assert all(drawn(character) != drawn("\U0010ffff") for character in "…–éßΩЖ\N{REPLACEMENT CHARACTER}")
