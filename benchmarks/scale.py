@@ -32,12 +32,11 @@ from dataset_builder.audit import audit
 from dataset_builder.config.cages import CAGES, CagesRequest
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.specs import ConfigSpec, RandomViewsSpec
+from dataset_builder.pipeline.blender_process import OnViewDone
 from dataset_builder.pipeline.build import plan_build
 from dataset_builder.pipeline.disk_space import check_readable, spaces_of_configs
 from dataset_builder.pipeline.folder import remove_build_folder, remove_stagings
-from dataset_builder.pipeline.local_renderer import OnViewDone
-from dataset_builder.pipeline.place_cameras import ScenePlan
-from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan
+from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, ScenePlan
 from dataset_builder.pipeline.publish import publish_plans
 from dataset_builder.pipeline.retained import Finished, check_retained, kept_scenes
 from dataset_builder.pipeline.shards import Staging, View, encode_view, stage_row

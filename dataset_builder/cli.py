@@ -29,8 +29,8 @@ from rebar_depth_bench.version import software_version
 
 if TYPE_CHECKING:
     from dataset_builder.config.specs import ColourSpec
+    from dataset_builder.pipeline.blender_process import Renderer
     from dataset_builder.pipeline.build import BuildSummary
-    from dataset_builder.pipeline.local_renderer import Renderer
 
 _EXTRA_MODULES = ("bpy", "cv2", "embreex", "trimesh")
 
@@ -74,14 +74,14 @@ def _build(options: argparse.Namespace) -> None:
         names = ("config", "scene", "mesh", "views", "overwrite", "dry_run")
         if given := [f"--{name.replace('_', '-')}" for name in names if getattr(options, name)]:
             raise InputError(f"--rewrite-manifest is combined with {', '.join(given)}, expected only --out ROOT")
-        from dataset_builder.pipeline.rewrite import rewrite_manifest
+        from dataset_builder.pipeline.folder import rewrite_manifest
 
         rewrite_manifest(options.out)
         print(options.out)
         return
     _check_extra()
+    from dataset_builder.pipeline.blender_process import Devices, find_devices
     from dataset_builder.pipeline.build import build
-    from dataset_builder.pipeline.devices import Devices, find_devices
 
     if options.cluster is not None and options.dry_run:
         raise InputError(
@@ -140,7 +140,7 @@ def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
     configs are those of the lattice.
     """
     from dataset_builder.config.scene_file import scene_config
-    from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
+    from dataset_builder.scene.assemblies.cage_file import mesh_file_spec
 
     default = () if options.scene else LATTICE_CONFIGS if options.mesh else CONFIGS
     return BuildRequest(
@@ -237,7 +237,7 @@ def _inspect(options: argparse.Namespace) -> None:
     from dataset_builder.inspection.picture import inspection_picture
     from dataset_builder.inspection.report import inspection_json, print_inspection
     from dataset_builder.inspection.summary import inspect_cage
-    from dataset_builder.pipeline.notes import print_notes
+    from dataset_builder.pipeline.plan import print_notes
     from dataset_builder.scene.assemblies.cage_checks import raise_problems
 
     check_outputs({**vars(options), "scene_files": files_of_scene(options.scene_file)})

@@ -25,14 +25,13 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.blender.colour import configure_colour, render_colour
-from dataset_builder.blender.devices import select_device
 from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
 from dataset_builder.blender.render import render_depth, use_cycles
 from dataset_builder.blender.scene import add_object, build_scene, mesh_data
 from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import ConfigSpec
+from dataset_builder.config.specs import CPU, GPU_TYPES, ConfigSpec
 from dataset_builder.config.trajectories import poses
-from dataset_builder.pipeline.blender_process import DepthTask, RenderTask
+from dataset_builder.pipeline.blender_process import DepthTask, DevicesTask, RenderTask
 from dataset_builder.pipeline.shards import View, encode_view, stage_row
 from dataset_builder.scene.assemblies import aim_point_m, make_assembly
 from dataset_builder.scene.mesh_ply import read_mesh_ply, write_mesh_ply
@@ -41,7 +40,7 @@ from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.variants.sensor import recorded
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.errors import BuildError
+from rebar_depth_bench.errors import BuildError, InputError
 
 
 class Stopwatch:
@@ -174,3 +173,49 @@ def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None])
             np.save(content, depth_m)
             write_bytes(task.out / f"{n}.npy", content.getvalue())
             report({"camera": n})
+
+
+def run_devices_task(task: DevicesTask, report: Callable[[Mapping[str, Any]], None]) -> None:  # noqa: ARG001
+    """Report the devices of this machine."""
+    report({"devices": available_devices()})
+
+
+def available_devices() -> dict[str, list[str]]:
+    """Return the names of the devices by type; types without devices are absent."""
+    supported = {entry[0].lower() for entry in _preferences().get_device_types(bpy.context)}
+    found = {device: [entry.name for entry in _entries(device)] for device in (CPU, *GPU_TYPES)}
+    return {device: names for device, names in found.items() if names and device in (CPU, *supported)}
+
+
+def select_device(device: str, index: int) -> None:
+    """Let Cycles render the open scene on device number ``index`` of a type, and on no other device.
+
+    Required after ``configure_colour``. The compositor denoises on the CPU in any case: images are then denoised
+    in the same way on all devices, and the GPU's memory holds only the scene.
+
+    Raises ``InputError`` if there is no such device.
+    """
+    cycles = bpy.context.scene.cycles
+    if device == CPU:
+        cycles.device = "CPU"
+        return
+    chosen = _entries(device)[index : index + 1]
+    if not chosen:
+        listed = ", ".join(f"{name} ({len(names)})" for name, names in available_devices().items())
+        raise InputError(f"--device {device}: device {index} was not found, only: {listed}")
+    preferences = _preferences()
+    preferences.compute_device_type = device.upper()
+    for entry in preferences.devices:
+        entry.use = (entry.type, entry.id) == (chosen[0].type, chosen[0].id)
+    cycles.device = "GPU"
+
+
+def _preferences() -> Any:
+    """Return the preferences of Cycles; ``read_factory_settings`` replaces them."""
+    return bpy.context.preferences.addons["cycles"].preferences
+
+
+def _entries(device: str) -> list[Any]:
+    """Return Cycles' entries of the devices of a type, in the order of their ids, which hold the PCI address."""
+    entries = _preferences().get_devices_for_type(device.upper())
+    return sorted((entry for entry in entries if entry.type == device.upper()), key=lambda entry: entry.id)

@@ -33,8 +33,7 @@ from dataset_builder.config.survey import with_stations
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.scene.assemblies import aim_point_m, check_above_ground, check_fits, make_assembly
 from dataset_builder.scene.assemblies.cage import Cage
-from dataset_builder.scene.assemblies.cage_file import cage_file_spec, read_cage
-from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
+from dataset_builder.scene.assemblies.cage_file import cage_file_spec, mesh_file_spec, read_cage
 from dataset_builder.scene.assemblies.mesh_import import SUFFIXES as MESH_SUFFIXES
 from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.errors import InputError, MeshError

@@ -15,9 +15,9 @@ from dataset_builder.config.scene_schema import SCENE_NAME
 from dataset_builder.importing.bars_file import read_bars_file
 from dataset_builder.importing.layout import Layout, read_layout
 from dataset_builder.importing.views import SourceViews, open_views
-from dataset_builder.pipeline.folder import check_target, remove_build_folder
+from dataset_builder.pipeline.folder import build_lock, check_target, remove_build_folder
 from dataset_builder.pipeline.plan import BUILD_FOLDER, KEY_CHARACTERS, generator_versions
-from dataset_builder.pipeline.publish import StagedScene, build_lock, publish, remove_leftovers
+from dataset_builder.pipeline.publish import StagedScene, publish, remove_leftovers
 from dataset_builder.pipeline.retained import Finished, check_retained
 from dataset_builder.pipeline.shards import Staging, encode_row, stage_row, view_record
 from rebar_depth_bench.data.bars import Bar

@@ -13,14 +13,19 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
+from dataset_builder.config.specs import CPU, GPU_TYPES
 from dataset_builder.pipeline.shards import Staging
-from dataset_builder.pipeline.work_units import WorkUnit
+from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
+from rebar_depth_bench.atomic_io import scratch_folder
+from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError, InputError, OutputError, RebarDepthError, RenderProcessError
 from rebar_depth_bench.geometry.cameras import Camera
 
@@ -163,3 +168,141 @@ def _failure_message(label: str, status: int, attempts: int, log: Path) -> str:
         f"the render process for {label} died {attempts} times, the last time with {reason}; "
         f"end of {log}:\n{log_excerpt}"
     )
+
+
+OnViewDone = Callable[[int], None]
+"""Callback with the index of each rendered view; may run in another thread, and twice for the same view."""
+
+
+class Renderer(Protocol):
+    """Renderer of work units; leaving the context that created it cancels unfinished units."""
+
+    def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
+        """Schedule ``unit``; ``staging`` is the staging folder of the config on this machine."""
+        ...
+
+
+@dataclass(frozen=True)
+class LocalRenderer:
+    """Renderer on this machine that writes directly to the staging folder: a kill loses at most one view."""
+
+    pool: ThreadPoolExecutor
+    blender: BlenderProcesses
+    threads: int
+    devices: DeviceShares
+
+    def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
+        """Schedule ``unit`` on the next free process."""
+        return self.pool.submit(self._render, unit, staging, on_view_done)
+
+    def _render(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> UnitResult:
+        with self.devices.least_busy() as index:
+            return render_unit(unit, staging, self.threads, self.blender, on_view_done, "this machine", index)
+
+
+@contextmanager
+def local_processes(workers: int, threads: int, devices: int = 1) -> Iterator[LocalRenderer]:
+    """Yield a renderer with ``workers`` concurrent Blender processes per device, of ``threads`` threads each."""
+    with ThreadPoolExecutor(workers * devices) as pool, BlenderProcesses() as blender:
+        yield LocalRenderer(pool, blender, threads, DeviceShares(devices))
+
+
+def render_unit(
+    unit: WorkUnit,
+    staging: Staging,
+    threads: int,
+    blender: BlenderProcesses,
+    on_view_done: OnViewDone,
+    worker: str,
+    device_index: int = 0,
+) -> UnitResult:
+    """Render a unit in a Blender process into ``staging`` and return its result without row and mesh bytes.
+
+    A GPU is number ``device_index`` of the type that the config names.
+
+    Raises the ``InputError``, ``BuildError`` or ``OutputError`` that the process reports, and
+    ``RenderProcessError`` naming the unit if the process dies twice.
+    """
+    seconds: defaultdict[str, float] = defaultdict(float)
+
+    def on_event(event: Event) -> None:
+        for stage, duration_s in event["seconds"].items():
+            seconds[stage] += duration_s
+        if "view" in event:
+            on_view_done(event["view"])
+
+    blender.run(RenderTask(unit, staging, threads, device_index), unit.label, staging.log(unit.shard), on_event)
+    return UnitResult(worker, dict(seconds), file_sha256(staging.mesh))
+
+
+AUTO = "auto"
+"""Choice of the best type of device that the machine has."""
+
+DeviceNames = Mapping[str, Sequence[str]]
+"""Names of the devices by type, ``cpu`` or one of ``GPU_TYPES``; types without devices are absent."""
+
+
+@dataclass(frozen=True)
+class Devices:
+    """Devices of one type that render a build; the CPU is one device."""
+
+    type: str = CPU
+    count: int = 1
+
+
+def find_devices(requested: str) -> Devices:
+    """Return the devices of this machine for a value of ``--device``.
+
+    Raises what ``choose_devices`` raises, and ``RenderProcessError`` if Blender fails while it lists the devices.
+    """
+    return Devices() if requested == CPU else choose_devices(requested, available_devices(), "this machine")
+
+
+def available_devices() -> DeviceNames:
+    """Return the devices of this machine, as Cycles lists them in a Blender process."""
+    found: dict[str, list[str]] = {}
+
+    def on_event(event: Event) -> None:
+        found.update(event["devices"])
+
+    with scratch_folder("rebar-devices-") as scratch, BlenderProcesses() as blender:
+        blender.run(DevicesTask(), "the list of devices", scratch / "blender.log", on_event)
+    return found
+
+
+def choose_devices(requested: str, available: DeviceNames, machine: str) -> Devices:
+    """Return the devices of the type ``requested``, or of the best available type for ``auto``.
+
+    Raises ``InputError`` that lists the devices of ``machine`` if it has none of this type.
+    """
+    if requested == AUTO:
+        requested = next((name for name in GPU_TYPES if available.get(name)), CPU)
+    if requested == CPU:
+        return Devices()
+    if not available.get(requested):
+        listed = [f"{device} ({', '.join(names)})" for device, names in available.items()]
+        raise InputError(
+            f"--device {requested}: {machine} has no such device, expected one of those that Cycles finds: "
+            f"{'; '.join(listed) or CPU}"
+        )
+    return Devices(requested, len(available[requested]))
+
+
+class DeviceShares:
+    """Number of render processes on each of several equal devices; thread-safe."""
+
+    def __init__(self, devices: int) -> None:
+        self._running = [0] * devices
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def least_busy(self) -> Iterator[int]:
+        """Yield the index of the device with the fewest processes, the first of them; count one until the end."""
+        with self._lock:
+            index = self._running.index(min(self._running))
+            self._running[index] += 1
+        try:
+            yield index
+        finally:
+            with self._lock:
+                self._running[index] -= 1

@@ -15,14 +15,11 @@ from pathlib import Path
 
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.specs import SceneConfigSpec
+from dataset_builder.pipeline.blender_process import Renderer, local_processes
 from dataset_builder.pipeline.disk_space import check_fits_on_disk, check_readable
-from dataset_builder.pipeline.folder import check_folder, remove_build_folder, remove_stagings
-from dataset_builder.pipeline.local_renderer import Renderer, local_processes
-from dataset_builder.pipeline.notes import print_notes
-from dataset_builder.pipeline.place_cameras import place_cameras
-from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, plan_config
+from dataset_builder.pipeline.folder import build_lock, check_folder, remove_build_folder, remove_stagings
+from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, place_cameras, plan_config, print_notes
 from dataset_builder.pipeline.publish import (
-    build_lock,
     publish_plans,
     remove_leftovers,
     repair_metadata,

@@ -30,9 +30,14 @@ from distributed.scheduler import KilledWorker
 
 from dataset_builder.config.file_specs import PinnedFile, read_assembly_file
 from dataset_builder.config.specs import CPU, ConfigSpec
-from dataset_builder.pipeline.blender_process import BlenderProcesses
-from dataset_builder.pipeline.devices import AUTO, available_devices, choose_devices
-from dataset_builder.pipeline.local_renderer import OnViewDone, render_unit
+from dataset_builder.pipeline.blender_process import (
+    AUTO,
+    BlenderProcesses,
+    OnViewDone,
+    available_devices,
+    choose_devices,
+    render_unit,
+)
 from dataset_builder.pipeline.plan import generator_versions
 from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, check_software_versions, with_payload

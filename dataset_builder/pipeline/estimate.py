@@ -17,8 +17,7 @@ from pathlib import Path
 from dataset_builder.config.specs import ColourSpec, ConfigSpec, SceneConfigSpec
 from dataset_builder.pipeline.disk_space import ConfigSpace, bytes_text, config_space, free_bytes, needed_bytes
 from dataset_builder.pipeline.folder import stagings_by_label
-from dataset_builder.pipeline.place_cameras import with_cameras
-from dataset_builder.pipeline.plan import ConfigPlan
+from dataset_builder.pipeline.plan import ConfigPlan, with_cameras
 from dataset_builder.pipeline.retained import Finished
 from dataset_builder.pipeline.trial import Trial, run_trial
 from dataset_builder.pipeline.work_units import remaining_units

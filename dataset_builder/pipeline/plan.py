@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+import multiprocessing
+import sys
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from dataset_builder.config.specs import ConfigSpec
+from dataset_builder.config.camera_site import CameraSite
+from dataset_builder.config.random_views import SPACING_M, with_random_stations
+from dataset_builder.config.specs import ConfigSpec, GeneratedCageSpec, RandomViewsSpec, SceneConfigSpec
+from dataset_builder.config.surroundings import SURROUNDINGS
 from dataset_builder.config.trajectories import subset, view_count
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging
 from dataset_builder.scene.assemblies import aim_point_m, make_assembly
-from dataset_builder.scene.model import Assembly
+from dataset_builder.scene.assemblies.generated import cage_assembly, spec_cage
+from dataset_builder.scene.model import Assembly, Note
 from dataset_builder.scene.variants.image_light import image_light
+from dataset_builder.scene.variants.props import make_props
 from dataset_builder.scene.variants.sensor import sensor_spec
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import ROW_SCHEMA
 from rebar_depth_bench.data.digests import parameters_digest
+from rebar_depth_bench.errors import printable
+from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.version import software_version
 
 KEY_CHARACTERS = 16
@@ -108,3 +118,74 @@ def _installed_version(name: str) -> str:
         return version(name)
     except PackageNotFoundError:
         return "of another distribution"  # For example OpenCV built with a window toolkit.
+
+
+@dataclass(frozen=True)
+class ScenePlan(ConfigPlan):
+    """Plan of a generated scene with its cameras: also its bars, and the record of the generator."""
+
+    bars: tuple[Bar, ...] = ()
+    record: Mapping[str, Any] = field(default_factory=dict)
+
+    def derived(self) -> dict[str, Any]:
+        """Return the family of the cage and the record of the generator."""
+        return {"family": self.record["family"], "cage": dict(self.record)}
+
+
+def place_cameras(plans: Sequence[ConfigPlan], processes: int, progress: Progress = silent) -> list[ConfigPlan]:
+    """Return the plans; those of generated scenes have the stations of their cameras.
+
+    Raises ``InputError`` for a cage that cannot be generated, or round which cameras cannot be placed.
+    """
+    missing = [plan for plan in plans if is_generated(plan)]
+    if not missing:
+        return list(plans)
+    placed: dict[str, ConfigPlan] = {}
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(processes, len(missing)), mp_context=context) as pool:
+        futures: list[Future[ConfigPlan]] = [pool.submit(with_cameras, plan) for plan in missing]
+        try:
+            for done, future in enumerate(futures, start=1):
+                plan = future.result()
+                placed[plan.key] = plan
+                progress("cages and cameras", done, len(missing))
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return [placed.get(plan.key, plan) for plan in plans]
+
+
+def is_generated(plan: ConfigPlan) -> bool:
+    """Return whether a plan is that of a generated scene, whose cameras are not placed yet."""
+    return isinstance(plan.spec, SceneConfigSpec) and not isinstance(plan, ScenePlan)
+
+
+def with_cameras(plan: ConfigPlan) -> ConfigPlan:
+    """Return the plan of a generated scene with its cameras, another one as it is. Raises as ``place_cameras``."""
+    if not is_generated(plan):
+        return plan
+    spec = plan.spec
+    cage = spec_cage(cast(GeneratedCageSpec, spec.scene.assembly))
+    assembly = cage_assembly(cage)
+    space, props = SURROUNDINGS[spec.scene.environment].cameras, make_props(assembly, spec.scene)
+    site = CameraSite(assembly, space, SPACING_M, props)
+    views = with_random_stations(cast(RandomViewsSpec, spec.protocol), site, spec.rig, f"scene {spec.label}")
+    return ScenePlan(
+        spec=replace(spec, protocol=views),
+        indices=plan.indices,
+        key=plan.key,
+        staging=plan.staging,
+        bars=assembly.bars,
+        record=cage.record,
+    )
+
+
+MAX_NOTES, _MAX_CHARACTERS = 20, 4000
+"""Largest number of notes on scene files that are printed, and of characters of one."""
+
+
+def print_notes(notes: Sequence[Note]) -> None:
+    """Print notes on scene files to standard error, at most ``MAX_NOTES`` of them."""
+    for note in notes[:MAX_NOTES]:
+        print(printable(f"note: {note.source}: {note.text}", _MAX_CHARACTERS), file=sys.stderr)
+    if len(notes) > MAX_NOTES:
+        print(f"note: {len(notes) - MAX_NOTES} more notes are not shown", file=sys.stderr)

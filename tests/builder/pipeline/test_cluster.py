@@ -21,7 +21,7 @@ from dataset_builder.pipeline.dask_renderer import connect_to_cluster
 from dataset_builder.pipeline.plan import BUILD_FOLDER, generator_versions, plan_config
 from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import remaining_units
-from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
+from dataset_builder.scene.assemblies.cage_file import mesh_file_spec
 from rebar_depth_bench.errors import InputError
 from tests.building import (
     TINY,

@@ -9,7 +9,7 @@ import pytest
 
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
 from dataset_builder.config.specs import CPU, GPU_TYPES, ColourSpec
-from dataset_builder.pipeline.devices import AUTO, Devices, DeviceShares, available_devices, choose_devices
+from dataset_builder.pipeline.blender_process import AUTO, Devices, DeviceShares, available_devices, choose_devices
 from dataset_builder.pipeline.plan import config_parameters, plan_config
 from rebar_depth_bench.errors import InputError
 from tests.building import TINY, TWO_BARS, RunBuild
