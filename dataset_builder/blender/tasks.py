@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import io
 import os
-import resource
-import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -28,12 +26,14 @@ from dataset_builder.blender.colour import configure_colour, render_colour
 from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
 from dataset_builder.blender.render import render_depth, use_cycles
 from dataset_builder.blender.scene import add_object, build_scene, mesh_data
+from dataset_builder.config.file_specs import PinnedFile
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import CPU, GPU_TYPES, ConfigSpec
 from dataset_builder.config.trajectories import poses
 from dataset_builder.pipeline.blender_process import DepthTask, DevicesTask, RenderTask
 from dataset_builder.pipeline.shards import View, encode_view, stage_row
 from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from dataset_builder.scene.assemblies.cage import unpacked_cage
 from dataset_builder.scene.mesh_ply import read_mesh_ply, write_mesh_ply
 from dataset_builder.scene.model import Mesh, WorldMesh, surface
 from dataset_builder.scene.raycast import RayCaster
@@ -74,11 +74,13 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
     unit, staging = task.unit, task.staging
     config = unit.config
     with watch.timing("scene"):
-        assembly = make_assembly(config.scene.assembly)
+        of_file = isinstance(config.scene.assembly, PinnedFile)
+        cage = unpacked_cage(staging.cage.read_bytes()) if of_file else None
+        assembly = make_assembly(config.scene.assembly, cage)
         build_scene(assembly, config.scene, colour=config.colour is not None)
         if config.colour is not None:
             configure_colour(task.threads)
-            select_device(config.colour.device, task.device_index)
+            select_device(config.colour.device)
         mesh = evaluated_world_mesh()
         _stage_mesh(mesh, staging.mesh, unit.mesh_sha256)
         caster = RayCaster(mesh)
@@ -96,12 +98,6 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
                 with watch.timing("write"):
                     stage_row(path, row, record)
             report({"view": index, "seconds": watch.take()})
-    report({"seconds": {}, "memory_bytes": _peak_memory_bytes(), "cpu_s": time.process_time()})
-
-
-def _peak_memory_bytes() -> int:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024  # Linux counts KiB.
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,11 +183,12 @@ def available_devices() -> dict[str, list[str]]:
     return {device: names for device, names in found.items() if names and device in (CPU, *supported)}
 
 
-def select_device(device: str, index: int) -> None:
-    """Let Cycles render the open scene on device number ``index`` of a type, and on no other device.
+def select_device(device: str) -> None:
+    """Let Cycles render the open scene on all devices of a type, and on no other device.
 
     Required after ``configure_colour``. The compositor denoises on the CPU in any case: images are then denoised
-    in the same way on all devices, and the GPU's memory holds only the scene.
+    in the same way on all devices, and the GPU's memory holds only the scene. Ground truth is ray cast on the CPU
+    and does not depend on the device. Rendering on a GPU is untested, since no machine with one was at hand.
 
     Raises ``InputError`` if there is no such device.
     """
@@ -199,14 +196,13 @@ def select_device(device: str, index: int) -> None:
     if device == CPU:
         cycles.device = "CPU"
         return
-    chosen = _entries(device)[index : index + 1]
-    if not chosen:
+    if not _entries(device):
         listed = ", ".join(f"{name} ({len(names)})" for name, names in available_devices().items())
-        raise InputError(f"--device {device}: device {index} was not found, only: {listed}")
+        raise InputError(f"--device {device}: no such device was found, only: {listed}")
     preferences = _preferences()
     preferences.compute_device_type = device.upper()
     for entry in preferences.devices:
-        entry.use = (entry.type, entry.id) == (chosen[0].type, chosen[0].id)
+        entry.use = entry.type == device.upper()
     cycles.device = "GPU"
 
 
@@ -216,6 +212,5 @@ def _preferences() -> Any:
 
 
 def _entries(device: str) -> list[Any]:
-    """Return Cycles' entries of the devices of a type, in the order of their ids, which hold the PCI address."""
-    entries = _preferences().get_devices_for_type(device.upper())
-    return sorted((entry for entry in entries if entry.type == device.upper()), key=lambda entry: entry.id)
+    """Return Cycles' entries of the devices of a type."""
+    return [entry for entry in _preferences().get_devices_for_type(device.upper()) if entry.type == device.upper()]

@@ -21,7 +21,6 @@ from dataset_builder.config.specs import (
 )
 from dataset_builder.config.stereo_cameras import STEREO_CAMERAS
 from dataset_builder.config.surroundings import FORMWORK_FAMILIES, LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
-from dataset_builder.scene.cages.generate import drawn_family
 from dataset_builder.scene.variants import EXCLUSIVE_SLOTS, SENSOR, SHADOWS, VARIANTS
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
@@ -80,6 +79,8 @@ def cage_scenes(
 
 
 def _scene(request: CagesRequest, number: int, seed: int) -> SceneConfigSpec:
+    from dataset_builder.scene.cages.generate import drawn_family  # Only builds of ``cages`` need the generator.
+
     rng = np.random.default_rng([_STREAM, seed, SPLITS.index(request.split), number])
     family = drawn_family(request.split, number, seed)
     environment = str(rng.choice(LIFE_SIZE_ENVIRONMENTS))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 from dataset_builder.config.cages import CAGES, CagesRequest, cage_scenes
 from dataset_builder.config.file_specs import MeshFileSpec
@@ -31,6 +32,9 @@ from dataset_builder.scene.variants import VARIANTS, check_variants
 from rebar_depth_bench.data.trajectory import NEAREST_STEEL
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
+
+if TYPE_CHECKING:
+    from dataset_builder.scene.assemblies.cage import Cage
 
 LATTICE_DOME = DomeSpec(
     radii_m=(0.22, 0.30, 0.35, 0.38, 0.40, 0.42, 0.43),
@@ -127,7 +131,8 @@ class BuildRequest:
     ``colour`` None builds no colour. ``mesh`` replaces the rods of the lattice. ``variants`` are names of
     ``scene.variants.VARIANTS``; they are appended to the names of configs and scenes. ``scenes`` are the configs
     of user scene files. ``cages`` are the scenes of the config of that name, if it is among the ``configs``.
-    ``overwrite`` are the names of configs whose finished views may be replaced.
+    ``overwrite`` are the names of configs whose finished views may be replaced. ``cages_read`` has what was read
+    already from files of the ``scenes``, by their specs.
     """
 
     configs: tuple[str, ...] = tuple(CONFIGS)
@@ -141,6 +146,7 @@ class BuildRequest:
     scenes: tuple[ConfigSpec, ...] = ()
     cages: CagesRequest | None = None
     overwrite: tuple[str, ...] = ()
+    cages_read: Mapping[AssemblySpec, Cage] = field(default_factory=dict)
 
     def config_specs(self) -> list[ConfigSpec]:
         """Return the specs of all requested configs.

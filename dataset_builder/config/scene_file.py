@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -57,8 +57,21 @@ _SMALL = "laboratory"
 """Environment of steel and cameras that fit in it; for others it is outdoors."""
 
 
+@dataclass(frozen=True, eq=False)
+class UserScene:
+    """Scene of a user's file: its config, and the cage that was read from the file."""
+
+    config: ConfigSpec
+    cage: Cage
+
+
 def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
-    """Return the config of a scene file, with the default rig, colour settings and seed.
+    """Return the config of a scene file. Raises as ``read_scene``."""
+    return read_scene(path).config
+
+
+def read_scene(path: str | os.PathLike[str]) -> UserScene:
+    """Return the config of a scene file, with the default rig, colour settings and seed, and its cage.
 
     Defaults of omitted keys: the name is that of the file in lower case, with hyphens; the cameras are
     ``default_dome``, or a survey if that does not fit outdoors, or into the hall or onto the deck where these are
@@ -76,7 +89,8 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     _check_name(name, path)
     with _scene_and_key_named(scene_toml, path):
         assembly_spec = _assembly_spec(scene_toml, path)
-        assembly = make_assembly(assembly_spec)
+        cage = read_cage(assembly_spec)
+        assembly = make_assembly(assembly_spec, cage)
     trajectory = scene_toml.trajectory or _default_trajectory(assembly, scene_toml.environment)
     environment = scene_toml.environment or ("outdoors" if _misfit(_SMALL, assembly, trajectory) else _SMALL)
     if environment != "outdoors" and (misfit := _misfit(environment, assembly, trajectory)):
@@ -96,7 +110,7 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
         raise MeshError(f"{path}: {error}") from None
     markers = SURROUNDINGS[environment].markers if scene_toml.board is None else scene_toml.board
     board = BoardSpec(markers=markers) if markers else None
-    return replace(config, scene=replace(config.scene, board=board))
+    return UserScene(replace(config, scene=replace(config.scene, board=board)), cage)
 
 
 def scene_cage(path: str | os.PathLike[str], mesh_unit: str | float = "m") -> Cage:

@@ -1,8 +1,10 @@
-"""Blender subprocesses, the tasks they run and the events they report.
+"""Blender subprocesses: the tasks they run, the events they report, and the renderer that they are.
 
 A task is pickled to the standard input of the process. The input then stays open, and the process exits when it is
 closed, so that no render outlives its parent. Events are JSON lines on the standard output of the process. The
 output of Blender and its libraries goes to a log file, whose end is shown only if the process fails.
+
+The renderer of a cluster is ``dask_renderer``.
 """
 
 from __future__ import annotations
@@ -41,8 +43,6 @@ class RenderTask:
     unit: WorkUnit
     staging: Staging
     threads: int
-    device_index: int = 0
-    """Index of the device among those of the type that the config names; unused on the CPU."""
 
 
 @dataclass(frozen=True)
@@ -189,22 +189,19 @@ class LocalRenderer:
     pool: ThreadPoolExecutor
     blender: BlenderProcesses
     threads: int
-    devices: DeviceShares
 
     def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
         """Schedule ``unit`` on the next free process."""
-        return self.pool.submit(self._render, unit, staging, on_view_done)
-
-    def _render(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> UnitResult:
-        with self.devices.least_busy() as index:
-            return render_unit(unit, staging, self.threads, self.blender, on_view_done, "this machine", index)
+        return self.pool.submit(
+            render_unit, unit, staging, self.threads, self.blender, on_view_done, "this machine"
+        )
 
 
 @contextmanager
-def local_processes(workers: int, threads: int, devices: int = 1) -> Iterator[LocalRenderer]:
-    """Yield a renderer with ``workers`` concurrent Blender processes per device, of ``threads`` threads each."""
-    with ThreadPoolExecutor(workers * devices) as pool, BlenderProcesses() as blender:
-        yield LocalRenderer(pool, blender, threads, DeviceShares(devices))
+def local_processes(workers: int, threads: int) -> Iterator[LocalRenderer]:
+    """Yield a renderer with ``workers`` concurrent Blender processes of ``threads`` threads each."""
+    with ThreadPoolExecutor(workers) as pool, BlenderProcesses() as blender:
+        yield LocalRenderer(pool, blender, threads)
 
 
 def render_unit(
@@ -214,11 +211,8 @@ def render_unit(
     blender: BlenderProcesses,
     on_view_done: OnViewDone,
     worker: str,
-    device_index: int = 0,
 ) -> UnitResult:
-    """Render a unit in a Blender process into ``staging`` and return its result without row and mesh bytes.
-
-    A GPU is number ``device_index`` of the type that the config names.
+    """Render a unit in a Blender process into ``staging`` and return its result without the content of files.
 
     Raises the ``InputError``, ``BuildError`` or ``OutputError`` that the process reports, and
     ``RenderProcessError`` naming the unit if the process dies twice.
@@ -231,7 +225,7 @@ def render_unit(
         if "view" in event:
             on_view_done(event["view"])
 
-    blender.run(RenderTask(unit, staging, threads, device_index), unit.label, staging.log(unit.shard), on_event)
+    blender.run(RenderTask(unit, staging, threads), unit.label, staging.log(unit.shard), on_event)
     return UnitResult(worker, dict(seconds), file_sha256(staging.mesh))
 
 
@@ -242,20 +236,12 @@ DeviceNames = Mapping[str, Sequence[str]]
 """Names of the devices by type, ``cpu`` or one of ``GPU_TYPES``; types without devices are absent."""
 
 
-@dataclass(frozen=True)
-class Devices:
-    """Devices of one type that render a build; the CPU is one device."""
+def find_device(requested: str) -> str:
+    """Return the type of device for a value of ``--device`` on this machine.
 
-    type: str = CPU
-    count: int = 1
-
-
-def find_devices(requested: str) -> Devices:
-    """Return the devices of this machine for a value of ``--device``.
-
-    Raises what ``choose_devices`` raises, and ``RenderProcessError`` if Blender fails while it lists the devices.
+    Raises what ``choose_device`` raises, and ``RenderProcessError`` if Blender fails while it lists the devices.
     """
-    return Devices() if requested == CPU else choose_devices(requested, available_devices(), "this machine")
+    return CPU if requested == CPU else choose_device(requested, available_devices(), "this machine")
 
 
 def available_devices() -> DeviceNames:
@@ -270,39 +256,20 @@ def available_devices() -> DeviceNames:
     return found
 
 
-def choose_devices(requested: str, available: DeviceNames, machine: str) -> Devices:
-    """Return the devices of the type ``requested``, or of the best available type for ``auto``.
+def choose_device(requested: str, available: DeviceNames, machine: str) -> str:
+    """Return the type of device that is ``requested``, or the best available type for ``auto``.
+
+    Only the type is part of a config's key, so that equal GPUs give equal keys; GPUs of different models may
+    differ in the last bit of a pixel. Rendering on a GPU is untested: no machine with one was at hand.
 
     Raises ``InputError`` that lists the devices of ``machine`` if it has none of this type.
     """
     if requested == AUTO:
         requested = next((name for name in GPU_TYPES if available.get(name)), CPU)
-    if requested == CPU:
-        return Devices()
-    if not available.get(requested):
+    if requested != CPU and not available.get(requested):
         listed = [f"{device} ({', '.join(names)})" for device, names in available.items()]
         raise InputError(
             f"--device {requested}: {machine} has no such device, expected one of those that Cycles finds: "
             f"{'; '.join(listed) or CPU}"
         )
-    return Devices(requested, len(available[requested]))
-
-
-class DeviceShares:
-    """Number of render processes on each of several equal devices; thread-safe."""
-
-    def __init__(self, devices: int) -> None:
-        self._running = [0] * devices
-        self._lock = threading.Lock()
-
-    @contextmanager
-    def least_busy(self) -> Iterator[int]:
-        """Yield the index of the device with the fewest processes, the first of them; count one until the end."""
-        with self._lock:
-            index = self._running.index(min(self._running))
-            self._running[index] += 1
-        try:
-            yield index
-        finally:
-            with self._lock:
-                self._running[index] -= 1
+    return requested

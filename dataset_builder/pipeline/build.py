@@ -14,6 +14,7 @@ from itertools import groupby
 from pathlib import Path
 
 from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.specs import SceneConfigSpec
 from dataset_builder.pipeline.blender_process import Renderer, local_processes
 from dataset_builder.pipeline.disk_space import check_fits_on_disk, check_readable
@@ -27,6 +28,8 @@ from dataset_builder.pipeline.publish import (
 from dataset_builder.pipeline.retained import Finished, check_retained, kept_scenes
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, accept_result, remaining_units
 from dataset_builder.scene.assemblies import check_fits
+from dataset_builder.scene.assemblies.cage import packed_cage
+from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.progress import Progress, silent
 
@@ -46,23 +49,20 @@ def build(
     *,
     workers: int = 1,
     threads: int = 1,
-    devices: int = 1,
     cluster: Renderer | None = None,
     progress: Progress = silent,
 ) -> BuildSummary:
     """Build the requested configs in the folder ``out``, or continue an interrupted build of them.
 
-    Rendering uses ``workers`` concurrent processes of ``threads`` threads each on this machine, for each of
-    ``devices`` devices of the request's type, or the workers of ``cluster`` if it is not None. None of these
-    changes the bytes of the result. Each config is published as soon as it is complete.
+    Rendering uses ``workers`` concurrent processes of ``threads`` threads each on this machine, or the workers of
+    ``cluster`` if it is not None. None of these changes the bytes of the result. Each config is published as soon
+    as it is complete.
 
     Raises ``InputError`` for a request that cannot be built, ``OutputError`` if it does not fit on the disk or the
     machine cannot write, ``RenderProcessError`` if a render process dies twice, and ``BuildError`` if rendered
     data does not match its digests.
     """
-    plans = plan_build(request, out)
-    finished = Finished(out)
-    check_retained(out, finished, plans, request.overwrite)
+    plans, finished = plan_build(request, out)
     print_notes(finished.notes(plans))
     missing = [plan for plan in plans if not finished.has(plan)]
     check_fits_on_disk(out, missing, finished)
@@ -73,25 +73,37 @@ def build(
             if finished.is_outdated:
                 raise InputError(f"{out}: another build has changed the folder; run the same command again")
             remove_leftovers(out, finished.folder)
-            with nullcontext(cluster) if cluster else local_processes(workers, threads, devices) as renderer:
+            with nullcontext(cluster) if cluster else local_processes(workers, threads) as renderer:
                 return _build_plans(out, finished, plans, missing, renderer, progress)
         finally:
             remove_build_folder(out / BUILD_FOLDER)
 
 
-def plan_build(request: BuildRequest, out: Path) -> list[ConfigPlan]:
-    """Return the plans of the requested configs; nothing is written. Notes on their files go to standard error.
+def plan_build(request: BuildRequest, out: Path) -> tuple[list[ConfigPlan], Finished]:
+    """Return the plans of the requested configs, and what the folder ``out`` has; nothing is written.
 
-    Raises ``InputError`` for a request that cannot be built in the folder ``out``, such as an unusable mesh file.
+    Files that the request has not read are read here, each once; notes on them go to standard error. Raises
+    ``InputError`` for a request that cannot be built in the folder, such as an unusable mesh file or one whose
+    finished views would be lost.
     """
-    plans = [plan_config(spec, request.views, out) for spec in request.config_specs()]
+    specs = request.config_specs()
+    cages = dict(request.cages_read)
+    for spec in specs:
+        file = spec.scene.assembly
+        if isinstance(file, CageFileSpec | MeshFileSpec) and file not in cages:
+            from dataset_builder.scene.assemblies.cage_file import read_cage
+
+            cages[file] = read_cage(file)
+    plans = [plan_config(spec, request.views, out, cages.get(spec.scene.assembly)) for spec in specs]
     # Cameras of generated scenes are placed later, so that they fit.
     with_cameras = [plan for plan in plans if not isinstance(plan.spec, SceneConfigSpec)]
     for plan in with_cameras:
         check_fits(plan.assembly, plan.spec)
     print_notes(list(dict.fromkeys(note for plan in with_cameras for note in plan.assembly.notes)))
     check_folder(out, plans)
-    return plans
+    finished = Finished(out)
+    check_retained(out, finished, plans, request.overwrite)
+    return plans, finished
 
 
 def _build_plans(
@@ -151,7 +163,10 @@ def _render(plans: Sequence[ConfigPlan], renderer: Renderer, progress: Progress,
     waiting: dict[Future[UnitResult], tuple[ConfigPlan, WorkUnit]] = {}
     for plan in plans:
         plan.staging.root.mkdir(parents=True, exist_ok=True)
-        for unit in remaining_units(plan):
+        units = remaining_units(plan)
+        if units and plan.cage is not None:
+            write_bytes(plan.staging.cage, packed_cage(plan.cage))
+        for unit in units:
             waiting[renderer.submit(unit, plan.staging, partial(count.add, plan.key))] = plan, unit
     try:
         for future in as_completed(list(waiting)):

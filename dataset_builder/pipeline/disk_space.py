@@ -1,9 +1,9 @@
-"""Sizes of a build: estimates, and the refusal of one that does not fit on the disk or could not be read.
+"""Sizes of a build: views, disk space and memory, and the refusal of one that does not fit or could not be read.
 
 While a config is built, its rows are staged and then packed into shards beside them. The staged rows, and the
 files of an older build of the config, are deleted when it has been published. Only views that are not staged yet
-are estimated.
-The scratch folders of the workers of a cluster, which hold one work unit per render process, are not checked.
+are estimated. The scratch folders of the workers of a cluster, which hold one work unit per render process, are
+not checked.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from dataset_builder.config.specs import RigSpec, SceneConfigSpec
 from dataset_builder.pipeline.folder import existing_ancestor, stagings_by_label
 from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.retained import Finished
+from dataset_builder.scene.variants.image_light import image_light
 from rebar_depth_bench.data.bars import BARS_FILE, decoded_bytes
 from rebar_depth_bench.data.manifest import MANIFEST_FILE
 from rebar_depth_bench.errors import InputError, OutputError
@@ -46,6 +47,11 @@ _SURROUNDINGS_BYTES = 1_000_000
 
 _VIEW_BYTES, _SCENE_BYTES, _HEAD_BYTES = 280, 1200, 2000
 """Lengths in the manifest: a view, a scene without its parameters, and the rest, with digests of their files."""
+_PROCESS_BYTES, _PANORAMA_BYTES, _MEMORY_BYTES_PER_PIXEL = 660_000_000, 330_000_000, 850
+"""Peak memory of a render process: with any image, what a panorama adds, and growth with the number of pixels.
+
+Lattice, pile and pier differ by 5 %. ``python -m benchmarks.build`` prints the memory at 1280 x 720.
+"""
 _CAGE_BYTES = 6_000_000
 """Allowance for the mesh of a generated cage, which is not made for an estimate: the mean of 40 is 4 MB."""
 
@@ -105,11 +111,11 @@ def config_space(
     )
 
 
-def spaces_of_configs(out: Path, plans: Sequence[ConfigPlan], finished: Finished) -> list[ConfigSpace]:
-    """Return the disk space of each config of the plans that are missing in the folder ``out``."""
+def spaces_by_config(out: Path, plans: Sequence[ConfigPlan], finished: Finished) -> dict[str, ConfigSpace]:
+    """Return the disk space by name of each config of the plans that are missing in the folder ``out``."""
     stagings = stagings_by_label(out)
     groups = groupby(plans, key=lambda plan: plan.spec.name)
-    return [config_space(list(of_config), finished, stagings) for _, of_config in groups]
+    return {name: config_space(list(of_config), finished, stagings) for name, of_config in groups}
 
 
 def needed_bytes(spaces: Iterable[ConfigSpace]) -> int:
@@ -149,9 +155,45 @@ def check_readable(plans: Sequence[ConfigPlan], finished: Finished) -> None:
             )
 
 
+def estimate_lines(out: Path, plans: Sequence[ConfigPlan], finished: Finished) -> Iterator[str]:
+    """Yield lines that tell what building the plans in the folder ``out`` needs: views, disk space and memory."""
+    views, spaces = 0, spaces_by_config(out, [plan for plan in plans if not finished.has(plan)], finished)
+    for name, group in groupby(plans, key=lambda plan: plan.spec.name):
+        of_config = list(group)
+        spec, planned = of_config[0].spec, sum(len(plan.indices) for plan in of_config)
+        scenes = f" in {len(of_config)} scenes," if len(of_config) > 1 else ""
+        yield f"{name}: {planned} views{scenes} of two pictures, {spec.rig.width} x {spec.rig.height}"
+        if name not in spaces:
+            yield "  up to date: nothing to render"
+            continue
+        missing = sum(_missing_views(plan, finished) for plan in of_config if not finished.has(plan))
+        views, space = views + missing, spaces[name]
+        colour = asdict(spec.colour).items() if spec.colour else [("none", "")]
+        yield f"  views: {missing} to render ({2 * missing} pictures), {planned - missing} already rendered"
+        yield f"  colour: {', '.join(f'{key} {value}'.rstrip() for key, value in colour)}"
+        finished_text, building_text = bytes_text(space.finished_bytes), bytes_text(space.building_bytes)
+        yield f"  disk space: {finished_text} finished, {building_text} to build"
+        yield f"  memory: about {bytes_text(max(map(memory_bytes, of_config)))} in each render process"
+    yield f"total: {views} of {sum(len(plan.indices) for plan in plans)} views to render"
+    needed_text, free_text = bytes_text(needed_bytes(spaces.values())), bytes_text(free_bytes(out))
+    yield f"disk space: {needed_text} needed, {free_text} free for {out}"
+
+
+def _missing_views(plan: ConfigPlan, finished: Finished) -> int:
+    """Return the number of views of a plan that are neither staged nor kept from the finished config."""
+    staged = sum(plan.staging.row(index).is_file() for index in plan.indices)
+    return len(plan.indices) - staged - len(finished.kept_views(plan))
+
+
+def memory_bytes(plan: ConfigPlan) -> int:
+    """Return the peak memory of a process that renders colour of a plan; without colour, it needs less."""
+    panorama_bytes = _PANORAMA_BYTES if image_light(plan.spec.scene) is not None else 0
+    return _PROCESS_BYTES + panorama_bytes + _MEMORY_BYTES_PER_PIXEL * plan.spec.rig.width * plan.spec.rig.height
+
+
 def check_fits_on_disk(out: Path, plans: Sequence[ConfigPlan], finished: Finished) -> None:
     """Raise ``OutputError`` if building the plans, which are missing, needs more than the free disk space."""
-    check_space(out, spaces_of_configs(out, plans, finished))
+    check_space(out, spaces_by_config(out, plans, finished).values())
 
 
 def check_space(out: Path, spaces: Iterable[ConfigSpace]) -> None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cards import dataset_card
+from cards.dataset import dataset_card
 from dataset_builder.config.catalog import CONFIGS
 from dataset_builder.config.specs import SceneConfigSpec
 from dataset_builder.config.trajectories import view_count
@@ -35,7 +35,6 @@ from dataset_builder.pipeline.folder import (
 )
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_record, split_into_shards
-from dataset_builder.scene.assemblies import assembly_bars
 from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters
 from rebar_depth_bench.bar_crossings.table import (
@@ -185,7 +184,7 @@ def repair_metadata(out: Path, folder: DatasetFolder, plans: Sequence[ConfigPlan
         return folder
     write_contact_sheet(config, out / config.sheet)
     digests = {config.sheet: file_sha256(out / config.sheet)}
-    bars = {plan.spec.scene.name: assembly_bars(plan.spec.scene.assembly) for plan in plans}
+    bars = {plan.spec.scene.name: plan.bars for plan in plans}
     return write_folder(out, folder, folder.config_by_name, digests, bars)
 
 

@@ -10,8 +10,8 @@ import yaml
 
 import rebar_depth_bench as rdb
 from benchmarks import steel_coverage
-from cards import benchmark_card, dataset_card
-from cards.dataset import column_rows
+from cards.benchmark import benchmark_card
+from cards.dataset import column_rows, dataset_card
 from cards.steel import steel_by_config
 from dataset_builder.config.catalog import CONFIGS, SWEEPS
 from dataset_builder.config.specs import DomeSpec

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.specs import (
     AssemblySpec,
     ConfigSpec,
@@ -21,25 +17,13 @@ from dataset_builder.config.specs import (
     SurveySpec,
 )
 from dataset_builder.config.trajectories import camera_offsets_m
-from dataset_builder.scene.assemblies.cage_file import load_cage
-from dataset_builder.scene.assemblies.generated import cage_bars, generated_assembly, spec_cage
-from dataset_builder.scene.assemblies.lattice import lattice_assembly
-from dataset_builder.scene.assemblies.pier import pier_assembly
-from dataset_builder.scene.assemblies.pile import pile_assembly
+from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.variants import SHADOWS
 from dataset_builder.scene.variants.panels import SCREEN_DISTANCE
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import InputError, MeshError
 
-_BUILDERS: Mapping[type, Callable[[Any], Assembly]] = {
-    CageFileSpec: load_cage,
-    GeneratedCageSpec: generated_assembly,
-    LatticeSpec: lattice_assembly,
-    MeshFileSpec: load_cage,
-    PierSpec: pier_assembly,
-    PileSpec: pile_assembly,
-}
 _AIM_POINT_DECIMALS = 3
 """Rounding of the aim point in metres: to the millimetre."""
 
@@ -47,18 +31,38 @@ _BOARD_TOLERANCE_M = 0.001
 """Depth below z = 0 that an assembly may reach, metres."""
 
 
-def make_assembly(spec: AssemblySpec) -> Assembly:
-    """Return the bars and meshes of an assembly (world frame, metres).
+def make_assembly(spec: AssemblySpec, cage: Cage | None = None) -> Assembly:
+    """Return the bars and meshes of an assembly (world frame, metres); only modules of its kind are imported.
 
-    Raises ``MeshError`` if a user's file cannot be used, ``ValueError`` if the bars of a generated assembly
-    would collide or not fit.
+    A user's file is read unless its ``cage`` is given. Raises ``MeshError`` if the file cannot be used, and
+    ``ValueError`` if the bars of a generated assembly would collide or not fit.
     """
-    return _BUILDERS[type(spec)](spec)
+    if isinstance(spec, LatticeSpec):
+        from dataset_builder.scene.assemblies.lattice import lattice_assembly
+
+        return lattice_assembly(spec)
+    if isinstance(spec, PileSpec):
+        from dataset_builder.scene.assemblies.pile import pile_assembly
+
+        return pile_assembly(spec)
+    if isinstance(spec, PierSpec):
+        from dataset_builder.scene.assemblies.pier import pier_assembly
+
+        return pier_assembly(spec)
+    if isinstance(spec, GeneratedCageSpec):
+        from dataset_builder.scene.assemblies.generated import generated_assembly
+
+        return generated_assembly(spec)
+    from dataset_builder.scene.assemblies.cage_file import cage_assembly, read_cage
+
+    return cage_assembly(cage or read_cage(spec), spec.path)
 
 
 def assembly_bars(spec: AssemblySpec) -> tuple[Bar, ...]:
     """Return the bars of an assembly; for a generated cage, without making meshes. Raises as ``make_assembly``."""
     if isinstance(spec, GeneratedCageSpec):
+        from dataset_builder.scene.assemblies.generated import cage_bars, spec_cage
+
         return tuple(bar.bar for bar in cage_bars(spec_cage(spec)))
     return make_assembly(spec).bars
 

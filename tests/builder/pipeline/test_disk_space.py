@@ -19,7 +19,7 @@ from dataset_builder.pipeline.disk_space import (
     config_space,
     free_bytes,
     needed_bytes,
-    spaces_of_configs,
+    spaces_by_config,
     view_bytes,
 )
 from dataset_builder.pipeline.folder import stagings_by_label
@@ -135,7 +135,7 @@ def test_scenes_of_a_config_are_staged_together_and_replace_their_own_shards(tmp
     one, all_of_them = (config_space(part, finished, {}) for part in (plans[:1], plans))
     assert (one.replaced_bytes, all_of_them.replaced_bytes) == (1000, 3000)
     assert all_of_them.missing_bytes == 4 * one.missing_bytes
-    assert spaces_of_configs(tmp_path, plans, finished) == [all_of_them]
+    assert spaces_by_config(tmp_path, plans, finished) == {"cages": all_of_them}
 
 
 def test_published_config_needs_no_space(tiny_root: Path, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from benchmarks.scale import PreparedRows, placed
 from dataset_builder.audit import audit, run
 from dataset_builder.config.cages import CagesRequest
 from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.pipeline import folder, place_cameras, retained
+from dataset_builder.pipeline import folder, retained
 from dataset_builder.pipeline.build import BuildSummary, build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.data.bars import BARS_FILE
@@ -41,7 +41,6 @@ def cages(scenes: int, views: int = 2, split: str = "test", **changes: Any) -> B
 @pytest.fixture(autouse=True)
 def cameras_without_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """Give all generated scenes the same cameras, which takes no time."""
-    monkeypatch.setattr(place_cameras, "with_cameras", placed)
     monkeypatch.setattr("dataset_builder.pipeline.build.place_cameras", lambda plans, *_: [*map(placed, plans)])
 
 
