@@ -22,7 +22,7 @@ from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.view_ids import SPLITS
 
 if TYPE_CHECKING:
-    from dataset_builder.pipeline.blender_process import Renderer
+    from dataset_builder.pipeline.blender_process import Submit
     from dataset_builder.pipeline.build import BuildSummary
 
 CAGES_OPTIONS = ("split", "scenes", "views_per_scene")
@@ -204,15 +204,15 @@ def run(options: argparse.Namespace) -> None:
     if workers < 1:
         raise InputError(f"--workers is {workers}, expected 1 or more")
     device = options.device or CPU
-    with _cluster_context(options.cluster, device) as cluster:
-        request = _build_request(options, device if cluster else find_device(device))
+    with _cluster_context(options.cluster, device) as submit:
+        request = _build_request(options, device if submit else find_device(device))
         if options.dry_run:
             _print_estimate(request, options.out)
             return
         threads = max(1, (os.cpu_count() or 1) // workers)
         with ProgressBars(Rate("pictures", 2)) as bars:
             summary = build(
-                request, options.out, workers=workers, threads=threads, cluster=cluster, progress=bars.update
+                request, options.out, workers=workers, threads=threads, submit=submit, progress=bars.update
             )
     _print_summary(options.out, summary)
 
@@ -231,11 +231,12 @@ def _rewrite(options: argparse.Namespace) -> None:
 def _print_estimate(request: BuildRequest, out: Path) -> None:
     """Print what a build would need; raise ``InputError`` if it would be refused."""
     from dataset_builder.pipeline.build import plan_build
-    from dataset_builder.pipeline.disk_space import check_fits_on_disk, estimate_lines
+    from dataset_builder.pipeline.disk_space import check_space, estimate_lines, spaces_by_config
 
     plans, finished = plan_build(request, out)
     print(*map(printable, estimate_lines(out, plans, finished)), sep="\n")
-    check_fits_on_disk(out, [plan for plan in plans if not finished.has(plan)], finished)
+    missing = [plan for plan in plans if not finished.has(plan)]
+    check_space(out, spaces_by_config(out, missing, finished).values())
 
 
 def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
@@ -300,7 +301,7 @@ def _colour_spec(options: argparse.Namespace, device: str) -> ColourSpec | None:
 
 
 @contextmanager
-def _cluster_context(address: str | None, device: str) -> Iterator[Renderer | None]:
+def _cluster_context(address: str | None, device: str) -> Iterator[Submit | None]:
     """Connect to the cluster at ``address``, whose workers must have ``device``; yield None without an address.
 
     Raises ``InputError`` if ``distributed`` is not installed or a worker has no such device.
@@ -316,7 +317,7 @@ def _cluster_context(address: str | None, device: str) -> Iterator[Renderer | No
 
     with connect_to_cluster(address) as cluster:
         cluster.check_device(device)
-        yield cluster
+        yield cluster.submit
 
 
 def _print_summary(out: Path, summary: BuildSummary) -> None:

@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from dataset_builder.config.cages import CAGES
 from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
-from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec, unsupported_type
+from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.scene_name import scene_name_of
 from dataset_builder.config.scene_schema import SCENE_NAME, SceneToml, read_scene_toml
 from dataset_builder.config.specs import (
@@ -33,7 +33,7 @@ from dataset_builder.config.survey import with_stations
 from dataset_builder.config.trajectories import camera_offsets_m
 from dataset_builder.scene.assemblies import aim_point_m, check_above_ground, check_fits, make_assembly
 from dataset_builder.scene.assemblies.cage import Cage
-from dataset_builder.scene.assemblies.cage_file import cage_file_spec, mesh_file_spec, read_cage
+from dataset_builder.scene.assemblies.cage_file import cage_file_spec, mesh_file_spec, read_cage, unsupported_type
 from dataset_builder.scene.assemblies.mesh_import import SUFFIXES as MESH_SUFFIXES
 from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.errors import InputError, MeshError

@@ -1,10 +1,10 @@
-"""Blender subprocesses: the tasks they run, the events they report, and the renderer that they are.
+"""Blender subprocesses: the tasks they run, the events they report, and the rendering of work units in them.
 
 A task is pickled to the standard input of the process. The input then stays open, and the process exits when it is
 closed, so that no render outlives its parent. Events are JSON lines on the standard output of the process. The
 output of Blender and its libraries goes to a log file, whose end is shown only if the process fails.
 
-The renderer of a cluster is ``dask_renderer``.
+Workers of a cluster render with ``dask_renderer``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from dataset_builder.config.specs import CPU, GPU_TYPES
 from dataset_builder.pipeline.shards import Staging
@@ -140,7 +140,10 @@ def _exchange(process: subprocess.Popen[bytes], task: Task, on_event: Callable[[
     for line in process.stdout:
         if not line.endswith(b"\n"):
             break  # The process died while writing an event.
-        _dispatch_event(json.loads(line), on_event)
+        event = json.loads(line)
+        for name in _ERRORS.keys() & event.keys():
+            raise _ERRORS[name](event[name])
+        on_event(event)
     return process.wait()
 
 
@@ -151,13 +154,6 @@ def _send_task(stream: Any, task: Task) -> None:
     except BrokenPipeError:  # The process died at once; its exit status and log are reported by the caller.
         with suppress(BrokenPipeError):
             stream.close()  # Discard the unsent bytes: Popen would otherwise flush them again on exit.
-
-
-def _dispatch_event(event: Event, on_event: Callable[[Event], None]) -> None:
-    for name, error in _ERRORS.items():
-        if name in event:
-            raise error(event[name])
-    on_event(event)
 
 
 def _failure_message(label: str, status: int, attempts: int, log: Path) -> str:
@@ -174,42 +170,33 @@ OnViewDone = Callable[[int], None]
 """Callback with the index of each rendered view; may run in another thread, and twice for the same view."""
 
 
-class Renderer(Protocol):
-    """Renderer of work units; leaving the context that created it cancels unfinished units."""
+Submit = Callable[[WorkUnit, Staging, OnViewDone], Future[UnitResult]]
+"""Function that schedules a unit to be rendered; ``staging`` is the staging folder of the config on this machine.
 
-    def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
-        """Schedule ``unit``; ``staging`` is the staging folder of the config on this machine."""
-        ...
-
-
-@dataclass(frozen=True)
-class LocalRenderer:
-    """Renderer on this machine that writes directly to the staging folder: a kill loses at most one view."""
-
-    pool: ThreadPoolExecutor
-    blender: BlenderProcesses
-    threads: int
-
-    def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
-        """Schedule ``unit`` on the next free process."""
-        return self.pool.submit(
-            render_unit, unit, staging, self.threads, self.blender, on_view_done, "this machine"
-        )
+Leaving the context that made the function cancels unfinished units.
+"""
 
 
 @contextmanager
-def local_processes(workers: int, threads: int) -> Iterator[LocalRenderer]:
-    """Yield a renderer with ``workers`` concurrent Blender processes of ``threads`` threads each."""
+def local_processes(workers: int, threads: int) -> Iterator[Submit]:
+    """Yield the function that renders in ``workers`` concurrent processes of ``threads`` threads each.
+
+    They write directly to the staging folder: a kill loses at most one view.
+    """
     with ThreadPoolExecutor(workers) as pool, BlenderProcesses() as blender:
-        yield LocalRenderer(pool, blender, threads)
+
+        def submit(unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
+            return pool.submit(render_unit, unit, staging, on_view_done, threads, blender, "this machine")
+
+        yield submit
 
 
 def render_unit(
     unit: WorkUnit,
     staging: Staging,
+    on_view_done: OnViewDone,
     threads: int,
     blender: BlenderProcesses,
-    on_view_done: OnViewDone,
     worker: str,
 ) -> UnitResult:
     """Render a unit in a Blender process into ``staging`` and return its result without the content of files.

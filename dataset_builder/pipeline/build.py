@@ -16,8 +16,8 @@ from pathlib import Path
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.specs import SceneConfigSpec
-from dataset_builder.pipeline.blender_process import Renderer, local_processes
-from dataset_builder.pipeline.disk_space import check_fits_on_disk, check_readable
+from dataset_builder.pipeline.blender_process import Submit, local_processes
+from dataset_builder.pipeline.disk_space import check_readable, check_space, spaces_by_config
 from dataset_builder.pipeline.folder import build_lock, check_folder, remove_build_folder, remove_stagings
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, place_cameras, plan_config, print_notes
 from dataset_builder.pipeline.publish import (
@@ -49,14 +49,14 @@ def build(
     *,
     workers: int = 1,
     threads: int = 1,
-    cluster: Renderer | None = None,
+    submit: Submit | None = None,
     progress: Progress = silent,
 ) -> BuildSummary:
     """Build the requested configs in the folder ``out``, or continue an interrupted build of them.
 
-    Rendering uses ``workers`` concurrent processes of ``threads`` threads each on this machine, or the workers of
-    ``cluster`` if it is not None. None of these changes the bytes of the result. Each config is published as soon
-    as it is complete.
+    Rendering uses ``workers`` concurrent processes of ``threads`` threads each on this machine, or what ``submit``
+    schedules if it is not None, such as workers of a cluster. None of these changes the bytes of the result. Each
+    config is published as soon as it is complete.
 
     Raises ``InputError`` for a request that cannot be built, ``OutputError`` if it does not fit on the disk or the
     machine cannot write, ``RenderProcessError`` if a render process dies twice, and ``BuildError`` if rendered
@@ -65,7 +65,7 @@ def build(
     plans, finished = plan_build(request, out)
     print_notes(finished.notes(plans))
     missing = [plan for plan in plans if not finished.has(plan)]
-    check_fits_on_disk(out, missing, finished)
+    check_space(out, spaces_by_config(out, missing, finished).values())
     missing = place_cameras(missing, os.cpu_count() or 1, progress)
     check_readable(missing, finished)
     with build_lock(out / BUILD_FOLDER):
@@ -73,8 +73,8 @@ def build(
             if finished.is_outdated:
                 raise InputError(f"{out}: another build has changed the folder; run the same command again")
             remove_leftovers(out, finished.folder)
-            with nullcontext(cluster) if cluster else local_processes(workers, threads) as renderer:
-                return _build_plans(out, finished, plans, missing, renderer, progress)
+            with nullcontext(submit) if submit else local_processes(workers, threads) as schedule:
+                return _build_plans(out, finished, plans, missing, schedule, progress)
         finally:
             remove_build_folder(out / BUILD_FOLDER)
 
@@ -111,7 +111,7 @@ def _build_plans(
     finished: Finished,
     plans: Sequence[ConfigPlan],
     missing: Sequence[ConfigPlan],
-    renderer: Renderer,
+    submit: Submit,
     progress: Progress,
 ) -> BuildSummary:
     """Build the ``missing`` plans config by config, and repair the metadata of the others."""
@@ -122,7 +122,7 @@ def _build_plans(
         if of_config := missing_by_name.get(name):
             for plan in of_config:
                 finished.stage_views(plan)
-            _render(of_config, renderer, progress, summary)
+            _render(of_config, submit, progress, summary)
             kept = kept_scenes(finished.configs.get(name), of_config)
             folder = publish_plans(out, folder, of_config, kept)
             summary.built.append(name)
@@ -156,7 +156,7 @@ class _ViewCount:
             self._progress(self._name, len(self._done), self._total)
 
 
-def _render(plans: Sequence[ConfigPlan], renderer: Renderer, progress: Progress, summary: BuildSummary) -> None:
+def _render(plans: Sequence[ConfigPlan], submit: Submit, progress: Progress, summary: BuildSummary) -> None:
     """Render and stage the remaining work units of a config's plans; on failure, cancel those not started."""
     count = _ViewCount(plans, progress)
     count.add("")
@@ -167,7 +167,7 @@ def _render(plans: Sequence[ConfigPlan], renderer: Renderer, progress: Progress,
         if units and plan.cage is not None:
             write_bytes(plan.staging.cage, packed_cage(plan.cage))
         for unit in units:
-            waiting[renderer.submit(unit, plan.staging, partial(count.add, plan.key))] = plan, unit
+            waiting[submit(unit, plan.staging, partial(count.add, plan.key))] = plan, unit
     try:
         for future in as_completed(list(waiting)):
             plan, unit = waiting.pop(future)  # Drop the future, which holds the rendered bytes.

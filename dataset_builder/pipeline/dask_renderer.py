@@ -218,7 +218,7 @@ def render_on_worker(unit: WorkUnit, software_versions: Mapping[str, str], cage:
         if cage is not None:
             staging.cage.write_bytes(cage)
         try:
-            result = render_unit(unit, staging, threads, blender, _make_progress_reporter(worker), worker.address)
+            result = render_unit(unit, staging, _make_progress_reporter(worker), threads, blender, worker.address)
         except BuildError as error:
             raise type(error)(f"worker {worker.address}: {error}") from None
         except InputError as error:

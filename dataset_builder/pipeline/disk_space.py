@@ -191,11 +191,6 @@ def memory_bytes(plan: ConfigPlan) -> int:
     return _PROCESS_BYTES + panorama_bytes + _MEMORY_BYTES_PER_PIXEL * plan.spec.rig.width * plan.spec.rig.height
 
 
-def check_fits_on_disk(out: Path, plans: Sequence[ConfigPlan], finished: Finished) -> None:
-    """Raise ``OutputError`` if building the plans, which are missing, needs more than the free disk space."""
-    check_space(out, spaces_by_config(out, plans, finished).values())
-
-
 def check_space(out: Path, spaces: Iterable[ConfigSpace]) -> None:
     """Raise ``OutputError`` if building configs one after the other needs more than the free disk space."""
     needed, free = needed_bytes(spaces), free_bytes(out)

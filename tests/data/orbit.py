@@ -76,7 +76,7 @@ class StoredImages:
 
 def write_orbit(root: Path, mesh: Path) -> None:
     """Write the dataset folder ``root``; ``mesh`` is the PLY file of the lattice."""
-    build(REQUEST, root, cluster=StoredImages(mesh))
+    build(REQUEST, root, submit=StoredImages(mesh).submit)
 
 
 def _image(index: int) -> Path:

@@ -177,7 +177,7 @@ class _NoRenderer:
 
 
 def _build(workspace: Workspace) -> None:
-    build(_REQUEST, workspace.root / ROOT, cluster=_NoRenderer())
+    build(_REQUEST, workspace.root / ROOT, submit=_NoRenderer().submit)
 
 
 _REQUEST = BuildRequest(configs=(CONFIG,), views=2, width=160, height=90, colour=colour_spec(quality="preview"))

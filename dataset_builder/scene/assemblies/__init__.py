@@ -53,9 +53,9 @@ def make_assembly(spec: AssemblySpec, cage: Cage | None = None) -> Assembly:
         from dataset_builder.scene.assemblies.generated import generated_assembly
 
         return generated_assembly(spec)
-    from dataset_builder.scene.assemblies.cage_file import cage_assembly, read_cage
+    from dataset_builder.scene.assemblies.cage_file import load_cage
 
-    return cage_assembly(cage or read_cage(spec), spec.path)
+    return load_cage(spec, cage)
 
 
 def assembly_bars(spec: AssemblySpec) -> tuple[Bar, ...]:

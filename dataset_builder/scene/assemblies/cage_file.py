@@ -6,16 +6,16 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from dataset_builder.config.file_specs import (
     CageFileSpec,
     MeshFileSpec,
+    PinnedFile,
     PlacementSpec,
     Trust,
-    read_assembly_file,
 )
 from dataset_builder.config.scene_schema import UNITS_M
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, with_ribs_chosen
@@ -34,8 +34,17 @@ from dataset_builder.scene.assemblies.toml_bars import toml_cage
 from dataset_builder.scene.model import Assembly, Note
 from dataset_builder.scene.selection import Selection
 from rebar_depth_bench.errors import MeshError, Problem, escape_text
+from rebar_depth_bench.limits import IFC_BYTES, MESH_BYTES, TOML_BYTES
+from rebar_depth_bench.reading import read_file
 
 _SUFFIXES = (".toml", ".ifc")
+_GLTF_CONVERSION = (
+    ": convert glTF to OBJ, as with python -c "
+    "\"import trimesh; trimesh.load_scene('FILE.glb').export('FILE.obj')\", "
+    'and name the OBJ file in a scene TOML with mesh = "FILE.obj", unit = "m" and up = "y"'
+)
+_LIMITS = {".toml": TOML_BYTES, ".ifc": IFC_BYTES}
+"""Limits of the files of an assembly by suffix; those of meshes have ``MESH_BYTES``."""
 
 
 def cage_file_spec(
@@ -52,12 +61,13 @@ def cage_file_spec(
     return CageFileSpec(os.fspath(path), digest, placement, select, trust)
 
 
-def load_cage(spec: CageFileSpec | MeshFileSpec) -> Assembly:
+def load_cage(spec: CageFileSpec | MeshFileSpec, cage: Cage | None = None) -> Assembly:
     """Return the file's bars, in its order, and a mesh (world, metres) for each of them.
 
-    Raises as ``read_cage``, and ``MeshError`` if the bars are not valid (see ``cage_assembly``).
+    The file is not read if ``cage`` is what was read from it. Raises as ``read_cage``, and ``MeshError`` if the
+    bars are not valid (see ``cage_assembly``).
     """
-    return cage_assembly(read_cage(spec), spec.path)
+    return cage_assembly(cage or read_cage(spec), spec.path)
 
 
 def read_cage(spec: CageFileSpec | MeshFileSpec) -> Cage:
@@ -74,7 +84,7 @@ def read_cage(spec: CageFileSpec | MeshFileSpec) -> Cage:
 
 def _read_bars(spec: CageFileSpec) -> Cage:
     """Return the bars of a TOML or IFC file (the file's frame, metres)."""
-    content = spec.check(read_assembly_file(spec.path, "cage", _SUFFIXES))
+    content = _pinned_content(spec, "cage", _SUFFIXES)
     if Path(spec.path).suffix.lower() == ".ifc":
         return ifc_cage(content, spec.path, spec.select, spec.trust)
     return toml_cage(content, spec.path)
@@ -82,6 +92,39 @@ def _read_bars(spec: CageFileSpec) -> Cage:
 
 _MAX_REASONS = 5
 """Largest number of reasons for leaving out objects that a note gives."""
+
+
+def _pinned_content(spec: PinnedFile, kind: str, suffixes: Collection[str]) -> bytes:
+    """Return the content of the file of a spec.
+
+    Raises as ``read_assembly_file``, and ``MeshError`` if the content is not that of the spec.
+    """
+    content = read_assembly_file(spec.path, kind, suffixes)
+    actual_sha256 = hashlib.sha256(content).hexdigest()
+    if actual_sha256 != spec.sha256:
+        raise MeshError(
+            f"{spec.path}: the file has changed since it was selected: its sha256 is {actual_sha256}, "
+            f"expected {spec.sha256}"
+        )
+    return content
+
+
+def unsupported_type(path: str | os.PathLike[str], kind: str, expected: str) -> str:
+    """Return the message about a file of a type that is not read; for glTF it names the conversion."""
+    suffix = Path(path).suffix.lower()
+    conversion = _GLTF_CONVERSION if suffix in (".glb", ".gltf") else ""
+    return f"{path}: unsupported {kind} file type {suffix!r}, expected {expected}{conversion}"
+
+
+def read_assembly_file(path: str | os.PathLike[str], kind: str, suffixes: Collection[str]) -> bytes:
+    """Return the bytes of a user's file; ``kind`` is ``mesh`` or ``cage``.
+
+    Raises ``MeshError`` if its suffix is not one of ``suffixes``, it cannot be read or it is too large.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in suffixes:
+        raise MeshError(unsupported_type(path, kind, ", ".join(suffixes)))
+    return read_file(Path(path), _LIMITS.get(suffix, MESH_BYTES), f"a {kind} file", MeshError)
 
 
 def cage_assembly(cage: Cage, where: str) -> Assembly:
@@ -146,7 +189,7 @@ def read_mesh(spec: MeshFileSpec) -> Cage:
     65,535 bars, a bar without area or a non-finite coordinate, or stores coordinates that are too coarse.
     """
     _check_unit(spec.unit_m, spec.path)
-    parts = read_parts(spec.check(read_assembly_file(spec.path, "mesh", SUFFIXES)), spec)
+    parts = read_parts(_pinned_content(spec, "mesh", SUFFIXES), spec)
     taken, left_out = _selected(parts, spec)
     _check_spacing(taken, spec)
     bars = [_fitted_bar(part, spec.path) for part in taken]

@@ -47,7 +47,7 @@ def cameras_without_search(monkeypatch: pytest.MonkeyPatch) -> None:
 def built(out: Path, request: BuildRequest) -> tuple[list[str], BuildSummary]:
     """Build with prepared rows; return the ids of the views that were rendered, and the summary."""
     renderer = PreparedRows()
-    summary = build(request, out, cluster=renderer)
+    summary = build(request, out, submit=renderer.submit)
     return renderer.rendered, summary
 
 
@@ -99,7 +99,7 @@ def test_old_config_stays_readable_while_it_grows_and_after_an_interruption(tmp_
     built(root, lattice(9))
     before = contents(root)
     with pytest.raises(KeyboardInterrupt):
-        build(lattice(63), root, cluster=Interrupting(1))
+        build(lattice(63), root, submit=Interrupting(1).submit)
     assert {name: digest for name, digest in contents(root).items() if BUILD_FOLDER not in name} == before
     assert len(rdb.load(root, "lattice")) == 9
     problems = file_problems(open_folder(root), silent)
@@ -202,7 +202,7 @@ def test_damaged_bars_of_other_scenes_are_refused(tmp_path: Path) -> None:
     (tmp_path / BARS_FILE).unlink()
     renderer = PreparedRows()
     with pytest.raises(InputError, match=r"bars\.parquet does not match the manifest"):
-        build(cages(1), tmp_path, cluster=renderer)
+        build(cages(1), tmp_path, submit=renderer.submit)
     assert renderer.rendered == []
 
 
