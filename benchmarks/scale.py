@@ -107,7 +107,7 @@ def plan_missing(out: Path, scenes: int, split: str = "test") -> tuple[Finished,
     """Return what the folder has, and the plans of the scenes that are missing."""
     plans, finished = plan_build(request(scenes, split), out)
     missing = [plan for plan in plans if not finished.has(plan)]
-    spaces_by_config(out, missing, finished)  # Not compared: it is that of real scenes.
+    spaces_by_config(missing)  # Not compared: it is that of real scenes.
     return finished, missing
 
 

@@ -235,8 +235,7 @@ def _print_estimate(request: BuildRequest, out: Path) -> None:
 
     plans, finished = plan_build(request, out)
     print(*map(printable, estimate_lines(out, plans, finished)), sep="\n")
-    missing = [plan for plan in plans if not finished.has(plan)]
-    check_space(out, spaces_by_config(out, missing, finished).values())
+    check_space(out, spaces_by_config([plan for plan in plans if not finished.has(plan)]).values())
 
 
 def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:

@@ -79,7 +79,7 @@ def run_import(source: Import, out: Path, progress: Progress = silent, *, overwr
     """
     key = parameters_digest(_key_inputs(source, progress))
     staging = Staging(out / BUILD_FOLDER / f"{source.name}-{key[:KEY_CHARACTERS]}")
-    check_target(out, [source.name], [staging.root])
+    check_target(out, [source.name])
     finished = Finished(out)
     published = finished.configs.get(source.name)
     if published is not None:

@@ -18,7 +18,7 @@ from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.specs import SceneConfigSpec
 from dataset_builder.pipeline.blender_process import Submit, local_processes
 from dataset_builder.pipeline.disk_space import check_readable, check_space, spaces_by_config
-from dataset_builder.pipeline.folder import build_lock, check_folder, remove_build_folder, remove_stagings
+from dataset_builder.pipeline.folder import build_lock, check_target, remove_build_folder, remove_stagings
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, place_cameras, plan_config, print_notes
 from dataset_builder.pipeline.publish import (
     publish_plans,
@@ -65,7 +65,7 @@ def build(
     plans, finished = plan_build(request, out)
     print_notes(finished.notes(plans))
     missing = [plan for plan in plans if not finished.has(plan)]
-    check_space(out, spaces_by_config(out, missing, finished).values())
+    check_space(out, spaces_by_config(missing).values())
     missing = place_cameras(missing, os.cpu_count() or 1, progress)
     check_readable(missing, finished)
     with build_lock(out / BUILD_FOLDER):
@@ -100,7 +100,7 @@ def plan_build(request: BuildRequest, out: Path) -> tuple[list[ConfigPlan], Fini
     for plan in with_cameras:
         check_fits(plan.assembly, plan.spec)
     print_notes(list(dict.fromkeys(note for plan in with_cameras for note in plan.assembly.notes)))
-    check_folder(out, plans)
+    check_target(out, {spec.name for spec in specs})
     finished = Finished(out)
     check_retained(out, finished, plans, request.overwrite)
     return plans, finished

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -46,20 +46,6 @@ SHARD_NAME = re.compile(
 """Names of the files in the folder of a config; those of a config of several scenes name split and scene."""
 
 
-def check_folder(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder that the plans can be built in.
-
-    Raises as ``check_target`` does.
-    """
-    labels = {plan.spec.label for plan in plans}
-
-    def stagings() -> Iterator[Path]:  # Not read before ``out`` is checked.
-        for label, paths in stagings_by_label(out).items():
-            yield from paths if label in labels else ()
-
-    check_target(out, {plan.spec.name for plan in plans}, stagings())
-
-
 def stagings_by_label(out: Path) -> dict[str, list[Path]]:
     """Return the staging folders of ``out`` by the label of their config, those of abandoned builds included."""
     by_label: dict[str, list[Path]] = {}
@@ -71,11 +57,11 @@ def stagings_by_label(out: Path) -> dict[str, list[Path]]:
     return by_label
 
 
-def check_target(out: Path, configs: Collection[str], stagings: Iterable[Path]) -> None:
+def check_target(out: Path, configs: Collection[str]) -> None:
     """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder, where configs can be written.
 
     Raises ``OutputError`` if it cannot be written. No other files are ever changed. Folders that a build changes,
-    its lock and the files in the staging folders may not be links.
+    its lock and the files in staging folders may not be links.
     """
     ancestor = existing_ancestor(out)
     if not ancestor.is_dir():
@@ -83,7 +69,7 @@ def check_target(out: Path, configs: Collection[str], stagings: Iterable[Path]) 
     if not os.access(ancestor, os.W_OK | os.X_OK):
         raise OutputError(f"{out}: cannot be written: no permission to write in {ancestor}")
     check_no_links(out, f"{BUILD_FOLDER}/{LOCK}", f"{BUILD_FOLDER}/{BARS_FILE}", MESHES, PICTURES, *configs)
-    for staging in stagings:
+    for staging in (path for paths in stagings_by_label(out).values() for path in paths):
         check_no_links(out, os.path.relpath(staging, out))
         for folder, folders, files in os.walk(staging):
             check_no_links(Path(folder), *folders, *files)
@@ -201,7 +187,7 @@ def rewrite_manifest(out: Path) -> None:
     Digests of views and files do not change. Raises ``DatasetError`` if the folder has no valid manifest, and
     ``InputError`` if another build is using the folder.
     """
-    check_target(out, (), ())
+    check_target(out, ())
     path = out / MANIFEST_FILE
     values, problems = read_manifest(path)
     if isinstance(values, dict) and values.get("format") == OLD_FORMAT:

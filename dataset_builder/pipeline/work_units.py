@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -76,18 +76,15 @@ class UnitResult:
     files: tuple[ReceivedFile, ...] = ()
 
 
-def remaining_units(plan: ConfigPlan, finished: Collection[int] = ()) -> list[WorkUnit]:
-    """Return the units of the views not staged yet; the first one requests the mesh if that is not staged.
-
-    Views with ``finished`` indices are left out.
-    """
+def remaining_units(plan: ConfigPlan) -> list[WorkUnit]:
+    """Return the units of the views not staged yet; the first one requests the mesh if that is not staged."""
     known_mesh_sha256 = _known_mesh_sha256(plan.staging)
     needs_mesh = not plan.staging.mesh.is_file()
     views = VIEWS_WITHOUT_COLOUR if plan.spec.colour is None else VIEWS_PER_SHARD
     incomplete = [
         (position * views // VIEWS_PER_SHARD, missing)
         for position, run in enumerate(split_into_shards(plan.indices, views))
-        if (missing := tuple(i for i in run if i not in finished and not plan.staging.row(i).is_file()))
+        if (missing := tuple(i for i in run if not plan.staging.row(i).is_file()))
     ]
     if needs_mesh and not incomplete:
         incomplete = [(0, ())]

@@ -174,7 +174,8 @@ def mesh_file_spec(
     if isinstance(unit, str) and unit not in UNITS_M:
         raise MeshError(f"{path}: unknown unit {unit!r}, expected one of {', '.join(UNITS_M)} or metres")
     unit_m = UNITS_M[unit] if isinstance(unit, str) else float(unit)
-    _check_unit(unit_m, str(path))
+    if not (math.isfinite(unit_m) and unit_m > 0):
+        raise MeshError(f"{path}: one file unit is {unit_m} m, expected a positive length")
     digest = hashlib.sha256(read_assembly_file(path, "mesh", SUFFIXES)).hexdigest()
     return MeshFileSpec(os.fspath(path), digest, unit_m, placement or PlacementSpec(), select)
 
@@ -188,7 +189,6 @@ def read_mesh(spec: MeshFileSpec) -> Cage:
     Raises ``MeshError`` if the file cannot be read, does not match ``spec.sha256``, holds no bar, more than
     65,535 bars, a bar without area or a non-finite coordinate, or stores coordinates that are too coarse.
     """
-    _check_unit(spec.unit_m, spec.path)
     parts = read_parts(_pinned_content(spec, "mesh", SUFFIXES), spec)
     taken, left_out = _selected(parts, spec)
     _check_spacing(taken, spec)
@@ -237,9 +237,3 @@ def _fitted_bar(part: MeshPart, where: str) -> CageBar:
         raise MeshError(
             f"{where}: {label} ({len(part.mesh.faces)} triangles) is not a valid surface: {error}"
         ) from error
-
-
-def _check_unit(unit_m: float, where: str) -> None:
-    """Raise ``MeshError`` unless a file unit is a positive finite length."""
-    if not (math.isfinite(unit_m) and unit_m > 0):
-        raise MeshError(f"{where}: one file unit is {unit_m} m, expected a positive length")
