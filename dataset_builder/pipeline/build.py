@@ -28,7 +28,6 @@ from dataset_builder.pipeline.publish import (
 from dataset_builder.pipeline.retained import Finished, check_retained, kept_scenes
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, accept_result, remaining_units
 from dataset_builder.scene.assemblies import check_fits
-from dataset_builder.scene.assemblies.cage import packed_cage
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.progress import Progress, silent
@@ -165,6 +164,8 @@ def _render(plans: Sequence[ConfigPlan], submit: Submit, progress: Progress, sum
         plan.staging.root.mkdir(parents=True, exist_ok=True)
         units = remaining_units(plan)
         if units and plan.cage is not None:
+            from dataset_builder.scene.assemblies.cage import packed_cage
+
             write_bytes(plan.staging.cage, packed_cage(plan.cage))
         for unit in units:
             waiting[submit(unit, plan.staging, partial(count.add, plan.key))] = plan, unit

@@ -10,13 +10,12 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from dataset_builder.config.specs import ConfigSpec, GeneratedCageSpec, RandomViewsSpec, SceneConfigSpec
 from dataset_builder.config.trajectories import subset, view_count
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging
 from dataset_builder.scene.assemblies import aim_point_m, assembly_bars, make_assembly
-from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.model import Assembly, Note
 from dataset_builder.scene.variants.image_light import image_light
 from dataset_builder.scene.variants.sensor import sensor_spec
@@ -26,6 +25,9 @@ from rebar_depth_bench.data.digests import parameters_digest
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.progress import Progress, silent
 from rebar_depth_bench.version import software_version
+
+if TYPE_CHECKING:
+    from dataset_builder.scene.assemblies.cage import Cage
 
 KEY_CHARACTERS = 16
 STAGING_KEY = f"[0-9a-f]{{{KEY_CHARACTERS}}}"

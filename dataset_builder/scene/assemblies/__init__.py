@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
@@ -17,12 +19,14 @@ from dataset_builder.config.specs import (
     SurveySpec,
 )
 from dataset_builder.config.trajectories import camera_offsets_m
-from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.variants import SHADOWS
 from dataset_builder.scene.variants.panels import SCREEN_DISTANCE
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import InputError, MeshError
+
+if TYPE_CHECKING:
+    from dataset_builder.scene.assemblies.cage import Cage
 
 _AIM_POINT_DECIMALS = 3
 """Rounding of the aim point in metres: to the millimetre."""
