@@ -22,7 +22,7 @@ def test_dry_run_prints_views_space_and_memory(tmp_path: Path, run_build: RunBui
     assert "two-bars: 9 views of two pictures, 160 x 90" in process.stdout
     assert "9 to render (18 pictures), 0 already rendered" in process.stdout
     assert f"steel_samples {QUALITIES['preview'].steel_samples}" in process.stdout
-    memory = re.search(r"memory: ([\d.]+) ([MG])B in each", process.stdout)
+    memory = re.search(r"memory: about ([\d.]+) ([MG])B in each", process.stdout)
     assert memory
     assert 200 < float(memory[1]) * (1000 if memory[2] == "G" else 1) < 5000
     assert re.search(r"disk space: [\d.]+ MB needed, [\d.]+ [GT]B free", process.stdout)
