@@ -29,8 +29,8 @@ from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.quality import QUALITIES, UNIFORM, colour_spec
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import ColourSpec, ConfigSpec
-from dataset_builder.config.trajectories import poses, subset
-from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from dataset_builder.config.trajectories import aim_point_m, poses, subset
+from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.geometry.cameras import Camera
 

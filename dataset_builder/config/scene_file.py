@@ -16,6 +16,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.config.cages import CAGES
+from dataset_builder.config.camera_fit import check_above_ground, check_fits
 from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec, unsupported_type
 from dataset_builder.config.scene_name import scene_name_of
@@ -30,8 +31,8 @@ from dataset_builder.config.specs import (
 )
 from dataset_builder.config.surroundings import LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
 from dataset_builder.config.survey import with_stations
-from dataset_builder.config.trajectories import camera_offsets_m
-from dataset_builder.scene.assemblies import aim_point_m, check_above_ground, check_fits, make_assembly
+from dataset_builder.config.trajectories import aim_point_m, camera_offsets_m
+from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, read_cage
 from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from dataset_builder.config.specs import ConfigSpec
-from dataset_builder.config.trajectories import subset, view_count
+from dataset_builder.config.trajectories import aim_point_m, subset, view_count
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging
-from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.variants.image_light import image_light
 from dataset_builder.scene.variants.sensor import sensor_spec

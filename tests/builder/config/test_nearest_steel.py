@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from dataset_builder.config.catalog import LATTICE_DOME, PIER_DOME, PILE_DOME
 from dataset_builder.config.scene_file import OUTDOORS_CAMERA_RADIUS_M
 from dataset_builder.config.specs import DomeSpec, PierSpec, RigSpec
-from dataset_builder.config.trajectories import camera_offsets_m, poses, view_count
-from dataset_builder.scene.assemblies import aim_point_m
+from dataset_builder.config.trajectories import aim_point_m, camera_offsets_m, poses, view_count
 from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.environments.outdoors import CLEAR_M
 from dataset_builder.scene.model import Assembly

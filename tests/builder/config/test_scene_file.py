@@ -15,13 +15,14 @@ from hypothesis import strategies as st
 from numpy import ndarray
 from scipy.spatial import cKDTree
 
+from dataset_builder.config.camera_fit import check_fits
 from dataset_builder.config.catalog import LATTICE_DOME
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.scene_file import NEAREST_RADIUS_PER_REACH, scene_config
 from dataset_builder.config.scene_schema import read_scene_toml
 from dataset_builder.config.specs import DomeSpec, LatticeSpec, RingSpec
-from dataset_builder.config.trajectories import view_count
-from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
+from dataset_builder.config.trajectories import aim_point_m, view_count
+from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.assemblies.bar_meshes import MAX_RIBS_PER_ROW
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
