@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 from dataset_builder.build_options import add_build_arguments, add_mesh_unit, add_scene_arguments
 from dataset_builder.config.cages import CAGES, CagesRequest
 from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, BuildRequest
-from dataset_builder.config.quality import colour_spec
-from dataset_builder.config.specs import CPU
+from dataset_builder.config.specs import CPU, colour_spec
 from dataset_builder.export import command as export_command
 from dataset_builder.importing import command as import_command
 from dataset_builder.push import command as push_command

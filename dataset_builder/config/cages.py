@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dataset_builder.config.rigs import STEREO_CAMERAS
 from dataset_builder.config.specs import (
     AppearanceSpec,
     ColourSpec,
@@ -19,7 +20,6 @@ from dataset_builder.config.specs import (
     SceneConfigSpec,
     SceneSpec,
 )
-from dataset_builder.config.stereo_cameras import STEREO_CAMERAS
 from dataset_builder.config.surroundings import FORMWORK_FAMILIES, LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
 from dataset_builder.scene.cages.generate import drawn_family
 from dataset_builder.scene.variants import EXCLUSIVE_SLOTS, SENSOR, SHADOWS, VARIANTS

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib import resources
-from math import isclose
+from math import isclose, radians, tan
 
 import numpy as np
 from jaxtyping import Float64
@@ -113,3 +114,32 @@ GRIDS: Mapping[str, Callable[[RigSpec, Pose], dict[str, Camera]]] = {
     "rectified": _rectified_cameras,
 }
 """Functions that return the cameras of a rig, by the name of the grid in ``RigSpec.grid``."""
+
+
+@dataclass(frozen=True)
+class StereoCamera:
+    """Stereo camera: name, distance of the eyes in metres, and focal length in pixels of an image 1280 px wide."""
+
+    name: str
+    baseline_m: float
+    focal_px: float
+
+    def rig(self) -> FocalRigSpec:
+        """Return the rig of two parallel pinholes with this baseline and focal length."""
+        return FocalRigSpec(baseline_m=self.baseline_m, camera=self.name, focal_px=self.focal_px)
+
+
+def focal_of_view_px(horizontal_deg: float) -> float:
+    """Return the focal length that shows ``horizontal_deg`` in an image 1280 px wide, to 0.1 px."""
+    return round(NOMINAL_WIDTH / 2 / tan(radians(horizontal_deg) / 2), 1)
+
+
+_ALL = (
+    StereoCamera("Stereolabs ZED", 0.120, NOMINAL_FOCAL_PX),  # HD720; the rig of the paper.
+    StereoCamera("Luxonis OAK-D", 0.075, 882.5),  # Documentation of stereo depth, 1280 x 800 pixels.
+    StereoCamera("Intel RealSense D415", 0.055, focal_of_view_px(65.0)),
+    StereoCamera("Intel RealSense D435", 0.050, focal_of_view_px(87.0)),
+    StereoCamera("Intel RealSense D455", 0.095, focal_of_view_px(87.0)),
+)
+STEREO_CAMERAS: Mapping[str, StereoCamera] = {camera.name: camera for camera in _ALL}
+"""Cameras by name."""

@@ -6,6 +6,8 @@ The keys of the TOML file are documented in ``scene_schema``. An IFC model uses 
 from __future__ import annotations
 
 import os
+import re
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,7 +21,6 @@ from dataset_builder.config.cages import CAGES
 from dataset_builder.config.camera_fit import check_above_ground, check_fits
 from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec, unsupported_type
-from dataset_builder.config.scene_name import scene_name_of
 from dataset_builder.config.scene_schema import SCENE_NAME, SceneToml, read_scene_toml
 from dataset_builder.config.specs import (
     ConfigSpec,
@@ -155,6 +156,16 @@ def _read_scene(path: Path) -> SceneToml:
     if suffix != ".toml":
         raise InputError(unsupported_type(path, "scene", ".toml or .ifc"))
     return read_scene_toml(read_file(path, TOML_BYTES, "a scene file", InputError), str(path), RESERVED_NAMES)
+
+
+def scene_name_of(path: Path) -> str:
+    """Return the scene name that a file name gives: lower case, with hyphens for all but letters and digits.
+
+    Accents are removed, and letters without an ASCII form are left out; the name may be empty or reserved.
+    """
+    letters = unicodedata.normalize("NFKD", path.stem).casefold()
+    plain = "".join(character for character in letters if not unicodedata.combining(character))
+    return re.sub("[^a-z0-9]+", "-", plain).strip("-")
 
 
 def _check_name(name: str, path: Path) -> None:

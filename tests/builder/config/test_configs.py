@@ -17,8 +17,7 @@ import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
 from dataset_builder.config.camera_fit import check_fits
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
-from dataset_builder.config.quality import colour_spec
-from dataset_builder.config.specs import ColourSpec, DomeSpec, RigSpec, RingSpec
+from dataset_builder.config.specs import ColourSpec, DomeSpec, RigSpec, RingSpec, colour_spec
 from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.contact_sheet import STRIP_PANEL_PX, TILE_PX
 from dataset_builder.scene.assemblies import make_assembly

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from dataset_builder.config import scene_schema
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
-from dataset_builder.config.scene_file import scene_config
-from dataset_builder.config.scene_name import scene_name_of
+from dataset_builder.config.scene_file import scene_config, scene_name_of
 from dataset_builder.config.scene_schema import TomlBar, read_scene_toml
 from dataset_builder.config.specs import DomeSpec, SurveySpec
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage

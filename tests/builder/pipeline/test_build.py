@@ -16,7 +16,7 @@ import pytest
 
 import rebar_depth_bench as rdb
 from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.quality import colour_spec
+from dataset_builder.config.specs import colour_spec
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.data.bars import read_bars

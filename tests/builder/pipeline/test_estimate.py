@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.quality import QUALITIES
-from dataset_builder.config.specs import ColourSpec, RigSpec
+from dataset_builder.config.specs import QUALITIES, ColourSpec, RigSpec
 from dataset_builder.pipeline.disk_space import ConfigSpace
 from dataset_builder.pipeline.estimate import ConfigEstimate, makespan, of_scenes
 from dataset_builder.pipeline.trial import Trial, split_times, trial_rig
