@@ -19,6 +19,7 @@ from numpy import ndarray
 
 from dataset_builder.config.cages import CAGES
 from dataset_builder.config.camera_fit import check_above_ground, check_fits
+from dataset_builder.config.camera_placement import with_stations
 from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec, unsupported_type
 from dataset_builder.config.scene_schema import SCENE_NAME, SceneToml, read_scene_toml
@@ -31,7 +32,6 @@ from dataset_builder.config.specs import (
     TrajectorySpec,
 )
 from dataset_builder.config.surroundings import LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
-from dataset_builder.config.survey import with_stations
 from dataset_builder.config.trajectories import aim_point_m, camera_offsets_m
 from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.assemblies.cage import Cage

@@ -149,7 +149,7 @@ class SurveySpec:
 
     The distances are those of the left camera from the point of a bar's surface that the rig is aimed at.
     ``stations`` are the places of the views in order, to the micrometre: they follow from the other fields and the
-    assembly (``config.survey``), and are stored so that every machine uses the same ones.
+    assembly (``config.camera_placement``), and are stored so that every machine uses the same ones.
     """
 
     distances_m: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
@@ -168,8 +168,8 @@ class RandomViewsSpec:
     """Random views of steel: cameras at distances between the two ``distances_m`` from points of the steel.
 
     ``stations`` are the places of the views in order. They follow from the other fields, the assembly and the rig
-    (``config.random_views``), each view from its own number, so that the views of a longer list begin with those
-    of a shorter one.
+    (``config.camera_placement``), each view from its own number, so that the views of a longer list begin with
+    those of a shorter one.
     """
 
     views: int

@@ -12,8 +12,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from dataset_builder.config.camera_site import CameraSite
-from dataset_builder.config.random_views import SPACING_M, with_random_stations
+from dataset_builder.config.camera_placement import with_random_stations
 from dataset_builder.config.specs import GeneratedCageSpec, RandomViewsSpec, SceneConfigSpec
 from dataset_builder.config.surroundings import SURROUNDINGS
 from dataset_builder.pipeline.plan import ConfigPlan
@@ -70,8 +69,8 @@ def with_cameras(plan: ConfigPlan) -> ConfigPlan:
     cage = spec_cage(cast(GeneratedCageSpec, spec.scene.assembly))
     assembly = cage_assembly(cage)
     space, props = SURROUNDINGS[spec.scene.environment].cameras, make_props(assembly, spec.scene)
-    site = CameraSite(assembly, space, SPACING_M, props)
-    views = with_random_stations(cast(RandomViewsSpec, spec.protocol), site, spec.rig, f"scene {spec.label}")
+    views = cast(RandomViewsSpec, spec.protocol)
+    views = with_random_stations(views, assembly, space, spec.rig, f"scene {spec.label}", props)
     return ScenePlan(
         spec=replace(spec, protocol=views),
         indices=plan.indices,
