@@ -80,7 +80,7 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     with _scene_and_key_named(scene_toml, path):
         assembly_spec = _assembly_spec(scene_toml, path)
         assembly = make_assembly(assembly_spec)
-    trajectory = scene_toml.trajectory or _default_trajectory(assembly, scene_toml.environment)
+    trajectory = scene_toml.cameras or _default_trajectory(assembly, scene_toml.environment)
     environment = scene_toml.environment or ("outdoors" if _misfit(_SMALL, assembly, trajectory) else _SMALL)
     if environment != "outdoors" and (misfit := _misfit(environment, assembly, trajectory)):
         raise InputError(f'{path}: {misfit}: place the cage at the origin, or set environment = "outdoors"')
