@@ -1,4 +1,4 @@
-"""Checks that an assembly stays above the ground and clear of a config's cameras. World frame, metres."""
+"""Checks that an assembly and its cameras fit each other and their environment. World frame, metres."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import ConfigSpec, RandomViewsSpec, SurveySpec
+from dataset_builder.config.specs import ConfigSpec, RandomViewsSpec, SurveySpec, TrajectorySpec
+from dataset_builder.config.surroundings import LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
 from dataset_builder.config.trajectories import aim_point_m, camera_offsets_m
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.variants import SHADOWS
@@ -59,3 +60,49 @@ def _check_shadow_screen(vertices_m: Float64[ndarray, "n 3"], farthest_m: float,
             f"the screen of the variant {SHADOWS!r} would be among the cameras: {screen_m:.4g} m from the steel, "
             f"expected more than {right_eye_m:.4g} m, the distance of the farthest camera of {config.name}"
         )
+
+
+def misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> str | None:
+    """Return why the assembly or its cameras do not fit into an environment, or None if they do."""
+    steel_radius_m, limit_m = _steel_radius_m(assembly), SURROUNDINGS[environment].steel_radius_m
+    if steel_radius_m > limit_m:
+        return _outside("the steel extends", steel_radius_m, limit_m, environment)
+    return cameras_misfit(environment, assembly, trajectory)
+
+
+def cameras_misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> str | None:
+    """Return why the cameras do not fit into an environment, or None if they do.
+
+    A survey has no stations yet: in an environment for life-size steel its cameras are placed where they fit, in
+    the laboratory all places that they could have must fit.
+    """
+    space = SURROUNDINGS[environment].cameras
+    if isinstance(trajectory, SurveySpec):
+        if environment in LIFE_SIZE_ENVIRONMENTS:
+            return None
+        radius_m, height_m = _steel_radius_m(assembly) + max(trajectory.distances_m), 0.0
+    else:
+        aim_m = aim_point_m(assembly)
+        centres_m = aim_m + np.array(camera_offsets_m(trajectory, aim_m, assembly.bars))
+        radius_m = float(np.linalg.norm(centres_m[:, :2], axis=1).max())
+        height_m = float(centres_m[:, 2].max())
+    if radius_m > space.radius_m:
+        return _outside("cameras are", radius_m, space.radius_m, environment)
+    if height_m > space.ceiling_m:
+        return (
+            f"cameras are {height_m:.4g} m high, "
+            f"expected at most {space.ceiling_m:g} m in the environment {environment}"
+        )
+    return None
+
+
+def _steel_radius_m(assembly: Assembly) -> float:
+    """Return the largest horizontal distance of steel from the world's origin."""
+    return float(np.linalg.norm(assembly.vertices_m[:, :2], axis=1).max())
+
+
+def _outside(what: str, radius_m: float, limit_m: float, environment: str) -> str:
+    return (
+        f"{what} {radius_m:.4g} m from the world's origin, "
+        f"expected at most {limit_m:g} m in the environment {environment}"
+    )

@@ -168,7 +168,8 @@ def test_large_cage_is_outdoors_and_rejected_in_laboratory(tmp_path: Path) -> No
     config = scene_config(write_scene(tmp_path, content))
     assert (config.scene.environment, config.scene.board) == ("outdoors", None)
     with pytest.raises(
-        InputError, match=r"steel extends 2 m from the laboratory's centre, expected at most 0\.45 m"
+        InputError,
+        match=r"steel extends 2 m from the world's origin, expected at most 0\.45 m in the environment lab",
     ):
         scene_config(write_scene(tmp_path, 'environment = "laboratory"\n' + content))
     far = '[cameras]\nkind = "ring"\nradius = 2000\nelevation_deg = 35\nazimuths = 4\n'
@@ -176,7 +177,7 @@ def test_large_cage_is_outdoors_and_rejected_in_laboratory(tmp_path: Path) -> No
         InputError, match=r"the steel extends 21 m from the world's origin, expected at most 20\.5"
     ):
         scene_config(write_scene(tmp_path, MM + BAR.replace("100", "21000")))
-    with pytest.raises(InputError, match=r"cameras are 1.638 m from the laboratory's centre"):
+    with pytest.raises(InputError, match=r"cameras are 1.638 m from the world's origin"):
         scene_config(write_scene(tmp_path, 'environment = "laboratory"\n' + MM + BAR + far))
 
 

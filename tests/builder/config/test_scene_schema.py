@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import unicodedata
 from pathlib import Path
 
@@ -322,6 +323,13 @@ def test_file_names_without_a_scene_name_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=f"would be named '{name}', expected a name.*rename the file"):
             scene_config(write_scene(tmp_path, MM + BAR, file))
+
+
+def test_ifc_file_may_have_a_name_that_a_scene_file_cannot_name(tmp_path: Path) -> None:
+    """A path in a scene file must not begin with a tilde, but an IFC file that is the scene itself may."""
+    path = tmp_path / "~x.ifc"
+    shutil.copy("examples/column.ifc", path)
+    assert scene_config(path).name == "x"
 
 
 def test_files_that_give_the_same_scene_name_are_refused(tmp_path: Path) -> None:
