@@ -60,16 +60,11 @@ class Surroundings:
         )
 
 
-LABORATORY_CAMERAS = CameraSpace(1.6, clear_radius_m=0.6, objects_m=0.2)
-OUTDOOR_CAMERAS = CameraSpace(20.5, clear_radius_m=20.5)
-HALL_CAMERAS = CameraSpace(10.4, clear_radius_m=10.4, ceiling_m=6.8)
-DECK_CAMERAS = CameraSpace(8.3, clear_radius_m=8.3, ceiling_m=8.0)
-
 SURROUNDINGS: Mapping[str, Surroundings] = {
-    "laboratory": Surroundings(LABORATORY_CAMERAS, 0.45, markers=6),
-    "outdoors": Surroundings(OUTDOOR_CAMERAS, 20.5),
-    "hall": Surroundings(HALL_CAMERAS, 5.0, unsuitable=(SHADOWS,)),
-    "deck": Surroundings(DECK_CAMERAS, 5.0, unsuitable=(SHADOWS,)),
+    "laboratory": Surroundings(CameraSpace(1.6, clear_radius_m=0.6, objects_m=0.2), 0.45, markers=6),
+    "outdoors": Surroundings(CameraSpace(20.5, clear_radius_m=20.5), 20.5),
+    "hall": Surroundings(CameraSpace(10.4, clear_radius_m=10.4, ceiling_m=6.8), 5.0, unsuitable=(SHADOWS,)),
+    "deck": Surroundings(CameraSpace(8.3, clear_radius_m=8.3, ceiling_m=8.0), 5.0, unsuitable=(SHADOWS,)),
 }
 """Surroundings by the name of their environment.
 

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from dataset_builder.config.camera_placement import MAX_ROLL_DEG, RANDOM_RULES, with_random_stations
-from dataset_builder.config.rigs import STEREO_CAMERAS, StereoCamera, focal_of_view_px, rig_cameras
+from dataset_builder.config.rigs import STEREO_CAMERAS, focal_of_view_px, rig_cameras
 from dataset_builder.config.specs import FocalRigSpec, GeneratedCageSpec, RandomViewsSpec
 from dataset_builder.config.surroundings import CameraSpace
 from dataset_builder.config.trajectories import camera_offsets_m, look_at_with_rig, poses, view_count
@@ -23,7 +23,7 @@ from rebar_depth_bench.geometry.cameras import camera_centre, ideal_K
 SPACE = CameraSpace(20.0, clear_radius_m=20.0)
 VIEWS = 6
 SPEC = RandomViewsSpec(VIEWS, seed=4)
-RIG = STEREO_CAMERAS["Luxonis OAK-D"].rig()
+RIG = STEREO_CAMERAS["Luxonis OAK-D"]
 
 
 @pytest.fixture(scope="module")
@@ -107,8 +107,8 @@ def test_rolled_rig_turns_about_its_line_of_sight() -> None:
 
 
 @pytest.mark.parametrize("camera", STEREO_CAMERAS.values(), ids=STEREO_CAMERAS)
-def test_rig_of_a_named_camera_has_its_focal_length(camera: StereoCamera) -> None:
-    eyes = rig_cameras(camera.rig(), np.eye(4))
+def test_rig_of_a_named_camera_has_its_focal_length(camera: FocalRigSpec) -> None:
+    eyes = rig_cameras(camera, np.eye(4))
     assert eyes["left"].K[0, 0] == eyes["left"].K[1, 1] == camera.focal_px
     assert eyes["right"].cam_from_world[0, 3] == -camera.baseline_m
     half = ideal_K(640, 360, camera.focal_px)
