@@ -14,8 +14,15 @@ from typing import TYPE_CHECKING
 
 from dataset_builder.config.cages import CAGES, CagesRequest
 from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, SWEEPS, BuildRequest
-from dataset_builder.config.quality import DEFAULT_QUALITY, QUALITIES, SAMPLINGS, colour_spec
-from dataset_builder.config.specs import CPU, GPU_TYPES, ColourSpec
+from dataset_builder.config.specs import (
+    CPU,
+    DEFAULT_QUALITY,
+    GPU_TYPES,
+    QUALITIES,
+    SAMPLINGS,
+    ColourSpec,
+    colour_spec,
+)
 from dataset_builder.scene.variants import VARIANTS
 from rebar_depth_bench.console import ProgressBars, Rate, require_extra
 from rebar_depth_bench.errors import InputError, printable

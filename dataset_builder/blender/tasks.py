@@ -29,10 +29,10 @@ from dataset_builder.blender.scene import add_object, build_scene, mesh_data
 from dataset_builder.config.file_specs import PinnedFile
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import CPU, GPU_TYPES, ConfigSpec
-from dataset_builder.config.trajectories import poses
+from dataset_builder.config.trajectories import aim_point_m, poses
 from dataset_builder.pipeline.blender_process import DepthTask, DevicesTask, RenderTask
 from dataset_builder.pipeline.shards import View, encode_view, stage_row
-from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.assemblies.cage import unpacked_cage
 from dataset_builder.scene.mesh_ply import read_mesh_ply, write_mesh_ply
 from dataset_builder.scene.model import Mesh, WorldMesh, surface

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dataset_builder.config.scene_file import RESERVED_NAMES
-from dataset_builder.config.scene_name import scene_name_of
+from dataset_builder.config.scene_file import RESERVED_NAMES, scene_name_of
 from dataset_builder.config.scene_schema import SCENE_NAME
 from dataset_builder.importing.bars_file import read_bars_file
 from dataset_builder.importing.layout import Layout, read_layout

@@ -13,6 +13,7 @@ from functools import partial
 from itertools import groupby
 from pathlib import Path
 
+from dataset_builder.config.camera_fit import check_fits
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.specs import SceneConfigSpec
@@ -27,7 +28,6 @@ from dataset_builder.pipeline.publish import (
 )
 from dataset_builder.pipeline.retained import Finished, check_retained, kept_scenes
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, accept_result, remaining_units
-from dataset_builder.scene.assemblies import check_fits
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.progress import Progress, silent

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from dataset_builder.config.specs import ConfigSpec, GeneratedCageSpec, RandomViewsSpec, SceneConfigSpec
-from dataset_builder.config.trajectories import subset, view_count
+from dataset_builder.config.trajectories import aim_point_m, subset, view_count
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging
-from dataset_builder.scene.assemblies import aim_point_m, assembly_bars, make_assembly
+from dataset_builder.scene.assemblies import assembly_bars, make_assembly
 from dataset_builder.scene.model import Assembly, Note
 from dataset_builder.scene.variants.image_light import image_light
 from dataset_builder.scene.variants.sensor import sensor_spec
@@ -170,8 +170,7 @@ def place_cameras(plans: Sequence[ConfigPlan], processes: int, progress: Progres
 def with_cameras(plan: ConfigPlan) -> ScenePlan:
     """Return the plan of a generated scene with its cameras. Raises as ``place_cameras``."""
     # Only processes that place cameras need these modules.
-    from dataset_builder.config.camera_site import CameraSite
-    from dataset_builder.config.random_views import SPACING_M, with_random_stations
+    from dataset_builder.config.camera_placement import with_random_stations
     from dataset_builder.config.surroundings import SURROUNDINGS
     from dataset_builder.scene.assemblies.generated import cage_assembly, spec_cage
     from dataset_builder.scene.variants.props import make_props
@@ -180,8 +179,8 @@ def with_cameras(plan: ConfigPlan) -> ScenePlan:
     cage = spec_cage(cast(GeneratedCageSpec, spec.scene.assembly))
     assembly = cage_assembly(cage)
     space, props = SURROUNDINGS[spec.scene.environment].cameras, make_props(assembly, spec.scene)
-    site = CameraSite(assembly, space, SPACING_M, props)
-    views = with_random_stations(cast(RandomViewsSpec, spec.protocol), site, spec.rig, f"scene {spec.label}")
+    views = cast(RandomViewsSpec, spec.protocol)
+    views = with_random_stations(views, assembly, space, spec.rig, f"scene {spec.label}", props)
     return ScenePlan(
         spec=replace(spec, protocol=views),
         indices=plan.indices,

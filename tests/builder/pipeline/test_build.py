@@ -16,8 +16,8 @@ import pytest
 
 import rebar_depth_bench as rdb
 from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.quality import colour_spec
 from dataset_builder.config.scene_file import read_scene
+from dataset_builder.config.specs import colour_spec
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from dataset_builder.scene.assemblies.cage_file import mesh_file_spec
