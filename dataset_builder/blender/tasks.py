@@ -42,27 +42,18 @@ from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError, InputError
 
+Seconds = defaultdict[str, float]
+"""Wall-clock seconds by stage."""
 
-class Stopwatch:
-    """Accumulator of wall-clock seconds by stage."""
 
-    def __init__(self) -> None:
-        self._seconds: defaultdict[str, float] = defaultdict(float)
-
-    @contextmanager
-    def timing(self, stage: str) -> Iterator[None]:
-        """Add the time spent in the block to ``stage``."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._seconds[stage] += time.perf_counter() - start
-
-    def take(self) -> dict[str, float]:
-        """Return the seconds by stage since the last call, and reset them to zero."""
-        seconds = dict(self._seconds)
-        self._seconds.clear()
-        return seconds
+@contextmanager
+def _timed(seconds: Seconds, stage: str) -> Iterator[None]:
+    """Add the time spent in the block to ``stage``."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[stage] += time.perf_counter() - start
 
 
 def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None]) -> None:
@@ -70,10 +61,10 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
 
     Raises ``BuildError`` if the scene's mesh differs from the one of other shards or Blender fails.
     """
-    watch = Stopwatch()
+    seconds = Seconds(float)
     unit, staging = task.unit, task.staging
     config = unit.config
-    with watch.timing("scene"):
+    with _timed(seconds, "scene"):
         of_file = isinstance(config.scene.assembly, PinnedFile)
         cage = unpacked_cage(staging.cage.read_bytes()) if of_file else None
         assembly = make_assembly(config.scene.assembly, cage)
@@ -86,18 +77,18 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
         caster = RayCaster(mesh)
         left_poses = poses(config.protocol, aim_point_m(assembly), config.rig, assembly.bars)
         rays_cam = {eye: camera.rays() for eye, camera in rig_cameras(config.rig, np.eye(4)).items()}
-    report({"seconds": watch.take()})
+    report({"seconds": seconds})
     with tempfile.TemporaryDirectory(dir=staging.root) as scratch:
         context = _RenderContext(config, caster, rays_cam, Path(scratch))
         for index in unit.indices:
-            path = staging.row(index)
+            path, seconds = staging.row(index), Seconds(float)
             if not path.is_file():
-                view = _render_view(context, index, left_poses[index], watch)
-                with watch.timing("encode"):
+                view = _render_view(context, index, left_poses[index], seconds)
+                with _timed(seconds, "encode"):
                     row, record = encode_view(view)
-                with watch.timing("write"):
+                with _timed(seconds, "write"):
                     stage_row(path, row, record)
-            report({"view": index, "seconds": watch.take()})
+            report({"view": index, "seconds": seconds})
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,16 +102,16 @@ class _RenderContext:
 
 
 def _render_view(
-    context: _RenderContext, index: int, left_cam_from_world: Float64[ndarray, "4 4"], watch: Stopwatch
+    context: _RenderContext, index: int, left_cam_from_world: Float64[ndarray, "4 4"], seconds: Seconds
 ) -> View:
     """Render colour, if the config has it, and ray cast ground truth of both eyes of one view."""
     config = context.config
     eyes, rgb = {}, None
     for eye_index, (eye, camera) in enumerate(rig_cameras(config.rig, left_cam_from_world).items()):
-        with watch.timing("truth"):
+        with _timed(seconds, "truth"):
             truth = context.caster.cast(camera, context.rays_cam[eye])
         if config.colour is not None:
-            with watch.timing("colour"):
+            with _timed(seconds, "colour"):
                 seed = _cycles_seed(config, index, eye_index)
                 rgb = render_colour(camera, truth.mask, config.colour, seed, context.scratch)
                 rgb = recorded(rgb, config.scene, seed)

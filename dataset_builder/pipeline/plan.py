@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import sys
 from collections.abc import Mapping, Sequence
@@ -110,7 +111,8 @@ def config_parameters(spec: ConfigSpec) -> dict[str, Any]:
     assembly = parameters["scene"]["assembly"]
     if "path" in assembly:
         assembly["path"] = Path(assembly["path"]).name
-    return parameters
+    values: dict[str, Any] = json.loads(json.dumps(parameters))
+    return values
 
 
 @cache
