@@ -186,9 +186,9 @@ def _import(options: argparse.Namespace) -> None:
 
 
 def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scene_file", metavar="SCENE", help="scene TOML, IFC model, or mesh file (STL, PLY, OBJ)")
     from dataset_builder.build_command import add_mesh_unit
 
+    parser.add_argument("scene_file", metavar="SCENE", help="scene TOML, IFC model, or mesh file (STL, PLY, OBJ)")
     add_mesh_unit(parser)
     add_output_file(parser, "--json", "write the bars, what is left out, and the placement as JSON")
     add_output_file(parser, "--picture", "write a PNG of the cage from four sides")
